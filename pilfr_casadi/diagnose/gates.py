@@ -1,20 +1,26 @@
-"""Faults of recordings as edits, and the faults of whole channels: sign, unit, exchange, unit of time, offset.
+"""Faults of recordings as edits, the one rule that accepts them, and the faults of whole channels.
 
-All faults are found in the same way. An edit of the recordings (`Gate.change`), or an element at a sensor, corrects the
-fault, and the simulator is refitted with it. The edit is accepted if it leaves a small share of the refit's mean square
-error (`CURED`, `EXPLAINED`), and by comparison with the noise (`AT_NOISE`). Parameters that an edit adds must gain more
-evidence than they cost (`gain`; Schwarz 1978). Each check takes a `Checked` and returns one.
+A fault is a small frozen object (`Gate`). It corrects the recordings or the simulator, and says so in a sentence. All
+faults that a refit can confirm take the same steps.
 
-Edits are screened to first order (`FirstOrder`): with base the orthonormal directions that parameters and initial
-states can follow, an error e leaves `e - base baseᵀ e`.
+1. Screen to first order (`FirstOrder`), which gives the start value: with base the orthonormal directions that
+   parameters and initial states can follow, an error e leaves `e - base baseᵀ e`.
+2. Correct the fault and refit (`correct`). If the fault has a size or a place, relocate and refit in turn (`settle`).
+3. Accept the fault by one rule (`accept`). The gain in log evidence has to exceed the BIC cost of the parameters
+   (Schwarz 1978) by the prior odds against a fault, `LEAST_GAIN`, and at most the share `CURED` of the mean square
+   error may be left: other physics hardly mimics a fault so closely.
+
+The faults of whole channels are sign, unit or gain, exchange, unit of time, and offset.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
@@ -31,16 +37,17 @@ from .workbench import QUICK, THOROUGH, Fitted, Workbench
 
 Change = Callable[[Recording], Recording]
 
-# largest share of the mean square error left: by an edit of a whole channel, which other physics hardly mimics; by
-# others
-CURED, EXPLAINED = 0.12, 0.3
-CLEARLY = 0.8  # the same for an edit that is clearly better than another edit, or than none
-AT_NOISE = 5.0  # rms error over the noise up to which nothing else is wrong; faults are sought from ABOVE_NOISE on
-# mean square error from which a refit may be in a wrong minimum; from which it says nothing
-POOR_FIT, USELESS_FIT = 0.04, 0.25
-SAME = 1.02  # ratio of errors that count as equal
-LEAST_GAIN = 12.0  # least gain of an edit's parameters beyond their BIC cost, in nats: odds of about 1e5
+LEAST_GAIN = 12.0  # least gain of a correction beyond the BIC cost of its parameters, in nats: odds of about 1e5
 CERTAIN = (2 * LEAST_GAIN) ** 0.5  # the same in standard errors of one parameter
+CURED = 0.25  # largest share of the mean square that the correction of a fault leaves: it halves the error
+USELESS_FIT = CURED  # the same share of the outputs' variance: a worse refit says nothing
+POOR_FIT = 0.04  # share of the outputs' variance from which a refit may be in a wrong minimum
+CLEARLY = 0.8  # share left by an edit that is clearly better than another edit, or than none
+RARE = 0.02  # share of a mean square, or of the samples, up to which something is an exception
+SAME = 1.02  # ratio of errors that count as equal
+AT_NOISE = 5.0  # rms error over the noise up to which nothing else is wrong
+FEWEST = 30.0  # effective samples that a residual has at least
+TURNS = 8  # alternations of edit and refit at most
 
 # metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
 UNITS = (1e3, 1e6, 1e2, 180 / np.pi, 9.80665, 30 / np.pi, 3.6, 1e5, 60.0, 4.4482216, 25.4, 1 / 0.0254, 6894.757)
@@ -53,16 +60,17 @@ BENT = 0.3  # share of the parameters at their bounds above which a refit does n
 # first refit of each trial, only to discard hopeless ones
 GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
 
-LEAST = 0.01  # least share of the mean square that an offset must remove, to first order
-STILL = 0.1  # share of its first value that an offset must keep beside effects to be reported
-
 
 @dataclass(frozen=True)
 class Gate:
-    """A finding about a channel, and the edit that corrects it.
+    """A finding about a channel; if it is a fault that can be corrected, also the edit that corrects it.
 
     Attributes
     ----------
+    value : object
+        What is wrong, as reported; the start value until the edit is settled.
+    sentence : str
+        What is wrong; `accept` adds the effect of the correction.
     corrected : bool
         Whether the diagnosis goes on with the corrected recordings.
     fault : bool
@@ -85,10 +93,34 @@ class Gate:
     parameter: str = ""
     left: float = 1.0
 
+    # for the rule: parameters that the correction adds, the largest share that it may leave, and how it is described
+    parameters: ClassVar[int] = 0
+    most_left: ClassVar[float] = CURED
+    remedy: ClassVar[str] = "with it corrected"
+
     def to_dict(self) -> dict[str, Any]:
         """Return the finding as in diagnosis.json."""
         keys = ("channel", "finding", "value", "sentence", "corrected")
         return {k: getattr(self, k) for k in keys}
+
+    def apply(self, bench: Workbench) -> Workbench:
+        """Return the bench with changed recordings; errors are in units of the outputs' new deviation."""
+        recordings = tuple(self.change(r) if self.change else r for r in bench.recordings)
+        if recordings[0].dt != bench.dt:
+            return Workbench.of(bench.simulator, recordings, bench.hold, bench.engine)
+        scale = np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
+        return replace(bench, recordings=recordings, scale=scale)
+
+    def begin(self, previous: Fitted) -> Sequence[np.ndarray]:
+        """Return guesses of the initial states of the corrected recordings."""
+        return previous.begin
+
+    def relocate(self, now: Checked, after: Checked) -> Self | None:
+        """Return the fault at its best value to first order at the corrected refit, or None if there is none."""
+        return self
+
+
+G = TypeVar("G", bound=Gate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,15 +151,96 @@ class Checked:
         return Checked(bench, fitted, (*self.gates, *gates))
 
 
+# the one rule
+
+
+def gain(before: float, after: float, residual: Sequence[np.ndarray], parameters: int = 1) -> float:
+    """Compute the gain in log evidence, nats, of a fit with more parameters, by BIC on its effective samples."""
+    n = max(effective_size(residual), FEWEST)
+    return float(0.5 * n * np.log(before / max(after, 1e-300)) - 0.5 * parameters * np.log(n))
+
+
 def describe_fall(before: float, after: float) -> str:
     """Describe by how much an edit reduces the mean square error."""
     return f"the refitted error falls from {before**0.5:.3g} to {after**0.5:.3g} of the outputs' deviation"
 
 
-def gain(before: float, after: float, residual: Sequence[np.ndarray], parameters: int = 1) -> float:
-    """Compute the gain in log evidence, nats, of a fit with more parameters, by BIC on its effective samples."""
-    n = max(effective_size(residual), 30.0)
-    return float(0.5 * n * np.log(before / max(after, 1e-300)) - 0.5 * parameters * np.log(n))
+def refit(
+    bench: Workbench,
+    starts: Sequence[Mapping[str, Any]] = ({},),
+    simulator: Simulator | None = None,
+    *,
+    states: Sequence[np.ndarray] = (),
+    solver: GaussNewton = QUICK,
+    like: Fitted | None = None,
+) -> Fitted | None:
+    """Fit a simulator, by default the bench's; None if it diverges. The compiled model of `like` is reused."""
+    model, engine = (like.model, like.engine) if like else (None, None)
+    simulator = simulator or bench.simulator
+    try:
+        return bench.fit(simulator, starts, states=states, solver=solver, model=model, engine=engine)
+    except InputError:
+        return None
+
+
+def correct(
+    now: Checked,
+    fault: Gate,
+    starts: Sequence[Mapping[str, Any]] = ({},),
+    states: Sequence[np.ndarray] = (),
+    solver: GaussNewton = QUICK,
+) -> Checked | None:
+    """Correct a fault and refit; None if the simulator cannot follow then."""
+    try:
+        bench = fault.apply(now.bench)
+    except InputError:
+        return None
+    same_model = bench.simulator is now.bench.simulator and bench.dt == now.bench.dt
+    found = refit(bench, starts, states=states, solver=solver, like=now.fitted if same_model else None)
+    return None if found is None else now.then(bench, found)
+
+
+def settle(now: Checked, fault: G, solver: GaussNewton = QUICK) -> tuple[G, Checked] | None:
+    """Refit and relocate a fault in turn until it stays, because a refit without it may be in a wrong minimum."""
+    best: tuple[G, Checked] | None = None
+    previous = now.fitted
+    for _ in range(TURNS):
+        after = correct(now, fault, [previous.values, {}], fault.begin(previous), solver)
+        if after is None:
+            break
+        if best is None or after.cost < best[1].cost:
+            best = fault, after
+        following = fault.relocate(now, after)
+        if following is None:
+            break
+        if following.value == fault.value:
+            return following, after
+        fault, previous = following, after.fitted
+    return best
+
+
+def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
+    """Return the corrected state with its finding if the rule accepts the fault, else the state before.
+
+    If the recordings as given are followed as well from the corrected refit's values, the correction only led the refit
+    out of a local minimum; that refit is returned.
+    """
+    if after is None or not _satisfies_rule(now, after, fault):
+        return now
+    back = refit(now.bench, [after.fitted.values], states=now.fitted.initial, like=now.fitted)
+    if back is not None and not _satisfies_rule(now.then(now.bench, back), after, fault):
+        return now.then(now.bench, back)
+    sentence = f"{fault.sentence}; {fault.remedy} {describe_fall(now.cost, after.cost)}"
+    noises = (after.cost / max(now.noise2, 1e-300)) ** 0.5
+    if noises > AT_NOISE:
+        sentence += f", still {noises:.2g} times the noise: more is wrong"
+    told = replace(fault, sentence=f"{sentence}.", fault=True, left=after.cost / now.cost)
+    return now.then(after.bench, after.fitted, told)
+
+
+def _satisfies_rule(now: Checked, after: Checked, fault: Gate) -> bool:
+    gained = gain(now.cost, after.cost, after.fitted.residual, fault.parameters)
+    return gained > LEAST_GAIN and after.cost < min(fault.most_left * now.cost, USELESS_FIT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,67 +282,50 @@ class FirstOrder:
         return np.concatenate(out)
 
 
-# edits of recordings
+def robust_deviation(v: np.ndarray) -> np.ndarray:
+    """Estimate the deviation of zero-mean columns from the upper quartile of their sizes, which ignores outliers."""
+    return np.asarray(np.quantile(np.abs(v), 0.75, axis=0) / 1.1503)
 
 
-def scale_channels(kind: str, index: int | list[int], factor: float) -> Change:
-    """Multiply one channel, or several."""
-
-    def change(r: Recording) -> Recording:
-        values = np.array(getattr(r, kind))
-        values[:, index] *= factor
-        return r.with_(**{kind: values})
-
-    return change
+# sign, unit, exchange, unit of time
 
 
-def exchange_channels(kind: str, one: int, other: int) -> Change:
-    """Exchange two channels."""
-
-    def change(r: Recording) -> Recording:
-        values = np.array(getattr(r, kind))
-        values[:, [one, other]] = values[:, [other, one]]
-        return r.with_(**{kind: values})
-
-    return change
+def map_channels(kind: str, matrix: np.ndarray, channel: str, finding: str, value: Any, words: str) -> Gate:
+    """Return the fault that inputs ("u") or outputs ("y") times a matrix (n, n) correct."""
+    sentence = f"In the recordings {channel if finding != 'exchange' else ' and '.join(value)} {words}"
+    return Gate(channel, finding, value, sentence, change=lambda r: r.with_(**{kind: getattr(r, kind) @ matrix}))
 
 
-def scale_time(factor: float) -> Change:
-    """Multiply the time."""
-    return lambda r: r.with_(dt=r.dt * factor)
+def scale_channels(kind: str, names: Sequence[str], columns: Sequence[int], factor: float, more: str = "") -> Gate:
+    """Return the fault that a factor on some channels corrects: a wrong sign or unit."""
+    matrix, channel = np.eye(len(names)), ", ".join(names[i] for i in columns)
+    matrix[columns, columns] = factor
+    if factor < 0:
+        return map_channels(kind, matrix, channel, "sign", factor, f"has the wrong sign{more}")
+    words = f"{'are' if len(columns) > 1 else 'is'} {_describe_factor(factor, more)}"
+    return map_channels(kind, matrix, channel, "unit", factor, words)
+
+
+def exchange_channels(kind: str, names: Sequence[str], one: int, other: int) -> Gate:
+    """Return the fault that two channels are exchanged."""
+    matrix, both = np.eye(len(names)), [names[one], names[other]]
+    matrix[[one, other]] = matrix[[other, one]]
+    return map_channels(kind, matrix, ", ".join(both), "exchange", both, "are exchanged")
+
+
+def scale_time(factor: float) -> Gate:
+    """Return the fault that a factor on the time corrects."""
+    words = f"In the recordings the time is {_describe_factor(factor)}"
+    return Gate("time", "time-unit", factor, words, change=lambda r: r.with_(dt=r.dt * factor))
+
+
+def _describe_factor(correction: float, more: str = "") -> str:
+    return f"off by a factor of {1 / correction:.4g}{more}, as from a wrong unit"
 
 
 def open_start(r: Recording) -> Recording:
     """Estimate the initial state of a periodic recording, because it is not on its steady cycle."""
     return r.with_(initial="estimate", period=None) if r.begins == "periodic" else r
-
-
-def change_recordings(bench: Workbench, change: Change) -> Workbench:
-    """Return the bench with changed recordings; the errors are in units of their new deviation."""
-    recordings = tuple(change(r) for r in bench.recordings)
-    scale = np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
-    return replace(bench, recordings=recordings, scale=scale)
-
-
-def refit(
-    bench: Workbench,
-    starts: Sequence[Mapping[str, Any]] = ({},),
-    simulator: Simulator | None = None,
-    *,
-    states: Sequence[np.ndarray] = (),
-    solver: GaussNewton = QUICK,
-    like: Fitted | None = None,
-) -> Fitted | None:
-    """Fit a simulator, by default the bench's; None if it diverges. The compiled model of `like` is reused."""
-    model, engine = (like.model, like.engine) if like else (None, None)
-    simulator = simulator or bench.simulator
-    try:
-        return bench.fit(simulator, starts, states=states, solver=solver, model=model, engine=engine)
-    except InputError:
-        return None
-
-
-# sign, unit, exchange, unit of time
 
 
 def open_bench(simulator: Any, recordings: Sequence[Recording], hold: str, engine: str) -> tuple[Workbench, list[Gate]]:
@@ -244,99 +340,90 @@ def open_bench(simulator: Any, recordings: Sequence[Recording], hold: str, engin
         return Workbench.of(simulator, recordings, hold, engine), []
     except InputError as error:
         for factor in TIME_UNITS:
-            try:
-                bench = Workbench.of(simulator, [scale_time(factor)(r) for r in recordings], hold, engine)
-            except InputError:
-                continue
-            found = refit(bench)
-            if found is not None and found.cost < USELESS_FIT:
-                words = (
-                    f"The time of the recordings is off by a factor of {1 / factor:.4g}, as from a wrong unit: as "
-                    f"given, the simulator cannot follow at all; corrected, its error is {found.cost**0.5:.3g} of the "
-                    "outputs' deviation."
-                )
-                return bench, [Gate("time", "time-unit", factor, words, fault=True, change=scale_time(factor))]
+            with suppress(InputError):
+                bench = Workbench.of(simulator, [r.with_(dt=r.dt * factor) for r in recordings], hold, engine)
+                cost, fault = bench.fit(simulator).cost, scale_time(factor)
+                if cost < USELESS_FIT:
+                    words = f"as given, the simulator cannot follow; corrected, its error is {cost**0.5:.3g}"
+                    words = f"{fault.sentence}; {words} of the outputs' deviation."
+                    return bench, [replace(fault, sentence=words, fault=True)]
         raise error
 
 
-def find_slips(now: Checked, workers: int, beside: str = "") -> Checked:
-    """Try sign and unit of each channel, of all outputs and of the time, and exchanged channels, `workers` at a time.
+def find_slips(now: Checked, workers: int) -> Checked:
+    """Find wrong signs and units, exchanged channels and a wrong unit of time, with `workers` trials at a time.
 
-    With `beside`, try that channel alone, in addition to the offset that it has already.
+    If the error stays large, try each output with an offset as well; `find_offsets` reports the offset and keeps it.
     """
-    bench, plain = now.bench, now.fitted
+    bench = now.bench
     # with an offset there is a working point, which a run from rest would have to reach first
-    sizes = _sizes(bench, plain.residual if beside else _from_rest(bench))
-    near = (lambda ratio: True) if plain.cost > 1 else _near  # if the run diverged, its size says nothing
-    outputs, inputs = bench.simulator.output_names, bench.simulator.inputs
-    trials = list[Gate]()
-    for kind, names in (("y", outputs), ("u", inputs)):
-        for i, name in enumerate(names):
-            trials.append(Gate(name, "sign", -1.0, change=scale_channels(kind, i, -1.0)))
-            for f in (*FACTORS, *FAHRENHEIT) if beside else FACTORS:
-                if near(f * sizes[i]) if kind == "y" else any(near(v / f) for v in sizes):
-                    trials.append(Gate(name, "unit", f, change=scale_channels(kind, i, f)))
-    if beside:
-        return _take_best_slip(now, [g for g in trials if g.channel == beside], workers, " and an offset")
-    for f in FACTORS if len(outputs) > 1 else ():
-        if all(near(f * size) for size in sizes):
-            trials.append(Gate(", ".join(outputs), "unit", f, change=scale_channels("y", list(range(len(outputs))), f)))
-    for kind, names in (("y", outputs), ("u", inputs)) if plain.cost > POOR_FIT else ():
-        for i, j in combinations(range(len(names)), 2):
-            both = [names[i], names[j]]
-            trials.append(Gate(", ".join(both), "exchange", both, change=exchange_channels(kind, i, j)))
-    for f in TIME_UNITS if plain.cost > POOR_FIT else ():
-        trials.append(Gate("time", "time-unit", f, change=scale_time(f)))
-    return _take_best_slip(now, trials, workers)
+    found = _accept_best(now, _possible_slips(now, _from_rest(bench)), workers)
+    for i, name in enumerate(bench.simulator.output_names if found.cost > POOR_FIT else ()):
+        offset = constant_at(f"sensor:{name}")
+        level = correct(now, offset, [{}, now.fitted.values], now.fitted.begin)
+        if level is None:
+            continue
+        near = _near(level, level.fitted.residual)
+        factors = [f for f in (-1.0, *FACTORS, *FAHRENHEIT) if f < 0 or near("y", [i], f)]
+        faults = [scale_channels("y", bench.simulator.output_names, [i], f, " and an offset") for f in factors]
+        beside = _accept_best(level, faults, workers)
+        if len(beside.gates) > len(now.gates) and beside.cost < CURED * found.cost:
+            found = replace(beside, bench=replace(beside.bench, simulator=bench.simulator))
+    return found
 
 
-def _take_best_slip(now: Checked, trials: Sequence[Gate], workers: int, more: str = "") -> Checked:
-    """Take the trial with the smallest error, if it is far smaller than the error without it."""
-    bench, plain = now.bench, now.fitted
-    channels = (*bench.simulator.inputs, *bench.simulator.output_names)
-
-    def tried(gate: Gate) -> Checked | None:
-        assert gate.change is not None
-        other: Workbench = change_recordings(bench, gate.change)
-        like: Fitted | None = plain
-        if gate.finding == "time-unit":
-            try:
-                other, like = Workbench.of(bench.simulator, other.recordings, bench.hold, bench.engine), None
-            except InputError:
-                return None
-        glanced = refit(other, solver=GLANCE, like=like)
-        if glanced is None or not glanced.cost < plain.cost:
-            return None
-        found = refit(other, [{}, glanced.values], states=glanced.begin, like=glanced)
-        if found is None or (gate.finding == "time-unit" and found.at_bounds > BENT):
-            return None
-        return now.then(other, found, gate)
-
-    best = now
-    for found in side_by_side(tried, trials, workers):
-        # for a linear simulator, a unit of all outputs is equivalent to a unit of its input, or of its only output
-        joint = found is not None and found.gates[-1].finding == "unit" and found.gates[-1].channel not in channels
-        if found is not None and found.cost < (CLEARLY if joint else 1 - 1e-6) * best.cost:
-            best = found
-    if best is now or best.cost > min(CURED * plain.cost, USELESS_FIT):
-        return now
-    gate = best.gates[-1]
-    factor = 1 / gate.value if isinstance(gate.value, float) else 1.0
-    be = "is" if gate.channel in (*channels, "time") else "are"
-    what = f"{'the time' if gate.channel == 'time' else gate.channel} {be}"
-    words = {
-        "sign": f"{gate.channel} has the wrong sign{more}",
-        "exchange": f"{gate.channel.replace(', ', ' and ')} are exchanged",
-    }.get(gate.finding, f"{what} off by a factor of {factor:.4g}{more}, as from a wrong unit")
-    sentence = f"In the recordings {words}: with it corrected {describe_fall(plain.cost, best.cost)}."
-    return now.then(best.bench, best.fitted, replace(gate, sentence=sentence, fault=True, left=best.cost / plain.cost))
+def _possible_slips(now: Checked, errors: Sequence[np.ndarray]) -> list[Gate]:
+    """List the faults of sign, unit, exchange and unit of time that the outputs' sizes allow."""
+    near, faults = _near(now, errors), list[Gate]()
+    channels = {"y": now.bench.simulator.output_names, "u": now.bench.simulator.inputs}
+    for kind, names in channels.items():
+        for i in range(len(names)):
+            factors = [f for f in FACTORS if near(kind, [i], f)]
+            faults += [scale_channels(kind, names, [i], f) for f in (-1.0, *factors)]
+    every = range(len(channels["y"]))
+    joint = [f for f in FACTORS if len(every) > 1 and near("y", every, f)]
+    faults += [scale_channels("y", channels["y"], every, f) for f in joint]
+    if now.cost > POOR_FIT:
+        for kind, names in channels.items():
+            faults += [exchange_channels(kind, names, i, j) for i, j in combinations(range(len(names)), 2)]
+        faults += map(scale_time, TIME_UNITS)
+    return faults
 
 
-def _sizes(bench: Workbench, errors: Sequence[np.ndarray]) -> np.ndarray:
-    """Compute the ratio of the measured to the simulated size of each output; nan if the simulation diverges."""
+def _near(now: Checked, errors: Sequence[np.ndarray]) -> Callable[[str, Sequence[int], float], bool]:
+    """Return a test whether a factor on channels lets the outputs of a run have about the measured size."""
     with np.errstate(all="ignore"):
-        y = [e + r.y for e, r in zip(errors, bench.recordings, strict=True)]
-        return np.asarray(bench.scale / np.std(np.concatenate(y), axis=0))
+        y = np.concatenate([e + r.y for e, r in zip(errors, now.bench.recordings, strict=True)])
+        sizes = now.bench.scale / np.std(y, axis=0)
+
+    def near(kind: str, columns: Sequence[int], factor: float) -> bool:
+        ratios = factor * sizes[columns] if kind == "y" else sizes / factor
+        unknown = ~np.isfinite(ratios) | (ratios == 0) | (now.cost > 1)  # the size of a diverging run says nothing
+        close = unknown | ((ratios > 1 / NEAR) & (ratios < NEAR))
+        return bool(np.all(close) if kind == "y" else np.any(close))
+
+    return near
+
+
+def _accept_best(now: Checked, faults: Sequence[Gate], workers: int) -> Checked:
+    """Accept the fault whose correction leaves the smallest error, if the rule accepts it."""
+    best: tuple[Gate, Checked] | None = None
+    for fault, after in zip(faults, side_by_side(partial(_try, now), faults, workers), strict=True):
+        # for a linear simulator, a unit of all outputs is equivalent to a unit of its input, or of its only output
+        joint = fault.finding == "unit" and "," in fault.channel
+        if after is not None and (best is None or after.cost < (CLEARLY if joint else 1 - 1e-6) * best[1].cost):
+            best = fault, after
+    return now if best is None else accept(now, best[1], best[0])
+
+
+def _try(now: Checked, fault: Gate) -> Checked | None:
+    """Correct a fault and refit from the user's values; None if it is hopeless."""
+    glanced = correct(now, fault, solver=GLANCE)
+    if glanced is None or not glanced.cost < now.cost:
+        return None
+    after = correct(now, fault, [{}, glanced.fitted.values], glanced.fitted.begin)
+    bent = fault.finding == "time-unit" and after is not None and after.fitted.at_bounds > BENT
+    return None if bent else after
 
 
 def _from_rest(bench: Workbench) -> list[np.ndarray]:
@@ -346,10 +433,6 @@ def _from_rest(bench: Workbench) -> list[np.ndarray]:
     start, n = model.parameters.start, model.n_state
     with np.errstate(all="ignore"):
         return [engine.simulate(model.drive(r), start, np.zeros(n))[0] - r.y for r in bench.recordings]
-
-
-def _near(ratio: float) -> bool:
-    return not np.isfinite(ratio) or ratio == 0 or 1 / NEAR < ratio < NEAR
 
 
 # offset: a constant at an input or an output (a bias of an amplifier, the zero of a sensor, a constant load)
@@ -371,21 +454,26 @@ class Offset(Law):
         return p.w_0
 
 
-def find_slip_beside_offset(now: Checked, slipped: Checked, workers: int) -> Checked:
-    """Return the corrected slips; try each output with a slip and an offset, and return that if it is far better.
+@dataclass(frozen=True)
+class Constant(Gate):
+    """A constant at an input or an output; as a parameter of the simulator, it may leave any error to other physics."""
 
-    `find_offsets` reports the offset and keeps it.
-    """
-    bench = now.bench
-    for name in bench.simulator.output_names if slipped.cost > POOR_FIT else ():
-        placed = replace(bench, simulator=bench.simulator.with_element(f"sensor:{name}", Offset()))
-        level = refit(placed, [{}, now.fitted.values], states=now.fitted.begin)
-        if level is None:
-            continue
-        found = find_slips(Checked(placed, level, now.gates), workers, name)
-        if len(found.gates) > len(now.gates) and found.cost < CURED * slipped.cost:
-            slipped = replace(found, bench=replace(found.bench, simulator=bench.simulator))
-    return slipped
+    port: str = ""
+    parameters: ClassVar[int] = 1
+    most_left: ClassVar[float] = 1.0
+    remedy: ClassVar[str] = "with it as a parameter"
+
+    def apply(self, bench: Workbench) -> Workbench:
+        """Return the bench with the constant in its simulator."""
+        return replace(bench, simulator=bench.simulator.with_element(self.port, Offset()))
+
+
+def constant_at(port: str, value: float = 0.0, parameter: str = "") -> Constant:
+    """Return the fault that a channel has a constant offset."""
+    kind, name = port.split(":", 1)
+    where, load = ("input", ", or a constant load acts like one") if kind == "actuator" else ("output", "")
+    words = f"The {where} {name} has a constant offset of about {value:.3g}{load}"
+    return Constant(name, "offset", value, words, parameter=parameter, port=port)
 
 
 def find_offsets(now: Checked) -> Checked:
@@ -393,29 +481,27 @@ def find_offsets(now: Checked) -> Checked:
 
     They count as a fault if they explain most of the mismatch.
     """
-    begin = now
-    ports = [f"actuator:{n}" for n in now.bench.simulator.inputs]
-    ports += [f"sensor:{n}" for n in now.bench.simulator.output_names]
-    taken = {e.port for e in now.bench.simulator.elements}
-    ports = [port for port in ports if port not in taken]
+    begin, simulator = now, now.bench.simulator
+    ports = [f"actuator:{n}" for n in simulator.inputs] + [f"sensor:{n}" for n in simulator.output_names]
+    ports = [port for port in ports if port not in {e.port for e in simulator.elements}]
     while ports:
-        bench, plain = now.bench, now.fitted
-        share = share_of_constants(bench, plain, ports)
+        share = share_of_constants(now.bench, now.fitted, ports)
         port = max(share, key=lambda name: share[name])
-        if share[port] < LEAST:
+        if share[port] < RARE:
             break
-        other = replace(bench, simulator=bench.simulator.with_element(port, Offset()))
-        parameter = f"{other.simulator.elements[-1].prefix}w_0"
-        found = refit(other, [plain.values], states=plain.initial, solver=THOROUGH)
-        if found is None or gain(plain.cost, found.cost, found.residual) < LEAST_GAIN:
+        after = correct(now, constant_at(port), [now.fitted.values], now.fitted.initial, THOROUGH)
+        if after is None:
             break
-        value = float(found.values[parameter])
-        sentence = f"{_constant(port, value)}; with it as a parameter {describe_fall(plain.cost, found.cost)}."
-        now = now.then(other, found, Gate(port.split(":", 1)[1], "offset", value, sentence, parameter=parameter))
+        name = f"{after.bench.simulator.elements[-1].prefix}w_0"
+        accepted = accept(now, after, constant_at(port, float(after.fitted.values[name]), name))
+        if accepted.bench is now.bench:
+            break
+        now = accepted
         ports.remove(port)
     fault = now.cost < CURED * begin.cost
-    told = (replace(g, fault=fault) for g in now.gates[len(begin.gates) :])
-    return begin.then(now.bench, now.fitted, *told)
+    # a constant load acts alike, so that the share that is left does not prove a fault
+    found = (replace(g, fault=fault, left=1.0) for g in now.gates[len(begin.gates) :])
+    return begin.then(now.bench, now.fitted, *found)
 
 
 def share_of_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[str, float]:
@@ -428,32 +514,19 @@ def share_of_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -
     return dict(zip(ports, (along**2 / max(first.error @ first.error, 1e-300)).tolist(), strict=True))
 
 
-def _constant(port: str, value: float) -> str:
-    kind, name = port.split(":", 1)
-    where, load = ("input", ", or a constant load acts like one") if kind == "actuator" else ("output", "")
-    return f"The {where} {name} has a constant offset of about {value:.3g}{load}"
-
-
 def offset_gates(elements: Sequence[Any], values: Mapping[str, Any]) -> list[Gate]:
     """List the offsets among fitted laws as findings."""
-    out = []
-    for e in elements:
-        if isinstance(e.law, Offset):
-            parameter = f"{e.prefix}w_0"
-            value = float(values[parameter])
-            sentence = f"{_constant(e.port, value)}; it is a parameter of the corrected simulator."
-            out.append(Gate(e.port.split(":", 1)[1], "offset", value, sentence, parameter=parameter))
-    return out
+    placed = [(e.port, f"{e.prefix}w_0") for e in elements if isinstance(e.law, Offset)]
+    found = [constant_at(port, float(values[name]), name) for port, name in placed]
+    return [replace(c, sentence=f"{c.sentence}; it is a parameter of the corrected simulator.") for c in found]
 
 
 def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
     """Fix offsets at zero that gain nothing beside effects: an effect may have looked like an offset."""
     before = len(bench.simulator.elements)
     placed = fitted.simulator.elements
-    for element in placed[:before] if len(placed) > before else ():
-        if not isinstance(element.law, Offset):
-            continue
-        name = f"{element.prefix}w_0"
+    for offset in offset_gates(placed[:before], fitted.values) if len(placed) > before else ():
+        name = offset.parameter
         held = replace(fitted.simulator.parameters[name], value=0.0, fixed=True)
         simulator = fitted.simulator.with_parameters({**fitted.simulator.parameters, name: held})
         start = {k: v for k, v in fitted.values.items() if k != name}
@@ -467,19 +540,17 @@ def final_gates(
     gates: Sequence[Gate], after: Fitted, std: Mapping[str, np.ndarray], effects: bool, sure: bool
 ) -> tuple[Gate, ...]:
     """Return the findings with the offsets that remain, at their fitted values beside the effects, if any."""
+    fitted = {g.parameter: g for g in offset_gates(after.simulator.elements, after.values)}
     out = []
     for gate in gates:
         if not gate.parameter:
             out.append(gate)
             continue
-        value, error = float(after.values[gate.parameter]), float(std[gate.parameter])
-        if not (abs(value) > CERTAIN * error and abs(value) > STILL * abs(gate.value)):
+        remaining = fitted[gate.parameter]
+        if not abs(remaining.value) > CERTAIN * float(std[gate.parameter]):
             continue
-        sentence = gate.sentence
-        if effects:  # an offset fitted without the effects says little
-            element = next(e for e in after.simulator.elements if gate.parameter.startswith(e.prefix))
-            sentence = offset_gates([element], after.values)[0].sentence
+        sentence = remaining.sentence if effects else gate.sentence  # fitted without the effects, it says little
         if not sure:
             sentence += " As long as the mismatch has no sure name, it may be a part of that."
-        out.append(replace(gate, value=value, sentence=sentence))
+        out.append(replace(gate, value=remaining.value, sentence=sentence))
     return tuple(out)

@@ -20,7 +20,7 @@ from ..data import Recording
 from ..laws import LINEAR, display_name
 from ..simulators import states_along
 from .evidence import AT_FLOOR, FAR, SURE, deviations
-from .gates import CERTAIN, EXPLAINED, LEAST_GAIN, SAME, USELESS_FIT, Gate, describe_fall, gain, open_start, refit
+from .gates import CERTAIN, CURED, LEAST_GAIN, SAME, USELESS_FIT, Gate, describe_fall, gain, open_start, refit
 from .search import Search
 from .verdict import Posterior, posterior
 from .workbench import FEW, THOROUGH, Fitted, Workbench
@@ -164,7 +164,7 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
     more_starts = sum(len(part.recordings) for part in benches) - len(bench.recordings)
     more = whole.model.parameters.free.sum() * (len(fits) - 1) + len(whole.initial[0]) * more_starts
     residual = [e for f in fits for e in f.residual]
-    if cost > EXPLAINED * whole.cost or gain(whole.cost, max(cost, search.floor2), residual, more) < LEAST_GAIN:
+    if cost > CURED * whole.cost or gain(whole.cost, max(cost, search.floor2), residual, more) < LEAST_GAIN:
         return None
     values = _clearest_differences(whole, fits, benches)
     if not values:

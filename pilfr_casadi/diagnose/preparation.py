@@ -26,7 +26,6 @@ from .gates import (
     Checked,
     Gate,
     find_offsets,
-    find_slip_beside_offset,
     find_slips,
     open_bench,
     refit,
@@ -133,7 +132,7 @@ class _Checks:
 
     def _slips(self, now: Checked, part: float) -> Checked:
         """Find wrong signs, units and exchanged channels; or a shift, because half a period late looks like a sign."""
-        found = find_slip_beside_offset(now, find_slips(now, self.workers), self.workers)
+        found = find_slips(now, self.workers)
         if len(found.gates) == len(now.gates) or found.cost <= POOR_FIT:
             return found
         late = find_time_shift(now, part, self.early)

@@ -85,7 +85,7 @@ def swinging(m=1200):
 def test_a_command_that_stops_at_its_limits_is_no_fault_beside_a_missing_law():
     u = np.clip(swinging(), -9, 9)
     bench, ready = _prepared(u, moved(np.sign(u) * np.abs(u) ** 0.6))
-    assert [(c.column, c.limits) for c in find_clipping(bench.recordings, "u")] == [(0, [-9.0, 9.0])]
+    assert [(c.channel, c.value) for c in find_clipping(bench.recordings, "u")] == [("drive", [-9.0, 9.0])]
     assert clipped_input(bench, ready, 1.0) is None
 
 
