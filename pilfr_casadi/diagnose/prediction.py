@@ -30,7 +30,7 @@ from .workbench import MOST_GROWTH, Workbench
 
 FOCUS = "simulation", "prediction"
 # memories that are tried, in turn: times the time of e-fold growth, or the longest recording's duration
-OF_GROWTH, OF_DURATION = (1.0, 0.3, 0.1), (0.1, 0.03, 0.01, 0.003)
+OF_GROWTH, OF_DURATION = (3.0, 1.0, 0.3, 0.1), (0.1, 0.03, 0.01, 0.003)
 FOLLOWED = 0.25  # share of the outputs' variance that a simulator which follows the recordings leaves at most
 
 
