@@ -18,7 +18,6 @@ import numpy as np
 
 from .._base import InputError
 from ..data import Recording
-from ..engine import make_engine
 from ..laws import Law
 from ..simulators import Placed, Simulator
 from .evidence import FAR, FORMULA
@@ -176,8 +175,7 @@ class Trials:
         """Fit a trial to convergence and to all samples."""
         bench = replace(self.bench, at_least=max(self.bench.at_least, trial.fitted.model.substeps))
         placed = trial.fitted.corrected()  # choose sub-steps for the fitted laws
-        model = bench.model(placed)
-        engine = make_engine(model, bench.engine)
+        model, engine = bench.compile(placed)
         starts, states = knee_starts(trial.fitted, trial.knee), trial.fitted.initial
         try:
             if len(starts) > 1:
@@ -241,8 +239,7 @@ class Trials:
         """Compile a pair and fit it briefly from its best start."""
         first, base = entries[0], parent.fitted
         placed, _ = place_law(base.simulator, first, first.starts[0])
-        model = self.bench.model(placed, gain)
-        engine = make_engine(model, self.bench.engine)
+        model, engine = self.bench.compile(placed, gain)
         nominal = {k: p.value for k, p in base.simulator.parameters.items()}
         starts: list[Mapping[str, Any]] = []
         # values from the observer's run, which may be near the truth if the simulation is not
