@@ -15,7 +15,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -140,7 +140,7 @@ class Search:
     out_of_time: bool = False
     count: float = FEWEST
 
-    @property
+    @cached_property
     def fits(self) -> Trials:
         """Fits of hypotheses, with the bench, workers and time limit of the search."""
         return Trials(self.bench, self.workers, self.until)

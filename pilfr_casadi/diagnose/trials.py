@@ -144,7 +144,7 @@ class Trials:
         """Whether the time limit has passed."""
         return time.perf_counter() > self.until
 
-    @property
+    @functools.cached_property
     def part(self) -> Workbench:
         """The bench with the part of the recordings that brief fits use."""
         total = sum(map(len, self.bench.recordings))
@@ -263,7 +263,7 @@ class Trials:
         return _BriefFit(placed, options, ranked, count, brief)
 
     def _refine(self, pairs: Sequence[_BriefFit], observer: bool, pool: ThreadPoolExecutor) -> Iterator[Trial | None]:
-        """Fit pairs from several starts, and if asked with the observer as well; three that agree are enough."""
+        """Fit pairs from several starts, with `observer` along the observer as well; three that agree are enough."""
 
         def submit(pair: _BriefFit, some: slice) -> list[Future[Trial | None]]:
             return [
