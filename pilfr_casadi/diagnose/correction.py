@@ -116,17 +116,20 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     """Choose the corrected simulator from the candidates that can be tried before the deadline.
 
     With `named`, the answer names its effects. If a learned element at another port predicts as well without them, the
-    correction omits them. Learned elements at their own ports would only imitate them, and are not tried.
+    correction omits them. Learned elements at their own ports would only imitate them, and are not tried. After the
+    deadline nothing more is fitted.
     """
     best_laws = answer.best
     if named and answer.sure > SURE and explainable_remainder(search, best_laws) < FORMULA:
         return named_correction(search, best_laws.fitted), best_laws.fitted
-    refitted = _predict(search, [_of_trial(search, search.root)], [])
-    tried = [search.thorough(best_laws)] if named else _with_laws(search)
-    predicted = _predict(search, [_of_trial(search, t) for t in tried], refitted)
+    refitted = _predict(search, [_make_candidate(search, search.root)], [])
+    tried = [search.thorough(best_laws)] if named else _hypotheses_with_laws(search)
+    predicted = _predict(search, [_make_candidate(search, t) for t in tried], refitted)
+    if named and len(predicted) == 1 and search.past_deadline:  # without a comparison the named laws stay
+        return named_correction(search, tried[0].fitted), tried[0].fitted
     beside = best_laws if named else _choose(predicted)[0].base
-    learned = _learned(search, search.memo[beside.key]) if beside.laws else []
-    learned += _learned(search, search.root, {e.port for e in best_laws.laws} if named else ())
+    learned = _learned_candidates(search, search.memo[beside.key]) if beside.laws else []
+    learned += _learned_candidates(search, search.root, {e.port for e in best_laws.laws} if named else ())
     candidate, held_out = _choose(_predict(search, learned, predicted))
     fitted, base = candidate.fitted, candidate.base
     shares = _shares(search, base.fitted, fitted)
@@ -155,7 +158,7 @@ def _choose(predicted: Sequence[_Predicted]) -> _Predicted:
     return min(predicted, key=lambda p: p[1].mean_square)
 
 
-def _with_laws(search: Search) -> list[Trial]:
+def _hypotheses_with_laws(search: Search) -> list[Trial]:
     """List the hypotheses with laws that may correct: the likeliest, and of those not yet polished only a few."""
     found, recurring = list[Trial](), [t for t in search.memo.values() if _may_recur(search, t)]
     likely = sorted(likeliest(recurring, search.optimistic_evidence), key=search.evidence, reverse=True)
@@ -166,12 +169,12 @@ def _with_laws(search: Search) -> list[Trial]:
     return [t for t in found if np.isfinite(t.whole)]
 
 
-def _of_trial(search: Search, trial: Trial) -> _Candidate:
+def _make_candidate(search: Search, trial: Trial) -> _Candidate:
     """Make the candidate of a trial."""
     return _Candidate(trial.fitted, trial, search.spread(trial.fitted, trial.laws))
 
 
-def _learned(search: Search, base: Trial, taken: Collection[str] = ()) -> list[_Candidate]:
+def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()) -> list[_Candidate]:
     """Make the candidate with the best learned force beside a trial at a port that is not taken, if there is one.
 
     After the deadline no further force is fitted.

@@ -26,7 +26,6 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, side_by_side
-from ..engine import make_engine
 from ..laws import SCALABLE, Law, Local, display_name, scheduled, unit_forces
 from ..models import Parameter, play
 from .force_recovery import law_signals
@@ -230,8 +229,7 @@ def learn_forces(bench: Workbench, base: Fitted, port_names: Sequence[str], work
 def _fit_element(bench: Workbench, base: Fitted, start: Start) -> Fitted | None:
     """Fit a learned element together with the simulator's own parameters; None if every start diverges."""
     placed = base.simulator.with_element(start.port, start.law)
-    model = bench.model(placed)
-    engine = make_engine(model, bench.engine)
+    model, engine = bench.compile(placed)
     name = f"{placed.elements[-1].prefix}c"
     starts = [{**base.values, name: share * np.asarray(start.law.values["c"])} for share in START_SHARES]
     best = bench.by_cost(placed, model, engine, starts, base.initial)[0]

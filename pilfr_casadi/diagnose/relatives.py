@@ -172,10 +172,7 @@ def _matching_forces(bench: Workbench, trials: Sequence[Trial], scored: Sequence
     best, near = trials[0], _near(trials)
     if not best.law.flexible:
         return []
-    entries: dict[type[Law], Scored] = {}
-    for s in scored:
-        if s.port == best.port and not s.law.flexible and s.pair not in near:
-            entries.setdefault(type(s.law), s)
+    entries = _first_of_pairs(s for s in scored if s.port == best.port and not s.law.flexible and s.pair not in near)
     local = port_signals(bench, best.fitted, best.port)
     # also excludes nan, for example from the root of a negative number
     if not entries or not np.all(np.abs([local.z, local.dz]) < HUGE):
@@ -185,7 +182,7 @@ def _matching_forces(bench: Workbench, trials: Sequence[Trial], scored: Sequence
     strengths = np.concatenate([np.ravel(values[k]) for k in law.strength]) if law.strength else np.ones(1)
     force = unit_forces(law.at(values), local, [shape])[:, 0] @ strengths
     with np.errstate(over="ignore", invalid="ignore"):
-        found = [(*_match_force(s.law, local, force), s) for s in entries.values()]
+        found = [(*_match_force(s.law, local, force), s) for s in entries]
     ranked = sorted((f for f in found if f[0] < 1), key=lambda f: f[0])[:FEW]
     return [replace(s, starts=(start, *s.starts)) for _, start, s in ranked]
 

@@ -15,12 +15,11 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
 from .._base import InputError, Stages, side_by_side
-from ..engine import make_engine
 from ..laws import FINER, Law
 from ..simulators import Placed, Simulator
 from .evidence import (
@@ -48,7 +47,7 @@ from .linearise import linearised
 from .relatives import choose_pairs, complements, fit_pair, relatives
 from .screen import Remainder, Scored, flexible_shares, screen
 from .trials import Key, Trial, Trials
-from .workbench import FEW, THOROUGH, Fitted, Workbench, start_vector
+from .workbench import FEW, THOROUGH, Fitted, Workbench
 
 # Effort
 POLISHED = 5  # trials of a step that are fitted to convergence at most
@@ -141,7 +140,7 @@ class Search:
     out_of_time: bool = False
     count: float = FEWEST
 
-    @property
+    @cached_property
     def fits(self) -> Trials:
         """Fits of hypotheses, with the bench, workers and time limit of the search."""
         return Trials(self.bench, self.workers, self.until)
@@ -357,27 +356,24 @@ class Search:
             self.memo[trial.key] = trial
             self.findings.pop(trial.key, None)
 
-    def add(self, parent: Trial, again: bool = False) -> Step:
+    def add(self, parent: Trial, again: bool = False) -> None:
         """Fit the laws that the screen selects beside a hypothesis, fewer if `again`; polish those that may win."""
         scored, gain = self.screened(parent)
-        beside = parent.laws
-        scored = [s for s in scored if _may_stand_beside(beside, s.port, s.law)]
+        scored = [s for s in scored if _may_stand_beside(parent.laws, s.port, s.law)]
         enough = float(np.sqrt(self.floor2 + NEARLY * max(parent.whole - self.floor2, 0.0)))
         trials = self._fitted(parent, scored, gain, enough, again)
         more = relatives(self.bench, trials, scored) if self._in_time() else []
         if more:
             trials = sorted([*trials, *self._fitted(parent, more, gain, enough, again)], key=lambda t: t.error)
         with self.stage("choice"):
-            step = self._record(parent, scored, trials)
+            self._record(parent, scored, trials)
             self._finer(parent)
             self._estimate_noise()
-        return step
 
-    def _record(self, parent: Trial, scored: Sequence[Scored], trials: Sequence[Trial]) -> Step:
+    def _record(self, parent: Trial, scored: Sequence[Scored], trials: Sequence[Trial]) -> None:
         """Keep the trials of a move, and note the move."""
         self._keep_all(trials)
         self.steps.append(Step(parent, tuple(scored), tuple(trials)))
-        return self.steps[-1]
 
     def screened(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
         """Score every port and law beside a hypothesis; see `screen`."""
@@ -552,11 +548,7 @@ class Search:
         for e in laws:
             simulator = simulator.with_element(e.port, e.law)
             named |= simulator.elements[-1].named(e.own(joint.fitted.values))
-        model = self.bench.model(simulator)
-        engine = make_engine(model, self.bench.engine)
-        vector = start_vector(model, named)
-        initial = self.bench.initial_states(simulator, model, vector, joint.fitted.begin)
-        fitted = self.bench.result(simulator, model.parameters.unpack(vector), initial, engine, model)
+        fitted = self.bench.run(simulator, named, joint.fitted.begin)
         return Trial(fitted.last_elements(len(laws)), fitted, fitted.cost, fitted.cost)
 
 

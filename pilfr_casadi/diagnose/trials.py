@@ -18,7 +18,6 @@ import numpy as np
 
 from .._base import InputError
 from ..data import Recording
-from ..engine import make_engine
 from ..laws import Law
 from ..simulators import Placed, Simulator
 from .evidence import FAR, FORMULA
@@ -145,7 +144,7 @@ class Trials:
         """Whether the time limit has passed."""
         return time.perf_counter() > self.until
 
-    @property
+    @functools.cached_property
     def part(self) -> Workbench:
         """The bench with the part of the recordings that brief fits use."""
         total = sum(map(len, self.bench.recordings))
@@ -176,8 +175,7 @@ class Trials:
         """Fit a trial to convergence and to all samples."""
         bench = replace(self.bench, at_least=max(self.bench.at_least, trial.fitted.model.substeps))
         placed = trial.fitted.corrected()  # choose sub-steps for the fitted laws
-        model = bench.model(placed)
-        engine = make_engine(model, bench.engine)
+        model, engine = bench.compile(placed)
         starts, states = knee_starts(trial.fitted, trial.knee), trial.fitted.initial
         try:
             if len(starts) > 1:
@@ -241,8 +239,7 @@ class Trials:
         """Compile a pair and fit it briefly from its best start."""
         first, base = entries[0], parent.fitted
         placed, _ = place_law(base.simulator, first, first.starts[0])
-        model = self.bench.model(placed, gain)
-        engine = make_engine(model, self.bench.engine)
+        model, engine = self.bench.compile(placed, gain)
         nominal = {k: p.value for k, p in base.simulator.parameters.items()}
         starts: list[Mapping[str, Any]] = []
         # values from the observer's run, which may be near the truth if the simulation is not
@@ -266,7 +263,7 @@ class Trials:
         return _BriefFit(placed, options, ranked, count, brief)
 
     def _refine(self, pairs: Sequence[_BriefFit], observer: bool, pool: ThreadPoolExecutor) -> Iterator[Trial | None]:
-        """Fit pairs from several starts, and if asked with the observer as well; three that agree are enough."""
+        """Fit pairs from several starts, with `observer` along the observer as well; three that agree are enough."""
 
         def submit(pair: _BriefFit, some: slice) -> list[Future[Trial | None]]:
             return [

@@ -171,6 +171,11 @@ class Workbench:
         model = discretise(simulator, self.dt, self.hold, self._substeps(simulator))
         return model if gain is None else with_output_injection(model, gain)
 
+    def compile(self, simulator: Simulator, gain: np.ndarray | None = None) -> tuple[Model, Engine]:
+        """Discretise and compile a simulator, with output injection if a gain is given."""
+        model = self.model(simulator, gain)
+        return model, make_engine(model, self.engine)
+
     def _substeps(self, simulator: Simulator) -> int:
         """Choose more sub-steps for a fast law, up to a limit: a stiff start of a law is not worth a fine grid."""
         if not simulator.elements:
@@ -363,13 +368,12 @@ class Workbench:
         lengths, rest = tuple(map(len, self.recordings)), tuple(r.begins == "zero" for r in self.recordings)
         return Local(z, dz, self.dt, lengths, inputs=inputs, from_zero=rest)
 
-    def rerun(self, fitted: Fitted, simulator: Simulator | None = None) -> Fitted:
-        """Run the same values on this bench's steps, with the laws' parameters of `simulator` if that is given."""
-        simulator = simulator or fitted.simulator
-        model = self.model(simulator)
-        engine = make_engine(model, self.engine)
-        states = self.initial_states(simulator, model, model.parameters.pack(fitted.values), fitted.begin)
-        return self.result(simulator, fitted.values, states, engine, model)
+    def run(self, simulator: Simulator, values: Mapping[str, Any], states: Sequence[np.ndarray]) -> Fitted:
+        """Run a simulator at values by name, from the simulator's own initial states."""
+        model, engine = self.compile(simulator)
+        vector = start_vector(model, values)
+        initial = self.initial_states(simulator, model, vector, states)
+        return self.result(simulator, model.parameters.unpack(vector), initial, engine, model)
 
     def result(
         self,
@@ -403,7 +407,7 @@ def refine_steps(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
         steps = FINER * steps
         tried = replace(bench, substeps=steps)
         try:
-            there = tried.rerun(fitted)
+            there = tried.run(fitted.simulator, fitted.values, fitted.begin)
             if _difference2(bench, there, fitted) < DEPENDS**2 * noise2:
                 break
             fitted = tried.fit(
@@ -446,7 +450,7 @@ def refit_on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
     finer, placed = replace(bench, at_least=FINER * fitted.model.substeps), fitted.corrected()
     sharper = replace(given, value=fitted.values[knee], bounds=(low / FINER, high))
     placed = placed.with_parameters({**placed.parameters, knee: sharper})
-    there = finer.rerun(fitted, placed)
+    there = finer.run(placed, fitted.values, fitted.begin)
     held = fitted.values[knee] <= low
     if not held and abs(there.cost / fitted.cost - 1) < CHANGED:
         return fitted

@@ -70,8 +70,10 @@ def test_after_the_deadline_the_correction_fits_nothing_more(monkeypatch):
 
     monkeypatch.setattr(Trials, "polish", lambda self, trial: fitted.append(trial) or polish(self, trial))
     monkeypatch.setattr(correction, "refit_learned", refit)
-    found.deadline = 0.0
-    correction.find_correction(found, posterior(found))
+    found.deadline, answer = 0.0, posterior(found)
+    correction.find_correction(found, answer)
+    unsure = replace(answer, effects=tuple(replace(e, confidence=0.4) for e in answer.effects))
+    assert correction.find_correction(found, unsure, named=True)[0].elements  # no comparison has refuted the name
     assert not fitted
     found.deadline = np.inf
     correction.find_correction(found, posterior(found))
