@@ -43,6 +43,7 @@ from .workbench import THOROUGH, Fitted, Workbench
 
 FINE = 40  # thresholds of each of the two fine grids from which the density of weights is estimated
 BENDS = (-0.2, 0.0, 0.2)  # tried bends of generalized plays, a_2 times the largest |z|, as in the catalogue
+SPLIT = 0.2  # distance of the thresholds that one threshold of the diagnosed law is split into, over this threshold
 FLOOR = 0.01  # least weight of an operator at a start, over the mean weight
 IDLE = 1e-9  # deviation of an operator's output, over that of the strongest, below which it is idle
 EXTENT = 1.2  # range in which thresholds are spread, over the threshold below which 99 % of the weight lies
@@ -198,7 +199,10 @@ def refine(diagnosis: Diagnosis, operators: int, kind: str | None, port: str | N
             f"With a layer of {n} operators at {element.port} the simulation diverges; give fewer operators, or keep "
             "the diagnosed law."
         )
-    best = min(layers, key=lambda name: held_out[name].mean_square)
+    best, *others = layers
+    for name in others:  # plays and stops differ by a line only: of two that are alike, the first stays
+        one, other = held_out[best], held_out[name]
+        best = name if other.error < one.error and other.mean_square < one.mean_square else best
     return _build(diagnosis, search.bench, best, layers[best], number, held_out)
 
 
@@ -269,9 +273,11 @@ def _fit_layer(bench: Workbench, after: Fitted, number: int, kind: type[Law]) ->
 
 
 def _start_values(law: Any, local: Local, force: np.ndarray, found: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Compute two starts: thresholds spread along the density of the weights, and on an even grid over the range of z.
+    """Compute start values that differ in their thresholds.
 
-    The weights fit the diagnosed law's force (M,). The density comes from such a fit on a fine grid.
+    The thresholds are spread along the density of the weights; on an even grid over the range of z; and, if the
+    diagnosed law has thresholds, about these. The weights fit the diagnosed law's force (M,); the density comes from
+    such a fit on a fine grid.
     """
     n = law.parameters()["r"].size
     fine = local.half * np.union1d(np.linspace(0.0, 0.95, FINE), np.geomspace(0.003, 0.95, FINE))
@@ -281,11 +287,14 @@ def _start_values(law: Any, local: Local, force: np.ndarray, found: Mapping[str,
         bends += [{name: found[name] for name in ("a_2", "a_3")}] if "a_2" in found else []
     solved = [_fit_weights(law, local, force, {"r": fine, **bend}) for bend in bends]
     (_, dense), bend = min(zip(solved, bends, strict=True), key=lambda pair: pair[0][0])
-    even = local.half * (np.arange(n) + 0.5) / n
-    return [
-        {**dense, **_spread_anew(fine, dense["w"], local.half, n)},
-        _fit_weights(law, local, force, {"r": even, **bend})[1],
-    ]
+    grids = [local.half * (np.arange(n) + 0.5) / n]
+    own = np.ravel(found.get("r", ()))
+    if 0 < len(own) <= n:
+        copies = -(-n // len(own))
+        about = np.outer(1 + SPLIT * (np.arange(copies) - (copies - 1) / 2), own)
+        grids.append(np.clip(np.ravel(about)[:n], 0.0, 0.95 * local.half))
+    spread = {**dense, **_spread_anew(fine, dense["w"], local.half, n)}
+    return [spread, *(_fit_weights(law, local, force, {"r": grid, **bend})[1] for grid in grids)]
 
 
 def _fit_weights(law: Any, local: Local, force: np.ndarray, shape: dict[str, Any]) -> tuple[float, dict[str, Any]]:
