@@ -6,9 +6,11 @@ a layer of many operators takes the place of the found law (Krikelis et al. 2024
     w(k) = Σ_i w_i H_{r_i}[z](k),   w_i ≥ 0, r_i ≥ 0,
 
 with H a stop, a play or a generalized play; `laws.hysteresis_layer` adds a linear term where it belongs. Thresholds
-start on a grid over the range of z along the diagnosed run, weights at the non-negative least-squares fit of the
+start on grids over the range of z along the diagnosed run, weights at the non-negative least-squares fit of the
 diagnosed law's force there. Then all of them are fitted together with the simulator's own parameters and the other
-laws, on the recordings, the steps and the hold of the diagnosis. The bounds are bounds of the solver.
+laws, on the recordings, the steps and the hold of the diagnosis. The bounds are bounds of the solver. As in `fit`,
+thresholds of the best fit are spread anew along the density of their weights, because some have clustered or are idle,
+and the layer is fitted again, as long as that helps.
 
 The layer replaces the law if it predicts held-out parts of the training recordings better (`evidence`): error on
 blocks or second halves that a fit has not seen, plus the spread of predictions for other inputs, which grows with every
@@ -26,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, whole
+from .._base import InputError, one_blas_thread, whole
 from ..data import Recording
 from ..engine import make_engine
 from ..identify import regrid
@@ -167,6 +169,7 @@ class Refinement:
     __repr__ = __str__
 
 
+@one_blas_thread
 def refine(diagnosis: Diagnosis, operators: int, kind: str | None, port: str | None) -> Refinement:
     """Carry out `Diagnosis.refine`; see there."""
     n = whole(operators, "operators", 1)
@@ -261,8 +264,8 @@ def _fit_layer(bench: Workbench, after: Fitted, number: int, kind: type[Law]) ->
         best = bench.fit(placed, own, states=states, model=model, engine=engine)
         for _ in range(ROUNDS):
             values = element.own(best.values)
-            spread = element.named({**values, **_spread_anew(values["r"], values["w"], local.half, len(values["r"]))})
-            own = [{**best.values, **spread}, best.values]
+            moved = {**values, **_spread_anew(values["r"], values["w"], local.half, len(values["r"]))}
+            own = [{**best.values, **element.named(moved)}, best.values]
             found = bench.fit(placed, own, states=best.initial, solver=THOROUGH, model=model, engine=engine)
             gained, best = found.cost < GAIN * best.cost, min(found, best, key=lambda f: f.cost)
             if not gained:
@@ -293,8 +296,8 @@ def _start_values(law: Any, local: Local, force: np.ndarray, found: Mapping[str,
         copies = -(-n // len(own))
         about = np.outer(1 + SPLIT * (np.arange(copies) - (copies - 1) / 2), own)
         grids.append(np.clip(np.ravel(about)[:n], 0.0, 0.95 * local.half))
-    spread = {**dense, **_spread_anew(fine, dense["w"], local.half, n)}
-    return [spread, *(_fit_weights(law, local, force, {"r": grid, **bend})[1] for grid in grids)]
+    along_density = {**dense, **_spread_anew(fine, dense["w"], local.half, n)}
+    return [along_density, *(_fit_weights(law, local, force, {"r": grid, **bend})[1] for grid in grids)]
 
 
 def _fit_weights(law: Any, local: Local, force: np.ndarray, shape: dict[str, Any]) -> tuple[float, dict[str, Any]]:
