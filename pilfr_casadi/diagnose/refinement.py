@@ -6,9 +6,11 @@ a layer of many operators takes the place of the found law (Krikelis et al. 2024
     w(k) = Σ_i w_i H_{r_i}[z](k),   w_i ≥ 0, r_i ≥ 0,
 
 with H a stop, a play or a generalized play; `laws.hysteresis_layer` adds a linear term where it belongs. Thresholds
-start on a grid over the range of z along the diagnosed run, weights at the non-negative least-squares fit of the
+start on grids over the range of z along the diagnosed run, weights at the non-negative least-squares fit of the
 diagnosed law's force there. Then all of them are fitted together with the simulator's own parameters and the other
-laws, on the recordings, the steps and the hold of the diagnosis. The bounds are bounds of the solver.
+laws, on the recordings, the steps and the hold of the diagnosis. The bounds are bounds of the solver. As in `fit`,
+thresholds of the best fit are spread anew along the density of their weights, because some have clustered or are idle,
+and the layer is fitted again, as long as that helps.
 
 The layer replaces the law if it predicts held-out parts of the training recordings better (`evidence`): error on
 blocks or second halves that a fit has not seen, plus the spread of predictions for other inputs, which grows with every
@@ -26,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, whole
+from .._base import InputError, one_blas_thread, whole
 from ..data import Recording
 from ..engine import make_engine
 from ..identify import regrid
@@ -43,6 +45,7 @@ from .workbench import THOROUGH, Fitted, Workbench
 
 FINE = 40  # thresholds of each of the two fine grids from which the density of weights is estimated
 BENDS = (-0.2, 0.0, 0.2)  # tried bends of generalized plays, a_2 times the largest |z|, as in the catalogue
+SPLIT = 0.2  # distance of the thresholds that one threshold of the diagnosed law is split into, over this threshold
 FLOOR = 0.01  # least weight of an operator at a start, over the mean weight
 IDLE = 1e-9  # deviation of an operator's output, over that of the strongest, below which it is idle
 EXTENT = 1.2  # range in which thresholds are spread, over the threshold below which 99 % of the weight lies
@@ -166,6 +169,7 @@ class Refinement:
     __repr__ = __str__
 
 
+@one_blas_thread
 def refine(diagnosis: Diagnosis, operators: int, kind: str | None, port: str | None) -> Refinement:
     """Carry out `Diagnosis.refine`; see there."""
     n = whole(operators, "operators", 1)
@@ -198,7 +202,10 @@ def refine(diagnosis: Diagnosis, operators: int, kind: str | None, port: str | N
             f"With a layer of {n} operators at {element.port} the simulation diverges; give fewer operators, or keep "
             "the diagnosed law."
         )
-    best = min(layers, key=lambda name: held_out[name].mean_square)
+    best, *others = layers
+    for name in others:  # plays and stops differ by a line only: of two that are alike, the first stays
+        one, other = held_out[best], held_out[name]
+        best = name if other.error < one.error and other.mean_square < one.mean_square else best
     return _build(diagnosis, search.bench, best, layers[best], number, held_out)
 
 
@@ -257,8 +264,8 @@ def _fit_layer(bench: Workbench, after: Fitted, number: int, kind: type[Law]) ->
         best = bench.fit(placed, own, states=states, model=model, engine=engine)
         for _ in range(ROUNDS):
             values = element.own(best.values)
-            spread = element.named({**values, **_spread_anew(values["r"], values["w"], local.half, len(values["r"]))})
-            own = [{**best.values, **spread}, best.values]
+            moved = {**values, **_spread_anew(values["r"], values["w"], local.half, len(values["r"]))}
+            own = [{**best.values, **element.named(moved)}, best.values]
             found = bench.fit(placed, own, states=best.initial, solver=THOROUGH, model=model, engine=engine)
             gained, best = found.cost < GAIN * best.cost, min(found, best, key=lambda f: f.cost)
             if not gained:
@@ -269,9 +276,11 @@ def _fit_layer(bench: Workbench, after: Fitted, number: int, kind: type[Law]) ->
 
 
 def _start_values(law: Any, local: Local, force: np.ndarray, found: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Compute two starts: thresholds spread along the density of the weights, and on an even grid over the range of z.
+    """Compute start values that differ in their thresholds.
 
-    The weights fit the diagnosed law's force (M,). The density comes from such a fit on a fine grid.
+    The thresholds are spread along the density of the weights; on an even grid over the range of z; and, if the
+    diagnosed law has thresholds, about these. The weights fit the diagnosed law's force (M,); the density comes from
+    such a fit on a fine grid.
     """
     n = law.parameters()["r"].size
     fine = local.half * np.union1d(np.linspace(0.0, 0.95, FINE), np.geomspace(0.003, 0.95, FINE))
@@ -281,11 +290,14 @@ def _start_values(law: Any, local: Local, force: np.ndarray, found: Mapping[str,
         bends += [{name: found[name] for name in ("a_2", "a_3")}] if "a_2" in found else []
     solved = [_fit_weights(law, local, force, {"r": fine, **bend}) for bend in bends]
     (_, dense), bend = min(zip(solved, bends, strict=True), key=lambda pair: pair[0][0])
-    even = local.half * (np.arange(n) + 0.5) / n
-    return [
-        {**dense, **_spread_anew(fine, dense["w"], local.half, n)},
-        _fit_weights(law, local, force, {"r": even, **bend})[1],
-    ]
+    grids = [local.half * (np.arange(n) + 0.5) / n]
+    own = np.ravel(found.get("r", ()))
+    if 0 < len(own) <= n:
+        copies = -(-n // len(own))
+        about = np.outer(1 + SPLIT * (np.arange(copies) - (copies - 1) / 2), own)
+        grids.append(np.clip(np.ravel(about)[:n], 0.0, 0.95 * local.half))
+    along_density = {**dense, **_spread_anew(fine, dense["w"], local.half, n)}
+    return [along_density, *(_fit_weights(law, local, force, {"r": grid, **bend})[1] for grid in grids)]
 
 
 def _fit_weights(law: Any, local: Local, force: np.ndarray, shape: dict[str, Any]) -> tuple[float, dict[str, Any]]:

@@ -339,7 +339,7 @@ class Diagnosis:
         operators : int
             Operators of the layer.
         kind : {"stop", "play", "generalized_play"}, optional
-            The operators; by default all that may stand at the port are tried, and the smallest held-out error decides.
+            The operators; by default all that may stand at the port are tried, and the error on held-out data decides.
             Generalized plays are for actuators and sensors.
         port : str, optional
             The port; by default that of the surest effect with hysteresis.
