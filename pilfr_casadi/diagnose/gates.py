@@ -46,6 +46,7 @@ CLEARLY = 0.8  # share left by an edit that is clearly better than another edit,
 RARE = 0.02  # share of a mean square, or of the samples, up to which something is an exception
 SAME = 1.02  # ratio of errors that count as equal
 AT_NOISE = 5.0  # rms error over the noise up to which nothing else is wrong
+STILL = 0.1  # share of its first value that an offset must keep beside effects to be reported
 FEWEST = 30.0  # effective samples that a residual has at least
 TURNS = 8  # alternations of edit and refit at most
 
@@ -547,7 +548,8 @@ def final_gates(
             out.append(gate)
             continue
         remaining = fitted[gate.parameter]
-        if not abs(remaining.value) > CERTAIN * float(std[gate.parameter]):
+        certain = abs(remaining.value) > CERTAIN * float(std[gate.parameter])
+        if not (certain and abs(remaining.value) > STILL * abs(gate.value)):
             continue
         sentence = remaining.sentence if effects else gate.sentence  # fitted without the effects, it says little
         if not sure:

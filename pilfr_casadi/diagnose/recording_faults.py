@@ -40,6 +40,7 @@ ALONE = 0.12  # largest distance of neighbours, and deviation nearby, over a gli
 
 CONTINUOUS = 0.5  # share of the samples with distinct values above which a signal is not quantised
 STANDING = 5  # longest rest of an encoder or a machine, in samples; largest motion of an encoder in a sample, in steps
+MOST_LEFT = 0.5  # largest share of the mismatch left by what an input may have been beyond its limit, a guess
 BY_CHANCE = 3.0  # factor on the number of repeats that noise causes
 
 OWN = 5  # spectral lines on either side that may belong to a tone
@@ -180,7 +181,7 @@ def clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gate | N
     """
     for fault in find_clipping(bench.recordings, "u"):
         explained = _explained_beyond(bench, without, fault)
-        if 1 - explained < min(CURED, remains):
+        if 1 - explained < min(MOST_LEFT, remains):
             sentence = (
                 f"{fault.sentence}, and what it may have been beyond explains {explained:.0%} of the mismatch: what "
                 "went into the machine there is not in the recording. Record it with a larger range."
