@@ -70,10 +70,11 @@ def headline(diagnosis: Diagnosis) -> str:
     """Write the verdict with its errors."""
     role, errors = errors_that_count(diagnosis)
     on = "On held-out recordings" if role == "test" else "On the training recordings (no test was given)"
+    ahead = " of predictions one sample ahead" if "free_run" in diagnosis.errors else ""
     summary = diagnosis.summary
     if diagnosis.nameless:  # the section below tells what it consists of
         summary = summary.replace(f" {diagnosis.nameless.sentence}", "")
-    text = f"{summary.rstrip('. ')}. {on} the error is {percent(errors.get('nominal'))} as given"
+    text = f"{summary.rstrip('. ')}. {on} the error{ahead} is {percent(errors.get('nominal'))} as given"
     text += f", {percent(errors.get('before'))} refitted"
     if what := correction_words(diagnosis):
         text += f", {percent(errors.get('after'))} {what}"

@@ -85,7 +85,7 @@ def test_the_engines_agree_on_predictions_and_their_slopes(machine, substeps):
     assert np.allclose(*runs, rtol=0, atol=1e-10)
 
 
-def test_friction_in_an_unstable_machine_is_named_and_a_complete_simulator_is_too(machine):
+def test_friction_in_an_unstable_machine_is_named_and_a_complete_simulator_is_too(machine, tmp_path):
     laws = (CoulombFriction, CubicStiffness, Saturation)
     found = pilfr.diagnose(levitation(30.0, 1.0), machine[0], test=machine[1], laws=laws, workers=1)
     assert [(e.port, e.law) for e in found.effects] == [("guide", "coulomb_friction")]
@@ -94,6 +94,8 @@ def test_friction_in_an_unstable_machine_is_named_and_a_complete_simulator_is_to
     assert found.errors["free_run"]["after"] > 100 * found.errors["test"]["after"]
     assert "free run" in str(found) and "unstable by itself" in str(found)
     assert found.nrmse(machine[1]) == pytest.approx(found.errors["test"]["after"], rel=1e-6)
+    page = found.report(tmp_path).read_text()
+    assert "the error of predictions one sample ahead is" in page and "the same, free run" in page
     assert found.to_casadi().size1_in(1) == 1  # the exported step reads no measured output
     complete = pilfr.diagnose(levitation(30.0, 1.0), controlled(2, 0.0), laws=laws, workers=1)
     assert complete.verdict == "complete"
