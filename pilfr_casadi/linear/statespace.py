@@ -192,7 +192,7 @@ def steady_state_gain(a: Array, c: Array, q: Array, r: Array) -> Array:
     for fading in (1.0, FADING):
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # balancing may overflow; the gain is checked below
-                p = solve_discrete_are(fading * a.T, c.T, q + 1e-12 * max(np.trace(q) / n, 1e-300) * np.eye(n), r)
+                p = solve_discrete_are(fading * a.T, c.T, q + 1e-12 * np.trace(q) / n * np.eye(n), r)
                 gain = innovation_gain(c @ p @ c.T + r, p, c, a)
                 radius = np.max(np.abs(np.linalg.eigvals(a - gain @ c)))
         except (np.linalg.LinAlgError, ValueError):
