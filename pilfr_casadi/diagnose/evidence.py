@@ -65,7 +65,7 @@ class Sample:
 def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
     """Compute the eigenvalues λ of a sample's information on the laws' parameters, in units of their prior widths."""
     own = _of_laws(fitted, laws)
-    problem, hessian = _hessian(bench, fitted)
+    problem, hessian = information_matrix(bench, fitted)
     own = own[problem.free]
     if not own.any():
         return np.zeros(0)
@@ -94,8 +94,8 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     parameters, because the two may make up for each other. The spread reveals parameters that the recordings hardly
     determine, such as a curve of a pressure that had two levels; a cross-validation on the same recordings cannot.
     """
-    problem, told = _hessian(bench, fitted)
-    _, asked = _hessian(bench.on([r.with_(u=INPUT_FACTOR * r.u) for r in bench.recordings]), fitted)
+    problem, told = information_matrix(bench, fitted)
+    _, asked = information_matrix(bench.on([r.with_(u=INPUT_FACTOR * r.u) for r in bench.recordings]), fitted)
     free = int(problem.free.sum())
     if not free:
         return 0.0
@@ -127,7 +127,7 @@ def _of_laws(fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
     return own
 
 
-def _hessian(bench: Workbench, fitted: Fitted) -> tuple[Problem, np.ndarray]:
+def information_matrix(bench: Workbench, fitted: Fitted) -> tuple[Problem, np.ndarray]:
     """Compute the Fisher information of one sample on free parameters and initial states; it may be infinite."""
     model = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
     problem = bench.problem(model, fitted.engine)

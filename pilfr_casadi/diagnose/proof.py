@@ -14,6 +14,7 @@ from ..laws import Law
 from ..models import Model
 from ..optimise import first_state, samples_for_state
 from ..simulators import Simulator
+from .evidence import information_matrix
 from .floor import effective_size
 from .gates import Gate
 from .linearise import linearised
@@ -97,36 +98,22 @@ def test_errors(
 
 
 def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
-    """Compute standard errors from the residual and its correlation time; nan for fixed parameters and at bounds."""
-    return _by_name(fitted, *covariance(bench, fitted))
+    """Compute standard errors from the residual and its correlation time; nan for fixed parameters and at bounds.
 
-
-def _by_name(fitted: Fitted, where: np.ndarray, matrix: np.ndarray) -> dict[str, np.ndarray]:
-    full = np.full(fitted.model.parameters.size, np.nan)
-    full[where] = np.sqrt(np.maximum(np.diag(matrix), 0))
-    return fitted.model.parameters.unpack(full)
-
-
-def covariance(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
-    """Return the places (k,) of free parameters inside their bounds, and the covariance (k, k) of their estimates.
-
-    Initial states are estimated together with them.
+    Initial states are estimated together with the parameters.
     """
-    free = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
-    problem = bench.problem(free, fitted.engine)
-    n_free = int(problem.free.sum())
-    theta = problem.start.copy()
-    states = [s for p, s in zip(problem._placed, fitted.initial, strict=True) if p.first is not None]
-    theta[n_free:] = np.concatenate(states) if states else theta[n_free:]
-    _, _, hessian = problem.normal(theta)
-    inside = (theta > problem.lower) & (theta < problem.upper)
-    keep = np.flatnonzero(inside & (np.diag(hessian) > 0))
-    size = np.sqrt(np.maximum(np.diag(hessian)[keep], 1e-300))
-    scaled = hessian[np.ix_(keep, keep)] / np.outer(size, size)
-    matrix = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) / np.outer(size, size)
-    n = max(effective_size(fitted.residual), 10.0)
-    own = keep < n_free
-    return np.flatnonzero(problem.free)[keep[own]], matrix[np.ix_(own, own)] * fitted.cost / n
+    problem, hessian = information_matrix(bench, fitted)
+    full = np.full(fitted.model.parameters.size, np.nan)
+    if np.all(np.isfinite(hessian)):  # a run at the edge of divergence has no derivatives
+        inside = (problem.start > problem.lower) & (problem.start < problem.upper)
+        keep = np.flatnonzero(inside & (np.diag(hessian) > 0))
+        size = np.sqrt(np.maximum(np.diag(hessian)[keep], 1e-300))
+        scaled = hessian[np.ix_(keep, keep)] / np.outer(size, size)
+        inverse = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) / np.outer(size, size)
+        variances = np.maximum(np.diag(inverse), 0) * fitted.cost / max(effective_size(fitted.residual), 10.0)
+        own = keep < problem.n_free
+        full[np.flatnonzero(problem.free)[keep[own]]] = np.sqrt(variances[own])
+    return fitted.model.parameters.unpack(full)
 
 
 def parameter_table(
