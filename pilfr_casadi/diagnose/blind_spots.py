@@ -294,7 +294,7 @@ def assess_recordings(
     probe, runs = linearised(bench, fitted)
     quiet = replace(bench, scale=noise)  # from here on, the noise is the unit of all outputs
     response = Sensitivity.of(quiet, fitted, runs)
-    parameters, ties = assess_parameters(response, quiet, fitted)
+    parameters, ties = assess_parameters(response)
     rows, classes = assess_laws(quiet, fitted, probe, runs, laws, response.names)
     found = Check(
         blind_spots=(),
@@ -317,7 +317,7 @@ def assess_recordings(
     found = replace(
         found, blind_spots=tuple(_find_blind_spots(found, still, _alive_as_given(quiet, fitted, parameters)))
     )
-    sensors = helpful_sensors(quiet, fitted, runs, response) if ties else ()
+    sensors = helpful_sensors(response, runs) if ties else ()
     return replace(found, next_record=_next_record(found, inputs, sensors), seconds=time.perf_counter() - began)
 
 

@@ -91,16 +91,16 @@ class Sensitivity:
 
     Attributes
     ----------
-    names, values : tuple of str, array of shape (n,)
-        Free entries of the simulator's parameters, as refitted.
+    bench, fitted : Workbench, Fitted
+        The bench, whose scale is the noise, and the refitted simulator.
     span : array, shape (n,)
         Prior standard deviation of each value, from its bounds alone.
     raw, start : array, shapes (R, n) and (R, k)
         Changes of all outputs, in units of the noise, by a unit change of each parameter and unknown initial state.
     """
 
-    names: tuple[str, ...]
-    values: np.ndarray
+    bench: Workbench
+    fitted: Fitted
     span: np.ndarray
     raw: np.ndarray
     start: np.ndarray
@@ -109,14 +109,28 @@ class Sensitivity:
     def of(cls, bench: Workbench, fitted: Fitted, runs: Sequence[Run]) -> Sensitivity:
         """Compute the sensitivity along the fitted runs of a bench whose scale is the noise."""
         own = bench.simulator.parameter_set
-        places = np.flatnonzero(own.free)
-        values, given, lower, upper = (v[places] for v in (fitted.vector, own.start, own.lower, own.upper))
+        given, lower, upper = (v[own.free] for v in (own.start, own.lower, own.upper))
         raw, start = _changes(bench, runs)
         signal = np.concatenate([r.y[r.skip :] for r in bench.recordings]) / bench.scale
         # without bounds the range is the given value, or for zero the change that moves the outputs by their deviation
         unit = np.linalg.norm(signal - signal.mean(axis=0)) / np.where(lengths(raw) > 0, lengths(raw), 1.0)
         span = prior_width(np.where(given != 0, np.abs(given), unit), lower, upper)
-        return cls(tuple(own.labels[i] for i in places), values, span, raw, start)
+        return cls(bench, fitted, span, raw, start)
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """Places of the free entries in the parameter vector, shape (n,)."""
+        return np.flatnonzero(self.bench.simulator.parameter_set.free)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free entries."""
+        return tuple(self.bench.simulator.parameter_set.labels[i] for i in self.places)
+
+    @property
+    def values(self) -> np.ndarray:
+        """Refitted values of the free entries, shape (n,)."""
+        return self.fitted.vector[self.places]
 
     @cached_property
     def base(self) -> np.ndarray:
@@ -145,16 +159,14 @@ def _undetermined(scaled: np.ndarray) -> np.ndarray:
     return np.asarray(v[np.append(s, np.zeros(len(v) - len(s))) < 1])
 
 
-def assess_parameters(
-    response: Sensitivity, bench: Workbench, fitted: Fitted
-) -> tuple[tuple[ParameterRow, ...], tuple[Tie, ...]]:
+def assess_parameters(response: Sensitivity) -> tuple[tuple[ParameterRow, ...], tuple[Tie, ...]]:
     """Assess each free parameter, and find the groups that are traded off."""
-    own, scaled = bench.simulator.parameter_set, response.scaled
+    own, scaled = response.bench.simulator.parameter_set, response.scaled
     status = np.full(len(response.names), "identifiable", dtype=object)
     status[lengths(scaled) < 1] = "start"
     status[response.reach < 1] = "flat"
     status[response.reach == 0] = "dead"
-    status[_read_by_ports_alone(bench.simulator)] = "port"
+    status[_read_by_ports_alone(response.bench.simulator)] = "port"
     rest = np.flatnonzero(status == "identifiable")
     groups = [rest[members] for members in _groups(scaled[:, rest])]
     for group in groups:
@@ -168,7 +180,7 @@ def assess_parameters(
     at_bound = (response.values <= own.lower[own.free]) | (response.values >= own.upper[own.free])
     columns = (response.names, response.values.tolist(), units.tolist(), std, status, at_bound.tolist())
     rows = tuple(ParameterRow(*row) for row in zip(*columns, strict=True))
-    return rows, tuple(Tie(tuple(response.names[i] for i in g), _only_as(response, g, bench, fitted)) for g in groups)
+    return rows, tuple(Tie(tuple(response.names[i] for i in group), _only_as(response, group)) for group in groups)
 
 
 def _read_by_ports_alone(simulator: Simulator) -> np.ndarray:
@@ -205,13 +217,13 @@ def _groups(scaled: np.ndarray) -> list[list[int]]:
     return [[j for j, own in zip(members, group, strict=True) if own == k] for k in range(count)]
 
 
-def _only_as(response: Sensitivity, group: np.ndarray, bench: Workbench, fitted: Fitted) -> tuple[str, ...]:
+def _only_as(response: Sensitivity, group: np.ndarray) -> tuple[str, ...]:
     """Write the identifiable combinations of a group: monomials or sums with small integers, or nothing."""
     names, values = [response.names[i] for i in group], response.values[group]
     found = []
     for unit, write in ((values, _monomial), (np.ones(len(group)), _sum)):
         if np.all(unit != 0) and (rows := _whole(response.scaled[:, group], response.span[group] / unit)) is not None:
-            change = _finite_change(rows, write is _monomial, group, response, bench, fitted)
+            change = _finite_change(response, group, rows, write is _monomial)
             found.append((change, tuple(write(names, row) for row in rows)))
     change, best = min(found, default=(np.inf, ()))
     return best if change < SAME else ()
@@ -276,22 +288,19 @@ def _sum(names: Sequence[str], factors: np.ndarray) -> str:
     return text
 
 
-def _finite_change(
-    rows: np.ndarray, logarithmic: bool, group: np.ndarray, response: Sensitivity, bench: Workbench, fitted: Fitted
-) -> float:
+def _finite_change(response: Sensitivity, group: np.ndarray, rows: np.ndarray, logarithmic: bool) -> float:
     """Compute the change of the outputs by a step of a tenth along which the rows are constant.
 
     The result is relative to the change by the first parameter alone, and zero if it is below the noise. Unknown
     initial states are projected off both.
     """
+    bench, fitted, value = response.bench, response.fitted, response.values[group]
     direction, alone = _complement(rows)[0], np.eye(len(group))[0]
-    places = np.flatnonzero(bench.simulator.parameter_set.free)[group]
-    value = fitted.vector[places]
     step = (STEP - 1) * np.min(np.abs(value))
     sizes = []
     for way in (direction / np.max(np.abs(direction)), alone):
         vector = fitted.vector.copy()
-        vector[places] = value * STEP**way if logarithmic else value + step * way
+        vector[response.places[group]] = value * STEP**way if logarithmic else value + step * way
         values = fitted.model.parameters.unpack(vector)
         there = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model)
         if not np.isfinite(there.cost):
@@ -302,10 +311,11 @@ def _finite_change(
     return sizes[0] / sizes[1] if sizes[0] > 1 else 0.0
 
 
-def helpful_sensors(bench: Workbench, fitted: Fitted, runs: Sequence[Run], response: Sensitivity) -> tuple[str, ...]:
+def helpful_sensors(response: Sensitivity, runs: Sequence[Run]) -> tuple[str, ...]:
     """Find the states whose sensor, as quiet as the present ones, would determine more parameters; best first."""
+    bench = response.bench
     signal = np.std(np.concatenate([r.y for r in bench.recordings]), axis=0)
-    noise = np.mean(bench.scale / signal) * np.std(along(bench, fitted)[0], axis=0)
+    noise = np.mean(bench.scale / signal) * np.std(along(bench, response.fitted)[0], axis=0)
     count, found = len(_undetermined(response.scaled)), list[tuple[int, str]]()
     for j in np.flatnonzero(noise > 0):
         row = np.eye(runs[0].a.shape[1])[j]
