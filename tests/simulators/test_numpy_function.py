@@ -1,0 +1,146 @@
+"""NumPy functions as simulators: their equations are those of the function, or one sentence says why not."""
+
+import math
+import random
+import re
+from math import copysign
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import InputError, Parameter, Port, Simulator
+from pilfr_casadi.simulators import from_function
+
+K = np.array([[3.0, -1.0], [-1.0, 2.0]])
+PARAMETERS = {
+    "m": Parameter(2.0, unit="kg", fixed=True),
+    "k": Parameter(1100.0, unit="N/m", bounds=(500, 3000)),
+    "d": Parameter(15.0, unit="N s/m", bounds=(0, 100)),
+}
+GROUND = Port("ground", lambda p: {"vel": -1 / p.m}, lambda x: x.pos, lambda x: x.vel, "N", "m")
+NAMES = {"states": ("pos", "vel"), "inputs": "force", "parameters": PARAMETERS}
+
+
+def rhs(t, x, u, p):
+    dx = np.zeros(2)
+    dx[0] = x[1]
+    dx[1] = (u[0] - p["k"] * x[0] - p["d"] * x[1]) / p["m"]
+    return dx
+
+
+def symbolic():
+    return Simulator(
+        lambda x, u, p: {"pos": x.vel, "vel": (u.force - p.k * x.pos - p.d * x.vel) / p.m},
+        lambda x: {"pos": x.pos},
+        ports=GROUND,
+        **{**NAMES, "inputs": ("force",)},
+    )
+
+
+def equations(function):
+    """The equations of a function of two states, one input and k as a `casadi.Function`."""
+    made = from_function(function, ("a", "b"), states=("a", "b"), inputs="f", parameters={"k": Parameter(0.7)})
+    x, u, p, t = made.symbols()
+    return ca.Function("f", [t, x.a, x.b, u.f, p.k], [made.derivatives(x, u, p, t)])
+
+
+def spring(v, k):
+    """A helper of the functions below, found by its name."""
+    if v > 0.5:
+        return k * (v - 0.5)
+    return k * (v + 0.5) if v < -0.5 else 0.0
+
+
+def mass_matrix(t, x, u, p):
+    M = np.array([[2.0, np.cos(x[0])], [np.cos(x[0]), 1.5]])
+    return np.linalg.solve(M, np.array([u[0], p["k"] * np.sin(x[1])]))
+
+
+def masked(t, x, u, p):
+    y = np.zeros_like(x)
+    y[x > 0] = 1.0
+    y[1] += p["k"] * x[0]
+    return y
+
+
+def table(t, x, u, p):
+    return [np.interp(x[0], [-1.0, 0.0, 2.0], [1.0, 0.0, 5.0]), np.interp(t, [0, 10], [0, 1]) + u[0]]
+
+
+class Plant:
+    stiffness = 4.0
+
+    def rhs(self, t, x, u, p):
+        return np.array([x[1], -self.stiffness * x[0] + p["k"] * math.tanh(u[0])])
+
+
+FUNCTIONS = {
+    "list": lambda t, x, u, p: [x[1], u[0] - p["k"] * x[0] ** 3],
+    "matrix": lambda t, x, u, p: -K @ x + np.array([0, 1]) * u,
+    "column": lambda t, x, u, p: (-K @ x.reshape(2, 1)) * p["k"],
+    "sums": lambda t, x, u, p: [np.sum(x * x), np.linalg.norm(x) + np.mean(K * x)],
+    "functions": lambda t, x, u, p: [np.sin(t) * np.exp(-abs(x[0])), np.arctan2(x[1], u[0]) + np.log10(1 + x[0] ** 2)],
+    "mathematics": lambda t, x, u, p: [math.sin(x[0]), copysign(p["k"], x[1]) * math.sqrt(abs(u[0]))],
+    "where": lambda t, x, u, p: np.where(np.abs(x) > 0.3, x, 2 * x) * np.sign(u[0]),
+    "limits": lambda t, x, u, p: [np.clip(x[0], -1, 1), np.maximum(0, x[1]) + np.minimum(x[0], u[0])],
+    "branches": lambda t, x, u, p: [max(0, x[0]), spring(x[0] - x[1], p["k"]) if u[0] > 0 else min(x[1], 1)],
+    "conditions": lambda t, x, u, p: [1.0 if 0 < x[0] < 1 or x[1] > u[0] else -1.0, float(len(x)) * x[0]],
+    "mass matrix": mass_matrix,
+    "boolean index": masked,
+    "tables": table,
+    "method": Plant().rhs,
+}
+
+
+@pytest.mark.parametrize("case", FUNCTIONS)
+def test_equations_are_those_of_the_function(case):
+    function, traced = FUNCTIONS[case], equations(FUNCTIONS[case])
+    rng = np.random.default_rng(1)
+    for _ in range(100):
+        t, k, u, x = rng.uniform(0, 9), rng.uniform(0.5, 2), rng.normal(size=1), rng.normal(size=2)
+        expected = np.ravel(np.asarray(function(t, x, u, {"k": k}), dtype=float))
+        assert np.allclose(traced(t, *x, *u, k).full().ravel(), expected, rtol=1e-12, atol=1e-13)
+
+
+def test_parameters_may_be_arrays():
+    stiffness = Parameter(np.array([[3.0, -1.0], [-2.0, 5.0]]))
+    made = from_function(lambda t, x, u, p: -p["K"] @ x, "a", states=("a", "b"), parameters={"K": stiffness})
+    x, u, p, t = made.symbols()
+    f = ca.Function("f", [x.a, x.b, p.K], [made.derivatives(x, u, p, t)])
+    assert np.allclose(f(1.0, 2.0, stiffness.value).full().ravel(), -stiffness.value @ [1, 2])
+
+
+def test_it_simulates_as_the_symbolic_simulator_does_and_is_not_called_any_more():
+    calls = 0
+
+    def counted(t, x, u, p):
+        nonlocal calls
+        calls += 1
+        return rhs(t, x, u, p)
+
+    made = from_function(counted, lambda t, x, u, p: {"pos": x[0]}, ports=GROUND, hold="zero", **NAMES)
+    assert calls == 41
+    assert "derivatives: equations of counted; called 41 times (1 for its branches, 40 as a check)" in repr(made)
+    u = np.random.default_rng(0).normal(size=(400, 1))
+    record = pilfr.Recording(u, u, 5e-3, inputs=("force",), outputs=("pos",), initial="zero", hold="zero")
+    one, other = made.simulate(record), symbolic().simulate(record)
+    assert np.max(np.abs(one - other)) <= 1e-12 * np.max(np.abs(other)) and calls == 41
+
+
+def test_missing_friction_is_found_as_with_the_symbolic_simulator():
+    t = np.arange(1200) * 5e-3
+    f, phase = np.linspace(0.3, 8, 30), np.random.default_rng(0).uniform(0, 2 * np.pi, 30)
+    force = 12 * np.sum(np.cos(2 * np.pi * f[:, None] * t + phase[:, None]), axis=0)[:, None]
+    blank = pilfr.Recording(force, force, 5e-3, inputs=("force",), outputs=("pos",), initial="zero", hold="zero")
+    law = pilfr.laws.CoulombFriction
+    y = symbolic().with_element("ground", law().at({"F_c": 12.0, "v_0": 0.003})).simulate(blank)
+    record = blank.with_(y=y + 1e-3 * np.std(y) * np.random.default_rng(1).standard_normal(y.shape))
+    made = from_function(rhs, "pos", ports=GROUND, **NAMES)
+    found = [
+        pilfr.diagnose(s, record, laws=(law, pilfr.laws.CubicStiffness), effects=1, workers=1)
+        for s in (made, symbolic())
+    ]
+    named = [(d.verdict, [(e.port, e.law) for e in d.effects]) for d in found]
+    assert named[0] == named[1] == ("missing-physics", [("ground", "coulomb_friction")])
