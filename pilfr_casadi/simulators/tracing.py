@@ -117,6 +117,7 @@ _RENAMED = {
     "pow": "power",
 }
 _OF_MATH = {ufunc.__name__: ufunc for ufunc in RULES if hasattr(math, ufunc.__name__)}
+del _OF_MATH["remainder"]  # that of math has another sign
 _OF_MATH |= {name: getattr(np, other) for name, other in _RENAMED.items()}
 REPLACED |= {getattr(math, name): _scalar_function(getattr(math, name), ufunc) for name, ufunc in _OF_MATH.items()}
 

@@ -1,17 +1,17 @@
 """NumPy functions as simulators: their equations are those of the function, or one sentence says why not."""
 
 import math
-import random
-import re
 from math import copysign
 
 import casadi as ca
+import cloudpickle
 import numpy as np
 import pytest
+from scipy.interpolate import interp1d
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Simulator
-from pilfr_casadi.simulators import from_function
+from pilfr_casadi.simulators import from_function, load_simulator
 
 K = np.array([[3.0, -1.0], [-1.0, 2.0]])
 PARAMETERS = {
@@ -112,6 +112,12 @@ def test_parameters_may_be_arrays():
     assert np.allclose(f(1.0, 2.0, stiffness.value).full().ravel(), -stiffness.value @ [1, 2])
 
 
+def test_equations_survive_a_worker_process_and_are_exported():
+    made = cloudpickle.loads(cloudpickle.dumps(from_function(rhs, "pos", ports=GROUND, hold="zero", **NAMES)))
+    step = pilfr.exported(made, dt=1e-3).step
+    assert made.output_names == ("pos",) and step.size1_in(0) == 2
+
+
 def test_it_simulates_as_the_symbolic_simulator_does_and_is_not_called_any_more():
     calls = 0
 
@@ -144,3 +150,125 @@ def test_missing_friction_is_found_as_with_the_symbolic_simulator():
     ]
     named = [(d.verdict, [(e.port, e.law) for e in d.effects]) for d in found]
     assert named[0] == named[1] == ("missing-physics", [("ground", "coulomb_friction")])
+
+
+def loops(t, x, u, p):
+    v = x[0]
+    while v > 1:
+        v = v / 2
+    return [v, 0.0]
+
+
+def writes(t, x, u, p):
+    x[0] = 0.0
+    return x
+
+
+def sets_parameter(t, x, u, p):
+    p["k"] = 3.0
+    return [x[0], x[1]]
+
+
+def adds_into_numbers(t, x, u, p):
+    total = np.linspace(0, 1, 2)
+    total += x
+    return total
+
+
+def guards(t, x, u, p):
+    if x[0] > 1e9:
+        raise ValueError("out of range")
+    return x
+
+
+def rounds(t, x, u, p):
+    return [np.round(x[0]), x[1]]
+
+
+def converts(t, x, u, p):
+    return [float(x[0]), x[1]]
+
+
+def looks_up(t, x, u, p):
+    return [TABLE(x[0]), x[1]]
+
+
+def asks_for_a_type(t, x, u, p):
+    return [x[0] if isinstance(x[0], float) else 2 * x[0], x[1]]
+
+
+NOISE = np.random.default_rng(0)
+TABLE = interp1d([-1e9, 0.0, 1e9], [0.0, 1.0, 2.0])
+BAD = {
+    "not callable": (3, ("3", "function of t, x, u and p")),
+    "other arguments": (lambda t, x: x, ("(t, x, u, p)",)),
+    "too few": (lambda t, x, u, p: [x[0]], ("1 value;", "derivatives a, b")),
+    "too many": (lambda t, x, u, p: [x[0], x[1], 0], ("3 values;", "derivatives a, b")),
+    "a matrix": (lambda t, x, u, p: np.outer(x, x)[:, :1] * x, ("shape (2, 2)", "derivatives a, b")),
+    "nothing": (lambda t, x, u, p: None, ("1 value",)),
+    "texts": (lambda t, x, u, p: ["a", x[0]], ("a str for 'a'", "number")),
+    "writes into its arguments": (writes, ("line", "x[0] = 0.0", "arguments", "np.array")),
+    "sets a parameter": (sets_parameter, ("line", "arguments")),
+    "unknown parameter": (lambda t, x, u, p: x * p["q"], ("'q'", "there are k")),
+    "always fails": (lambda t, x, u, p: x + np.ones(3), ("line", "ValueError", "with numbers")),
+    "never finite": (lambda t, x, u, p: x * np.nan, ("finite",)),
+    "guard": (guards, ("line", "raise ValueError", "out of range")),
+    "endless": (loops, ("line", "while v > 1", "64 times", "fixed number")),
+    "rounds": (rounds, ("line", "np.round(x[0])", "np.rint", "np.where")),
+    "float": (converts, ("line", "float(x[0])", "leave out float()")),
+    "adds into numbers": (adds_into_numbers, ("line", "total += x", "y = y + ...")),
+    "table of another package": (looks_up, ("line", "TABLE(x[0])", "CasADi")),
+    "random": (lambda t, x, u, p: x * NOISE.random(), ("its equations", "random numbers")),
+    "types": (asks_for_a_type, ("its equations", "types")),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_functions_are_refused_in_one_sentence(case):
+    function, says = BAD[case]
+    with pytest.raises(InputError) as caught:
+        equations(function)
+    message = str(caught.value)
+    print(message)
+    assert "\n" not in message and len(message) < 420
+    for word in says:
+        assert word in message, message
+
+
+@pytest.mark.parametrize(
+    "changes, says",
+    [
+        ({"states": ("pos", "pos")}, "not unique"),
+        ({"states": ()}, "names"),
+        ({"inputs": 3}, "names"),
+        ({"parameters": {"k": 3.0}}, "Parameter"),
+        ({"parameters": [1]}, "Parameter"),
+        ({"outputs": 3}, "function of t, x, u and p"),
+        ({"outputs": ("pos", "speed")}, "pos and vel"),
+        ({"outputs": lambda t, x, u, p: [x[0]]}, "{name: value}"),
+        ({"outputs": lambda t, x, u, p: {"a": x[0]} if x[0] > 0 else {"b": x[0]}}, "before"),
+        ({"outputs": lambda t, x, u, p: {"a": x}}, "shape (1, 2)"),
+    ],
+)
+def test_bad_arguments_are_refused_in_one_sentence(changes, says):
+    with pytest.raises(InputError) as caught:
+        from_function(rhs, **{"outputs": "pos", **NAMES, **changes})
+    assert says in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_simulator_file_may_hold_a_numpy_function(tmp_path):
+    text = """\
+import numpy as np
+from pilfr_casadi import Parameter, from_function
+
+def rhs(t, x, u, p):
+    return [x[1], u[0] - p["k"] * np.tanh(x[0])]
+
+simulator = from_function(rhs, "pos", states=("pos", "vel"), inputs="force", parameters={"k": Parameter(3.0)})
+"""
+    path = tmp_path / "rig.py"
+    path.write_text(text)
+    assert load_simulator(path).inputs == ("force",)
+    path.write_text(text.replace("np.tanh", "int"))
+    with pytest.raises(InputError, match=r"rig.py, line 5: .*int\(x\[0\]\)"):
+        load_simulator(path)
