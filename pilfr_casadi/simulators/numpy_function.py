@@ -271,7 +271,8 @@ def _failure(called: str, error: BaseException | None, names: _Names, followed: 
     if followed:
         return (
             f"{place} fails with symbols in place of numbers, for which every branch is entered ({said}); use "
-            "arithmetic and functions of NumPy that have a formula, or write the equations in CasADi as a Simulator."
+            "arithmetic and functions of NumPy (np.interp for tables), leave out checks, or write the equations in "
+            "CasADi as a Simulator."
         )
     return f"{place} fails with numbers ({said}); it is called as {called}(t, x, u, p) with p[name]."
 

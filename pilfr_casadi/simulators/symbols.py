@@ -62,8 +62,8 @@ class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
             return float(self.sx)
         raise NotFollowed(
             f"{does} from a value that is a symbol here",
-            "leave out float() and int(), use np.sin and the like in place of other modules, and collect results by "
-            "np.array([...])",
+            "leave out int(), use functions of NumPy in place of other modules (np.interp for tables), and collect "
+            "results by np.array([...])",
         )
 
     def __float__(self) -> float:
@@ -103,9 +103,22 @@ class Symbols(np.ndarray):
 
     def astype(self, dtype: Any, *args: Any, **options: Any) -> Any:
         """Return a copy for any type of floats, which symbols stand for."""
+        dtype = float if dtype is Float else dtype
         if np.dtype(dtype).kind == "f" and has_symbol(self):
             return self.copy()
         return super().astype(dtype, *args, **options)
+
+
+class _KindOfFloat(type):
+    def __call__(cls, value: Any = 0.0) -> Any:
+        return value if isinstance(value, Symbol) else float(value)
+
+    def __instancecheck__(cls, value: Any) -> bool:
+        return isinstance(value, float | Symbol)
+
+
+class Float(metaclass=_KindOfFloat):
+    """The type `float`, of which a symbol is an instance too, as NumPy's scalars are."""
 
 
 def symbols(expression: Any, shape: tuple[int, ...], trace: Decides) -> Any:
@@ -180,13 +193,14 @@ def _elementwise(ufunc: Any, *inputs: Any) -> Any:
     arrays = np.broadcast_arrays(*map(objects, inputs))
     out = np.empty(arrays[0].shape, dtype=object)
     for i in np.ndindex(out.shape):
-        values = [a[i] for a in arrays]
+        values: list[Any] = [a[i] for a in arrays]
         if not has_symbol(values):
             out[i] = ufunc(*values)
         elif rule is None:
             raise NotFollowed(f"uses np.{ufunc.__name__}, which has no symbolic counterpart", INSTEAD)
         else:
-            out[i] = Symbol(ca.SX(rule(*map(expression, values))), _trace(values))
+            own = [v.sx if isinstance(v, Symbol) else float(v) for v in values]
+            out[i] = Symbol(rule(*own), _trace(values))
     return array_of(out)
 
 
@@ -319,7 +333,7 @@ RULES: dict[Any, Rule] = {
     np.fabs: ca.fabs,
     np.sign: ca.sign,
     np.copysign: ca.copysign,
-    np.heaviside: lambda a, b: ca.if_else(a == 0, b, a > 0),
+    np.heaviside: lambda a, b: ca.if_else(ca.SX(a) == 0, b, ca.SX(a) > 0),
     np.square: lambda a: a * a,
     np.sqrt: ca.sqrt,
     np.cbrt: lambda a: ca.sign(a) * ca.fabs(a) ** (1 / 3),
@@ -368,6 +382,9 @@ RULES: dict[Any, Rule] = {
     np.bitwise_and: ca.logic_and,  # `&`, `|` and `~` of conditions
     np.bitwise_or: ca.logic_or,
     np.invert: ca.logic_not,
+    np.isfinite: lambda a: ca.SX(1),  # a guard that equations do not need
+    np.isnan: lambda a: ca.SX(0),
+    np.isinf: lambda a: ca.SX(0),
 }
 FUNCTIONS: dict[Any, Rule] = {
     np.where: _where,

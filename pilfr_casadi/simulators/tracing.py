@@ -20,7 +20,19 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .symbols import RULES, NotFollowed, Rule, Symbol, Symbols, array_of, has_symbol, objects, to_numbers, writable
+from .symbols import (
+    RULES,
+    Float,
+    NotFollowed,
+    Rule,
+    Symbol,
+    Symbols,
+    array_of,
+    has_symbol,
+    objects,
+    to_numbers,
+    writable,
+)
 
 LEFT_AS_THEY_ARE = {"numpy", "casadi", "scipy"}  # packages whose functions are not copied
 MOST_CALLS = 512  # of a function for all of its branches; nine decisions that are all independent
@@ -82,6 +94,8 @@ def follow(call: Callable[[Trace], Any]) -> tuple[Any, int]:
 
 def _creator(function: Rule) -> Rule:
     def create(*args: Any, **options: Any) -> Any:
+        args = tuple(float if a is Float else a for a in args)
+        options = {k: float if v is Float else v for k, v in options.items()}
         if not has_symbol(args[:1]):
             return writable(function(*to_numbers(args), **options))
         if isinstance(args[0], Symbol | Symbols) and function is not np.array:
@@ -160,8 +174,11 @@ def _accepting(value: Any, done: dict[int, Any]) -> Any:
     copy = types.FunctionType(value.__code__, names, value.__name__, value.__defaults__, cells or None)
     copy.__kwdefaults__ = value.__kwdefaults__
     done[id(value)] = copy
-    for name in _names_of(value.__code__) & set(names):
+    used = _names_of(value.__code__)
+    for name in used & set(names):
         names[name] = _accepting(names[name], done)
+    if "float" in used:
+        names.setdefault("float", Float)
     for cell in cells:
         if isinstance(content := _content(cell), COPIED):
             cell.cell_contents = _accepting(content, done)

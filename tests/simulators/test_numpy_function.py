@@ -86,10 +86,12 @@ FUNCTIONS = {
     "where": lambda t, x, u, p: np.where(np.abs(x) > 0.3, x, 2 * x) * np.sign(u[0]),
     "limits": lambda t, x, u, p: [np.clip(x[0], -1, 1), np.maximum(0, x[1]) + np.minimum(x[0], u[0])],
     "branches": lambda t, x, u, p: [max(0, x[0]), spring(x[0] - x[1], p["k"]) if u[0] > 0 else min(x[1], 1)],
-    "conditions": lambda t, x, u, p: [1.0 if 0 < x[0] < 1 or x[1] > u[0] else -1.0, float(len(x)) * x[0]],
+    "conditions": lambda t, x, u, p: [1.0 if 0 < x[0] < 1 or x[1] > u[0] else -1.0, (x[0] > x[1]) & (u[0] < 1)],
+    "floats": lambda t, x, u, p: np.array([float(x[0]), float(len(x)) * u.astype(float)[0]], dtype=float),
     "mass matrix": mass_matrix,
     "boolean index": masked,
     "tables": table,
+    "guard": lambda t, x, u, p: x if np.all(np.isfinite(x)) else None,
     "method": Plant().rhs,
 }
 
@@ -186,7 +188,7 @@ def rounds(t, x, u, p):
 
 
 def converts(t, x, u, p):
-    return [float(x[0]), x[1]]
+    return [K[int(x[0]) % 2, 0], x[1]]
 
 
 def looks_up(t, x, u, p):
@@ -194,7 +196,7 @@ def looks_up(t, x, u, p):
 
 
 def asks_for_a_type(t, x, u, p):
-    return [x[0] if isinstance(x[0], float) else 2 * x[0], x[1]]
+    return [x[0] if isinstance(x[0], np.floating) else 2 * x[0], x[1]]
 
 
 NOISE = np.random.default_rng(0)
@@ -215,7 +217,7 @@ BAD = {
     "guard": (guards, ("line", "raise ValueError", "out of range")),
     "endless": (loops, ("line", "while v > 1", "64 times", "fixed number")),
     "rounds": (rounds, ("line", "np.round(x[0])", "np.rint", "np.where")),
-    "float": (converts, ("line", "float(x[0])", "leave out float()")),
+    "whole number": (converts, ("line", "int(x[0])", "leave out int()")),
     "adds into numbers": (adds_into_numbers, ("line", "total += x", "y = y + ...")),
     "table of another package": (looks_up, ("line", "TABLE(x[0])", "CasADi")),
     "random": (lambda t, x, u, p: x * NOISE.random(), ("its equations", "random numbers")),
