@@ -160,6 +160,7 @@ _ELSEWHERE = {
     "do_mpc_model",
     "feedforward",
     "fit_report",
+    "frequency_subspace",
     "generalized_play",
     "inverse_element",
     "kalman_filter",

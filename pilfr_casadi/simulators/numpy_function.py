@@ -157,7 +157,7 @@ def _equations(function: Any, kind: str, names: _Names, found: tuple[str, ...] |
         return ca.vertcat(ca.SX(0, 1), *map(expression, _row(result, found, called, kind)[1]))
 
     try:
-        equations, calls = follow(call)
+        equations, calls = follow(call, ca.vertcat(t, x, u))
     except InputError:
         raise
     except Exception as error:

@@ -26,10 +26,13 @@ class NotFollowed(Exception):
 
 
 class Decides(Protocol):
-    """Answers a condition that is a symbol."""
+    """Answers conditions that are symbols."""
 
     def decide(self, condition: Any) -> bool:
-        """Return the answer."""
+        """Return the answer to a condition."""
+
+    def guard(self, argument: Any) -> Any:
+        """Return the argument of a function that is singular, made harmless where the answers are others."""
 
 
 class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
@@ -200,7 +203,10 @@ def _elementwise(ufunc: Any, *inputs: Any) -> Any:
             raise NotFollowed(f"uses np.{ufunc.__name__}, which has no symbolic counterpart", INSTEAD)
         else:
             own = [v.sx if isinstance(v, Symbol) else float(v) for v in values]
-            out[i] = Symbol(rule(*own), _trace(values))
+            trace = _trace(values)
+            if (k := SINGULAR.get(ufunc)) is not None and isinstance(values[k], Symbol):
+                own[k] = trace.guard(own[k])
+            out[i] = Symbol(rule(*own), trace)
     return array_of(out)
 
 
@@ -385,6 +391,16 @@ RULES: dict[Any, Rule] = {
     np.isfinite: lambda a: ca.SX(1),  # a guard that equations do not need
     np.isnan: lambda a: ca.SX(0),
     np.isinf: lambda a: ca.SX(0),
+}
+SINGULAR: dict[
+    Any, int
+] = {  # functions that are singular or undefined for some values of an argument, and which one it is
+    np.divide: 1,
+    np.reciprocal: 0,
+    np.power: 0,
+    np.float_power: 0,
+    **dict.fromkeys((np.sqrt, np.cbrt, np.log, np.log2, np.log10, np.log1p), 0),
+    **dict.fromkeys((np.arcsin, np.arccos, np.arccosh, np.arctanh), 0),
 }
 FUNCTIONS: dict[Any, Rule] = {
     np.where: _where,

@@ -41,10 +41,14 @@ DEPTH = 20  # levels of two expressions that are compared to tell that a decisio
 
 
 class Trace:
-    """The decisions of one call: those it was told first, then True for each new one."""
+    """The decisions of one call: those it was told first, then True for each new one.
 
-    def __init__(self, told: Sequence[bool] = ()) -> None:
-        self.told = list(told)
+    Both results of a decision are part of the expressions, and a derivative of the one that is not taken must not
+    spoil the other: `0 * nan` is nan. So a root of h that is taken where h > 0 is that of `if_else(h > 0, h, 1)`.
+    """
+
+    def __init__(self, told: Sequence[bool], signals: Any) -> None:
+        self.told, self.signals = list(told), signals
         self.taken: list[tuple[Any, bool]] = []
 
     def decide(self, condition: Any) -> bool:
@@ -61,14 +65,23 @@ class Trace:
         self.taken.append((condition, answer))
         return answer
 
+    def guard(self, argument: Any) -> Any:
+        """Replace an argument that varies by one where the decisions are others than so far."""
+        if not self.taken or not ca.depends_on(argument, self.signals):
+            return argument
+        so = [condition if answer else ca.logic_not(condition) for condition, answer in self.taken]
+        return ca.if_else(functools.reduce(ca.logic_and, so), argument, 1.0)
 
-def follow(call: Callable[[Trace], Any]) -> tuple[Any, int]:
+
+def follow(call: Callable[[Trace], Any], signals: Any) -> tuple[Any, int]:
     """Return the expressions of all paths of a call, joined by their conditions, and the number of calls.
 
     Parameters
     ----------
     call : callable
         From a trace, whose symbols it uses, to a vector of expressions.
+    signals : casadi.SX
+        The symbols that vary in time.
 
     Raises
     ------
@@ -82,7 +95,7 @@ def follow(call: Callable[[Trace], Any]) -> tuple[Any, int]:
         calls += 1
         if calls > MOST_CALLS:
             raise NotFollowed(f"has more than {MOST_CALLS} branches", "write np.where, np.maximum or np.sign for them")
-        trace = Trace(told)
+        trace = Trace(told, signals)
         value = call(trace)
         answers = [answer for _, answer in trace.taken]
         for i in reversed(range(len(told), len(answers))):

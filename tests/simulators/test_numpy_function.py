@@ -106,12 +106,36 @@ def test_equations_are_those_of_the_function(case):
         assert np.allclose(traced(t, *x, *u, k).full().ravel(), expected, rtol=1e-12, atol=1e-13)
 
 
+def outflow(t, x, u, p):
+    flow = p["k"] * math.sqrt(x[0]) if x[0] > 0 else 0.0
+    return [u[0] - flow, flow - (np.sqrt(x[1]) / x[1] if x[1] > 0 else 0.0)]
+
+
+def test_derivatives_are_finite_in_both_branches():
+    traced = equations(outflow)
+    for x in ([0.0, 0.0], [-1.0, 2.0], [4.0, -1.0]):
+        assert np.all(np.isfinite(traced.jacobian()(0.5, *x, 1.0, 0.7, np.zeros(2))[1].full()))
+    slope = traced.jacobian()(0.5, 4.0, 1.0, 1.0, 0.7, np.zeros(2))[1].full().ravel()
+    assert np.allclose(slope, [-0.7 / 4, 0.7 / 4])
+
+
 def test_parameters_may_be_arrays():
     stiffness = Parameter(np.array([[3.0, -1.0], [-2.0, 5.0]]))
     made = from_function(lambda t, x, u, p: -p["K"] @ x, "a", states=("a", "b"), parameters={"K": stiffness})
     x, u, p, t = made.symbols()
     f = ca.Function("f", [x.a, x.b, p.K], [made.derivatives(x, u, p, t)])
     assert np.allclose(f(1.0, 2.0, stiffness.value).full().ravel(), -stiffness.value @ [1, 2])
+
+
+def test_time_and_discrete_functions_are_followed():
+    u = np.ones((50, 1))
+    record = pilfr.Recording(u, u, 0.1, inputs=("u",), outputs=("y",), initial="zero", hold="zero")
+    options = {"states": "y", "inputs": "u", "hold": "zero"}
+    swing = from_function(lambda t, x, u, p: [np.cos(t)], "y", **options)
+    assert np.allclose(swing.simulate(record)[:, 0], np.sin(0.1 * np.arange(50)), atol=1e-6)
+    step = from_function(lambda t, x, u, p: 0.5 * x + u, "y", discrete=True, **options)
+    assert np.allclose(step.simulate(record)[:, 0], 2 * (1 - 0.5 ** np.arange(50)))
+    assert from_function(rhs, "pos", **NAMES).kinematic == {"pos"}
 
 
 def test_equations_survive_a_worker_process_and_are_exported():
