@@ -137,7 +137,7 @@ if TYPE_CHECKING:
         stable as stable,
     )
     from .report import fit_report as fit_report, write_report as write_report
-    from .simulators import Port as Port, Simulator as Simulator
+    from .simulators import Port as Port, Simulator as Simulator, from_function as from_function
     from .studies import campaign as campaign, read_run as read_run, run as run
 else:
     __getattr__, __dir__, _listed = lazy_face(__name__, __file__)
@@ -160,6 +160,7 @@ _ELSEWHERE = {
     "do_mpc_model",
     "feedforward",
     "fit_report",
+    "frequency_subspace",
     "generalized_play",
     "inverse_element",
     "kalman_filter",

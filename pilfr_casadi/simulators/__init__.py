@@ -2,7 +2,8 @@
 
 `equations` evaluates them with their laws, `integration` makes them a discrete-time `Model`, `simulator` holds the
 class `Simulator` and the state in which its laws begin at rest, and `adapters` accept a Python file, a state space or a
-fitted model in its place.
+fitted model in its place. `numpy_function` makes one from a NumPy function, whose equations `tracing` finds by calling
+it with the `symbols` of the file of that name.
 """
 
 from typing import TYPE_CHECKING
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
         signals as signals,
         states_along as states_along,
     )
+    from .numpy_function import from_function as from_function
     from .simulator import (
         Simulator as Simulator,
         compute_equilibrium as compute_equilibrium,

@@ -234,7 +234,7 @@ class _SubStep:
         x, h, own = self.x, self.h, len(self.simulator.states)
         k1, y, _, _ = self._at(x, self.memory, self.u0, self.t)
         if self.simulator.discrete:  # the laws' own states move with z held over the sample
-            return ca.vertcat(k1[:own], x[own:] + h * k1[own:]), y, None
+            return ca.vertcat(k1[:own], x[own:, 0] + h * k1[own:, 0]), y, None
         middle, end = (self.u0 + self.end) / 2, self.end
         c2 = x + h / 2 * k1
         k2 = self._slope(c2, middle, 0.5)

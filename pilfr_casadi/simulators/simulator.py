@@ -125,6 +125,7 @@ class Simulator(Equations):
             f"Simulator with the states {', '.join(self.states) or 'none'}; inputs {', '.join(self.inputs) or 'none'}; "
             f"outputs {', '.join(self.output_names)}",
             *(f"  {e.port}: {e.law.id}" for e in self.elements),
+            *(f"  {note}" for f in (self.dynamics, self.outputs) if (note := getattr(f, "note", ""))),
         ]
         for name, p in self.parameters.items():
             value = f"{float(p.value):.5g}" if p.value.ndim == 0 else np.array2string(p.value, precision=5, threshold=8)

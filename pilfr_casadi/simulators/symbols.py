@@ -1,0 +1,423 @@
+"""Symbols that NumPy's functions accept: expressions of CasADi that behave like numbers and arrays of numbers.
+
+NumPy hands its functions over to their arguments (NEP 13, `__array_ufunc__`, and NEP 18, `__array_function__`). `RULES`
+gives the expression of each ufunc, and `FUNCTIONS` that of functions which need more than ufuncs. All others run as
+they are, on arrays of objects.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import casadi as ca
+import numpy as np
+
+Rule = Callable[..., Any]
+
+
+class NotFollowed(Exception):
+    """An operation has no symbolic counterpart: what the function does, and what to write instead."""
+
+    def __init__(self, does: str, instead: str) -> None:
+        super().__init__(f"{does}; {instead}")
+
+
+class Decides(Protocol):
+    """Answers conditions that are symbols."""
+
+    def decide(self, condition: Any) -> bool:
+        """Return the answer to a condition."""
+
+    def guard(self, argument: Any) -> Any:
+        """Return the argument of a function that is singular, made harmless where the answers are others."""
+
+
+class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
+    """A scalar expression `sx` that NumPy's functions accept."""
+
+    __hash__ = None  # type: ignore[assignment]
+    shape, ndim, size = (), 0, 1
+
+    def __init__(self, sx: Any, trace: Decides) -> None:
+        self.sx, self.trace = sx, trace
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        return _apply_ufunc(ufunc, method, inputs, options)
+
+    def __array_function__(self, function: Any, _: Any, inputs: Any, options: Any) -> Any:
+        return _apply_function(function, inputs, options)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return np.<name> as a method, as NumPy's own loops over objects call it."""
+        ufunc: Any = None if name.startswith("_") else getattr(np, name, None)
+        if ufunc not in RULES:
+            raise AttributeError(f"a symbol has no attribute {name!r}")
+        return functools.partial(ufunc, self)
+
+    def __bool__(self) -> bool:
+        return bool(float(self.sx)) if self.sx.is_constant() else self.trace.decide(self.sx)
+
+    def _number(self, does: str) -> float:
+        if self.sx.is_constant():
+            return float(self.sx)
+        raise NotFollowed(
+            f"{does} from a value that is a symbol here",
+            "leave out int(), use functions of NumPy in place of other modules (np.interp for tables), and collect "
+            "results by np.array([...])",
+        )
+
+    def __float__(self) -> float:
+        return self._number("makes a plain number")
+
+    def __int__(self) -> int:
+        return int(self._number("makes a whole number"))
+
+    def __index__(self) -> int:
+        return int(self._number("makes an index"))
+
+    def __round__(self, digits: int | None = None) -> float:
+        return round(self._number("rounds"), digits)
+
+    def __complex__(self) -> complex:
+        return complex(self._number("makes a complex number"))
+
+    def item(self) -> Symbol:
+        """Return itself, as the scalars of NumPy return their number."""
+        return self
+
+
+class Symbols(np.ndarray):
+    """An array of objects: symbols and numbers."""
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        return _apply_ufunc(ufunc, method, inputs, options)
+
+    def __array_function__(self, function: Any, types: Any, args: Any, kwargs: Any) -> Any:
+        return _apply_function(function, args, kwargs)
+
+    def __getitem__(self, key: Any) -> Any:
+        return super().__getitem__(_decided(key))
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        super().__setitem__(_decided(key), value)
+
+    def astype(self, dtype: Any, *args: Any, **options: Any) -> Any:
+        """Return a copy for any type of floats, which symbols stand for."""
+        dtype = float if dtype is Float else dtype
+        if np.dtype(dtype).kind == "f" and has_symbol(self):
+            return self.copy()
+        return super().astype(dtype, *args, **options)
+
+
+class _KindOfFloat(type):
+    def __call__(cls, value: Any = 0.0) -> Any:
+        return value if isinstance(value, Symbol) else float(value)
+
+    def __instancecheck__(cls, value: Any) -> bool:
+        return isinstance(value, float | Symbol)
+
+
+class Float(metaclass=_KindOfFloat):
+    """The type `float`, of which a symbol is an instance too, as NumPy's scalars are."""
+
+
+def symbols(expression: Any, shape: tuple[int, ...], trace: Decides) -> Any:
+    """Make a read-only array of a shape from a matrix of expressions; of the shape (), one symbol."""
+    if not shape:
+        return Symbol(expression, trace)
+    out = np.empty(shape, dtype=object)
+    for i in np.ndindex(shape):
+        out[i] = Symbol(expression[i], trace)
+    out.flags.writeable = False
+    return out.view(Symbols)
+
+
+def expression(value: Any) -> Any:
+    """Return the expression of a symbol or a number."""
+    return value.sx if isinstance(value, Symbol) else ca.SX(float(value))
+
+
+def _decided(key: Any) -> Any:
+    """Decide the conditions of a boolean index."""
+    if isinstance(key, tuple):
+        return tuple(map(_decided, key))
+    if isinstance(key, Symbols):
+        return np.array([bool(c) for c in key.ravel()], dtype=bool).reshape(key.shape)
+    return key
+
+
+def has_symbol(value: Any) -> bool:
+    """Tell whether a value, an array or a nested list holds a symbol."""
+    if isinstance(value, Symbol):
+        return True
+    if isinstance(value, np.ndarray):
+        return value.dtype == object and any(isinstance(e, Symbol) for e in value.flat)
+    return isinstance(value, list | tuple) and any(map(has_symbol, value))
+
+
+def _trace(values: Sequence[Any]) -> Decides:
+    return next(v.trace for v in values if isinstance(v, Symbol))
+
+
+def objects(value: Any) -> np.ndarray:
+    """Make a plain array of objects."""
+    if isinstance(value, Symbol):
+        out = np.empty((), dtype=object)
+        out[()] = value
+        return out
+    return np.asarray(value, dtype=object).view(np.ndarray)
+
+
+def array_of(array: np.ndarray) -> Any:
+    """Make an array of objects one of symbols, or its only element."""
+    return array.view(Symbols) if array.ndim else array[()]
+
+
+def to_numbers(value: Any) -> Any:
+    """Make arrays of objects without a symbol arrays of numbers again."""
+    if isinstance(value, Symbols):
+        return np.array(value.tolist())
+    return type(value)(map(to_numbers, value)) if type(value) in (list, tuple) else value
+
+
+def _arrays(value: Any) -> Any:
+    """Make scalars arrays, which NumPy's own functions work on."""
+    if isinstance(value, Symbol):
+        return objects(value).view(Symbols)
+    return type(value)(map(_arrays, value)) if type(value) in (list, tuple) else value
+
+
+def _elementwise(ufunc: Any, *inputs: Any) -> Any:
+    """Apply a rule, or a ufunc to elements that are all numbers."""
+    rule = RULES.get(ufunc)
+    arrays = np.broadcast_arrays(*map(objects, inputs))
+    out = np.empty(arrays[0].shape, dtype=object)
+    for i in np.ndindex(out.shape):
+        values: list[Any] = [a[i] for a in arrays]
+        if not has_symbol(values):
+            out[i] = ufunc(*values)
+        elif rule is None:
+            raise NotFollowed(f"uses np.{ufunc.__name__}, which has no symbolic counterpart", INSTEAD)
+        else:
+            own = [v.sx if isinstance(v, Symbol) else float(v) for v in values]
+            trace = _trace(values)
+            if (k := SINGULAR.get(ufunc)) is not None and isinstance(values[k], Symbol):
+                own[k] = trace.guard(own[k])
+            out[i] = Symbol(rule(*own), trace)
+    return array_of(out)
+
+
+def _apply_ufunc(ufunc: Any, method: str, inputs: Sequence[Any], options: dict[str, Any]) -> Any:
+    into = options.pop("out", (None,))[0]
+    if options.pop("where", True) is not True:
+        raise NotFollowed(f"uses the option where= of np.{ufunc.__name__}", "write np.where(condition, a, b)")
+    if method == "__call__" and ufunc.signature is None:
+        result = _elementwise(ufunc, *inputs)
+    elif method == "reduce" and ufunc in RULES:
+        result = _reduce(ufunc, inputs[0], **options)
+    else:  # products of arrays, sums over pieces
+        result = array_of(objects(getattr(ufunc, method)(*map(objects, inputs), **options)))
+    if into is None or isinstance(into, Symbol):
+        return result
+    if into.dtype != object:
+        raise NotFollowed("writes symbols into an array of numbers", "write y = y + ... in place of y += ...")
+    into[...] = result
+    return into
+
+
+def _reduce(ufunc: Any, array: Any, axis: Any = 0, keepdims: bool = False, initial: Any = None, **_: Any) -> Any:
+    values = objects(array)
+    axes = tuple(range(values.ndim)) if axis is None else axis if isinstance(axis, tuple) else (axis,)
+    rows = np.moveaxis(values, axes, range(len(axes))) if values.ndim else values[None]
+    rows = rows.reshape(-1, *rows.shape[len(axes) :]) if values.ndim else rows
+    first = ufunc.identity if initial is None else initial
+    start = [first] if first is not None and (not len(rows) or initial is not None) else []
+    total = functools.reduce(functools.partial(_elementwise, ufunc), [*start, *rows])
+    return np.expand_dims(objects(total), axes).view(Symbols) if keepdims else array_of(objects(total))
+
+
+def _apply_function(function: Any, inputs: Sequence[Any], options: dict[str, Any]) -> Any:
+    if not has_symbol([*inputs, *options.values()]) and function not in WRITING:
+        result = function(*to_numbers(tuple(inputs)), **{k: to_numbers(v) for k, v in options.items()})
+        return writable(result)
+    if function in FUNCTIONS:
+        return FUNCTIONS[function](*inputs, **options)
+    inputs, options = _arrays(tuple(inputs)), {k: _arrays(v) for k, v in options.items()}
+    result = np.ndarray.__array_function__(objects([]).view(Symbols), function, (Symbols,), inputs, options)
+    return array_of(objects(result)) if isinstance(result, np.ndarray) and result.dtype == object else result
+
+
+def _if_else(condition: Any, a: Any, b: Any) -> Any:
+    """Choose elements as np.where does."""
+    arrays: Any = np.broadcast_arrays(*map(objects, (condition, a, b)))
+    out = np.empty(arrays[0].shape, dtype=object)
+    for i in np.ndindex(out.shape):
+        c, *ab = (array[i] for array in arrays)
+        if isinstance(c, Symbol):
+            out[i] = Symbol(ca.if_else(c.sx, *map(expression, ab)), c.trace)
+        else:
+            out[i] = ab[0] if c else ab[1]
+    return array_of(out)
+
+
+def _where(condition: Any, *choices: Any) -> Any:
+    if len(choices) != 2:
+        raise NotFollowed("uses np.where with one argument", "write np.where(condition, a, b)")
+    return _if_else(condition, *choices)
+
+
+def _clip(a: Any, a_min: Any = None, a_max: Any = None, **_: Any) -> Any:
+    a = a if a_min is None else np.maximum(a, a_min)
+    return a if a_max is None else np.minimum(a, a_max)
+
+
+def _select(conditions: Any, choices: Any, default: Any = 0) -> Any:
+    for condition, choice in reversed(list(zip(conditions, choices, strict=True))):
+        default = _if_else(condition, choice, default)
+    return default
+
+
+def _interp(x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None, period: Any = None) -> Any:
+    """Interpolate linearly in a table of numbers, with the end values beyond its ends."""
+    if has_symbol([xp, fp]) or not (left is right is period is None):
+        raise NotFollowed("uses np.interp with more than x and a table of numbers", "write np.interp(x, xp, fp)")
+    at, table = (np.asarray(to_numbers(v), dtype=float).ravel() for v in (xp, fp))
+    if len(at) < 2 or len(at) != len(table) or np.any(np.diff(at) <= 0):
+        raise NotFollowed("uses np.interp with a table whose x does not increase", "give one that increases")
+    arrays = objects(x)
+    out = np.empty(arrays.shape, dtype=object)
+    for i in np.ndindex(out.shape):
+        inside = ca.fmin(ca.fmax(expression(arrays[i]), at[0]), at[-1])
+        value = ca.SX(table[-1])
+        for a, b, fa, fb in reversed(list(zip(at[:-1], at[1:], table[:-1], table[1:], strict=True))):
+            value = ca.if_else(inside < b, fa + (fb - fa) / (b - a) * (inside - a), value)
+        out[i] = Symbol(value, _trace(arrays.ravel().tolist()))
+    return array_of(out)
+
+
+def _like(function: Rule) -> Rule:
+    """Make np.zeros of a shape np.zeros_like of an array."""
+    return lambda a, *values, **_: array_of(objects(function(np.shape(a), *values[: function is np.full])))
+
+
+def _matrix(rule: Rule) -> Rule:
+    """Make a function of matrices of expressions one of arrays of symbols."""
+
+    def apply(*arrays: Any) -> Any:
+        own = [objects(a) for a in arrays]
+        dense = [ca.vertcat(*(ca.horzcat(*map(expression, row)) for row in a.reshape(len(a), -1))) for a in own]
+        found = ca.SX(rule(*dense))
+        out = np.empty(found.shape, dtype=object)
+        for i in np.ndindex(out.shape):
+            out[i] = Symbol(found[i], _trace([e for a in own for e in a.flat]))
+        return out[0, 0] if rule is ca.det else array_of(out.reshape(own[-1].shape))
+
+    return apply
+
+
+def _floored_remainder(a: Any, b: Any) -> Any:
+    return a - b * ca.floor(a / b)
+
+
+INSTEAD = "write it with arithmetic, np.where, or the functions of math and NumPy that have a formula"
+RULES: dict[Any, Rule] = {
+    np.add: lambda a, b: a + b,
+    np.subtract: lambda a, b: a - b,
+    np.multiply: lambda a, b: a * b,
+    np.divide: lambda a, b: a / b,
+    np.floor_divide: lambda a, b: ca.floor(a / b),
+    np.remainder: _floored_remainder,
+    np.fmod: ca.fmod,
+    np.power: lambda a, b: a**b,
+    np.float_power: lambda a, b: a**b,
+    np.negative: lambda a: -a,
+    np.positive: lambda a: a,
+    np.absolute: ca.fabs,
+    np.fabs: ca.fabs,
+    np.sign: ca.sign,
+    np.copysign: ca.copysign,
+    np.heaviside: lambda a, b: ca.if_else(ca.SX(a) == 0, b, ca.SX(a) > 0),
+    np.square: lambda a: a * a,
+    np.sqrt: ca.sqrt,
+    np.cbrt: lambda a: ca.sign(a) * ca.fabs(a) ** (1 / 3),
+    np.reciprocal: lambda a: 1 / a,
+    np.exp: ca.exp,
+    np.exp2: lambda a: 2.0**a,
+    np.expm1: ca.expm1,
+    np.log: ca.log,
+    np.log2: lambda a: ca.log(a) / math.log(2),
+    np.log10: lambda a: ca.log(a) / math.log(10),
+    np.log1p: ca.log1p,
+    np.sin: ca.sin,
+    np.cos: ca.cos,
+    np.tan: ca.tan,
+    np.arcsin: ca.asin,
+    np.arccos: ca.acos,
+    np.arctan: ca.atan,
+    np.arctan2: ca.atan2,
+    np.hypot: ca.hypot,
+    np.sinh: ca.sinh,
+    np.cosh: ca.cosh,
+    np.tanh: ca.tanh,
+    np.arcsinh: ca.asinh,
+    np.arccosh: ca.acosh,
+    np.arctanh: ca.atanh,
+    np.maximum: ca.fmax,
+    np.minimum: ca.fmin,
+    np.fmax: ca.fmax,
+    np.fmin: ca.fmin,
+    np.floor: ca.floor,
+    np.ceil: ca.ceil,
+    np.trunc: lambda a: ca.sign(a) * ca.floor(ca.fabs(a)),
+    np.deg2rad: lambda a: a * (math.pi / 180),
+    np.radians: lambda a: a * (math.pi / 180),
+    np.rad2deg: lambda a: a * (180 / math.pi),
+    np.degrees: lambda a: a * (180 / math.pi),
+    np.less: lambda a, b: a < b,
+    np.less_equal: lambda a, b: a <= b,
+    np.greater: lambda a, b: a > b,
+    np.greater_equal: lambda a, b: a >= b,
+    np.equal: lambda a, b: a == b,
+    np.not_equal: lambda a, b: a != b,
+    np.logical_and: ca.logic_and,
+    np.logical_or: ca.logic_or,
+    np.logical_not: ca.logic_not,
+    np.bitwise_and: ca.logic_and,  # `&`, `|` and `~` of conditions
+    np.bitwise_or: ca.logic_or,
+    np.invert: ca.logic_not,
+    np.isfinite: lambda a: ca.SX(1),  # a guard that equations do not need
+    np.isnan: lambda a: ca.SX(0),
+    np.isinf: lambda a: ca.SX(0),
+}
+SINGULAR: dict[
+    Any, int
+] = {  # functions that are singular or undefined for some values of an argument, and which one it is
+    np.divide: 1,
+    np.reciprocal: 0,
+    np.power: 0,
+    np.float_power: 0,
+    **dict.fromkeys((np.sqrt, np.cbrt, np.log, np.log2, np.log10, np.log1p), 0),
+    **dict.fromkeys((np.arcsin, np.arccos, np.arccosh, np.arctanh), 0),
+}
+FUNCTIONS: dict[Any, Rule] = {
+    np.where: _where,
+    np.clip: _clip,
+    np.select: _select,
+    np.interp: _interp,
+    np.linalg.solve: _matrix(ca.solve),
+    np.linalg.inv: _matrix(ca.inv),
+    np.linalg.det: _matrix(ca.det),
+}
+
+
+WRITING = {np.copyto, np.put, np.place, np.putmask, np.fill_diagonal}  # functions that write into an array
+for _name in ("zeros", "ones", "empty", "full"):
+    FUNCTIONS[getattr(np, f"{_name}_like")] = _like(getattr(np, _name))
+
+
+def writable(made: Any) -> Any:
+    """Make an array of floats one that can hold symbols."""
+    return array_of(made.astype(object)) if isinstance(made, np.ndarray) and made.dtype.kind == "f" else made

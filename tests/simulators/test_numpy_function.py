@@ -1,0 +1,300 @@
+"""NumPy functions as simulators: their equations are those of the function, or one sentence says why not."""
+
+import math
+from math import copysign
+
+import casadi as ca
+import cloudpickle
+import numpy as np
+import pytest
+from scipy.interpolate import interp1d
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import InputError, Parameter, Port, Simulator
+from pilfr_casadi.simulators import from_function, load_simulator
+
+K = np.array([[3.0, -1.0], [-1.0, 2.0]])
+PARAMETERS = {
+    "m": Parameter(2.0, unit="kg", fixed=True),
+    "k": Parameter(1100.0, unit="N/m", bounds=(500, 3000)),
+    "d": Parameter(15.0, unit="N s/m", bounds=(0, 100)),
+}
+GROUND = Port("ground", lambda p: {"vel": -1 / p.m}, lambda x: x.pos, lambda x: x.vel, "N", "m")
+NAMES = {"states": ("pos", "vel"), "inputs": "force", "parameters": PARAMETERS}
+
+
+def rhs(t, x, u, p):
+    dx = np.zeros(2)
+    dx[0] = x[1]
+    dx[1] = (u[0] - p["k"] * x[0] - p["d"] * x[1]) / p["m"]
+    return dx
+
+
+def symbolic():
+    return Simulator(
+        lambda x, u, p: {"pos": x.vel, "vel": (u.force - p.k * x.pos - p.d * x.vel) / p.m},
+        lambda x: {"pos": x.pos},
+        ports=GROUND,
+        **{**NAMES, "inputs": ("force",)},
+    )
+
+
+def equations(function):
+    """The equations of a function of two states, one input and k as a `casadi.Function`."""
+    made = from_function(function, ("a", "b"), states=("a", "b"), inputs="f", parameters={"k": Parameter(0.7)})
+    x, u, p, t = made.symbols()
+    return ca.Function("f", [t, x.a, x.b, u.f, p.k], [made.derivatives(x, u, p, t)])
+
+
+def spring(v, k):
+    """A helper of the functions below, found by its name."""
+    if v > 0.5:
+        return k * (v - 0.5)
+    return k * (v + 0.5) if v < -0.5 else 0.0
+
+
+def mass_matrix(t, x, u, p):
+    M = np.array([[2.0, np.cos(x[0])], [np.cos(x[0]), 1.5]])
+    return np.linalg.solve(M, np.array([u[0], p["k"] * np.sin(x[1])]))
+
+
+def masked(t, x, u, p):
+    y = np.zeros_like(x)
+    y[x > 0] = 1.0
+    y[1] += p["k"] * x[0]
+    return y
+
+
+def table(t, x, u, p):
+    return [np.interp(x[0], [-1.0, 0.0, 2.0], [1.0, 0.0, 5.0]), np.interp(t, [0, 10], [0, 1]) + u[0]]
+
+
+class Plant:
+    stiffness = 4.0
+
+    def rhs(self, t, x, u, p):
+        return np.array([x[1], -self.stiffness * x[0] + p["k"] * math.tanh(u[0])])
+
+
+FUNCTIONS = {
+    "list": lambda t, x, u, p: [x[1], u[0] - p["k"] * x[0] ** 3],
+    "matrix": lambda t, x, u, p: -K @ x + np.array([0, 1]) * u,
+    "column": lambda t, x, u, p: (-K @ x.reshape(2, 1)) * p["k"],
+    "sums": lambda t, x, u, p: [np.sum(x * x), np.linalg.norm(x) + np.mean(K * x)],
+    "functions": lambda t, x, u, p: [np.sin(t) * np.exp(-abs(x[0])), np.arctan2(x[1], u[0]) + np.log10(1 + x[0] ** 2)],
+    "mathematics": lambda t, x, u, p: [math.sin(x[0]), copysign(p["k"], x[1]) * math.sqrt(abs(u[0]))],
+    "where": lambda t, x, u, p: np.where(np.abs(x) > 0.3, x, 2 * x) * np.sign(u[0]),
+    "limits": lambda t, x, u, p: [np.clip(x[0], -1, 1), np.maximum(0, x[1]) + np.minimum(x[0], u[0])],
+    "branches": lambda t, x, u, p: [max(0, x[0]), spring(x[0] - x[1], p["k"]) if u[0] > 0 else min(x[1], 1)],
+    "conditions": lambda t, x, u, p: [1.0 if 0 < x[0] < 1 or x[1] > u[0] else -1.0, (x[0] > x[1]) & (u[0] < 1)],
+    "floats": lambda t, x, u, p: np.array([float(x[0]), float(len(x)) * u.astype(float)[0]], dtype=float),
+    "mass matrix": mass_matrix,
+    "boolean index": masked,
+    "tables": table,
+    "guard": lambda t, x, u, p: x if np.all(np.isfinite(x)) else None,
+    "method": Plant().rhs,
+}
+
+
+@pytest.mark.parametrize("case", FUNCTIONS)
+def test_equations_are_those_of_the_function(case):
+    function, traced = FUNCTIONS[case], equations(FUNCTIONS[case])
+    rng = np.random.default_rng(1)
+    for _ in range(100):
+        t, k, u, x = rng.uniform(0, 9), rng.uniform(0.5, 2), rng.normal(size=1), rng.normal(size=2)
+        expected = np.ravel(np.asarray(function(t, x, u, {"k": k}), dtype=float))
+        assert np.allclose(traced(t, *x, *u, k).full().ravel(), expected, rtol=1e-12, atol=1e-13)
+
+
+def outflow(t, x, u, p):
+    flow = p["k"] * math.sqrt(x[0]) if x[0] > 0 else 0.0
+    return [u[0] - flow, flow - (np.sqrt(x[1]) / x[1] if x[1] > 0 else 0.0)]
+
+
+def test_derivatives_are_finite_in_both_branches():
+    traced = equations(outflow)
+    for x in ([0.0, 0.0], [-1.0, 2.0], [4.0, -1.0]):
+        assert np.all(np.isfinite(traced.jacobian()(0.5, *x, 1.0, 0.7, np.zeros(2))[1].full()))
+    slope = traced.jacobian()(0.5, 4.0, 1.0, 1.0, 0.7, np.zeros(2))[1].full().ravel()
+    assert np.allclose(slope, [-0.7 / 4, 0.7 / 4])
+
+
+def test_parameters_may_be_arrays():
+    stiffness = Parameter(np.array([[3.0, -1.0], [-2.0, 5.0]]))
+    made = from_function(lambda t, x, u, p: -p["K"] @ x, "a", states=("a", "b"), parameters={"K": stiffness})
+    x, u, p, t = made.symbols()
+    f = ca.Function("f", [x.a, x.b, p.K], [made.derivatives(x, u, p, t)])
+    assert np.allclose(f(1.0, 2.0, stiffness.value).full().ravel(), -stiffness.value @ [1, 2])
+
+
+def test_time_and_discrete_functions_are_followed():
+    u = np.ones((50, 1))
+    record = pilfr.Recording(u, u, 0.1, inputs=("u",), outputs=("y",), initial="zero", hold="zero")
+    options = {"states": "y", "inputs": "u", "hold": "zero"}
+    swing = from_function(lambda t, x, u, p: [np.cos(t)], "y", **options)
+    assert np.allclose(swing.simulate(record)[:, 0], np.sin(0.1 * np.arange(50)), atol=1e-6)
+    step = from_function(lambda t, x, u, p: 0.5 * x + u, "y", discrete=True, **options)
+    assert np.allclose(step.simulate(record)[:, 0], 2 * (1 - 0.5 ** np.arange(50)))
+    assert from_function(rhs, "pos", **NAMES).kinematic == {"pos"}
+
+
+def test_equations_survive_a_worker_process_and_are_exported():
+    made = cloudpickle.loads(cloudpickle.dumps(from_function(rhs, "pos", ports=GROUND, hold="zero", **NAMES)))
+    step = pilfr.exported(made, dt=1e-3).step
+    assert made.output_names == ("pos",) and step.size1_in(0) == 2
+
+
+def test_it_simulates_as_the_symbolic_simulator_does_and_is_not_called_any_more():
+    calls = 0
+
+    def counted(t, x, u, p):
+        nonlocal calls
+        calls += 1
+        return rhs(t, x, u, p)
+
+    made = from_function(counted, lambda t, x, u, p: {"pos": x[0]}, ports=GROUND, hold="zero", **NAMES)
+    assert calls == 41
+    assert "derivatives: equations of counted; called 41 times (1 for its branches, 40 as a check)" in repr(made)
+    u = np.random.default_rng(0).normal(size=(400, 1))
+    record = pilfr.Recording(u, u, 5e-3, inputs=("force",), outputs=("pos",), initial="zero", hold="zero")
+    one, other = made.simulate(record), symbolic().simulate(record)
+    assert np.max(np.abs(one - other)) <= 1e-12 * np.max(np.abs(other)) and calls == 41
+
+
+def test_missing_friction_is_found_as_with_the_symbolic_simulator():
+    t = np.arange(1200) * 5e-3
+    f, phase = np.linspace(0.3, 8, 30), np.random.default_rng(0).uniform(0, 2 * np.pi, 30)
+    force = 12 * np.sum(np.cos(2 * np.pi * f[:, None] * t + phase[:, None]), axis=0)[:, None]
+    blank = pilfr.Recording(force, force, 5e-3, inputs=("force",), outputs=("pos",), initial="zero", hold="zero")
+    law = pilfr.laws.CoulombFriction
+    y = symbolic().with_element("ground", law().at({"F_c": 12.0, "v_0": 0.003})).simulate(blank)
+    record = blank.with_(y=y + 1e-3 * np.std(y) * np.random.default_rng(1).standard_normal(y.shape))
+    made = from_function(rhs, "pos", ports=GROUND, **NAMES)
+    found = [
+        pilfr.diagnose(s, record, laws=(law, pilfr.laws.CubicStiffness), effects=1, workers=1)
+        for s in (made, symbolic())
+    ]
+    named = [(d.verdict, [(e.port, e.law) for e in d.effects]) for d in found]
+    assert named[0] == named[1] == ("missing-physics", [("ground", "coulomb_friction")])
+
+
+def loops(t, x, u, p):
+    v = x[0]
+    while v > 1:
+        v = v / 2
+    return [v, 0.0]
+
+
+def writes(t, x, u, p):
+    x[0] = 0.0
+    return x
+
+
+def sets_parameter(t, x, u, p):
+    p["k"] = 3.0
+    return [x[0], x[1]]
+
+
+def adds_into_numbers(t, x, u, p):
+    total = np.linspace(0, 1, 2)
+    total += x
+    return total
+
+
+def guards(t, x, u, p):
+    if x[0] > 1e9:
+        raise ValueError("out of range")
+    return x
+
+
+def rounds(t, x, u, p):
+    return [np.round(x[0]), x[1]]
+
+
+def converts(t, x, u, p):
+    return [K[int(x[0]) % 2, 0], x[1]]
+
+
+def looks_up(t, x, u, p):
+    return [TABLE(x[0]), x[1]]
+
+
+def asks_for_a_type(t, x, u, p):
+    return [x[0] if isinstance(x[0], np.floating) else 2 * x[0], x[1]]
+
+
+NOISE = np.random.default_rng(0)
+TABLE = interp1d([-1e9, 0.0, 1e9], [0.0, 1.0, 2.0])
+BAD = {
+    "not callable": (3, ("3", "function of t, x, u and p")),
+    "other arguments": (lambda t, x: x, ("(t, x, u, p)",)),
+    "too few": (lambda t, x, u, p: [x[0]], ("1 value;", "derivatives a, b")),
+    "too many": (lambda t, x, u, p: [x[0], x[1], 0], ("3 values;", "derivatives a, b")),
+    "a matrix": (lambda t, x, u, p: np.outer(x, x)[:, :1] * x, ("shape (2, 2)", "derivatives a, b")),
+    "nothing": (lambda t, x, u, p: None, ("1 value",)),
+    "texts": (lambda t, x, u, p: ["a", x[0]], ("a str for 'a'", "number")),
+    "writes into its arguments": (writes, ("line", "x[0] = 0.0", "arguments", "np.array")),
+    "sets a parameter": (sets_parameter, ("line", "arguments")),
+    "unknown parameter": (lambda t, x, u, p: x * p["q"], ("'q'", "there are k")),
+    "always fails": (lambda t, x, u, p: x + np.ones(3), ("line", "ValueError", "with numbers")),
+    "never finite": (lambda t, x, u, p: x * np.nan, ("finite",)),
+    "guard": (guards, ("line", "raise ValueError", "out of range")),
+    "endless": (loops, ("line", "while v > 1", "64 times", "fixed number")),
+    "rounds": (rounds, ("line", "np.round(x[0])", "np.rint", "np.where")),
+    "whole number": (converts, ("line", "int(x[0])", "leave out int()")),
+    "adds into numbers": (adds_into_numbers, ("line", "total += x", "y = y + ...")),
+    "table of another package": (looks_up, ("line", "TABLE(x[0])", "CasADi")),
+    "random": (lambda t, x, u, p: x * NOISE.random(), ("its equations", "random numbers")),
+    "types": (asks_for_a_type, ("its equations", "types")),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_functions_are_refused_in_one_sentence(case):
+    function, says = BAD[case]
+    with pytest.raises(InputError) as caught:
+        equations(function)
+    message = str(caught.value)
+    print(message)
+    assert "\n" not in message and len(message) < 420
+    for word in says:
+        assert word in message, message
+
+
+@pytest.mark.parametrize(
+    "changes, says",
+    [
+        ({"states": ("pos", "pos")}, "not unique"),
+        ({"states": ()}, "names"),
+        ({"inputs": 3}, "names"),
+        ({"parameters": {"k": 3.0}}, "Parameter"),
+        ({"parameters": [1]}, "Parameter"),
+        ({"outputs": 3}, "function of t, x, u and p"),
+        ({"outputs": ("pos", "speed")}, "pos and vel"),
+        ({"outputs": lambda t, x, u, p: [x[0]]}, "{name: value}"),
+        ({"outputs": lambda t, x, u, p: {"a": x[0]} if x[0] > 0 else {"b": x[0]}}, "before"),
+        ({"outputs": lambda t, x, u, p: {"a": x}}, "shape (1, 2)"),
+    ],
+)
+def test_bad_arguments_are_refused_in_one_sentence(changes, says):
+    with pytest.raises(InputError) as caught:
+        from_function(rhs, **{"outputs": "pos", **NAMES, **changes})
+    assert says in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_simulator_file_may_hold_a_numpy_function(tmp_path):
+    text = """\
+import numpy as np
+from pilfr_casadi import Parameter, from_function
+
+def rhs(t, x, u, p):
+    return [x[1], u[0] - p["k"] * np.tanh(x[0])]
+
+simulator = from_function(rhs, "pos", states=("pos", "vel"), inputs="force", parameters={"k": Parameter(3.0)})
+"""
+    path = tmp_path / "rig.py"
+    path.write_text(text)
+    assert load_simulator(path).inputs == ("force",)
+    path.write_text(text.replace("np.tanh", "int"))
+    with pytest.raises(InputError, match=r"rig.py, line 5: .*int\(x\[0\]\)"):
+        load_simulator(path)
