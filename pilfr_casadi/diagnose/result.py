@@ -30,6 +30,7 @@ VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
 STEPS = {"nominal": "as given", "before": "refitted", "after": "corrected"}  # the errors that are printed
 MOST = 8  # parameters and blind spots that are printed at most
+GRAVEST = 2  # blind spots that are told right after the verdict
 WORSE = 1.05  # ratio of the test errors after and before above which a correction makes the test recordings worse
 SURE = 0.5  # confidence above which an effect is stated as found; below it is a guess
 CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
@@ -364,7 +365,7 @@ class Diagnosis:
         return out
 
     def __str__(self) -> str:
-        lines = [self.summary]
+        lines = [self.summary, *self.gravest_blind_spots()]
         for e in self.effects:
             lines += _effect_lines(e)
         lines += [*self._own(), *self._error_lines(), *self._blind_lines()]
@@ -386,11 +387,15 @@ class Diagnosis:
                 lines.append(f"  {kind:<10}" + "".join(f"{text:>11}" for text in shown))
         return [*lines, f"  noise floor {self.floor['nrmse']:.4f} ({self.floor['source']})"]
 
+    def gravest_blind_spots(self) -> list[str]:
+        """Describe the gravest facts that the recordings cannot reveal, one a line."""
+        return [f"Blind spot of these recordings: {b.sentence}" for b in self.blind_spots[:GRAVEST]]
+
     def _blind_lines(self) -> list[str]:
-        """List the gravest blind spots of the recordings."""
-        told = [f"  {b.sentence}" for b in self.blind_spots[:MOST]]
+        """List the blind spots that are not told after the verdict."""
+        told = [f"  {b.sentence}" for b in self.blind_spots[GRAVEST:MOST]]
         more = [f"  and {len(self.blind_spots) - MOST} more, see pilfr check"] if len(self.blind_spots) > MOST else []
-        return ["blind spots of these recordings:", *told, *more] if told else []
+        return ["further blind spots of these recordings:", *told, *more] if told else []
 
     def _own(self) -> list[str]:
         """List the simulator's own estimated values, largest changes first."""
