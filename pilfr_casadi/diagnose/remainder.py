@@ -18,7 +18,7 @@ import numpy as np
 
 from ..laws import Law, Local, count_columns, unit_forces
 from ..simulators import Port
-from .linearise import Probe, Run, locals_of, propagate
+from .linearise import Probe, Run, locals_of, loudest_stretch, propagate
 from .workbench import Workbench
 
 MOST = 6000  # samples used at most
@@ -155,17 +155,10 @@ def own_changes(
 def _windows(bench: Workbench, runs: Sequence[Run]) -> list[slice]:
     """Choose the stretch of each recording that is used: the one with the largest error."""
     share = max(MOST // len(runs) // len(bench.scale), 200)
-    out = []
-    for r, recording in zip(runs, bench.recordings, strict=True):
-        m, skip = len(r.error), recording.skip
-        if m - skip <= share:
-            out.append(slice(skip, m))
-            continue
-        energy = np.cumsum(np.append(0.0, np.sum((r.error / bench.scale) ** 2, axis=1)))
-        starts = np.arange(skip, m - share + 1, max(share // 8, 1))
-        at = int(starts[np.argmax(energy[starts + share] - energy[starts])])
-        out.append(slice(at, at + share))
-    return out
+    return [
+        loudest_stretch(np.sum((r.error / bench.scale) ** 2, axis=1), share, recording.skip)
+        for r, recording in zip(runs, bench.recordings, strict=True)
+    ]
 
 
 def _tasks(bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list[Run], short: list[Run]) -> list[Task]:
