@@ -30,7 +30,7 @@ from ..simulators import (
     signals,
     states_along,
 )
-from .linearise import Constant, over_samples
+from .linearise import Constant, input_slope, local_signals, loudest_stretch, over_samples
 from .workbench import Fitted, Workbench
 
 LOUDER = (1.0, 3.0, 9.0)  # factors on the given noise that are tried
@@ -177,7 +177,8 @@ def hidden_force(
         instant = port.startswith("sensor:") or (port.startswith("actuator:") and bench.hold == "zero")
         held = np.zeros(len(r)) if law is None else law[2]
         held = held if instant else (held + np.append(held[1:], held[-1])) / 2
-        window = _window(held if law is not None else np.abs(fitted.residual[i] / bench.scale).sum(axis=1), r.skip)
+        loud = held if law is not None else np.abs(fitted.residual[i] / bench.scale).sum(axis=1)
+        window = loudest_stretch(loud**2, MOST_SAMPLES, r.skip)
         found = _recover(bench, fitted, _Target(base, port, x0, r, held, noise, window))
     if found is None:
         return None
@@ -208,12 +209,8 @@ def _law_signals(
     x, s, u, v, t = (ca.SX.sym(k, m) for k, m in (("x", n_x), ("s", n_s), ("u", n_u), ("v", n_u), ("t", 1)))
     found = equations.evaluate(Instant(x, s, u, v, t))[3][number]
     function = ca.Function("law", [ca.vertcat(x, s), u, v, t, vector], [ca.vertcat(*map(ca.SX, found))])
-    (rows,) = map_points(function, states, r.u, _slope(bench, r), r.t[:, None], fitted.vector)
+    (rows,) = map_points(function, states, r.u, input_slope(bench, r), r.t[:, None], fitted.vector)
     return rows[:, 0, 0], rows[:, 1, 0], rows[:, 2, 0]
-
-
-def _slope(bench: Workbench, r: Recording) -> np.ndarray:
-    return np.gradient(r.u, r.dt, axis=0) if bench.hold == "linear" else np.zeros_like(r.u)
 
 
 def _without(fitted: Fitted, number: int | None, start: np.ndarray, h: float) -> tuple[Simulator, np.ndarray]:
@@ -230,17 +227,6 @@ def _without(fitted: Fitted, number: int | None, start: np.ndarray, h: float) ->
     kept = {k: p for k, p in own.items() if not k.startswith(prefix)}
     elements = tuple(e for k, e in enumerate(simulator.elements) if k != number)
     return replace(simulator, elements=elements, parameters=ParameterSet(kept)), np.delete(start, dropped)
-
-
-def _window(weight: np.ndarray, skip: int) -> slice:
-    """Choose the stretch that is smoothed: the one with the most energy."""
-    m = len(weight)
-    if m - skip <= MOST_SAMPLES:
-        return slice(skip, m)
-    energy = np.cumsum(np.append(0.0, np.abs(weight) ** 2))
-    starts = np.arange(skip, m - MOST_SAMPLES + 1, MOST_SAMPLES // 8)
-    at = int(starts[np.argmax(energy[starts + MOST_SAMPLES] - energy[starts])])
-    return slice(at, at + MOST_SAMPLES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,6 +301,6 @@ def _local(
     """Compute local coordinate and rate, (M,) each, of a port along states (M, n_x)."""
     own = base.parameter_set
     vector = own.pack({k: v for k, v in values.items() if k in own})
-    rows = signals(base)(states.T, r.u.T, _slope(bench, r).T, r.t[None], np.tile(vector[:, None], (1, len(r))))
+    z, dz, *_ = local_signals(bench, signals(base), states, r, vector)
     index = [known.name for known in base.all_ports()].index(port)
-    return np.asarray(rows[0])[index], np.asarray(rows[1])[index]
+    return z[:, index], dz[:, index]

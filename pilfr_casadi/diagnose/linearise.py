@@ -19,6 +19,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import one_at_a_time
+from ..data import Recording
 from ..laws import Law, Local
 from ..linear import steady_state_gain, with_output_injection
 from ..models import Model, map_points
@@ -175,15 +176,38 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
             whole[begin // n : begin // n + len(v)] = v
     a, b, c, d, y = kept
     mean = tuple(sum(v) / len(states) for v in zip(*means, strict=True))
-    u = r.u
-    slope = np.gradient(u, r.dt, axis=0) if bench.hold == "linear" and len(u) > 2 else np.zeros_like(u)
-    own = p[: len(p) - len(probe.ports)]
-    at = states[::n, : probe.n_x], u, slope, r.dt * np.arange(len(u))[:, None], own
-    z, dz, lift, push = (v[:, :, 0] for v in map_points(probe.local, *at))
+    z, dz, lift, push = local_signals(bench, probe.local, states[::n, : probe.n_x], r, p[: len(p) - len(probe.ports)])
     moved, sign = np.abs(lift).max(axis=0) > 0, -np.sign(np.median(push, axis=0))
     sense = {"sign": np.where(moved, 0.0, sign), "back": np.where(moved, -np.sign(np.median(lift, axis=0)), sign)}
     felt = {"lift": np.abs(lift).max(axis=0), "push": np.abs(push).max(axis=0)}
-    return Run(a, b, c, d, mean, error=y - r.y, z=z, dz=dz, u=u, **sense, **felt, from_zero=r.begins == "zero")
+    return Run(a, b, c, d, mean, error=y - r.y, z=z, dz=dz, u=r.u, **sense, **felt, from_zero=r.begins == "zero")
+
+
+def local_signals(
+    bench: Workbench, local: ca.Function, states: np.ndarray, r: Recording, p: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Compute z, dz, lift and push of every port, (M, n_ports) each, along states (M, n_x) and a recording's inputs.
+
+    `local` is the function of `simulators.signals`.
+    """
+    found = map_points(local, states, r.u, input_slope(bench, r), r.t[:, None], p)
+    return tuple(v[:, :, 0] for v in found)
+
+
+def input_slope(bench: Workbench, r: Recording) -> np.ndarray:
+    """Compute the inputs' rates at the samples, (M, n_u); zero if the inputs are held."""
+    return np.gradient(r.u, r.dt, axis=0) if bench.hold == "linear" and len(r) > 2 else np.zeros_like(r.u)
+
+
+def loudest_stretch(power: np.ndarray, length: int, skip: int) -> slice:
+    """Choose the stretch of at most `length` samples with the largest sum of `power` (M,), after the first `skip`."""
+    m = len(power)
+    if m - skip <= length:
+        return slice(skip, m)
+    energy = np.cumsum(np.append(0.0, power))
+    starts = np.arange(skip, m - length + 1, max(length // 8, 1))
+    at = int(starts[np.argmax(energy[starts + length] - energy[starts])])
+    return slice(at, at + length)
 
 
 def over_samples(a: np.ndarray, b: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:

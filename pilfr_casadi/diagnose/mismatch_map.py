@@ -124,21 +124,21 @@ def _by_frequency(
 
 def _envelope(v: np.ndarray) -> np.ndarray:
     """Compute the amplitude (M,): modulus of the analytic signal about the mean, over all columns."""
-    centred = v - np.mean(v, axis=0)
-    n = len(v)
-    spectrum = np.fft.fft(centred, axis=0)
-    keep = np.zeros((n, 1))
-    keep[0], keep[1 : (n + 1) // 2] = 1.0, 2.0
-    if n % 2 == 0:
-        keep[n // 2] = 1.0
-    return np.asarray(np.sqrt(np.mean(np.abs(np.fft.ifft(spectrum * keep, axis=0)) ** 2, axis=1)))
+    from scipy.signal import hilbert
+
+    return np.asarray(np.sqrt(np.mean(np.abs(hilbert(v - np.mean(v, axis=0), axis=0)) ** 2, axis=1)))
+
+
+def _bins(x: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return the bin of each value; values outside join the outer bins."""
+    return np.clip(np.searchsorted(edges, x, side="right") - 1, 0, BINS - 1)
 
 
 def _binned(x: np.ndarray, power: np.ndarray, from_zero: bool = False) -> dict[str, Any]:
     """Compute the rms of the residual in bins of x; the outermost half percents join the outer bins."""
     a, b = (0.0 if from_zero else float(np.quantile(x, 0.005))), float(np.quantile(x, 0.995))
     edges = np.linspace(a, b if b > a else a + 1.0, BINS + 1)
-    index = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, BINS - 1)
+    index = _bins(x, edges)
     count = np.bincount(index, minlength=BINS)
     mean = np.bincount(index, power, minlength=BINS) / np.maximum(count, 1)
     rms = [float(np.sqrt(m)) if c else None for m, c in zip(mean, count, strict=True)]
@@ -154,7 +154,7 @@ def _map(
     dt: float,
 ) -> dict[str, Any]:
     """Compute the residual's rms by frequency band and amplitude bin; None for bins with few samples."""
-    index = np.concatenate([np.clip(np.searchsorted(edges, v, side="right") - 1, 0, BINS - 1) for v in envelope])
+    index = _bins(np.concatenate(envelope), edges)
     count = np.bincount(index, minlength=BINS)
     spectra = [(np.fft.rfft(v, axis=0), np.fft.rfftfreq(len(v), dt), len(v)) for v in e]
     rows: list[list[float | None]] = []

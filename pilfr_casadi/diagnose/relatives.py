@@ -27,9 +27,9 @@ from typing import Any
 import numpy as np
 
 from ..laws import Attached, Delay, Lag, Law, Local, Resonance, unit_forces
-from ..models import map_points
 from ..simulators import in_series, signals, states_along
 from .evidence import FAR, NEAR
+from .linearise import local_signals
 from .screen import HUGE, Dose, Pair, Remainder, Scored, fit_shapes, held_out, orthonormal, start_values
 from .trials import Trial, Trials, place_law
 from .workbench import BRIEF, FEW, Fitted, Workbench
@@ -195,9 +195,8 @@ def port_signals(bench: Workbench, fitted: Fitted, port: str) -> Local:
     for r, state in zip(bench.recordings, fitted.initial, strict=True):
         with np.errstate(over="ignore", invalid="ignore"):
             x = states_along(model, model.drive(r), fitted.vector, state)[:: model.substeps, : len(simulator.states)]
-            slope = np.gradient(r.u, r.dt, axis=0) if bench.hold == "linear" and len(r) > 2 else np.zeros_like(r.u)
-            z, dz, *_ = map_points(own, x, r.u, slope, r.dt * np.arange(len(r))[:, None], fitted.vector)
-        parts.append((z[:, index, 0], dz[:, index, 0]))
+            z, dz, *_ = local_signals(bench, own, x, r, fitted.vector)
+        parts.append((z[:, index], dz[:, index]))
     z, dz = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
     return bench.local(z, dz)
 

@@ -35,6 +35,7 @@ VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 STEPS = {"nominal": "as given", "before": "refitted", "after": "corrected"}  # the errors that are printed
 MOST = 8  # parameters and blind spots that are printed at most
 RUN_AWAY = 1e4  # error from which its size says nothing
+GRAVEST = 2  # blind spots that are told right after the verdict
 CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
 OUT_OF_TIME = "The time limit ended the search: the answer rests on the fits made until then."
@@ -402,7 +403,7 @@ class Diagnosis:
         return out
 
     def __str__(self) -> str:
-        lines = [self.summary]
+        lines = [self.summary, *self.gravest_blind_spots()]
         for e in self.effects:
             lines += _effect_lines(e)
         lines += [*self._own(), *self._error_lines(), *self._blind_lines()]
@@ -424,11 +425,15 @@ class Diagnosis:
                 lines.append(f"  {kind.replace('_', ' '):<10}" + "".join(f"{text:>11}" for text in shown))
         return [*lines, f"  noise floor {self.floor['nrmse']:.4f} ({self.floor['source']})"]
 
+    def gravest_blind_spots(self) -> list[str]:
+        """Describe the gravest facts that the recordings cannot reveal, one a line."""
+        return [f"Blind spot of these recordings: {b.sentence}" for b in self.blind_spots[:GRAVEST]]
+
     def _blind_lines(self) -> list[str]:
-        """List the gravest blind spots of the recordings."""
-        told = [f"  {b.sentence}" for b in self.blind_spots[:MOST]]
+        """List the blind spots that are not told after the verdict."""
+        told = [f"  {b.sentence}" for b in self.blind_spots[GRAVEST:MOST]]
         more = [f"  and {len(self.blind_spots) - MOST} more, see pilfr check"] if len(self.blind_spots) > MOST else []
-        return ["blind spots of these recordings:", *told, *more] if told else []
+        return ["further blind spots of these recordings:", *told, *more] if told else []
 
     def _own(self) -> list[str]:
         """List the simulator's own estimated values, largest changes first."""

@@ -28,7 +28,7 @@ from .._base import side_by_side
 from ..laws import Creep, Law, Local, PlayHysteresis, Relaxation, StopHysteresis, count_columns, unit_forces
 from ..models import Parameter
 from ..simulators import Port
-from .linearise import Probe, Run, linearised, locals_of, observer_gain, propagate, run
+from .linearise import Probe, Run, linearised, locals_of, loudest_stretch, observer_gain, propagate, run
 from .workbench import FEW, Fitted, Workbench
 
 Pair = tuple[str, type[Law]]  # a port and the class of a law
@@ -172,17 +172,10 @@ def own_changes(
 def _windows(bench: Workbench, runs: Sequence[Run]) -> list[slice]:
     """Choose the stretch of each recording that is used: the one with the largest error."""
     share = max(USED // len(runs) // len(bench.scale), 200)
-    out = []
-    for r, recording in zip(runs, bench.recordings, strict=True):
-        m, skip = len(r.error), recording.skip
-        if m - skip <= share:
-            out.append(slice(skip, m))
-            continue
-        energy = np.cumsum(np.append(0.0, np.sum((r.error / bench.scale) ** 2, axis=1)))
-        starts = np.arange(skip, m - share + 1, max(share // 8, 1))
-        at = int(starts[np.argmax(energy[starts + share] - energy[starts])])
-        out.append(slice(at, at + share))
-    return out
+    return [
+        loudest_stretch(np.sum((r.error / bench.scale) ** 2, axis=1), share, recording.skip)
+        for r, recording in zip(runs, bench.recordings, strict=True)
+    ]
 
 
 def _tasks(bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list[Run], short: list[Run]) -> list[Task]:

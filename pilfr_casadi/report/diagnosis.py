@@ -127,7 +127,7 @@ def _result_title(d: Diagnosis) -> str:
 
 
 def _result(d: Diagnosis) -> list[Block]:
-    out: list[Block] = []
+    out: list[Block] = [Text(line) for line in d.gravest_blind_spots()]
     for k in range(len(d.effects)):
         out += tables.effect_blocks(d, k)
     if d.verdict == "complete" and not d.freed:

@@ -52,6 +52,7 @@ def test_a_diagnosis_tells_the_same_blind_spots(checked):
     diagnosis = pilfr.diagnose(rig.simulator, rig.train, laws=(), workers=1)
     assert [b.sentence for b in diagnosis.blind_spots] == [b.sentence for b in found.blind_spots]
     assert all(b.sentence in str(diagnosis) for b in found.blind_spots)
+    assert diagnosis.blind_spots[0].sentence in str(diagnosis).splitlines()[1]
     assert json.loads(json.dumps(diagnosis.to_dict()))["blind_spots"][0]["kind"] == found.blind_spots[0].kind
 
 

@@ -10,6 +10,7 @@ from diagnosis_example import example, recorded, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
+from pilfr_casadi.diagnose import BlindSpot
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness
 from pilfr_casadi.models import Parameter
 from pilfr_casadi.report import diagnosis_report
@@ -121,6 +122,19 @@ def test_the_outcome_compares_the_test_errors(after, outcome):
 def test_a_correction_that_diverges_on_the_test_recording_is_worse():
     d = with_test_errors(0.5, np.inf, 0.9)
     assert d.outcome == "worse" and "the simulation diverges" in d.summary
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_the_gravest_blind_spots_stand_right_after_the_verdict(tmp_path):
+    spots = tuple(BlindSpot("flat", (name,), f"These recordings say nothing about {name}.") for name in "abc")
+    d = replace(example(), blind_spots=spots)
+    lines = str(d).splitlines()
+    assert [line.partition(": ")[2] for line in lines[1:3]] == [b.sentence for b in spots[:2]]
+    assert f"  {spots[2].sentence}" in lines[4:]
+    page = d.report(tmp_path).read_text()
+    assert page.index(spots[0].sentence) < page.index(spots[1].sentence) < page.index("Confidence")
+    assert spots[2].sentence not in page
+    assert "blind spot" not in str(example()).lower()
 
 
 @pytest.mark.usefixtures("blank_figures")
