@@ -3,12 +3,13 @@
 A fault is a small frozen object (`Gate`). It corrects the recordings or the simulator, and says so in a sentence. All
 faults that a refit can confirm take the same steps.
 
-1. Screen to first order (`FirstOrder`), which gives the start value: with base the orthonormal directions that
-   parameters and initial states can follow, an error e leaves `e - base baseᵀ e`.
+1. Screen by the size of the outputs, or to first order (`FirstOrder`), which gives the start value: with base the
+   orthonormal directions that parameters and initial states can follow, an error e leaves `e - base baseᵀ e`.
 2. Correct the fault and refit (`correct`). If the fault has a size or a place, relocate and refit in turn (`settle`).
 3. Accept the fault by one rule (`accept`). The gain in log evidence has to exceed the BIC cost of the parameters
    (Schwarz 1978) by the prior odds against a fault, `LEAST_GAIN`, and at most the share `CURED` of the mean square
-   error may be left: other physics hardly mimics a fault so closely.
+   error may be left: other physics hardly mimics a fault so closely. If the recordings as given are followed from the
+   corrected refit's values so well that the rule no longer holds, there is no fault.
 
 The faults of whole channels are sign, unit or gain, exchange, unit of time, and offset.
 """
@@ -494,10 +495,9 @@ def find_offsets(now: Checked) -> Checked:
         if after is None:
             break
         name = f"{after.bench.simulator.elements[-1].prefix}w_0"
-        accepted = accept(now, after, constant_at(port, float(after.fitted.values[name]), name))
-        if accepted.bench is now.bench:
+        before, now = now, accept(now, after, constant_at(port, float(after.fitted.values[name]), name))
+        if now.bench is before.bench:
             break
-        now = accepted
         ports.remove(port)
     fault = now.cost < CURED * begin.cost
     # a constant load acts alike, so that the share that is left does not prove a fault

@@ -2,6 +2,10 @@
 
 How an answer comes about:
 
+0. Steps 1 and 2 are done once as a rule. They are repeated with an observer if the simulator is unstable and runs away
+   from the recordings (`prediction`), with the other hold if nobody stated it and the best hypothesis follows better
+   with it, and without a shift if a channel seemed to be early, because missing physics can look like a lead. Each
+   search explains other numbers, so that not the evidence but the smaller error of its best hypothesis decides.
 1. `prepare` corrects faults of the recordings, refits the simulator, and measures the noise. The refitted simulator is
    the hypothesis that nothing is missing. What it leaves above the noise is the mismatch.
 2. `Search.run` fits further hypotheses: the simulator with laws in its ports, with all parameters estimated together.
@@ -15,6 +19,8 @@ How an answer comes about:
    else unexplained.
 5. `find_correction` compares named laws with a learned force on held-out parts of the recordings. A name that predicts
    worse than the force is refuted, and the verdict is chosen again.
+   Beside the laws there are explanations without one: a parameter pinned to a wrong value, and a clipped input. They
+   are tried if there is time, and count if they explain as much.
 6. The proof (`proof`) adds errors on test recordings, placebos and standard errors. It changes no verdict; offsets that
    gain nothing beside the effects are set to zero.
 """
@@ -38,11 +44,11 @@ from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction, find_correction, named_correction
 from .evidence import AS_GIVEN, SURE, deviations
 from .floor import Floor
-from .gates import Gate, Offset, final_gates, offset_gates, without_idle_offsets
+from .gates import USELESS_FIT, Gate, Offset, final_gates, offset_gates, without_idle_offsets
 from .identifiability import port_units
 from .mismatch_map import mismatch
 from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
-from .prediction import FOCUS, FOLLOWED, can_be_led, prediction_note, predictor
+from .prediction import FOCUS, can_be_led, prediction_note, predictor
 from .preparation import (
     CHECKS,
     Prepared,
@@ -63,7 +69,7 @@ from .trials import Trial
 from .verdict import Named, Posterior, Verdict, judge, names, posterior
 from .workbench import Fitted, RunsAway
 
-SEARCHING = 0.7  # share of the remaining time for the search; the rest is for the correction
+SEARCHING = 0.7  # share of the remaining time for preparation and search; the rest is for the correction
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,9 +164,10 @@ def _search_with_focus(request: Request) -> tuple[Request, Prepared, Search]:
     if request.focus != "prediction":
         try:
             return request, *_search_both_holds(request)
-        except RunsAway:
-            if request.focus or not can_be_led(request.simulator, request.recordings):
+        except RunsAway:  # by `Workbench`, in the first refit or as the check of it in `_search_once`
+            if request.focus == "simulation" or not can_be_led(request.simulator, request.recordings):
                 raise
+    # the gain depends little on the hold, which the search may still change
     hold = stated_hold(request.simulator, request.recordings, request.hold) or "zero"
     led, memory = predictor(request.simulator, request.recordings, hold, request.engine)
     request = replace(request, simulator=led, notes=(prediction_note(request.simulator, request.recordings, memory),))
@@ -211,7 +218,7 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         say=request.say,
     )
     if request.focus is None:  # an unstable simulator may stay within bounds and still not follow
-        ready.bench.check_followed(ready.without, FOLLOWED)
+        ready.bench.check_followed(ready.without, USELESS_FIT)
     search = Search(
         ready.bench,
         ready.without,
@@ -311,7 +318,7 @@ def _build_diagnosis(
     proving = time.perf_counter()
     request.say("proof", 0, 1)
     bench, without, after = search.bench, search.root.fitted, found.fitted
-    if found.effects and not np.isfinite(found.correction.after):  # what was compared is handed back as it is
+    if found.effects and not np.isfinite(found.correction.after):  # a held-out comparison chose what it compared
         after = without_idle_offsets(bench, after)
     std = deviations(bench, after)
     errors: dict[str, dict[str, float] | None] = {
@@ -389,7 +396,7 @@ def _effect(search: Search, named: Named, fitted: Fitted, std: dict[str, np.ndar
     own, unrelated = placebo(bench, search.root.fitted, element.port, law)
     port = bench.simulator.port(element.port)
     w_unit, z_unit = port_units(port, bench.recordings[0])
-    if port.series and not w_unit:  # what it is in series with
+    if port.series and not w_unit:  # in the unit of its signal, such as [force]
         w_unit = z_unit = f"[{port.name.partition(':')[2]}]"
     values = {k: v for k, v in fitted.values.items() if k.startswith(element.prefix)}
     shown: dict[str, dict[str, Any]] = {}

@@ -9,8 +9,10 @@ so that it forgets its past within a memory τ. The gain L is that of a predicto
 in place of A: every eigenvalue of A - L C is then within e^(-dt/τ) (prescribed degree of stability: Anderson & Moore
 1971, Linear Optimal Control, sec. 3.5), and eigenvalues that are there already stay.
 
-A long memory shows missing physics best: its effect adds up over τ. So the longest memory is used with which the
-refitted simulator follows the recordings.
+A long memory shows missing physics best, because its effect adds up over τ; and it is nearest to the predictor of a
+machine without disturbances, so that feedback of noise by a controller bends the fit least. So the longest memory is
+used with which the refitted simulator follows the recordings; if it follows with none, the one that it follows with
+best.
 """
 
 from __future__ import annotations
@@ -25,13 +27,19 @@ from .._base import InputError
 from ..data import Recording
 from ..linear import steady_state_gain
 from ..simulators import Simulator, discretise, growth_rate
-from .gates import Gate
+from .gates import USELESS_FIT, Gate
 from .workbench import MOST_GROWTH, Workbench
 
 FOCUS = "simulation", "prediction"
-# memories that are tried, in turn: times the time of e-fold growth, or the longest recording's duration
+# memories that are tried in turn, in half decades: times the time of e-fold growth (a longer one leaves the unstable
+# eigenvalue of the observer as it is); for a stable simulator times the longest recording's duration
 OF_GROWTH, OF_DURATION = (3.0, 1.0, 0.3, 0.1), (0.1, 0.03, 0.01, 0.003)
-FOLLOWED = 0.25  # share of the outputs' variance that a simulator which follows the recordings leaves at most
+
+
+def _growth(simulator: Simulator, recordings: Sequence[Recording]) -> float:
+    """Compute the rate, 1/s, at which a simulator grows; 0 if the recordings are too short to show it."""
+    rate, duration = growth_rate(simulator, recordings[0]), max(len(r) * r.dt for r in recordings)
+    return rate if rate * duration > MOST_GROWTH else 0.0
 
 
 def can_be_led(simulator: Simulator, recordings: Sequence[Recording]) -> bool:
@@ -45,12 +53,11 @@ def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, 
     Raises
     ------
     InputError
-        If it follows the recordings with no observer.
+        If it diverges with every observer.
     """
-    rate, duration = growth_rate(simulator, recordings[0]), max(len(r) * r.dt for r in recordings)
-    unstable = rate * duration > MOST_GROWTH
-    memories = [times / rate for times in OF_GROWTH] if unstable else [times * duration for times in OF_DURATION]
-    memories = [memory for memory in memories if memory >= recordings[0].dt]
+    rate, duration = _growth(simulator, recordings), max(len(r) * r.dt for r in recordings)
+    memories = [times / rate for times in OF_GROWTH] if rate else [times * duration for times in OF_DURATION]
+    memories = [max(memory, recordings[0].dt) for memory in memories]  # what is measured once a sample leads no faster
     best: tuple[float, Simulator, float] | None = None
     for memory in memories:
         led = replace(simulator, observer=observer(simulator, recordings, hold, memory))
@@ -59,7 +66,7 @@ def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, 
             cost = bench.fit(led).cost
         except InputError:
             continue
-        if cost < FOLLOWED:
+        if cost < USELESS_FIT:
             return led, memory
         if best is None or cost < best[0]:
             best = cost, led, memory
@@ -73,18 +80,21 @@ def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, 
 
 def prediction_note(simulator: Simulator, recordings: Sequence[Recording], memory: float) -> Gate:
     """Note that the errors are those of predictions, and that the simulator is unstable if it is."""
-    rate = growth_rate(simulator, recordings[0])
-    unstable = rate * memory > OF_GROWTH[-1]
-    why = f"The simulator is unstable by itself (it grows e-fold in {1 / rate:.2g} s). " if unstable else ""
+    rate = _growth(simulator, recordings)
+    why = f"The simulator is unstable by itself (it grows e-fold in {1 / rate:.2g} s). " if rate else ""
     sentence = (
         f"{why}The recordings lead the simulator: an observer lets it forget its past within {memory:.3g} s, and the "
         "errors are those of predictions one sample ahead, not of a free run."
     )
-    return Gate(", ".join(simulator.output_names), "prediction", memory, sentence)
+    return Gate(", ".join(simulator.output_names), "prediction", memory, sentence, corrected=False)
 
 
 def observer(simulator: Simulator, recordings: Sequence[Recording], hold: str, memory: float) -> np.ndarray:
-    """Compute the gain (n_x, n_y) of an observer that forgets within `memory` seconds, where a recording begins."""
+    """Compute the gain (n_x, n_y) of an observer that forgets within `memory` seconds.
+
+    The simulator is linearised where the first recording begins. Its outputs count by their deviations, and laws' own
+    states get no correction.
+    """
     bench = Workbench.of(simulator, recordings, hold)
     model = discretise(simulator, bench.dt, hold, bench.substeps)
     x, u, p = ca.SX.sym("x", model.n_state), ca.SX.sym("u", model.n_u), ca.SX.sym("p", model.parameters.size)
