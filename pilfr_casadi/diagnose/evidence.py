@@ -98,11 +98,10 @@ class Sample:
 
 def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
     """Compute the eigenvalues λ of a sample's information on the laws' parameters, in units of their prior widths."""
-    own = _of_laws(fitted, laws)
-    problem, _, hessian = _hessian(bench, fitted)
-    own = own[problem.free]
+    own = _of_laws(fitted, laws)[fitted.model.parameters.free]
     if not own.any():
         return np.zeros(0)
+    problem, _, hessian = _hessian(bench, fitted)
     if not np.all(np.isfinite(hessian)):  # a run at the edge of divergence has no derivatives
         return np.full(int(own.sum()), np.inf)
     laws_at = np.flatnonzero(np.append(own, np.zeros(len(hessian) - len(own), dtype=bool)))
@@ -128,11 +127,11 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     parameters, because the two may make up for each other. The spread reveals parameters that the recordings hardly
     determine, such as a curve of a pressure that had two levels; a cross-validation on the same recordings cannot.
     """
+    if not np.any(fitted.model.parameters.free):
+        return 0.0
     problem, _, recorded = _hessian(bench, fitted)
     *_, other = _hessian(bench.on([r.with_(u=INPUT_FACTOR * r.u) for r in bench.recordings]), fitted)
     free = int(problem.free.sum())
-    if not free:
-        return 0.0
     if not (np.all(np.isfinite(recorded)) and np.all(np.isfinite(other))):
         return np.inf
     own = _widths(fitted, laws, problem.free, np.diag(recorded)[:free])
@@ -179,6 +178,9 @@ def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
 
     Initial states are estimated together with the parameters.
     """
+    full = np.full(fitted.model.parameters.size, np.nan)
+    if not np.any(fitted.model.parameters.free):
+        return fitted.model.parameters.unpack(full)
     problem, theta, hessian = _hessian(bench, fitted)
     inside, diagonal = (theta > problem.lower) & (theta < problem.upper), np.diag(hessian)
     kept = np.flatnonzero(inside & np.isfinite(diagonal) & (diagonal > 0))
@@ -186,7 +188,6 @@ def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
     scaled = hessian[np.ix_(kept, kept)] / np.outer(size, size)
     matrix = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) / np.outer(size, size)
     own, n = kept < problem.n_free, max(effective_size(fitted.residual), 10.0)
-    full = np.full(fitted.model.parameters.size, np.nan)
     full[np.flatnonzero(problem.free)[kept[own]]] = np.sqrt(np.maximum(np.diag(matrix)[own] * fitted.cost / n, 0))
     return fitted.model.parameters.unpack(full)
 

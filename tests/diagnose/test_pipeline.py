@@ -1,5 +1,6 @@
 """How a search is begun anew, with the other hold or without a shift, and what an interrupt on the way leaves."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -144,3 +145,16 @@ def recordings_of(placed):
         true = true.with_element(port, law)
     port, law = placed[-1]
     return recordings(law, port=port, count=1, of=true)
+
+
+@pytest.mark.parametrize(
+    "missing", [(), (laws.CoulombFriction().at({"F_c": 40.0, "v_0": 0.02}),)], ids=["none", "friction"]
+)
+def test_a_simulator_without_a_free_parameter_is_diagnosed(missing):
+    held = rig()
+    held = held.with_parameters({name: replace(p, fixed=True) for name, p in held.parameters.items()})
+    record = recordings(*missing)[0].with_(initial="zero")
+    found = pilfr.diagnose(held, record, workers=1, laws=[laws.CoulombFriction, laws.CubicStiffness])
+    named = [(e.port, e.law) for e in found.effects]
+    assert named == ([("ground-m1", "coulomb_friction")] if missing else [])
+    assert found.verdict == ("missing-physics" if missing else "complete")
