@@ -284,18 +284,72 @@ def _interp(x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None, perio
     """Interpolate linearly in a table of numbers, with the end values beyond its ends."""
     if has_symbol([xp, fp]) or not (left is right is period is None):
         raise NotFollowed("uses np.interp with more than x and a table of numbers", "write np.interp(x, xp, fp)")
-    at, table = (np.asarray(to_numbers(v), dtype=float).ravel() for v in (xp, fp))
-    if len(at) < 2 or len(at) != len(table) or np.any(np.diff(at) <= 0):
+    at, values = (np.asarray(to_numbers(v), dtype=float).ravel() for v in (xp, fp))
+    if len(at) < 2 or len(at) != len(values) or np.any(np.diff(at) <= 0):
         raise NotFollowed("uses np.interp with a table whose x does not increase", "give one that increases")
-    arrays = objects(x)
-    out = np.empty(arrays.shape, dtype=object)
+    return _each(x, lambda e: _piecewise(ca.fmin(ca.fmax(e, at[0]), at[-1]), at, _chords(at, values)))
+
+
+def _each(x: Any, rule: Rule) -> Any:
+    """Apply a rule to each element of an array that holds a symbol."""
+    elements = objects(x)
+    out = np.empty(elements.shape, dtype=object)
     for i in np.ndindex(out.shape):
-        inside = ca.fmin(ca.fmax(expression(arrays[i]), at[0]), at[-1])
-        value = ca.SX(table[-1])
-        for a, b, fa, fb in reversed(list(zip(at[:-1], at[1:], table[:-1], table[1:], strict=True))):
-            value = ca.if_else(inside < b, fa + (fb - fa) / (b - a) * (inside - a), value)
-        out[i] = Symbol(value, _trace(arrays.ravel().tolist()))
+        out[i] = Symbol(rule(expression(elements[i])), _trace(elements.ravel().tolist()))
     return array_of(out)
+
+
+def _chords(at: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the coefficients of a polygon for `_piecewise`."""
+    return np.array([np.diff(values) / np.diff(at), values[:-1]])
+
+
+def _piecewise(x: Any, at: np.ndarray, coefficients: np.ndarray) -> Any:
+    """Evaluate polynomials of x - at[j], highest power first, shape (order, pieces), the outer ones beyond the ends."""
+    found = None
+    for start, end, row in reversed(list(zip(at[:-1], at[1:], coefficients.T, strict=True))):
+        value = functools.reduce(lambda total, c, start=start: total * (x - start) + c, row, ca.SX(0))  # type: ignore[misc]
+        found = value if found is None else ca.if_else(x < end, value, found)
+    return found
+
+
+def as_table(value: Any) -> Rule | None:
+    """Make an interpolator of SciPy in one variable, linear or a spline, accept symbols; None of anything else."""
+    if not type(value).__module__.startswith("scipy.interpolate"):
+        return None
+    from scipy.interpolate import BSpline, PPoly, interp1d
+
+    own: Any = value
+    beyond: Any  # what holds beyond the ends: True the outer pieces, numbers, or "periodic"
+    if isinstance(value, BSpline) and own.c.ndim == 1:
+        pieces = PPoly.from_spline(own)
+        keep = np.diff(pieces.x) > 0  # a spline's knots are repeated at its ends
+        at, coefficients, beyond = np.append(pieces.x[:-1][keep], pieces.x[-1]), pieces.c[:, keep], own.extrapolate
+    elif isinstance(value, PPoly) and own.c.ndim == 2:
+        at, coefficients, beyond = own.x, own.c, own.extrapolate
+    elif isinstance(value, interp1d) and own._kind == "linear" and np.ndim(own.y) == 1:
+        at, coefficients = np.asarray(own.x, dtype=float), _chords(own.x, own.y)
+        beyond = True if isinstance(own.fill_value, str) else own.fill_value
+    else:
+        return None
+
+    def evaluate(x: Any, *order: Any, **options: Any) -> Any:
+        if not has_symbol(x):
+            return value(x, *order, **options)
+        if order or options:
+            raise NotFollowed("asks a table for more than its value", "make a table of the derivative")
+        return _each(x, at_one)
+
+    def at_one(x: Any) -> Any:
+        if isinstance(beyond, str):  # "periodic"
+            x = at[0] + _floored_remainder(x - at[0], at[-1] - at[0])
+        found = _piecewise(x, at, coefficients)
+        if isinstance(beyond, str | bool | np.bool):
+            return found
+        low, high = np.broadcast_to(np.asarray(beyond, dtype=float), 2)
+        return ca.if_else(x < at[0], low, ca.if_else(x > at[-1], high, found)) if np.isfinite(low + high) else found
+
+    return evaluate
 
 
 def _like(function: Rule) -> Rule:

@@ -28,6 +28,7 @@ from .symbols import (
     Symbol,
     Symbols,
     array_of,
+    as_table,
     has_symbol,
     objects,
     to_numbers,
@@ -176,6 +177,8 @@ def _accepting(value: Any, done: dict[int, Any]) -> Any:
         return types.MethodType(_accepting(value.__func__, done), value.__self__)
     if isinstance(value, functools.partial):
         return functools.partial(_accepting(value.func, done), *value.args, **value.keywords)
+    if (table := as_table(value)) is not None:
+        return table
     if callable(value) and isinstance(value, Hashable) and value in REPLACED:
         return REPLACED[value]
     if not isinstance(value, types.FunctionType) or (value.__module__ or "").partition(".")[0] in LEFT_AS_THEY_ARE:
@@ -184,9 +187,10 @@ def _accepting(value: Any, done: dict[int, Any]) -> Any:
         return done[id(value)]
     names = dict(value.__globals__)
     cells = tuple(map(_copy_cell, value.__closure__ or ()))
-    copy = types.FunctionType(value.__code__, names, value.__name__, value.__defaults__, cells or None)
-    copy.__kwdefaults__ = value.__kwdefaults__
+    copy = types.FunctionType(value.__code__, names, value.__name__, None, cells or None)
     done[id(value)] = copy
+    copy.__defaults__ = tuple(_accepting(v, done) for v in value.__defaults__ or ())
+    copy.__kwdefaults__ = {k: _accepting(v, done) for k, v in (value.__kwdefaults__ or {}).items()}
     used = _names_of(value.__code__)
     for name in used & set(names):
         names[name] = _accepting(names[name], done)

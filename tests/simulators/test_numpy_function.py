@@ -7,7 +7,7 @@ import casadi as ca
 import cloudpickle
 import numpy as np
 import pytest
-from scipy.interpolate import interp1d
+from scipy.interpolate import CubicSpline, PchipInterpolator, RegularGridInterpolator, interp1d, make_interp_spline
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Simulator
@@ -69,6 +69,14 @@ def table(t, x, u, p):
     return [np.interp(x[0], [-1.0, 0.0, 2.0], [1.0, 0.0, 5.0]), np.interp(t, [0, 10], [0, 1]) + u[0]]
 
 
+LEVELS = np.array([-2.0, -0.5, 0.0, 1.0, 2.5])
+LINE = interp1d(LEVELS, LEVELS**3, fill_value="extrapolate")
+HELD = interp1d(LEVELS, LEVELS**3, bounds_error=False, fill_value=(-8.0, 9.0))
+SPLINE, PCHIP = CubicSpline(LEVELS, np.sin(LEVELS)), PchipInterpolator(LEVELS, np.sin(LEVELS))
+PERIODIC = CubicSpline([0.0, 1.0, 2.0, 3.0], [1.0, 2.0, 0.5, 1.0], bc_type="periodic")
+SMOOTH = make_interp_spline(LEVELS, np.cos(LEVELS))
+
+
 class Plant:
     stiffness = 4.0
 
@@ -91,6 +99,8 @@ FUNCTIONS = {
     "mass matrix": mass_matrix,
     "boolean index": masked,
     "tables": table,
+    "tables of SciPy": lambda t, x, u, p: [LINE(x[0]) + HELD(x[1]), SPLINE(x[0]) * PERIODIC(x[1])],
+    "arrays in a table": lambda t, x, u, p, table=PCHIP: table(x) + SMOOTH(x[0]),
     "guard": lambda t, x, u, p: x if np.all(np.isfinite(x)) else None,
     "method": Plant().rhs,
 }
@@ -216,7 +226,7 @@ def converts(t, x, u, p):
 
 
 def looks_up(t, x, u, p):
-    return [TABLE(x[0]), x[1]]
+    return [TABLE(x[:1])[0], x[1]]
 
 
 def asks_for_a_type(t, x, u, p):
@@ -224,7 +234,7 @@ def asks_for_a_type(t, x, u, p):
 
 
 NOISE = np.random.default_rng(0)
-TABLE = interp1d([-1e9, 0.0, 1e9], [0.0, 1.0, 2.0])
+TABLE = RegularGridInterpolator([[-1e9, 0.0, 1e9]], [0.0, 1.0, 2.0])
 BAD = {
     "not callable": (3, ("3", "function of t, x, u and p")),
     "other arguments": (lambda t, x: x, ("(t, x, u, p)",)),
@@ -243,7 +253,7 @@ BAD = {
     "rounds": (rounds, ("line", "np.round(x[0])", "np.rint", "np.where")),
     "whole number": (converts, ("line", "int(x[0])", "leave out int()")),
     "adds into numbers": (adds_into_numbers, ("line", "total += x", "y = y + ...")),
-    "table of another package": (looks_up, ("line", "TABLE(x[0])", "CasADi")),
+    "table of another package": (looks_up, ("line", "TABLE(x[:1])", "CasADi")),
     "random": (lambda t, x, u, p: x * NOISE.random(), ("its equations", "random numbers")),
     "types": (asks_for_a_type, ("its equations", "types")),
 }
