@@ -150,14 +150,14 @@ _OF_MATH |= {name: getattr(np, other) for name, other in _RENAMED.items()}
 REPLACED |= {getattr(math, name): _scalar_function(getattr(math, name), ufunc) for name, ufunc in _OF_MATH.items()}
 
 
-class _Module:
-    """A module whose functions accept symbols."""
+class _Accepting:
+    """A module or an object whose functions accept symbols; it keeps what they write into it to itself."""
 
-    def __init__(self, module: types.ModuleType, done: dict[int, Any]) -> None:
-        self._module, self._done = module, done
+    def __init__(self, owner: Any, done: dict[int, Any]) -> None:
+        self._owner, self._done = owner, done
 
     def __getattr__(self, name: str) -> Any:
-        return _accepting(getattr(self._module, name), self._done)
+        return _accepting(getattr(self._owner, name), self._done)
 
 
 COPIED = (types.ModuleType, types.FunctionType, types.BuiltinFunctionType, types.MethodType, functools.partial)
@@ -165,16 +165,17 @@ COPIED = (types.ModuleType, types.FunctionType, types.BuiltinFunctionType, types
 
 def accept_symbols(function: Any) -> Any:
     """Copy a function, and those of Python that it calls by name, with `numpy` and `math` that accept symbols."""
-    return _accepting(function, {})
+    written = isinstance(type(function).__call__, types.FunctionType)  # an object of the user's own class
+    return _accepting(function.__call__ if written else function, {})
 
 
 def _accepting(value: Any, done: dict[int, Any]) -> Any:
     if isinstance(value, types.ModuleType):
-        return _Module(value, done)
+        return _Accepting(value, done)
     if type(value).__module__.startswith("numba."):
         value = getattr(value, "py_func", value)  # the function that it has compiled
     if isinstance(value, types.MethodType):
-        return types.MethodType(_accepting(value.__func__, done), value.__self__)
+        return types.MethodType(_accepting(value.__func__, done), _Accepting(value.__self__, done))
     if isinstance(value, functools.partial):
         return functools.partial(_accepting(value.func, done), *value.args, **value.keywords)
     if (table := as_table(value)) is not None:

@@ -79,9 +79,15 @@ SMOOTH = make_interp_spline(LEVELS, np.cos(LEVELS))
 
 class Plant:
     stiffness = 4.0
+    table = LINE
 
-    def rhs(self, t, x, u, p):
-        return np.array([x[1], -self.stiffness * x[0] + p["k"] * math.tanh(u[0])])
+    def __call__(self, t, x, u, p):
+        dx = np.zeros(2)
+        dx[0], dx[1] = x[1], self.force(x[0]) + p["k"] * math.tanh(u[0])
+        return dx
+
+    def force(self, q):
+        return -self.stiffness * q if q > 0 else self.table(q)
 
 
 FUNCTIONS = {
@@ -102,7 +108,8 @@ FUNCTIONS = {
     "tables of SciPy": lambda t, x, u, p: [LINE(x[0]) + HELD(x[1]), SPLINE(x[0]) * PERIODIC(x[1])],
     "arrays in a table": lambda t, x, u, p, table=PCHIP: table(x) + SMOOTH(x[0]),
     "guard": lambda t, x, u, p: x if np.all(np.isfinite(x)) else None,
-    "method": Plant().rhs,
+    "method": Plant().__call__,
+    "object": Plant(),
 }
 
 
