@@ -74,6 +74,11 @@ def from_function(
         If the function fails, returns another number of values, writes into its arguments, or uses an operation that
         has no symbolic counterpart; with the line of the function and what to write instead.
 
+    Notes
+    -----
+    Derivatives of both results of a choice are evaluated. They stay finite for `if h > 0: q = np.sqrt(h)`, and not for
+    `np.where(h > 0, np.sqrt(h), 0)` where h is zero or less.
+
     Examples
     --------
     >>> def rhs(t, x, u, p):

@@ -31,8 +31,8 @@ class Decides(Protocol):
     def decide(self, condition: Any) -> bool:
         """Return the answer to a condition."""
 
-    def guard(self, argument: Any) -> Any:
-        """Return the argument of a function that is singular, made harmless where the answers are others."""
+    def guard(self, argument: Any, harmless: float) -> Any:
+        """Return the argument of a function that is singular, or a harmless one where the answers are others."""
 
 
 class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
@@ -204,8 +204,9 @@ def _elementwise(ufunc: Any, *inputs: Any) -> Any:
         else:
             own = [v.sx if isinstance(v, Symbol) else float(v) for v in values]
             trace = _trace(values)
-            if (k := SINGULAR.get(ufunc)) is not None and isinstance(values[k], Symbol):
-                own[k] = trace.guard(own[k])
+            k, harmless = SINGULAR.get(ufunc, (0, None))
+            if harmless is not None and isinstance(values[k], Symbol):
+                own[k] = trace.guard(own[k], harmless)
             out[i] = Symbol(rule(*own), trace)
     return array_of(out)
 
@@ -446,15 +447,13 @@ RULES: dict[Any, Rule] = {
     np.isnan: lambda a: ca.SX(0),
     np.isinf: lambda a: ca.SX(0),
 }
-SINGULAR: dict[
-    Any, int
-] = {  # functions that are singular or undefined for some values of an argument, and which one it is
-    np.divide: 1,
-    np.reciprocal: 0,
-    np.power: 0,
-    np.float_power: 0,
-    **dict.fromkeys((np.sqrt, np.cbrt, np.log, np.log2, np.log10, np.log1p), 0),
-    **dict.fromkeys((np.arcsin, np.arccos, np.arccosh, np.arctanh), 0),
+# functions that are singular or undefined for some values of an argument: which one, and a value where they are not
+SINGULAR: dict[Any, tuple[int, float]] = {
+    np.divide: (1, 1.0),
+    **dict.fromkeys((np.reciprocal, np.power, np.float_power, np.sqrt, np.cbrt), (0, 1.0)),
+    **dict.fromkeys((np.log, np.log2, np.log10, np.log1p), (0, 1.0)),
+    **dict.fromkeys((np.arcsin, np.arccos, np.arctanh), (0, 0.0)),
+    np.arccosh: (0, 2.0),
 }
 FUNCTIONS: dict[Any, Rule] = {
     np.where: _where,

@@ -66,12 +66,12 @@ class Trace:
         self.taken.append((condition, answer))
         return answer
 
-    def guard(self, argument: Any) -> Any:
-        """Replace an argument that varies by one where the decisions are others than so far."""
+    def guard(self, argument: Any, harmless: float) -> Any:
+        """Replace an argument that varies by a harmless value where the decisions are others than so far."""
         if not self.taken or not ca.depends_on(argument, self.signals):
             return argument
         so = [condition if answer else ca.logic_not(condition) for condition, answer in self.taken]
-        return ca.if_else(functools.reduce(ca.logic_and, so), argument, 1.0)
+        return ca.if_else(functools.reduce(ca.logic_and, so), argument, harmless)
 
 
 def follow(call: Callable[[Trace], Any], signals: Any) -> tuple[Any, int]:

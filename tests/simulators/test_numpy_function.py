@@ -125,13 +125,15 @@ def test_equations_are_those_of_the_function(case):
 
 def outflow(t, x, u, p):
     flow = p["k"] * math.sqrt(x[0]) if x[0] > 0 else 0.0
-    return [u[0] - flow, flow - (np.sqrt(x[1]) / x[1] if x[1] > 0 else 0.0)]
+    angle = math.acos(x[1] / 9) + np.arccosh(x[1] + 1) + np.log(x[1]) / x[1] if 0 < x[1] < 9 else 0.0
+    return [u[0] - flow, flow - angle]
 
 
 def test_derivatives_are_finite_in_both_branches():
     traced = equations(outflow)
-    for x in ([0.0, 0.0], [-1.0, 2.0], [4.0, -1.0]):
+    for x in ([0.0, 0.0], [-1.0, 2.0], [4.0, -1.0], [4.0, 10.0]):
         assert np.all(np.isfinite(traced.jacobian()(0.5, *x, 1.0, 0.7, np.zeros(2))[1].full()))
+        assert np.all(np.isfinite(traced.jacobian()(0.5, *x, 1.0, 0.7, np.zeros(2))[2].full()))
     slope = traced.jacobian()(0.5, 4.0, 1.0, 1.0, 0.7, np.zeros(2))[1].full().ravel()
     assert np.allclose(slope, [-0.7 / 4, 0.7 / 4])
 
