@@ -364,7 +364,7 @@ def _matrix(rule: Rule) -> Rule:
     def apply(*arrays: Any) -> Any:
         own = [objects(a) for a in arrays]
         dense = [ca.vertcat(*(ca.horzcat(*map(expression, row)) for row in a.reshape(len(a), -1))) for a in own]
-        found = ca.SX(rule(*dense))
+        found = ca.densify(rule(*map(ca.sparsify, dense)))  # zeros spare most of the work
         out = np.empty(found.shape, dtype=object)
         for i in np.ndindex(out.shape):
             out[i] = Symbol(found[i], _trace([e for a in own for e in a.flat]))
