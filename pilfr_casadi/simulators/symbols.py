@@ -31,8 +31,8 @@ class Decides(Protocol):
     def decide(self, condition: Any) -> bool:
         """Return the answer to a condition."""
 
-    def guard(self, argument: Any) -> Any:
-        """Return the argument of a function that is singular, made harmless where the answers are others."""
+    def guard(self, argument: Any, harmless: float) -> Any:
+        """Return the argument of a function that is singular, or a harmless one where the answers are others."""
 
 
 class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
@@ -204,8 +204,9 @@ def _elementwise(ufunc: Any, *inputs: Any) -> Any:
         else:
             own = [v.sx if isinstance(v, Symbol) else float(v) for v in values]
             trace = _trace(values)
-            if (k := SINGULAR.get(ufunc)) is not None and isinstance(values[k], Symbol):
-                own[k] = trace.guard(own[k])
+            k, harmless = SINGULAR.get(ufunc, (0, None))
+            if harmless is not None and isinstance(values[k], Symbol):
+                own[k] = trace.guard(own[k], harmless)
             out[i] = Symbol(rule(*own), trace)
     return array_of(out)
 
@@ -284,18 +285,72 @@ def _interp(x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None, perio
     """Interpolate linearly in a table of numbers, with the end values beyond its ends."""
     if has_symbol([xp, fp]) or not (left is right is period is None):
         raise NotFollowed("uses np.interp with more than x and a table of numbers", "write np.interp(x, xp, fp)")
-    at, table = (np.asarray(to_numbers(v), dtype=float).ravel() for v in (xp, fp))
-    if len(at) < 2 or len(at) != len(table) or np.any(np.diff(at) <= 0):
+    at, values = (np.asarray(to_numbers(v), dtype=float).ravel() for v in (xp, fp))
+    if len(at) < 2 or len(at) != len(values) or np.any(np.diff(at) <= 0):
         raise NotFollowed("uses np.interp with a table whose x does not increase", "give one that increases")
-    arrays = objects(x)
-    out = np.empty(arrays.shape, dtype=object)
+    return _each(x, lambda e: _piecewise(ca.fmin(ca.fmax(e, at[0]), at[-1]), at, _chords(at, values)))
+
+
+def _each(x: Any, rule: Rule) -> Any:
+    """Apply a rule to each element of an array that holds a symbol."""
+    elements = objects(x)
+    out = np.empty(elements.shape, dtype=object)
     for i in np.ndindex(out.shape):
-        inside = ca.fmin(ca.fmax(expression(arrays[i]), at[0]), at[-1])
-        value = ca.SX(table[-1])
-        for a, b, fa, fb in reversed(list(zip(at[:-1], at[1:], table[:-1], table[1:], strict=True))):
-            value = ca.if_else(inside < b, fa + (fb - fa) / (b - a) * (inside - a), value)
-        out[i] = Symbol(value, _trace(arrays.ravel().tolist()))
+        out[i] = Symbol(rule(expression(elements[i])), _trace(elements.ravel().tolist()))
     return array_of(out)
+
+
+def _chords(at: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the coefficients of a polygon for `_piecewise`."""
+    return np.array([np.diff(values) / np.diff(at), values[:-1]])
+
+
+def _piecewise(x: Any, at: np.ndarray, coefficients: np.ndarray) -> Any:
+    """Evaluate polynomials of x - at[j], highest power first, shape (order, pieces), the outer ones beyond the ends."""
+    found = None
+    for start, end, row in reversed(list(zip(at[:-1], at[1:], coefficients.T, strict=True))):
+        value = functools.reduce(lambda total, c, start=start: total * (x - start) + c, row, ca.SX(0))  # type: ignore[misc]
+        found = value if found is None else ca.if_else(x < end, value, found)
+    return found
+
+
+def as_table(value: Any) -> Rule | None:
+    """Make an interpolator of SciPy in one variable, linear or a spline, accept symbols; None of anything else."""
+    if not type(value).__module__.startswith("scipy.interpolate"):
+        return None
+    from scipy.interpolate import BSpline, PPoly, interp1d
+
+    own: Any = value
+    beyond: Any  # what holds beyond the ends: True the outer pieces, numbers, or "periodic"
+    if isinstance(value, BSpline) and own.c.ndim == 1:
+        pieces = PPoly.from_spline(own)
+        keep = np.diff(pieces.x) > 0  # a spline's knots are repeated at its ends
+        at, coefficients, beyond = np.append(pieces.x[:-1][keep], pieces.x[-1]), pieces.c[:, keep], own.extrapolate
+    elif isinstance(value, PPoly) and own.c.ndim == 2:
+        at, coefficients, beyond = own.x, own.c, own.extrapolate
+    elif isinstance(value, interp1d) and own._kind == "linear" and np.ndim(own.y) == 1:
+        at, coefficients = np.asarray(own.x, dtype=float), _chords(own.x, own.y)
+        beyond = True if isinstance(own.fill_value, str) else own.fill_value
+    else:
+        return None
+
+    def evaluate(x: Any, *order: Any, **options: Any) -> Any:
+        if not has_symbol(x):
+            return value(x, *order, **options)
+        if order or options:
+            raise NotFollowed("asks a table for more than its value", "make a table of the derivative")
+        return _each(x, at_one)
+
+    def at_one(x: Any) -> Any:
+        if isinstance(beyond, str):  # "periodic"
+            x = at[0] + _floored_remainder(x - at[0], at[-1] - at[0])
+        found = _piecewise(x, at, coefficients)
+        if isinstance(beyond, str | bool | np.bool):
+            return found
+        low, high = np.broadcast_to(np.asarray(beyond, dtype=float), 2)
+        return ca.if_else(x < at[0], low, ca.if_else(x > at[-1], high, found)) if np.isfinite(low + high) else found
+
+    return evaluate
 
 
 def _like(function: Rule) -> Rule:
@@ -309,7 +364,7 @@ def _matrix(rule: Rule) -> Rule:
     def apply(*arrays: Any) -> Any:
         own = [objects(a) for a in arrays]
         dense = [ca.vertcat(*(ca.horzcat(*map(expression, row)) for row in a.reshape(len(a), -1))) for a in own]
-        found = ca.SX(rule(*dense))
+        found = ca.densify(rule(*map(ca.sparsify, dense)))  # zeros spare most of the work
         out = np.empty(found.shape, dtype=object)
         for i in np.ndindex(out.shape):
             out[i] = Symbol(found[i], _trace([e for a in own for e in a.flat]))
@@ -392,15 +447,13 @@ RULES: dict[Any, Rule] = {
     np.isnan: lambda a: ca.SX(0),
     np.isinf: lambda a: ca.SX(0),
 }
-SINGULAR: dict[
-    Any, int
-] = {  # functions that are singular or undefined for some values of an argument, and which one it is
-    np.divide: 1,
-    np.reciprocal: 0,
-    np.power: 0,
-    np.float_power: 0,
-    **dict.fromkeys((np.sqrt, np.cbrt, np.log, np.log2, np.log10, np.log1p), 0),
-    **dict.fromkeys((np.arcsin, np.arccos, np.arccosh, np.arctanh), 0),
+# functions that are singular or undefined for some values of an argument: which one, and a value where they are not
+SINGULAR: dict[Any, tuple[int, float]] = {
+    np.divide: (1, 1.0),
+    **dict.fromkeys((np.reciprocal, np.power, np.float_power, np.sqrt, np.cbrt), (0, 1.0)),
+    **dict.fromkeys((np.log, np.log2, np.log10, np.log1p), (0, 1.0)),
+    **dict.fromkeys((np.arcsin, np.arccos, np.arctanh), (0, 0.0)),
+    np.arccosh: (0, 2.0),
 }
 FUNCTIONS: dict[Any, Rule] = {
     np.where: _where,

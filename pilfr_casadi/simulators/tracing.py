@@ -28,6 +28,7 @@ from .symbols import (
     Symbol,
     Symbols,
     array_of,
+    as_table,
     has_symbol,
     objects,
     to_numbers,
@@ -65,12 +66,12 @@ class Trace:
         self.taken.append((condition, answer))
         return answer
 
-    def guard(self, argument: Any) -> Any:
-        """Replace an argument that varies by one where the decisions are others than so far."""
+    def guard(self, argument: Any, harmless: float) -> Any:
+        """Replace an argument that varies by a harmless value where the decisions are others than so far."""
         if not self.taken or not ca.depends_on(argument, self.signals):
             return argument
         so = [condition if answer else ca.logic_not(condition) for condition, answer in self.taken]
-        return ca.if_else(functools.reduce(ca.logic_and, so), argument, 1.0)
+        return ca.if_else(functools.reduce(ca.logic_and, so), argument, harmless)
 
 
 def follow(call: Callable[[Trace], Any], signals: Any) -> tuple[Any, int]:
@@ -149,14 +150,14 @@ _OF_MATH |= {name: getattr(np, other) for name, other in _RENAMED.items()}
 REPLACED |= {getattr(math, name): _scalar_function(getattr(math, name), ufunc) for name, ufunc in _OF_MATH.items()}
 
 
-class _Module:
-    """A module whose functions accept symbols."""
+class _Accepting:
+    """A module or an object whose functions accept symbols; it keeps what they write into it to itself."""
 
-    def __init__(self, module: types.ModuleType, done: dict[int, Any]) -> None:
-        self._module, self._done = module, done
+    def __init__(self, owner: Any, done: dict[int, Any]) -> None:
+        self._owner, self._done = owner, done
 
     def __getattr__(self, name: str) -> Any:
-        return _accepting(getattr(self._module, name), self._done)
+        return _accepting(getattr(self._owner, name), self._done)
 
 
 COPIED = (types.ModuleType, types.FunctionType, types.BuiltinFunctionType, types.MethodType, functools.partial)
@@ -164,18 +165,21 @@ COPIED = (types.ModuleType, types.FunctionType, types.BuiltinFunctionType, types
 
 def accept_symbols(function: Any) -> Any:
     """Copy a function, and those of Python that it calls by name, with `numpy` and `math` that accept symbols."""
-    return _accepting(function, {})
+    written = isinstance(type(function).__call__, types.FunctionType)  # an object of the user's own class
+    return _accepting(function.__call__ if written else function, {})
 
 
 def _accepting(value: Any, done: dict[int, Any]) -> Any:
     if isinstance(value, types.ModuleType):
-        return _Module(value, done)
+        return _Accepting(value, done)
     if type(value).__module__.startswith("numba."):
         value = getattr(value, "py_func", value)  # the function that it has compiled
     if isinstance(value, types.MethodType):
-        return types.MethodType(_accepting(value.__func__, done), value.__self__)
+        return types.MethodType(_accepting(value.__func__, done), _Accepting(value.__self__, done))
     if isinstance(value, functools.partial):
         return functools.partial(_accepting(value.func, done), *value.args, **value.keywords)
+    if (table := as_table(value)) is not None:
+        return table
     if callable(value) and isinstance(value, Hashable) and value in REPLACED:
         return REPLACED[value]
     if not isinstance(value, types.FunctionType) or (value.__module__ or "").partition(".")[0] in LEFT_AS_THEY_ARE:
@@ -184,9 +188,10 @@ def _accepting(value: Any, done: dict[int, Any]) -> Any:
         return done[id(value)]
     names = dict(value.__globals__)
     cells = tuple(map(_copy_cell, value.__closure__ or ()))
-    copy = types.FunctionType(value.__code__, names, value.__name__, value.__defaults__, cells or None)
-    copy.__kwdefaults__ = value.__kwdefaults__
+    copy = types.FunctionType(value.__code__, names, value.__name__, None, cells or None)
     done[id(value)] = copy
+    copy.__defaults__ = tuple(_accepting(v, done) for v in value.__defaults__ or ())
+    copy.__kwdefaults__ = {k: _accepting(v, done) for k, v in (value.__kwdefaults__ or {}).items()}
     used = _names_of(value.__code__)
     for name in used & set(names):
         names[name] = _accepting(names[name], done)

@@ -7,7 +7,7 @@ import casadi as ca
 import cloudpickle
 import numpy as np
 import pytest
-from scipy.interpolate import interp1d
+from scipy.interpolate import CubicSpline, PchipInterpolator, RegularGridInterpolator, interp1d, make_interp_spline
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Simulator
@@ -69,11 +69,25 @@ def table(t, x, u, p):
     return [np.interp(x[0], [-1.0, 0.0, 2.0], [1.0, 0.0, 5.0]), np.interp(t, [0, 10], [0, 1]) + u[0]]
 
 
+LEVELS = np.array([-2.0, -0.5, 0.0, 1.0, 2.5])
+LINE = interp1d(LEVELS, LEVELS**3, fill_value="extrapolate")
+HELD = interp1d(LEVELS, LEVELS**3, bounds_error=False, fill_value=(-8.0, 9.0))
+SPLINE, PCHIP = CubicSpline(LEVELS, np.sin(LEVELS)), PchipInterpolator(LEVELS, np.sin(LEVELS))
+PERIODIC = CubicSpline([0.0, 1.0, 2.0, 3.0], [1.0, 2.0, 0.5, 1.0], bc_type="periodic")
+SMOOTH = make_interp_spline(LEVELS, np.cos(LEVELS))
+
+
 class Plant:
     stiffness = 4.0
+    table = LINE
 
-    def rhs(self, t, x, u, p):
-        return np.array([x[1], -self.stiffness * x[0] + p["k"] * math.tanh(u[0])])
+    def __call__(self, t, x, u, p):
+        dx = np.zeros(2)
+        dx[0], dx[1] = x[1], self.force(x[0]) + p["k"] * math.tanh(u[0])
+        return dx
+
+    def force(self, q):
+        return -self.stiffness * q if q > 0 else self.table(q)
 
 
 FUNCTIONS = {
@@ -91,8 +105,11 @@ FUNCTIONS = {
     "mass matrix": mass_matrix,
     "boolean index": masked,
     "tables": table,
+    "tables of SciPy": lambda t, x, u, p: [LINE(x[0]) + HELD(x[1]), SPLINE(x[0]) * PERIODIC(x[1])],
+    "arrays in a table": lambda t, x, u, p, table=PCHIP: table(x) + SMOOTH(x[0]),
     "guard": lambda t, x, u, p: x if np.all(np.isfinite(x)) else None,
-    "method": Plant().rhs,
+    "method": Plant().__call__,
+    "object": Plant(),
 }
 
 
@@ -108,13 +125,15 @@ def test_equations_are_those_of_the_function(case):
 
 def outflow(t, x, u, p):
     flow = p["k"] * math.sqrt(x[0]) if x[0] > 0 else 0.0
-    return [u[0] - flow, flow - (np.sqrt(x[1]) / x[1] if x[1] > 0 else 0.0)]
+    angle = math.acos(x[1] / 9) + np.arccosh(x[1] + 1) + np.log(x[1]) / x[1] if 0 < x[1] < 9 else 0.0
+    return [u[0] - flow, flow - angle]
 
 
 def test_derivatives_are_finite_in_both_branches():
     traced = equations(outflow)
-    for x in ([0.0, 0.0], [-1.0, 2.0], [4.0, -1.0]):
+    for x in ([0.0, 0.0], [-1.0, 2.0], [4.0, -1.0], [4.0, 10.0]):
         assert np.all(np.isfinite(traced.jacobian()(0.5, *x, 1.0, 0.7, np.zeros(2))[1].full()))
+        assert np.all(np.isfinite(traced.jacobian()(0.5, *x, 1.0, 0.7, np.zeros(2))[2].full()))
     slope = traced.jacobian()(0.5, 4.0, 1.0, 1.0, 0.7, np.zeros(2))[1].full().ravel()
     assert np.allclose(slope, [-0.7 / 4, 0.7 / 4])
 
@@ -216,7 +235,7 @@ def converts(t, x, u, p):
 
 
 def looks_up(t, x, u, p):
-    return [TABLE(x[0]), x[1]]
+    return [TABLE(x[:1])[0], x[1]]
 
 
 def asks_for_a_type(t, x, u, p):
@@ -224,7 +243,7 @@ def asks_for_a_type(t, x, u, p):
 
 
 NOISE = np.random.default_rng(0)
-TABLE = interp1d([-1e9, 0.0, 1e9], [0.0, 1.0, 2.0])
+TABLE = RegularGridInterpolator([[-1e9, 0.0, 1e9]], [0.0, 1.0, 2.0])
 BAD = {
     "not callable": (3, ("3", "function of t, x, u and p")),
     "other arguments": (lambda t, x: x, ("(t, x, u, p)",)),
@@ -243,7 +262,7 @@ BAD = {
     "rounds": (rounds, ("line", "np.round(x[0])", "np.rint", "np.where")),
     "whole number": (converts, ("line", "int(x[0])", "leave out int()")),
     "adds into numbers": (adds_into_numbers, ("line", "total += x", "y = y + ...")),
-    "table of another package": (looks_up, ("line", "TABLE(x[0])", "CasADi")),
+    "table of another package": (looks_up, ("line", "TABLE(x[:1])", "CasADi")),
     "random": (lambda t, x, u, p: x * NOISE.random(), ("its equations", "random numbers")),
     "types": (asks_for_a_type, ("its equations", "types")),
 }
