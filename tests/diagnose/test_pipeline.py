@@ -18,7 +18,7 @@ from pilfr_casadi.diagnose.verdict import Verdict
 def a_request(hold=None):
     """A diagnosis of two effects, of nothing in particular."""
     return pipeline.Request(
-        SimpleNamespace(hold=None), (), (), hold, "auto", 1, 2, 0.0, np.inf, Stages(lambda *_: None)
+        SimpleNamespace(hold=None), (), (), hold, "auto", 1, 2, 0.0, np.inf, Stages(lambda *_: None), "simulation"
     )
 
 
