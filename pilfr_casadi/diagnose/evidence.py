@@ -41,8 +41,9 @@ from .floor import effective_size
 from .workbench import DIVERGED, Fitted, Workbench
 
 # The priors and thresholds on which every answer of a search rests. Elsewhere are those of the noise (`floor`), of
-# faults (`gates`), the bases of flexible forces (`screen`, `learned`) and the accuracy of integration (`workbench`).
-# All other numbers limit the effort or keep numbers finite.
+# faults (`gates`, `timing`, `recording_faults`), the memories of an observer (`prediction`), the bases of flexible
+# forces (`screen`, `learned`) and the accuracy of integration (`workbench`). All other numbers limit the effort or keep
+# numbers finite.
 
 # Prior probabilities
 EFFECT_PRIOR = np.log(0.5)  # log probability of each further effect: one more effect is as likely as not
@@ -55,7 +56,6 @@ STATE_PRIOR = 1e-9  # precision of initial states relative to the information of
 FORMULA = 1e-3  # share of a mismatch that the right explanation may leave: 3 % of its force
 EXACT = 8.0  # effective samples of a model whose whole error is model error (n_0)
 LEAST_WRONG = 0.05  # least share of the error that counts as model error
-FEWEST = 30.0  # least effective samples of the recordings
 WRONG = 0.2  # share of model error in the error above which models are judged on held-out blocks
 DISTURBED = 0.2  # weight of a law's remainder that no force at a port explains: a disturbance may act beside the law
 INPUT_FACTOR = 0.7  # factor on the inputs for which the spread is computed: well inside the recorded range

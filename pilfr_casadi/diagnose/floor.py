@@ -16,6 +16,7 @@ from ..data import Recording
 
 CORRELATED, P_VALUE = 0.5, 1e-4  # rank correlation, and its p-value, from which a residual's power depends on a signal
 ABOVE_NOISE = 2.0  # ratio of the error to the noise from which results say that more is missing
+FEWEST = 30.0  # effective samples that a residual has at least
 LONGEST = 400  # longest correlation of a residual, in samples
 
 

@@ -31,7 +31,7 @@ from ..engine import make_engine
 from ..laws import Law
 from ..optimise import GaussNewton
 from ..simulators import Simulator
-from .floor import Floor, effective_size, noise_floor
+from .floor import FEWEST, Floor, effective_size, noise_floor
 from .linearise import Probe, Run, linearised
 from .screen import followed, lengths, moved, project_off
 from .workbench import QUICK, THOROUGH, Fitted, Workbench
@@ -48,7 +48,6 @@ RARE = 0.02  # share of a mean square, or of the samples, up to which something 
 SAME = 1.02  # ratio of errors that count as equal
 AT_NOISE = 5.0  # rms error over the noise up to which nothing else is wrong
 STILL = 0.1  # share of its first value that an offset must keep beside effects to be reported
-FEWEST = 30.0  # effective samples that a residual has at least
 TURNS = 8  # alternations of edit and refit at most
 
 # metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
@@ -57,7 +56,7 @@ FACTORS = tuple(f for unit in UNITS for f in (unit, 1 / unit))  # each unit by m
 FAHRENHEIT = (1.8, 1 / 1.8)  # Fahrenheit's zero differs as well: this unit comes with an offset
 # factors on the time: ms, minutes, µs, hours, and the reverse of the first two
 TIME_UNITS = (1e-3, 1 / 60, 1e-6, 1 / 3600, 60.0, 1e3)
-NEAR = 6.0  # a factor is tried if it brings the simulated size within this ratio of the measured one
+SIZE_RATIO = 6.0  # a factor is tried if it brings the simulated size within this ratio of the measured one
 BENT = 0.3  # share of the parameters at their bounds above which a refit does not confirm a unit of time
 # first refit of each trial, only to discard hopeless ones
 GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
@@ -401,7 +400,7 @@ def _near(now: Checked, errors: Sequence[np.ndarray]) -> Callable[[str, Sequence
     def near(kind: str, columns: Sequence[int], factor: float) -> bool:
         ratios = factor * sizes[columns] if kind == "y" else sizes / factor
         unknown = ~np.isfinite(ratios) | (ratios == 0) | (now.cost > 1)  # the size of a diverging run says nothing
-        close = unknown | ((ratios > 1 / NEAR) & (ratios < NEAR))
+        close = unknown | ((ratios > 1 / SIZE_RATIO) & (ratios < SIZE_RATIO))
         return bool(np.all(close) if kind == "y" else np.any(close))
 
     return near

@@ -1,4 +1,4 @@
-"""What recordings determine: which parameters are identifiable, and which laws are detectable at which ports.
+"""Compute which parameters recordings can identify, and which laws they can detect at which ports.
 
 Everything follows from the simulator linearised along its refitted run, in units of the noise.
 

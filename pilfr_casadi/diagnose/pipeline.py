@@ -10,7 +10,7 @@ How an answer comes about:
    the hypothesis that nothing is missing. What it leaves above the noise is the mismatch.
 2. `Search.run` fits further hypotheses: the simulator with laws in its ports, with all parameters estimated together.
    Each of them gets a log evidence: how well it follows the recordings, less the cost of its parameters, plus its prior
-   (`evidence`, which lists every number on which an answer rests, with its reason).
+   (`evidence`, which lists the numbers on which an answer rests).
 3. `posterior` turns the evidences into probabilities. An effect's confidence is the probability of all hypotheses that
    have it, times the probability that its law is the physics, which is small if a flexible force explains much of the
    rest.

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -35,11 +35,11 @@ from ..identify import regrid
 from ..laws import OPERATORS, Law, Local, display_name, hysteresis_layer, unit_forces
 from ..models import check_size, play
 from ..simulators import Placed, Simulator, discretise, in_series, on_grid
+from .correction import Correction
 from .evidence import HeldOut, Sample, held_out_errors, spread
 from .floor import effective_size
 from .learned import signals_along
 from .proof import mean_nrmse
-from .result import Diagnosis
 from .search import Search
 from .workbench import THOROUGH, Fitted, Workbench
 
@@ -55,6 +55,45 @@ GRID = 201  # points of a loading curve
 PER_OPERATOR = 10  # least samples for each operator: its weight, its threshold and their standard errors
 DIAGNOSED = "diagnosed"  # key of the law that the diagnosis has found
 HYSTERETIC = ("hysteresis", "backlash")  # ids of laws with rate-independent memory; friction with presliding has it too
+
+
+class Answer(Protocol):
+    """What is used of a `Diagnosis`, whose file imports this one."""
+
+    @property
+    def corrected(self) -> Simulator:
+        """The corrected simulator."""
+
+    @property
+    def effects(self) -> Sequence[Any]:
+        """The named effects."""
+
+    @property
+    def correction(self) -> Correction | None:
+        """The elements beside the refit."""
+
+    @property
+    def evidence(self) -> Mapping[str, Any]:
+        """The search, and the fits."""
+
+    @property
+    def test(self) -> tuple[Recording, ...]:
+        """The test recordings."""
+
+    def with_fit(self, fitted: Fitted) -> Self:
+        """Copy with another corrected simulator."""
+
+    def simulate(self, recording: Recording) -> np.ndarray:
+        """Simulate the corrected simulator."""
+
+    def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
+        """Compute its NRMSE."""
+
+    def export(self, **options: Any) -> Any:
+        """Export it."""
+
+    def to_casadi(self, name: str = "model", smooth: float = 0.0) -> Any:
+        """Export it as a function."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +135,7 @@ class Refinement:
     held_out: Mapping[str, HeldOut]
     errors: Mapping[str, Mapping[str, float] | None]
     layer: Simulator
-    _chosen: Diagnosis
+    _chosen: Answer
     _law: str
     _loops: tuple[np.ndarray, ...]
 
@@ -170,7 +209,7 @@ class Refinement:
 
 
 @one_blas_thread
-def refine(diagnosis: Diagnosis, operators: int, kind: str | None, port: str | None) -> Refinement:
+def refine(diagnosis: Answer, operators: int, kind: str | None, port: str | None) -> Refinement:
     """Carry out `Diagnosis.refine`; see there."""
     n = whole(operators, "operators", 1)
     check_size("A layer", 2 * n)
@@ -224,7 +263,7 @@ def _predict(search: Search, fitted: Fitted) -> HeldOut:
     return replace(found, spread=spread(bench, fitted, own, v, n) if np.isfinite(v) else np.inf)
 
 
-def _found_hysteresis(diagnosis: Diagnosis, after: Fitted, given: int, port: str | None) -> int:
+def _found_hysteresis(diagnosis: Answer, after: Fitted, given: int, port: str | None) -> int:
     """Return the index of the law with rate-independent memory, the surest one at the port if several are there."""
     elements = after.simulator.elements
     found = [i for i in range(given, len(elements)) if _is_hysteretic(elements[i].law)]
@@ -251,7 +290,7 @@ def _fit_layer(bench: Workbench, after: Fitted, number: int, kind: type[Law]) ->
     """Fit a layer in place of an element, together with all other parameters; None if the simulation diverges."""
     old = after.simulator.elements[number]
     z, dz, force = signals_along(bench, after, number)
-    local = Local(z, dz, bench.dt, tuple(map(len, bench.recordings)))
+    local = bench.local(z, dz)
     starts = _start_values(kind(), local, force, old.own(after.values))
     placed = _exchange(after.simulator, number, kind().at(starts[0], kind().bounds(local)))
     element = placed.elements[number]
@@ -364,17 +403,12 @@ def _memory(element: Placed) -> int:
 
 
 def _build(
-    diagnosis: Diagnosis, bench: Workbench, kind: str, fitted: Fitted, number: int, held_out: Mapping[str, HeldOut]
+    diagnosis: Answer, bench: Workbench, kind: str, fitted: Fitted, number: int, held_out: Mapping[str, HeldOut]
 ) -> Refinement:
     """Put the best layer into a Refinement."""
     element, after = fitted.simulator.elements[number], diagnosis.evidence["after"]
     values, port = element.own(fitted.values), element.port
-    refined = replace(
-        diagnosis,
-        corrected=fitted.corrected(),
-        evidence={**diagnosis.evidence, "after": fitted},
-        substeps=fitted.model.substeps,
-    )
+    refined = diagnosis.with_fit(fitted)
     errors: dict[str, dict[str, float] | None] = {
         "train": {DIAGNOSED: mean_nrmse(bench, after), "refined": mean_nrmse(bench, fitted)},
         "test": None,

@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -26,9 +26,8 @@ from .floor import ABOVE_NOISE
 from .gates import Gate
 from .learned import Learned
 from .proof import run_free, starts_of
-
-if TYPE_CHECKING:
-    from .refinement import Refinement
+from .refinement import Refinement, refine
+from .workbench import Fitted
 
 VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
@@ -204,6 +203,7 @@ class Diagnosis:
     def simulate(self, recording: Recording) -> np.ndarray:
         """Simulate the corrected simulator along the inputs of a recording.
 
+        With an observer (`focus="prediction"`), the outputs are predictions one sample ahead.
         Recordings are corrected as the training recordings were (sign, unit, shift; see `gates`). An unknown initial
         state is estimated from the first samples.
 
@@ -355,9 +355,12 @@ class Diagnosis:
         InputError
             If the diagnosis has found no hysteresis (at the port), or an argument is wrong.
         """
-        from .refinement import refine
-
         return refine(self, operators, kind, port)
+
+    def with_fit(self, fitted: Fitted) -> Diagnosis:
+        """Copy with another fitted simulator as the corrected one."""
+        evidence = {**self.evidence, "after": fitted}
+        return replace(self, corrected=fitted.corrected(), evidence=evidence, substeps=fitted.model.substeps)
 
     def warnings(self) -> list[str]:
         """List the reasons for doubt: an interrupt, parameters at their bounds, errors that stay large."""

@@ -26,7 +26,6 @@ from .evidence import (
     BETTER,
     EFFECT_PRIOR,
     EXACT,
-    FEWEST,
     FORMULA,
     LOUDEST,
     NEAR,
@@ -40,7 +39,7 @@ from .evidence import (
     log_prior,
     spread,
 )
-from .floor import Floor, effective_size, white_part
+from .floor import FEWEST, Floor, effective_size, white_part
 from .gates import CLEARLY
 from .learned import learn_forces, nearest_to_learned
 from .linearise import linearised

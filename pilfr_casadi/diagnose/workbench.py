@@ -273,7 +273,7 @@ class Workbench:
         return (
             f"it is unstable (it grows e-fold in {1 / rate:.2g} s) and cannot be run by its own inputs alone: put the "
             "controller into the simulator, with its reference as the input; or let the recordings lead it, by the "
-            "focus 'prediction'."
+            "focus 'prediction' of a diagnosis."
         )
 
     def _run_fixed(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:
