@@ -2,10 +2,11 @@
 SHELL := /bin/sh
 PYTHON := .venv/bin/python
 STAMP := .venv/.installed
+DOCS_STAMP := .venv/.installed-docs
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 WORKERS ?= auto
 
-.PHONY: demo test lint slow clean
+.PHONY: demo test lint slow docs clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -19,11 +20,15 @@ lint: $(STAMP)
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m mypy
 
-slow: $(STAMP)
+slow: $(STAMP) $(DOCS_STAMP)
 	$(ONE_THREAD) $(PYTHON) -m pytest -q -n $(WORKERS) --dist worksteal -m slow
 
+docs: $(DOCS_STAMP)
+	$(ONE_THREAD) $(PYTHON) -m sphinx -q -W --keep-going -b html docs build/docs
+	@echo "open build/docs/index.html"
+
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist docs/laws docs/pictures docs/reference docs/gallery *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(STAMP): pyproject.toml requirements.lock
@@ -43,4 +48,9 @@ $(STAMP): pyproject.toml requirements.lock
 	@echo "installing into .venv (a few minutes the first time)"
 	$(PYTHON) -m pip install --quiet --disable-pip-version-check -r requirements.lock
 	$(PYTHON) -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+$(DOCS_STAMP): $(STAMP) requirements-docs.lock
+	@echo "installing what builds the documentation (half a minute)"
+	$(PYTHON) -m pip install --quiet --disable-pip-version-check -r requirements.lock -r requirements-docs.lock
 	@touch $@
