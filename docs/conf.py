@@ -12,10 +12,10 @@ import pictures
 import pilfr_casadi
 import reference
 
-for part in (catalogue, pictures, reference):
+for part in (catalogue, gallery, pictures, reference):
     part.build()
 
-project, author, copyright = "pilfr_casadi", "the authors of pilfr_casadi", "Apache-2.0"
+project, copyright = "pilfr_casadi", "the authors of pilfr_casadi, Apache-2.0"
 version = release = pilfr_casadi.__version__
 extensions = ["myst_parser", "numpydoc", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx_design"]
 exclude_patterns = ["_tools", "_templates"]
@@ -40,9 +40,12 @@ html_show_sourcelink = html_copy_source = False
 html_sidebars = {"index": [], "getting_started": [], "comparison": [], "validation": []}
 html_theme_options = {
     "header_links_before_dropdown": 8,
+    "navbar_align": "left",
+    "navbar_persistent": ["search-button"],
     "navbar_end": ["theme-switcher"],
     "show_prev_next": False,
     "secondary_sidebar_items": {"**": ["page-toc"], "index": []},
+    "article_header_start": [],
     "footer_start": ["copyright"],
     "footer_end": [],
     "pygments_light_style": "a11y-high-contrast-light",

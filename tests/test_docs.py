@@ -14,6 +14,13 @@ ROOT = Path(__file__).parent.parent
 DEMO = ROOT / "pilfr_casadi" / "cli" / "demo_data"
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
+PAGES = sorted(p.relative_to(ROOT).as_posix() for p in (ROOT / "docs").rglob("*.md"))
+QUICK = {"docs/howto/numpy.md", "docs/howto/ports.md", "docs/howto/own_law.md"}  # pages of about a second
+SAID = {
+    "docs/start/axis.md": ["leaves out Coulomb friction at guide."],
+    "docs/start/tank.md": ["leaves out dead zone at actuator:pump."],
+    "docs/howto/closed_loop.md": ["leaves out Coulomb friction at guide."],
+}
 LONG = {"combined_elements", "mpc_piezo", "baselines", "own_law", "diagnose"}  # examples of more than some seconds
 COMMAND = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
 
@@ -47,6 +54,16 @@ def folder(tmp_path):
     return tmp_path
 
 
+def commands(*names):
+    """The `pilfr` commands of the documents as lists of arguments, without comments."""
+    lines = [line for block in snippets("sh", *names) for line in block.splitlines() if line.startswith("pilfr ")]
+    return [line.partition("  #")[0].split()[1:] for line in lines]
+
+
+# run files have a test of their own
+EXECUTED = [name for name in PAGES if name != "docs/studies.md" and (snippets("python", name) or commands(name))]
+
+
 def run(arguments, folder):
     done = subprocess.run(
         [sys.executable, *arguments], cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, check=False
@@ -59,7 +76,7 @@ def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 900
 
 
-@pytest.mark.parametrize("name", ["README.md", *sorted(f"docs/{p.name}" for p in (ROOT / "docs").glob("*.md"))])
+@pytest.mark.parametrize("name", ["README.md", *PAGES])
 def test_links_lead_somewhere(name):
     text = (ROOT / name).read_text(encoding="utf-8")
     for link in re.findall(r"\]\(([^)#]+)\)", text):
@@ -73,22 +90,6 @@ def test_python_of_the_readme(folder):
     assert (folder / "rig.json").exists()
 
 
-@pytest.mark.slow
-def test_python_of_the_documents(folder):
-    blocks = snippets("python", "docs/identify.md", "docs/control.md", "docs/diagnose.md")
-    (folder / "documents.py").write_text("\n".join(blocks), encoding="utf-8")
-    said = run(["documents.py"], folder)
-    table = said.partition("strength  operators")[2].partition("the strongest")[0]
-    operators = [int(row.split()[1]) for row in table.splitlines()[1:]]
-    assert operators[0] == 10 and operators[-1] < 9  # the path shows what it is for
-
-
-def commands(*names):
-    """The `pilfr` commands of the documents as lists of arguments, without comments."""
-    lines = [line for block in snippets("sh", *names) for line in block.splitlines() if line.startswith("pilfr ")]
-    return [line.partition("  #")[0].split()[1:] for line in lines]
-
-
 def test_commands_of_the_readme(folder):
     assert commands("README.md")
     for arguments in commands("README.md"):
@@ -96,17 +97,18 @@ def test_commands_of_the_readme(folder):
     assert (folder / "diagnosis" / "diagnosis.json").exists()
 
 
-@pytest.mark.slow
-def test_commands_of_the_documents(folder):
-    tables = [block for block in snippets("python", "docs/diagnose.md") if "rig import" in block or "savetxt(" in block]
-    (folder / "simulation.py").write_text("\n".join(["import pilfr_casadi as pilfr", *tables]), encoding="utf-8")
-    run(["simulation.py"], folder)
-    done = 0
-    for arguments in commands("docs/identify.md", "docs/diagnose.md"):
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in EXECUTED]
+)
+def test_snippets_of_a_page(folder, name):
+    """Every page stands alone: its Python runs as one script beside the demonstration's files, then its commands."""
+    blocks, lines = snippets("python", name), commands(name)
+    if blocks:
+        (folder / "page.py").write_text("\n".join(blocks), encoding="utf-8")
+        said = run(["page.py"], folder)
+        assert all(words in said for words in SAID.get(name, ()))
+    for arguments in lines:
         run(["-c", COMMAND, *arguments], folder)
-        done += 1
-    assert done >= 5
-    assert {"rig.c", "rig.h"} <= {p.name for p in (folder / "rig" / "c").iterdir()}
 
 
 RUN_FILES = snippets("toml", "docs/studies.md")

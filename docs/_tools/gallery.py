@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from common import write
+
 FOLDER = Path(__file__).parents[2] / "examples" / "gallery"
 SCRIPTS = sorted(FOLDER.glob("plot_*.py"))
 STORED = [path for path in SCRIPTS if path.with_suffix(".png").exists()]
@@ -18,3 +20,9 @@ SETTINGS = {
     "show_memory": False,
     "plot_gallery": "True",
 }
+
+
+def build() -> None:
+    """Write an empty page if there are no scripts."""
+    if not SCRIPTS:
+        write("gallery/index.rst", "Gallery\n=======\n\nThere are no scripts in ``examples/gallery`` yet.\n")

@@ -7,7 +7,7 @@ import inspect
 from typing import Any
 
 import pilfr_casadi as pilfr
-from common import heading, write
+from common import DOCS, heading, write
 
 # folder -> its title; the names of these folders are the package's own and those that it reaches through them
 FOLDERS = {
@@ -59,6 +59,7 @@ def summary(module: str, names: list[str]) -> str:
 def build() -> None:
     """Write the index and a page for each folder."""
     index = [heading("Reference"), "Every public name, from its docstring. ``import pilfr_casadi as pilfr``.\n"]
+    listed: set[str] = set()
     for folder, title in FOLDERS.items():
         own, more = entries(folder)
         text = [heading(title)]
@@ -70,6 +71,10 @@ def build() -> None:
             text.append("The laws themselves are in :doc:`the catalogue </laws/index>`.\n")
         write(f"reference/{folder.strip('_')}.rst", "\n".join(text))
         shown = " · ".join([*(f":obj:`~pilfr_casadi.{n}`" for n in own)]) or f"``pilfr.{folder}.…``"
+        listed |= {*(f"pilfr_casadi.{n}" for n in own), *(f"pilfr_casadi.{folder}.{n}" for n in more)}
         index.append(f":doc:`{title} <{folder.strip('_')}>`\n    {shown}\n")
-    listed = "".join(f"   {folder.strip('_')}\n" for folder in FOLDERS)
-    write("reference/index.rst", "\n".join([*index, f".. toctree::\n   :hidden:\n\n{listed}"]))
+    pages = "".join(f"   {folder.strip('_')}\n" for folder in FOLDERS)
+    write("reference/index.rst", "\n".join([*index, f".. toctree::\n   :hidden:\n\n{pages}"]))
+    for page in (DOCS / "reference" / "api").glob("*.rst"):  # of names that have gone
+        if page.stem not in listed:
+            page.unlink()
