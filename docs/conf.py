@@ -9,8 +9,9 @@ sys.path.insert(0, str(HERE / "_tools"))
 import catalogue
 import gallery
 import pictures
-import pilfr_casadi
 import reference
+
+import pilfr_casadi
 
 for part in (catalogue, gallery, pictures, reference):
     part.build()

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from common import heading, table, write, write_figure
+
 from pilfr_casadi.laws import CATALOGUE, LINEAR, Law, Local, display_name, readable_unit, unit_forces
 from pilfr_casadi.plots import new_figure
 from pilfr_casadi.plots.canvas import BLUE, GREY, finish
@@ -22,6 +23,7 @@ KINDS = {
     "catalogue": "Forces of speed",
 }
 NEAREST = 3  # look-alikes on a page
+SECOND, IN_SERIES = 0.4, 0.5  # in a picture: strengths after the first, and the change of a signal, over its size
 
 
 def motion() -> Local:
@@ -40,12 +42,13 @@ def columns(law: type[Law], local: Local) -> np.ndarray:
 
 
 def example(law: type[Law], forces: np.ndarray) -> np.ndarray:
-    """Force of the middle shape, with all strengths felt alike."""
+    """Force of the middle shape, with all strengths above zero."""
     own = forces[:, forces.shape[1] // 2]
     if not law.strength:
         return own[:, 0]
-    size = np.where(np.ptp(own, axis=0) > 0, np.max(np.abs(own), axis=0), np.inf)
-    return np.sum(own / size, axis=1) / own.shape[1] * (0.6 if "parallel" not in law.places else 1.0)
+    share = np.where(np.arange(own.shape[1]) == 0, 1.0, SECOND) if len(law.strength) > 1 else np.ones(own.shape[1])
+    force = np.sum(share * own / np.maximum(np.max(np.abs(own), axis=0), 1e-12), axis=1)
+    return force / np.max(np.abs(force)) * (1.0 if "parallel" in law.places else IN_SERIES)
 
 
 def draw(law: type[Law], force: np.ndarray, local: Local) -> Any:
@@ -120,9 +123,10 @@ def parameter_table(law: type[Law]) -> str:
 
 
 def form_section(law: type[Law], alike: list[tuple[str, float]], several: bool) -> str:
-    """Write the section of one form of a law."""
-    title = (law.form or ("in series" if "parallel" not in law.places else "plain")).replace("_", " ")
-    title = display_name(law.form) if law.form == "bouc_wen" else title
+    """Write the section of one form of a law; `several` forms have headings."""
+    series = "parallel" not in law.places
+    title = display_name(law.form) if law.form else "plain"
+    title += ", in series" if series and several else ""
     text = [heading(title[0].upper() + title[1:], "-")] if several else []
     text += [
         f"*{law.sentence[0].upper() + law.sentence[1:]}.*\n",
@@ -156,8 +160,8 @@ def page(law_id: str, laws: list[type[Law]], alike: dict[type[Law], list[tuple[s
         text.append(f"It is a special case of {', '.join(map(link, general))}.\n")
     if law_id in LINEAR:
         text.append(
-            "It is tried only where the simulator has no free spring or damper of its own at that port: otherwise it is "
-            "the same as another value of that parameter.\n"
+            "It is tried only where the simulator has no free spring or damper of its own at that port: otherwise it "
+            "is the same as another value of that parameter.\n"
         )
     for law in laws:
         text.append(form_section(law, alike[law], len(laws) > 1))
@@ -180,7 +184,7 @@ another middle. *Nearest laws* are those that follow this law's force best on th
 damper (behind an actuator or sensor: a free gain and offset). Real recordings decide better than this: ask
 :func:`~pilfr_casadi.check`.
 
-A law of your own takes :doc:`ten lines </howto/own_law>`. These pages are made from `pilfr.laws` when the site is built.
+A law of your own takes :doc:`ten lines </howto/own_law>`. These pages are made from `pilfr.laws` by the build.
 """
 
 

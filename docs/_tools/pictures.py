@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import pilfr_casadi as pilfr
 from common import write_figure
 from matplotlib.axes import Axes
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+
+import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose.verdict import share_named
 from pilfr_casadi.plots import new_figure
 from pilfr_casadi.plots.canvas import BLUE, FONT, GREY, INK, PALE_BLUE, PALE_GREY, SKY, VERMILLION, finish
@@ -17,7 +19,7 @@ from pilfr_casadi.plots.canvas import BLUE, FONT, GREY, INK, PALE_BLUE, PALE_GRE
 def motion() -> np.ndarray:
     """A rise from rest, a major loop, and a minor loop inside it."""
     turns = [0, 1, -1, 1, -0.2, 0.5, -1]
-    return np.concatenate([np.linspace(a, b, 200) for a, b in zip(turns[:-1], turns[1:], strict=True)])
+    return np.concatenate([np.linspace(a, b, 200) for a, b in pairwise(turns)])
 
 
 def operate(z: np.ndarray, r: float, operator: Any = pilfr.play) -> np.ndarray:

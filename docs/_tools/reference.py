@@ -6,8 +6,9 @@ import importlib
 import inspect
 from typing import Any
 
-import pilfr_casadi as pilfr
 from common import DOCS, heading, write
+
+import pilfr_casadi as pilfr
 
 # folder -> its title; the names of these folders are the package's own and those that it reaches through them
 FOLDERS = {
@@ -46,8 +47,8 @@ def entries(folder: str) -> tuple[list[str], list[str]]:
 def documented(thing: Any, folder: str, name: str) -> bool:
     """Tell whether a name of a face belongs into the reference; laws have the catalogue."""
     law = inspect.isclass(thing) and issubclass(thing, pilfr.Law)
-    public = folder in WHOLE or hasattr(pilfr, name)
-    return public and (inspect.isclass(thing) or inspect.isfunction(thing)) and not law
+    callable_here = (inspect.isclass(thing) or inspect.isfunction(thing)) and f".{folder}." in thing.__module__
+    return callable_here and (folder in WHOLE or hasattr(pilfr, name)) and not law
 
 
 def summary(module: str, names: list[str]) -> str:
