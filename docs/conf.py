@@ -60,5 +60,6 @@ def escape_bars(app, what, name, obj, options, lines):
 
 
 def setup(app):
-    """Connect the one hook."""
+    """Connect the hooks."""
+    gallery.connect(app)
     app.connect("autodoc-process-docstring", escape_bars, priority=100)
