@@ -28,6 +28,7 @@ SETTINGS = {
     "show_memory": False,
     "image_scrapers": ("matplotlib", "gallery.scrape_figures"),
     "capture_repr": (),
+    "write_computation_times": False,
 }
 
 
