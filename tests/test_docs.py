@@ -169,6 +169,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
     shutil.copytree(ROOT / "docs", source / "docs", ignore=made)
     for part in ("examples", "problems"):
         shutil.copytree(ROOT / part, source / part)
+    shutil.copytree(DEMO, source / DEMO.relative_to(ROOT))
     run(["-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", source / "docs", built], tmp_path)
     pages = {path.relative_to(built).as_posix() for path in built.rglob("*.html")}
     assert {"index.html", "laws/hysteresis.html", "reference/api/pilfr_casadi.diagnose.html"} <= pages
