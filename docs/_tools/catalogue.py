@@ -30,7 +30,8 @@ def motion() -> Local:
     """Two periods at full amplitude, then two small ones about another middle: a motion with major and minor loops."""
     dt = 0.005
     t = np.arange(0, 4, dt)
-    fade = np.clip((t - 2) / 0.25, 0, 1)
+    fade = np.clip((t - 2) / 0.5, 0, 1)
+    fade = fade**2 * (3 - 2 * fade)  # no jump of the rate
     z = (1 - 0.65 * fade) * np.sin(2 * np.pi * t) + 0.25 * fade
     return Local(z=z, dz=np.gradient(z, dt), dt=dt, lengths=(len(t),), max_stiffness=1e4, max_damping=1e2)
 
