@@ -53,16 +53,17 @@ def example(law: type[Law], forces: np.ndarray) -> np.ndarray:
 
 
 def draw(law: type[Law], force: np.ndarray, local: Local) -> Any:
-    """Draw a force over coordinate and rate, or a signal behind a law over the signal and over time."""
+    """Draw a force over coordinate and rate (or time), or a signal behind a law over the signal and over time."""
     figure = new_figure(7.2, 2.7)
     left, right = figure.subplots(1, 2)
+    t = local.dt * np.arange(len(local.z))
     if "parallel" in law.places:
         left.plot(local.z, force, color=BLUE)
-        right.plot(local.dz, force, color=BLUE)
         finish(left, "coordinate z", "force w")
-        finish(right, "rate dz/dt", "force w")
+        of_rate = "dz" in law.reads()
+        right.plot(local.dz if of_rate else t, force, color=BLUE)
+        finish(right, "rate dz/dt" if of_rate else "time [s]", "force w")
     else:
-        t = local.dt * np.arange(len(local.z))
         left.plot(local.z, local.z, color=GREY, linewidth=1)
         left.plot(local.z, local.z + force, color=BLUE)
         right.plot(t, local.z, color=GREY, linewidth=1)
