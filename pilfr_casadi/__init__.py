@@ -137,7 +137,12 @@ if TYPE_CHECKING:
         stable as stable,
     )
     from .report import fit_report as fit_report, write_report as write_report
-    from .simulators import Port as Port, Simulator as Simulator, from_function as from_function
+    from .simulators import (
+        Port as Port,
+        Simulator as Simulator,
+        from_fmu as from_fmu,
+        from_function as from_function,
+    )
     from .studies import campaign as campaign, read_run as read_run, run as run
 else:
     __getattr__, __dir__, _listed = lazy_face(__name__, __file__)
@@ -182,6 +187,7 @@ _ELSEWHERE = {
     "response_bound",
     "rmse",
     "select_order",
+    "ssnn",
     "stable",
     "standard_errors",
     "stop",

@@ -20,7 +20,17 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 PAGES = sorted(p.relative_to(ROOT).as_posix() for p in (ROOT / "docs").rglob("*.md"))
 QUICK = {  # pages of about a second; all others are slow
     f"docs/howto/{name}.md"
-    for name in ("fixed_parameters", "friction", "hold", "known_physics", "numpy", "own_law", "ports", "unknown_start")
+    for name in (
+        "fixed_parameters",
+        "fmu",
+        "friction",
+        "hold",
+        "known_physics",
+        "numpy",
+        "own_law",
+        "ports",
+        "unknown_start",
+    )
 }
 SAID = {
     "docs/start/axis.md": "leaves out Coulomb friction at guide.",
@@ -34,6 +44,7 @@ WRITTEN = {
     "docs/diagnose.md": {"report/report.html", "diagnosis/diagnosis.json"},
     "docs/identify.md": {"rig.json", "fit-report/report.html", "rig/model.json", "rig/simulated.csv"},
     "docs/howto/export.md": {"c/rig.c", "c/rig.h", "rig.casadi", "small/model.casadi", "small/c/small.c"},
+    "docs/howto/fmu.md": {"plant.fmu", "tiny/plant.fmu"},
     "docs/howto/table.md": {"from-table/diagnosis.json"},
 }
 LONG = {

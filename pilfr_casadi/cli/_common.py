@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 
 import typer
 
-from .._base import InputError
+from .._base import InputError, listed
 
 if TYPE_CHECKING:
     from ..data import Recording
@@ -133,7 +133,10 @@ class DataOptions:
 
 def simulator_files(metavar: str) -> Any:
     """Make the argument that takes a simulator file and recordings."""
-    text = "A Python file that sets `simulator` (or a model.json), then training recordings (.csv, .mat, .npz)."
+    text = (
+        "A Python file that sets `simulator` (or a model.json, or an FMU, which is a program that runs), then training "
+        "recordings (.csv, .mat, .npz)."
+    )
     return typer.Argument(..., metavar=metavar, help=text)
 
 
@@ -142,6 +145,12 @@ class SimulatorOptions(DataOptions):
     """Options of commands that compare a simulator with recordings."""
 
     files: list[str] = simulator_files("SIMULATOR TRAIN")
+    port: list[str] = option(
+        "Port of an FMU by its variables: an input that is a force, a coordinate, its speed (repeatable).",
+        "NAME=INTO:ACROSS[:RATE]",
+        [],
+    )
+    bound: list[str] = option("Bounds of a parameter of an FMU (repeatable).", "NAME=LOW:HIGH", [])
 
     @property
     def source(self) -> str | None:
@@ -178,13 +187,63 @@ class SimulatorOptions(DataOptions):
             raise InputError(f"--inputs and --outputs were given, but a simulator file has its own names{where}.")
         check_given_once(self.recordings)
 
+    def load_simulator(self) -> Any:
+        """Return the `simulator` of a Python file, the model of a model.json, or the simulator of an FMU."""
+        from ..identify import load
+        from ..simulators import simulator_variable
 
-def load_simulator(path: str) -> Any:
-    """Return the `simulator` of a Python file, or the model of a model.json."""
-    from ..identify import load
-    from ..simulators import simulator_variable
+        path = self.files[0]
+        kind = Path(path).suffix.lower()
+        if kind == ".fmu":
+            return self._load_fmu(path)
+        for name in ("port", "bound"):
+            if getattr(self, name):
+                raise InputError(f"--{name} was given, which is for an FMU; {path} has its own, leave it out.")
+        return load(path) if kind == ".json" else simulator_variable(path)
 
-    return load(path) if Path(path).suffix.lower() == ".json" else simulator_variable(path)
+    def _load_fmu(self, path: str) -> Any:
+        """Make a simulator of the inputs and outputs of an FMU that the first recording has."""
+        from ..data import column_names
+        from ..simulators import fmu_signals, from_fmu
+
+        ports = {}
+        for name, text in pairs(self.port, "--port").items():
+            parts = text.split(":")
+            if not 2 <= len(parts) <= 3 or not all(parts):
+                raise InputError(f"--port {name}={text} was given; write --port NAME=INTO:ACROSS or INTO:ACROSS:RATE.")
+            ports[name] = dict(zip(("into", "across", "rate"), parts, strict=False))
+        bounds = bounds_of(self.bound)
+        columns, recorded = self.columns(self.train[0]), set(column_names(self.train[0]))
+        kept = []
+        for role, names in zip(("input", "output"), fmu_signals(path), strict=True):
+            kept.append(tuple(name for name in names if columns.get(name, name) in recorded))
+            forces = {port["into"] for port in ports.values()}
+            left = [name for name in names if name not in kept[-1] and name not in forces]
+            if left and kept[-1]:
+                print(f"note: {self.train[0]} has no column for the {role}s {listed(left)} of {path}", flush=True)
+            if not kept[-1] and (role == "output" or len(left) > 0):
+                raise InputError(
+                    f"{self.train[0]} has no column for any {role} of {path} ({listed(names)}); rename its columns, or "
+                    f"say which they are, as in --column {names[0]}=COLUMN."
+                )
+        return from_fmu(path, ports=ports, bounds=bounds, inputs=kept[0], outputs=kept[1])
+
+
+def bounds_of(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Split each `NAME=LOW:HIGH`; an end that is left out is infinite."""
+    out = {}
+    for name, value in pairs(texts, "--bound").items():
+        low, sign, high = value.partition(":")
+        given = f"--bound {name}={value}"
+        if not sign:
+            raise InputError(f"{given} was given; write --bound NAME=LOW:HIGH.")
+        ends = number(low, given) if low else -math.inf, number(high, given) if high else math.inf
+        if not ends[0] <= ends[1]:
+            raise InputError(
+                f"The bounds {value} of {name} are infeasible: the lower one exceeds the upper one; swap them."
+            )
+        out[name] = ends
+    return out
 
 
 def name_list(text: str, option: str) -> tuple[str, ...]:

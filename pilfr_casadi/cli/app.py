@@ -24,7 +24,7 @@ COMMANDS = {  # name: (file, help)
     "check": ("diagnose", "Find what recordings can reveal about a simulator, before a diagnosis."),
     "diagnose": ("diagnose", "Find the physics that a simulator leaves out."),
     "simulate": ("models", "Simulate a saved model on a recording's inputs."),
-    "export": ("models", "Write a model's step as a serialized CasADi function or as C."),
+    "export": ("models", "Write a model's step as a serialized CasADi function, as C, or as an FMU."),
     "run": ("studies", "Execute the jobs of a run file one by one; finished jobs are skipped."),
     "campaign": (
         "studies",

@@ -25,7 +25,6 @@ from ._common import (
     SimulatorOptions,
     describe,
     flag,
-    load_simulator,
     make_folder,
     new_file,
     numbers_of,
@@ -98,7 +97,7 @@ def diagnose_command(options: DiagnoseOptions) -> int:
     if options.source is None:
         inputs, outputs = _simulated_names(options)
     else:
-        given = load_simulator(options.source)
+        given = options.load_simulator()
         simulator = as_simulator(given)
         inputs, outputs = simulator.inputs, simulator.output_names
     train = {path: options.read(path, inputs, outputs) for path in options.train}
@@ -276,7 +275,7 @@ def check_command(options: CheckOptions) -> int:
     options.check_files()
     if options.out is not None:
         new_file(options.out, "check.json", options.overwrite)
-    given = load_simulator(options.files[0])
+    given = options.load_simulator()
     simulator = as_simulator(given)
     recordings = [options.read(path, simulator.inputs, simulator.output_names) for path in options.train]
     folder = make_folder(options.out) if options.out is not None else None

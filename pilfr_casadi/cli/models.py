@@ -18,6 +18,7 @@ from .._base import (
     InputError,
     Progress,
     deferred_interrupt,
+    in_words,
     listed,
     progress_bar,
     time_limit,
@@ -47,13 +48,13 @@ from ._common import (
     INTERRUPTED,
     NO_RESULT,
     DataOptions,
+    bounds_of,
     check_given_once,
     check_names,
     describe,
     flag,
     make_folder,
     new_file,
-    number,
     numbers_of,
     option,
     pairs,
@@ -191,25 +192,8 @@ def _structure(options: FitOptions, train: Sequence[Recording], progress: Progre
             choice = select_order(train, range(1, 9), offset=True, progress=progress)
             nx, how = int(choice.recommended), "chosen on the training data"
         print(f"order: {nx}, {how}", flush=True)
-        given |= {"nx": nx, "bounds": _bounds(options.bound), "fix": numbers_of(options.fix, "--fix")}
+        given |= {"nx": nx, "bounds": bounds_of(options.bound), "fix": numbers_of(options.fix, "--fix")}
     return named_structure(structure, **{k: v for k, v in given.items() if v is not None})
-
-
-def _bounds(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Split each `NAME=LOW:HIGH`; an end that is left out is infinite."""
-    out = {}
-    for name, value in pairs(texts, "--bound").items():
-        low, sign, high = value.partition(":")
-        given = f"--bound {name}={value}"
-        if not sign:
-            raise InputError(f"{given} was given; write --bound NAME=LOW:HIGH.")
-        ends = number(low, given) if low else -np.inf, number(high, given) if high else np.inf
-        if not ends[0] <= ends[1]:
-            raise InputError(
-                f"The bounds {value} of {name} are infeasible: the lower one exceeds the upper one; swap them."
-            )
-        out[name] = ends
-    return out
 
 
 def announce_engine(task: PILFR | Lagged | Fit, recording: Recording, choice: str, quiet: bool = False) -> str:
@@ -415,6 +399,8 @@ class ExportOptions:
     out: str = option("Path of the file; with --c the folder of both files.", "FILE", ...)
     casadi: bool = flag("Write a file for casadi.Function.load, and one with its names (default).", "--casadi")
     c: bool = flag("Write C source and header that need no library.", "--c")
+    fmu: bool = flag("Write a co-simulation FMU, FILE.fmu, for this platform.", "--fmu")
+    fmi: Literal["2.0", "3.0"] | None = option("Version of the FMU (default: 2.0).")
     name: str = option("Name of the function (default: model).", "NAME", "model")
     smooth: float = option("Width of the rounding of min and max (default: 0, exact).", "EPS", 0.0)
     dt: float | None = option("Duration of a step, needed for a simulator.", "SECONDS")
@@ -424,8 +410,11 @@ class ExportOptions:
 @takes_options
 def export_command(options: ExportOptions) -> int:
     """The function maps (x, u) to (x_next, y), with the memory of the operators inside x."""
-    if options.casadi and options.c:
-        raise InputError("--casadi and --c were given; give one of them.")
+    kinds = [f"--{kind}" for kind in ("casadi", "c", "fmu") if getattr(options, kind)]
+    if len(kinds) > 1:
+        raise InputError(f"{in_words(kinds)} were given; give one of them.")
+    if options.fmi and not options.fmu:
+        raise InputError("--fmi was given, which is the version of an FMU; give --fmu too, or leave it out.")
     simulated = Path(options.model).suffix.lower() == ".py"
     source: Any = load_simulator(options.model) if simulated else load(options.model)
     for key in ("dt", "hold"):
@@ -438,6 +427,9 @@ def export_command(options: ExportOptions) -> int:
     if options.c:
         code, header = step.to_c(options.out)
         print(f"C source: {code}\nheader: {header}")
+        return DONE
+    if options.fmu:
+        print(f"FMU: {step.to_fmu(options.out, options.fmi or '2.0')}")
         return DONE
     if out.is_dir() or not out.parent.is_dir() or not os.access(out.parent, os.W_OK):
         raise InputError(f"--out {options.out} cannot be written; give a file in a folder that exists.")

@@ -10,7 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define SLOTS 16 /* more than the arguments, results and whole numbers of a generated function */
+#define SLOTS 64 /* more than the arguments, results and whole numbers of a generated function */
 #define LANE 8  /* columns are padded to a multiple of this */
 #define TILE 64 /* columns worked on at a time, so that the rows read again and again stay in the nearest cache */
 

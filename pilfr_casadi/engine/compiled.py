@@ -38,6 +38,8 @@ from platformdirs import user_cache_path
 
 from .._base import InputError, one_at_a_time
 from ..models import Model
+from ..simulators import calls_external
+from .external import Bindings, entry_point, external_names, fill_gaps, without_remarks
 from .sensitivities import BLOCKS, TARGETS, Engine, Linearization, VirtualMachine, linearize
 
 _SOURCES = {"x": 0, "s": 1, "z": 2, "w": 3}
@@ -65,7 +67,9 @@ class _Code:
         symbol = linear.symbols()
         stepped = linear.step(*(symbol[k] for k in linear.step.name_in()))
         blocks = linear.blocks(symbol)
-        (*found,), names, fixed = ca.extract_parametric([*stepped, *blocks.values()], symbol["p"], {})
+        found, names, fixed = [*stepped, *blocks.values()], [], []
+        if not calls_external(linear.step):  # extraction loses symbols between calls
+            (*found,), names, fixed = ca.extract_parametric(found, symbol["p"], {})
         stepped, blocks = found[: len(stepped)], dict(zip(blocks, found[len(stepped) :], strict=True))
         symbol["fixed"] = ca.vertcat(ca.SX(0, 1), *names)
         known = {e.element_hash(): (k, i) for k, v in symbol.items() for i, e in enumerate(v.elements())}
@@ -105,8 +109,10 @@ def source_code(linear: Linearization) -> str:
     at, sizes = code.at, linear.sizes
     options = {"with_header": False, "main": False, "indent": 0, "casadi_int": "long long"}
     generator = ca.CodeGenerator("generated", options)
-    for function in code.functions.values():
-        generator.add(function)
+    with without_remarks() if calls_external(linear.step) else contextlib.nullcontext():
+        for function in code.functions.values():
+            generator.add(function)
+        generated = generator.dump()
     lines = [f"static const double constants[] = {{{', '.join(map(repr, code.constants)) or '0'}}};"]
     staged, most = sizes["c"] > 0, 0
     for target in TARGETS if not staged else ():
@@ -136,7 +142,10 @@ def source_code(linear: Linearization) -> str:
     # a diagonal s_s lets the memory's slopes be advanced in place
     entries["keeps"] = str(int(linear.partial.sparsity_out(BLOCKS.index(("s", "s"))).is_diag()))
     model = ", ".join(f".{name} = {value}" for name, value in entries.items())
-    return "\n".join([generator.dump(), _text("_kernel.h"), *lines, f"const model_t pilfr_model = {{{model}}};\n"])
+    lines = [_text("_kernel.h"), *lines, f"const model_t pilfr_model = {{{model}}};\n"]
+    if not calls_external(linear.step):
+        return "\n".join([generated, *lines])
+    return "\n".join([_text("_external.h"), fill_gaps(generated), *lines])
 
 
 def _entries(linear: Linearization, code: _Code, target: str) -> Iterator[tuple[str, int, int, int]]:
@@ -333,10 +342,14 @@ class Compiled:
     def __init__(self, model: Model) -> None:
         self.linear = linearize(model)
         self.loops = _loops(cache_directory())
-        self.library = _load(build(source_code(self.linear)))
+        source = source_code(self.linear)
+        self.library = _load(build(source))
+        self.bindings = Bindings(self.library, external_names(source), build)
         self.model = ctypes.byref(ctypes.c_char.in_dll(self.library, "pilfr_model"))
 
     def _call(self, name: str, *arguments: Any) -> None:
+        if self.bindings.names:
+            self.bindings.bind()
         if getattr(self.loops, name)(self.model, *arguments):
             raise MemoryError("the compiled model found no memory for its slopes")
 
@@ -375,7 +388,8 @@ def make_engine(model: Model, engine: str = "auto") -> Engine:
     """Make the engine for a closed model: "c", "vm", or "auto" (C where there is a compiler that works)."""
     if engine not in ("auto", "c", "vm"):
         raise InputError(f"The engine {engine!r} is unknown; use 'auto', 'c' or 'vm'.")
-    if engine == "vm" or (engine == "auto" and compiler() is None):
+    without = compiler() is None or (calls_external(model.step) and entry_point() is None)
+    if engine == "vm" or (engine == "auto" and without):
         return VirtualMachine(model)
     try:
         return Compiled(model)

@@ -26,6 +26,7 @@ import numpy as np
 
 from .._base import one_at_a_time
 from ..models import Model
+from ..simulators import calls_external
 
 TARGETS = {
     "z": ("x", "p"),
@@ -78,7 +79,9 @@ def linearize(model: Model) -> Linearization:
     by_c, x_next = stages(x, u, w, p, c)[1:] if stages else (c, x_next)
     value = {"z": model.port(x, u, p), "w": w_out, "s": s_next, "c": by_c, "x": x_next, "y": y}
     symbol = {"x": x, "s": s, "z": z, "w": w, "c": c, "u": u, "p": p}
-    blocks = [ca.jacobian(value[target], symbol[source]) for target, source in BLOCKS]
+    # calls of other programs are differentiated along directions alone
+    options = {"helper_options": {"ad_weight": 0.0}} if calls_external(step) else {}
+    blocks = [ca.jacobian(value[target], symbol[source], options) for target, source in BLOCKS]
     names = [f"{target}_{source}" for target, source in BLOCKS]
     partial = ca.Function("pilfr_partial", list(symbol.values()), ca.cse(blocks), list(symbol), names)
     sizes = {k: int(v.shape[0]) for k, v in symbol.items()}

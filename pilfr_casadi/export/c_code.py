@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,20 +62,25 @@ def write_c(
     x, u = (ca.MX.sym(key, step.size1_in(key)) for key in ("x", "u"))
     # long ones hold a loop and stay as they are, called from a function of the right name
     function = step.expand(inner) if step.is_a("SXFunction") else ca.Function(inner, [x, u], step.call([x, u]))
-    generator = ca.CodeGenerator(inner)
-    generator.add(function)
     entries = {}
     for letter, role in (("X", "states"), ("U", "inputs"), ("Y", "outputs")):
         constants = _constant_names(f"{big}_{letter}_", list(names[role]))
         comments = [_clean_comment(_describe_entry(names, entry)) for entry in names[role]]
         entries[letter] = list(zip(constants, comments, strict=True))
     values = {**names, "big": big, "entries": entries, "interpolated": interpolated, "function": function}
-    header = write_atomically(target / f"{name}.h", _fill("_step.h", values))
-    values["code"] = _use_all_parameters(generator.dump())
-    return write_atomically(target / f"{name}.c", _fill("_step.c", values)), header
+    header = write_atomically(target / f"{name}.h", fill_template("_step.h", values))
+    values["code"] = generate_code(function)
+    return write_atomically(target / f"{name}.c", fill_template("_step.c", values)), header
 
 
-def _fill(template: str, values: Mapping[str, Any]) -> str:
+def generate_code(function: ca.Function) -> str:
+    """Generate the C code of a function."""
+    generator = ca.CodeGenerator(function.name())
+    generator.add(function)
+    return _use_all_parameters(generator.dump())
+
+
+def fill_template(template: str, values: Mapping[str, Any]) -> str:
     """Fill a template of this folder."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -97,6 +102,16 @@ def _use_all_parameters(code: str) -> str:
         return "\n  ".join([match[0], " ".join(f"(void){name};" for name in names)])
 
     return re.sub(r"^[^\n]*\(([^()\n]*\bint mem)\) \{$", mark_used, code, flags=re.MULTILINE)
+
+
+def make_unique(names: Iterable[str]) -> tuple[str, ...]:
+    """Append underscores to names that are taken already."""
+    out: list[str] = []
+    for name in names:
+        while name in out:
+            name += "_"
+        out.append(name)
+    return tuple(out)
 
 
 def _describe_entry(names: Mapping[str, Any], name: str) -> str:

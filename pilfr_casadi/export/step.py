@@ -23,10 +23,11 @@ import numpy as np
 from .._base import LARGEST, InputError, is_number, numbers, path_text, positive, whole, write_atomically
 from ..data import Recording
 from ..engine import make_engine
-from ..models import Model, PrandtlIshlinskii
+from ..models import Model, ParameterSet, PrandtlIshlinskii
 from ..optimise import first_state
-from ..simulators import ClosedEquations, Instant, Simulator, choose_substeps, discretise, on_grid
-from .c_code import check_name, write_c
+from ..simulators import ClosedEquations, Instant, Simulator, calls_external, choose_substeps, discretise, on_grid
+from .c_code import check_name, make_unique, write_c
+from .fmu import FmuContent, write_fmu
 from .smoothing import enclose, smooth_kinks
 
 FORMAT, VERSION = "pilfr_casadi function", 1
@@ -133,9 +134,15 @@ class Exported:
         Number of sub-steps in a step.
     memory_names : tuple of str
         States that are memory of operators. The shift register of a delay is not among them: it moves at every step.
+    parametric : casadi.Function
+        The same sub-step with the parameters as an argument, `(x, row, p) -> (x_next, y)`.
+    parameters : ParameterSet
+        The entries of p, with the values that `one` holds as constants.
     """
 
     one: ca.Function
+    parametric: ca.Function
+    parameters: ParameterSet
     reads: tuple[str, ...]
     substeps: int
     dt: float
@@ -153,23 +160,33 @@ class Exported:
     @cached_property
     def step(self) -> CheckedStep:
         """The function `(x, u) -> (x_next, y)`."""
-        one = smooth_kinks(self.one, self.smooth) if self.smooth else self.one
+        x, u, x_next, y = self._over_sample(self.one)
+        return CheckedStep(ca.Function(self.name, [x, u], [x_next, y], ["x", "u"], ["x_next", "y"]))
+
+    def step_with_parameters(self, name: str) -> ca.Function:
+        """Make the function `(x, u, p) -> (x_next, y)`; p (n_p,) is the vector of `parameters`."""
+        p = (ca.SX if self.substeps <= INLINE else ca.MX).sym("p", self.parameters.size)
+        x, u, x_next, y = self._over_sample(self.parametric, p)
+        return ca.Function(name, [x, u, p], [x_next, y], ["x", "u", "p"], ["x_next", "y"])
+
+    def _over_sample(self, one: ca.Function, *p: Any) -> tuple[Any, Any, Any, Any]:
+        """Run the sub-steps of a sample; return x, u and the expressions of x_next and y."""
+        one = smooth_kinks(one, self.smooth) if self.smooth else one
         own = len(self.states) - self.timed
         kind = ca.SX if self.substeps <= INLINE else ca.MX
         x, u = kind.sym("x", len(self.states)), kind.sym("u", len(self.inputs))
         t = x[own] if self.timed else kind(0)
         rows = self._rows(u, t, ca.vertcat)
         if kind is ca.SX:
-            state, y = one(x[:own], rows[0])
+            state, y = one(x[:own], rows[0], *p)
             for row in rows[1:]:
-                state = one(state, row)[0]
+                state = one(state, row, *p)[0]
         else:
-            first = one(x[:own], rows[0])
+            first = one(x[:own], rows[0], *p)
             run = one.mapaccum(self.substeps - 1)
-            state, y = run(first[0], ca.horzcat(*rows[1:]))[0][:, -1], first[1]
+            state, y = run(first[0], ca.horzcat(*rows[1:]), *p)[0][:, -1], first[1]
         state = ca.vertcat(state, t + self.dt) if self.timed else state
-        x_next, y = ca.densify(state), ca.densify(y)
-        return CheckedStep(ca.Function(self.name, [x, u], [x_next, y], ["x", "u"], ["x_next", "y"]))
+        return x, u, ca.densify(state), ca.densify(y)
 
     @property
     def timed(self) -> bool:
@@ -225,6 +242,14 @@ class Exported:
             out.append(stack(*(columns[name] for name in self.reads)))
         return out
 
+    def _check_closed(self) -> None:
+        """Refuse to write a step that calls another program."""
+        if calls_external(self.one):
+            raise InputError(
+                "The equations call another program (an FMU or a Python function), which no file can hold; use `step` "
+                "in this process."
+            )
+
     def names(self) -> dict[str, Any]:
         """Return everything but the function as plain JSON."""
         return {
@@ -250,8 +275,9 @@ class Exported:
         Raises
         ------
         InputError
-            If a file cannot be written.
+            If a file cannot be written, or the equations call another program.
         """
+        self._check_closed()
         text = json.dumps(self.names(), indent=1, allow_nan=False) + "\n"
         write_atomically(f"{path_text(path, 'file')}{NAMES}", text)
         with tempfile.TemporaryDirectory() as folder:
@@ -272,9 +298,41 @@ class Exported:
         Raises
         ------
         InputError
-            If the folder cannot be made or written.
+            If the folder cannot be made or written, or the equations call another program.
         """
+        self._check_closed()
         return write_c(folder, self.step, self.names(), self.interpolated)
+
+    def to_fmu(self, path: str | os.PathLike[str], fmi: str = "2.0") -> Path:
+        """Write a co-simulation FMU for this platform, with its C source inside.
+
+        A communication step is one sample of `dt` seconds or several. Parameters that were held are `fixed` in the FMU,
+        the others `tunable` within their bounds. States are the variables `state.<name>`, whose start values can be set
+        before the initialisation; the memory of hysteresis is among them, and saved with the FMU's state. Where inputs
+        are interpolated, `der(<input>)` is the slope of an input from this sample to the next one; in FMI 2.0
+        `fmi2SetRealInputDerivatives` sets it too.
+
+        Parameters
+        ----------
+        path : path
+            File whose name ends in `.fmu`.
+        fmi : {"2.0", "3.0"}
+            Version of the standard (https://fmi-standard.org).
+
+        Returns
+        -------
+        Path
+            The file.
+
+        Raises
+        ------
+        InputError
+            If there is no working C compiler, the file cannot be written, or the equations call another program.
+        """
+        self._check_closed()
+        time = len(self.states) - 1 if self.timed else None
+        step = self.step_with_parameters(f"{self.name.rstrip('_')}_casadi")
+        return write_fmu(path, FmuContent(step, self.names(), self.parameters, self.interpolated, time), fmi)
 
     def to_control(self) -> Any:
         """Return the model as a `control.NonlinearIOSystem` in discrete time; dots in names become underscores.
@@ -287,7 +345,7 @@ class Exported:
             return self.step(np.atleast_1d(x), np.atleast_1d(u))
 
         def without_dots(names: Iterable[str]) -> tuple[str, ...]:
-            return _make_unique(name.replace(".", "_") for name in names)
+            return make_unique(name.replace(".", "_") for name in names)
 
         return control.NonlinearIOSystem(
             (lambda t, x, u, params: np.asarray(step(x, u)[0]).ravel()) if self.states else None,
@@ -492,20 +550,27 @@ def _build_step(model: Model, dt: float, simulator: Simulator | None = None) -> 
     x, row = ca.SX.sym("x", model.n_state), ca.SX.sym("row", model.n_u)
     stepped = model.closed(x, row, ca.DM(model.parameters.start))
     one = ca.Function("one", [x, row], [ca.densify(e) for e in stepped], ["x", "row"], ["x_next", "y"])
+    p = ca.SX.sym("p", model.parameters.size)
+    stepped = model.closed(x, row, p)
+    found = [ca.densify(e) for e in stepped]
+    parametric = ca.Function("one", [x, row, p], found, ["x", "row", "p"], ["x_next", "y"])
+    parameters = model.parameters if simulator is None else simulator.readable_parameters()
     if simulator is None:
         states, thresholds, memory = _name_element_states(model)
     else:
         states, thresholds, memory = _name_law_states(model, dt, simulator)
     inputs = model.inputs + (tuple(f"{name}{NEXT}" for name in model.inputs) if "next" in model.reads else ())
-    names = _make_unique([*states, *([TIME] if "t" in model.reads else [])])
+    names = make_unique([*states, *([TIME] if "t" in model.reads else [])])
     renamed = dict(zip(states, names, strict=False))
     return Exported(
         one=one,
+        parametric=parametric,
+        parameters=parameters,
         reads=model.reads,
         substeps=model.substeps,
         dt=dt,
         states={name: i for i, name in enumerate(names)},
-        inputs=_make_unique(inputs),
+        inputs=make_unique(inputs),
         outputs=model.outputs,
         thresholds={renamed[name]: value for name, value in thresholds.items()},
         memory_names=tuple(renamed[name] for name in memory),
@@ -560,13 +625,3 @@ def _name_law_states(model: Model, dt: float, simulator: Simulator) -> tuple[lis
         memory += own
         operators += [] if getattr(element.law, "shifts", False) else own
     return [*simulator.states, *flows, *memory], thresholds, operators
-
-
-def _make_unique(names: Iterable[str]) -> tuple[str, ...]:
-    """Append underscores to names that are taken already."""
-    out: list[str] = []
-    for name in names:
-        while name in out:
-            name += "_"
-        out.append(name)
-    return tuple(out)

@@ -2,8 +2,9 @@
 
 `equations` evaluates them with their laws, `integration` makes them a discrete-time `Model`, `simulator` holds the
 class `Simulator` and the state in which its laws begin at rest, and `adapters` accept a Python file, a state space or a
-fitted model in its place. `numpy_function` makes one from a NumPy function, whose equations `tracing` finds by calling
-it with the `symbols` of the file of that name.
+fitted model in its place. `fmu` makes one of a functional mock-up unit, which its equations call (`external`,
+`fmu_description`, `fmu_instance`). `numpy_function` makes one from a NumPy function, whose equations `tracing` finds by
+calling it with the `symbols` of the file of that name; one that cannot be followed stays a `black_box`.
 """
 
 from typing import TYPE_CHECKING
@@ -17,7 +18,17 @@ if TYPE_CHECKING:
         simulator_variable as simulator_variable,
         user_variable as user_variable,
     )
+    from .black_box import Numeric as Numeric
     from .equations import Named as Named, Placed as Placed, Port as Port, in_series as in_series
+    from .external import (
+        PythonFunction as PythonFunction,
+        calls_external as calls_external,
+        leaves as leaves,
+        units as units,
+    )
+    from .fmu import from_fmu as from_fmu
+    from .fmu_description import fmu_signals as fmu_signals
+    from .fmu_instance import FmuInstance as FmuInstance
     from .integration import (
         LARGEST_STEP as LARGEST_STEP,
         MOST_SUBSTEPS as MOST_SUBSTEPS,

@@ -2,7 +2,8 @@
 
 The function is called with symbols (`tracing`), which gives its equations. They are compared with the function itself
 at random points. From then on the simulator has equations like any other, with exact derivatives and compiled code, and
-the function is not called any more.
+the function is not called any more. A function that cannot be followed stays as it is with `symbolic=False`
+(`black_box`).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import traceback
 import types
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ import numpy as np
 
 from .._base import InputError, in_words, listed
 from ..models import Named, Parameter, ParameterSet
+from .black_box import BlackBox, Numeric, nominal_sizes
 from .simulator import Simulator
 from .symbols import NotFollowed, expression, symbols
 from .tracing import Trace, accept_symbols, follow
@@ -45,6 +47,7 @@ def from_function(
     hold: str | None = None,
     discrete: bool = False,
     units: Mapping[str, str] | None = None,
+    numeric: Numeric | None = None,
 ) -> Simulator:
     """Make a simulator from a NumPy function.
 
@@ -62,11 +65,15 @@ def from_function(
     ports, hold, discrete, units
         As of `Simulator`; ports use `x.<state>`, `u.<input>`, `p.<parameter>`. With `discrete` the function returns the
         next sample's states.
+    numeric : Numeric, optional
+        Call the function with numbers at every step, instead of finding its equations: for compiled libraries, maps and
+        solvers. It must not have memory or random numbers. A fit then takes as long as its calls do.
 
     Returns
     -------
     Simulator
-        With the function's equations. Its print says how often the function was called to find and check them.
+        With the function's equations. Its print says how often the function was called to find and check them; with
+        `numeric`, how often it has been called.
 
     Raises
     ------
@@ -89,11 +96,14 @@ def from_function(
     ('pos',)
     """
     names = _Names(_tuple(states, "states"), _tuple(inputs, "inputs"), _parameter_set(parameters))
-    dynamics = _equations(function, "derivatives", names, names.states)
+    dynamics = _made(function, "derivatives", names, names.states, numeric)
     if not callable(outputs):
         measured: Any = _MeasuredStates(_measured(outputs, names.states))
     else:
-        measured = _equations(outputs, "outputs", names, None)
+        measured = _made(outputs, "outputs", names, None, numeric and replace(numeric, jacobian=None))
+    for made in (dynamics, measured):
+        if isinstance(made, BlackBox) and not (discrete and made is dynamics):
+            made.find_equal_states()
     own = (names.states, names.inputs, names.parameters)
     return Simulator(dynamics, measured, *own, ports, hold, discrete, units=units or {})
 
@@ -144,6 +154,38 @@ class _MeasuredStates:
 
     def __call__(self, x: Named) -> dict[str, Any]:
         return {n: x[n] for n in self.states}
+
+
+def _made(
+    function: Any, kind: str, names: _Names, found: tuple[str, ...] | None, numeric: Numeric | None
+) -> _Equations | BlackBox:
+    """Find the equations of a function, or make one that is called with numbers."""
+    if numeric is None:
+        return _equations(function, kind, names, found)
+    called = getattr(function, "__name__", type(function).__name__)
+    _check_arguments(function, called, kind)
+    rows, values = _evaluate(function, called, kind, names, found)
+    every = (*names.states, *names.inputs, *names.parameters)
+    counts = [*(1 for _ in (*names.states, *names.inputs)), *(p.size for p in names.parameters.values())]
+    sizes = nominal_sizes(numeric.nominal, every, counts)
+    at = np.cumsum([1, len(names.states), len(names.inputs)])
+
+    latest: list[Any] = [b"", None]  # parameters change once in a run
+
+    def arguments(z: np.ndarray) -> tuple[Any, ...]:
+        if (key := z[at[2] :].tobytes()) != latest[0] or latest[1] is None:
+            latest[:] = key, _numbers((0.0, z[:0], z[:0], z[at[2] :]), names.parameters)[3]
+        return float(z[0]), z[1 : at[1]].copy(), z[at[1] : at[2]].copy(), latest[1]
+
+    def evaluate(z: np.ndarray) -> np.ndarray:
+        result = function(*arguments(z))
+        result = [result[n] for n in rows] if kind == "outputs" else result
+        return np.array(result, dtype=float).reshape(len(rows))
+
+    by, own = numeric.jacobian, (names.states, names.inputs, tuple(names.parameters))
+    made = BlackBox(evaluate, called, rows, own, None if by is None else (lambda z: by(*arguments(z))), sizes)
+    made.points = [(np.hstack(point), row) for point, row in values if np.all(np.isfinite(row))]
+    return made
 
 
 def _equations(function: Any, kind: str, names: _Names, found: tuple[str, ...] | None) -> _Equations:

@@ -132,6 +132,10 @@ class Simulator(Equations):
             lines.append(f"  {name} = {value} {self._unit(name)}{' (fixed)' if np.all(p.fixed) else ''}".rstrip())
         return "\n".join(lines)
 
+    def readable_parameters(self) -> ParameterSet:
+        """Copy of the parameters with those of a law in the units of its port."""
+        return ParameterSet({name: replace(p, unit=self._unit(name)) for name, p in self.parameters.items()})
+
     def _unit(self, name: str) -> str:
         """Unit of a parameter, that of a law in the units of its port."""
         unit = self.parameters[name].unit

@@ -1,0 +1,158 @@
+"""Functions that CasADi cannot look into, in equations: a call by numbers, with derivatives along directions.
+
+The equations hold a call of `r = f(z)`. Their derivatives call it too: along a direction s, by the function's own
+derivative `J(z) s` where it has one, else by a difference
+
+    (f(z + h s) - r) / h,   h = ε / Σ_j |s_j| / max(|z_j|, nominal_j),   ε = square root of the rounding.
+
+So a sensitivity costs one call for each state and free parameter at each stage of the integration. Every result is
+taken to depend on every argument. Second derivatives are left out: they matter where the rate of a port is not given
+and its coordinate is a curved function of the states.
+
+A leaf is a function that is a program of its own: a Python function or a functional mock-up unit. Generated C cannot
+hold it and calls it by its name in `leaves`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .fmu_instance import FmuFile
+
+STEP = float(np.sqrt(np.finfo(float).eps))  # relative step at which rounding and curvature disturb a difference alike
+NOMINAL = 1e-3  # size of an argument that is zero: small beside values in SI units, far above rounding
+SAME = 1e-9  # relative difference that rounding may cause
+TINY = 1e-100  # against division by zero along a direction of zeros
+leaves: dict[str, ca.Function] = {}  # by name; CasADi itself does not keep callbacks alive
+units: dict[str, FmuFile] = {}  # of leaves that are functional mock-up units
+
+
+def keep_leaf(function: ca.Function, unit: FmuFile | None = None) -> ca.Function:
+    """Enter a function into `leaves`; its name must be unique, and for a program the same in any process."""
+    leaves[function.name()] = function
+    if unit is not None:
+        units[function.name()] = unit
+    return function
+
+
+def calls_external(function: ca.Function) -> bool:
+    """Tell whether a function of SX expressions calls one that CasADi cannot look into."""
+    return any(function.instruction_id(k) == ca.OP_CALL for k in range(function.n_instructions()))
+
+
+Expression = Callable[..., Any]
+
+
+def external(evaluate: Expression, nominal: np.ndarray, results: int, slope: Expression | None = None) -> ca.Function:
+    """Make a function that is called as it is when symbols are given to it.
+
+    Parameters
+    ----------
+    evaluate : callable
+        From symbols z (n,) to the expression r (m,) that calls a program (`call_external`).
+    nominal : array, (n,)
+        Sizes of the arguments, by which differences are scaled where z is smaller.
+    results : int
+        m.
+    slope : callable, optional
+        From symbols z and s to `J(z) s`.
+
+    Returns
+    -------
+    casadi.Function
+        `z -> r`, with the reciprocal sizes of z behind r for the derivatives; `call_external` puts it into expressions.
+    """
+    n, m = len(nominal), results
+    z, s, r, row = (ca.SX.sym(k, size) for k, size in (("z", n), ("s", n), ("r", m + n), ("l", m + n)))
+
+    def along(s: Any) -> Any:
+        if slope is not None:
+            return slope(z, s)
+        h = STEP / (ca.dot(ca.fabs(s), r[m:]) + TINY)
+        return (evaluate(z + h * s) - r[:m]) * (1 / h)
+
+    def across(row: Any) -> Any:  # along each argument in turn: CasADi asks for it only where results are few
+        columns = [along(ca.SX(ca.DM(np.eye(n)[:, j]))) for j in range(n)]
+        return ca.horzcat(*columns).T @ row[:m]
+
+    none = ca.SX.zeros(n)
+    # a slope changes with its direction; how it changes with z is left out
+    turned, slopes = ca.SX.sym("turned", n), ca.SX.sym("slopes", m + n)
+    changes = [z, r, s, slopes, ca.SX.sym("dz", n), ca.SX.sym("dr", m + n), turned]
+    cache = {
+        "fwd1_fwd1_external": ca.Function("fwd1_fwd1_external", changes, [ca.vertcat(along(turned), none)]),
+        "adj1_fwd1_external": ca.Function(
+            "adj1_fwd1_external", [z, r, s, slopes, row], [none, ca.SX.zeros(m + n), across(row)]
+        ),
+    }
+    forward = ca.Function("fwd1_external", [z, r, s], [ca.vertcat(along(s), none)], {"cache": cache})
+    reverse = ca.Function("adj1_external", [z, r, row], [across(row)])
+    # zero, and a dependence of all results on all arguments: some programs state too few, and lose derivatives
+    dependence = ca.fmin(ca.fabs(ca.sum1(z)), 0.0)
+    found = ca.vertcat(evaluate(z) + dependence, 1 / ca.fmax(ca.fabs(z), nominal))
+    options = {"never_inline": True, "cache": {"fwd1_external": forward, "adj1_external": reverse}}
+    return ca.Function("external", [z], [found], ["z"], ["r"], options)
+
+
+def call_external(function: ca.Function, *arguments: Any) -> Any:
+    """Call a function within SX expressions, where CasADi would otherwise write out its formulas; stack its results."""
+    return ca.vertcat(*function.call([ca.SX(a) for a in arguments], False, True))
+
+
+def equal_state(values: np.ndarray, states: np.ndarray, names: Sequence[str]) -> str:
+    """Return the name of the state that equals some values at all points, else ""; values (K,), states (K, n)."""
+    same = np.all(np.abs(values[:, None] - states) <= SAME * np.abs(states), axis=0) & np.any(states, axis=0)
+    return names[int(np.argmax(same))] if np.any(same) else ""
+
+
+class PythonFunction(ca.Callback):
+    """A Python function of one array as a `casadi.Function`; where it fails, its results are not numbers.
+
+    Attributes
+    ----------
+    calls : int
+        How often it was called.
+    failure : Exception or None
+        Its first error.
+    """
+
+    def __init__(self, function: Callable[..., np.ndarray], n_in: tuple[int, ...], n_out: int) -> None:
+        ca.Callback.__init__(self)
+        self.function, self.sizes, self.size = function, n_in, n_out
+        self.calls = 0
+        self.failure: Exception | None = None
+        self.construct(f"python{len(leaves)}", {})
+        keep_leaf(self)
+
+    def get_n_in(self) -> int:
+        """Number of arguments."""
+        return len(self.sizes)
+
+    def get_n_out(self) -> int:
+        """Number of results."""
+        return 1
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Shape of an argument."""
+        return ca.Sparsity.dense(self.sizes[i], 1)
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Shape of the result."""
+        return ca.Sparsity.dense(self.size, 1)
+
+    def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:
+        """Call the function, for CasADi."""
+        return [ca.DM(self.evaluate([a.full().ravel() for a in arguments]))]
+
+    def evaluate(self, arguments: list[np.ndarray]) -> np.ndarray:
+        """Call the function; a failed point is a failed trial, not the end."""
+        self.calls += 1
+        try:
+            return self.function(*arguments)
+        except Exception as error:
+            self.failure = self.failure or error
+            return np.full(self.size, np.nan)

@@ -1,0 +1,347 @@
+"""Simulators from functional mock-up units for model exchange (https://fmi-standard.org), FMI 2.0 and 3.0.
+
+CasADi loads the unit and evaluates its derivatives and outputs; differences along directions give their derivatives
+(`external`), because CasADi takes both not to depend on parameters. Where a derivative or an output equals a state at
+every point of a trial, the equations say so instead of calling the unit.
+
+A force in a port enters an input of the unit, to which it adds. States are counted from their start values. Events are
+not looked for: a step of the integration runs over them.
+
+A unit is a program and runs with the rights of the user. It is loaded in a process of its own first, so that one that
+ends its process ends that one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .._base import InputError, listed, run_in_worker
+from ..models import Named, Parameter
+from .equations import Port
+from .external import NOMINAL, SAME, call_external, equal_state, external, keep_leaf
+from .fmu_description import Variable, check_file, describe, tidy
+from .fmu_instance import FmuFile, unpack
+from .simulator import Simulator
+
+POINTS = 8  # at which a trial compares derivatives and outputs with states, and looks at what ports do
+TIMES = (0.0, 0.7, 13.0, 400.0)  # s, at which a trial looks for a dependence on time
+WITHIN = 10.0  # factor by which a parameter may move where the unit states no bounds
+PATIENCE = 60.0  # seconds that loading may take
+
+
+@dataclass(frozen=True, eq=False)
+class _Unit:
+    """A loaded unit: its description, and `(t, x, u, p) -> (derivatives, outputs)`."""
+
+    path: Path
+    variables: Mapping[str, Variable]
+    leaf: ca.Function
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    parameters: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    @classmethod
+    def load(cls, path: Path, outputs: Sequence[str] | None = None) -> _Unit:
+        """Load a unit whose file has been checked, with some of its outputs."""
+        folder, key = unpack(path)
+        builder = ca.DaeBuilder("unit", str(folder), {"enable_ls_serialization": False})
+        if outputs is not None:
+            builder.set_y(list(outputs))
+        names = [tuple(getattr(builder, kind)()) for kind in ("x", "u", "p", "y")]
+        key = hashlib.sha256(f"{key} {names}".encode()).hexdigest()[:16]
+        leaf = builder.create(f"fmu_{key}", ["t", "x", "u", "p"], ["ode", "y"])
+        described = describe(path)
+        variables = described.variables
+        roles = zip("xupy", names, strict=True)
+        references = {role: [variables[n].reference for n in found] for role, found in roles}
+        direct = described.states == names[0]  # else its order of the states is another one
+        file = FmuFile(folder, int(described.version), described.token, described.binary, references)
+        return cls(path, variables, keep_leaf(leaf, file if direct else None), *names)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Load the file again in another process."""
+        return _Unit.load, (self.path, self.outputs)
+
+    def starts(self, names: Sequence[str]) -> np.ndarray:
+        """Start values, zero where there is none."""
+        return np.nan_to_num(np.array([self.variables[n].start for n in names]))
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Numbers of t, x, u and p."""
+        return 1, len(self.states), len(self.inputs), len(self.parameters)
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """`z -> (derivatives, outputs)` in one vector, for expressions; z holds t, x, u and p."""
+
+        def evaluate(z: Any) -> Any:
+            return call_external(self.leaf, *(z[a:b] for a, b in pairwise(np.cumsum([0, *self.sizes]).tolist())))
+
+        nominal = [1.0, *(self.variables[n].nominal for n in (*self.states, *self.inputs, *self.parameters))]
+        sizes = NOMINAL * np.nan_to_num(np.array(nominal), nan=1.0)
+        return external(evaluate, sizes, len(self.states) + len(self.outputs))
+
+    def values(self, t: float, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """Evaluate derivatives and outputs by numbers."""
+        return np.concatenate([np.asarray(a.full()).ravel() for a in self.leaf(t, x, u, p)])
+
+
+def from_fmu(
+    path: str | os.PathLike[str],
+    *,
+    ports: Mapping[str, Mapping[str, Any]] | None = None,
+    parameters: Sequence[str] | Mapping[str, Parameter] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    hold: str | None = None,
+) -> Simulator:
+    """Make a simulator from a functional mock-up unit for model exchange.
+
+    Parameters
+    ----------
+    path : path
+        An `.fmu` file. It is a program, and runs as such.
+    ports : mapping, optional
+        By name of a port `dict(into=..., across=..., rate=...)` with names of the unit's variables: `into` an input to
+        which a law's force is added with the opposite sign (friction opposes motion), or `{input: factor}`; `across` an
+        output or a state, the local coordinate; `rate`, which may be left out, its speed. By default each state's
+        equation is a port. Actuators and sensors are always ports.
+    parameters : names, or mapping from names to Parameter, optional
+        Tunable parameters that a fit may change; by default all. The others keep the unit's values.
+    bounds : mapping, optional
+        `(lower, upper)` by parameter; by default those of the unit, else a factor of ten either way.
+    inputs, outputs : tuple of str, optional
+        Inputs and outputs that are recorded; by default all that no port uses. Other inputs keep their start values.
+    hold : {"zero", "linear"}, optional
+        As of `Simulator`.
+
+    Returns
+    -------
+    Simulator
+        Its states are deviations from the unit's start values.
+
+    Raises
+    ------
+    InputError
+        If the file is no unit for model exchange on this platform, or a name is not one of its variables.
+    """
+    path = Path(path)
+    check_file(path)
+    _check_program(path)
+    given, unit = dict(ports or {}), _Unit.load(path)
+    for name, port in given.items():
+        if not isinstance(port, Mapping):
+            raise InputError(f"The port {name!r} is {port!r}; give dict(into=INPUT, across=VARIABLE, rate=VARIABLE).")
+    used = [name for port in given.values() for name in _factors(port.get("into"))]
+    own = parameters if parameters is not None else unit.parameters
+    for names, there, kind in (
+        (used, unit.inputs, "inputs"),
+        (inputs or (), unit.inputs, "inputs"),
+        (outputs or (), unit.outputs, "outputs"),
+        ((*own, *(bounds or {})), unit.parameters, "tunable parameters"),
+    ):
+        _check_names(names, there, kind, path)
+    free = tuple(own)
+    drives = tuple(inputs) if inputs is not None else tuple(n for n in unit.inputs if n not in used)
+    measured = tuple(outputs) if outputs is not None else unit.outputs
+    read = {port.get(key) for port in given.values() for key in ("across", "rate")}
+    needed = [n for n in unit.outputs if n in measured or n in read]
+    equations = _Equations(_Unit.load(path, needed), drives, free, measured)
+    made = own if isinstance(own, Mapping) else {n: _parameter(unit.variables[n], (bounds or {}).get(n)) for n in own}
+    return Simulator(
+        equations.dynamics,
+        equations.measured,
+        unit.states,
+        drives,
+        made,
+        tuple(equations.port(name, port) for name, port in given.items()),
+        hold,
+        units={n: unit.variables[n].unit for n in (*drives, *measured)},
+    )
+
+
+class _Equations:
+    """The equations of a unit with some of its inputs, parameters and outputs.
+
+    Parameters
+    ----------
+    unit : _Unit
+    inputs, free, outputs : tuple of str
+        Inputs and parameters that are symbols; outputs that are given.
+    """
+
+    def __init__(self, unit: _Unit, inputs: tuple[str, ...], free: tuple[str, ...], outputs: tuple[str, ...]) -> None:
+        self.unit, self.inputs, self.free, self.outputs = unit, inputs, free, outputs
+        rows = (*map(_rate, unit.states), *unit.outputs)
+        points = list(self._points())
+        found = np.array([unit.values(*point) for point in points])
+        if not np.all(np.isfinite(found)):
+            row = rows[int(np.argmin(np.all(np.isfinite(found), axis=0)))]
+            raise InputError(f"{unit.path} gives no finite number for {row!r} near its start values; check it.")
+        later = np.array([[unit.values(t, *points[0][1:]), unit.values(t, *points[-1][1:])] for t in TIMES])
+        self.timed = bool(np.any(np.abs(later - later[0]) > SAME * np.max(np.abs(later))))
+        states = np.array([x - unit.starts(unit.states) for _, x, _, _ in points])
+        equal = [equal_state(row, states, unit.states) for row in found.T]
+        self.equal = {row: same for row, same in zip(rows, equal, strict=True) if same}
+        self.unit = _Unit.load(unit.path, [n for n in unit.outputs if n not in self.equal])
+        if self.timed:
+            self.dynamics: Callable[..., dict[str, Any]] = lambda x, u, p, t: self._derivatives(x, u, p, t)
+            self.measured: Callable[..., dict[str, Any]] = lambda x, u, p, t: self._outputs(x, u, p, t)
+        else:
+            self.dynamics = lambda x, u, p: self._derivatives(x, u, p, 0.0)
+            self.measured = lambda x, u, p: self._outputs(x, u, p, 0.0)
+
+    def _points(self) -> Any:
+        """Draw times, states, inputs and parameters near the start values; the first are these."""
+        unit, rng = self.unit, np.random.default_rng(0)
+        x, u, p = (unit.starts(names) for names in (unit.states, unit.inputs, unit.parameters))
+        yield 0.0, x, u, p
+        moves = np.array([n in self.free for n in unit.parameters], dtype=float)
+        for _ in range(1, POINTS):
+            changes = [10 ** rng.uniform(-3, 0) * rng.standard_normal(len(a)) for a in (x, u)]
+            yield 0.0, x + changes[0], u + changes[1], p * (1 + 0.1 * moves * rng.uniform(-1, 1, len(p)))
+
+    def _stack(self, x: Any, u: Any, p: Any, t: Any, added: Mapping[str, float] | None = None) -> Any:
+        unit = self.unit
+        state = [x[n] + start for n, start in zip(unit.states, unit.starts(unit.states), strict=True)]
+        drive = [
+            (u[n] if n in self.inputs else start) + (added or {}).get(n, 0.0)
+            for n, start in zip(unit.inputs, unit.starts(unit.inputs), strict=True)
+        ]
+        values = zip(unit.parameters, unit.starts(unit.parameters), strict=True)
+        return ca.vertcat(t, *state, *drive, *(p[n] if n in self.free else start for n, start in values))
+
+    def _rows(self, names: Sequence[str], x: Named, u: Named, p: Named, t: Any) -> list[Any]:
+        """Evaluate derivatives `der(state)` and outputs."""
+        rows = (*map(_rate, self.unit.states), *self.unit.outputs)
+        calls = any(n not in self.equal for n in names)
+        found: Any = call_external(self.unit.function, self._stack(x, u, p, t)) if calls else None
+        return [x[self.equal[n]] if n in self.equal else found[rows.index(n)] for n in names]
+
+    def _derivatives(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
+        states = self.unit.states
+        return dict(zip(states, self._rows([_rate(n) for n in states], x, u, p, t), strict=True))
+
+    def _outputs(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
+        return dict(zip(self.outputs, self._rows(self.outputs, x, u, p, t), strict=True))
+
+    def port(self, name: str, given: Mapping[str, Any]) -> Port:
+        """Make a port from the names of the unit's variables."""
+        factors, across, rate = _factors(given.get("into")), given.get("across"), given.get("rate")
+        unknown = [key for key in given if key not in ("into", "across", "rate")]
+        if unknown or not factors or not isinstance(across, str) or not isinstance(rate, str | None):
+            raise InputError(
+                f"The port {name!r} is {dict(given)!r}; give dict(into=INPUT, across=VARIABLE, rate=VARIABLE) with "
+                "names of the unit's variables."
+            )
+        z = self._signal(name, "across", across)
+        dz = None if rate is None else self._signal(name, "rate", rate)
+        force, coordinate = self.unit.variables[next(iter(factors))], self.unit.variables[across]
+        return Port(name, self._into(name, factors), z, dz, force.unit, coordinate.unit)
+
+    def _signal(self, port: str, key: str, name: str) -> Callable[..., Any]:
+        unit = self.unit
+        if name in unit.states:
+            return lambda x: x[name]
+        if name not in (*unit.outputs, *self.equal):
+            known = listed([*unit.outputs, *(n for n in self.equal if not n.startswith("der(")), *unit.states])
+            raise InputError(f"`{key}` of port {port!r} is {name!r}; give an output or a state of the unit: {known}.")
+        if same := self.equal.get(name):
+            return lambda x: x[same]
+        return lambda x, u, p: self._rows([name], x, u, p, 0.0)[0]
+
+    def _into(self, port: str, factors: Mapping[str, float]) -> Any:
+        """Find how a unit force changes derivatives and outputs: constants, or differences of two calls."""
+        unit, step = self.unit, np.array([factors.get(n, 0.0) for n in self.unit.inputs])
+        names = (*unit.states, *unit.outputs)
+        rows = [i for i, n in enumerate(names) if i < len(unit.states) or n in self.outputs]
+        points = list(self._points())
+        none, once, twice = (
+            np.array([unit.values(t, x, u + k * step, p)[rows] for t, x, u, p in points]) for k in (0, 1, 2)
+        )
+        once, twice = once - none, twice - none
+        size = np.max(np.abs(once)) + SAME * np.max(np.abs(none))
+        if np.any(np.abs(twice - 2 * once) > np.sqrt(SAME) * size):
+            raise InputError(
+                f"The force of port {port!r} does not add up in {listed(list(factors))}: twice the input has not twice "
+                "the effect; name an input that is a force."
+            )
+        moved = {k: i for k, i in enumerate(rows) if np.any(np.abs(once[:, k]) > SAME * size)}
+        if not moved:
+            raise InputError(f"The input {listed(list(factors))} of port {port!r} changes nothing; name another one.")
+        if np.all(np.abs(once - once[0]) <= np.sqrt(SAME) * size):
+            return {names[i]: float(once[0, k]) for k, i in moved.items()}
+
+        def into(x: Named, u: Named, p: Named) -> dict[str, Any]:
+            before, after = (
+                call_external(unit.function, self._stack(x, u, p, 0.0, added)) for added in ({}, dict(factors))
+            )
+            return {names[i]: after[i] - before[i] for i in moved.values()}
+
+        return into
+
+
+def _rate(state: str) -> str:
+    return f"der({state})"
+
+
+def _factors(into: Any) -> dict[str, float]:
+    """Return the inputs that a port's force enters, with its factors; the name of one means the opposite sign."""
+    if isinstance(into, str):
+        return {into: -1.0}
+    return dict(into) if isinstance(into, Mapping) else {}
+
+
+def _parameter(variable: Variable, bounds: tuple[float, float] | None) -> Parameter:
+    value = 0.0 if np.isnan(variable.start) else variable.start
+    low, high = bounds if bounds is not None else (variable.low, variable.high)
+    ends = sorted((value / WITHIN, value * WITHIN)) if value else (-np.inf, np.inf)
+    low, high = (end if np.isnan(given) else given for given, end in zip((low, high), ends, strict=True))
+    if not low <= value <= high:
+        raise InputError(
+            f"The parameter {variable.name!r} is {value:g}, outside of its bounds {low:g} to {high:g}; widen them."
+        )
+    return Parameter(value, variable.unit, (low, high))
+
+
+def _check_names(names: Sequence[str], there: Sequence[str], kind: str, path: Path) -> None:
+    for name in names:
+        if name not in there:
+            raise InputError(f"{path} has no {name!r} among its {kind}; they are {listed(there) or 'none'}.")
+
+
+def _check_program(path: Path) -> None:
+    """Refuse a unit whose program does not load and evaluate, in a process that it may end."""
+    job = path.resolve(), unpack(path)[0]
+    reply = run_in_worker(pickle.dumps(_try), pickle.dumps(job), PATIENCE)
+    if reply.timed_out or reply.lost:
+        what = f"takes more than {PATIENCE:g} s to load" if reply.timed_out else "ends the process that loads it"
+        raise InputError(f"The program inside {path} {what}; ask its maker for another one.")
+    if reply.result:
+        raise InputError(f"{path} cannot be evaluated ({reply.result}); check it with the tool that made it.")
+
+
+def _try(unpacked: tuple[Path, Path]) -> str:
+    """Load and evaluate a unit that is unpacked in a folder; return what went wrong."""
+    path, folder = unpacked
+    try:
+        unpack(path, folder)
+        unit = _Unit.load(path)
+        unit.values(0.0, *(unit.starts(names) for names in (unit.states, unit.inputs, unit.parameters)))
+    except Exception as error:
+        return tidy(error)
+    return ""

@@ -1,0 +1,145 @@
+"""What a functional mock-up unit says of itself: its file and `modelDescription.xml`, read without running it."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from .._base import InputError, existing_file, listed
+
+SYSTEMS = {  # folders of programs in FMI 2.0 and 3.0, and how programs end
+    "linux": ("linux", "linux", ".so"),
+    "darwin": ("darwin", "darwin", ".dylib"),
+    "win32": ("win", "windows", ".dll"),
+}
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A variable of modelDescription.xml; numbers are NaN where it states none."""
+
+    name: str
+    causality: str
+    variability: str
+    unit: str
+    low: float
+    high: float
+    nominal: float
+    start: float
+    reference: int
+
+
+@dataclass(frozen=True)
+class Description:
+    """The content of modelDescription.xml; `identifier` is empty where the unit is not for model exchange."""
+
+    version: str
+    token: str
+    identifier: str
+    binary: str
+    variables: dict[str, Variable]
+    states: tuple[str, ...]
+
+
+def describe(path: Path) -> Description:
+    """Read modelDescription.xml."""
+    try:
+        with zipfile.ZipFile(existing_file(path)) as archive:
+            root = ET.fromstring(archive.read("modelDescription.xml"))
+    except (zipfile.BadZipFile, KeyError, ET.ParseError, OSError, EOFError, ValueError) as error:
+        raise InputError(f"{path} is not a functional mock-up unit ({tidy(error)}); export it again.") from None
+    entries = list(root.iterfind("ModelVariables/*"))
+    variables = {v.name: v for entry in entries if (v := _variable(entry)) is not None}
+    version = root.get("fmiVersion", "").partition(".")[0]
+    token = root.get("guid" if version == "2" else "instantiationToken", "")
+    exchange = root.find("ModelExchange")
+    identifier = exchange.get("modelIdentifier", "") if exchange is not None else ""
+    system, system3, suffix = SYSTEMS.get(sys.platform, SYSTEMS["linux"])
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower(), platform.machine().lower())
+    folder = f"{system}64" if version == "2" else f"{machine}-{system3}"
+    try:
+        states = tuple(_state_names(root, entries, version))
+    except (ValueError, IndexError, KeyError, StopIteration):
+        states = ()
+    return Description(version, token, identifier, f"binaries/{folder}/{identifier}{suffix}", variables, states)
+
+
+def _state_names(root: ET.Element, entries: list[ET.Element], version: str) -> Iterator[str]:
+    """List the states in the order of the unit's vector, by the derivatives of its structure."""
+    if version == "2":
+        for unknown in root.iterfind("ModelStructure/Derivatives/Unknown"):
+            real = entries[int(unknown.get("index", 0)) - 1].find("Real")
+            assert real is not None
+            yield entries[int(real.get("derivative", 0)) - 1].get("name", "")
+        return
+    by_reference = {entry.get("valueReference"): entry for entry in entries}
+    for unknown in root.iterfind("ModelStructure/ContinuousStateDerivative"):
+        state = by_reference[unknown.get("valueReference")].get("derivative")
+        yield by_reference[state].get("name", "")
+
+
+def _variable(entry: ET.Element) -> Variable | None:
+    """Read a real variable; None for one of another type."""
+    real = entry.find("Real")
+    if real is None and entry.tag != "Float64":
+        return None
+    numbers = entry if real is None else real
+    low, high, nominal, start = (_number(numbers.get(key)) for key in ("min", "max", "nominal", "start"))
+    return Variable(
+        entry.get("name", ""),
+        entry.get("causality", "local"),
+        entry.get("variability", "continuous"),
+        numbers.get("unit", ""),
+        low,
+        high,
+        nominal,
+        start,
+        int(entry.get("valueReference", 0)),
+    )
+
+
+def _number(text: str | None) -> float:
+    try:
+        return float(text) if text is not None else np.nan
+    except ValueError:
+        return np.nan
+
+
+def check_file(path: Path) -> None:
+    """Refuse what is no unit for model exchange with a program for this platform."""
+    unit = describe(path)
+    if unit.version not in ("2", "3"):
+        raise InputError(f"{path} is a unit of FMI {unit.version or '(none stated)'}; give one of FMI 2.0 or 3.0.")
+    if not unit.identifier:
+        raise InputError(
+            f"{path} is for co-simulation alone, which is not read yet; export it for model exchange "
+            "(in most tools an option of the FMU export)."
+        )
+    if not any(v.causality == "output" for v in unit.variables.values()):
+        raise InputError(f"{path} has no output; export it with the measured variables as outputs.")
+    with zipfile.ZipFile(path) as archive:
+        there = {name.split("/")[1] for name in archive.namelist() if name.startswith("binaries/") and name[-1] != "/"}
+    own = unit.binary.split("/")[1]
+    if own not in there:
+        raise InputError(f"{path} has programs for {listed(sorted(there)) or 'no platform'}; export it for {own}.")
+
+
+def fmu_signals(path: str | os.PathLike[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """List the inputs and the outputs of a functional mock-up unit, without running it."""
+    variables = describe(Path(path)).variables.values()
+    inputs, outputs = (tuple(v.name for v in variables if v.causality == role) for role in ("input", "output"))
+    return inputs, outputs
+
+
+def tidy(error: Exception) -> str:
+    """Shorten an error of CasADi to its last line."""
+    lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+    return " ".join(lines[-1].split())[:160].rstrip(".")

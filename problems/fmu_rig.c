@@ -1,0 +1,113 @@
+/* A two-mass rig for model exchange by FMI 2.0, written by hand for the tests: linear springs and dampers.
+ *
+ * Value references are places in `v`: parameters, states, derivatives, inputs, outputs. It keeps neither time nor events.
+ */
+#include <stdlib.h>
+#include <string.h>
+
+#if defined _WIN32
+#define EXPORT __declspec(dllexport)
+#else
+#define EXPORT __attribute__((visibility("default")))
+#endif
+
+enum { K1, K2, D1, D2, M1, M2, X1, V1, X2, V2, DX1, DV1, DX2, DV2, FORCE, GUIDE, POS1, POS2, VEL1, POWER, N_V };
+typedef struct {
+  double v[N_V];
+} rig_t;
+
+static void evaluate(double *v) {
+  const double inner = v[K2] * (v[X1] - v[X2]) + v[D2] * (v[V1] - v[V2]);
+  v[DX1] = v[V1];
+  v[DV1] = (v[FORCE] + v[GUIDE] - v[K1] * v[X1] - v[D1] * v[V1] - inner) / v[M1];
+  v[DX2] = v[V2];
+  v[DV2] = inner / v[M2];
+  v[POS1] = v[X1];
+  v[POS2] = v[X2];
+  v[VEL1] = v[V1];
+  v[POWER] = v[FORCE] * v[FORCE];
+}
+
+EXPORT const char *fmi2GetTypesPlatform(void) { return "default"; }
+EXPORT const char *fmi2GetVersion(void) { return "2.0"; }
+EXPORT int fmi2SetDebugLogging(void *c, int on, size_t n, const char *const categories[]) { return 0; }
+
+EXPORT void *fmi2Instantiate(const char *name, int type, const char *guid, const char *resources, const void *functions,
+                             int visible, int on) {
+  static const double start[N_V] = {380, 1000, 2.3, 1.3, 1.2, 0.8};
+  rig_t *m;
+#ifdef CRASHES
+  abort();
+#endif
+  if (type != 0 || strcmp(guid, "rig")) return NULL;
+  m = malloc(sizeof *m);
+  if (m) memcpy(m->v, start, sizeof start);
+  return m;
+}
+EXPORT void fmi2FreeInstance(void *c) { free(c); }
+EXPORT int fmi2SetupExperiment(void *c, int given, double tolerance, double start, int stops, double stop) { return 0; }
+EXPORT int fmi2EnterInitializationMode(void *c) { return 0; }
+EXPORT int fmi2ExitInitializationMode(void *c) { return 0; }
+EXPORT int fmi2Terminate(void *c) { return 0; }
+EXPORT int fmi2Reset(void *c) { return 0; }
+
+EXPORT int fmi2GetReal(void *c, const unsigned vr[], size_t n, double value[]) {
+  size_t i;
+  evaluate(((rig_t *)c)->v);
+  for (i = 0; i < n; i++) value[i] = ((rig_t *)c)->v[vr[i]];
+  return 0;
+}
+EXPORT int fmi2SetReal(void *c, const unsigned vr[], size_t n, const double value[]) {
+  size_t i;
+  for (i = 0; i < n; i++) ((rig_t *)c)->v[vr[i]] = value[i];
+  return 0;
+}
+#define NONE(name, type) \
+  EXPORT int name(void *c, const unsigned vr[], size_t n, type value[]) { return n ? 3 : 0; }
+NONE(fmi2GetInteger, int)
+NONE(fmi2GetBoolean, int)
+NONE(fmi2GetString, const char *)
+NONE(fmi2SetInteger, const int)
+NONE(fmi2SetBoolean, const int)
+NONE(fmi2SetString, const char *const)
+EXPORT int fmi2GetFMUstate(void *c, void **state) { return 3; }
+EXPORT int fmi2SetFMUstate(void *c, void *state) { return 3; }
+EXPORT int fmi2FreeFMUstate(void *c, void **state) { return 3; }
+EXPORT int fmi2SerializedFMUstateSize(void *c, void *state, size_t *size) { return 3; }
+EXPORT int fmi2SerializeFMUstate(void *c, void *state, char bytes[], size_t size) { return 3; }
+EXPORT int fmi2DeSerializeFMUstate(void *c, const char bytes[], size_t size, void **state) { return 3; }
+EXPORT int fmi2GetDirectionalDerivative(void *c, const unsigned unknown[], size_t n, const unsigned known[], size_t m,
+                                        const double seed[], double value[]) {
+  return 3;
+}
+
+EXPORT int fmi2EnterEventMode(void *c) { return 0; }
+EXPORT int fmi2NewDiscreteStates(void *c, void *information) {
+  memset(information, 0, 5 * sizeof(int));
+  return 0;
+}
+EXPORT int fmi2EnterContinuousTimeMode(void *c) { return 0; }
+EXPORT int fmi2CompletedIntegratorStep(void *c, int final, int *event, int *terminate) {
+  *event = *terminate = 0;
+  return 0;
+}
+EXPORT int fmi2SetTime(void *c, double time) { return 0; }
+EXPORT int fmi2SetContinuousStates(void *c, const double x[], size_t n) {
+  memcpy(((rig_t *)c)->v + X1, x, n * sizeof(double));
+  return 0;
+}
+EXPORT int fmi2GetContinuousStates(void *c, double x[], size_t n) {
+  memcpy(x, ((rig_t *)c)->v + X1, n * sizeof(double));
+  return 0;
+}
+EXPORT int fmi2GetDerivatives(void *c, double xdot[], size_t n) {
+  evaluate(((rig_t *)c)->v);
+  memcpy(xdot, ((rig_t *)c)->v + DX1, n * sizeof(double));
+  return 0;
+}
+EXPORT int fmi2GetEventIndicators(void *c, double z[], size_t n) { return 0; }
+EXPORT int fmi2GetNominalsOfContinuousStates(void *c, double x[], size_t n) {
+  size_t i;
+  for (i = 0; i < n; i++) x[i] = 1;
+  return 0;
+}

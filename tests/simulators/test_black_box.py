@@ -1,0 +1,117 @@
+"""Functions that are called with numbers: values and derivatives are those of their equations, failures are trials."""
+
+import re
+
+import cloudpickle
+import numpy as np
+import pytest
+
+from pilfr_casadi import InputError, Parameter, Recording, fit
+from pilfr_casadi.engine import compiler, make_engine
+from pilfr_casadi.simulators import Numeric, discretise, from_function
+
+needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
+
+
+def swing(t, x, u, p):
+    pos, vel = x
+    return [vel, (u[0] - p["k"] * pos - p["d"] * vel**3) / 2.0]
+
+
+def swing_jacobian(t, x, u, p):
+    pos, vel = x
+    slope = [-p["k"], -3 * p["d"] * vel**2, 1.0, -pos, -(vel**3)]
+    return np.array([[0.0, 1.0, 0.0, 0.0, 0.0], np.array(slope) / 2.0])
+
+
+SWING = dict(
+    states=("pos", "vel"),
+    inputs="force",
+    parameters={"k": Parameter(90.0, bounds=(10, 500)), "d": Parameter(1.0, bounds=(0, 10))},
+)
+
+
+def sensitivities(simulator, engine):
+    u = 20 * np.sin(0.05 * np.arange(200))[:, None]
+    given = Recording(u, np.zeros((200, 1)), 0.01, ("force",), ("pos",), initial="zero")
+    model = discretise(simulator, 0.01, "zero", 2)
+    p, n = model.parameters.start, model.n_state
+    seed = np.zeros((n, len(p) + n))
+    seed[:, len(p) :] = np.eye(n)
+    return make_engine(model, engine).sensitivity(model.drive(given), p, np.zeros(n), seed, np.arange(len(p)))[:2]
+
+
+@pytest.mark.parametrize("engine", ["vm", pytest.param("c", marks=needs_compiler)])
+@pytest.mark.parametrize("numeric, exact", [(Numeric(), 1e-6), (Numeric(jacobian=swing_jacobian), 1e-12)])
+def test_a_function_called_with_numbers_has_the_derivatives_of_its_equations(engine, numeric, exact):
+    y_equations, jac_equations = sensitivities(from_function(swing, "pos", **SWING), "vm")
+    made = from_function(swing, "pos", numeric=numeric, **SWING)
+    y, jac = sensitivities(made, engine)
+    assert np.abs(y - y_equations).max() <= 1e-12 * np.ptp(y)
+    assert np.all(np.abs(jac - jac_equations).max(axis=(0, 1)) <= exact * np.abs(jac_equations).max(axis=(0, 1)))
+    assert ("its Jacobian" in str(made)) == (numeric.jacobian is not None)
+    assert int(re.search(r"swing: called (\d+) times", str(made))[1]) >= 4 * 2 * 200  # stages, sub-steps, samples
+
+
+def test_a_function_called_with_numbers_keeps_what_it_defines():
+    def measured(t, x, u, p):
+        return {"pos": x[0], "power": u[0] * x[1]}
+
+    made = from_function(swing, measured, numeric=Numeric(), **SWING)
+    assert made.kinematic == {"pos"}
+    x, u, p, t = made.symbols()
+    assert str(made.measured(x, u, p, t)["pos"]) == "pos"
+    given = Recording(np.ones((50, 1)), np.zeros((50, 2)), 0.01, ("force",), ("pos", "power"))
+    equations = from_function(swing, measured, **SWING)
+    assert np.allclose(made.simulate(given), equations.simulate(given), rtol=1e-12, atol=1e-14)
+
+
+def test_a_function_that_cannot_be_followed_is_called_with_numbers():
+    table = {0: 90.0, 1: 110.0}
+
+    def stepped(t, x, u, p):
+        k = table[int(float(x[0]) > 0.1)] * p["k"] / 90.0
+        return [x[1], (u[0] - k * x[0] - x[1]) / 2.0]
+
+    parameters = {"k": Parameter(90.0, bounds=(10, 500))}
+    options = dict(states=("pos", "vel"), inputs="force", parameters=parameters)
+    made = from_function(stepped, "pos", numeric=Numeric(nominal={"pos": 1e-4}), **options)
+    u = 20 + 10 * np.sin(0.1 * np.arange(100))[:, None]
+    given = Recording(u, np.zeros((100, 1)), 0.01, ("force",), ("pos",), initial="zero")
+    given = given.with_(y=made.simulate(given))
+    moved = made.with_parameters(made.parameter_set.change(k={"value": 80.0}))
+    found = fit(moved, given)
+    assert found.parameters["k"] == pytest.approx(90.0, rel=1e-4)
+
+
+def test_a_function_that_fails_at_a_point_is_a_failed_trial():
+    def fragile(t, x, u, p):
+        if x[0] > 1.0:
+            raise ValueError("too far")
+        return [x[1], u[0] - p["k"] * x[0]]
+
+    options = dict(states=("pos", "vel"), inputs="force", parameters={"k": Parameter(1.0)})
+    made = from_function(fragile, "pos", numeric=Numeric(), **options)
+    given = Recording(np.full((200, 1), 5.0), np.zeros((200, 1)), 0.05, ("force",), ("pos",))
+    assert np.isnan(made.simulate(given)[-1, 0]) and np.isfinite(made.simulate(given)[0, 0])
+    assert "it failed first with ValueError('too far')" in str(made)
+
+
+@pytest.mark.parametrize(
+    "numeric, says",
+    [
+        (Numeric(nominal={"x": 1.0}), "give a positive size by the name of a state"),
+        (Numeric(nominal={"pos": 0.0}), "give a positive size by the name of a state"),
+    ],
+)
+def test_wrong_sizes_are_refused_in_one_sentence(numeric, says):
+    with pytest.raises(InputError, match=says) as error:
+        from_function(swing, "pos", numeric=numeric, **SWING)
+    assert str(error.value).count(".") <= 3 and "\n" not in str(error.value)
+
+
+def test_it_survives_another_process():
+    made = from_function(swing, "pos", numeric=Numeric(jacobian=swing_jacobian), **SWING)
+    again = cloudpickle.loads(cloudpickle.dumps(made))
+    assert again.kinematic == {"pos"} and "called 0 times" in str(again)
+    assert np.array_equal(sensitivities(again, "vm")[1], sensitivities(made, "vm")[1])

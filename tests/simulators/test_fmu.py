@@ -1,0 +1,246 @@
+"""Simulators from functional mock-up units: the same numbers as from equations, ports, parameters, plain refusals."""
+
+import pickle
+import subprocess
+import sys
+import zipfile
+
+import cloudpickle
+import numpy as np
+import pytest
+from command_line import refused, run
+from exported_fits import one_sentence
+
+from pilfr_casadi import InputError, Parameter, exported, from_fmu
+from pilfr_casadi.engine import VirtualMachine, compiler, make_engine
+from pilfr_casadi.laws import CoulombFriction
+from pilfr_casadi.simulators import discretise
+from problems.fmu_rig import FOLDER, GUIDE, PARAMETERS, c_rig, casadi_rig, description, recording, rig
+
+pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler")
+DRY = {"F_c": 1.0, "v_0": 0.01}
+
+
+@pytest.fixture(scope="module")
+def units(tmp_path_factory):
+    """Files of the rig: in C by FMI 2.0, and as CasADi exports it by FMI 3.0."""
+    pytest.importorskip("fmpy")
+    folder = tmp_path_factory.mktemp("units")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        return {"c": c_rig(folder / "c.fmu"), "casadi": casadi_rig(folder / "casadi.fmu")}
+
+
+@pytest.fixture(params=["c", "casadi"])
+def unit(request, units):
+    return units[request.param]
+
+
+def guided(path, **more):
+    return from_fmu(path, ports=GUIDE, outputs=("pos1", "pos2"), **more)
+
+
+def test_it_has_the_names_units_and_bounds_of_the_file(unit):
+    simulator = from_fmu(unit)
+    assert simulator.states == ("x1", "v1", "x2", "v2")
+    assert simulator.inputs == ("force", "guide_force")
+    assert simulator.output_names == ("pos1", "pos2", "vel1", "power")
+    for name, (value, low, high) in PARAMETERS.items():
+        p = simulator.parameters[name]
+        assert (float(p.value), *map(float, p.bounds), bool(p.fixed)) == (value, low, high, False)
+    assert simulator.parameters["k1"].unit == "N/m"
+    assert {p.suffix for p in unit.parent.iterdir()} <= {".fmu", ".c", ".o", ".so", ".xml", ".h"}  # CasADi's export
+    assert not [p for p in unit.parent.iterdir() if p.is_dir()]  # nothing is unpacked beside the file
+
+
+def test_it_simulates_as_the_equations_do(unit):
+    given = recording(0, samples=300)
+    friction = CoulombFriction(DRY)
+    for own, other in (
+        (guided(unit), rig()),
+        (guided(unit).with_element("guide", friction), rig().with_element("guide", friction)),
+    ):
+        assert np.abs(own.simulate(given) - other.simulate(given)).max() <= 1e-12 * np.ptp(given.y)
+
+
+@pytest.mark.parametrize("engine", ["vm", "c"])
+def test_sensitivities_are_those_of_the_equations(unit, engine):
+    given = recording(1, samples=60)
+    found = []
+    for simulator in (guided(unit), rig()):
+        model = discretise(simulator.with_element("guide", CoulombFriction(DRY)), given.dt, "zero", 1)
+        own = make_engine(model, engine)
+        assert isinstance(own, VirtualMachine) == (engine == "vm")
+        p, n = model.parameters.start, model.n_state
+        seed = np.zeros((n, len(p) + n))
+        seed[:, len(p) :] = np.eye(n)
+        found.append(own.sensitivity(model.drive(given), p, np.zeros(n), seed, np.arange(len(p)))[:2])
+    (y, jac), (y_equations, jac_equations) = found
+    assert np.abs(y - y_equations).max() <= 1e-12 * np.ptp(y)
+    size = np.abs(jac_equations).max(axis=(0, 1))
+    assert np.all(np.abs(jac - jac_equations).max(axis=(0, 1)) <= 1e-5 * size)
+
+
+ELSEWHERE = """
+import pickle, sys
+import numpy as np
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.simulators import discretise
+simulator, given = pickle.load(sys.stdin.buffer)
+model = discretise(simulator, given.dt, "zero", 1)
+y = make_engine(model).simulate(model.drive(given), model.parameters.start, np.zeros(model.n_state))[0]
+sys.stdout.buffer.write(pickle.dumps(y))
+"""
+
+
+def test_it_survives_another_process(unit):
+    given, simulator = recording(5, samples=40), guided(unit)
+    job = cloudpickle.dumps((simulator, given))
+    done = subprocess.run([sys.executable, "-c", ELSEWHERE], input=job, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr.decode()
+    model = discretise(simulator, given.dt, "zero", 1)
+    y = make_engine(model).simulate(model.drive(given), model.parameters.start, np.zeros(model.n_state))[0]
+    assert np.array_equal(pickle.loads(done.stdout), y)
+
+
+def test_a_port_enters_an_input_and_reads_outputs(unit):
+    port = guided(unit).port("guide")
+    assert port.into == pytest.approx({"v1": -1 / 1.2})
+    x, *_ = guided(unit).symbols()
+    assert str(port.across(x)) == "x1" and str(port.rate(x)) == "v1"
+    assert guided(unit).inputs == ("force",)
+    pair = {"both": {"into": {"force": -1.0, "guide_force": 0.5}, "across": "x2"}}
+    assert from_fmu(unit, ports=pair, outputs=("pos1",)).port("both").into == pytest.approx({"v1": -0.5 / 1.2})
+    assert [q.name for q in from_fmu(unit).all_ports()][:4] == [f"equation:{n}" for n in ("x1", "v1", "x2", "v2")]
+
+
+def test_parameters_and_bounds_can_be_chosen(unit):
+    chosen = guided(unit, parameters=("k1",), bounds={"k1": (300, 500)})
+    assert list(chosen.parameters) == ["k1"] and tuple(map(float, chosen.parameters["k1"].bounds)) == (300, 500)
+    own = guided(unit, parameters={"d2": Parameter(2.0, fixed=True)})
+    assert list(own.parameters) == ["d2"] and float(own.parameters["d2"].value) == 2.0
+    given = recording(2, samples=100)
+    equations = rig()
+    changed = equations.with_parameters(equations.parameter_set.change(d2={"value": 2.0}))
+    assert np.abs(own.simulate(given) - changed.simulate(given)).max() <= 1e-12 * np.ptp(given.y)
+
+
+@pytest.mark.parametrize(
+    "more, says",
+    [
+        ({"parameters": ("m1",)}, "has no 'm1' among its tunable parameters; they are k1"),
+        ({"inputs": ("moment",)}, "has no 'moment' among its inputs; they are force"),
+        ({"outputs": ("acc",)}, "has no 'acc' among its outputs"),
+        ({"bounds": {"k1": (1, 2)}}, "'k1' is 380, outside of its bounds 1 to 2"),
+        ({"ports": {"guide": {"into": "guide", "across": "pos1"}}}, "has no 'guide' among its inputs"),
+        ({"ports": {"guide": {"into": "guide_force", "across": "pos"}}}, "`across` of port 'guide' is 'pos'"),
+        ({"ports": {"guide": {"into": "guide_force"}}}, "give dict"),
+        ({"ports": {"guide": "guide_force"}}, "give dict"),
+        ({"ports": {"guide": {"into": "force", "across": "pos1", "speed": "v1"}}}, "give dict"),
+    ],
+)
+def test_wrong_names_are_refused_in_one_sentence(units, more, says):
+    with pytest.raises(InputError) as error:
+        from_fmu(units["c"], **more)
+    assert says in one_sentence(error)
+
+
+def test_an_input_that_is_no_force_is_refused(units):
+    port = {"odd": {"into": "force", "across": "pos1"}}
+    with pytest.raises(InputError, match="does not add up") as error:  # an output holds its square
+        from_fmu(units["c"], ports=port)
+    one_sentence(error)
+
+
+def test_files_that_are_no_units_are_refused(tmp_path, units):
+    def zipped(name, **files):
+        with zipfile.ZipFile(tmp_path / name, "w") as archive:
+            for path, text in files.items():
+                archive.writestr(path, text)
+        return tmp_path / name
+
+    (tmp_path / "text.fmu").write_text("no archive")
+    (tmp_path / "half.fmu").write_bytes(units["c"].read_bytes()[:2000])
+    both = {"modelDescription.xml": description(), f"binaries/{FOLDER}/rig.so": "no program"}
+    cases = {
+        tmp_path / "text.fmu": "is not a functional mock-up unit",
+        tmp_path / "half.fmu": "is not a functional mock-up unit",
+        tmp_path / "none.fmu": "none.fmu",
+        zipped("empty.fmu"): "is not a functional mock-up unit",
+        zipped("broken.fmu", **{"modelDescription.xml": "<fmi"}): "is not a functional mock-up unit",
+        zipped("bare.fmu", **{"modelDescription.xml": description()}): f"no platform; export it for {FOLDER}",
+        zipped("program.fmu", **both): "cannot be evaluated",
+        zipped("cosim.fmu", **{"modelDescription.xml": description("CoSimulation")}): "for co-simulation alone",
+        zipped("old.fmu", **{"modelDescription.xml": description(version="1.0")}): "FMI 1; give one of FMI 2.0",
+        c_rig(tmp_path / "other.fmu", folder="win32"): f"has programs for win32; export it for {FOLDER}",
+        c_rig(tmp_path / "crash.fmu", "CRASHES"): "ends the process that loads it",
+    }
+    for path, says in cases.items():
+        with pytest.raises(InputError) as error:
+            from_fmu(path)
+        assert says in one_sentence(error), path
+
+
+def test_a_unit_of_python_is_for_co_simulation(tmp_path):
+    """As PythonFMU makes them."""
+    builder = pytest.importorskip("pythonfmu.builder")
+    script = tmp_path / "slave.py"
+    script.write_text(
+        "from pythonfmu import Fmi2Causality, Fmi2Slave, Real\n"
+        "class Slave(Fmi2Slave):\n"
+        "    def __init__(self, **kwargs):\n"
+        "        super().__init__(**kwargs)\n"
+        "        self.y = 0.0\n"
+        "        self.register_variable(Real('y', causality=Fmi2Causality.output))\n"
+        "    def do_step(self, current_time, step_size):\n"
+        "        return True\n"
+    )
+    path = builder.FmuBuilder.build_FMU(script, dest=tmp_path)
+    with pytest.raises(InputError, match="for co-simulation alone, which is not read yet") as error:
+        from_fmu(path)
+    one_sentence(error)
+
+
+def test_what_calls_a_unit_cannot_become_a_file(tmp_path, units):
+    step = exported(guided(units["c"]), dt=2e-3)
+    given = recording(3, samples=50)
+    x, found = step.x0(), []
+    for u in given.u:
+        x, y = step.step(x, u)
+        found.append(np.asarray(y).ravel())
+    assert np.abs(found - rig().simulate(given)).max() <= 1e-12 * np.ptp(given.y)
+    for write in (lambda: step.to_c(tmp_path / "c"), lambda: step.to_fmu(tmp_path / "a.fmu")):
+        with pytest.raises(InputError, match="call another program") as error:
+            write()
+        one_sentence(error)
+    with pytest.raises(InputError, match="call another program"):
+        step.serialize(tmp_path / "a.casadi")
+    assert not list(tmp_path.iterdir())
+
+
+def write_table(path, given):
+    columns = np.column_stack([np.arange(len(given)) * given.dt, given.u, given.y])
+    rows = "\n".join(",".join(map(repr, row)) for row in columns.tolist())
+    path.write_text(f"t,force,pos1,pos2\n{rows}\n")
+    return path
+
+
+def test_the_command_checks_a_unit(tmp_path, capsys, units):
+    train = write_table(tmp_path / "train.csv", recording(4, CoulombFriction({"F_c": 3.0, "v_0": 0.002}), samples=600))
+    port = ("--port", "guide=guide_force:pos1:vel1", "--initial", "zero", "--hold", "zero")
+    status, out, _ = run(capsys, "check", units["c"], train, *port, "--bound", "k1=300:500")
+    assert status == 0 and "guide" in out and "has no column for the outputs vel1, power" in out
+    bad = tmp_path / "bad.fmu"
+    bad.write_text("x")
+    refused(capsys, "check", bad, train, says="is not a functional mock-up unit")
+    refused(capsys, "diagnose", bad, train, "--out", tmp_path / "d", says="is not a functional mock-up unit")
+    assert not (tmp_path / "d").exists()
+    refused(capsys, "check", units["c"], train, "--port", "guide=x", says="write --port NAME=INTO:ACROSS")
+    refused(capsys, "check", units["c"], train, "--port", "guide=no:pos1", says="has no 'no' among its inputs")
+    refused(capsys, "check", units["c"], train, "--bound", "k1=2:1", says="infeasible")
+    model = tmp_path / "model.py"
+    model.write_text("simulator = 1\n")
+    refused(capsys, "check", model, train, "--bound", "k1=1:2", says="--bound was given, which is for an FMU")
+    table = tmp_path / "other.csv"
+    table.write_text("t,a,b\n0,1,2\n1,2,3\n")
+    refused(capsys, "check", units["c"], table, says="has no column for any input")
