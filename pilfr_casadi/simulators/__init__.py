@@ -1,6 +1,6 @@
 """The user's equations with ports for missing physics.
 
-`equations` evaluates them with their laws, `integration` makes them a discrete-time `Model`, `simulator` holds the
+`equations` evaluates them with their laws, `domains` infers a port's physical domain, `integration` makes them a discrete-time `Model`, `simulator` holds the
 class `Simulator` and the state in which its laws begin at rest, and `adapters` accept a Python file, a state space or a
 fitted model in its place. `fmu` makes one of a functional mock-up unit, which its equations call (`external`,
 `fmu_description`, `fmu_instance`). `numpy_function` makes one from a NumPy function, whose equations `tracing` finds by
@@ -19,6 +19,12 @@ if TYPE_CHECKING:
         user_variable as user_variable,
     )
     from .black_box import Numeric as Numeric
+    from .domains import (
+        DOMAINS as DOMAINS,
+        MECHANICAL as MECHANICAL,
+        UNKNOWN as UNKNOWN,
+        infer_domain as infer_domain,
+    )
     from .equations import Named as Named, Placed as Placed, Port as Port, in_series as in_series
     from .external import (
         PythonFunction as PythonFunction,
