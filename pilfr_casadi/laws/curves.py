@@ -149,20 +149,29 @@ class Orifice(Root):
 
 
 class Exponential(Polynomial):
-    """An exponential of the signal, such as an equal-percentage valve or a thermistor; its slope at zero is one."""
+    """An exponential of the signal, such as an equal-percentage valve or a thermistor, from zero to its end R."""
 
     form = "exponential"
-    equation = "w = (exp(c u) - 1) / c - u"
+    equation = "w = R (exp(c u) - 1) / (exp(c R) - 1) - u"
     source = "Luyben & Luyben (1997), Essentials of Process Control, sec. 3.4; Steinhart & Hart (1968)"
     sentence = "a memoryless curve: the gain grows exponentially with the signal, as of an equal-percentage valve"
-    units = {"c": "1/z"}
+    units = {"c": "1/z", "R": "z"}
+    strength = ()
     domains = ("thermal", "electrical", "fluid")
     special = True
-    starts = {"c": lambda at: np.array([-3.0, -1.0, 1.0, 3.0]) / at.reach}
+    starts = {
+        "c": lambda at: np.array([-3.0, -1.0, 1.0, 3.0]) / at.reach,
+        "R": lambda at: (at.high if at.high > -at.low else at.low,),
+    }
     ranges = {"c": lambda at: (-8.0 / at.reach, 8.0 / at.reach)}
 
     def force(self, z: Any, p: Any) -> Any:
-        return (ca.exp(p.c * z) - 1) / p.c - z
+        return p.R * (ca.exp(p.c * z) - 1) / (ca.exp(p.c * p.R) - 1) - z
+
+    def parameters(self) -> dict[str, Parameter]:
+        """Curvature, and the fixed end of the signal."""
+        out = super().parameters()
+        return {**out, "R": replace(out["R"], fixed=True)}
 
 
 class FreeCurve(Law):
