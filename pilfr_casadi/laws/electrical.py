@@ -6,59 +6,64 @@ from typing import Any
 
 import casadi as ca
 
-from .base import Law
+from .base import Law, Local
 
-STEEPEST = 25.0  # largest |z| / V_T that is tried: a current over e^25 decides nothing at smaller voltages
-LARGEST = 40.0  # exponent above which an exponential goes on as its tangent, so that a trial step stays finite
-
-
-def _exponential(x: Any) -> Any:
-    """Exponential minus one, with its tangent beyond `LARGEST`."""
-    inside = ca.fmin(x, LARGEST)
-    return ca.exp(inside) * (1 + x - inside) - 1
+SHARPEST = 0.005  # smallest width of a knee that is tried, over the largest |z|
 
 
 class Diode(Law):
-    """A junction that conducts in one direction (Shockley 1949)."""
+    """A junction that conducts in one direction, with its series resistance 1 / G (Shockley 1949)."""
 
     id = "static_curve"
     form = "diode"
-    equation = "w = I_s (exp(z / V_T) - 1)"
-    source = "Sze & Ng (2007), Physics of Semiconductor Devices, sec. 2.3"
-    sentence = "a diode: a current that grows exponentially with the voltage in one direction"
-    units = {"I_s": "w", "V_T": "z"}
+    equation = "w = G V_T (s(z) - s(0)),  s(z) = ln(1 + exp((z - V_0) / V_T))"
+    source = "Sze & Ng (2007), Physics of Semiconductor Devices, sec. 2.3; Enz, Krummenacher & Vittoz (1995)"
+    sentence = "a diode: a current that grows exponentially with the voltage, from about V_0 on in proportion to it"
+    units = {"G": "w/z", "V_0": "z", "V_T": "z"}
     domains = ("electrical",)
     special = True
-    restoring = True  # power flows into it
-    starts = {"V_T": lambda at: tuple(abs(at.high) / n for n in (2.0, 4.0, 7.0, 12.0, 20.0))}
-    ranges = {"V_T": ("reach", 1 / STEEPEST, 2.0)}
+    restoring = True  # it takes power
+    starts = {"V_0": ("reach", 0.1, 0.2, 0.35, 0.6, 0.9), "V_T": ("reach", 0.02, 0.08)}
+    ranges = {"G": ("max_stiffness", -1.0, 1.0), "V_0": ("reach", 0.01, 1.5), "V_T": ("reach", SHARPEST, 0.5)}
 
     def force(self, z: Any, p: Any) -> Any:
-        return p.I_s * _exponential(z / p.V_T)
+        return p.G * p.V_T * (_rise((z - p.V_0) / p.V_T) - _rise(-p.V_0 / p.V_T))
+
+    def why_not(self, local: Local) -> str:
+        return "" if local.high > 0 else "the voltage is never positive"
 
 
 class ReversedDiode(Diode):
     """A junction that conducts in the other direction."""
 
     form = "reversed diode"
-    equation = "w = -I_s (exp(-z / V_T) - 1)"
-    starts = {"V_T": lambda at: tuple(abs(at.low) / n for n in (2.0, 4.0, 7.0, 12.0, 20.0))}
+    equation = "w = -G V_T (s(-z) - s(0)),  s(z) = ln(1 + exp((z - V_0) / V_T))"
 
     def force(self, z: Any, p: Any) -> Any:
         return -super().force(-z, p)
+
+    def why_not(self, local: Local) -> str:
+        return "" if local.low < 0 else "the voltage is never negative"
 
 
 class Clamp(Diode):
     """Two junctions back to back, such as a clamp of a voltage or a varistor."""
 
     form = "clamp"
-    equation = "w = I_s (exp(z / V_T) - exp(-z / V_T))"
-    sentence = "a clamp: a current that grows exponentially with the voltage in both directions"
+    equation = "w = G V_T (s(z) - s(-z)),  s(z) = ln(1 + exp((z - V_0) / V_T))"
+    sentence = "a clamp: a current that grows exponentially with the voltage in both directions, beyond about V_0"
     two_sided = True
-    starts = {"V_T": lambda at: tuple(at.reach / n for n in (2.0, 4.0, 7.0, 12.0, 20.0))}
 
     def force(self, z: Any, p: Any) -> Any:
         return super().force(z, p) - super().force(-z, p)
+
+    def why_not(self, local: Local) -> str:
+        return Law.why_not(self, local)
+
+
+def _rise(x: Any) -> Any:
+    """Compute ln(1 + exp(x)) without overflow."""
+    return ca.fmax(x, 0) + ca.log1p(ca.exp(-ca.fabs(x)))
 
 
 class Overpotential(Law):
