@@ -27,6 +27,7 @@ QUICK = {  # pages of about a second; all others are slow
         "hold",
         "known_physics",
         "numpy",
+        "other_domains",
         "own_law",
         "ports",
         "unknown_start",

@@ -17,7 +17,7 @@ class Diode(Law):
     id = "static_curve"
     form = "diode"
     equation = "w = G V_T (s(z) - s(0)),  s(z) = ln(1 + exp((z - V_0) / V_T))"
-    source = "Sze & Ng (2007), Physics of Semiconductor Devices, sec. 2.3; Enz, Krummenacher & Vittoz (1995)"
+    source = "Sze & Ng (2007), Physics of Semiconductor Devices, sec. 2.3; Enz et al. (1995)"
     sentence = "a diode: a current that grows exponentially with the voltage, from about V_0 on in proportion to it"
     units = {"G": "w/z", "V_0": "z", "V_T": "z"}
     domains = ("electrical",)
@@ -90,7 +90,7 @@ class SaturatingInductance(Law):
 
     id = "saturating_inductance"
     equation = "w = -L_s dz/dt q / (1 + q),  q = (z / I_s)^2"
-    source = "Chua & Stromsmoe (1970), IEEE Trans. Circuit Theory 17(4); Boldea & Nasar (2010), ch. 5"
+    source = "Chua & Stromsmoe (1970), IEEE Trans. Circuit Theory 17(4); Boldea & Nasar (2010)"
     sentence = "a saturating inductance: the current changes faster as it grows, because the core carries no more flux"
     units = {"L_s": "w*s/z", "I_s": "z"}
     domains = ("electrical",)
