@@ -96,15 +96,15 @@ def guesses(rng: np.random.Generator, true: Mapping[str, float], units: Mapping[
 
 
 def battery(rng: np.random.Generator, kind: str) -> Rig:
-    """A cell that is charged and discharged to random depths."""
+    """A cell, half full at first, that is charged and discharged to random depths; its state is the charge moved."""
     capacity, dt = 3600 * rng.uniform(2.0, 4.0), 15.0
-    p = {"V_0": 3.3, "k": rng.uniform(0.4, 0.8), "R": 0.03, "R_1": 0.02, "C_1": rng.uniform(2e3, 6e3)}
+    p = {"V_0": 3.6, "k": rng.uniform(0.4, 0.8), "R": 0.03, "R_1": 0.02, "C_1": rng.uniform(2e3, 6e3)}
     knees, thresholds = rng.uniform(0.15, 0.3, 2), np.array([0.02, 0.06, 0.15])
     loops = rng.uniform(0.03, 0.06) * np.array([1.5, 1.0, 0.4]) / thresholds / 3
 
     def outputs(x: Array, u: Array) -> Array:
-        soc = x[:, 0]
-        y = p["V_0"] + p["k"] * soc + p["R"] * u[:, 0] + x[:, 1]
+        soc = 0.5 + x[:, 0]
+        y = p["V_0"] + p["k"] * x[:, 0] + p["R"] * u[:, 0] + x[:, 1]
         if kind == "voltage-curve":
             y = y - knees[0] * np.exp(-soc / 0.06) + knees[1] * np.exp(-(1 - soc) / 0.08)
         if kind == "voltage-loops":
@@ -125,19 +125,19 @@ def battery(rng: np.random.Generator, kind: str) -> Rig:
         return out[:SAMPLES, None]
 
     simulator = Simulator(
-        lambda x, u, p: {"soc": u.current / capacity, "v_1": (u.current - x.v_1 / p.R_1) / p.C_1},
-        lambda x, u, p: {"voltage": p.V_0 + p.k * x.soc + p.R * u.current + x.v_1},
-        states=("soc", "v_1"),
+        lambda x, u, p: {"charge": u.current / capacity, "v_1": (u.current - x.v_1 / p.R_1) / p.C_1},
+        lambda x, u, p: {"voltage": p.V_0 + p.k * x.charge + p.R * u.current + x.v_1},
+        states=("charge", "v_1"),
         inputs=("current",),
         parameters=guesses(rng, p, {"V_0": "V", "k": "V", "R": "Ohm", "R_1": "Ohm", "C_1": "F"}),
-        ports=Port("electrode", {"voltage": 1.0}, lambda x: x.soc, unit="V", across_unit="1"),
+        ports=Port("electrode", {"voltage": 1.0}, lambda x: x.charge, unit="V", across_unit="1"),
         units={"current": "A", "voltage": "V"},
     )
 
     def flow(x: Array, u: Array) -> Array:
         return np.array([u[0] / capacity, (u[0] - x[1] / p["R_1"]) / p["C_1"]])
 
-    return Rig(simulator, flow, outputs, drive, dt, np.array([0.5, 0.0]))
+    return Rig(simulator, flow, outputs, drive, dt, np.zeros(2))
 
 
 def oven(rng: np.random.Generator, kind: str) -> Rig:
