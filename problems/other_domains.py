@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from pilfr_casadi import Parameter, Port, Recording, Simulator, diagnose
+from pilfr_casadi import Parameter, Port, Recording, Simulator, diagnose, multisine
 
 Array = np.ndarray
 Flow = Callable[[Array, Array], Array]
@@ -142,8 +142,8 @@ def battery(rng: np.random.Generator, kind: str) -> Rig:
 
 def oven(rng: np.random.Generator, kind: str) -> Rig:
     """A block with a heater inside, in a room of known temperature; the block's sensor may lag."""
-    p = {"C_h": 40.0, "C_b": rng.uniform(100, 200), "G_h": rng.uniform(1.5, 3.0), "G_b": rng.uniform(0.15, 0.3)}
-    glow, rise, lag = rng.uniform(0.15, 0.4), rng.uniform(0.05, 0.12), rng.uniform(40.0, 120.0)
+    p = {"C_h": 40.0, "C_b": rng.uniform(80, 160), "G_h": rng.uniform(1.5, 3.0), "G_b": rng.uniform(0.15, 0.3)}
+    glow, rise, lag = rng.uniform(0.15, 0.4), rng.uniform(0.05, 0.12), rng.uniform(80.0, 160.0)
 
     def flow(x: Array, u: Array) -> Array:
         through, loss = p["G_h"] * (x[0] - x[1]), p["G_b"] * x[1]
@@ -238,8 +238,8 @@ def coil(rng: np.random.Generator, kind: str) -> Rig:
 def core(rng: np.random.Generator, kind: str) -> Rig:
     """The flux of a transformer at no load; its core may lose power by eddy currents."""
     p = {"R": rng.uniform(0.5, 2.0), "L": rng.uniform(0.02, 0.08)}
-    loss = rng.uniform(0.05, 0.15) / p["R"] if kind == "iron-loss" else 0.0  # 1 / Ohm
-    most, dt = rng.uniform(5, 10) * p["R"], 0.1 * p["L"] / p["R"]
+    loss = rng.uniform(0.1, 0.3) / p["R"] if kind == "iron-loss" else 0.0  # 1 / Ohm
+    most, dt = rng.uniform(5, 10) * p["R"], 0.05 * p["L"] / p["R"]
 
     def induced(flux: Array, u: Array) -> Array:
         return (u - p["R"] * flux / p["L"]) / (1 + p["R"] * loss)
@@ -257,7 +257,7 @@ def core(rng: np.random.Generator, kind: str) -> Rig:
         simulator,
         lambda x, u: induced(x, u[0]),
         lambda x, u: x / p["L"] + loss * induced(x, u),
-        lambda rng: levels(rng, -most, most, 5, 40),
+        lambda rng: most / 3 * multisine(SAMPLES, 0.02 / dt, 1 / dt, rng)[:, None],
         dt,
         np.zeros(1),
     )
