@@ -6,7 +6,7 @@
 | oven | heater and block, losses in proportion to the temperature | radiation; free convection; a slow thermistor |
 | tank | outflow in proportion to the level, linear pump valve | an orifice; an equal-percentage valve |
 | coil | constant inductance, over the current | a core that saturates |
-| core | constant inductance, over the flux | iron loss |
+| core | constant inductance, over the flux | hysteresis of the iron |
 | clamp | resistors and a capacitor | a diode; a clamp of two diodes |
 
 The truths are integrated here, without the catalogue. All values are drawn anew for every seed, and the simulator's are
@@ -25,11 +25,10 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from pilfr_casadi import Parameter, Port, Recording, Simulator, diagnose, multisine
+from pilfr_casadi import Parameter, Port, Recording, Simulator, diagnose
 
 Array = np.ndarray
 Flow = Callable[[Array, Array], Array]
@@ -130,7 +129,7 @@ def battery(rng: np.random.Generator, kind: str) -> Rig:
         states=("charge", "v_1"),
         inputs=("current",),
         parameters=guesses(rng, p, {"V_0": "V", "k": "V", "R": "Ohm", "R_1": "Ohm", "C_1": "F"}),
-        ports=Port("electrode", {"voltage": 1.0}, lambda x: x.charge, unit="V", across_unit="1"),
+        ports=(Port("electrode", {"voltage": 1.0}, lambda x: x.charge, unit="V", across_unit="1"),),
         units={"current": "A", "voltage": "V"},
     )
 
@@ -162,7 +161,7 @@ def oven(rng: np.random.Generator, kind: str) -> Rig:
         states=("heater", "block"),
         inputs=("power",),
         parameters=guesses(rng, p, {"C_h": "J/K", "C_b": "J/K", "G_h": "W/K", "G_b": "W/K"}),
-        ports=Port("surface", lambda p: {"block": -1 / p.C_b}, lambda x: x.block, unit="W", across_unit="K"),
+        ports=(Port("surface", lambda p: {"block": -1 / p.C_b}, lambda x: x.block, unit="W", across_unit="K"),),
         units={"power": "W", "T_heater": "K", "T_block": "K"},
     )
     most = rng.uniform(120, 200)
@@ -198,7 +197,7 @@ def tank(rng: np.random.Generator, kind: str) -> Rig:
             "k_out": Parameter(p["k_out"] * rng.uniform(1 - OFF, 1 + OFF), unit="m^2/s", bounds=(0.0, 0.01)),
             "a": Parameter(area, unit="m^2", fixed=True),
         },
-        ports=Port("outlet", lambda p: {"level": -1 / p.a}, lambda x: x.level, unit="m^3/s", across_unit="m"),
+        ports=(Port("outlet", lambda p: {"level": -1 / p.a}, lambda x: x.level, unit="m^3/s", across_unit="m"),),
         units={"opening": "1", "level": "m"},
     )
     most = 0.95 * min(height * p["k_out"] / p["k_in"] * 1.3, 1.0)
@@ -228,7 +227,7 @@ def coil(rng: np.random.Generator, kind: str) -> Rig:
         states=("current",),
         inputs=("voltage",),
         parameters=guesses(rng, p, {"R": "Ohm", "L": "H"}),
-        ports=Port("core", lambda p: {"current": -1 / p.L}, lambda x: x.current, unit="V", across_unit="A"),
+        ports=(Port("core", lambda p: {"current": -1 / p.L}, lambda x: x.current, unit="V", across_unit="A"),),
         units={"voltage": "V", "current": "A"},
     )
     dt = 0.1 * p["L"] / p["R"]
@@ -236,13 +235,16 @@ def coil(rng: np.random.Generator, kind: str) -> Rig:
 
 
 def core(rng: np.random.Generator, kind: str) -> Rig:
-    """The flux of a transformer at no load; its core may lose power by eddy currents."""
+    """The flux of a transformer at no load; its iron may have hysteresis (Bouc-Wen)."""
     p = {"R": rng.uniform(0.5, 2.0), "L": rng.uniform(0.02, 0.08)}
-    loss = rng.uniform(0.1, 0.3) / p["R"] if kind == "iron-loss" else 0.0  # 1 / Ohm
-    most, dt = rng.uniform(5, 10) * p["R"], 0.05 * p["L"] / p["R"]
+    most, dt = rng.uniform(5, 10) * p["R"], 0.1 * p["L"] / p["R"]
+    turn = rng.uniform(0.03, 0.1) * most * p["L"] / p["R"]  # V s
+    wide = rng.uniform(0.5, 1.0) / p["L"] if kind == "iron-loops" else 0.0
 
-    def induced(flux: Array, u: Array) -> Array:
-        return (u - p["R"] * flux / p["L"]) / (1 + p["R"] * loss)
+    def flow(x: Array, u: Array) -> Array:
+        induced = u[0] - p["R"] * (x[0] / p["L"] + wide * x[1])
+        falling = (0.5 + 0.5 * np.sign(x[1] * induced)) * abs(x[1]) / turn
+        return np.array([induced, induced * (1 - falling)])
 
     simulator = Simulator(
         lambda x, u, p: {"flux": u.voltage - p.R * x.flux / p.L},
@@ -250,16 +252,16 @@ def core(rng: np.random.Generator, kind: str) -> Rig:
         states=("flux",),
         inputs=("voltage",),
         parameters=guesses(rng, p, {"R": "Ohm", "L": "H"}),
-        ports=Port("core", lambda p: {"flux": -p.R, "current": 1.0}, lambda x: x.flux, unit="A", across_unit="V s"),
+        ports=(Port("core", lambda p: {"flux": -p.R, "current": 1.0}, lambda x: x.flux, unit="A", across_unit="V s"),),
         units={"voltage": "V", "current": "A"},
     )
     return Rig(
         simulator,
-        lambda x, u: induced(x, u[0]),
-        lambda x, u: x / p["L"] + loss * induced(x, u),
-        lambda rng: most / 3 * multisine(SAMPLES, 0.02 / dt, 1 / dt, rng)[:, None],
+        flow,
+        lambda x, u: x[:, :1] / p["L"] + wide * x[:, 1:],
+        lambda rng: levels(rng, -most, most, 5, 40),
         dt,
-        np.zeros(1),
+        np.zeros(2),
     )
 
 
@@ -284,7 +286,7 @@ def clamp(rng: np.random.Generator, kind: str) -> Rig:
         states=("v",),
         inputs=("source",),
         parameters=guesses(rng, p, {"R": "Ohm", "R_load": "Ohm", "C": "F"}),
-        ports=Port("load", lambda p: {"v": -1 / p.C}, lambda x: x.v, unit="A", across_unit="V"),
+        ports=(Port("load", lambda p: {"v": -1 / p.C}, lambda x: x.v, unit="A", across_unit="V"),),
         units={"source": "V", "voltage": "V"},
     )
     return Rig(simulator, flow, lambda x, u: x, lambda rng: levels(rng, -most, most, 5, 40), dt, np.zeros(1))
@@ -300,7 +302,7 @@ KINDS: dict[str, tuple[Callable[[np.random.Generator, str], Rig], str, str]] = {
     "orifice": (tank, "outlet", "static_curve"),
     "valve": (tank, "actuator:opening", "static_curve"),
     "saturating-core": (coil, "core", "saturating_inductance"),
-    "iron-loss": (core, "core", "viscous_damping"),
+    "iron-loops": (core, "core", "hysteresis"),
     "diode": (clamp, "load", "static_curve"),
     "diode-pair": (clamp, "load", "static_curve"),
 }

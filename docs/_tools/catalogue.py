@@ -210,8 +210,8 @@ def escape(text: str) -> str:
 
 
 INTRODUCTION = """\
-The physical laws that `diagnose` tries at each port. Some belong to one :doc:`domain </howto/other_domains>` alone. Every page has the equation, a picture, the parameters, and the
-laws that it is confused with. The pictures show one motion: two periods at full amplitude, then two small ones about
+The physical laws that `diagnose` tries at each port. Some belong to one :doc:`domain </howto/other_domains>` alone. Every
+page has the equation, a picture, the parameters, and the laws that it is confused with. The pictures show one motion: two periods at full amplitude, then two small ones about
 another middle. *Nearest laws* are those that follow this law's force best on that motion, beside a free spring and
 damper (behind an actuator or sensor: a free gain and offset). Real recordings decide better than this: ask
 :func:`~pilfr_casadi.check`.

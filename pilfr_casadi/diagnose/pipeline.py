@@ -42,7 +42,7 @@ from ..laws import Law, readable_unit
 from ..simulators import Simulator
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction, find_correction, named_correction
-from .evidence import AS_GIVEN, BETTER, SURE, deviations
+from .evidence import AS_GIVEN, SURE, deviations
 from .floor import Floor
 from .gates import USELESS_FIT, Gate, Offset, final_gates, offset_gates, without_idle_offsets
 from .identifiability import port_units
@@ -193,18 +193,13 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
 
 
 def _search(request: Request) -> tuple[Prepared, Search]:
-    """Prepare and search; repeat without shifting early channels if these were shifted, and keep the better search.
-
-    Of two searches that come as near, the one with fewer effects is the better one: a loss that looks like a lead needs
-    no delay to undo the shift.
-    """
+    """Prepare and search; repeat without shifting early channels if these were shifted, and keep the better search."""
     ready, search = _search_once(request, shift_early=True)
     seemed_early = any(g.finding == "alignment" and g.value < 0 for g in ready.gates)
     if not seemed_early or search.interrupted or search.out_of_time or not search.can_improve(search.best):
         return ready, search
     other, again = _search_once(request, shift_early=False)
-    simpler = len(again.best.effects) < len(search.best.effects)
-    if again.best.whole < (BETTER**2 if simpler else AS_GIVEN) * search.best.whole:
+    if again.best.whole < AS_GIVEN * search.best.whole:
         return other, again
     search.interrupted = again.interrupted
     return ready, search

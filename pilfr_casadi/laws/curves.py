@@ -153,7 +153,9 @@ class Exponential(Polynomial):
 
     form = "exponential"
     equation = "w = R (exp(c u) - 1) / (exp(c R) - 1) - u"
-    source = "Liptak (2006), Instrument Engineers' Handbook, vol. 2, ch. 6; Steinhart & Hart (1968), Deep-Sea Res. 15(4)"
+    source = (
+        "Liptak (2006), Instrument Engineers' Handbook, vol. 2, ch. 6; Steinhart & Hart (1968), Deep-Sea Res. 15(4)"
+    )
     sentence = "a memoryless curve: the gain grows exponentially with the signal, as of an equal-percentage valve"
     units = {"c": "1/z", "R": "z"}
     strength = ()

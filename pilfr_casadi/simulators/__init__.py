@@ -1,10 +1,11 @@
 """The user's equations with ports for missing physics.
 
-`equations` evaluates them with their laws, `domains` infers a port's physical domain, `integration` makes them a discrete-time `Model`, `simulator` holds the
-class `Simulator` and the state in which its laws begin at rest, and `adapters` accept a Python file, a state space or a
-fitted model in its place. `fmu` makes one of a functional mock-up unit, which its equations call (`external`,
-`fmu_description`, `fmu_instance`). `numpy_function` makes one from a NumPy function, whose equations `tracing` finds by
-calling it with the `symbols` of the file of that name; one that cannot be followed stays a `black_box`.
+`equations` evaluates them with their laws, `domains` infers a port's physical domain, `integration` makes them a
+discrete-time `Model`, `simulator` holds the class `Simulator` and the state in which its laws begin at rest, and
+`adapters` accept a Python file, a state space or a fitted model in its place. `fmu` makes one of a functional mock-up
+unit, which its equations call (`external`, `fmu_description`, `fmu_instance`). `numpy_function` makes one from a NumPy
+function, whose equations `tracing` finds by calling it with the `symbols` of the file of that name; one that cannot be
+followed stays a `black_box`.
 """
 
 from typing import TYPE_CHECKING

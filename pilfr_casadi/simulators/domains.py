@@ -1,7 +1,7 @@
 """The physical domain of a port: mechanical, thermal, electrical or fluid, inferred from its units.
 
 The unit of the hidden force and that of the local coordinate each allow some domains; the port belongs to the one
-domain that both allow. Dimensions decide, not spelling (Karnopp, Margolis & Rosenberg 2012, System Dynamics, table 2.2):
+domain that both allow. Dimensions decide, not spelling (Karnopp, Margolis & Rosenberg 2012, System Dynamics):
 a temperature is thermal, a unit with amperes is electrical, a volume or mass flow is fluid, a force or a torque is
 mechanical. A pressure or a length may be fluid or mechanical, and a number, a power or a unit that is not known may be
 anything: N over m is mechanical, m^3/s over m is fluid, W over K is thermal, V over the state of charge is electrical.
