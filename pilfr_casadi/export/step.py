@@ -22,10 +22,10 @@ import numpy as np
 
 from .._base import LARGEST, InputError, is_number, numbers, path_text, positive, whole, write_atomically
 from ..data import Recording
-from ..engine import make_engine
+from ..engine import calls_external, make_engine
 from ..models import Model, ParameterSet, PrandtlIshlinskii
 from ..optimise import first_state
-from ..simulators import ClosedEquations, Instant, Simulator, calls_external, choose_substeps, discretise, on_grid
+from ..simulators import ClosedEquations, Instant, Simulator, choose_substeps, discretise, on_grid
 from .c_code import check_name, make_unique, write_c
 from .fmu import FmuContent, write_fmu
 from .smoothing import enclose, smooth_kinks

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from .equations import Named as Named, Placed as Placed, Port as Port, in_series as in_series
     from .external import (
         PythonFunction as PythonFunction,
-        calls_external as calls_external,
         leaves as leaves,
         units as units,
     )
