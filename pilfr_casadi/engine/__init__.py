@@ -2,7 +2,7 @@
 
 `sensitivities` holds the recursion and the virtual machine, `compiled` the generated C, its compiler and its cache,
 `external` the calls from there of programs that CasADi cannot look into.
-Both engines sum in the same order, so simulations and derivatives, and so fits, agree bit by bit on x86-64.
+Both engines sum in the same order. So simulations, derivatives and fits agree bit for bit on x86-64.
 """
 
 from typing import TYPE_CHECKING
