@@ -2,10 +2,10 @@
 
 How an answer comes about:
 
-0. Steps 1 and 2 are done once as a rule. They are repeated in three cases: with an observer if the simulator is unstable
-   and runs away from the recordings (`prediction`); with the other hold if nobody stated it and the best hypothesis
-   follows better with it; without a shift if a channel seemed to be early, because missing physics can look like a lead.
-   Each search fits different data. Its evidence is therefore not comparable; the smaller error decides.
+0. Steps 1 and 2 are done once as a rule. They are repeated in three cases: with an observer if the simulator is
+   unstable and runs away from the recordings (`prediction`); with the other hold if nobody stated it and the best
+   hypothesis follows better with it; without a shift if a channel seemed to be early, because missing physics can look
+   like a lead. Each search fits different data. Its evidence is therefore not comparable; the smaller error decides.
 1. `prepare` corrects faults of the recordings, refits the simulator, and measures the noise. The refitted simulator is
    the hypothesis that nothing is missing. What it leaves above the noise is the mismatch.
 2. `Search.run` fits further hypotheses: the simulator with laws in its ports, with all parameters estimated together.

@@ -2,9 +2,9 @@
 
 `problem` states the problem and computes its derivatives, `constraints` holds constraints on named parameters,
 `gauss_newton` is the default solver (its damping is the class `Damping`, the first value `GaussNewton(damping=...)`),
-`ipopt` the other one. Initial states are variables of the problem (`place_recordings` there); `first_state` estimates
-the one of a further recording, for which the parameters are known. `exact_limits` solves at exact bounds on spectral
-radii and moves results into the feasible set. `solution` holds the result of a solver, its status and its active limits.
+`ipopt` the other one. Initial states are variables of the problem; `first_state` estimates that of a further recording,
+for which the parameters are known. `exact_limits` solves at exact bounds on spectral radii and moves results into the
+feasible set. `solution` holds the result of a solver, its status and its active limits.
 """
 
 from typing import TYPE_CHECKING

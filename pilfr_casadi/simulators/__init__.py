@@ -4,8 +4,8 @@
 holds the class `Simulator` and the state in which its laws begin at rest. `adapters` accept a Python file, a state
 space or a fitted model in its place. `fmu` wraps a functional mock-up unit as a simulator (`fmu_description`,
 `fmu_instance`). `numpy_function` makes a simulator from a NumPy function: `tracing` calls the function with `symbols`
-to obtain its equations. A function that cannot be traced is called with numbers (`black_box`). `external` lets equations
-call such a program.
+to obtain its equations. A function that cannot be traced is called with numbers (`black_box`). `external` lets
+equations call such a program.
 """
 
 from typing import TYPE_CHECKING
