@@ -53,6 +53,7 @@ from .other_explanations import find_pinned_parameter, find_undeclared_port, fin
 from .prediction import FOCUS, can_be_led, prediction_note, predictor
 from .preparation import (
     CHECKS,
+    FEWEST_SAMPLES,
     Prepared,
     add_scaled_laws,
     check_laws,
@@ -70,7 +71,7 @@ from .search import Search
 from .stretches import MOST_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
 from .trials import Trial
 from .verdict import Named, Posterior, Verdict, judge, names, posterior
-from .workbench import Fitted, RunsAway
+from .workbench import Fitted, RunsAway, Workbench
 
 SEARCHING = 0.7  # share of the remaining time for preparation and search; the rest is for the correction
 
@@ -178,7 +179,7 @@ def _on_stretches(request: Request, most: int) -> Request:
     recordings, spikes = remove_glitches(request.recordings)
     recordings, transients = open_unsettled(recordings)
     hold = stated_hold(request.simulator, recordings, request.hold) or "zero"
-    chosen = choose_stretches(request.simulator, recordings, hold, request.engine, most)
+    chosen = choose_stretches(request.simulator, recordings, hold, request.engine, most, request.workers)
     stretches = Stretches(recordings, chosen)
     request.say("choice of stretches", 1, 1)
     notes = (*request.notes, stretches.note, *spikes, *transients)

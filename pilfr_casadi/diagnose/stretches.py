@@ -22,23 +22,23 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import pairwise
 
 import numpy as np
 
 from .._base import InputError, side_by_side
 from ..data import Recording
-from ..laws import Creep, StopHysteresis
+from ..engine import Engine
+from ..laws import Creep, Law, StopHysteresis
 from ..models import Model
 from ..optimise import GaussNewton, first_state, samples_for_state
 from ..simulators import Simulator
-from .evidence import REACH
 from .floor import FEWEST, effective_size
 from .gates import Gate
-from .linearise import Probe, run
-from .screen import Remainder, Surface, orthonormal
+from .linearise import Probe, loudest_stretch, run
+from .screen import Remainder, Surface, Task, orthonormal
 from .search import Findings, Search, likeliest
 from .timing import Jump
 from .trials import Trial
@@ -49,6 +49,7 @@ SHARE, COUNT = 2 / 3, 10  # share of these samples that the stretches have toget
 SHORTEST = 500  # least length of a stretch in samples: a law with memory needs some history
 WARM_UP = 0.05  # share of a stretch that is simulated before it and not scored
 CANDIDATES = 300  # stretches that are linearised at most
+LINEARISED = 1000  # samples of each that are linearised
 FAMILIES = (Surface, StopHysteresis, Creep)  # forces near whose span the catalogue's laws are
 # the stretches' fits are near those to everything, so that few steps suffice
 FINAL = GaussNewton(max_iterations=40, tolerance=1e-5, patience=3)
@@ -126,7 +127,12 @@ class Stretches:
 
 
 def choose_stretches(
-    simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str = "auto", most: int = MOST_SAMPLES
+    simulator: Simulator,
+    recordings: Sequence[Recording],
+    hold: str,
+    engine: str = "auto",
+    most: int = MOST_SAMPLES,
+    workers: int = 1,
 ) -> tuple[Stretch, ...]:
     """Choose the stretches of recordings that tell most of missing forces; see the module docstring.
 
@@ -141,8 +147,9 @@ def choose_stretches(
     signals = signal_features(recordings, stretches)
     if len(stretches) > CANDIDATES:
         kept = spread_out(signals, CANDIDATES, int(np.argmax(np.sum(signals**2, axis=1))))
+        kept = sorted(kept)
         stretches, signals = [stretches[k] for k in kept], signals[kept]
-    explained = force_features(simulator, recordings, stretches, hold, engine)
+    explained = force_features(simulator, recordings, stretches, hold, engine, workers)
     leading = signals if explained is None else explained
     features = signals if explained is None else np.hstack([explained, signals])
     chosen = spread_out(features, count, int(np.argmax(np.sum(leading**2, axis=1))))
@@ -153,7 +160,7 @@ def divide(recording: int, samples: int, skip: int, length: int) -> list[Stretch
     """Divide a recording into stretches of about equal length; the first begins with its skipped samples."""
     edges = np.linspace(skip, samples, max(round((samples - skip) / length), 1) + 1).astype(int)
     edges[0] = 0
-    return [Stretch(recording, int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [Stretch(recording, int(a), int(b)) for a, b in pairwise(edges)]
 
 
 def spread_out(features: np.ndarray, count: int, first: int) -> list[int]:
@@ -187,29 +194,37 @@ def signal_features(recordings: Sequence[Recording], stretches: Sequence[Stretch
 
 
 def force_features(
-    simulator: Simulator, recordings: Sequence[Recording], stretches: Sequence[Stretch], hold: str, engine: str
+    simulator: Simulator,
+    recordings: Sequence[Recording],
+    stretches: Sequence[Stretch],
+    hold: str,
+    engine: str,
+    workers: int = 1,
 ) -> np.ndarray | None:
     """Compute the size of the residual that each family of forces explains at each port in each stretch, (n, k).
 
-    All are divided by the largest, and by the root of their number. None if the simulator as given cannot be run.
+    Each stretch counts where its residual is largest. All sizes are divided by the largest, and by the root of their
+    number. None if the simulator as given cannot be run.
     """
     try:
         bench = Workbench.of(simulator, recordings, hold, engine)
         model, runner = bench.compile(simulator)
     except InputError:
         return None
-    values = {name: p.value for name, p in model.parameters.items()}
-    states = _states_at(model, runner, recordings, stretches)
-    if not np.all(np.isfinite(states)):
+    pieces = [piece for i in range(len(recordings)) for piece in _loudest(bench, model, runner, i, stretches)]
+    if not all(np.all(np.isfinite(state)) for _, state in pieces):
         return None
-    fitted = Fitted(simulator, model, runner, values, list(states), [], np.nan)
+    values = {name: p.value for name, p in model.parameters.items()}
+    fitted = Fitted(simulator, model, runner, values, [], [], np.nan)
     probe = Probe.of(bench, fitted)
-    pieces = [recordings[s.recording].slice(s.begin, s.end) for s in stretches]
-    rows = []
-    for piece, state in zip(pieces, states, strict=True):
-        part = replace(bench, recordings=(piece,))
+
+    def explained(piece: tuple[Recording, np.ndarray]) -> dict[tuple[str, str], float]:
+        r, state = piece
+        part = replace(bench, recordings=(r,))
         rest = Remainder.of(part, probe, [run(part, probe, replace(fitted, initial=[state]), 0)], FAMILIES)
-        rows.append({(t.port.name, law.id): size for t in rest.tasks for law, size in _explained(rest, t)})
+        return {(t.port.name, law.id): size for t in rest.tasks for law, size in _explained(rest, t)}
+
+    rows = side_by_side(explained, pieces, workers)
     keys = sorted(set().union(*rows))
     found = np.array([[row.get(key, 0.0) for key in keys] for row in rows])
     largest = np.max(found, initial=0.0)
@@ -218,7 +233,36 @@ def force_features(
     return np.asarray(found / largest / np.sqrt(len(keys)))
 
 
-def _explained(rest: Remainder, task: Any) -> list[tuple[Any, float]]:
+def _loudest(
+    bench: Workbench, model: Model, engine: Engine, i: int, stretches: Sequence[Stretch]
+) -> Iterator[tuple[Recording, np.ndarray]]:
+    """Generate the part of each stretch of recording i with the largest residual as given, and the state before it."""
+    r, p, rows = bench.recordings[i], model.parameters.start, model.substeps
+    here = [s for s in stretches if s.recording == i]
+    if not here:
+        return
+    drive, at, state = model.drive(r), 0, _first_state(model, engine, r)
+
+    def simulate(begin: int, end: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if end == begin:
+            return r.y[:0], state
+        with np.errstate(all="ignore"):
+            y, after = engine.simulate(drive[begin * rows : end * rows], p, state)
+        return y, after
+
+    for s in here:  # in the order of their samples
+        state = simulate(at, s.begin, state)[1]
+        y, after = simulate(s.begin, s.end, state)
+        power = np.nan_to_num(np.sum(((y - r.y[s.begin : s.end]) / bench.scale) ** 2, axis=1), nan=0.0, posinf=0.0)
+        part = loudest_stretch(power, LINEARISED, 0)
+        yield (
+            r.slice(s.begin + part.start, s.begin + part.stop),
+            simulate(s.begin, s.begin + part.start, state)[1],
+        )
+        at, state = s.end, after
+
+
+def _explained(rest: Remainder, task: Task) -> list[tuple[Law, float]]:
     """Compute the size of the remainder along the forces of each family at a port."""
     out = []
     for law, doses in rest.doses(task):
@@ -227,27 +271,7 @@ def _explained(rest: Remainder, task: Any) -> list[tuple[Any, float]]:
     return out
 
 
-def _states_at(
-    model: Model, engine: Any, recordings: Sequence[Recording], stretches: Sequence[Stretch]
-) -> np.ndarray:
-    """Compute the model's state at the beginning of each stretch, at its start values, (n, n_state)."""
-    out = np.zeros((len(stretches), model.n_state))
-    p, rows = model.parameters.start, model.substeps
-    for i, r in enumerate(recordings):
-        here = sorted((s.begin, k) for k, s in enumerate(stretches) if s.recording == i)
-        if not here:
-            continue
-        with np.errstate(all="ignore"):
-            drive, at = model.drive(r), 0
-            state = _first_state(model, engine, r)
-            for begin, k in here:
-                if begin > at:
-                    state, at = engine.simulate(drive[at * rows : begin * rows], p, state)[1], begin
-                out[k] = state
-    return out
-
-
-def _first_state(model: Model, engine: Any, r: Recording) -> np.ndarray:
+def _first_state(model: Model, engine: Engine, r: Recording) -> np.ndarray:
     """Find the state at a recording's first sample at the model's start values; zero if that diverges."""
     try:
         return np.asarray(first_state(model, engine, r, min(samples_for_state(model), len(r) // 3) or None))
