@@ -3,9 +3,10 @@
 Two masses with three ports (ground spring, coupling, guide). The force is small, save for a few short bursts. There the
 coupling's spring stiffens with the cube of its stretch, which the simulator leaves out. Elsewhere this is not visible.
 
-    python -m problems.long_records                 both cases, each in a process of its own
+    python -m problems.long_records                 every case, each in a process of its own
     python -m problems.long_records one --samples 1000000
     python -m problems.long_records many --recordings 200
+    python -m problems.long_records open            the same recordings, with unknown initial states
     python -m problems.long_records cut             the same equations on 20,000 samples
 
 Each row has the answer, the seconds, the processors' seconds, and the peak memory of the process. A time is told on an
@@ -51,8 +52,8 @@ def plant() -> ca.Function:
     return ca.Function("step", [x, u], [s, x[[0, 2]]]).mapaccum(BLOCK)
 
 
-def record(samples: int, bursts: int, seed: int, name: str = "") -> Recording:
-    """One experiment from rest: coloured force with bursts, both displacements measured."""
+def record(samples: int, bursts: int, seed: int, name: str = "", initial: str = "zero") -> Recording:
+    """One experiment from rest, which `initial` may conceal: coloured force with bursts, two displacements."""
     rng = np.random.default_rng(seed)
     size = np.full(samples, QUIET)
     for at in rng.integers(0, max(samples - BURST, 1), bursts):
@@ -68,7 +69,7 @@ def record(samples: int, bursts: int, seed: int, name: str = "") -> Recording:
         state = np.asarray(states)[:, -1]
         y[begin : begin + BLOCK] = np.asarray(outputs).T[: len(now)]
     y += NOISE * rng.standard_normal(y.shape)
-    return Recording(force, y, DT, ("force",), ("x1", "x2"), initial="zero", hold="zero", name=name)
+    return Recording(force, y, DT, ("force",), ("x1", "x2"), initial=initial, hold="zero", name=name)
 
 
 def simulator() -> pilfr.Simulator:
@@ -102,6 +103,7 @@ def simulator() -> pilfr.Simulator:
 
 
 FREE = (("k1", K1, 1.1), ("k2", K2, 0.9), ("d1", D1, 1.15), ("d2", D2, 0.9), ("d3", D3, 1.1))
+CASES = ("cut", "one", "many", "open")
 
 
 def recordings(case: str, samples: int, count: int) -> list[Recording]:
@@ -110,7 +112,8 @@ def recordings(case: str, samples: int, count: int) -> list[Recording]:
         return [record(samples, 6, 1)]
     if case == "cut":
         return [record(20_000, 3, 2)]
-    return [record(2000, int(i % 40 == 7), 100 + i, f"day {i + 1}") for i in range(count)]
+    initial = "estimate" if case == "open" else "zero"
+    return [record(2000, int(i % 40 == 7), 100 + i, f"day {i + 1}", initial) for i in range(count)]
 
 
 def run(case: str, samples: int, count: int) -> str:
@@ -131,21 +134,22 @@ def run(case: str, samples: int, count: int) -> str:
     stages = ", ".join(f"{k} {v:.0f}" for k, v in found.times.items() if v > 1)
     return (
         f"{case:5}{size:>14}  {found.verdict:16} {effects:36} {values}  "
-        f"test {after}  {seconds:6.1f} s (processors {busy:.0f} s)  {peak:.2f} GB (before {before / 1e6:.2f})\n      {stages}"
+        f"test {after}  {seconds:6.1f} s (processors {busy:.0f} s)  "
+        f"{peak:.2f} GB (before {before / 1e6:.2f})\n      {stages}"
     )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a case, or all of them in processes of their own."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("case", nargs="?", choices=("one", "many", "cut"))
+    parser.add_argument("case", nargs="?", choices=CASES)
     parser.add_argument("--samples", type=int, default=1_000_000)
     parser.add_argument("--recordings", type=int, default=200)
     options = parser.parse_args(arguments)
     if options.case:
         print(run(options.case, options.samples, options.recordings), flush=True)
         return
-    for case in ("cut", "one", "many"):
+    for case in CASES:
         more = [f"--samples={options.samples}", f"--recordings={options.recordings}"]
         subprocess.run([sys.executable, "-m", "problems.long_records", case, *more], check=True)
 

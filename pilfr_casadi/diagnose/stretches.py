@@ -253,7 +253,8 @@ def _loudest(
     for s in here:  # in the order of their samples
         state = simulate(at, s.begin, state)[1]
         y, after = simulate(s.begin, s.end, state)
-        power = np.nan_to_num(np.sum(((y - r.y[s.begin : s.end]) / bench.scale) ** 2, axis=1), nan=0.0, posinf=0.0)
+        with np.errstate(all="ignore"):
+            power = np.nan_to_num(np.sum(((y - r.y[s.begin : s.end]) / bench.scale) ** 2, axis=1), nan=0.0, posinf=0.0)
         part = loudest_stretch(power, LINEARISED, 0)
         yield (
             r.slice(s.begin + part.start, s.begin + part.stop),
