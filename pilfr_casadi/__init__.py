@@ -78,8 +78,10 @@ if TYPE_CHECKING:
     from .diagnose import Check as Check, Diagnosis as Diagnosis, check as check
     from .export import Exported as Exported, exported as exported, to_casadi as to_casadi
     from .identify import (
+        Comparison as Comparison,
         Fit as Fit,
         RegularizationPath as RegularizationPath,
+        compare as compare,
         fit as fit,
         load as load,
         one_step as one_step,
@@ -151,6 +153,7 @@ else:
 # Reached through their folders (`pilfr.models.to_plays`); these spellings still work.
 _ELSEWHERE = {
     "BLA",
+    "Comparison",
     "Envelope",
     "Exported",
     "Limit",
@@ -162,6 +165,7 @@ _ELSEWHERE = {
     "StaticNetwork",
     "Status",
     "as_recordings",
+    "compare",
     "dc_gain",
     "do_mpc_controller",
     "do_mpc_model",

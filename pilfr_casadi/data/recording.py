@@ -13,7 +13,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from .._base import LARGEST, InputError, is_number, is_whole, listed, positive, real_array, usable
+from .._base import LARGEST, InputError, is_number, is_whole, later, listed, positive, real_array, usable
 from .preprocessing import butterworth, change_step, remove_trend
 
 SAME_STEP = 1e-4  # relative difference up to which two steps are the same; written times have few digits
@@ -140,6 +140,18 @@ class Recording:
         initial = self.begins
         shown = [f"initial {initial}", *(f"{key} {value}" for key, value in extras.items() if value is not None)]
         return f"<{text}, {', '.join(shown)}>"
+
+    def plot(self) -> Any:
+        """Draw every channel over time and over frequency; look at a recording before you fit it.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+        """
+        return later("plot_recording")(self)
+
+    def _repr_html_(self) -> str:
+        return str(later("recording_card")(self))
 
     def with_(self, **changes: Any) -> Self:
         """Return a copy with some fields replaced, checked anew."""

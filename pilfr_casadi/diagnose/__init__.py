@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
     from .mismatch_map import mismatch as mismatch
     from .refinement import Refinement as Refinement
-    from .result import Comparison as Comparison, Diagnosis as Diagnosis, Effect as Effect
+    from .result import BeforeAfter as BeforeAfter, Diagnosis as Diagnosis, Effect as Effect
     from .workbench import Fitted as Fitted, Workbench as Workbench
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, is_number, listed
+from .._base import InputError, is_number, later, listed
 from ..data import NOTHING_SENTENCE, Recording, as_recordings, explains_nothing, fingerprint, nrmse, rmse_per_output
 from ..engine import Engine, make_engine
 from ..export import FitContent, exported, read_model_file, write_model_file
@@ -204,7 +204,7 @@ class Fit:
         fitted to the first `samples` samples (default: ten per state, at least 50) at the model's parameters. Later
         samples are not used, and `nrmse` does not score the first ones.
         """
-        recording = self._matched(recording)
+        recording = self.matched(recording)
         known = self.initial.get(fingerprint(recording))
         return first_state(self.model, self._engine, recording, samples, state_prior=True) if known is None else known
 
@@ -220,14 +220,19 @@ class Fit:
 
     def signals(self, recording: Recording) -> dict[str, np.ndarray]:
         """Simulate `y` (M, n_y) with the element's `z` and `w` (M, n_w)."""
-        recording = self._matched(recording)
+        recording = self.matched(recording)
         state = self.initial_state(recording)
         y, _, z, w = self._engine.simulate(self.model.drive(recording), self.model.parameters.start, state, True)
         return {"y": y, "z": z, "w": w}
 
+    def run(self, recording: Recording) -> tuple[Recording, np.ndarray, int]:
+        """Simulate along a recording: it as the model takes it, its outputs (M, n_y), the first scored sample."""
+        recording = self.matched(recording)
+        return recording, self.simulate(recording), self.scored_from(recording)
+
     def scored_from(self, recording: Recording) -> int:
         """Find the first sample that is scored: after `skip`, and after those that an initial state is fitted to."""
-        recording = self._matched(recording)
+        recording = self.matched(recording)
         estimated = recording.begins == "estimate"
         if not estimated or fingerprint(recording) in self.initial or not self.model.n_state:
             return recording.skip
@@ -251,7 +256,7 @@ class Fit:
         InputError
             If a recording does not fit the model or has no samples left to score, or an output never changes.
         """
-        given = [self._matched(r) for r in as_recordings(recordings)]
+        given = [self.matched(r) for r in as_recordings(recordings)]
         first = [self.scored_from(r) for r in given]
         pooled = np.concatenate([r.y[k:] for r, k in zip(given, first, strict=True)])
         nrmse(pooled, pooled)  # refuses an output that never changes
@@ -262,7 +267,7 @@ class Fit:
             errors.append(np.mean(rmse_per_output(r.y, self.simulate(r), k) / spread))
         return float(np.mean(errors))
 
-    def _matched(self, recording: Recording) -> Recording:
+    def matched(self, recording: Recording) -> Recording:
         """Check that a recording fits the model; for a simulator, put its columns in the simulator's order."""
         if not isinstance(recording, Recording):
             raise InputError(
@@ -297,9 +302,7 @@ class Fit:
         test: Recording | Sequence[Recording] = (),
     ) -> Path:
         """Write report.html and model.json into a folder; return the page's path. See `report.fit_report`."""
-        from ..report import fit_report
-
-        return fit_report(self, train, test, folder)
+        return Path(later("fit_report")(self, train, test, folder))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the fit as JSON, atomically: an existing file stays as it is until the new one is complete on disk.
@@ -377,6 +380,9 @@ class Fit:
         return "\n".join(line for line in lines if line)
 
     __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return str(later("fit_card")(self))
 
 
 def match_channels(simulator: Simulator, recording: Recording) -> Recording:

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
         linear_simulation as linear_simulation,
         output_over_input as output_over_input,
         plot_comparison as plot_comparison,
+        plot_recording as plot_recording,
         remains as remains,
         spectrum as spectrum,
         time as time,
