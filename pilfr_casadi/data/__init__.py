@@ -6,6 +6,7 @@ from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
     from .common_clock import merge as merge
+    from .correlations import BAND as BAND, chance as chance, correlation as correlation
     from .excitation import (
         excited_bins as excited_bins,
         multisine as multisine,

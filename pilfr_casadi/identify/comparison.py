@@ -79,15 +79,25 @@ class Comparison:
         }[r.begins]
         return f"{start}; scored from {r.skip * r.dt:.4g} s on." if r.skip else f"{start}; all samples are scored."
 
-    def plot(self) -> Any:
-        """Draw a row for each output: the signals around the largest swing, and the errors over the whole recording.
+    def plot(self, kind: str = "signals", **options: Any) -> Any:
+        """Draw the models beside the recording, a row for each output.
+
+        Parameters
+        ----------
+        kind : {"signals", "residuals"}
+            The signals around the largest swing and the errors over the whole recording, or correlations of the errors
+            with themselves and with the inputs (`plots.residual_tests`, which takes the `options`).
 
         Returns
         -------
         matplotlib.figure.Figure
         """
-        from ..plots import plot_comparison
+        from ..plots import plot_comparison, residual_tests
 
+        if kind == "residuals":
+            return residual_tests(self.recording, list(self.simulated.items()), **options)
+        if kind != "signals":
+            raise InputError(f"kind={kind!r} was given to plot; give signals or residuals.")
         error = self.nrmse
         return plot_comparison(self.recording, [(f"{k} ({_shown(error[k])})", y) for k, y in self.simulated.items()])
 

@@ -22,7 +22,8 @@ from .._base import InputError, is_number, later, listed
 from ..data import NOTHING_SENTENCE, Recording, as_recordings, explains_nothing, fingerprint, nrmse, rmse_per_output
 from ..engine import Engine, make_engine
 from ..export import FitContent, exported, read_model_file, write_model_file
-from ..models import PILFR, Model
+from ..linear import LinearPart, any_bla, linear_parts
+from ..models import PILFR, Model, accumulate_steps
 from ..optimise import (
     Candidate,
     Constraint,
@@ -289,11 +290,45 @@ class Fit:
             )
         return recording
 
-    def plot(self, recordings: Recording | Sequence[Recording], **options: Any) -> Any:
-        """Draw the figures of the fit over recordings; see `plots.plot_fit`."""
-        from ..plots import plot_fit
+    def linear_parts(self, recording: Recording | None = None) -> dict[str, LinearPart]:
+        """Return the linear models in the fitted model, by name; see `linear.linear_parts`.
 
-        return plot_fit(self, recordings, **options)
+        A fit of a simulator is linearised about the mean state and input of the recording, or about zero.
+        """
+        if recording is None or "A" in self.model.parameters:
+            return linear_parts(self.model, self.dt)
+        recording = self.matched(recording)
+        drive, p = self.model.drive(recording), self.model.parameters.start
+        values = np.broadcast_to(p, (len(drive), len(p)))
+        states = accumulate_steps(self.model.closed, self.initial_state(recording), drive, values)[0]
+        return linear_parts(self.model, self.dt, np.mean(states, axis=0), np.mean(drive, axis=0))
+
+    def plot(self, recordings: Recording | Sequence[Recording], kind: str = "fit", **options: Any) -> Any:
+        """Draw the fit over recordings.
+
+        Parameters
+        ----------
+        recordings : Recording or several
+            `"residuals"` draws the first of them; a simulator is linearised about the means of the first.
+        kind : {"fit", "bode", "poles", "residuals"}
+            Outputs and hysteresis (`plots.plot_fit`); the Bode diagram of the linear parts over the response measured
+            in the recordings (`plots.bode`); their poles and zeros (`plots.pole_zero`); correlations of the residuals
+            with themselves and with the inputs (`plots.residual_tests`).
+        **options
+            Of that function, such as `output` and `input` (numbers from 0) or `lags`.
+        """
+        from ..plots import bode, plot_fit, pole_zero, residual_tests
+
+        given = as_recordings(recordings)
+        if kind == "fit":
+            return plot_fit(self, recordings, **options)
+        if kind == "residuals":
+            seen, y, first = self.run(given[0])
+            return residual_tests(seen.with_(skip=first), [("this model", y)], **options)
+        if kind not in ("bode", "poles"):
+            raise InputError(f"kind={kind!r} was given to plot; give fit, bode, poles or residuals.")
+        parts = self.linear_parts(given[0])
+        return pole_zero(parts, **options) if kind == "poles" else bode(parts, any_bla(given), **options)
 
     def report(
         self,
