@@ -316,6 +316,15 @@ class Fit:
             with themselves and with the inputs (`plots.residual_tests`).
         **options
             Of that function, such as `output` and `input` (numbers from 0) or `lags`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        InputError
+            If a recording does not fit the model, the kind is unknown, or the recording is too short for its tests.
         """
         from ..plots import bode, plot_fit, pole_zero, residual_tests
 
@@ -328,7 +337,7 @@ class Fit:
         if kind not in ("bode", "poles"):
             raise InputError(f"kind={kind!r} was given to plot; give fit, bode, poles or residuals.")
         parts = self.linear_parts(given[0])
-        return pole_zero(parts, **options) if kind == "poles" else bode(parts, any_bla(given), **options)
+        return pole_zero(parts, **options).figure if kind == "poles" else bode(parts, any_bla(given), **options)
 
     def report(
         self,

@@ -434,7 +434,7 @@ def test_a_bode_diagram_draws_both_linear_parts_over_the_measured_response(fitte
 
 
 def test_poles_and_zeros_are_drawn_in_the_upper_half_plane(fitted, data):
-    ax = fitted.plot(data, "poles")
+    (ax,) = fitted.plot(data, "poles").axes
     crosses = [line for line in ax.lines if line.get_marker() == "x"]
     expected = [p[p.imag >= 0].real for p in (part.poles for part in fitted.linear_parts().values())]
     assert [list(line.get_xdata()) for line in crosses] == [list(e) for e in expected]
@@ -450,6 +450,10 @@ def test_residual_tests_have_a_panel_for_the_residual_each_input_and_its_square(
     ]
     x, values = axes[1].lines[-1].get_data()
     assert x[0] == -30 and x[-1] == 30 and np.mean(np.abs(values) < 3) > 0.95  # the noise is independent of the force
+
+
+def test_a_notebook_shows_a_figure_without_pyplot(fitted, data):
+    assert fitted.plot(data, "poles")._repr_png_()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
 def test_pictures_that_cannot_be_drawn_are_refused(fitted, data):
