@@ -15,7 +15,7 @@ import numpy as np
 from .._base import InputError, later, to_json, write_atomically
 from ..data import SAME_STEP, Recording, as_recordings, nrmse
 from ..engine import make_engine
-from ..identify import match_channels, run_free
+from ..identify import RUN_AWAY, match_channels, run_free
 from ..laws import display_name
 from ..models import ParameterSet
 from ..simulators import Simulator, discretise, in_series
@@ -33,7 +33,6 @@ VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
 STEPS = {"nominal": "as given", "before": "refitted", "after": "corrected"}  # the errors that are printed
 MOST = 8  # parameters and blind spots that are printed at most
-RUN_AWAY = 1e4  # error from which its size says nothing
 GRAVEST = 2  # blind spots that are told right after the verdict
 CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."

@@ -186,9 +186,8 @@ def _residual(model: Any, recording: Recording) -> tuple[np.ndarray, int]:
     else:
         simulator = as_simulator(model, [recording])
         seen = match_channels(simulator, recording)
-        asked = [int(getattr(e.law, "substeps", 1)) for e in simulator.elements]
-        substeps = 1 if simulator.discrete else max([*asked, choose_substeps(simulator, [seen])])
-        discrete = discretise(simulator, seen.dt, seen.hold or simulator.hold or "zero", substeps)
+        hold = seen.hold or simulator.hold or "zero"
+        discrete = discretise(simulator, seen.dt, hold, choose_substeps(simulator, [seen]))
         y, first = run_free(discrete, make_engine(discrete), seen)
     missing = [name for name in recording.outputs if name not in seen.outputs]
     if missing:

@@ -99,8 +99,7 @@ class Simulator(Equations):
         )
         if self.observer is not None:
             own = own.with_(y=self._measured(own), outputs=self.output_names)
-        asked = max((int(getattr(e.law, "substeps", 1)) for e in self.elements), default=1)
-        substeps = 1 if self.discrete else max(asked, choose_substeps(self, [own]))
+        substeps = choose_substeps(self, [own])
         model = discretise(self, own.dt, own.hold or self.hold or "zero", substeps)
         start = np.zeros(model.n_state)
         if not isinstance(own.initial, str):
