@@ -2,8 +2,8 @@
 
 The truth is a motor and a hanging link on a spring and a damper, with viscous and dry friction at the motor. The
 simulator has one inertia, gravity, both frictions and a lag of the actuator, all free, so that a refit may hide the
-compliance behind damping and lag. Even seeds record the motor's angle, odd seeds the link's. Every third case is rigid, and complete. Values are
-drawn anew for every seed.
+compliance behind damping and lag. Even seeds record the motor's angle, odd seeds the link's. Every third case is rigid,
+and complete. Values are drawn anew for every seed.
 
     python -m problems.elastic_joint                20 elastic cases, 10 rigid ones
     python -m problems.elastic_joint --cases 4      4 elastic cases, 2 rigid ones
