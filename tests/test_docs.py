@@ -29,6 +29,7 @@ QUICK = {  # pages of about a second; all others are slow
         "known_physics",
         "look",
         "numpy",
+        "other_domains",
         "own_law",
         "ports",
         "unknown_start",

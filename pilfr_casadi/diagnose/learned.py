@@ -361,11 +361,11 @@ def nearest_to_learned(bench: Workbench, fitted: Fitted, laws: Collection[type[L
     element = fitted.simulator.elements[-1]
     z, dz, force = signals_along(bench, fitted)
     local = bench.local(z, dz)
-    kinds = bench.simulator.port(element.port).kinds
-    tried = [law for law in laws if kinds & set(law.places)]
-    for law in SCALABLE if "parallel" in kinds else ():
+    port = bench.simulator.port(element.port)
+    tried = [law for law in laws if port.admits(law)]
+    for law in SCALABLE if "parallel" in port.kinds else ():
         signals = [element.law.factor] * bool(element.law.factor) + ["z"] * law.dissipative
-        tried += [scheduled(law, by) for by in signals if law in laws]
+        tried += [scheduled(law, by) for by in signals if law in laws and port.admits(law)]
     return nearest_laws(local, force, tried)
 
 

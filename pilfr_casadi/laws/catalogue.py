@@ -15,7 +15,7 @@ import casadi as ca
 
 from .._base import InputError
 from ..models import Named, Parameter
-from . import curves, dynamic, friction, hysteresis, stiffness
+from . import curves, dynamic, electrical, friction, hysteresis, stiffness, thermal
 from .base import Law, Local, contact_onset
 
 GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
@@ -213,7 +213,7 @@ FINER: dict[type[Law], tuple[Any, ...]] = {
 CATALOGUE: tuple[type[Law], ...] = (
     *(
         law
-        for file in (stiffness, friction, hysteresis, curves, dynamic)
+        for file in (stiffness, friction, hysteresis, curves, dynamic, thermal, electrical)
         for law in vars(file).values()
         if isinstance(law, type) and issubclass(law, Law) and hasattr(law, "id") and (law,) not in FINER.values()
     ),

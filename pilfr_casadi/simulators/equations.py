@@ -20,6 +20,7 @@ import numpy as np
 
 from .._base import InputError, listed
 from ..models import Named, Parameter, ParameterSet
+from .domains import DOMAINS, UNKNOWN, common_domain, infer_domain
 
 Expression = Callable[..., Any]
 BUILT_IN = ("actuator:", "sensor:", "equation:")  # prefixes of the ports that need no declaration
@@ -68,11 +69,13 @@ class Port:
         angle both are the speed, which friction opposes.
     unit, across_unit : str
         Units of w and of z.
+    domain : {"mechanical", "thermal", "electrical", "fluid", "unknown"}, optional
+        Physical domain, which decides what laws are tried; by default inferred from the units.
 
     Raises
     ------
     InputError
-        If an argument has the wrong type.
+        If an argument has the wrong type, or the domain is not one of these.
 
     Examples
     --------
@@ -87,6 +90,7 @@ class Port:
     unit: str = ""
     across_unit: str = ""
     series: bool = False
+    domain: str = ""
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -101,6 +105,9 @@ class Port:
         for option in ("unit", "across_unit"):
             if not isinstance(getattr(self, option), str):
                 raise InputError(f"`{option}` {what} is {getattr(self, option)!r}; give plain text, such as 'N'.")
+        if self.domain not in ("", *DOMAINS, UNKNOWN):
+            raise InputError(f"The domain {what} is {self.domain!r}; give {', '.join(DOMAINS)} or {UNKNOWN}.")
+        object.__setattr__(self, "domain", self.domain or infer_domain(self.unit, self.across_unit))
 
     @property
     def kinds(self) -> set[str]:
@@ -108,6 +115,15 @@ class Port:
         if not self.series:
             return {"parallel"}
         return {"series", "sensor"} if self.name.startswith("sensor:") else {"series"}
+
+    def admits(self, law: Any) -> bool:
+        """Tell whether a law (or its class) may be missing here: by its places and its physical domains.
+
+        A port of unknown domain admits the laws of all domains, except special ones.
+        """
+        if not self.kinds & set(law.places):
+            return False
+        return self.domain in law.domains or not (law.special or (law.domains and self.domain != UNKNOWN))
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,8 +282,9 @@ class Equations:
     @cached_property
     def _every_port(self) -> tuple[Port, ...]:
         inner = self.ports or (() if self.discrete else tuple(map(self._equation, self.states)))
-        actuators = (_series("actuator", n, lambda u, n=n: u[n], self.units) for n in self.inputs)
-        sensors = (_series("sensor", n, lambda: 0, self.units) for n in self.output_names)
+        domain = common_domain(port.domain for port in self.ports)  # a voltage is a signal in all domains
+        actuators = (_series("actuator", n, lambda u, n=n: u[n], self.units, domain) for n in self.inputs)
+        sensors = (_series("sensor", n, lambda: 0, self.units, domain) for n in self.output_names)
         return (*inner, *actuators, *sensors)
 
     def _equation(self, state: str) -> Port:
@@ -300,9 +317,9 @@ class Equations:
         return tuple(name for name in self.inputs if not ca.depends_on(read, u[name]))
 
 
-def _series(kind: str, name: str, across: Expression, units: Mapping[str, str]) -> Port:
+def _series(kind: str, name: str, across: Expression, units: Mapping[str, str], domain: str) -> Port:
     unit = units.get(name, "")
-    return Port(f"{kind}:{name}", {}, across, None, unit, unit, series=True)
+    return Port(f"{kind}:{name}", {}, across, None, unit, unit, series=True, domain=domain)
 
 
 def _check_expressions(found: Mapping[str, Any], known: list[Any]) -> None:
