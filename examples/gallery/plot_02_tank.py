@@ -40,7 +40,7 @@ def record(machine, seed, samples=700, dt=2.0):
 # %%
 # Below 2 V nothing flows. Nobody knows the level at the start exactly: it is estimated.
 
-machine = tank(2e-5, 1e-4).with_element("actuator:voltage", DeadZone().at({"b": 2.0}))
+machine = tank(2e-5, 1e-4).with_element("actuator:voltage", DeadZone().at({"g": 2.0}))
 simulator, train, test = tank(1.5e-5, 1.2e-4), record(machine, 1), record(machine, 2)
 beside = simulator.plot(test)
 

@@ -19,7 +19,7 @@ stage = Simulator(
     inputs=("force",),
     parameters=dict(k=Parameter(100.0, bounds=(20, 500)), d=Parameter(2.0, bounds=(0.1, 20))),
 )
-late = stage.with_element("sensor:position", Delay().at({"tau": 0.03}))
+late = stage.with_element("sensor:position", Delay().at({"T": 0.03}))
 
 rng = np.random.default_rng(0)
 force = np.repeat(rng.normal(size=500), 4)

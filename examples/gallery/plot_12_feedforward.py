@@ -34,7 +34,7 @@ path = np.minimum(1, t / 0.1) * (5 + 2 * np.sin(2 * np.pi * 10 * t))
 reached = {}
 for name, element in (("linear", None), ("hysteresis", pilfr.PrandtlIshlinskii(pilfr.Play, 10))):
     fit = pilfr.fit(pilfr.PILFR(1, element), train, starts=2)
-    reached[name] = stage(pilfr.control.feedforward(fit, train, limits=(0.0, 100.0)).inputs(path))
+    reached[name] = stage(pilfr.control.feedforward(fit, train, limits=(0.0, 100.0)).inputs(path).ravel())
 
 wanted = pilfr.Recording(path, path, 1e-3, "path", "position", name="path", units={"position": "µm"})
 lines = [(f"inverse of the {name} model", y[:, None]) for name, y in reached.items()]
