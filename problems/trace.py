@@ -39,22 +39,23 @@ def passed(call: Callable[[], Any]) -> set[tuple[str, str]]:
     return found
 
 
-def fit() -> Any:
-    """Identify ten plays from the demonstration's recording, with two starts."""
+def fit() -> Callable[[], Any]:
+    """Read the demonstration's recording; return the call that identifies ten plays from it, with two starts."""
     folder = next(FOLDER.rglob("train.csv")).parent
     train = pilfr.read_csv(folder / "train.csv", inputs="u", outputs="x2", initial="zero")
     model = pilfr.PILFR(nx=5, element=pilfr.PrandtlIshlinskii(pilfr.Play, 10))
-    return pilfr.fit(model, train, starts=2, seed=0)
+    return lambda: pilfr.fit(model, train, starts=2, seed=0)
 
 
-def diagnose() -> Any:
-    """Diagnose the demonstration's rig."""
+def diagnose() -> Callable[[], Any]:
+    """Read the demonstration's rig and recordings; return the call that diagnoses it."""
     from pilfr_casadi.simulators import load_simulator
 
     folder = next(FOLDER.rglob("rig_train.csv")).parent
     known = {"inputs": "force", "outputs": "x2", "initial": "zero", "hold": "zero"}
     train, test = (pilfr.read_csv(folder / f"rig_{name}.csv", **known) for name in ("train", "test"))
-    return pilfr.diagnose(load_simulator(folder / "rig.py"), train, test=test)
+    simulator = load_simulator(folder / "rig.py")
+    return lambda: pilfr.diagnose(simulator, train, test=test)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -62,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("verbs", nargs="*", default=["fit", "diagnose"], help="fit, diagnose")
     for verb in parser.parse_args(arguments).verbs:
-        found = passed({"fit": fit, "diagnose": diagnose}[verb])
+        found = passed({"fit": fit, "diagnose": diagnose}[verb]())
         files = {name for name, _ in found}
         folders = Counter(str(Path(name).parent) for name in files)
         print(f"{verb}: {len(files)} files, {len(found)} functions")

@@ -214,8 +214,7 @@ The physical laws that `diagnose` tries at each port. Some belong to one :doc:`d
 Every page has the equation, a picture, the parameters, and the laws that it is confused with. The pictures show one
 motion: two periods at full amplitude, then two small ones about another middle. *Nearest laws* are those that follow
 this law's force best on that motion, beside a free spring and damper (behind an actuator or sensor: a free gain and
-offset). Real recordings decide better than this: ask
-:func:`~pilfr_casadi.check`.
+offset). Real recordings decide better than this: ask :func:`~pilfr_casadi.check`.
 
 A law of your own takes :doc:`ten lines </howto/own_law>`. These pages are made from `pilfr.laws` by the build.
 """

@@ -5,11 +5,11 @@ one log evidence; verdict, effects and confidence are sums over their posterior.
 about. The files by stage:
 
 - The whole: `pipeline` (the steps in their order), `workbench` (what all steps share).
-- Preparation: `prediction` lets the recordings lead an unstable simulator. `preparation` checks the arguments, then the
-  recordings. Each check of recordings makes an edit that
-  corrects a fault: `gates` (the edit and its acceptance; sign, unit or gain, exchange, offset), `recording_faults`
-  (glitches, stale and clipped samples, unsettled periods, tones) and `timing` (shift, clock, gap). `floor` estimates
-  the noise.
+- Preparation: `prediction` stabilises an unstable simulator with an observer. `preparation` checks the arguments, then
+  the recordings. A check of recordings corrects a fault where it finds one: `gates` (what a finding is and when it is
+  accepted; sign, unit or gain, exchange, offset), `recording_faults` (glitches, stale and clipped samples, unsettled
+  periods, tones) and `timing` (shift, clock, gap). `floor` estimates the noise.
+- Long recordings: `stretches` chooses what the search sees of them, and fits the leading hypotheses to everything.
 - Search: `search` moves from hypothesis to hypothesis. `linearise`, `screen` and `relatives` select the hypotheses that
   are worth a fit, `trials` fits them. `learned` fits forces that have no name yet.
 - Evidence: `evidence` is the one scale: log evidence, prior of laws, errors on held-out data, and a table of the
@@ -40,7 +40,12 @@ if TYPE_CHECKING:
     from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
     from .mismatch_map import mismatch as mismatch
     from .refinement import Refinement as Refinement
-    from .result import Comparison as Comparison, Diagnosis as Diagnosis, Effect as Effect
+    from .result import (
+        STEPS as STEPS,
+        BeforeAfter as BeforeAfter,
+        Diagnosis as Diagnosis,
+        Effect as Effect,
+    )
     from .workbench import Fitted as Fitted, Workbench as Workbench
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
@@ -61,6 +66,7 @@ def diagnose(
     stand_in_error: float = 0.0,
     time_limit: float | None = None,
     focus: str | None = None,
+    search_samples: int | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Find what a simulator leaves out, from recordings of the machine.
@@ -93,6 +99,9 @@ def diagnose(
     focus : {"simulation", "prediction"}, optional
         Errors to minimise: of a free run, or of predictions one sample ahead by an observer, as for an unstable machine
         in closed loop. By default a free run, and predictions if the simulator is unstable and runs away.
+    search_samples : int, optional
+        Samples of the training recordings up to which the search uses everything, by default 60 000. If there are more,
+        it uses the stretches that tell most of missing forces, and only the final fits use everything.
     progress : callable
         Called with (stage, done, total, smallest error so far).
 
@@ -120,5 +129,6 @@ def diagnose(
         stand_in_error=stand_in_error,
         time_limit=time_limit,
         focus=focus,
+        search_samples=search_samples,
         progress=progress,
     )

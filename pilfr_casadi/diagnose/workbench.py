@@ -33,6 +33,7 @@ from ..simulators import (
     discretise,
     fastest_rates,
     growth_rate,
+    least_substeps,
     needed_substeps,
     rate_at_start,
     resting_elements,
@@ -190,7 +191,7 @@ class Workbench:
             rates = fastest_rates(simulator, *self.typical, p)
             if np.any(np.isfinite(rates)):
                 wanted = max(wanted, int(np.ceil(float(np.nanquantile(rates, 0.95)) * self.dt / LARGEST_STEP)))
-        least = max(self.substeps, self.at_least, *(getattr(e.law, "substeps", 1) for e in simulator.elements))
+        least = max(self.substeps, self.at_least, least_substeps(simulator))
         if any(getattr(e.law, "shifts", False) for e in simulator.elements):  # its memory has an entry for every step
             least = min(least, FINER * self.chosen)
         return int(np.clip(wanted, least, max(FINER * self.chosen, least)))

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import io
 import os
-import platform
 import subprocess
-import sys
 import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -27,6 +25,7 @@ import numpy as np
 from .._base import InputError, __version__, digest, path_text, write_atomically
 from ..engine import compiler
 from ..models import ParameterSet
+from ..simulators import binary_path
 from .c_code import fill_template, generate_code, make_unique
 
 VERSIONS = ("2.0", "3.0")
@@ -41,11 +40,6 @@ UNUSED_TYPES = (  # of FMI 3.0
     ("Boolean", "bool"),
     ("String", "fmi3String"),
 )
-SYSTEMS = {
-    "linux": ("linux", "linux", "so"),
-    "darwin": ("darwin", "darwin", "dylib"),
-    "win32": ("win", "windows", "dll"),
-}
 
 
 @dataclass(frozen=True)
@@ -130,15 +124,13 @@ def write_fmu(path: str | os.PathLike[str], content: FmuContent, fmi: str) -> Pa
         raise InputError(f"The FMI version {fmi!r} was given; give one of {', '.join(VERSIONS)}.")
     if not path_text(path, "file").endswith(".fmu"):
         raise InputError(f"{path} was given for the FMU; give a name that ends in .fmu.")
-    name, (system, system3, suffix) = content.names["name"], SYSTEMS.get(sys.platform, SYSTEMS["linux"])
-    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower(), platform.machine().lower())
-    folder = f"{system}64" if fmi == "2.0" else f"{machine}-{system3}"
+    name = content.names["name"]
     code = generate_code(content.step)
     token = digest({"code": code, "description": _describe(content, fmi, "")})
     source = _source(content, fmi, token, code)
     files: dict[str, str | bytes] = {
         "modelDescription.xml": _describe(content, fmi, token),
-        f"binaries/{folder}/{name}.{suffix}": _compile(source),
+        binary_path(name, fmi[0]): _compile(source),
         f"sources/{name}.c": source,
     }
     if fmi == "3.0":

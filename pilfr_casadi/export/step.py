@@ -22,10 +22,10 @@ import numpy as np
 
 from .._base import LARGEST, InputError, is_number, numbers, path_text, positive, whole, write_atomically
 from ..data import Recording
-from ..engine import make_engine
+from ..engine import calls_external, make_engine
 from ..models import Model, ParameterSet, PrandtlIshlinskii
 from ..optimise import first_state
-from ..simulators import ClosedEquations, Instant, Simulator, calls_external, choose_substeps, discretise, on_grid
+from ..simulators import ClosedEquations, Instant, Simulator, choose_substeps, discretise, on_grid
 from .c_code import check_name, make_unique, write_c
 from .fmu import FmuContent, write_fmu
 from .smoothing import enclose, smooth_kinks
@@ -493,14 +493,11 @@ def _discretise_over_sample(model: Simulator, dt: float, hold: str | None, subst
 
 
 def _choose_substeps_at_rest(simulator: Simulator, dt: float) -> int:
-    """Choose sub-steps per sample from the fastest eigenvalue at rest, at least as many as the laws need."""
-    if simulator.discrete:
-        return 1
+    """Choose sub-steps per sample from the fastest eigenvalue at rest."""
     # a recording needs an input, so a simulator without inputs gets one that its equations do not read
     driven = simulator if simulator.inputs else replace(simulator, inputs=("none",))
     u, y = (np.zeros((REST_SAMPLES, len(names))) for names in (driven.inputs, driven.output_names))
-    least = max((getattr(e.law, "substeps", 1) for e in simulator.elements), default=1)
-    return max(choose_substeps(driven, [Recording(u, y, dt)]), least)
+    return choose_substeps(driven, [Recording(u, y, dt)])
 
 
 def _start_state(model: Any, closed: Model, step: Exported, start: Any) -> np.ndarray | None:

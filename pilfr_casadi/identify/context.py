@@ -45,6 +45,7 @@ from ..optimise import (
     limits_of,
     move_inside_exact,
     solve_within_radii,
+    undetermined_memory,
 )
 from .result import DENSITY_PRIOR, Fit, FitOptions, with_solution
 from .uncertainty import standard_errors
@@ -54,8 +55,6 @@ Array = np.ndarray
 BOUND_SOLVER = GaussNewton()  # solves at a bound on a spectral radius for solvers other than Gauss-Newton
 DIVERGES = 1e3  # a fit counts as diverged from this multiple of the error of a model whose outputs are zero
 NOISE_ROUNDS, NOISE_AGREES = 5, 0.05  # limit of noise estimates, and the relative change below which they stop
-CHUNK = 512  # samples of a period whose slopes are kept in memory at a time
-STILL = 1e-12  # difference from the identity up to which a slope counts as the identity
 APART = 0.05  # difference of gains, relative to the largest wanted gain, that is reported
 
 
@@ -283,28 +282,17 @@ def rms_error(problem: Problem, theta: Array) -> float:
     return float(np.sqrt(np.mean(problem.residual(theta) ** 2)))
 
 
-def find_open_memory(problem: Problem, theta: Array, recording: Recording, state: Array) -> Array:
-    """Find the memories (indices, (k,)) that affect the outputs but that a steady period does not determine."""
-    engine, p, n_x = problem.engine, problem.parameters(theta), problem.model.n_x
-    rows = CHUNK * problem.model.substeps
-    period = problem.model.drive(recording)[: (recording.period or 1) * problem.model.substeps]
-    slope, after, seen = np.eye(len(state)), state, np.zeros(len(state))
-    for a in range(0, len(period), rows):
-        _, jac, after, slope = engine.sensitivity(period[a : a + rows], p, after, slope, np.full(len(p), -1))
-        seen = np.maximum(seen, np.max(np.abs(jac / problem.scale[:, None]), axis=(0, 1), initial=0.0))
-    still = np.max(np.abs(slope - np.eye(len(state))), axis=1, initial=0.0) <= STILL
-    return np.flatnonzero(still[n_x:] & (seen[n_x:] > STILL * np.max(seen, initial=0.0)))
-
-
 def describe_open_memory(problem: Problem, theta: Array) -> str:
     """Name the recordings that do not determine some memories; empty where there are none."""
     counts = {}
     for k, (r, state) in enumerate(zip(problem.recordings, problem.first_states(theta), strict=True)):
         periodic = r.begins == "periodic"
         if periodic and problem.model.n_s and np.all(np.isfinite(state)):
-            counts[r.label if len(problem.recordings) == 1 or r.name else f"recording {k + 1}"] = len(
-                find_open_memory(problem, theta, r, state)
+            period = problem.model.drive(r)[: (r.period or 1) * problem.model.substeps]
+            open_memory = undetermined_memory(
+                problem.engine, period, problem.parameters(theta), state, problem.model.n_x, problem.scale
             )
+            counts[r.label if len(problem.recordings) == 1 or r.name else f"recording {k + 1}"] = len(open_memory)
     found = [f"{count} in {label}" for label, count in counts.items() if count]
     if not found:
         return ""

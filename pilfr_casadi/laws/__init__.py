@@ -1,10 +1,10 @@
 """The catalogue of physical laws that may be missing from a simulator, one small class for each hypothesis.
 
-`base` holds the class `Law` and shows how to add a law in ten lines. The laws stand by kind: `stiffness` (springs,
+`base` holds the class `Law` and shows how to add a law in ten lines. Laws are grouped by kind: `stiffness` (springs,
 contacts, gaps, periodic forces), `friction` (forces of speed), `hysteresis` (loops), `curves` (saturation and other
 curves of actuators and sensors), `dynamic` (delays, creep, modes, trends), and those of one domain, `thermal` and
-`electrical`. `catalogue` lists the laws that a
-diagnosis tries and makes laws from laws; `forces` evaluates laws along given signals.
+`electrical`. `catalogue` lists the laws that a diagnosis tries and composes laws (scaled, scheduled, behind a gap).
+`forces` evaluates laws along given signals.
 """
 
 from typing import TYPE_CHECKING

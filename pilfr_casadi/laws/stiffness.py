@@ -52,6 +52,7 @@ class PowerStiffness(CubicStiffness):
     form = "power"
     equation = "w = k_n sign(z) |z|^n"
     units = {"k_n": "w/z^n", "n": ""}
+    domains = ("mechanical",)
     starts = {"n": ("", 2.0, 2.5, 4.0)}
     ranges = {"n": ("", 1.7, 6.0)}
 
@@ -66,6 +67,7 @@ class GeometricStiffness(CubicStiffness):
     equation = "w = k z (1 - L / sqrt(L^2 + z^2))"
     source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 2.1"
     units = {"k": "w/z", "L": "z"}
+    domains = ("mechanical",)
     restoring = True  # with either sign it could follow any curve together with a plain spring
     starts = {"L": ("reach", 0.15, 0.4, 1.0)}
     ranges = {"L": ("reach", 0.03, 3)}

@@ -1,7 +1,7 @@
 """Models: parameters, hysteresis operators, elements, `Model` with `close_loop`, PI-LFR structures and baselines.
 
-A model is a symbolic step with open ports; an element is a law with memory from a local signal `z` to an internal
-signal `w`; closing the loop puts the element into the port.
+A model holds the equations of one time step, with ports for elements. An element maps a local signal `z` to an internal
+signal `w` and may have memory. `close_loop` puts an element into a port.
 """
 
 from typing import TYPE_CHECKING

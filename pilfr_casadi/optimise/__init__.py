@@ -2,8 +2,10 @@
 
 `problem` states the problem and computes its derivatives, `constraints` holds constraints on named parameters,
 `gauss_newton` is the default solver (its damping is the class `Damping`, the first value `GaussNewton(damping=...)`),
-`ipopt` the other one. `exact_limits` solves at exact bounds on spectral radii and moves results inside exact
-constraints. `solution` holds the result of a solver, its status and its active limits.
+`ipopt` the other one. `initial_state` estimates the state in which a further recording begins; in a fit such states are
+variables of the problem. `steady_state` finds the state of a periodic recording. `exact_limits` solves at exact bounds
+on spectral radii and moves results into the feasible set. `solution` holds the result of a solver, its status and its
+active limits.
 """
 
 from typing import TYPE_CHECKING
@@ -32,10 +34,9 @@ if TYPE_CHECKING:
     )
     from .gauss_newton import (
         GaussNewton as GaussNewton,
-        first_state as first_state,
-        samples_for_state as samples_for_state,
         unconstrained_step as unconstrained_step,
     )
+    from .initial_state import first_state as first_state, samples_for_state as samples_for_state
     from .ipopt import Ipopt as Ipopt
     from .problem import Problem as Problem, check_weights as check_weights
     from .solution import (
@@ -48,5 +49,6 @@ if TYPE_CHECKING:
         describe_unknown_multipliers as describe_unknown_multipliers,
         limits_of as limits_of,
     )
+    from .steady_state import undetermined_memory as undetermined_memory
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

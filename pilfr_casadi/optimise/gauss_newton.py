@@ -20,7 +20,7 @@ that point, with more damping and a larger penalty.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -29,19 +29,14 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, handled_interrupt, unwrapped_interrupt
-from ..data import Recording
-from ..engine import Engine
-from ..models import Model, Neighbours
+from ..models import Neighbours
 from .constraints import TOLERATED
-from .problem import STATE_NOISE, Penalties, Problem, given_state, state_precision, steady_state
 from .solution import Iteration, Progress, Solution, Status, check_solver_options
 
 FEASIBLE = 1e-9  # violation, in units of the constraints, up to which a point is feasible
 ROUNDING_VIOLATION = 1e-12  # violation that rounding alone can cause
 MOST_RETURNS = 4  # returns of a run that has strayed to its best feasible point, at most
 ENDED = (Status.CONVERGED, Status.SMALL_STEP, Status.SOLVER_FAILED)  # the run got as far as it can
-STATE_ROUNDS = 20  # solves for a first state, at most, each with a wider prior
-LARGEST_STATE = 1.1  # mean square of a first state, in units of its prior, above which the prior is widened
 KINK_SHARE = 1e-3  # predicted but unreachable improvement, as a share of the cost, that reveals a kink
 ZERO_COST = 1e-24  # cost that counts as zero: outputs are off by 1e-12 of their size
 ZERO_COLUMN = 1e-20  # squared column norm, relative to the largest of its matrix, that counts as zero
@@ -550,52 +545,3 @@ class _Run:
             multipliers=self.multipliers / np.concatenate([np.ones(self.problem.size), self.penalty.unit]),
             history=tuple(self.history),
         )
-
-
-def samples_for_state(model: Model) -> int:
-    """Return the number of samples that an unknown initial state is fitted to: ten per state, at least 50."""
-    return max(10 * model.n_state, 50)
-
-
-def first_state(
-    model: Model,
-    engine: Engine,
-    recording: Recording,
-    samples: int | None = None,
-    *,
-    state_prior: bool = False,
-    starts: Sequence[np.ndarray] = (),
-) -> np.ndarray:
-    """Find the state with memory at a recording's first sample, as its `initial` says, at the model's parameters.
-
-    A state that is to be estimated is fitted to the first `samples` outputs alone, from rest and from each of `starts`.
-    With `state_prior` it has a prior around rest, on the scale of the states in a run over all inputs
-    (`state_precision`), and is fitted from rest alone.
-    """
-    n, values, state = model.n_state, model.parameters.start, given_state(model, recording)
-    if recording.begins == "periodic":
-        period = model.drive(recording)[: (recording.period or 1) * model.substeps]
-        return steady_state(engine, period, values, state)
-    if recording.begins != "estimate" or not n:
-        return state
-    head = recording.slice(0, max(min(len(recording), samples or samples_for_state(model)), 2)).with_(skip=0)
-    spread = np.std(head.y, axis=0)
-    spread = np.where(spread > 0, spread, np.max(spread) or 1.0)
-    fixed = model.parameters.change(**{k: {"fixed": True, "prior": None} for k in model.parameters})
-    problem, solver = (
-        Problem(model.with_parameters(fixed), head, engine=engine, scale=spread),
-        GaussNewton(max_iterations=50),
-    )
-    square = state_precision(engine, model.drive(recording), values, model.n_x, model.n_s) if state_prior else None
-    if square is None:
-        found = [solver.solve(problem, start) for start in (problem.start, *starts)]
-        return min(found, key=lambda solution: solution.cost).theta
-    state, wider = problem.start, 1.0
-    for _ in range(STATE_ROUNDS):  # free decay from a large state exceeds the states of forced motion
-        problem.penalties = Penalties(fixed, {}, 1.0, problem.residuals, problem.size, [(0, square / wider)])
-        state = solver.solve(problem, state).theta
-        size = float(state @ square @ state) / STATE_NOISE**2 / n
-        if size <= LARGEST_STATE * wider:
-            break
-        wider = size
-    return state

@@ -25,6 +25,7 @@ from ..data import Recording, as_recordings
 from ..engine import Engine, VirtualMachine, make_engine
 from ..models import Model, Neighbours, ParameterSet, check_size
 from .constraints import Constraint, Rows, check_gain
+from .steady_state import NEARLY_STEADY, steady_slope, steady_state
 
 Array = np.ndarray
 T = TypeVar("T")
@@ -34,12 +35,7 @@ STATE_NOISE = 0.2
 STATE_SAMPLES = 256  # states of a run from which second moments are computed
 STILL_STATE = 1e-3  # least deviation of a state, relative to the largest of its kind
 LEAST_CORRELATION_VARIANCE = 1e-6  # added to the diagonal of the correlation matrix
-STEADY = 1e-10  # relative change of the state over a period that counts as none
-NEARLY_STEADY = 1e-6  # the same, accepted after the last period
-MOST_PERIODS, PERIODS_PER_NEWTON_STEP = 200, 10  # limit of periods; periods run between two Newton steps
 MOST_WRITTEN_PERIODS = 50  # most periods that `to_nlp` writes out before a recording in steady state
-STILL_MEMORY = 1e-12  # distance of a memory's slope over a period from 1 up to which nothing moves it
-CHUNK_SAMPLES = 512  # samples of a period whose slopes are kept in memory at a time
 STRETCH_ENTRIES = 2_000_000  # entries of the Jacobian kept in memory at a time (16 MB)
 
 
@@ -195,52 +191,6 @@ def state_precision(engine: Engine, drive: Array, p: Array, n_x: int, n_s: int) 
         size[group] = np.maximum(size[group], STILL_STATE * largest) if largest > 0 else 1.0
     together = moments / size / size[:, None] + LEAST_CORRELATION_VARIANCE * np.eye(len(size))
     return np.asarray(STATE_NOISE**2 * np.linalg.inv(together) / size / size[:, None])
-
-
-def steady_state(engine: Engine, period: Array, p: Array, state: Array, tolerance: float = STEADY) -> Array:
-    """Find the state at the beginning of a steady period; nan where no steady state is reached.
-
-    Periods are run from the given state, with a Newton step on `x = Φ(x)` now and then to speed up slow poles. A period
-    does not determine the memory of operators that never slip in it, so that memory keeps its given value.
-    """
-    change, size = np.inf, 1.0
-    with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(1, MOST_PERIODS + 1):
-            before, state = state, engine.simulate(period, p, state)[1]
-            change, size = np.max(np.abs(state - before), initial=0.0), np.max(np.abs(state), initial=1e-300)
-            if not np.isfinite(change) or change <= tolerance * size:
-                return state
-            if k % PERIODS_PER_NEWTON_STEP == 0:
-                state = _newton_step(engine, period, p, state)
-    return state if change <= NEARLY_STEADY * size else np.full_like(state, np.nan)
-
-
-def _newton_step(engine: Engine, period: Array, p: Array, state: Array) -> Array:
-    """Take one Newton step towards the fixed point of a period if that brings it nearer, else run one period."""
-    after, slope = state, np.eye(len(state))
-    rows = CHUNK_SAMPLES * engine.linear.substeps
-    for a in range(0, len(period), rows):
-        _, _, after, slope = engine.sensitivity(period[a : a + rows], p, after, slope, np.full(len(p), -1))
-    if not np.all(np.isfinite(slope)):
-        return after
-    try:
-        there = state + steady_slope(np.hstack([(after - state)[:, None], slope]), 1)[:, 0]
-    except np.linalg.LinAlgError:
-        return after
-    behind = engine.simulate(period, p, there)[1]
-    return there if np.max(np.abs(behind - there)) < np.max(np.abs(after - state)) else after
-
-
-def steady_slope(after: Array, n: int) -> Array:
-    """Compute `(I - Φ_x)^-1 Φ_θ`, (n_state, n), from the slope after one period, whose first n columns belong to θ.
-
-    Memory that nothing moves in a whole period has zero slope.
-    """
-    size = len(after)
-    matrix, right = np.eye(size) - after[:, n:], after[:, :n].copy()
-    still = np.max(np.abs(matrix), axis=1, initial=0.0) <= STILL_MEMORY
-    matrix[still, still], right[still] = 1.0, 0.0
-    return np.linalg.solve(matrix, right) if size else right
 
 
 class Problem:

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from ..models import weight_density
 from .canvas import (
     BLUE,
     FONT,
@@ -36,9 +35,9 @@ from .canvas import (
     scale_axis,
     with_unit,
 )
+from .fits import density_beside
 
 CLOUD_POINTS = 2500  # more cannot be told apart in a figure
-FEWEST_FOR_DENSITY = 4  # operators in use; fewer weights do not sample a density
 LINE_POINTS = 400  # samples along which laws are drawn over a learned force: a few swings
 
 
@@ -324,16 +323,10 @@ def refined_hysteresis(
     loading.margins(x=0)
     finish(loading, across, up, "initial loading curve")
     r, used = layer[0] / sx, layer[1] > 1e-3 * np.max(layer[1])
-    limit, right = 1.3 * float(np.max(r[used], initial=0.0)) or 1.0, None
+    limit = 1.3 * float(np.max(r[used], initial=0.0)) or 1.0
     weights.vlines(r[used], 0, layer[1][used], color=SKY, linewidth=1.5)
     weights.plot(r, layer[1], "o", color=BLUE, markersize=4, label="weights w (left)")
-    if np.count_nonzero(used) >= FEWEST_FOR_DENSITY:
-        right, grid = weights.twinx(), np.linspace(0.0, limit, 300)
-        density = weight_density(r, layer[1], grid, limit / 12)
-        right.plot(grid, density, color=VERMILLION, linewidth=1.8, label="smoothed density (right)")
-        finish(right, "", "density dw/dr", legend=False).grid(False)
-        right.spines["right"].set_visible(True)
-        right.set_ylim(bottom=0)
+    right = density_beside(weights, r, np.where(used, layer[1], 0.0), limit)
     finish(weights, across.replace(z.name, "threshold r", 1), "weight w", "weights over thresholds", 1, beside=right)
     weights.set_ylim(bottom=0)
     weights.set_xlim(-0.02 * limit, limit)

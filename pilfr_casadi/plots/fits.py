@@ -79,6 +79,24 @@ def virgin_curve(fit: PlottedFit, z: np.ndarray, channel: int = 0) -> np.ndarray
     return out
 
 
+def density_beside(ax: Axes, r: np.ndarray, w: np.ndarray, limit: float, reference: Curve | None = None) -> Axes | None:
+    """Draw the smoothed density of weights w over thresholds r on axes at the right; None if there are too few."""
+    smooth = np.count_nonzero(w) >= FEWEST_FOR_DENSITY
+    if not smooth and reference is None:
+        return None
+    right, grid = ax.twinx(), np.linspace(0.0, limit, 300)
+    if smooth:
+        drawn = weight_density(r, w, grid, limit / 12)
+        right.plot(grid, drawn, color=VERMILLION, linewidth=1.8, label="smoothed density (right)")
+    if reference is not None:
+        drawn = reference(grid)
+        right.plot(grid, drawn, color=INK, linestyle="--", linewidth=1.4, label="reference density (right)")
+    finish(right, "", "density dw/dr", legend=False).grid(False)
+    right.spines["right"].set_visible(True)
+    right.set_ylim(bottom=0)
+    return right
+
+
 def weights(
     fit: PlottedFit,
     recordings: Records | None = None,
@@ -105,22 +123,9 @@ def weights(
     ax.vlines(r, 0, w, color=SKY, linewidth=1.5)
     errors = fit.errors.get("w")
     spread = None if errors is None else np.nan_to_num(errors[channel][order], posinf=0.0)
-    grid, right = np.linspace(0.0, limit, 300), None
-    smooth = np.count_nonzero(w) >= FEWEST_FOR_DENSITY
-    two = smooth or reference is not None
-    label = "weights w (left)" if two else "weights w"
+    right = density_beside(ax, r, w, limit, reference)
+    label = "weights w" if right is None else "weights w (left)"
     ax.errorbar(r, w, yerr=spread, fmt="o", markersize=4, color=BLUE, elinewidth=1, label=label)
-    if two:
-        right = ax.twinx()
-        if smooth:
-            drawn = weight_density(r, w, grid, limit / 12)
-            right.plot(grid, drawn, color=VERMILLION, linewidth=1.8, label="smoothed density (right)")
-        if reference is not None:
-            drawn = reference(grid)
-            right.plot(grid, drawn, color=INK, linestyle="--", linewidth=1.4, label="reference density (right)")
-        finish(right, "", "density dw/dr", legend=False).grid(False)
-        right.spines["right"].set_visible(True)
-        right.set_ylim(bottom=0)
     across = _label(fit, "z", channel, f"threshold r{_index(fit, channel)}")
     finish(ax, across, "weight w", "weights over thresholds", 1, beside=right)
     ax.set_ylim(bottom=0)

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from .._base import to_json
-from ..diagnose import Diagnosis, learned_force
+from ..diagnose import STEPS, Diagnosis, learned_force
+from ..identify import RUN_AWAY
 from ..laws import display_name, scaled, scheduled
 from ..models import Parameter, ParameterSet
 from .page import Block, Code, Table, Text, number_text, render, uncertain_text
@@ -17,15 +18,11 @@ from .page import Block, Code, Table, Text, number_text, render, uncertain_text
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
 ALIKE = 1.03  # ratio of two errors up to which two laws do equally well
 RANKED = 12  # rows of the ranked table above the fold
-STEPS = {"nominal": "as given", "before": "refitted"}
-
-
-LARGEST = 1e4  # relative error from which its size says nothing
 
 
 def percent(value: float | None) -> str:
     """Write a relative error as a percentage."""
-    if value is None or not value < LARGEST:
+    if value is None or not value < RUN_AWAY:
         return "diverges"
     return f"{number_text(100 * value, 3)}\u00a0%"
 
@@ -57,7 +54,7 @@ def tone(diagnosis: Diagnosis) -> str:
 def _steps(diagnosis: Diagnosis) -> dict[str, str]:
     """Return the keys of the errors to show, with their names."""
     last = correction_words(diagnosis)
-    return STEPS | ({"after": last} if last else {})
+    return STEPS | {"after": last} if last else {k: name for k, name in STEPS.items() if k != "after"}
 
 
 def errors_that_count(diagnosis: Diagnosis) -> tuple[str, Mapping[str, float]]:

@@ -1,11 +1,12 @@
 """The user's equations with ports for missing physics.
 
-`equations` evaluates them with their laws, `domains` infers a port's physical domain, `integration` makes them a
-discrete-time `Model`, `simulator` holds the class `Simulator` and the state in which its laws begin at rest, and
-`adapters` accept a Python file, a state space or a fitted model in its place. `fmu` makes one of a functional mock-up
-unit, which its equations call (`external`, `fmu_description`, `fmu_instance`). `numpy_function` makes one from a NumPy
-function, whose equations `tracing` finds by calling it with the `symbols` of the file of that name; one that cannot be
-followed stays a `black_box`.
+`equations` evaluates them with the laws in their ports, and `integration` discretises them to a `Model`. `simulator`
+holds the class `Simulator` and the state in which its laws begin at rest. `domains` infers a port's physical domain.
+`adapters` accept a Python file, a state
+space or a fitted model in its place. `fmu` wraps a functional mock-up unit as a simulator (`fmu_description`,
+`fmu_instance`). `numpy_function` makes a simulator from a NumPy function: `tracing` calls the function with `symbols`
+to obtain its equations. A function that cannot be traced is called with numbers (`black_box`). `external` lets
+equations call such a program.
 """
 
 from typing import TYPE_CHECKING
@@ -29,12 +30,11 @@ if TYPE_CHECKING:
     from .equations import Named as Named, Placed as Placed, Port as Port, in_series as in_series
     from .external import (
         PythonFunction as PythonFunction,
-        calls_external as calls_external,
         leaves as leaves,
         units as units,
     )
     from .fmu import from_fmu as from_fmu
-    from .fmu_description import fmu_signals as fmu_signals
+    from .fmu_description import binary_path as binary_path, fmu_signals as fmu_signals
     from .fmu_instance import FmuInstance as FmuInstance
     from .integration import (
         LARGEST_STEP as LARGEST_STEP,
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
         discretise as discretise,
         fastest_rates as fastest_rates,
         growth_rate as growth_rate,
+        least_substeps as least_substeps,
         needed_substeps as needed_substeps,
         on_grid as on_grid,
         rate_at_start as rate_at_start,

@@ -39,11 +39,6 @@ def keep_leaf(function: ca.Function, unit: FmuFile | None = None) -> ca.Function
     return function
 
 
-def calls_external(function: ca.Function) -> bool:
-    """Tell whether a function of SX expressions calls one that CasADi cannot look into."""
-    return any(function.instruction_id(k) == ca.OP_CALL for k in range(function.n_instructions()))
-
-
 Expression = Callable[..., Any]
 
 

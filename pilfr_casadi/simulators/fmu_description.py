@@ -62,14 +62,19 @@ def describe(path: Path) -> Description:
     token = root.get("guid" if version == "2" else "instantiationToken", "")
     exchange = root.find("ModelExchange")
     identifier = exchange.get("modelIdentifier", "") if exchange is not None else ""
-    system, system3, suffix = SYSTEMS.get(sys.platform, SYSTEMS["linux"])
-    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower(), platform.machine().lower())
-    folder = f"{system}64" if version == "2" else f"{machine}-{system3}"
     try:
         states = tuple(_state_names(root, entries, version))
     except (ValueError, IndexError, KeyError, StopIteration):
         states = ()
-    return Description(version, token, identifier, f"binaries/{folder}/{identifier}{suffix}", variables, states)
+    return Description(version, token, identifier, binary_path(identifier, version), variables, states)
+
+
+def binary_path(identifier: str, version: str) -> str:
+    """Give the path inside a unit, of FMI "2" or "3", of its program for this platform."""
+    system, system3, suffix = SYSTEMS.get(sys.platform, SYSTEMS["linux"])
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower(), platform.machine().lower())
+    folder = f"{system}64" if version == "2" else f"{machine}-{system3}"
+    return f"binaries/{folder}/{identifier}{suffix}"
 
 
 def _state_names(root: ET.Element, entries: list[ET.Element], version: str) -> Iterator[str]:

@@ -351,16 +351,21 @@ def choose_substeps(simulator: Equations, recordings: Sequence[Recording]) -> in
     """Choose the sub-steps per sample that keep |λ| h below `LARGEST_STEP` where the first recording begins.
 
     Where a rate is very fast, the rates along a run decide (a square root is infinitely steep at zero). More than
-    `MOST_SUBSTEPS`, or a derivative that is not finite, is refused.
+    `MOST_SUBSTEPS`, or a derivative that is not finite, is refused. Laws in ports may ask for more (`least_substeps`).
     """
     needed, rate = needed_substeps(simulator, recordings)
     if needed <= MOST_SUBSTEPS:
-        return needed
+        return max(needed, least_substeps(simulator))
     raise InputError(
         _not_finite(simulator, recordings[0])
         or f"The simulator has an eigenvalue of {rate:.3g} rad/s, too fast for samples {recordings[0].dt:g} s apart; "
         "check its units, or replace the fast state by its steady state."
     )
+
+
+def least_substeps(simulator: Equations) -> int:
+    """Give the fewest sub-steps per sample that the laws in the ports ask for; 1 for an equation in discrete time."""
+    return 1 if simulator.discrete else max((int(getattr(e.law, "substeps", 1)) for e in simulator.elements), default=1)
 
 
 def _start(simulator: Equations, recording: Recording) -> np.ndarray:

@@ -7,6 +7,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Simulator
 from pilfr_casadi._base import InputError
 from pilfr_casadi.engine import make_engine
+from pilfr_casadi.laws import Delay
 from pilfr_casadi.simulators import discretise
 
 DT = 0.01
@@ -41,6 +42,14 @@ def test_the_parameters_are_found(record, fitted):
     assert fitted.simulator.parameters["d"].value == pytest.approx(25.0, rel=1e-2)
     assert fitted.nrmse(record) < 1e-3
     assert np.isfinite(fitted.errors["k"]) and np.isnan(fitted.errors["m"])
+
+
+def test_a_law_gets_the_substeps_that_it_asks_for_in_a_fit_as_in_a_simulation(record):
+    late = simulator().with_element("actuator:force", Delay({"T": 0.025}))
+    found = pilfr.fit(late, record, engine="vm")
+    assert found.model.substeps == Delay.substeps > 1
+    placed = found.simulator
+    assert np.max(np.abs(placed.simulate(record)[:, 0] - found.simulate(record)[:, 0])) < 1e-9 * np.std(record.y)
 
 
 def test_columns_are_matched_by_name(record, fitted):

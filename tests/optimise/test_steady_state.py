@@ -10,7 +10,7 @@ from pilfr_casadi.engine import make_engine
 from pilfr_casadi.identify import fit
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, Stop
 from pilfr_casadi.optimise import Problem
-from pilfr_casadi.optimise.problem import steady_slope
+from pilfr_casadi.optimise.steady_state import steady_slope
 
 
 def steady(seed=0, length=80, **options):
