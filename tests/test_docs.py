@@ -33,6 +33,7 @@ QUICK = {  # pages of about a second; all others are slow
         "own_law",
         "ports",
         "unknown_start",
+        "varying_strength",
     )
 }
 SAID = {
