@@ -28,6 +28,7 @@ QUICK = {  # pages of about a second; all others are slow
         "hold",
         "known_physics",
         "look",
+        "mujoco",
         "numpy",
         "other_domains",
         "own_law",
