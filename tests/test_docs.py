@@ -29,9 +29,11 @@ QUICK = {  # pages of about a second; all others are slow
         "known_physics",
         "look",
         "numpy",
+        "other_domains",
         "own_law",
         "ports",
         "unknown_start",
+        "varying_strength",
     )
 }
 SAID = {

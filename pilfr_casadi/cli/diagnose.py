@@ -60,6 +60,11 @@ class DiagnoseOptions(SimulatorOptions):
     focus: Literal["simulation", "prediction"] | None = option(
         "Errors of a free run, or of predictions one sample ahead (default: a free run, where the simulator can)."
     )
+    search_samples: int | None = whole(
+        "Training samples up to which the search uses everything; of more it uses stretches (default: 60000).",
+        20,
+        LARGEST_SIZE["samples"],
+    )
     out: str = option("Folder for diagnosis.json and report.html (default: diagnosis).", "DIR", "diagnosis")
     overwrite: bool = flag("Replace an existing diagnosis in that folder.", "--overwrite")
 
@@ -128,6 +133,7 @@ def diagnose_command(options: DiagnoseOptions) -> int:
                 stand_in_error=error,
                 time_limit=options.time_limit,
                 focus=options.focus,
+                search_samples=options.search_samples,
                 progress=progress,
             )
     except KeyboardInterrupt:

@@ -9,6 +9,7 @@ about. The files by stage:
   the recordings. A check of recordings corrects a fault where it finds one: `gates` (what a finding is and when it is
   accepted; sign, unit or gain, exchange, offset), `recording_faults` (glitches, stale and clipped samples, unsettled
   periods, tones) and `timing` (shift, clock, gap). `floor` estimates the noise.
+- Long recordings: `stretches` chooses what the search sees of them, and fits the leading hypotheses to everything.
 - Search: `search` moves from hypothesis to hypothesis. `linearise`, `screen` and `relatives` select the hypotheses that
   are worth a fit, `trials` fits them. `learned` fits forces that have no name yet.
 - Evidence: `evidence` is the one scale: log evidence, prior of laws, errors on held-out data, and a table of the
@@ -65,6 +66,7 @@ def diagnose(
     stand_in_error: float = 0.0,
     time_limit: float | None = None,
     focus: str | None = None,
+    search_samples: int | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Find what a simulator leaves out, from recordings of the machine.
@@ -97,6 +99,9 @@ def diagnose(
     focus : {"simulation", "prediction"}, optional
         Errors to minimise: of a free run, or of predictions one sample ahead by an observer, as for an unstable machine
         in closed loop. By default a free run, and predictions if the simulator is unstable and runs away.
+    search_samples : int, optional
+        Samples of the training recordings up to which the search uses everything, by default 60 000. If there are more,
+        it uses the stretches that tell most of missing forces, and only the final fits use everything.
     progress : callable
         Called with (stage, done, total, smallest error so far).
 
@@ -124,5 +129,6 @@ def diagnose(
         stand_in_error=stand_in_error,
         time_limit=time_limit,
         focus=focus,
+        search_samples=search_samples,
         progress=progress,
     )

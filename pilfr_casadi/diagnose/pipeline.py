@@ -21,6 +21,8 @@ How an answer comes about:
    predicts worse than the force, the name is withdrawn and the verdict is chosen again.
    There are explanations without a law: a parameter pinned to a wrong value, and a clipped input. They are tried if
    there is time, and count if they explain as much.
+   If the recordings are long, steps 1 to 5 see only their most informative stretches (`stretches`). The leading
+   hypotheses are then fitted to everything before step 3, and the answer's simulator before step 6.
 6. The proof (`proof`) adds errors on test recordings, placebos and standard errors. It changes no verdict. Offsets that
    no longer improve the fit beside the effects are set to zero.
 """
@@ -43,7 +45,7 @@ from ..simulators import Simulator
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction, find_correction, named_correction
 from .evidence import AS_GIVEN, SURE, deviations
-from .floor import Floor
+from .floor import Floor, measured_floor
 from .gates import USELESS_FIT, Gate, Offset, final_gates, offset_gates, without_idle_offsets
 from .identifiability import port_units
 from .mismatch_map import mismatch
@@ -51,6 +53,7 @@ from .other_explanations import find_pinned_parameter, find_undeclared_port, fin
 from .prediction import FOCUS, can_be_led, prediction_note, predictor
 from .preparation import (
     CHECKS,
+    FEWEST_SAMPLES,
     Prepared,
     add_scaled_laws,
     check_laws,
@@ -61,13 +64,14 @@ from .preparation import (
     prepare,
     stated_hold,
 )
-from .proof import free_run_errors, mean_nrmse, next_experiment, parameter_table, placebo, test_errors
-from .recording_faults import clipped_input, tones
+from .proof import errors_of, free_run_errors, mean_nrmse, next_experiment, parameter_table, placebo, test_errors
+from .recording_faults import clipped_input, open_unsettled, remove_glitches, tones
 from .result import Diagnosis, Effect
 from .search import Search
+from .stretches import MOST_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
 from .trials import Trial
 from .verdict import Named, Posterior, Verdict, judge, names, posterior
-from .workbench import Fitted, RunsAway
+from .workbench import Fitted, RunsAway, Workbench
 
 SEARCHING = 0.7  # share of the remaining time for preparation and search; the rest is for the correction
 
@@ -88,6 +92,7 @@ class Request:
     say: Stages
     focus: str | None = None
     notes: tuple[Gate, ...] = ()
+    stretches: Stretches | None = None  # where `recordings` are stretches of long ones
 
     @property
     def hold_said(self) -> bool:
@@ -134,6 +139,7 @@ def diagnose_in_steps(
     stand_in_error: float,
     time_limit: float | None,
     focus: str | None,
+    search_samples: int | None,
     progress: Progress | None,
 ) -> Diagnosis:
     """Carry out `diagnose`, whose parameters these are, by the steps of the module docstring."""
@@ -153,10 +159,32 @@ def diagnose_in_steps(
     request = Request(
         simulator, recordings, tried, hold, engine, workers, most_effects, stand_in_error, deadline, say, focus
     )
-    request, ready, search = _search_with_focus(request)
+    most = MOST_SAMPLES if search_samples is None else whole(search_samples, "search_samples", FEWEST_SAMPLES)
+    request, ready, search = _search_with_focus(_on_stretches(request, most))
+    everything: Everything | None = None
+    if request.stretches is not None:
+        with search.stage("fits to all recordings"):
+            everything = Everything.of(search, request.stretches, ready.gates)
+        request = replace(request, notes=(request.stretches.note(everything is not None), *request.notes))
     with search.stage("conclusion"):
         found = conclude(search, (*request.notes, *ready.gates))
-    return _build_diagnosis(request, ready, search, found, tests, limits, began)
+    final = _final_fits(request, ready, search, found, everything)
+    return _build_diagnosis(request, ready, search, found, final, tests, limits, began)
+
+
+def _on_stretches(request: Request, most: int) -> Request:
+    """Restrict a request to the most informative stretches if the recordings have more than `most` samples."""
+    if sum(map(len, request.recordings)) <= most:
+        return request
+    request.say("choice of stretches", 0, 1)
+    recordings, spikes = remove_glitches(request.recordings)
+    recordings, transients = open_unsettled(recordings)
+    hold = stated_hold(request.simulator, recordings, request.hold) or "zero"
+    chosen = choose_stretches(request.simulator, recordings, hold, request.engine, most, request.workers)
+    stretches = Stretches(recordings, chosen)
+    request.say("choice of stretches", 1, 1)
+    notes = (*request.notes, *spikes, *transients)
+    return replace(request, recordings=stretches.cut(), stretches=stretches, notes=notes)
 
 
 def _search_with_focus(request: Request) -> tuple[Request, Prepared, Search]:
@@ -170,7 +198,8 @@ def _search_with_focus(request: Request) -> tuple[Request, Prepared, Search]:
     # the gain depends little on the hold, which the search may still change
     hold = stated_hold(request.simulator, request.recordings, request.hold) or "zero"
     led, memory = predictor(request.simulator, request.recordings, hold, request.engine)
-    request = replace(request, simulator=led, notes=(prediction_note(request.simulator, request.recordings, memory),))
+    note = prediction_note(request.simulator, request.recordings, memory)
+    request = replace(request, simulator=led, notes=(*request.notes, note))
     return request, *_search_both_holds(request)
 
 
@@ -237,9 +266,12 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
 
 def _noise(request: Request, ready: Prepared) -> Floor:
     """Return the noise floor of the prepared recordings; the error of a surrogate counts as noise."""
+    floor = ready.floor
+    if request.stretches is not None and floor.source == "estimated":  # what repeats may be outside the stretches
+        floor = measured_floor(request.stretches.everything(ready.bench, ready.gates).recordings) or floor
     if not request.stand_in_error:
-        return ready.floor
-    return ready.floor.beside(request.stand_in_error * ready.bench.scale)
+        return floor
+    return floor.beside(request.stand_in_error * ready.bench.scale)
 
 
 def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
@@ -305,11 +337,52 @@ def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: S
     return Conclusion(fault, (*gates, clipping), refitted, named_correction(search, refitted))
 
 
+@dataclass(frozen=True, eq=False)
+class FinalFits:
+    """The fits whose values and errors an answer states.
+
+    Attributes
+    ----------
+    bench : Workbench
+        All training recordings as corrected.
+    without, after : Fitted
+        The refitted and the corrected simulator, fitted to them.
+    nominal : float
+        NRMSE at the user's values.
+    drawn : tuple of Fitted
+        Both along the recordings of the search's bench.
+    """
+
+    bench: Workbench
+    without: Fitted
+    after: Fitted
+    nominal: float
+    drawn: tuple[Fitted, Fitted]
+
+
+def _final_fits(
+    request: Request, ready: Prepared, search: Search, found: Conclusion, everything: Everything | None
+) -> FinalFits:
+    """Return the fits that the answer states: those of the search, or fits to everything if it ran on stretches."""
+    bench, without, after = search.bench, search.root.fitted, found.fitted
+    if found.effects and not np.isfinite(found.correction.after):  # a held-out comparison chose what it compared
+        after = without_idle_offsets(bench, after)
+    if everything is None:
+        return FinalFits(bench, without, after, ready.nominal, (without, after))
+    with search.stage("fits to all recordings"):
+        whole, pair = everything.bench, (without, after)
+        to_all = [everything.fitted(search, one) for one in pair]
+        drawn = [back_on_stretches(bench, f, one.initial) for f, one in zip(to_all, pair, strict=True)]
+        nominal = errors_of(whole, whole.model(request.simulator))
+    return FinalFits(whole, to_all[0], to_all[1], nominal, (drawn[0], drawn[1]))
+
+
 def _build_diagnosis(
     request: Request,
     ready: Prepared,
     search: Search,
     found: Conclusion,
+    final: FinalFits,
     tests: tuple[Recording, ...],
     limits: Mapping[str, float] | None,
     began: float,
@@ -317,12 +390,10 @@ def _build_diagnosis(
     """Put the search's conclusion and its proof into a Diagnosis."""
     proving = time.perf_counter()
     request.say("proof", 0, 1)
-    bench, without, after = search.bench, search.root.fitted, found.fitted
-    if found.effects and not np.isfinite(found.correction.after):  # a held-out comparison chose what it compared
-        after = without_idle_offsets(bench, after)
+    bench, without, after = final.bench, final.without, final.after
     std = deviations(bench, after)
     errors: dict[str, dict[str, float] | None] = {
-        "train": {"nominal": ready.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
+        "train": {"nominal": final.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
         "test": test_errors(bench, tests, found.gates, request.simulator, without, after) if tests else None,
     }
     if bench.simulator.observer is not None:
@@ -365,7 +436,7 @@ def _build_diagnosis(
         times={**search.times, "proof": now - proving},
         interrupted=search.interrupted,
         out_of_time=search.out_of_time,
-        evidence={"search": search, "without": without, "after": after},
+        evidence={"search": search, "without": final.drawn[0], "after": final.drawn[1]},
         substeps=after.model.substeps,
         freed=found.freed,
         correction=found.correction,

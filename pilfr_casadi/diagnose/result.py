@@ -260,6 +260,8 @@ class Diagnosis:
         finite = (y if y is not None and np.all(np.isfinite(y)) else None for y in (before, after))
         return BeforeAfter(r, *finite)
 
+    compare = before_and_after  # the earlier name
+
     @property
     def _changed(self) -> bool:
         """Whether the corrected simulator differs from the refitted one."""

@@ -242,12 +242,15 @@ class Jump(Gate):
         Share that a jump some samples away removes.
     states : list of array
         Initial states of the recordings when this one is cut there.
+    places : tuple of (int, int)
+        Once reported: each recording that is cut, and the sample at which its later piece begins.
     """
 
     share: float = 0.0
     rival: float = 0.0
     beside: float = 0.0
     states: Sequence[np.ndarray] = ()
+    places: tuple[tuple[int, int], ...] = ()
     remedy: ClassVar[str] = "with the recording cut there"
 
     def beats(self, other: float, share: float) -> bool:
@@ -320,7 +323,9 @@ def _describe_gaps(jump: Jump, origins: Sequence[tuple[Recording, int]]) -> Gate
         f"Samples are missing just before {at}: the state jumps there as no force and no shock could make it, as where "
         "a logger lost some and counted on"
     )
-    return replace(jump, value=[t for _, _, t in gaps], sentence=words)
+    given = list(dict.fromkeys(id(r) for r, _ in origins))  # the recordings in their order
+    places = tuple((given.index(id(r)), k) for r, k in origins if k)
+    return replace(jump, value=[t for _, _, t in gaps], sentence=words, places=places)
 
 
 def _quiet_noise2(now: Checked) -> float:

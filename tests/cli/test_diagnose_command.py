@@ -217,6 +217,7 @@ def test_files_that_are_missing_or_in_the_wrong_place(capsys, files):
     refused(capsys, "diagnose", files / "rig.py", "--out", files / "out", says="No training recording")
     refused(capsys, *arguments(files, "--inputs", "force"), says=("--inputs", "--simulated"))
     refused(capsys, *arguments(files, "--workers", 0), says="--workers 0")
+    refused(capsys, *arguments(files, "--search-samples", 5), says="--search-samples 5")
     (files / "file").write_text("kept")
     refused(capsys, *arguments(files)[:-4], "--out", files / "file" / "below", says="--out")
 

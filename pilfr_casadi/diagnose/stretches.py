@@ -1,0 +1,366 @@
+"""Long records: the search runs on the most informative stretches, the final fits on everything.
+
+A search fits hundreds of hypotheses. If the training recordings have more samples than it can use in minutes, it runs
+on a few stretches of them. Neighbouring stretches of a long record tell much the same, and what is rare tells most. So
+each candidate stretch gets features, and the stretches are chosen far apart in them (farthest-point selection, Gonzalez
+1985):
+
+- For each port, the size of the residual that forces of a family explain there beyond the simulator's own parameters,
+  along a run of the simulator as given. The families are smooth forces of position and rate, hysteresis, and a slow
+  relaxation; the catalogue's laws are near their span.
+- Amplitude, rate and operating point of each channel.
+
+A stretch from within a recording begins with a warm-up, samples that are simulated but not scored, and its initial
+state is estimated.
+
+The leading hypotheses are then fitted to everything, by normal equations that are summed over the recordings piece by
+piece (`optimise.Problem.normal`), so that memory does not grow with their length. A hypothesis that everything refutes
+is dropped; errors, values and standard errors come from everything.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from .._base import InputError, side_by_side
+from ..data import Recording
+from ..engine import Engine
+from ..laws import Creep, Law, StopHysteresis
+from ..models import Model
+from ..optimise import GaussNewton, first_state, samples_for_state
+from ..simulators import Simulator
+from .floor import FEWEST, effective_size
+from .gates import Gate
+from .linearise import Probe, loudest_stretch, run
+from .screen import Remainder, Surface, Task, orthonormal
+from .search import Findings, Search, likeliest
+from .timing import Jump
+from .trials import Trial
+from .workbench import DIVERGED, FEW, Fitted, Workbench
+
+MOST_SAMPLES = 60_000  # samples of the training recordings up to which everything is searched: effort
+SHARE, COUNT = 2 / 3, 10  # share of these samples that the stretches have together, and their largest number
+SHORTEST = 500  # least length of a stretch in samples: a law with memory needs some history
+WARM_UP = 0.05  # share of a stretch that is simulated before it and not scored
+CANDIDATES = 300  # stretches that are linearised at most
+LINEARISED = 1000  # samples of each that are linearised
+FAMILIES = (Surface, StopHysteresis, Creep)  # forces near whose span the catalogue's laws are
+# the stretches' fits are near those to everything, so that few steps suffice
+FINAL = GaussNewton(max_iterations=40, tolerance=1e-5, patience=3)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Samples `begin` up to `end` of a training recording, counted from zero."""
+
+    recording: int
+    begin: int
+    end: int
+
+    def __len__(self) -> int:
+        return self.end - self.begin
+
+    @property
+    def first(self) -> int:
+        """First sample of the warm-up before it."""
+        return max(self.begin - int(WARM_UP * len(self)), 0)
+
+    def cut(self, recordings: Sequence[Recording]) -> Recording:
+        """Cut the stretch out of its recording, with a warm-up before it; a whole recording is returned as it is."""
+        r = recordings[self.recording]
+        if len(self) == len(r):
+            return r
+        piece = r.slice(self.first, self.end)
+        name = f"{r.name or f'recording {self.recording + 1}'} from {self.first * r.dt:.6g} s"
+        return piece.with_(skip=max(piece.skip, self.begin - self.first), name=name)
+
+
+@dataclass(frozen=True, eq=False)
+class Stretches:
+    """All training recordings, and the stretches of them that a search uses."""
+
+    recordings: tuple[Recording, ...]
+    chosen: tuple[Stretch, ...]
+
+    def cut(self) -> tuple[Recording, ...]:
+        """Cut the chosen stretches out of the recordings."""
+        return tuple(s.cut(self.recordings) for s in self.chosen)
+
+    def note(self, fitted_to_all: bool = True) -> Gate:
+        """Say how much was searched, and whether the final fits use everything."""
+        lengths = sorted({len(s) for s in self.chosen})
+        size = f"{lengths[0]}" if len(lengths) == 1 else f"{lengths[0]} to {lengths[-1]}"
+        total, count = sum(map(len, self.recordings)), len(self.chosen)
+        of = f"{total} samples" if len(self.recordings) == 1 else f"{len(self.recordings)} recordings, {total} samples"
+        sentence = (
+            f"The search ran on {count} stretch{'es' if count > 1 else ''} of {size} samples, chosen from {of} by what "
+            "they tell of missing forces; "
+        )
+        sentence += (
+            "the final fits use everything."
+            if fitted_to_all
+            else "from the whole recordings the refitted simulation runs away, so that values and errors are those of "
+            "the stretches."
+        )
+        return Gate("recordings", "stretches", sum(map(len, self.chosen)), sentence, corrected=False)
+
+    def everything(self, bench: Workbench, gates: Sequence[Gate]) -> Workbench:
+        """Return a bench of the stretches with all recordings in their place, corrected by the gates."""
+        recordings = list(self.recordings)
+        for gate in gates:
+            if isinstance(gate, Jump):
+                recordings = self._cut_at_gaps(recordings, gate)
+            elif gate.change is not None and gate.corrected:
+                recordings = list(map(gate.change, recordings))
+        scale = np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
+        return replace(bench.on(recordings), scale=scale)
+
+    def _cut_at_gaps(self, recordings: list[Recording], gap: Jump) -> list[Recording]:
+        """Cut the recordings where samples are missing in a stretch."""
+        places = [(self.chosen[i].recording, self.chosen[i].first + k) for i, k in gap.places]
+        for i, k in sorted(places, reverse=True):
+            r = recordings[i]
+            later = r.slice(k).with_(initial="estimate", period=None, name=f"{r.name} from {k * r.dt:.6g} s".strip())
+            recordings[i : i + 1] = [r.slice(0, k), later]
+        return recordings
+
+
+def choose_stretches(
+    simulator: Simulator,
+    recordings: Sequence[Recording],
+    hold: str,
+    engine: str = "auto",
+    most: int = MOST_SAMPLES,
+    workers: int = 1,
+) -> tuple[Stretch, ...]:
+    """Choose the stretches of recordings that tell most of missing forces; see the module docstring.
+
+    Parameters
+    ----------
+    most : int
+        Samples up to which everything would be searched; the stretches have two thirds of it together at most.
+    """
+    length = max(int(SHARE * most) // COUNT, SHORTEST)
+    count = int(np.clip(int(SHARE * most) // length, 1, COUNT))
+    stretches = [s for i, r in enumerate(recordings) for s in divide(i, len(r), r.skip, length)]
+    signals = signal_features(recordings, stretches)
+    if len(stretches) > CANDIDATES:
+        kept = spread_out(signals, CANDIDATES, int(np.argmax(np.sum(signals**2, axis=1))))
+        kept = sorted(kept)
+        stretches, signals = [stretches[k] for k in kept], signals[kept]
+    explained = force_features(simulator, recordings, stretches, hold, engine, workers)
+    leading = signals if explained is None else explained
+    features = signals if explained is None else np.hstack([explained, signals])
+    chosen = spread_out(features, count, int(np.argmax(np.sum(leading**2, axis=1))))
+    return tuple(sorted((stretches[k] for k in chosen), key=lambda s: (s.recording, s.begin)))
+
+
+def divide(recording: int, samples: int, skip: int, length: int) -> list[Stretch]:
+    """Divide a recording into stretches of about equal length; the first begins with its skipped samples."""
+    edges = np.linspace(skip, samples, max(round((samples - skip) / length), 1) + 1).astype(int)
+    edges[0] = 0
+    return [Stretch(recording, int(a), int(b)) for a, b in pairwise(edges)]
+
+
+def spread_out(features: np.ndarray, count: int, first: int) -> list[int]:
+    """Select `count` rows of features (n, k), each as far from those before it as any; `first` is the first of them."""
+    chosen = [first]
+    distance = np.sum((features - features[first]) ** 2, axis=1)
+    while len(chosen) < min(count, len(features)):
+        distance[chosen] = -1.0
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.sum((features - features[chosen[-1]]) ** 2, axis=1))
+    return chosen
+
+
+def signal_features(recordings: Sequence[Recording], stretches: Sequence[Stretch]) -> np.ndarray:
+    """Compute mean, deviation and rate of each channel in each stretch, (n, 3 n_channels).
+
+    Each is divided by its largest value in any stretch and by the root of their number.
+    """
+    rows = []
+    for s in stretches:
+        r = recordings[s.recording]
+        v = np.column_stack([r.u[s.begin : s.end], r.y[s.begin : s.end]])
+        rows.append(np.concatenate([v.mean(axis=0), v.std(axis=0), np.sqrt(np.mean(np.diff(v, axis=0) ** 2, axis=0))]))
+    found = np.array(rows)
+    means = found.shape[1] // 3
+    found[:, :means] -= found[:, :means].mean(axis=0)
+    largest = np.max(np.abs(found), axis=0)
+    # a channel's mean is an operating point only relative to its amplitude
+    largest[:means] = np.maximum(largest[:means], largest[means : 2 * means])
+    return np.asarray(found / np.where(largest > 0, largest, 1.0) / np.sqrt(found.shape[1]))
+
+
+def force_features(
+    simulator: Simulator,
+    recordings: Sequence[Recording],
+    stretches: Sequence[Stretch],
+    hold: str,
+    engine: str,
+    workers: int = 1,
+) -> np.ndarray | None:
+    """Compute the size of the residual that each family of forces explains at each port in each stretch, (n, k).
+
+    Each stretch counts where its residual is largest. All sizes are divided by the largest, and by the root of their
+    number. None if the simulator as given cannot be run.
+    """
+    try:
+        bench = Workbench.of(simulator, recordings, hold, engine)
+        model, runner = bench.compile(simulator)
+    except InputError:
+        return None
+    pieces = [piece for i in range(len(recordings)) for piece in _loudest(bench, model, runner, i, stretches)]
+    if not all(np.all(np.isfinite(state)) for _, state in pieces):
+        return None
+    values = {name: p.value for name, p in model.parameters.items()}
+    fitted = Fitted(simulator, model, runner, values, [], [], np.nan)
+    probe = Probe.of(bench, fitted)
+
+    def explained(piece: tuple[Recording, np.ndarray]) -> dict[tuple[str, str], float]:
+        r, state = piece
+        part = replace(bench, recordings=(r,))
+        rest = Remainder.of(part, probe, [run(part, probe, replace(fitted, initial=[state]), 0)], FAMILIES)
+        return {(t.port.name, law.id): size for t in rest.tasks for law, size in _explained(rest, t)}
+
+    rows = side_by_side(explained, pieces, workers)
+    keys = sorted(set().union(*rows))
+    found = np.array([[row.get(key, 0.0) for key in keys] for row in rows])
+    largest = np.max(found, initial=0.0)
+    if not (np.isfinite(largest) and largest > 0):
+        return None
+    return np.asarray(found / largest / np.sqrt(len(keys)))
+
+
+def _loudest(
+    bench: Workbench, model: Model, engine: Engine, i: int, stretches: Sequence[Stretch]
+) -> Iterator[tuple[Recording, np.ndarray]]:
+    """Generate the part of each stretch of recording i with the largest residual as given, and the state before it."""
+    r, p, rows = bench.recordings[i], model.parameters.start, model.substeps
+    here = [s for s in stretches if s.recording == i]
+    if not here:
+        return
+    drive, at, state = model.drive(r), 0, _first_state(model, engine, r)
+
+    def simulate(begin: int, end: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if end == begin:
+            return r.y[:0], state
+        with np.errstate(all="ignore"):
+            y, after = engine.simulate(drive[begin * rows : end * rows], p, state)
+        return y, after
+
+    for s in here:  # in the order of their samples
+        state = simulate(at, s.begin, state)[1]
+        y, after = simulate(s.begin, s.end, state)
+        with np.errstate(all="ignore"):
+            power = np.nan_to_num(np.sum(((y - r.y[s.begin : s.end]) / bench.scale) ** 2, axis=1), nan=0.0, posinf=0.0)
+        part = loudest_stretch(power, LINEARISED, 0)
+        yield (
+            r.slice(s.begin + part.start, s.begin + part.stop),
+            simulate(s.begin, s.begin + part.start, state)[1],
+        )
+        at, state = s.end, after
+
+
+def _explained(rest: Remainder, task: Task) -> list[tuple[Law, float]]:
+    """Compute the size of the remainder along the forces of each family at a port."""
+    out = []
+    for law, doses in rest.doses(task):
+        base = orthonormal(np.hstack([d.phi for d in doses])) if doses else np.zeros((len(rest.left), 0))
+        out.append((law, float(np.linalg.norm(base.T @ rest.left))))
+    return out
+
+
+def _first_state(model: Model, engine: Engine, r: Recording) -> np.ndarray:
+    """Find the state at a recording's first sample at the model's start values; zero if that diverges."""
+    try:
+        return np.asarray(first_state(model, engine, r, min(samples_for_state(model), len(r) // 3) or None))
+    except (InputError, RuntimeError, FloatingPointError, np.linalg.LinAlgError):
+        return np.zeros(model.n_state)
+
+
+# final fits
+
+
+def fit_to_all(bench: Workbench, fitted: Fitted, time_limit: float = np.inf) -> Fitted:
+    """Fit a simulator to all recordings of a bench from its values on stretches of them.
+
+    Without time, or if the run diverges, the values stay as they are.
+    """
+    model, engine = fitted.model, fitted.engine
+    at = fitted.fitted_model
+    states = [_first_state(at, engine, r) for r in bench.recordings]
+    if time_limit > 0:
+        solver = replace(FINAL, time_limit=time_limit)
+        try:
+            return bench.fit(
+                fitted.simulator, [fitted.values], states=states, solver=solver, model=model, engine=engine
+            )
+        except InputError:
+            pass
+    return bench.result(fitted.simulator, fitted.values, states, engine, model)
+
+
+@dataclass(frozen=True, eq=False)
+class Everything:
+    """The fits to everything: the bench with all recordings, and the fit to it for each fit to the stretches."""
+
+    bench: Workbench
+    fits: dict[Fitted, Fitted]
+
+    @classmethod
+    def of(cls, search: Search, stretches: Stretches, gates: Sequence[Gate]) -> Everything | None:
+        """Fit the leading hypotheses of a search to everything, and drop from its memo those that everything refutes.
+
+        After an interrupt, or past the deadline, their values stay as they are. None if the refitted simulator runs
+        away from the whole recordings.
+        """
+        whole = stretches.everything(search.bench, gates)
+        leading = [t for t in likeliest(list(search.memo.values()), search.evidence) if t.laws][:FEW]
+        trials = [search.root, *leading]
+        limit = _seconds_left(search) / 2  # the rest is for the simulators that the conclusion adds
+        try:
+            fits = side_by_side(lambda t: fit_to_all(whole, t.fitted, limit), trials, search.workers)
+        except KeyboardInterrupt:
+            search.interrupted = True
+            fits = [fit_to_all(whole, t.fitted, 0.0) for t in trials]
+        search.interrupted = search.interrupted or bool(whole.interrupted_fits)
+        if not fits[0].cost < DIVERGED:
+            return None
+        there = replace(search, bench=whole, memo={}, steps=[], findings=defaultdict(Findings))
+        for trial, fitted in zip(trials, fits, strict=True):
+            there.keep(Trial(trial.laws, fitted, fitted.cost, fitted.cost, True))
+        best = max(there.memo.values(), key=there.evidence)
+        scored = [e[r.skip :] for e, r in zip(best.fitted.residual, whole.recordings, strict=True)]
+        there.count = max(effective_size(scored), FEWEST)
+        kept = {t.key for t in likeliest(list(there.memo.values()), there.evidence)} | {search.root.key}
+        for trial in trials:
+            if trial.key not in kept:
+                del search.memo[trial.key]
+        return cls(whole, {trial.fitted: fitted for trial, fitted in zip(trials, fits, strict=True)})
+
+    def fitted(self, search: Search, fitted: Fitted) -> Fitted:
+        """Return the fit to everything of a simulator fitted to the stretches."""
+        if fitted not in self.fits:
+            self.fits[fitted] = fit_to_all(self.bench, fitted, _seconds_left(search))
+            search.interrupted = search.interrupted or bool(self.bench.interrupted_fits)
+        return self.fits[fitted]
+
+
+def _seconds_left(search: Search) -> float:
+    """Return the seconds until the deadline of a search; none after an interrupt."""
+    return 0.0 if search.interrupted else search.deadline - time.perf_counter()
+
+
+def back_on_stretches(bench: Workbench, fitted: Fitted, states: Sequence[np.ndarray]) -> Fitted:
+    """Run a fit to everything along the stretches of a bench; only their initial states are fitted, from `states`."""
+    parameters = fitted.fitted_model.parameters
+    held = fitted.model.with_parameters(parameters.change(**{k: {"fixed": True} for k in parameters}))
+    found = bench.fit(fitted.simulator, [fitted.values], states=states, model=held, engine=fitted.engine)
+    return bench.result(fitted.simulator, fitted.values, found.initial, fitted.engine, fitted.model)
