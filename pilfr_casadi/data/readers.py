@@ -1,4 +1,4 @@
-"""Readers: CSV, ``.mat`` and ``.npz`` files into recordings.
+"""Readers: CSV, ``.mat``, ``.npz``, Parquet and MDF files into recordings.
 
 A file holds one recording: a time column (``t``, ``t_s`` or ``time``, in seconds, uniform) and one column for each
 input and output by name; other columns are ignored. Any fault of a file is reported in one sentence that names the
@@ -112,9 +112,10 @@ def read(path: Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
 def read(
     path: PathLike | Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
 ) -> Recording | tuple[Recording, ...]:
-    """Read recordings with the reader for the file's suffix: .csv, .tsv, .txt or .dat, .mat, .npz.
+    """Read recordings with the reader for the file's suffix: .csv, .tsv, .txt or .dat, .mat, .npz, .parquet, .mf4, .mdf.
 
-    Parameters, returned values and errors are those of :func:`read_csv`; files of different kinds may be mixed.
+    Parquet files need ``pilfr-casadi[parquet]``, MDF files ``pilfr-casadi[mdf]``. The time of an MDF file's channels is
+    its column ``t``; the channels must have the same times. Parameters, returned values and errors are those of :func:`read_csv`; files of different kinds may be mixed.
     """
     return _read_each(path, _Request(inputs, outputs, **options))
 
