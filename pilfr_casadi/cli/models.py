@@ -259,7 +259,8 @@ class SimulateOptions(DataOptions):
     data: str = typer.Argument(
         ...,
         metavar="DATA",
-        help="A recording (.csv, .mat, .npz, .parquet, .mf4), or several in one array (.npz, .npy: samples, channels, ...).",
+        help="A recording (.csv, .mat, .npz, .parquet, .mf4), or several in one array (.npz, .npy: samples, "
+        "channels, ...).",
     )
     out: str = option("CSV file; for several records also .npz or .npy.", "FILE", ...)
 

@@ -112,10 +112,12 @@ def read(path: Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
 def read(
     path: PathLike | Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
 ) -> Recording | tuple[Recording, ...]:
-    """Read recordings with the reader for the file's suffix: .csv, .tsv, .txt or .dat, .mat, .npz, .parquet, .mf4, .mdf.
+    """Read recordings with the reader for the file's suffix.
 
-    Parquet files need ``pilfr-casadi[parquet]``, MDF files ``pilfr-casadi[mdf]``. The time of an MDF file's channels is
-    its column ``t``; the channels must have the same times. Parameters, returned values and errors are those of :func:`read_csv`; files of different kinds may be mixed.
+    The suffixes are .csv, .tsv, .txt or .dat, .mat, .npz, .parquet, .mf4 and .mdf. Parquet files need
+    ``pilfr-casadi[parquet]``, MDF files ``pilfr-casadi[mdf]``. The times of an MDF file's channels are its column
+    ``t``; all channels that are read must have the same. Parameters, returned values and errors are those of
+    :func:`read_csv`; files of different kinds may be mixed.
     """
     return _read_each(path, _Request(inputs, outputs, **options))
 

@@ -36,7 +36,7 @@ def mdf(tmp_path):
             for t, channels in groups:
                 file.append([asammdf.Signal(samples=v, timestamps=t, name=k) for k, v in channels.items()])
             path = tmp_path / name
-            file.save(path)
+            file.save(path, overwrite=True)
         return path
 
     return write
