@@ -59,6 +59,7 @@ if TYPE_CHECKING:
         Recording as Recording,
         as_recordings as as_recordings,
         mean_period as mean_period,
+        merge as merge,
         multisine as multisine,
         noise_weights as noise_weights,
         nrmse as nrmse,
@@ -67,6 +68,7 @@ if TYPE_CHECKING:
         prbs as prbs,
         read as read,
         read_csv as read_csv,
+        read_frame as read_frame,
         read_mat as read_mat,
         read_npz as read_npz,
         rmse as rmse,
@@ -76,8 +78,10 @@ if TYPE_CHECKING:
     from .diagnose import Check as Check, Diagnosis as Diagnosis, check as check
     from .export import Exported as Exported, exported as exported, to_casadi as to_casadi
     from .identify import (
+        Comparison as Comparison,
         Fit as Fit,
         RegularizationPath as RegularizationPath,
+        compare as compare,
         fit as fit,
         load as load,
         one_step as one_step,
@@ -149,6 +153,7 @@ else:
 # Reached through their folders (`pilfr.models.to_plays`); these spellings still work.
 _ELSEWHERE = {
     "BLA",
+    "Comparison",
     "Envelope",
     "Exported",
     "Limit",
@@ -160,6 +165,7 @@ _ELSEWHERE = {
     "StaticNetwork",
     "Status",
     "as_recordings",
+    "compare",
     "dc_gain",
     "do_mpc_controller",
     "do_mpc_model",
@@ -170,6 +176,7 @@ _ELSEWHERE = {
     "inverse_element",
     "kalman_filter",
     "mean_period",
+    "merge",
     "modal",
     "network_lfr",
     "noise_weights",
@@ -182,6 +189,7 @@ _ELSEWHERE = {
     "play",
     "prbs",
     "prune",
+    "read_frame",
     "read_run",
     "regularization_path",
     "response_bound",

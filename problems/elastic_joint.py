@@ -2,7 +2,7 @@
 
 The truth is a motor and a link on a spring and a damper, with viscous and dry friction at the motor. The simulator has
 one inertia, both frictions and a lag of the actuator, all free, so that a refit may hide the compliance behind damping
-and lag. Even seeds record the motor's angle, odd seeds the link's. Every third case is rigid, and complete. Values are
+and lag. Even seeds record the motor's speed, odd seeds the link's. Every third case is rigid, and complete. Values are
 drawn anew for every seed.
 
     python -m problems.elastic_joint                20 elastic cases, 10 rigid ones
@@ -31,8 +31,8 @@ def simulator(values: Mapping[str, float], seen: str) -> Simulator:
     """Make the rigid simulator: one inertia with friction behind an actuator with a lag; `seen` is its output."""
 
     def dynamics(x: Any, u: Any, p: Any) -> dict[str, Any]:
-        friction = p.d * x.speed + p.F_c * ca.tanh(x.speed / KNEE)
-        return {"torque": (u.command - x.torque) / p.T, "angle": x.speed, "speed": (x.torque - friction) / p.J}
+        load = p.d * x.speed + p.F_c * ca.tanh(x.speed / KNEE)
+        return {"torque": (u.command - x.torque) / p.T, "angle": x.speed, "speed": (x.torque - load) / p.J}
 
     joint = Port(
         "joint",
@@ -46,13 +46,13 @@ def simulator(values: Mapping[str, float], seen: str) -> Simulator:
     units = {"J": "kg m^2", "d": "N m s/rad", "F_c": "N m", "T": "s"}
     return Simulator(
         dynamics,
-        lambda x: {seen: x.angle},
+        lambda x: {seen: x.speed},
         states=("torque", "angle", "speed"),
         inputs=("command",),
         parameters={k: Parameter(values[k], unit=units[k], bounds=bounds[k]) for k in units},
         ports=(joint,),
         hold="zero",
-        units={"command": "N m", seen: "rad"},
+        units={"command": "N m", seen: "rad/s"},
     )
 
 
@@ -92,7 +92,7 @@ def _run(
 
     x, h, y = np.zeros(5), DT / FINE, np.zeros(SAMPLES)
     for i in range(SAMPLES):
-        y[i] = x[1] if seen == "motor" else x[3]
+        y[i] = x[2] if seen == "motor" else x[4]
         for _ in range(FINE):
             k1 = flow(x, u[i])
             k2 = flow(x + h / 2 * k1, u[i])

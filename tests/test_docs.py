@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import json
 import os
 import re
 import shutil
@@ -15,7 +16,7 @@ import pilfr_casadi as pilfr
 
 ROOT = Path(__file__).parent.parent
 DEMO = ROOT / "pilfr_casadi" / "cli" / "demo_data"
-EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+EXAMPLES = sorted((ROOT / "examples").rglob("*.py"))
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 PAGES = sorted(p.relative_to(ROOT).as_posix() for p in (ROOT / "docs").rglob("*.md"))
 QUICK = {  # pages of about a second; all others are slow
@@ -26,10 +27,13 @@ QUICK = {  # pages of about a second; all others are slow
         "friction",
         "hold",
         "known_physics",
+        "look",
         "numpy",
+        "other_domains",
         "own_law",
         "ports",
         "unknown_start",
+        "varying_strength",
     )
 }
 SAID = {
@@ -54,12 +58,17 @@ LONG = {
     "own_law",
     "diagnose",
     "identify",
-}  # examples of more than some seconds
+}  # examples of more than some seconds, as all of the gallery but its quickest
+QUICK_PICTURES = {"plot_06_first_look", "plot_07_operators"}
 COMMAND = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
 
 
+def is_long(path):
+    return path.stem in LONG or (path.parent.name == "gallery" and path.stem not in QUICK_PICTURES)
+
+
 @pytest.mark.parametrize(
-    "path", [pytest.param(p, marks=[pytest.mark.slow] if p.stem in LONG else [], id=p.stem) for p in EXAMPLES]
+    "path", [pytest.param(p, marks=[pytest.mark.slow] if is_long(p) else [], id=p.stem) for p in EXAMPLES]
 )
 def test_example(path, tmp_path):
     done = subprocess.run([sys.executable, path], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True)
@@ -77,6 +86,53 @@ def snippets(language, *names):
     """Code blocks of a language in the given documents, in their order."""
     texts = [(ROOT / name).read_text(encoding="utf-8") for name in names]
     return [block for text in texts for block in re.findall(rf"```{language}\n(.*?)```", text, re.S)]
+
+
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+LONG_NOTEBOOKS = {"real_machine", "fit_to_mpc"}
+# runs the code cells of a notebook in their order and shows the value of each, as a notebook does
+SHOW_CELLS = """
+import ast, json, sys
+
+names = {"__name__": "__main__"}
+for k, cell in enumerate(json.load(open(sys.argv[1], encoding="utf-8"))["cells"]):
+    if cell["cell_type"] == "code":
+        tree = ast.parse("".join(cell["source"]))
+        last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+        exec(compile(tree, f"cell {k}", "exec"), names)
+        if last is not None:
+            shown = eval(compile(ast.Expression(last.value), f"cell {k}", "eval"), names)
+            for method in ("_repr_html_", "_repr_png_"):
+                print(k, method, len(getattr(shown, method)() or "") if hasattr(shown, method) else 0)
+"""
+
+
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, marks=[pytest.mark.slow] if p.stem in LONG_NOTEBOOKS else [], id=p.stem) for p in NOTEBOOKS],
+)
+def test_notebook(path, tmp_path):
+    if path.stem == "real_machine" and not (Path(os.environ.get("PILFR_DATA", "")) / "dfki_pendulum").is_dir():
+        pytest.skip("the recordings of the pendulum are not here; PILFR_DATA names the folder above dfki_pendulum")
+    done = subprocess.run(
+        [sys.executable, "-c", SHOW_CELLS, path],
+        cwd=tmp_path,
+        env={**ENVIRONMENT, "MPLBACKEND": "agg"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"_repr_html_ [1-9]", done.stdout) and re.search(r"_repr_png_ [1-9]", done.stdout)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+def test_notebooks_are_small_and_hold_no_results(path):
+    content = json.loads(path.read_text(encoding="utf-8"))
+    code = [cell for cell in content["cells"] if cell["cell_type"] == "code"]
+    assert len(code) >= 5 and path.stat().st_size < 8000
+    assert not any(cell["outputs"] or cell["execution_count"] for cell in code)
+    assert any("assert " in "".join(cell["source"]) for cell in code)
 
 
 @pytest.fixture

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         to_json as to_json,
         write_atomically as write_atomically,
     )
+    from .forward import LATER_VERBS as LATER_VERBS, later as later
     from .interrupts import (
         Clock as Clock,
         deferred_interrupt as deferred_interrupt,

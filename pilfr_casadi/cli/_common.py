@@ -101,6 +101,7 @@ class DataOptions:
     time_tolerance: float | None = option(
         "Largest deviation of samples from a uniform grid (default: 1e-4 steps, beyond rounding).", "STEPS"
     )
+    resample: float | None = option("New step, for times that are not uniform.", "SECONDS")
 
     def __post_init__(self) -> None:
         if self.period is not None and self.initial is None:
@@ -127,7 +128,7 @@ class DataOptions:
         columns = self.columns(path)
         if only_these:
             columns = {name: column for name, column in columns.items() if name in (*inputs, *outputs, *TIME_NAMES)}
-        more = {key: getattr(self, key) for key in ("period", "hold", "skip", "dt", "time_tolerance")}
+        more = {key: getattr(self, key) for key in ("period", "hold", "skip", "dt", "time_tolerance", "resample")}
         return read(path, inputs, outputs, columns=columns, initial=self.initial or "estimate", **more)
 
 

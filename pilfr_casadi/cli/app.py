@@ -33,7 +33,10 @@ COMMANDS = {  # name: (file, help)
     "demo": ("demo", "Identify a rig and diagnose a simulator, from recordings that come with the package."),
 }
 # keyword arguments in messages of the package that are options of the same name here
-KEYWORDS = ("dt", "time_tolerance", "period", "hold", "initial", "skip", "starts", "seed", "workers", "engine")
+KEYWORDS = (
+    *("dt", "time_tolerance", "resample", "period", "hold", "initial", "skip"),
+    *("starts", "seed", "workers", "engine"),
+)
 
 
 class PlainCommand(typer.core.TyperCommand):

@@ -332,7 +332,8 @@ def _check_initial(options: SimulateOptions, lack: str) -> None:
 
 def _table(options: SimulateOptions, fitted: Fit, recording: Recording, y: np.ndarray, columns: dict[str, str]) -> str:
     """Write times (as they were read), inputs and simulated outputs as CSV."""
-    times = written_times(options.data, columns) or [repr(float(f"{t:.12g}")) for t in recording.t]
+    written = None if options.resample else written_times(options.data, columns)
+    times = written or [repr(float(f"{t:.12g}")) for t in recording.t]
     rows = np.column_stack([recording.u, y]).tolist()
     lines = [",".join([t.strip(), *map(repr, row)]) for t, row in zip(times, rows, strict=True)]
     header = ",".join(["t", *fitted.model.inputs, *fitted.model.outputs])

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
+    from .common_clock import merge as merge
+    from .correlations import BAND as BAND, chance as chance, correlation as correlation
     from .excitation import (
         excited_bins as excited_bins,
         multisine as multisine,
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
         column_names as column_names,
         read as read,
         read_csv as read_csv,
+        read_frame as read_frame,
         read_mat as read_mat,
         read_npz as read_npz,
         step_of as step_of,

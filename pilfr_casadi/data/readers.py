@@ -1,4 +1,4 @@
-"""Readers: CSV, ``.mat``, ``.npz``, Parquet and MDF files into recordings.
+"""Readers: CSV, ``.mat``, ``.npz``, Parquet and MDF files, and frames of pandas or polars, into recordings.
 
 A file holds one recording: a time column (``t``, ``t_s`` or ``time``, in seconds, uniform) and one column for each
 input and output by name; other columns are ignored. Any fault of a file is reported in one sentence that names the
@@ -14,8 +14,9 @@ from typing import Any, overload
 import numpy as np
 
 from .._base import InputError, listed, positive
+from .preprocessing import even_grid
 from .recording import Recording
-from .tables import ArrayTable, CsvTable, open_table
+from .tables import ArrayTable, CsvTable, frame_table, open_table
 
 PathLike = str | Path
 Names = Sequence[str] | str
@@ -39,6 +40,7 @@ def read_csv(
     columns: Mapping[str, str] | None = None,
     dt: float | None = None,
     time_tolerance: float | None = None,
+    resample: float | None = None,
     **recording_options: Any,
 ) -> Recording | tuple[Recording, ...]:
     """Read recordings from CSV files with a header row.
@@ -58,6 +60,9 @@ def read_csv(
     time_tolerance : float, optional
         Allowed deviation of the times from a uniform grid, in steps, beyond the rounding of the written times; 1e-4 by
         default.
+    resample : float, optional
+        New step in seconds, for times that are not uniform: linear interpolation on a fine grid, then an anti-alias
+        filter. A gap of more than ten usual steps is refused.
     **recording_options
         Further fields of :class:`Recording`: `hold`, `initial`, `period`, `skip`, `units`, `name` (by default the
         file's).
@@ -71,7 +76,7 @@ def read_csv(
     InputError
         If a file, a column or a cell cannot be used.
     """
-    options = dict(columns=columns, dt=dt, time_tolerance=time_tolerance, **recording_options)
+    options = dict(columns=columns, dt=dt, time_tolerance=time_tolerance, resample=resample, **recording_options)
     return _read_each(path, _Request(inputs, outputs, **options), ".csv")
 
 
@@ -122,6 +127,29 @@ def read(
     return _read_each(path, _Request(inputs, outputs, **options))
 
 
+def read_frame(
+    frame: Any, inputs: Names, outputs: Names, *, columns: Mapping[str, str] | None = None, **options: Any
+) -> Recording:
+    """Make a recording from a pandas or polars data frame, or from any table with `columns` of named arrays.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        A time column in seconds, or one of dates or durations (of which the seconds from the first on are taken), and
+        a column for each input and output. Without a time column, the index of a pandas frame is the time if it has
+        the name of one, or holds dates or durations.
+    inputs, outputs, columns, **options
+        As for :func:`read_csv`.
+
+    Raises
+    ------
+    InputError
+        If it is no frame, or a column or a value cannot be used.
+    """
+    request = _Request(inputs, outputs, columns=columns, **{"name": "", **options})
+    return request.recording(frame_table(frame, TIME_NAMES, request.wanted))
+
+
 def column_names(path: PathLike, wanted: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the names of a file's columns or variables; `wanted` helps to find the delimiter of a CSV file."""
     return open_table(Path(path), wanted).names
@@ -146,10 +174,11 @@ class _Request:
         columns: Mapping[str, str] | None = None,
         dt: float | None = None,
         time_tolerance: float | None = None,
+        resample: float | None = None,
         **options: Any,
     ) -> None:
         self.inputs, self.outputs = _names(inputs, "inputs"), _names(outputs, "outputs")
-        self.dt, self.time_tolerance, self.options = dt, time_tolerance, options
+        self.dt, self.time_tolerance, self.new_step, self.options = dt, time_tolerance, resample, options
         if not self.inputs:
             raise InputError("a recording needs at least one input; name its column.")
         known = [f.name for f in fields(Recording) if f.name not in ("u", "y", "dt", "inputs", "outputs")]
@@ -167,6 +196,10 @@ class _Request:
                 )
         if dt is not None:
             positive(dt, "dt", "the seconds from one sample to the next")
+        if resample is not None:
+            positive(resample, "resample", "the new step in seconds")
+            if dt is not None or time_tolerance is not None:
+                raise InputError("resample was given with dt or time_tolerance; it makes times uniform by itself.")
         if time_tolerance is not None:
             positive(time_tolerance, "time_tolerance", "the steps that samples may lie off the grid", zero=True)
 
@@ -213,7 +246,12 @@ class _Request:
         """Make the recording from the columns of a file."""
         time, wanted = self.locate(table.names, str(table.path))
         parts = table.columns([*wanted, time] if time else wanted)
-        if time is None:
+        if self.new_step is not None:
+            assert time is not None
+            t = parts.pop()[:, 0]
+            parts = [even_grid(t, part, self.new_step, f"{table.path}: column {time!r}") for part in parts]
+            dt = float(self.new_step)
+        elif time is None:
             assert self.dt is not None
             dt = float(self.dt)
         else:
@@ -325,7 +363,7 @@ def step_of(
         raise InputError(
             f"{column} is not uniform: {place(k)} comes {gaps[k - 1]:.6g} s after the sample before it where "
             f"{usual:.6g} s is usual, and samples lie up to {deviation.max() / step:.2g} steps off a uniform grid; "
-            "resample, or allow more with time_tolerance=STEPS."
+            "resample with resample=STEP, or allow more with time_tolerance=STEPS."
         )
     step = float(f"{step:.12g}")
     if dt is None:

@@ -6,14 +6,15 @@ leading samples that are not scored. It is immutable, and all code that receives
 """
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
 
-from .._base import LARGEST, InputError, is_whole, listed, positive, real_array, usable
+from .._base import LARGEST, InputError, is_number, is_whole, later, listed, positive, real_array, usable
+from .preprocessing import butterworth, change_step, remove_trend
 
 SAME_STEP = 1e-4  # relative difference up to which two steps are the same; written times have few digits
 HOLDS = ("zero", "linear", None)
@@ -140,6 +141,18 @@ class Recording:
         shown = [f"initial {initial}", *(f"{key} {value}" for key, value in extras.items() if value is not None)]
         return f"<{text}, {', '.join(shown)}>"
 
+    def plot(self) -> Any:
+        """Draw every channel over time and over frequency; look at a recording before you fit it.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+        """
+        return later("plot_recording")(self)
+
+    def _repr_html_(self) -> str:
+        return str(later("recording_card")(self))
+
     def with_(self, **changes: Any) -> Self:
         """Return a copy with some fields replaced, checked anew."""
         return replace(self, **changes)
@@ -173,6 +186,125 @@ class Recording:
             raise InputError(f"{self.label} cannot be split at {fraction}; give a fraction between 0 and 1.")
         cut = round(fraction * len(self))
         return self.slice(0, cut), self.slice(cut, None)
+
+    def cut(self, start: float | None = None, stop: float | None = None) -> Self:
+        """Return the samples from `start` up to `stop`, both in seconds after the first sample; see :meth:`slice`.
+
+        Raises
+        ------
+        InputError
+            If a time is not a number within the recording, or fewer than two samples are left.
+        """
+        last = len(self) * self.dt
+        for value, name in ((start, "start"), (stop, "stop")):
+            if value is not None and not (is_number(value) and 0 <= value <= last * (1 + SAME_STEP)):
+                raise InputError(f"{name}={value!r} was given; {self.label} lasts from 0 to {last:g} s.")
+        first, after = (None if v is None else round(v / self.dt) for v in (start, stop))
+        return self.slice(first, after)
+
+    def detrend(self, kind: str = "constant", channels: Sequence[str] | str | None = None) -> Self:
+        """Subtract the mean (`"constant"`) or a straight line (`"linear"`) from every channel, or from those named.
+
+        The working point of a nonlinear machine belongs to its physics, so a simulator of it needs the signals as they
+        are; a linear or a PI-LFR model is fitted about a working point. An initial state of zero or given as numbers
+        no longer holds and is estimated.
+
+        Raises
+        ------
+        InputError
+            If the kind or a channel is unknown.
+        """
+        return self._edited(lambda values: remove_trend(values, kind), channels)
+
+    def filter(
+        self,
+        cutoff: float | tuple[float, float],
+        kind: str = "lowpass",
+        order: int = 4,
+        channels: Sequence[str] | str | None = None,
+    ) -> Self:
+        """Filter every channel, or those named, forwards and backwards: without phase.
+
+        Inputs and outputs that are filtered alike keep the relation of a linear model. They do not keep that of a
+        hysteresis or of friction, whose memory turns at the extremes of the signal, which a filter rounds off: filter
+        only above the band in which the machine moves, and use no high-pass. A filtered input is no longer held
+        between samples, so `hold` becomes `"linear"` if it was said. An initial state of zero or given as numbers no
+        longer holds and is estimated.
+
+        Parameters
+        ----------
+        cutoff : float, or two of them for a band
+            Frequency in Hz where the gain is one half.
+        kind : {"lowpass", "highpass", "bandpass", "bandstop"}
+        order : int
+            Order of the Butterworth filter, which runs twice.
+        channels : names, optional
+            By default all inputs and outputs.
+
+        Raises
+        ------
+        InputError
+            If a cutoff is not below the Nyquist frequency, there are too few samples, or a name is unknown.
+        """
+        edited = self._edited(lambda values: butterworth(values, self.dt, cutoff, kind, order), channels)
+        return replace(edited, hold=edited._sloped(edited.inputs if channels is None else channels))
+
+    def resample(self, dt: float) -> Self:
+        """Resample to another step in seconds; an anti-alias filter precedes a longer one.
+
+        The input between the new samples is no longer held, so `hold` becomes `"linear"` if it was said. `skip` covers
+        the same time. A period that is no whole number of new samples is dropped.
+
+        Raises
+        ------
+        InputError
+            If the step is not a positive number, or too long.
+        """
+        positive(dt, "dt", "the new step in seconds")
+        u, y = (change_step(values, self.dt, dt) if values.shape[1] else values for values in (self.u, self.y))
+        if u is self.u:
+            return self
+        skip = min(int(np.ceil(self.skip * self.dt / dt * (1 - SAME_STEP))), len(u) - 2)
+        period = round((self.period or 0) * self.dt / dt)
+        whole = bool(self.period) and abs(period * dt / ((self.period or 1) * self.dt) - 1) < SAME_STEP / period
+        kept = period if whole and 2 <= period <= len(u) - skip else None
+        initial = "estimate" if self.begins == "periodic" and kept is None else self.initial
+        y = y if self.n_y else np.empty((len(u), 0))
+        return replace(self, u=u, y=y, dt=dt, skip=skip, period=kept, initial=initial, hold=self._sloped(self.inputs))
+
+    def to_frame(self) -> Any:
+        """Return a pandas `DataFrame` with a column for each input and output over the index `t`, in seconds.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        try:
+            from pandas import DataFrame, Index
+        except ImportError:
+            raise InputError("pandas is not installed; install it with `pip install pilfr-casadi[frames]`.") from None
+        names = (*self.inputs, *self.outputs)
+        return DataFrame(np.hstack([self.u, self.y]), columns=list(names), index=Index(self.t, name="t"))
+
+    def _edited(self, edit: Callable[[np.ndarray], np.ndarray], channels: Sequence[str] | str | None) -> Self:
+        """Return a copy with some channels edited; its initial state is estimated unless it is periodic."""
+        every = (*self.inputs, *self.outputs)
+        chosen = every if channels is None else (channels,) if isinstance(channels, str) else tuple(channels)
+        for name in chosen:
+            if name not in every:
+                raise InputError(f"{self.label} has no channel {name!r}; it has {listed(every)}.")
+        values = np.hstack([self.u, self.y])
+        where = [every.index(name) for name in chosen]
+        if where:
+            values[:, where] = edit(values[:, where])
+        initial = self.initial if self.begins == "periodic" else "estimate"
+        return replace(self, u=values[:, : self.n_u], y=values[:, self.n_u :], initial=initial)
+
+    def _sloped(self, channels: Sequence[str] | str) -> str | None:
+        """Return the hold after inputs among the channels were smoothed: straight between samples, if it was said."""
+        named = (channels,) if isinstance(channels, str) else channels
+        return "linear" if self.hold and set(named) & set(self.inputs) else self.hold
 
 
 def as_recordings(data: "Recording | Iterable[Recording]") -> tuple[Recording, ...]:

@@ -148,6 +148,32 @@ class ArrayTable:
         return column
 
 
+def frame_table(frame: Any, time_names: Sequence[str], wanted: Sequence[str]) -> ArrayTable:
+    """Take the columns of a data frame as named arrays; an index that holds times becomes a column.
+
+    Dates and durations become seconds from the first one on. Columns that are not `wanted` are taken as they are.
+    """
+    if isinstance(frame, Mapping) or not hasattr(frame, "columns") or not hasattr(frame, "__getitem__"):
+        raise InputError(f"a {type(frame).__name__} was given; give a data frame of pandas or polars.")
+    names = [str(name) for name in frame.columns]
+    arrays: dict[str, Any] = {}
+    for key, name in zip(frame.columns, names, strict=True):
+        if names.count(name) > 1 and name in wanted:
+            raise InputError(f"the frame has {names.count(name)} columns named {name!r}; rename all but one.")
+        arrays[name] = _seconds(np.asarray(frame[key]))
+    index = getattr(frame, "index", None)
+    if index is not None and not {*time_names} & {*names}:
+        values, named = np.asarray(index), str(getattr(index, "name", None))
+        if values.dtype.kind in "mM" or named in time_names:
+            arrays[named if named in time_names else time_names[0]] = _seconds(values)
+    return ArrayTable(Path("the frame"), tuple(arrays), arrays)
+
+
+def _seconds(values: Array) -> Array:
+    """Return dates and durations as seconds from the first one on; anything else as it is."""
+    return (values - values[0]) / np.timedelta64(1, "s") if values.dtype.kind in "mM" and len(values) else values
+
+
 def open_table(path: Path, wanted: Sequence[str] = (), suffix: str = "") -> CsvTable | ArrayTable:
     """Open a file by its suffix, or as a file with another one; `wanted` columns tell the delimiter of a CSV file."""
     suffix = suffix or path.suffix.lower()

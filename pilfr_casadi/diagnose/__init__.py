@@ -41,9 +41,8 @@ if TYPE_CHECKING:
     from .mismatch_map import mismatch as mismatch
     from .refinement import Refinement as Refinement
     from .result import (
-        RUN_AWAY as RUN_AWAY,
         STEPS as STEPS,
-        Comparison as Comparison,
+        BeforeAfter as BeforeAfter,
         Diagnosis as Diagnosis,
         Effect as Effect,
     )

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from ..data import Recording, nrmse
-from ..engine import Engine, make_engine
+from ..engine import make_engine
+from ..identify import run_free
 from ..laws import Law
 from ..models import Model
-from ..optimise import first_state, samples_for_state
 from ..simulators import Simulator, discretise
 from .gates import Gate
 from .linearise import linearised
@@ -28,31 +28,6 @@ def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
     """Compute the NRMSE averaged over outputs and recordings."""
     pairs = zip(fitted.residual, bench.recordings, strict=True)
     return float(np.mean([nrmse(r.y, r.y + e, skip=r.skip) for e, r in pairs]))
-
-
-def run_free(
-    model: Model, engine: Engine, recording: Recording, starts: Sequence[np.ndarray] = ()
-) -> tuple[np.ndarray, int]:
-    """Simulate a model at its start values along a recording.
-
-    An unknown initial state is fitted to the first part of the recording, starting from rest and from `starts`.
-
-    Returns
-    -------
-    array, shape (M, n_y)
-        Simulated outputs; not finite where the simulation diverges.
-    int
-        First scored sample: the part that the state is fitted to is left out.
-    """
-    estimated = recording.begins == "estimate" and model.n_state > 0
-    used = min(samples_for_state(model), len(recording) // 3) if estimated else 0
-    with np.errstate(all="ignore"):
-        try:
-            state = first_state(model, engine, recording, used or None, starts=starts)
-            y = engine.simulate(model.drive(recording), model.parameters.start, state)[0]
-        except (RuntimeError, FloatingPointError):  # a quadratic program of huge numbers
-            y = np.full(recording.y.shape, np.nan)
-    return np.asarray(y), max(recording.skip, used)
 
 
 def errors_of(bench: Workbench, model: Model, starts: Sequence[np.ndarray] = ()) -> float:

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, to_json, write_atomically
+from .._base import InputError, later, to_json, write_atomically
 from ..data import SAME_STEP, Recording, as_recordings, nrmse
 from ..engine import make_engine
-from ..identify import match_channels
+from ..identify import RUN_AWAY, match_channels, run_free
 from ..laws import display_name
 from ..models import ParameterSet
 from ..simulators import Simulator, discretise, in_series
@@ -25,7 +25,7 @@ from .evidence import BETTER, FAR, SURE
 from .floor import ABOVE_NOISE
 from .gates import Gate
 from .learned import Learned
-from .proof import run_free, starts_of
+from .proof import starts_of
 from .refinement import Refinement, refine
 from .workbench import Fitted
 
@@ -33,7 +33,6 @@ VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
 STEPS = {"nominal": "as given", "before": "refitted", "after": "corrected"}  # the errors that are printed
 MOST = 8  # parameters and blind spots that are printed at most
-RUN_AWAY = 1e4  # error from which its size says nothing
 GRAVEST = 2  # blind spots that are told right after the verdict
 CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
@@ -73,7 +72,7 @@ class Effect:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class BeforeAfter:
     """A recording beside the refitted and the corrected simulator.
 
     Attributes
@@ -222,7 +221,7 @@ class Diagnosis:
         InputError
             If the recording lacks a channel or has another step than the training recordings.
         """
-        return self._run(recording)[1]
+        return self.run(recording)[1]
 
     def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
         """Compute the NRMSE (Eq. 27) of the corrected simulator, averaged over outputs and recordings.
@@ -230,7 +229,7 @@ class Diagnosis:
         Samples from which an initial state was estimated are not scored; otherwise see `simulate`. The error is
         infinite if the simulation diverges.
         """
-        runs = [self._run(recording) for recording in as_recordings(recordings)]
+        runs = [self.run(recording) for recording in as_recordings(recordings)]
         return float(np.mean([nrmse(r.y, y, skip=k) if np.all(np.isfinite(y)) else np.inf for r, y, k in runs]))
 
     def plot(self, recording: Recording) -> Any:
@@ -248,18 +247,20 @@ class Diagnosis:
         """
         from ..plots import Simulated, plot_comparison
 
-        found = self.compare(recording)
+        found = self.before_and_after(recording)
         r = found.recording
         simulated: Simulated = [("refitted", found.before)]
         simulated += [("corrected", found.after)] if self._changed else []
         return plot_comparison(r, simulated, self.floor["nrmse"] * np.std(r.y[r.skip :], axis=0))
 
-    def compare(self, recording: Recording) -> Comparison:
+    def before_and_after(self, recording: Recording) -> BeforeAfter:
         """Simulate the refitted and the corrected simulator along a recording; see `simulate`."""
-        r, before, _ = self._run(recording, self.refitted)
-        after = self._run(recording)[1] if self._changed else None
+        r, before, _ = self.run(recording, self.refitted)
+        after = self.run(recording)[1] if self._changed else None
         finite = (y if y is not None and np.all(np.isfinite(y)) else None for y in (before, after))
-        return Comparison(r, *finite)
+        return BeforeAfter(r, *finite)
+
+    compare = before_and_after  # the earlier name
 
     @property
     def _changed(self) -> bool:
@@ -281,8 +282,18 @@ class Diagnosis:
         """The correction, if it has elements and no effect is named."""
         return self.correction if self.correction and self.correction.elements and not self.effects else None
 
-    def _run(self, recording: Recording, simulator: Simulator | None = None) -> tuple[Recording, np.ndarray, int]:
-        """Return the recording as corrected, a simulator's outputs along it, and the first scored sample."""
+    def run(self, recording: Recording, simulator: Simulator | None = None) -> tuple[Recording, np.ndarray, int]:
+        """Simulate the corrected simulator, or another one, along a recording.
+
+        Returns
+        -------
+        recording : Recording
+            As corrected, with its channels in the simulator's order.
+        array, shape (M, n_y)
+            Outputs; not finite where the simulation diverges.
+        int
+            First scored sample: after those that an initial state is estimated from.
+        """
         simulator = simulator or self.corrected
         r, dt = match_channels(simulator, recording), self.train[0].dt
         if abs(r.dt / dt - 1) > SAME_STEP:
@@ -324,9 +335,7 @@ class Diagnosis:
 
     def report(self, folder: str | os.PathLike[str]) -> Path:
         """Write report.html, diagnosis.json and figures into a folder; return the page's path."""
-        from ..report import diagnosis_report
-
-        return diagnosis_report(self, folder)
+        return Path(later("diagnosis_report")(self, folder))
 
     def refine(self, operators: int = 12, kind: str | None = None, *, port: str | None = None) -> Refinement:
         """Identify a Prandtl-Ishlinskii layer in the port where hysteresis was found; see `refinement`.
@@ -417,6 +426,9 @@ class Diagnosis:
         return "\n".join(lines)
 
     __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return str(later("diagnosis_card")(self))
 
     def _error_lines(self) -> list[str]:
         """Format the errors as a table, with the noise floor below it."""

@@ -4,7 +4,8 @@
 chooses which of them are tried and polishes the best, `context` solves with the options that all fits share,
 `penalty` adds the L1 penalty, and `lagged` trains NARX and NOE models. `result` is the `Fit`, `uncertainty` its
 standard errors, and `sparse` makes fits with fewer operators from it. `surrogates` identifies a linear modal model
-from a table of simulated inputs and outputs (`modes` converts it).
+from a table of simulated inputs and outputs (`modes` converts it). `comparison` simulates models of any kind
+beside one recording.
 """
 
 from typing import TYPE_CHECKING
@@ -12,6 +13,12 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
+    from .comparison import (
+        RUN_AWAY as RUN_AWAY,
+        Comparison as Comparison,
+        compare as compare,
+        run_free as run_free,
+    )
     from .context import (
         FitContext as FitContext,
         check_recordings as check_recordings,

@@ -18,11 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, is_number, listed
+from .._base import InputError, is_number, later, listed
 from ..data import NOTHING_SENTENCE, Recording, as_recordings, explains_nothing, fingerprint, nrmse, rmse_per_output
 from ..engine import Engine, make_engine
 from ..export import FitContent, exported, read_model_file, write_model_file
-from ..models import PILFR, Model
+from ..linear import LinearPart, any_bla, linear_parts
+from ..models import PILFR, Model, accumulate_steps
 from ..optimise import (
     Candidate,
     Constraint,
@@ -204,7 +205,7 @@ class Fit:
         fitted to the first `samples` samples (default: ten per state, at least 50) at the model's parameters. Later
         samples are not used, and `nrmse` does not score the first ones.
         """
-        recording = self._matched(recording)
+        recording = self.matched(recording)
         known = self.initial.get(fingerprint(recording))
         return first_state(self.model, self._engine, recording, samples, state_prior=True) if known is None else known
 
@@ -220,14 +221,19 @@ class Fit:
 
     def signals(self, recording: Recording) -> dict[str, np.ndarray]:
         """Simulate `y` (M, n_y) with the element's `z` and `w` (M, n_w)."""
-        recording = self._matched(recording)
+        recording = self.matched(recording)
         state = self.initial_state(recording)
         y, _, z, w = self._engine.simulate(self.model.drive(recording), self.model.parameters.start, state, True)
         return {"y": y, "z": z, "w": w}
 
+    def run(self, recording: Recording) -> tuple[Recording, np.ndarray, int]:
+        """Simulate along a recording: it as the model takes it, its outputs (M, n_y), the first scored sample."""
+        recording = self.matched(recording)
+        return recording, self.simulate(recording), self.scored_from(recording)
+
     def scored_from(self, recording: Recording) -> int:
         """Find the first sample that is scored: after `skip`, and after those that an initial state is fitted to."""
-        recording = self._matched(recording)
+        recording = self.matched(recording)
         estimated = recording.begins == "estimate"
         if not estimated or fingerprint(recording) in self.initial or not self.model.n_state:
             return recording.skip
@@ -251,7 +257,7 @@ class Fit:
         InputError
             If a recording does not fit the model or has no samples left to score, or an output never changes.
         """
-        given = [self._matched(r) for r in as_recordings(recordings)]
+        given = [self.matched(r) for r in as_recordings(recordings)]
         first = [self.scored_from(r) for r in given]
         pooled = np.concatenate([r.y[k:] for r, k in zip(given, first, strict=True)])
         nrmse(pooled, pooled)  # refuses an output that never changes
@@ -262,7 +268,7 @@ class Fit:
             errors.append(np.mean(rmse_per_output(r.y, self.simulate(r), k) / spread))
         return float(np.mean(errors))
 
-    def _matched(self, recording: Recording) -> Recording:
+    def matched(self, recording: Recording) -> Recording:
         """Check that a recording fits the model; for a simulator, put its columns in the simulator's order."""
         if not isinstance(recording, Recording):
             raise InputError(
@@ -284,11 +290,54 @@ class Fit:
             )
         return recording
 
-    def plot(self, recordings: Recording | Sequence[Recording], **options: Any) -> Any:
-        """Draw the figures of the fit over recordings; see `plots.plot_fit`."""
-        from ..plots import plot_fit
+    def linear_parts(self, recording: Recording | None = None) -> dict[str, LinearPart]:
+        """Return the linear models in the fitted model, by name; see `linear.linear_parts`.
 
-        return plot_fit(self, recordings, **options)
+        A fit of a simulator is linearised about the mean state and input of the recording, or about zero.
+        """
+        if recording is None or "A" in self.model.parameters:
+            return linear_parts(self.model, self.dt)
+        recording = self.matched(recording)
+        drive, p = self.model.drive(recording), self.model.parameters.start
+        values = np.broadcast_to(p, (len(drive), len(p)))
+        states = accumulate_steps(self.model.closed, self.initial_state(recording), drive, values)[0]
+        return linear_parts(self.model, self.dt, np.mean(states, axis=0), np.mean(drive, axis=0))
+
+    def plot(self, recordings: Recording | Sequence[Recording], kind: str = "fit", **options: Any) -> Any:
+        """Draw the fit over recordings.
+
+        Parameters
+        ----------
+        recordings : Recording or several
+            `"residuals"` draws the first of them; a simulator is linearised about the means of the first.
+        kind : {"fit", "bode", "poles", "residuals"}
+            Outputs and hysteresis (`plots.plot_fit`); the Bode diagram of the linear parts over the response measured
+            in the recordings (`plots.bode`); their poles and zeros (`plots.pole_zero`); correlations of the residuals
+            with themselves and with the inputs (`plots.residual_tests`).
+        **options
+            Of that function, such as `output` and `input` (numbers from 0) or `lags`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        InputError
+            If a recording does not fit the model, the kind is unknown, or the recording is too short for its tests.
+        """
+        from ..plots import bode, plot_fit, pole_zero, residual_tests
+
+        given = as_recordings(recordings)
+        if kind == "fit":
+            return plot_fit(self, recordings, **options)
+        if kind == "residuals":
+            seen, y, first = self.run(given[0])
+            return residual_tests(seen.with_(skip=first), [("this model", y)], **options)
+        if kind not in ("bode", "poles"):
+            raise InputError(f"kind={kind!r} was given to plot; give fit, bode, poles or residuals.")
+        parts = self.linear_parts(given[0])
+        return pole_zero(parts, **options).figure if kind == "poles" else bode(parts, any_bla(given), **options)
 
     def report(
         self,
@@ -297,9 +346,7 @@ class Fit:
         test: Recording | Sequence[Recording] = (),
     ) -> Path:
         """Write report.html and model.json into a folder; return the page's path. See `report.fit_report`."""
-        from ..report import fit_report
-
-        return fit_report(self, train, test, folder)
+        return Path(later("fit_report")(self, train, test, folder))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the fit as JSON, atomically: an existing file stays as it is until the new one is complete on disk.
@@ -377,6 +424,9 @@ class Fit:
         return "\n".join(line for line in lines if line)
 
     __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return str(later("fit_card")(self))
 
 
 def match_channels(simulator: Simulator, recording: Recording) -> Recording:

@@ -150,6 +150,7 @@ class HertzContact(PiecewiseStiffness):
     equation = "w = k_c max(z - g, 0)^1.5"
     source = "Johnson (1985), Contact Mechanics, ch. 4"
     units = {"k_c": "w/z^1.5", "g": "z"}
+    domains = ("mechanical",)
     ranges = {**PiecewiseStiffness.ranges, "k_c": _hertz_limits}
 
     def force(self, z: Any, p: Any) -> Any:
@@ -212,6 +213,7 @@ class SoftClearance(Clearance):
     equation = "w = k_g sign(z) max(|z| - g, 0)^1.5"
     source = "Johnson (1985), Contact Mechanics, ch. 4"
     units = {"k_g": "w/z^1.5", "g": "z"}
+    domains = ("mechanical",)
     ranges = {**Clearance.ranges, "k_g": _hertz_limits}
 
     def force(self, z: Any, p: Any) -> Any:
@@ -241,6 +243,7 @@ class PeriodicForce(Law):
     source = "Hanselman (2006), Brushless Permanent Magnet Motor Design, sec. 8.3"
     sentence = "a force that repeats with position, as from cogging or the pitch of a screw or gear"
     units = {"a": "w", "b": "w", "L": "z"}
+    domains = ("mechanical",)
     min_periods = 1.5  # smallest number of periods within the motion that is tried
     starts = {"L": lambda at: 2 * at.half / np.concatenate([np.arange(1.5, 8, 0.5), np.arange(8, 60.1, 1.0)])}
 

@@ -5,7 +5,14 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .bla import BLA as BLA, output_spectra as output_spectra, plain_bla as plain_bla, robust_bla as robust_bla
+    from .bla import (
+        BLA as BLA,
+        any_bla as any_bla,
+        output_spectra as output_spectra,
+        plain_bla as plain_bla,
+        robust_bla as robust_bla,
+    )
+    from .parts import LinearPart as LinearPart, linear_parts as linear_parts
     from .statespace import (
         INJECTION as INJECTION,
         in_modal_coordinates as in_modal_coordinates,

@@ -451,3 +451,11 @@ def _local_polynomials(
     gain = np.sum(np.abs(inverse[:, :n_u]) ** 2, axis=2)
     inflation = gain * np.sum(np.abs(U) ** 2, axis=1)
     return response, np.maximum(var, 0.0)[:, :, None] * gain[:, None, :], good, inflation
+
+
+def any_bla(recordings: Sequence[Recording]) -> BLA | None:
+    """Estimate the BLA by the method that recordings allow, robust for periodic ones; None where none does."""
+    try:
+        return robust_bla(recordings) if all(r.period for r in recordings) else plain_bla(recordings)
+    except InputError:
+        return None

@@ -10,6 +10,7 @@ from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
     from .canvas import new_figure as new_figure
+    from .correlations import residual_tests as residual_tests
     from .diagnosis import (
         Signal as Signal,
         force_cloud as force_cloud,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
         virgin_curve as virgin_curve,
         weights as weights,
     )
+    from .linear_parts import bode as bode, pole_zero as pole_zero
     from .signals import (
         Simulated as Simulated,
         amplitude_density as amplitude_density,
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
         linear_simulation as linear_simulation,
         output_over_input as output_over_input,
         plot_comparison as plot_comparison,
+        plot_recording as plot_recording,
         remains as remains,
         spectrum as spectrum,
         time as time,

@@ -6,6 +6,7 @@ object interface: no pyplot, no change of settings, so they work in scripts, not
 
 from __future__ import annotations
 
+import io
 from typing import Any
 
 import numpy as np
@@ -20,15 +21,25 @@ PALE_GREY, PALE_BLUE = "#EEEEEE", "#E8F1F7"  # areas: not scored or not visited;
 BOX = "#D6E8F4"  # inside of box plots
 SHADES, LOOPS = "cividis", "viridis"  # colormaps of maps of errors, and of loops; distinct for all, and in grey
 FONT = 10.5  # points
+SCREEN = 90  # dots per inch in a notebook, whose column is about 1000 pixels wide
 MOST_POINTS = 3000  # points of a line before it is thinned: more than a page has pixels
 LONGEST_TITLE = 46  # letters that fit above a figure of the usual width
 DEPTH = 200.0  # dB below the largest value down to which curves are drawn; rounding errors lie deeper
 RUNAWAY = 1e3  # times the span of the measured signal above which a simulation is not drawn
 
 
+class ShownFigure(Figure):
+    """A figure that a notebook shows where it ends a cell; of figures without pyplot it knows only the text."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png", dpi=SCREEN)
+        return buffer.getvalue()
+
+
 def new_figure(width: float = 5.2, height: float = 3.5) -> Figure:
     """Make an empty figure of a size in inches, laid out so that nothing overlaps or is cut off."""
-    return Figure(figsize=(width, height), layout="constrained")
+    return ShownFigure(figsize=(width, height), layout="constrained")
 
 
 def axes_or_new(ax: Axes | None) -> Axes:

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import cycle
 from typing import Any, Protocol, cast
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from .._base import InputError
 from ..data import Recording, nrmse
@@ -25,6 +27,7 @@ from .canvas import (
     ORANGE,
     PALE_GREY,
     PURPLE,
+    SKY,
     VERMILLION,
     axes_or_new,
     choose_scale,
@@ -318,8 +321,27 @@ def _unit(fit: PlottedFit, recording: Recording, name: str) -> str:
     return recording.units.get(name, fit.units.get(name, ""))
 
 
+def plot_recording(r: Recording) -> Figure:
+    """Draw a recording: a row for each channel, over time on the left and as amplitude density on the right."""
+    columns = [*zip(r.inputs, r.u.T, strict=True), *zip(r.outputs, r.y.T, strict=True)]
+    figure = new_figure(11.0, 2.4 * len(columns))
+    axes = figure.subplots(len(columns), 2, squeeze=False)
+    for k, ((name, x), (left, right)) in enumerate(zip(columns, axes, strict=True)):
+        unit, colour = r.units.get(name, ""), INK if k < r.n_u else BLUE
+        size, up = scale_axis(name, x, unit)
+        line(left, r.t, x / size, "input" if k < r.n_u else "output", colour, linewidth=0.9)
+        _over_time(left, r.with_(name="" if k else r.name), up)
+        f, power = amplitude_density(x, r)
+        curve = decibel(power)
+        line(right, f, curve, "", colour, linewidth=0.9)
+        right.set_xscale("log")
+        limit_depth(right, curve)
+        finish(right, "frequency [Hz]", f"{name} [dB re {unit or '1'}/√Hz]", legend=False)
+    return figure
+
+
 Simulated = list[tuple[str, np.ndarray | None]]  # (label, outputs (M, n_y)), before first, after last
-SIMULATED_COLOURS = (ORANGE, INK)
+SIMULATED_COLOURS = (ORANGE, INK, VERMILLION, PURPLE, SKY)  # further simulations begin again
 
 
 def plot_comparison(r: Recording, simulated: Simulated, noise: np.ndarray | None = None) -> Any:
@@ -349,7 +371,7 @@ def compared_traces(
     part = _quiet(y, part.stop - part.start, r.skip) if quiet else part
     size, up = scale_axis(r.outputs[output], y[part], unit)
     line(ax, r.t[part], y[part] / size, "measured", BLUE, linewidth=4.0, alpha=0.45)
-    for (label, values), colour in zip(simulated, SIMULATED_COLOURS, strict=False):
+    for (label, values), colour in zip(simulated, cycle(SIMULATED_COLOURS), strict=False):
         if values is not None:
             line(ax, r.t[part], mask_divergence(values[part, output], np.ptp(y)) / size, label, colour, linewidth=1.4)
     ax.margins(x=0.01)
@@ -373,7 +395,7 @@ def compared_residuals(
     y = r.y[:, output]
     kept: list[tuple[str, np.ndarray, Any]] = [
         (label, mask_divergence(v[:, output] - y, np.ptp(y)), colour)
-        for (label, v), colour in zip(simulated, SIMULATED_COLOURS, strict=False)
+        for (label, v), colour in zip(simulated, cycle(SIMULATED_COLOURS), strict=False)
         if v is not None
     ]
     size, up = scale_axis(f"simulated − measured {r.outputs[output]}", np.nan_to_num(kept[0][1]) if kept else y, unit)
@@ -388,7 +410,7 @@ def compared_spectra(r: Recording, simulated: Simulated, output: int, unit: str,
     """Draw amplitude densities of the output, of each residual, and of white noise of deviation `floor`."""
     y = r.y[:, output]
     signals = [("measured", y, BLUE)]
-    for (label, v), colour in zip(simulated, SIMULATED_COLOURS, strict=False):
+    for (label, v), colour in zip(simulated, cycle(SIMULATED_COLOURS), strict=False):
         if v is not None:
             signals.append((f"left {label}", v[:, output] - y, colour))
     ends = amplitude_density(y, r)[0][[0, -1]]

@@ -1,7 +1,8 @@
 """Self-contained HTML pages of fits, diagnoses and anything else.
 
-`page.py` holds the general page and its blocks, `fit.py` and `diagnosis.py` fill it. The look of every page (colours,
-fonts, layout) stands in `templates/report.css`, its structure in `templates/page.html` and `templates/blocks.html`.
+`page.py` holds the general page and its blocks, `fit.py` and `diagnosis.py` fill it; `cards.py` holds the short
+pieces that a notebook shows. The look of every page (colours, fonts, layout) stands in `templates/report.css`, its
+structure in `templates/page.html` and `templates/blocks.html`.
 """
 
 from typing import TYPE_CHECKING
@@ -9,6 +10,13 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
+    from .cards import (
+        comparison_card as comparison_card,
+        diagnosis_card as diagnosis_card,
+        fit_card as fit_card,
+        recording_card as recording_card,
+        simulator_card as simulator_card,
+    )
     from .diagnosis import diagnosis_report as diagnosis_report
     from .diagnosis_tables import usage as usage
     from .fit import fit_page as fit_page, fit_report as fit_report

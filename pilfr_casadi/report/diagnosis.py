@@ -14,7 +14,7 @@ import numpy as np
 
 from .. import plots
 from .._base import InputError, make_folder, write_atomically
-from ..diagnose import Comparison, Diagnosis, Fitted, HiddenForce, Learned, Workbench, hidden_force
+from ..diagnose import BeforeAfter, Diagnosis, Fitted, HiddenForce, Learned, Workbench, hidden_force
 from ..laws import display_name
 from ..plots import Signal
 from ..simulators import Port
@@ -310,14 +310,14 @@ def _proof(case: _Case) -> list[Block]:
     role, recordings = ("test", d.test) if d.test else ("training", d.train)
     for k, r in enumerate(recordings[:MOST_DRAWN]):
         label = r.name or numbered(role, k, len(recordings))
-        compared = d.compare(r)
+        compared = d.before_and_after(r)
         compared = replace(compared, recording=compared.recording.with_(name=label))
         for i in range(min(r.n_y, MOST_DRAWN)):
             out += _draw_comparison(case, compared, i)
     return out
 
 
-def _draw_comparison(case: _Case, c: Comparison, i: int) -> list[Block]:
+def _draw_comparison(case: _Case, c: BeforeAfter, i: int) -> list[Block]:
     """Draw one output of a recording: two stretches, the errors over time, and the spectra."""
     r, name = c.recording, c.recording.outputs[i]
     unit, floor = case.unit(name), float(case.noise[i])

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from .._base import to_json
-from ..diagnose import RUN_AWAY, STEPS, Diagnosis, learned_force
+from ..diagnose import STEPS, Diagnosis, learned_force
+from ..identify import RUN_AWAY
 from ..laws import display_name, scaled, scheduled
 from ..models import Parameter, ParameterSet
 from .page import Block, Code, Table, Text, number_text, render, uncertain_text

@@ -19,7 +19,7 @@ from ..identify import Fit
 from ..models import StaticNetwork
 from ..optimise import Status
 from .fit_sections import curve, hysteresis, limit_blocks, linear_part, output_pictures, parameter_blocks
-from .page import Block, Code, Page, Picture, Section, Table, Text, numbered, render
+from .page import Block, Code, Page, Picture, Section, Table, Text, numbered, render, status_tone
 
 Records = Recording | Sequence[Recording]
 RUNAWAY = 1e3  # NRMSE above which the page reports that the simulation diverges
@@ -60,7 +60,7 @@ def fit_page(fit: Fit, train: Records, tests: Records, *, model_file: str = "mod
         [s for s in sections if s.blocks],
         subtitle=_subtitle(fit),
         status=f"{status.value} {status.advice}".strip(),
-        tone="good" if status.converged else "bad" if status.value.startswith("Failed") else "warning",
+        tone=status_tone(status),
         facts=_facts(fit, rows),
     )
 

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from .. import plots
-from .._base import InputError
 from ..data import Recording
 from ..identify import Fit
-from ..linear import plain_bla, robust_bla
-from ..models import BLOCKS, ParameterSet, Play, Stop
+from ..linear import LinearPart, any_bla
+from ..models import BLOCKS, ParameterSet
 from .page import Block, Picture, Table, Text, uncertain_text
 
 MOST_DRAWN = 4  # outputs of a recording that are drawn; the table has all of them
@@ -92,10 +91,8 @@ def linear_part(fit: Fit, train: Sequence[Recording]) -> list[Block]:
     linear = fit.linear if fit.linear is not None else fit.model if fit.model.element is None else None
     if linear is None or "A" not in linear.parameters:
         return out
-    try:
-        periodic = all(r.period for r in train)
-        bla = robust_bla(train) if periodic else plain_bla(train)
-    except InputError:
+    bla = any_bla(train)
+    if bla is None:
         return out
     for i in range(min(bla.n_y, 2)):
         for j in range(min(bla.n_u, 2)):
@@ -112,32 +109,30 @@ def linear_part(fit: Fit, train: Sequence[Recording]) -> list[Block]:
 
 def mode_tables(fit: Fit) -> list[Block]:
     """Tabulate the modes in small motions, where no operator slips, and in large motions, where all slip."""
-    values, element = fit.parameters, fit.model.element
-    a = values.get("A")
+    a = fit.parameters.get("A")
     if a is None or not len(a) or a.shape != (fit.model.n_x,) * 2:
         return []
-    operator = getattr(element, "operator", None)
-    if not isinstance(operator, Play | Stop):
-        return [Table(*_modes(a, fit.dt), caption="Modes of the linear part")]
-    with_slope = a + values["B_w"] @ np.diag(values["w"].sum(axis=1)) @ values["C_z"]
-    small, large = (a, with_slope) if isinstance(operator, Play) else (with_slope, a)
+    parts = fit.linear_parts()
+    if len(parts) == 1:
+        return [Table(*_modes(*parts.values()), caption="Modes of the linear part")]
     note = (
         "In small motions no operator reaches its threshold; in large motions all operators slip. With growing "
         "amplitude the hysteresis moves the modes from the first table towards the second."
     )
+    small, large = parts.items()
     return [
-        Table(*_modes(small, fit.dt), caption="Modes in small motions"),
-        Table(*_modes(large, fit.dt), caption="Modes in large motions", note=note),
+        Table(*_modes(small[1]), caption=f"Modes in {small[0]}"),
+        Table(*_modes(large[1]), caption=f"Modes in {large[0]}", note=note),
     ]
 
 
-def _modes(a: np.ndarray, dt: float) -> tuple[list[str], list[list[Any]]]:
-    """Return columns and rows of a table of the eigenvalues of a discrete-time A."""
+def _modes(part: LinearPart) -> tuple[list[str], list[list[Any]]]:
+    """Return columns and rows of a table of the poles."""
     rows: list[list[Any]] = []
-    for value in sorted(np.linalg.eigvals(a), key=lambda v: abs(np.angle(v))):
+    for value in sorted(part.poles, key=lambda v: abs(np.angle(v))):
         if value.imag < 0:
             continue
-        rate = np.log(complex(value)) / dt if value != 0 else complex(np.nan)
+        rate = np.log(complex(value)) / part.dt if value != 0 else complex(np.nan)
         oscillates = value.imag > 0 or value.real < 0
         kind = "oscillation" if oscillates else "decay" if abs(value) < 1 else "drift"
         frequency, damping = (abs(rate) / (2 * np.pi), -rate.real / abs(rate)) if oscillates else (None, None)

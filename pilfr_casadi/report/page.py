@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, write_atomically
+from ..optimise import Status
 
 TONES = ("plain", "good", "warning", "bad")
 DPI = 160  # dots per inch of the pictures: sharp at twice the resolution of an ordinary screen
@@ -49,6 +50,11 @@ def uncertain_text(value: float, error: float) -> str:
 def numbered(word: str, i: int, count: int) -> str:
     """Name the i-th of some recordings without a name: "test 2", or "test" if it is the only one."""
     return word if count == 1 else f"{word} {i + 1}"
+
+
+def status_tone(status: Status) -> str:
+    """Choose the colour of the headline of a fit."""
+    return "good" if status.converged else "bad" if status.value.startswith("Failed") else "warning"
 
 
 @dataclass(frozen=True)

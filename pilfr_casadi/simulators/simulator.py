@@ -18,7 +18,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, one_at_a_time
+from .._base import InputError, later, one_at_a_time
 from ..data import Recording, as_recordings, nrmse
 from ..laws import readable_unit
 from ..models import Parameter, ParameterSet, accumulate_steps, map_points
@@ -118,6 +118,21 @@ class Simulator(Equations):
         """
         given = as_recordings(recordings)
         return float(np.mean([nrmse(self._measured(r), self.simulate(r), r.skip) for r in given]))
+
+    def plot(self, recording: Recording) -> Any:
+        """Draw the simulator beside a recording: a row for each output, the largest swing and all residuals.
+
+        An initial state that the recording does not give is fitted to the first samples; see `compare`, whose figure
+        this is. `nrmse` begins at zero instead.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+        """
+        return later("compare")(recording, self).plot()
+
+    def _repr_html_(self) -> str:
+        return str(later("simulator_card")(self))
 
     def __repr__(self) -> str:
         lines = [

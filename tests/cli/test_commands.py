@@ -247,6 +247,7 @@ def test_messages_name_options_of_the_command_line(capsys, tmp_path, train, monk
         ("give `period=`.", "give --period PERIOD."),
         ("as in columns={'force': 'u_vir_V'}.", "as in --column force=u_vir_V."),
         ("allow more with time_tolerance=STEPS.", "allow more with --time-tolerance STEPS."),
+        ("resample with resample=STEP, or", "resample with --resample STEP, or"),
         ("the file /data/run_dt=0.1.csv is empty", "the file /data/run_dt=0.1.csv is empty"),
         ("but dt=0.01 was stated, a ratio", "but --dt 0.01 was stated, a ratio"),
         ("give the model as `model=`", "use it in Python with load(FILE, model=MODEL)"),

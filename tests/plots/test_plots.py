@@ -419,3 +419,45 @@ def test_the_map_of_ports_and_laws_shows_the_errors_it_is_given():
     assert [key for key, t in shown.items() if t.get_fontweight() == "bold"] == [("ground", "hysteresis")]
     assert ax.figure.axes[1].get_ylabel() == "error after the fit [%]"
     pixels(ax.figure)
+
+
+# ------------------------------------------------------------------------------------- linear parts and residual tests
+
+
+def test_a_bode_diagram_draws_both_linear_parts_over_the_measured_response(fitted, data):
+    up, down = fitted.plot(data, "bode").axes
+    assert up.get_legend_handles_labels()[1] == ["measured (BLA)", "small motions", "large motions"]
+    small = fitted.linear_parts()["small motions"]
+    f, drawn = up.lines[1].get_data()
+    assert np.allclose(drawn, 20 * np.log10(np.abs(small.response(f)[:, 0, 0])), atol=1e-6)
+    assert down.get_xlabel() == "frequency [Hz]" and len(down.lines) == 3
+
+
+def test_poles_and_zeros_are_drawn_in_the_upper_half_plane(fitted, data):
+    (ax,) = fitted.plot(data, "poles").axes
+    crosses = [line for line in ax.lines if line.get_marker() == "x"]
+    expected = [p[p.imag >= 0].real for p in (part.poles for part in fitted.linear_parts().values())]
+    assert [list(line.get_xdata()) for line in crosses] == [list(e) for e in expected]
+    assert any("Hz" in text.get_text() for text in ax.texts)
+
+
+def test_residual_tests_have_a_panel_for_the_residual_each_input_and_its_square(fitted, data):
+    axes = fitted.plot(data, "residuals", lags=30).axes
+    assert [ax.get_ylabel() for ax in axes] == [
+        "residual of x with itself [deviations]",
+        "with force [deviations]",
+        "with force² [deviations]",
+    ]
+    x, values = axes[1].lines[-1].get_data()
+    assert x[0] == -30 and x[-1] == 30 and np.mean(np.abs(values) < 3) > 0.95  # the noise is independent of the force
+
+
+def test_a_notebook_shows_a_figure_without_pyplot(fitted, data):
+    assert fitted.plot(data, "poles")._repr_png_()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_pictures_that_cannot_be_drawn_are_refused(fitted, data):
+    with pytest.raises(InputError, match="give fit, bode, poles or residuals"):
+        fitted.plot(data, "nyquist")
+    with pytest.raises(InputError, match="residual tests need at least 32"):
+        plots.residual_tests(data.slice(0, 20), [("model", data.y[:20])])

@@ -87,7 +87,7 @@ def test_it_is_simulated_in_the_steps_of_the_fits():
         "after": as_it_stands(replace(bench, at_least=5), d.corrected),
     }
     assert [f.model.substeps for f in fine.values()] == [2, 5]
-    found, known = replace(d, evidence=fine).compare(d.train[0]), d.compare(d.train[0])
+    found, known = replace(d, evidence=fine).before_and_after(d.train[0]), d.before_and_after(d.train[0])
     for name, evidence in (("before", "without"), ("after", "after")):
         assert np.allclose(getattr(found, name), fine[evidence].residual[0] + d.train[0].y, rtol=0, atol=1e-12)
         assert not np.array_equal(getattr(found, name), getattr(known, name))

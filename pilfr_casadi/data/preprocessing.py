@@ -1,0 +1,147 @@
+"""Signals before identification: detrend, filter, resample, put on an even clock; on arrays, by SciPy.
+
+The verbs of `Recording` (`cut`, `detrend`, `filter`, `resample`, `merge`) call these functions and keep the rest of the
+recording consistent.
+
+All filters are linear. A linear model relates inputs and outputs that went through the same filter exactly as it
+relates the signals themselves, so filter both alike. A hysteresis does not commute with a filter: its memory turns at
+the extremes of its own input, and a filter rounds them off. For a model with hysteresis or friction, filter only above
+the band in which the machine moves, and never with a high-pass. Oppenheim & Schafer (2010), Discrete-Time Signal
+Processing, sec. 4.6 (change of step), 5.7 (zero phase).
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from .._base import InputError, is_number, listed, positive, whole
+
+Array = np.ndarray
+
+TRENDS = ("constant", "linear")
+FILTERS = ("lowpass", "highpass", "bandpass", "bandstop")
+LARGEST_FACTOR = 1000  # numerator and denominator up to which a change of step is a ratio of whole numbers
+EXACT = 1e-9  # relative error of that ratio, far below a sample over the longest recordings
+PASSED = 0.8  # share of the new Nyquist frequency that an anti-alias filter passes: the rest is its transition
+ORDER = 8  # order of the Butterworth filter before a step that is no ratio of whole numbers
+LONGEST_GAP = 10  # usual steps; over a longer gap interpolated samples would be an invention
+
+
+def remove_trend(values: Array, kind: str) -> Array:
+    """Subtract the mean, or the straight line of least squares, from every column of (M, n)."""
+    if kind not in TRENDS:
+        raise InputError(f"kind={kind!r} was given to detrend; give {listed(TRENDS)}.")
+    from scipy.signal import detrend
+
+    return np.asarray(detrend(values, axis=0, type="linear" if kind == "linear" else "constant"))
+
+
+def butterworth(values: Array, dt: float, cutoff: float | tuple[float, float], kind: str, order: int) -> Array:
+    """Run a Butterworth filter forwards and backwards over every column of (M, n): no phase, twice the order.
+
+    The gain at a cutoff frequency is one half.
+
+    Parameters
+    ----------
+    values : array, (M, n)
+    dt : float
+        Step in s.
+    cutoff : float or two of them
+        Edge, or both edges of a band, in Hz.
+    kind : {"lowpass", "highpass", "bandpass", "bandstop"}
+    order : int
+        Order of one pass.
+
+    Raises
+    ------
+    InputError
+        If a cutoff is not between zero and the Nyquist frequency, or there are too few samples.
+    """
+    if kind not in FILTERS:
+        raise InputError(f"kind={kind!r} was given to filter; give {listed(FILTERS)}.")
+    edges = (cutoff,) if is_number(cutoff) else tuple(cutoff) if isinstance(cutoff, tuple | list | Array) else ()
+    needed = 2 if kind.startswith("band") else 1
+    if len(edges) != needed or not all(is_number(edge) for edge in edges) or list(edges) != sorted(set(edges)):
+        wanted = "two frequencies in Hz, the lower one first" if needed == 2 else "one frequency in Hz"
+        raise InputError(f"cutoff={cutoff!r} was given for a {kind} filter; give {wanted}.")
+    for edge in edges:
+        positive(edge, "cutoff", "a frequency in Hz")
+        if edge >= 0.5 / dt:
+            raise InputError(
+                f"cutoff={edge:g} Hz is not below the Nyquist frequency {0.5 / dt:g} Hz, half the sampling rate; give "
+                "a lower one."
+            )
+    return _zero_phase(values, dt, edges if needed == 2 else edges[0], kind, whole(order, "order", 1))
+
+
+def _zero_phase(values: Array, dt: float, edges: Any, kind: Any, order: int) -> Array:
+    """Filter forwards and backwards; the ends are continued by their reflection in the first and last value."""
+    from scipy.signal import butter, sosfiltfilt
+
+    sections = butter(order, edges, kind, fs=1 / dt, output="sos")
+    edge = 6 * len(sections) + 3
+    if len(values) <= edge:
+        raise InputError(f"{len(values)} samples are too few for this filter, which needs more than {edge}.")
+    return np.asarray(sosfiltfilt(sections, values, axis=0, padlen=edge))
+
+
+def change_step(values: Array, dt: float, step: float) -> Array:
+    """Resample every column of (M, n) from one step to another, s, with an anti-alias filter where it grows.
+
+    A ratio of whole numbers is done by a polyphase filter. Any other is done by a zero-phase low-pass and a cubic
+    spline. The first sample stays the first.
+    """
+    ratio = Fraction(dt / step).limit_denominator(LARGEST_FACTOR)
+    count = int(np.floor((len(values) - 1) * dt / step * (1 + EXACT))) + 1
+    if count < 2:
+        raise InputError(
+            f"a step of {step:g} s leaves {count} sample of {(len(values) - 1) * dt:g} s; give a shorter one."
+        )
+    if ratio.numerator in range(1, LARGEST_FACTOR + 1) and abs(float(ratio) * step / dt - 1) < EXACT:
+        if ratio == 1:
+            return values
+        from scipy.signal import resample_poly
+
+        polyphase = resample_poly(values, ratio.numerator, ratio.denominator, axis=0, padtype="line")
+        return np.asarray(polyphase[:count])
+    return sample_at(values, dt, np.arange(count) * step, step)
+
+
+def sample_at(values: Array, dt: float, times: Array, step: float) -> Array:
+    """Sample every column of (M, n) at times in s after its first sample, for a later step of `step` seconds."""
+    from scipy.interpolate import CubicSpline
+
+    if step > dt * (1 + EXACT):
+        values = _zero_phase(values, dt, PASSED * 0.5 / step, "lowpass", ORDER)
+    known = np.arange(len(values)) * dt
+    return np.asarray(CubicSpline(known, values, axis=0)(np.clip(times, 0.0, known[-1])))
+
+
+def even_grid(t: Array, values: Array, step: float, label: str) -> Array:
+    """Interpolate uneven samples at times t (M,), s, onto an even grid from t[0] on, with an anti-alias filter.
+
+    The signals are interpolated linearly on a grid at least as fine as the usual gap, and then resampled.
+
+    Raises
+    ------
+    InputError
+        If times do not increase, or a gap is longer than `LONGEST_GAP` usual ones; `label` begins the message.
+    """
+    positive(step, "resample", "the new step in seconds")
+    gaps = np.diff(t)
+    if not len(gaps) or np.any(gaps <= 0):
+        raise InputError(f"{label} needs at least two times that increase from sample to sample; sort the samples.")
+    usual = float(np.median(gaps))
+    worst = int(np.argmax(gaps))
+    if gaps[worst] > LONGEST_GAP * max(usual, step):
+        raise InputError(
+            f"{label} has a gap of {gaps[worst]:.3g} s after {t[worst]:.6g} s, where {usual:.3g} s is usual; cut the "
+            "record there into two."
+        )
+    fine = step / max(int(np.ceil(step / usual - EXACT)), 1)
+    grid = t[0] + np.arange(int(np.floor((t[-1] - t[0]) / fine * (1 + EXACT))) + 1) * fine
+    even = np.column_stack([np.interp(grid, t, column) for column in values.T])
+    return change_step(even, fine, step)

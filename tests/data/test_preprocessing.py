@@ -1,0 +1,231 @@
+"""Preprocessing of recordings: what each verb does to tones whose fate is known, and to the rest of the recording."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import InputError, Recording
+from pilfr_casadi.data import merge, read_csv, read_frame
+
+DT = 1e-3
+T = np.arange(4000) * DT
+SLOW, FAST = np.sin(2 * np.pi * 5 * T), np.sin(2 * np.pi * 180 * T + 0.4)
+
+
+@pytest.fixture
+def tones():
+    return Recording(
+        SLOW + FAST, 2 * SLOW + 3, DT, ("force",), ("x",), units={"force": "N"}, initial="zero", hold="zero"
+    )
+
+
+def middle(values):
+    """The samples away from the ends, where a filter has settled."""
+    return values[len(values) // 10 : -len(values) // 10]
+
+
+def amplitude(values, frequency, dt):
+    t = np.arange(len(values)) * dt
+    return 2 * abs(np.mean(values * np.exp(-2j * np.pi * frequency * t)))
+
+
+def test_cut_counts_seconds(tones):
+    piece = tones.cut(0.5, 1.5)
+    assert len(piece) == 1000 and piece.begins == "estimate"
+    np.testing.assert_array_equal(piece.y, tones.y[500:1500])
+    assert tones.cut(0, 2).begins == "zero" and len(tones.cut(3.9)) == 100
+    with pytest.raises(InputError, match=r"stop=5 was given; the recording lasts from 0 to 4 s\."):
+        tones.cut(0, 5)
+    with pytest.raises(InputError, match="fewer than 2"):
+        tones.cut(1, 1)
+
+
+def test_detrend_takes_mean_or_line_from_the_channels_named(tones):
+    level = tones.detrend()
+    assert abs(level.y.mean()) < 1e-12 and abs(level.u.mean()) < 1e-12 and level.begins == "estimate"
+    drifting = tones.with_(y=tones.y + 7 * T[:, None])
+    line = drifting.detrend("linear", channels="x")
+    np.testing.assert_array_equal(line.u, tones.u)
+    assert np.std(line.y) < 1.5 and abs(np.polyfit(T, line.y[:, 0], 1)[0]) < 1e-9
+    with pytest.raises(InputError, match=r"no channel 'y'; it has force, x"):
+        tones.detrend(channels="y")
+    with pytest.raises(InputError, match="give constant, linear"):
+        tones.detrend("cubic")
+
+
+def test_a_filter_has_no_phase_and_half_the_gain_at_its_cutoff(tones):
+    low = tones.filter(40.0)
+    np.testing.assert_allclose(middle(low.u[:, 0]), middle(SLOW), atol=2e-3)
+    assert low.begins == "estimate" and low.hold == "linear"
+    edge = tones.with_(u=np.sin(2 * np.pi * 40 * T)).filter(40.0)
+    assert amplitude(middle(edge.u[:, 0]), 40, DT) == pytest.approx(0.5, abs=0.01)
+    high = tones.filter(40.0, "highpass", channels="force")
+    np.testing.assert_allclose(middle(high.u[:, 0]), middle(FAST), atol=5e-3)
+    np.testing.assert_array_equal(high.y, tones.y)
+    band = tones.filter((100.0, 300.0), "bandpass")
+    assert amplitude(middle(band.u[:, 0]), 180, DT) == pytest.approx(1.0, abs=0.02)
+    assert tones.filter(40.0, channels="x").hold == "zero"
+
+
+def test_filtering_inputs_and_outputs_alike_keeps_a_linear_relation(tones):
+    y = np.convolve(tones.u[:, 0], [0.2, 0.5, 0.1])[: len(T)]
+    filtered = tones.with_(y=y).filter(60.0)
+    again = np.convolve(filtered.u[:, 0], [0.2, 0.5, 0.1])[: len(T)]
+    np.testing.assert_allclose(middle(filtered.y[:, 0]), middle(again), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "cutoff, kind, said",
+    [
+        (500.0, "lowpass", "cutoff=500 Hz is not below the Nyquist frequency 500 Hz"),
+        (-1.0, "lowpass", "cutoff=-1.0 was given; give a frequency in Hz, above zero"),
+        ((10.0, 20.0), "lowpass", "give one frequency in Hz"),
+        (10.0, "bandpass", "give two frequencies in Hz, the lower one first"),
+        ((20.0, 10.0), "bandstop", "the lower one first"),
+        ("10", "lowpass", "give one frequency in Hz"),
+        (10.0, "median", "give lowpass, highpass, bandpass, bandstop"),
+    ],
+)
+def test_a_filter_that_cannot_be_is_refused(tones, cutoff, kind, said):
+    with pytest.raises(InputError, match=said):
+        tones.filter(cutoff, kind)
+
+
+def test_too_few_samples_for_a_filter(tones):
+    with pytest.raises(InputError, match=r"10 samples are too few for this filter, which needs more than 15\."):
+        tones.slice(0, 10).filter(40.0)
+
+
+@pytest.mark.parametrize("dt", [4e-3, 2.5e-3, np.pi * 1e-3], ids=["whole", "ratio", "irrational"])
+def test_resampling_keeps_slow_tones_and_lets_none_fold(tones, dt):
+    """180 Hz folds to 70, 180 and 138 Hz at the three steps; the anti-alias filter removes it where it would fold."""
+    coarse = tones.with_(skip=400).resample(dt)
+    t = np.arange(len(coarse)) * dt
+    assert coarse.dt == dt and t[-1] <= T[-1] < t[-1] + 1.01 * dt
+    np.testing.assert_allclose(middle(coarse.y[:, 0]), middle(2 * np.sin(2 * np.pi * 5 * t) + 3), atol=0.02)
+    assert coarse.skip * dt == pytest.approx(0.4, abs=dt) and coarse.hold == "linear" and coarse.begins == "zero"
+    if dt > 1 / 360:
+        np.testing.assert_allclose(middle(coarse.u[:, 0]), middle(np.sin(2 * np.pi * 5 * t)), atol=0.03)
+
+
+def test_resampling_to_a_finer_step_and_to_its_own(tones):
+    assert tones.resample(DT) is tones
+    fine = tones.resample(DT / 2)
+    assert len(fine) == 2 * len(T) - 1
+    np.testing.assert_allclose(middle(fine.y[::2]), middle(tones.y), atol=0.02)
+
+
+def test_resampling_keeps_a_period_of_whole_samples():
+    r = Recording(np.tile(SLOW[:200], 5), np.tile(SLOW[:200], 5), DT, period=200, initial="periodic")
+    assert r.resample(2e-3).period == 100 and r.resample(2e-3).begins == "periodic"
+    assert r.resample(3e-3).period is None and r.resample(3e-3).begins == "estimate"
+
+
+@pytest.mark.parametrize("dt, said", [(0.0, "dt=0.0 was given"), (10.0, "leaves 1 sample of"), ("1", "dt='1'")])
+def test_a_step_that_cannot_be_is_refused(tones, dt, said):
+    with pytest.raises(InputError, match=said):
+        tones.resample(dt)
+
+
+def test_two_loggers_on_one_clock():
+    a = Recording(np.sin(2 * np.pi * T), np.cos(2 * np.pi * T), DT, ("force",), ("x",), units={"x": "m"})
+    t = np.arange(500) * 4.3e-3
+    b = Recording(np.sin(2 * np.pi * 3 * (t + 0.8)), np.zeros((500, 0)), 4.3e-3, ("current",), units={"current": "A"})
+    both = merge(a, b, start=0.8, outputs=("x", "current"), inputs="force")
+    assert both.dt == 4.3e-3 and both.inputs == ("force",) and both.outputs == ("x", "current")
+    at = 0.8 + both.t
+    np.testing.assert_allclose(middle(both.y[:, 0]), middle(np.cos(2 * np.pi * at)), atol=2e-3)
+    np.testing.assert_allclose(middle(both.y[:, 1]), middle(np.sin(2 * np.pi * 3 * at)), atol=2e-3)
+    assert both.begins == "estimate" and both.units["current"] == "A"
+    finer = pilfr.merge(a, b, dt=1e-3, start=0.8)
+    assert finer.inputs == ("force", "current") and finer.dt == 1e-3
+    with pytest.raises(InputError, match=r"both recordings have a channel 'force'"):
+        merge(a, a)
+    with pytest.raises(InputError, match="fewer than 2 samples"):
+        merge(a, b, start=9.0)
+    with pytest.raises(InputError, match="no channel 'y'; they have force, x, current"):
+        merge(a, b, outputs="y")
+
+
+def test_the_same_clock_is_left_as_it_is(tones):
+    more = Recording(SLOW, np.zeros((len(T), 0)), DT, ("current",))
+    both = merge(tones, more)
+    np.testing.assert_allclose(both.u, np.column_stack([tones.u[:, 0], SLOW]), atol=1e-12)
+    assert both.hold == "zero" and both.begins == "zero"
+
+
+# ---------------------------------------------------------------------------------------------------- uneven time
+
+
+def test_uneven_times_are_resampled_where_the_user_says_so(tmp_path):
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.uniform(0.5e-3, 1.5e-3, 4000))
+    table = np.column_stack([t, np.sin(2 * np.pi * 2 * t), np.cos(2 * np.pi * 2 * t)])
+    path = tmp_path / "jitter.csv"
+    np.savetxt(path, table, delimiter=",", header="t,force,x", comments="")
+    with pytest.raises(InputError, match=r"not uniform.*resample"):
+        read_csv(path, "force", "x")
+    r = read_csv(path, "force", "x", resample=0.01)
+    assert r.dt == 0.01
+    np.testing.assert_allclose(middle(r.u[:, 0]), middle(np.sin(2 * np.pi * 2 * (t[0] + r.t))), atol=2e-3)
+    with pytest.raises(InputError, match="resample was given with dt"):
+        read_csv(path, "force", "x", resample=0.01, dt=0.01)
+    gap = np.vstack([table[:1000], table[1300:]])
+    np.savetxt(path, gap, delimiter=",", header="t,force,x", comments="")
+    with pytest.raises(InputError, match=r"gap of 0\.297 s after 1\.01691 s, where 0\.00099 s is usual; cut"):
+        read_csv(path, "force", "x", resample=0.01)
+
+
+# --------------------------------------------------------------------------------------------------------- frames
+
+
+def test_a_recording_goes_into_a_frame_and_comes_back(tones):
+    frame = tones.to_frame()
+    assert list(frame.columns) == ["force", "x"] and frame.index.name == "t"
+    back = read_frame(frame, "force", "x", initial="zero", hold="zero")
+    np.testing.assert_array_equal(back.u, tones.u)
+    assert back.dt == pytest.approx(DT) and back.name == ""
+    for named in (frame.reset_index(), frame.reset_index(drop=True)):
+        other = pilfr.read_frame(named, "force", "x", dt=DT, units={"force": "N"}, name="rig")
+        np.testing.assert_array_equal(other.y, tones.y)
+        assert other.name == "rig"
+
+
+def test_dates_and_durations_are_times():
+    start = pd.Timestamp("2024-05-01 12:00")
+    index = start + pd.to_timedelta(np.arange(100) * 10, unit="ms")
+    frame = pd.DataFrame({"force": np.arange(100.0), "x": np.arange(100), "remark": "text"}, index=index)
+    assert read_frame(frame, "force", "x").dt == pytest.approx(0.01)
+    assert read_frame(frame.reset_index(names="time"), "force", "x").dt == pytest.approx(0.01)
+
+
+class Table:
+    """A frame as polars has them: columns by name, no index."""
+
+    def __init__(self, **columns):
+        self.held, self.columns = columns, list(columns)
+
+    def __getitem__(self, name):
+        return self.held[name]
+
+
+def test_any_table_of_named_columns_is_a_frame():
+    r = read_frame(Table(t=[0.0, 0.1, 0.2], u=[1, 2, 3], y=[4.0, 5.0, 6.0]), "u", "y")
+    np.testing.assert_array_equal(r.y[:, 0], [4, 5, 6])
+
+
+@pytest.mark.parametrize(
+    "frame, said",
+    [
+        ({"u": [1.0]}, "a dict was given; give a data frame of pandas or polars"),
+        (pd.DataFrame({"t": [0.0, 1.0], "u": [1.0, 2.0]}), "the frame has no column 'y'; it has t, u"),
+        (pd.DataFrame({"u": [1.0, 2.0], "y": [1.0, 2.0]}), "the frame has no time column"),
+        (pd.DataFrame({"t": [0.0, 1.0], "u": [1.0, np.nan], "y": [1.0, 2.0]}), "'u', sample 1 is nan"),
+        (pd.DataFrame({"t": [0.0, 1.0], "u": ["a", "b"], "y": [1.0, 2.0]}), "'u' holds"),
+        (pd.DataFrame([[0.0, 1, 2], [1, 2, 3]], columns=["t", "u", "u"]), "2 columns named 'u'"),
+    ],
+)
+def test_frames_that_cannot_be_used(frame, said):
+    with pytest.raises(InputError, match=said):
+        read_frame(frame, "u", "y")
