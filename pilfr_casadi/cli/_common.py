@@ -136,7 +136,7 @@ def simulator_files(metavar: str) -> Any:
     """Make the argument that takes a simulator file and recordings."""
     text = (
         "A Python file that sets `simulator` (or a model.json, or an FMU, which is a program that runs), then training "
-        "recordings (.csv, .mat, .npz)."
+        "recordings (.csv, .mat, .npz, .parquet, .mf4)."
     )
     return typer.Argument(..., metavar=metavar, help=text)
 
