@@ -151,6 +151,8 @@ class Law:
         Physical domains in which it occurs; left out, all of them.
     special : bool
         It is tried at ports of its domains alone, and not where the domain is unknown.
+    across : str
+        Unit that the local coordinate of a special law can be converted to, such as "V"; left out, any.
     dissipative, restoring : bool
         The force always opposes the motion, or always pushes back towards z = 0. This fixes the sign of all strengths
         except those in `signed`.
@@ -201,6 +203,7 @@ class Law:
     places: ClassVar[tuple[str, ...]] = ("parallel",)
     domains: ClassVar[tuple[str, ...]] = ()
     special: ClassVar[bool] = False
+    across: ClassVar[str] = ""
     dissipative: ClassVar[bool] = False
     restoring: ClassVar[bool] = False
     two_sided: ClassVar[bool] = False

@@ -182,14 +182,14 @@ class FreeCurve(Law):
     id = "static_curve"
     flexible = True
     form = "free"
-    equation = "w = sum_i c_i (T_i(x) - T_i(x_0)),  i = 2..7,  x = (z - z_m) / z_h,  x_0 = -z_m / z_h"
+    equation = "w = sum_i c_i (T_i(x) - T_i(x_0)),  i = 2..9,  x = (z - z_m) / z_h,  x_0 = -z_m / z_h"
     source = "Plett (2015), Battery Management Systems, vol. 1, sec. 2.2; Press et al. (2007), sec. 5.8"
     sentence = "a memoryless curve of a free shape, such as an open-circuit voltage over the state of charge"
     units = {"c": "w", "z_m": "z", "z_h": "z"}
     strength = ("c",)
     domains = ("electrical", "fluid")
     special = True
-    degrees = (2, 3, 4, 5, 6, 7)  # those below are an offset and a slope of the simulator
+    degrees = tuple(range(2, 10))  # an offset and a slope are parameters of the simulator; nine follow a narrow knee
 
     def force(self, z: Any, p: Any) -> Any:
         terms, at_zero = (_chebyshev((at - p.z_m) / p.z_h, max(self.degrees)) for at in (z, 0.0))

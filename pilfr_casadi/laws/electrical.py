@@ -22,6 +22,7 @@ class Diode(Law):
     units = {"G": "w/z", "V_0": "z", "V_T": "z"}
     domains = ("electrical",)
     special = True
+    across = "V"
     restoring = True  # it takes power
     starts = {"V_0": ("reach", 0.1, 0.2, 0.35, 0.6, 0.9), "V_T": ("reach", 0.02, 0.08)}
     ranges = {"G": ("max_stiffness", -1.0, 1.0), "V_0": ("reach", 0.01, 1.5), "V_T": ("reach", SHARPEST, 0.5)}
@@ -77,6 +78,7 @@ class Overpotential(Law):
     units = {"V_a": "w", "I_0": "z"}
     domains = ("electrical",)
     special = True
+    across = "A"
     restoring = True
     starts = {"I_0": ("reach", 0.003, 0.02, 0.1, 0.4)}
     ranges = {"I_0": ("reach", 1e-4, 2.0)}
@@ -95,6 +97,7 @@ class SaturatingInductance(Law):
     units = {"L_s": "w*s/z", "I_s": "z"}
     domains = ("electrical",)
     special = True
+    across = "A"
     starts = {"I_s": ("reach", 0.2, 0.5, 1.0, 2.0)}
     ranges = {"I_s": ("reach", 0.05, 5.0), "L_s": ("", 0.0, float("inf"))}
 

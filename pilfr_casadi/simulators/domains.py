@@ -85,6 +85,16 @@ def infer_domain(*units: str) -> str:
     return allowed.pop() if len(allowed) == 1 else UNKNOWN
 
 
+def may_convert(unit: str, other: str) -> bool:
+    """Tell whether a unit may be converted to another: of the same dimension, or not known.
+
+    >>> may_convert("mV", "V"), may_convert("A", "V"), may_convert("", "V")
+    (True, False, True)
+    """
+    sizes = _dimension(unit), _dimension(other)
+    return None in sizes or sizes[0] == sizes[1]
+
+
 def common_domain(domains: Iterable[str]) -> str:
     """Return the domain that all of them are, else unknown."""
     found = set(domains)

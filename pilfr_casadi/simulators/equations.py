@@ -20,7 +20,7 @@ import numpy as np
 
 from .._base import InputError, listed
 from ..models import Named, Parameter, ParameterSet
-from .domains import DOMAINS, UNKNOWN, common_domain, infer_domain
+from .domains import DOMAINS, UNKNOWN, common_domain, infer_domain, may_convert
 
 Expression = Callable[..., Any]
 BUILT_IN = ("actuator:", "sensor:", "equation:")  # prefixes of the ports that need no declaration
@@ -128,11 +128,11 @@ class Port:
         return {"series", "sensor"} if self.name.startswith("sensor:") else {"series"}
 
     def admits(self, law: Any) -> bool:
-        """Tell whether a law (or its class) may be missing here: by its places and its physical domains.
+        """Tell whether a law (or its class) may be missing here: by its places, physical domains and coordinate.
 
         A port of unknown domain admits the laws of all domains, except special ones.
         """
-        if not self.kinds & set(law.places):
+        if not self.kinds & set(law.places) or (law.across and not may_convert(self.across_unit, law.across)):
             return False
         return self.domain in law.domains or not (law.special or (law.domains and self.domain != UNKNOWN))
 

@@ -67,6 +67,8 @@ def test_special_laws_are_for_their_own_domain_alone():
     assert not at["mechanical"] & special and not at["unknown"] & special
     assert at["mechanical"] == at["unknown"] == {k for k in laws.CATALOGUE if "parallel" in k.places} - special
     assert port("W", "K").admits(laws.Radiation) and not port("A", "V").admits(laws.Radiation)
+    assert port("A", "mV").admits(laws.Diode) and not port("V", "1").admits(laws.Diode)
+    assert port("V", "A").admits(laws.Overpotential) and not port("A", "V").admits(laws.Overpotential)
     assert port("A", "V").admits(laws.Clamp) and port("m^3/s", "Pa").admits(laws.FreeCurve)
 
 
