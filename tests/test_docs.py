@@ -28,11 +28,13 @@ QUICK = {  # pages of about a second; all others are slow
         "hold",
         "known_physics",
         "look",
+        "mujoco",
         "numpy",
         "other_domains",
         "own_law",
         "ports",
         "unknown_start",
+        "varying_strength",
     )
 }
 SAID = {

@@ -31,10 +31,10 @@ def arm(gravity, damper, torque_of=lambda angle: angle):
     )
 
 
-def record(machine, seed, samples=900, dt=0.01):
+def record(machine, seed, samples=700, dt=0.01):
     """A multisine of torque, and the angle with noise of 2 mrad."""
     rng = np.random.default_rng(seed)
-    torque = 0.55 * pilfr.multisine(samples, f_max=1.2, fs=1 / dt, rng=rng)
+    torque = 0.35 * pilfr.multisine(samples, f_max=1.2, fs=1 / dt, rng=rng)
     blank = pilfr.Recording(torque, np.zeros(samples), dt, "torque", "angle", initial="zero", hold="zero")
     return blank.with_(y=machine.simulate(blank) + 2e-3 * rng.normal(size=(samples, 1)), name=f"run {seed}")
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -29,7 +29,7 @@ from .._base import InputError, side_by_side
 from ..laws import SCALABLE, Law, Local, display_name, scheduled, unit_forces
 from ..models import Parameter, play
 from .force_recovery import law_signals
-from .linearise import linearised
+from .linearise import linearised, port_signals
 from .screen import Remainder, Task, fit_shapes, held_out_squares, lengths, ridge_solution, start_values, usable
 from .workbench import FEW, LONG, Fitted, Workbench
 
@@ -360,7 +360,7 @@ def nearest_to_learned(bench: Workbench, fitted: Fitted, laws: Collection[type[L
     """
     element = fitted.simulator.elements[-1]
     z, dz, force = signals_along(bench, fitted)
-    local = bench.local(z, dz)
+    local = replace(bench.local(z, dz), inputs=port_signals(bench, fitted, element.port).inputs)
     port = bench.simulator.port(element.port)
     tried = [law for law in laws if port.admits(law)]
     for law in SCALABLE if "parallel" in port.kinds else ():

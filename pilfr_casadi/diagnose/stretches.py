@@ -10,8 +10,8 @@ each candidate stretch gets features, and the stretches are chosen far apart in 
   relaxation; the catalogue's laws are near their span.
 - Amplitude, rate and operating point of each channel.
 
-A stretch from within a recording begins with a warm-up, samples that are simulated but not scored, and its initial
-state is estimated.
+The initial state of a stretch from within a recording is estimated, with the memory of laws. All its samples are
+scored: a state before unscored samples is hardly determined, and could be far outside the recorded range.
 
 The leading hypotheses are then fitted to everything, by normal equations that are summed over the recordings piece by
 piece (`optimise.Problem.normal`), so that memory does not grow with their length. A hypothesis that everything refutes
@@ -47,7 +47,6 @@ from .workbench import DIVERGED, FEW, Fitted, Workbench
 MOST_SAMPLES = 60_000  # samples of the training recordings up to which everything is searched: effort
 SHARE, COUNT = 2 / 3, 10  # share of these samples that the stretches have together, and their largest number
 SHORTEST = 500  # least length of a stretch in samples: a law with memory needs some history
-WARM_UP = 0.05  # share of a stretch that is simulated before it and not scored
 CANDIDATES = 300  # stretches that are linearised at most
 LINEARISED = 1000  # samples of each that are linearised
 FAMILIES = (Surface, StopHysteresis, Creep)  # forces near whose span the catalogue's laws are
@@ -66,19 +65,13 @@ class Stretch:
     def __len__(self) -> int:
         return self.end - self.begin
 
-    @property
-    def first(self) -> int:
-        """First sample of the warm-up before it."""
-        return max(self.begin - int(WARM_UP * len(self)), 0)
-
     def cut(self, recordings: Sequence[Recording]) -> Recording:
-        """Cut the stretch out of its recording, with a warm-up before it; a whole recording is returned as it is."""
+        """Cut the stretch out of its recording; a whole recording is returned as it is."""
         r = recordings[self.recording]
         if len(self) == len(r):
             return r
-        piece = r.slice(self.first, self.end)
-        name = f"{r.name or f'recording {self.recording + 1}'} from {self.first * r.dt:.6g} s"
-        return piece.with_(skip=max(piece.skip, self.begin - self.first), name=name)
+        name = f"{r.name or f'recording {self.recording + 1}'} from {self.begin * r.dt:.6g} s"
+        return r.slice(self.begin, self.end).with_(name=name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +116,7 @@ class Stretches:
 
     def _cut_at_gaps(self, recordings: list[Recording], gap: Jump) -> list[Recording]:
         """Cut the recordings where samples are missing in a stretch."""
-        places = [(self.chosen[i].recording, self.chosen[i].first + k) for i, k in gap.places]
+        places = [(self.chosen[i].recording, self.chosen[i].begin + k) for i, k in gap.places]
         for i, k in sorted(places, reverse=True):
             r = recordings[i]
             later = r.slice(k).with_(initial="estimate", period=None, name=f"{r.name} from {k * r.dt:.6g} s".strip())

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from .._base import InputError
 from ..models import Named, Parameter
@@ -50,7 +51,7 @@ def scheduled(law: type[Law], by: str) -> type[Law]:
     law : class of Law
         Any law that may act in parallel, as a force.
     by : str
-        An input of the simulator, or "z", the local coordinate.
+        An input of the simulator, one of the port's own `signals`, or "z", the local coordinate.
 
     Raises
     ------
@@ -92,6 +93,13 @@ def _parallel(law: Any) -> Any:
     return law
 
 
+def _not_there(by: str, local: Local) -> str:
+    """Say why a signal cannot vary a strength at a port; empty if it can."""
+    if by not in local.inputs:
+        return f"the port has no signal {by}"
+    return "" if np.ptp(local.inputs[by]) > 0 else f"{by} is constant"
+
+
 @functools.cache  # the same class for the same arguments
 def _scaled(base: Any, by: str) -> Any:
     strengths = {name: f"{unit}/[{by}]" if name in base.strength else unit for name, unit in base.units.items()}
@@ -104,6 +112,10 @@ def _scaled(base: Any, by: str) -> Any:
         places = ("parallel",)
         dissipative = restoring = False  # the signal may have either sign
         scaled_by = by
+
+        def why_not(self, local: Local) -> str:
+            """Say why the data carries no information on this law; empty if it does."""
+            return super().why_not(local) or _not_there(by, local)
 
     return _name(Scaled, f"{base.__name__}ScaledBy_{by}", f"{base.__doc__}\n\n    Its strength is scaled by {by}.")
 
@@ -129,6 +141,10 @@ def _scheduled(base: Any, by: str) -> Any:
         strength = (*base.strength, *high.values())
         places = ("parallel",)
         scheduled_by = by
+
+        def why_not(self, local: Local) -> str:
+            """Say why the data carries no information on this law; empty if it does."""
+            return super().why_not(local) or ("" if by == "z" else _not_there(by, local))
 
         def parameters(self) -> dict[str, Parameter]:
             """Parameters, of which the ends of the signal's range are fixed."""

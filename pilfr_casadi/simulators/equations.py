@@ -69,6 +69,9 @@ class Port:
         angle both are the speed, which friction opposes.
     unit, across_unit : str
         Units of w and of z.
+    signals : mapping of str to callable, optional
+        Further quantities with which the strength of a law here may vary, besides the inputs and z: a load that the
+        contact transmits, a temperature, `{"load": lambda x, u: ca.fabs(u.torque)}`; from any of x, u, p.
     domain : {"mechanical", "thermal", "electrical", "fluid", "unknown"}, optional
         Physical domain, which decides what laws are tried; by default inferred from the units.
 
@@ -91,6 +94,7 @@ class Port:
     across_unit: str = ""
     series: bool = False
     domain: str = ""
+    signals: Mapping[str, Expression] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -105,6 +109,13 @@ class Port:
         for option in ("unit", "across_unit"):
             if not isinstance(getattr(self, option), str):
                 raise InputError(f"`{option}` {what} is {getattr(self, option)!r}; give plain text, such as 'N'.")
+        if not isinstance(self.signals, Mapping) or not all(map(callable, self.signals.values())):
+            raise InputError(
+                f"`signals` {what} are {self.signals!r}; give functions by name, {{'load': lambda x: ...}}."
+            )
+        for name in self.signals:
+            if not isinstance(name, str) or not name.isidentifier() or name == "z":
+                raise InputError(f"A signal {what} is named {name!r}; give a name like 'load' (z is the coordinate).")
         if self.domain not in ("", *DOMAINS, UNKNOWN):
             raise InputError(f"The domain {what} is {self.domain!r}; give {', '.join(DOMAINS)} or {UNKNOWN}.")
         object.__setattr__(self, "domain", self.domain or infer_domain(self.unit, self.across_unit))
@@ -249,6 +260,16 @@ class Equations:
     def output_names(self) -> tuple[str, ...]:
         """Names of the outputs."""
         return tuple(self.measured(*self.symbols()))
+
+    def port_signals(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
+        """Evaluate a port's own signals by name."""
+        found = {}
+        for name, signal in port.signals.items():
+            what = f"signal {name!r} of port {port.name!r}"
+            if name in self.inputs:
+                raise InputError(f"The {what} has the name of an input; give it another one.")
+            found[name] = _scalar(call(signal, what, x=x, u=u, p=p, t=t), what)
+        return found
 
     def into(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
         """Evaluate the factors of w by state or output."""
