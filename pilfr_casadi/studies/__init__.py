@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     )
     from .executor import AHEAD as AHEAD, dask_executor as dask_executor
     from .folder import (
-        MODEL as MODEL,
         PAGE as PAGE,
         PICTURE as PICTURE,
         SUMMARY as SUMMARY,
@@ -24,7 +23,8 @@ if TYPE_CHECKING:
         check_own as check_own,
         lock_folder as lock_folder,
     )
-    from .jobs import fold as fold, input_digests as input_digests, jobs_of as jobs_of
+    from .jobs import MODEL as MODEL, fold as fold, input_digests as input_digests, jobs_of as jobs_of
+    from .population import Population as Population, estimate_population as estimate_population, slope as slope
     from .schema import (
         LARGEST_SIZE as LARGEST_SIZE,
         ROLES as ROLES,
