@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from .gates import Gate as Gate
     from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
     from .mismatch_map import mismatch as mismatch
+    from .preparation import add_scaled_laws as add_scaled_laws, check_laws as check_laws
     from .refinement import Refinement as Refinement
     from .replication import (
         Replication as Replication,
@@ -54,7 +55,6 @@ if TYPE_CHECKING:
         Diagnosis as Diagnosis,
         Effect as Effect,
     )
-    from .preparation import add_scaled_laws as add_scaled_laws, check_laws as check_laws
     from .workbench import Fitted as Fitted, Workbench as Workbench
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

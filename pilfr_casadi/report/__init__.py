@@ -21,8 +21,10 @@ if TYPE_CHECKING:
     from .diagnosis_tables import usage as usage
     from .fit import fit_page as fit_page, fit_report as fit_report
     from .fit_sections import mode_tables as mode_tables
+    from .fleet import fleet_map as fleet_map, fleet_page as fleet_page
     from .page import (
         Code as Code,
+        Link as Link,
         Page as Page,
         Picture as Picture,
         Section as Section,

@@ -1,4 +1,9 @@
-"""Scripted identification runs and campaigns: a file describes the jobs, a folder holds the results."""
+"""Many jobs, kept in a folder: runs and campaigns, which a file describes, and fleets of machines.
+
+`executor` runs jobs of any kind side by side, `folder` keeps their results. Of runs: `schema` (the file), `jobs`,
+`execution`, `summary`. Of fleets: `fleets` (the steps), `machines` (the work at one machine), `population` (statistics
+over machines), `fleet_result`.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -14,6 +19,8 @@ if TYPE_CHECKING:
         seeds_advice as seeds_advice,
     )
     from .executor import AHEAD as AHEAD, dask_executor as dask_executor
+    from .fleet_result import Fleet as Fleet, Machine as Machine, read_fleet as read_fleet
+    from .fleets import fleet as fleet
     from .folder import (
         PAGE as PAGE,
         PICTURE as PICTURE,

@@ -204,7 +204,7 @@ class Store:
         for name in (TABLE, MODEL, PAGE, SUMMARY, PICTURE):
             self.manifest.holds(name)
         if campaign:
-            _refuse_other_versions(self.manifest)
+            refuse_other_versions(self.manifest)
         described = {"file": run.file.name, "said": run.plain_tables}
         self.manifest.content |= {"run": described, "versions": versions(), "inputs": dict(inputs)}
         self.manifest.write()
@@ -280,7 +280,7 @@ class Store:
         self.written = time.monotonic()
 
 
-def _refuse_other_versions(manifest: Manifest) -> None:
+def refuse_other_versions(manifest: Manifest) -> None:
     """Refuse to mix results of different versions in one campaign, which compares its results."""
     before, now = manifest.content.get("versions", {}), versions()
     for name in now:

@@ -17,7 +17,7 @@ meta-analysis with known errors. Whether τ differs from zero is decided by the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,9 +62,14 @@ class Population:
         v = self.deviation**2 + self.mean_error**2 + error**2
         return float(_posterior(np.array([value - self.mean]), np.array([v]), np.array([width]), self.share)[0])
 
-    def signed(self, values: np.ndarray, side: float = 1.0) -> np.ndarray:
-        """Return the probabilities with zero for machines that lie on the other side of the mean."""
-        return np.where(side * (values - self.mean) > 0, self.differs, 0.0)
+    def to_dict(self) -> dict[str, float]:
+        """Return the distribution, without the machines."""
+        return {k: v for k, v in vars(self).items() if k != "differs"}
+
+    @classmethod
+    def of(cls, content: Mapping[str, Any]) -> Population:
+        """Make it of the numbers of `to_dict`, with None for nan."""
+        return cls(**{k: np.nan if v is None else float(v) for k, v in content.items()}, differs=np.zeros(0))
 
 
 def estimate_population(
