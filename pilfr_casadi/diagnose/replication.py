@@ -177,8 +177,14 @@ def _each_recording(bench: Workbench, after: Fitted) -> tuple[list[np.ndarray], 
     residuals, values = [], []
     for i, r in enumerate(bench.recordings):
         own = bench.on([r])
-        options = {"states": after.initial[i : i + 1], "model": after.model, "engine": after.engine}
-        fitted = own.fit(after.simulator, [after.values], solver=THOROUGH, **options)
+        fitted = own.fit(
+            after.simulator,
+            [after.values],
+            states=after.initial[i : i + 1],
+            solver=THOROUGH,
+            model=after.model,
+            engine=after.engine,
+        )
         residuals.append(fitted.residual[0])
         values.append(_values(own, fitted))
     return residuals, tuple(values)

@@ -48,7 +48,7 @@ def machine_map(x: Column, y: Column, names: Sequence[str], differs: np.ndarray)
 
 def machine_strips(columns: Sequence[Column], names: Sequence[str], differs: np.ndarray) -> Figure:
     """Draw each value of all machines as a strip, with bars of two standard errors; arguments as for `machine_map`."""
-    figure = new_figure(7.2, 0.6 + 1.3 * max(len(columns), 1))
+    figure = new_figure(7.2, 0.6 + 1.6 * max(len(columns), 1))
     rank = np.arange(len(names))
     for i, column in enumerate(columns):
         ax = figure.add_subplot(len(columns), 1, i + 1)
@@ -81,25 +81,23 @@ def small_multiples(residuals: Sequence[Mapping[str, Any]], titles: Sequence[str
     titles : sequence of str
         Titles of the pictures.
     """
-    rows = -(-len(residuals) // ACROSS)
-    figure = new_figure(7.2, 0.4 + 1.7 * max(rows, 1))
+    figure, rows, across = _small_pictures(len(residuals), 1.7)
     largest = max((np.max(np.abs([r["low"], r["high"]])) for r in residuals), default=1.0)
     for k, (r, title) in enumerate(zip(residuals, titles, strict=True)):
-        ax = figure.add_subplot(rows, ACROSS, k + 1)
+        ax = figure.add_subplot(rows, across, k + 1)
         t = np.linspace(0, r["seconds"], len(r["low"]))
         ax.axhspan(-2 * r["noise"], 2 * r["noise"], color=GREEN, alpha=0.25, linewidth=0)
         ax.fill_between(t, r["low"], r["high"], color=VERMILLION, linewidth=0.4)
-        finish(ax, "time [s]" if k // ACROSS == rows - 1 else "", "error" if k % ACROSS == 0 else "", title)
+        finish(ax, "time [s]" if k // across == rows - 1 else "", "error" if k % across == 0 else "", title)
         ax.set_ylim(-1.05 * largest, 1.05 * largest)
     return figure
 
 
 def machine_trends(trends: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw values over time, one small picture each: `title`, `times`, `values`, `errors`, `slope`, `mean`, `unit`."""
-    rows = -(-len(trends) // ACROSS)
-    figure = new_figure(7.2, 0.4 + 1.9 * max(rows, 1))
+    figure, rows, across = _small_pictures(len(trends), 1.9)
     for k, r in enumerate(trends):
-        ax = figure.add_subplot(rows, ACROSS, k + 1)
+        ax = figure.add_subplot(rows, across, k + 1)
         t, v, e = (np.asarray(r[name], dtype=float) for name in ("times", "values", "errors"))
         ax.axhspan(*r["regular"], color=PALE_BLUE, linewidth=0)
         ax.errorbar(t, v, ERRORS * np.nan_to_num(e), fmt="o", color=BLUE, markersize=3, elinewidth=1.0)
@@ -107,8 +105,14 @@ def machine_trends(trends: Sequence[Mapping[str, Any]]) -> Figure:
         weight = 1 / e[known] ** 2
         centre = [float(np.sum(weight * a[known]) / np.sum(weight)) for a in (t, v)]
         ax.plot(t, centre[1] + r["slope"] * (t - centre[0]), color=VERMILLION, linewidth=1.2)
-        finish(ax, "time" if k // ACROSS == rows - 1 else "", with_unit(r["name"], r["unit"]), r["title"])
+        finish(ax, "time" if k // across == rows - 1 else "", with_unit(r["name"], r["unit"]), r["title"])
     return figure
+
+
+def _small_pictures(count: int, height: float) -> tuple[Figure, int, int]:
+    """Make a figure for some small pictures; return it, and the numbers of rows and columns."""
+    rows, across = max(-(-count // ACROSS), 1), min(max(count, 1), ACROSS)
+    return new_figure(7.2 / ACROSS * across, 0.4 + height * rows), rows, across
 
 
 def _scaled(column: Column) -> tuple[np.ndarray, np.ndarray, str]:

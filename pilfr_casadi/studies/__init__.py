@@ -31,7 +31,12 @@ if TYPE_CHECKING:
         lock_folder as lock_folder,
     )
     from .jobs import MODEL as MODEL, fold as fold, input_digests as input_digests, jobs_of as jobs_of
-    from .population import Population as Population, estimate_population as estimate_population, slope as slope
+    from .population import (
+        Population as Population,
+        combine as combine,
+        estimate_population as estimate_population,
+        slope as slope,
+    )
     from .schema import (
         LARGEST_SIZE as LARGEST_SIZE,
         ROLES as ROLES,

@@ -18,11 +18,11 @@ import numpy as np
 
 from .._base import InputError, existing_file, make_folder, to_json, write_atomically
 from ..data import Recording
-from ..diagnose import SURE, replicate
-from ..laws import display_name
-from ..simulators import Simulator
+from ..diagnose import SURE, add_scaled_laws, check_laws, replicate
+from ..laws import Law, display_name
+from ..simulators import as_simulator
 from .machines import DONE, PAGE, RESIDUAL, LawAt, MachineWork, measured_entry
-from .population import Population, estimate_population, slope
+from .population import Population, combine, estimate_population, slope
 
 CONTENT, TABLE = "fleet.json", "fleet.csv"
 SCHEMA = 1
@@ -106,10 +106,8 @@ class Machine:
 
     def _rest(self) -> str:
         said = f"lacks more: its error is {self.ratio:.3g} times the noise"
-        named = [
-            f"{display_name(e['law'])} at {e['port']} ({e['confidence']:.2f})" for e in self.rest.get("effects", ())
-        ]
-        return f"{said}; {', '.join(named)}" if named else said
+        named = ", ".join(f"{display_name(e['law'])} at {e['port']}" for e in self.rest.get("effects", ()))
+        return f"{said}; {named}" if named else said
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for JSON."""
@@ -122,7 +120,7 @@ class Machine:
     def of(cls, content: Mapping[str, Any]) -> Machine:
         """Read it from JSON."""
         known = {k: v for k, v in content.items() if k not in ("trends", "probability")}
-        numbers = {k: np.nan if v is None else v for k, v in known.items()}
+        numbers: dict[str, Any] = {k: np.nan if v is None else v for k, v in known.items()}
         for name in ("values", "errors", "differs"):
             numbers[name] = {k: np.nan if v is None else v for k, v in known[name].items()}
         trends = {
@@ -339,7 +337,8 @@ class Fleet:
     def report(self, folder: Any) -> Path:
         """Write fleet.json, fleet.csv, report.html and the machines' own reports; return the page's path."""
         target = make_folder(folder)
-        for name, data in {**self.files, **self.documents()}.items():
+        contents: dict[str, str | bytes] = {**self.files, **self.documents()}
+        for name, data in contents.items():
             make_folder((target / name).parent)
             write_atomically(target / name, data)
         return target / PAGE
@@ -367,22 +366,25 @@ def judge_entry(
     times: Sequence[float] | None,
 ) -> Machine:
     """Judge the numbers of a machine by the distributions over the fleet."""
-    differs, trends = {}, {}
-    for v in values:
-        one = (entry[kind].get(v.name) for kind in ("values", "errors", "widths"))
-        value, error, width = (np.nan if x is None else float(x) for x in one)
-        if np.isfinite(value) and np.isfinite(error) and np.isfinite(v.population.mean):
-            differs[v.name] = v.population.probability(value, error, width)
-        found = trend_of(entry, v.name, times)
-        if np.isfinite(found[0]):
-            trends[v.name] = Trend(found[0], found[1], v.trends.probability(*found))
+    found = {v.name: trend_of(entry, v.name, times) for v in values}
+    trends = {
+        v.name: Trend(*found[v.name][:2], v.trends.probability(*found[v.name]))
+        for v in values
+        if np.isfinite(found[v.name][0])
+    }
+    estimates = estimates_of(entry, any(t.probability > SURE for t in trends.values()))
+    differs = {
+        v.name: v.population.probability(*estimates[v.name], float(entry["widths"][v.name]))
+        for v in values
+        if np.all(np.isfinite(estimates.get(v.name, np.nan))) and np.isfinite(v.population.mean)
+    }
     above = entry["remainder"] > remainder.mean
     width = remainder_width(entry)
     beyond = remainder.probability(entry["remainder"], entry["remainder_error"], width) if above else 0.0
-    own = {kind: {k: np.nan if v is None else v for k, v in entry[kind].items()} for kind in ("values", "errors")}
     return Machine(
         name,
-        **own,
+        values={label: value for label, (value, _) in estimates.items()},
+        errors={label: error for label, (_, error) in estimates.items()},
         differs=differs,
         trends=trends,
         beyond=beyond,
@@ -392,6 +394,21 @@ def judge_entry(
         nrmse_after=entry["nrmse_after"],
         noise=entry["noise"],
     )
+
+
+def estimates_of(entry: Mapping[str, Any], drifts: bool) -> dict[str, tuple[float, float]]:
+    """Return value and standard error of each parameter: of the fit to all recordings, or means if values drift.
+
+    A fit to all recordings with the same values is bent by those that drift.
+    """
+    out = {}
+    for label, value in entry["values"].items():
+        rows = entry["by_recording"] if drifts else []
+        alone = (np.array([r[kind].get(label) for r in rows], dtype=float) for kind in ("values", "errors"))
+        mean, error = combine(*alone)
+        fitted = tuple(np.nan if x is None else float(x) for x in (value, entry["errors"].get(label)))
+        out[label] = (mean, error) if np.isfinite(mean) else (fitted[0], fitted[1])
+    return out
 
 
 def remainder_width(entry: Mapping[str, Any]) -> float:
@@ -414,29 +431,45 @@ def distributions(
 ) -> tuple[tuple[FleetValue, ...], Population]:
     """Estimate the distribution of every value, and of the remaining error, over the machines of a fleet."""
     good = {name: e for name, e in entries.items() if e["status"] == DONE}
-    labels = dict.fromkeys(label for e in good.values() for label in e["values"])
+    labels = list(dict.fromkeys(label for e in good.values() for label in e["values"]))
+    slopes = {label: np.array([trend_of(e, label, times.get(name)) for name, e in good.items()]) for label in labels}
+    trends = {label: estimate_population(*slopes[label].T, centre=0.0) for label in labels}
+    drifting = [any(t.differs[i] > SURE for t in trends.values()) for i in range(len(good))]
+    estimates = [estimates_of(e, drifts) for e, drifts in zip(good.values(), drifting, strict=True)]
     values = []
     for label in labels:
-        v, s, d = (
-            np.array([e[kind].get(label) for e in good.values()], dtype=float)
-            for kind in ("values", "errors", "widths")
-        )
-        trends = np.array([trend_of(e, label, times.get(name)) for name, e in good.items()])
-        slopes = estimate_population(trends[:, 0], trends[:, 1], trends[:, 2], centre=0.0)
-        values.append(FleetValue(label, units.get(label.partition("[")[0], ""), estimate_population(v, s, d), slopes))
+        v, s = np.array([e.get(label, (np.nan, np.nan)) for e in estimates]).T
+        d = np.array([e["widths"].get(label) for e in good.values()], dtype=float)
+        unit = units.get(label.partition("[")[0], "")
+        values.append(FleetValue(label, unit, estimate_population(v, s, d), trends[label]))
     left, error = (np.array([e[k] for e in good.values()]) for k in ("remainder", "remainder_error"))
     return tuple(values), estimate_population(left, error, [remainder_width(e) for e in good.values()])
 
 
-def read_fleet(folder: Any, simulator: Simulator, work: MachineWork) -> Fleet:
-    """Read a fleet from its fleet.json, to judge new machines."""
+def read_fleet(folder: Any, simulator: Any, laws: Sequence[type[Law]] | None = None) -> Fleet:
+    """Read a fleet from its folder, to judge new machines.
+
+    Parameters
+    ----------
+    folder : path
+        The folder of the fleet, or its fleet.json.
+    simulator, laws
+        As they were given to `fleet`.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is not of a fleet.
+    """
+    own = as_simulator(simulator)
+    tried = add_scaled_laws(check_laws(laws), own)
     path = Path(folder) / CONTENT if Path(folder).is_dir() else Path(folder)
     try:
         content = json.loads(existing_file(path).read_text(encoding="utf-8"))
         if content["schema"] != SCHEMA:
             raise KeyError
         common = content["common"]
-        laws = tuple(LawAt.of(law) for law in common["laws"])
+        found = tuple(LawAt.of(law) for law in common["laws"])
         starts = tuple({k: np.asarray(v, dtype=float) for k, v in s.items()} for s in common["starts"])
         values = tuple(
             FleetValue(v["name"], v["unit"], Population.of(v["population"]), Population.of(v["trends"]))
@@ -444,12 +477,12 @@ def read_fleet(folder: Any, simulator: Simulator, work: MachineWork) -> Fleet:
         )
         machines = tuple(Machine.of({k: v for k, v in m.items() if k != "reasons"}) for m in content["machines"])
         return Fleet(
-            Common(laws, common["probability"], tuple(common["sample"]), starts),
+            Common(found, common["probability"], tuple(common["sample"]), starts),
             content["confirmed"],
             values,
             Population.of(content["remainder"]),
             machines,
-            work,
+            MachineWork(own, content["hold"], tried, None, "auto"),
             histories=content["histories"],
         )
     except (KeyError, TypeError, ValueError, AttributeError):

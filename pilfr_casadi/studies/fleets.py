@@ -35,10 +35,9 @@ from .._base import (
     check_executor,
     deferred_interrupt,
     digest,
-    listed,
     make_folder,
+    numbers,
     processors,
-    real_array,
     whole,
 )
 from ..data import Recording, as_recordings
@@ -174,11 +173,10 @@ def _checked_times(times: Any, machines: Mapping[str, tuple[Recording, ...]]) ->
     for name, found in (times or {}).items():
         if name not in machines:
             raise InputError(f"times holds {name!r}, which is no machine of the fleet.")
-        t = real_array(found, f"times of {name!r}")
-        if t.shape != (len(machines[name]),):
-            raise InputError(
-                f"times of {name!r} has {t.size} numbers for {len(machines[name])} recordings; give one each."
-            )
+        t = numbers(found, f"times of {name!r}")
+        count = len(machines[name])
+        if t.shape != (count,):
+            raise InputError(f"times of {name!r} has {t.size} numbers for {count} recordings; give one for each.")
         out[name] = tuple(map(float, t))
     return out
 
@@ -191,9 +189,9 @@ def _opened(out: Any, overwrite: bool) -> Iterator[Manifest]:
             yield Manifest(Path(folder), layout=FLEET)
         return
     check_own(Path(out), None, overwrite, FLEET)
-    folder = make_folder(out)
-    with lock_folder(folder, FLEET):
-        manifest = Manifest(folder, layout=FLEET) if overwrite else Manifest.read(folder, FLEET)
+    target = make_folder(out)
+    with lock_folder(target, FLEET):
+        manifest = Manifest(target, layout=FLEET) if overwrite else Manifest.read(target, FLEET)
         refuse_other_versions(manifest)
         manifest.content["versions"] = versions()
         yield manifest
@@ -354,9 +352,7 @@ def common_physics(sample: Mapping[str, Mapping[str, Any]]) -> tuple[Common, str
     """
     good = {name: e for name, e in sample.items() if e["status"] == DONE}
     if not good:
-        raise NoModel(
-            f"No machine of the sample could be diagnosed; {listed([e['sentence'] for e in sample.values()], 1)}"
-        )
+        raise NoModel(f"No machine of the sample could be diagnosed; {next(iter(sample.values()))['sentence']}")
     found = [{_key(h): h for h in e["hypotheses"]} for e in good.values()]
     shared = [key for key in found[0] if all(key in other for other in found)]
     score = {

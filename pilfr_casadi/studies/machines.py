@@ -7,6 +7,7 @@ process, and gives numbers for the manifest and files for its folder.
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -105,7 +106,8 @@ class MachineWork:
     def __call__(self, job: MachineJob) -> Outcome:
         """Execute a step at a machine."""
         step = {REFIT: self._refit, SAMPLE: self._sample, MEASURE: self._measure, REST: self._rest}[job.step]
-        return step(job)
+        began = time.perf_counter()
+        return replace(step(job), seconds=time.perf_counter() - began)
 
     def key(self, job: MachineJob) -> str:
         """Compute the digest of everything that a job's result depends on, but for versions."""

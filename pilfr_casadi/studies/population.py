@@ -159,6 +159,16 @@ def _varies(y: np.ndarray, s: np.ndarray, tau: float, weight: np.ndarray) -> flo
     return float(1 / (1 + np.exp(-np.clip(gain, -500, 500)))) if count > 1 else 0.0
 
 
+def combine(values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
+    """Return the weighted mean of a value over recordings and its error, larger if they scatter more (Birge 1932)."""
+    if not len(values) or not np.all(np.isfinite(values) & np.isfinite(errors) & (errors > 0)):
+        return np.nan, np.nan
+    w = 1 / np.maximum(errors, TINY) ** 2
+    mean = float(np.sum(w * values) / np.sum(w))
+    excess = np.sum(w * (values - mean) ** 2) / (len(values) - 1) if len(values) > 1 else 1.0
+    return mean, float(np.sqrt(max(excess, 1.0) / np.sum(w)))
+
+
 def slope(times: np.ndarray, values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
     """Fit a line by weighted least squares; return its slope and the standard error, nan if it is not determined.
 
