@@ -20,18 +20,19 @@ from typing import Any
 
 import numpy as np
 
-from .._base import one_blas_thread
+from .._base import InputError, one_blas_thread
 from ..data import Recording
 from ..laws import Law
-from ..simulators import Placed, Simulator, as_simulator
+from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
 from .evidence import FORMULA, Sample, deviations, information, log_evidence, log_prior, prior_width
 from .floor import effective_size, measured_floor
 from .linearise import along
 from .preparation import match_recordings, stated_hold
 from .proof import mean_nrmse
 from .trials import Trials
-from .workbench import THOROUGH, Fitted, Workbench
+from .workbench import FINER, THOROUGH, Fitted, Workbench
 
+ACCURATE = 0.25  # standard errors by which finer steps may change a value: 3 % of the uncertainty, added in squares
 THIRD_DIFFERENCES = 2.31  # 1 + 2 Σ ρ² of third differences of white noise
 
 
@@ -133,6 +134,7 @@ def replicate(
     plain = bench.fit(bench.simulator, [{}, *starts], solver=THOROUGH)
     bench = replace(bench, typical=along(bench, plain))
     after = _with_laws(bench, plain, laws, starts) if laws else plain
+    after = _on_accurate_steps(bench, after)
     alone, values = _each_recording(bench, after)
     residuals = tuple((e / bench.scale)[r.skip :] for e, r in zip(alone, bench.recordings, strict=True))
     noise2 = _noise2(bench, residuals)
@@ -168,6 +170,27 @@ def _with_laws(
     quick = bench.fit(placed, [nominal, *({**nominal, **start} for start in starts)])
     found = trials.polish(trials.make_trial(quick, len(laws)))
     return found.fitted if np.isfinite(found.whole) else quick
+
+
+def _on_accurate_steps(bench: Workbench, fitted: Fitted) -> Fitted:
+    """Refit on finer integration steps until the values no longer depend on them.
+
+    In a search, steps are fine enough if their error is below the noise. Values are means over many samples, so their
+    standard errors are smaller than that by far.
+    """
+    most = min(FINER**2 * bench.chosen, MOST_SUBSTEPS)
+    while fitted.model.substeps < most and not fitted.simulator.discrete and np.any(fitted.model.parameters.free):
+        before, error = fitted, fitted.model.parameters.pack(deviations(bench, fitted))
+        steps = min(FINER * fitted.model.substeps, most)
+        finer = replace(bench, substeps=steps, at_least=steps, chosen=max(bench.chosen, -(-steps // FINER)))
+        try:
+            fitted = finer.fit(fitted.simulator, [fitted.values], states=fitted.initial, solver=THOROUGH)
+        except InputError:
+            return before
+        change = np.abs(fitted.vector - before.vector) / error
+        if not np.any(change > ACCURATE):
+            break
+    return fitted
 
 
 def _each_recording(bench: Workbench, after: Fitted) -> tuple[list[np.ndarray], tuple[Values, ...]]:
