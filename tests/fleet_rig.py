@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pilfr_casadi import Recording, Simulator
+from pilfr_casadi.data import Recording
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness
 from pilfr_casadi.simulators import discretise
@@ -33,8 +33,9 @@ simulator = Simulator(
 """
 
 
-def rig() -> Simulator:
-    names: dict = {}
+def rig():
+    """The simulator, which has neither friction nor a cubic spring."""
+    names = {}
     exec(SIMULATOR, names)
     return names["simulator"]
 
@@ -54,18 +55,23 @@ def recording(k, seed, cubic=0.0, friction=5.0, name=""):
     return blank.with_(y=y + 3e-3 * np.std(y) * rng.standard_normal(y.shape))
 
 
+STIFFNESS = {"a": 1250.0, "b": 1300.0, "c": 1340.0, "d": 1280.0, "e": 1310.0}  # on the first day
+WEAR = 0.03  # share of its stiffness that `b` loses from the first to the second day
+
+
 def machines():
-    """Five machines of two days: `e` stiffens, `b` wears."""
-    out = {}
-    for i, name in enumerate("abcde"):
-        k, wear = (1250.0, 1300.0, 1340.0, 1280.0, 1310.0)[i], 0.03 * (name == "b")
-        cubic = 4e4 * (name == "e")
-        out[name] = [recording(k * (1 - wear * day), 10 * i + day, cubic, name=f"{name}{day}") for day in (0, 1)]
-    return out
+    """Five machines of two days: the spring of `e` stiffens, that of `b` wears."""
+    return {
+        name: [
+            recording(k * (1 - WEAR * (name == "b") * day), 10 * i + day, 4e4 * (name == "e"), name=f"{name}{day}")
+            for day in (0, 1)
+        ]
+        for i, (name, k) in enumerate(STIFFNESS.items())
+    }
 
 
 def write_machines(folder, found):
-    """One folder a machine with a CSV a day, beside the simulator file."""
+    """Write the simulator file, and a folder for each machine with a CSV for each day."""
     (folder / "rig.py").write_text(SIMULATOR)
     for name, days in found.items():
         (folder / "data" / name).mkdir(parents=True)

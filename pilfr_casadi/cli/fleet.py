@@ -62,9 +62,7 @@ class FleetOptions(SimulatorOptions):
         from ..data import TABLE_SUFFIXES
 
         if len(self.files) != 2:
-            raise InputError(
-                f"{len(self.files)} files were given; give the simulator file, then one folder of machines."
-            )
+            raise InputError(f"{len(self.files)} paths were given; give the simulator file, then a folder of machines.")
         folder = Path(self.files[1])
         if not folder.is_dir():
             raise InputError(f"{folder} is no folder; give a folder with a recording, or a folder, for each machine.")

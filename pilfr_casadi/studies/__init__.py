@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     )
     from .executor import AHEAD as AHEAD, dask_executor as dask_executor
     from .fleet_result import Fleet as Fleet, Machine as Machine, read_fleet as read_fleet
-    from .fleets import fleet as fleet
+    from .fleets import FLEET as FLEET, common_physics as common_physics, fleet as fleet
     from .folder import (
         PAGE as PAGE,
         PICTURE as PICTURE,

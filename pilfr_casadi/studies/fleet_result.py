@@ -429,9 +429,12 @@ def trend_of(entry: Mapping[str, Any], name: str, times: Sequence[float] | None)
 def distributions(
     entries: Mapping[str, Mapping[str, Any]], units: Mapping[str, str], times: Mapping[str, Sequence[float]]
 ) -> tuple[tuple[FleetValue, ...], Population]:
-    """Estimate the distribution of every value, and of the remaining error, over the machines of a fleet."""
+    """Estimate the distribution of every value, and of the remaining error, over the machines of a fleet.
+
+    `units` are those of the parameters by label, in the order in which they are shown.
+    """
     good = {name: e for name, e in entries.items() if e["status"] == DONE}
-    labels = list(dict.fromkeys(label for e in good.values() for label in e["values"]))
+    labels = [label for label in units if any(label in e["values"] for e in good.values())]
     slopes = {label: np.array([trend_of(e, label, times.get(name)) for name, e in good.items()]) for label in labels}
     trends = {label: estimate_population(*slopes[label].T, centre=0.0) for label in labels}
     drifting = [any(t.differs[i] > SURE for t in trends.values()) for i in range(len(good))]
@@ -440,8 +443,7 @@ def distributions(
     for label in labels:
         v, s = np.array([e.get(label, (np.nan, np.nan)) for e in estimates]).T
         d = np.array([e["widths"].get(label) for e in good.values()], dtype=float)
-        unit = units.get(label.partition("[")[0], "")
-        values.append(FleetValue(label, unit, estimate_population(v, s, d), trends[label]))
+        values.append(FleetValue(label, units[label], estimate_population(v, s, d), trends[label]))
     left, error = (np.array([e[k] for e in good.values()]) for k in ("remainder", "remainder_error"))
     return tuple(values), estimate_population(left, error, [remainder_width(e) for e in good.values()])
 

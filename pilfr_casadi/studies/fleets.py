@@ -18,6 +18,7 @@ ends, the same call continues from there, and gives the same bytes with any exec
 
 from __future__ import annotations
 
+import json
 import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -279,7 +280,9 @@ class _Steps:
             for job, found in batch:
                 self.print_line(f"{job.id}: {found.entry['sentence']}")
             self.progress(step, len(ready) + sum(j.id in self._entries for j in missing), len(jobs), np.nan)
-        return {job.machine: self._entries[job.id] for job in jobs}
+        found = json.dumps({job.machine: self._entries[job.id] for job in jobs}, sort_keys=True)
+        entries: dict[str, dict[str, Any]] = json.loads(found)  # in the order in which a resumed fleet reads them
+        return entries
 
     @property
     def _entries(self) -> dict[str, Any]:
@@ -318,10 +321,12 @@ class _Steps:
         return out
 
     def _units(self, laws: Sequence[tuple[str, Law]]) -> dict[str, str]:
+        """Return the unit of each parameter by label, in the order of the simulator with the laws."""
         placed = self.work.simulator
         for port, law in laws:
             placed = placed.with_element(port, law)
-        return {name: p.unit for name, p in placed.readable_parameters().items()}
+        own = placed.readable_parameters()
+        return {label: own[label.partition("[")[0]].unit for label in own.labels}
 
     def _files(self) -> dict[str, bytes]:
         """Read the files of the jobs of this fleet."""
