@@ -77,11 +77,13 @@ class Truth:
         return self.k * (1 - self.wear * (DAYS - 1) / 2)
 
 
-def simulated_fleet(count: int, seed: int = 0) -> tuple[dict[str, list[pilfr.Recording]], dict[str, Truth]]:
-    """Draw a fleet: recordings and truth by machine."""
+def simulated_fleet(
+    count: int, seed: int = 0, share: float = FAULTY
+) -> tuple[dict[str, list[pilfr.Recording]], dict[str, Truth]]:
+    """Draw a fleet with a share of faulty machines: recordings and truth by machine."""
     rng = np.random.default_rng(seed)
     order = rng.permutation(count)
-    faulty, worn = max(round(FAULTY * count), 1), max(round(WORN * count), 1)
+    faulty, worn = max(round(share * count), 1), max(round(WORN * count), 1)
     truths, recordings = {}, {}
     for i in range(count):
         place = int(order[i])
@@ -191,12 +193,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--machines", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--faulty", type=float, default=FAULTY, help="share of the machines with a second fault")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--speed", type=int, default=0, help="machines on which one and two processes are compared")
     parser.add_argument("--kill", action="store_true", help="also kill and resume a run of at most 20 machines")
     parser.add_argument("--out", type=Path, help="folder of the results; a run that was ended is continued")
     options = parser.parse_args()
-    recordings, truths = simulated_fleet(options.machines, options.seed)
+    recordings, truths = simulated_fleet(options.machines, options.seed, options.faulty)
     fleet, seconds = run(recordings, options.out, options.workers)
     print(fleet)
     print(f"\n{score(fleet, truths)}\n{options.machines} machines of {DAYS} days in {seconds:.0f} s")

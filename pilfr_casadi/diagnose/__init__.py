@@ -41,7 +41,11 @@ if TYPE_CHECKING:
     from .gates import Gate as Gate
     from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
     from .mismatch_map import mismatch as mismatch
-    from .preparation import add_scaled_laws as add_scaled_laws, check_laws as check_laws
+    from .preparation import (
+        add_scaled_laws as add_scaled_laws,
+        check_laws as check_laws,
+        match_recordings as match_recordings,
+    )
     from .refinement import Refinement as Refinement
     from .replication import (
         Replication as Replication,

@@ -42,9 +42,9 @@ from .._base import (
     whole,
 )
 from ..data import Recording, as_recordings
-from ..diagnose import SURE, add_scaled_laws, check_laws
+from ..diagnose import SURE, add_scaled_laws, check_laws, match_recordings
 from ..laws import Law
-from ..simulators import as_simulator
+from ..simulators import Simulator, as_simulator
 from .execution import NoModel, PrintLine, RunInterrupted
 from .executor import AHEAD, LOST, Effort, run_side_by_side, versions
 from .fleet_result import CONTENT, TABLE, Common, Fleet, Machine, distributions, judge_entry
@@ -138,6 +138,7 @@ def fleet(
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"time_limit={time_limit!r} was given; give seconds, a positive number.")
     own = as_simulator(simulator, next(iter(given.values())))
+    given = _matched(own, given, hold)
     most = None if effects is None else whole(effects, "effects", 0)
     work = MachineWork(own, hold, add_scaled_laws(check_laws(laws), own), most, engine)
     when = _checked_times(times, given)
@@ -166,6 +167,19 @@ def _checked_machines(machines: Any) -> dict[str, tuple[Recording, ...]]:
     if len({name.lower() for name in machines}) < len(machines):
         raise InputError("Two machines have names that differ in upper and lower case only; rename one of them.")
     return {name: tuple(as_recordings(found)) for name, found in sorted(machines.items())}
+
+
+def _matched(
+    simulator: Simulator, machines: Mapping[str, tuple[Recording, ...]], hold: str | None
+) -> dict[str, tuple[Recording, ...]]:
+    """Return the recordings with the simulator's channels; refuse those that do not fit it, with the machine's name."""
+    out = {}
+    for name, recordings in machines.items():
+        try:
+            out[name] = match_recordings(simulator, recordings, hold)[1]
+        except InputError as error:
+            raise InputError(f"Machine {name!r}: {error}") from None
+    return out
 
 
 def _checked_times(times: Any, machines: Mapping[str, tuple[Recording, ...]]) -> dict[str, tuple[float, ...]]:
@@ -280,8 +294,8 @@ class _Steps:
             for job, found in batch:
                 self.print_line(f"{job.id}: {found.entry['sentence']}")
             self.progress(step, len(ready) + sum(j.id in self._entries for j in missing), len(jobs), np.nan)
-        found = json.dumps({job.machine: self._entries[job.id] for job in jobs}, sort_keys=True)
-        entries: dict[str, dict[str, Any]] = json.loads(found)  # in the order in which a resumed fleet reads them
+        text = json.dumps({job.machine: self._entries[job.id] for job in jobs}, sort_keys=True)
+        entries: dict[str, dict[str, Any]] = json.loads(text)  # in the order in which a resumed fleet reads them
         return entries
 
     @property

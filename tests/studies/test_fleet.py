@@ -174,6 +174,13 @@ def test_bad_arguments(days, tmp_path, change, says):
     assert not (tmp_path / "out").exists()
 
 
+def test_recordings_that_do_not_fit_are_refused_with_their_machine(days, tmp_path):
+    other = pilfr.Recording(np.arange(30.0), np.arange(30.0), 5e-3, inputs=("force",), outputs=("angle",))
+    with pytest.raises(InputError, match=r"Machine 'b': .*position"):
+        pilfr.fleet(rig(), {"a": days["a"], "b": other}, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_bad_commands(tmp_path, days, capsys):
     folder = write_machines(tmp_path, {"a": days["a"], "b": days["b"]})
     rig_file, data, out = folder / "rig.py", folder / "data", folder / "out"
