@@ -18,7 +18,13 @@ if TYPE_CHECKING:
         run as run,
         seeds_advice as seeds_advice,
     )
-    from .executor import AHEAD as AHEAD, dask_executor as dask_executor
+    from .executor import (
+        AHEAD as AHEAD,
+        Effort as Effort,
+        Outcome as Outcome,
+        dask_executor as dask_executor,
+        run_side_by_side as run_side_by_side,
+    )
     from .fleet_result import Fleet as Fleet, Machine as Machine, read_fleet as read_fleet
     from .fleets import FLEET as FLEET, common_physics as common_physics, fleet as fleet
     from .folder import (

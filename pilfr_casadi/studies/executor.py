@@ -217,10 +217,13 @@ def _attempt_with_versions(work: Work, job: Any) -> tuple[Outcome, dict[str, str
 
 def _pickle(thing: Any) -> bytes:
     try:
-        return pickle.dumps(thing)
+        data = pickle.dumps(thing)
+        if b"__main__" not in data:
+            return data
+        reason: object = "the script that runs defines it"  # a worker has another main script
     except Exception as error:
         reason = error
-    try:  # workers cannot import code of a run file in Python; cloudpickle sends it
+    try:  # workers cannot import code of a run file, a simulator file or a notebook; cloudpickle sends it
         import cloudpickle
 
         return bytes(cloudpickle.dumps(thing))
