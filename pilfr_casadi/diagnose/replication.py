@@ -96,7 +96,15 @@ def refit_error(simulator: Any, recordings: Any, *, hold: str | None = None, eng
     The arguments and errors are those of `replicate`.
     """
     bench = _bench(simulator, recordings, hold, engine)
-    return mean_nrmse(bench, bench.fit(bench.simulator, solver=THOROUGH))
+    fitted = bench.fit(bench.simulator, solver=THOROUGH)
+    _pass_on_interrupt(bench)
+    return mean_nrmse(bench, fitted)
+
+
+def _pass_on_interrupt(bench: Workbench) -> None:
+    """Raise KeyboardInterrupt if Ctrl-C has ended a fit, which then returned its best values so far."""
+    if bench.interrupted_fits:
+        raise KeyboardInterrupt
 
 
 def _bench(simulator: Any, recordings: Any, hold: str | None, engine: str) -> Workbench:
@@ -129,6 +137,8 @@ def replicate(
     ------
     InputError
         If simulator and recordings do not fit each other, or the simulation diverges.
+    KeyboardInterrupt
+        On Ctrl-C.
     """
     bench = _bench(simulator, recordings, hold, engine)
     plain = bench.fit(bench.simulator, [{}, *starts], solver=THOROUGH)
@@ -136,6 +146,7 @@ def replicate(
     after = _with_laws(bench, plain, laws, starts) if laws else plain
     after = _on_accurate_steps(bench, after)
     alone, values = _each_recording(bench, after)
+    _pass_on_interrupt(bench)
     residuals = tuple((e / bench.scale)[r.skip :] for e, r in zip(alone, bench.recordings, strict=True))
     noise2 = _noise2(bench, residuals)
     square = float(np.mean(np.concatenate(residuals) ** 2))

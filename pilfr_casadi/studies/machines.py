@@ -155,6 +155,8 @@ class MachineWork:
             workers=1,
             engine=self.engine,
         )
+        if found.interrupted:
+            raise KeyboardInterrupt
         return replace(found, seconds=0.0)  # the page is the same in every execution
 
     def _hypotheses(self, found: Diagnosis) -> list[dict[str, Any]]:

@@ -20,7 +20,7 @@ from pilfr_casadi import report
 from pilfr_casadi._base import InputError, close_workers
 from pilfr_casadi.cli import main
 from pilfr_casadi.report import Page
-from pilfr_casadi.studies import Manifest, common_physics, read_fleet
+from pilfr_casadi.studies import Manifest, RunInterrupted, common_physics, read_fleet
 
 OPTIONS = {"laws": LAWS, "effects": 1, "sample": 1}
 FRICTION = f"{PORT}.F_c"
@@ -129,6 +129,23 @@ def test_what_is_missing_is_done_again_and_nothing_else(found, days, tmp_path, m
     (copy / "jobs" / "measure-a" / "residual.json").write_text("{}")
     with pytest.raises(InputError, match="was changed after the fleet wrote it"):
         pilfr.fleet(rig(), days, **OPTIONS, workers=1, out=copy)
+
+
+def test_an_interrupt_keeps_what_is_done(days, tmp_path, monkeypatch):
+    from pilfr_casadi.optimise import GaussNewton
+
+    real, calls = GaussNewton.solve, []
+
+    def stopped(self, *args, **kwargs):
+        calls.append(1)
+        if len(calls) == 3:
+            signal.raise_signal(signal.SIGINT)
+        return real(self, *args, **kwargs)
+
+    monkeypatch.setattr(GaussNewton, "solve", stopped)
+    with pytest.raises(RunInterrupted, match=r"2 of \d+ jobs are done"):
+        pilfr.fleet(rig(), days, **OPTIONS, workers=1, out=tmp_path / "out")
+    assert jobs_in(tmp_path / "out") == 2 and not (tmp_path / "out" / "report.html").exists()
 
 
 def hypothesis(evidence, *laws, prior=-1.0):
