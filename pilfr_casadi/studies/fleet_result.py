@@ -275,6 +275,7 @@ class Fleet:
         for m in self.machines:
             row: dict[str, Any] = {"machine": m.name, "probability": m.probability, "beyond": m.beyond}
             row |= {"error_over_noise": m.ratio, "nrmse_before": m.nrmse_before, "nrmse_after": m.nrmse_after}
+            row |= {"log_evidence": m.gain}
             for v in self.values:
                 row |= {v.name: m.values.get(v.name, np.nan), f"{v.name} error": m.errors.get(v.name, np.nan)}
                 row |= {f"{v.name} differs": m.differs.get(v.name, np.nan)}
