@@ -146,6 +146,7 @@ if TYPE_CHECKING:
         Simulator as Simulator,
         from_fmu as from_fmu,
         from_function as from_function,
+        from_mujoco as from_mujoco,
     )
     from .studies import campaign as campaign, fleet as fleet, read_run as read_run, run as run
 else:
@@ -173,6 +174,7 @@ _ELSEWHERE = {
     "fleet",
     "fit_report",
     "frequency_subspace",
+    "from_mujoco",
     "generalized_play",
     "inverse_element",
     "kalman_filter",

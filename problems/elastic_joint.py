@@ -1,9 +1,9 @@
 """A motor that drives its link through an elastic gear; the simulator takes the gear for rigid.
 
-The truth is a motor and a hanging link on a spring and a damper, with viscous and dry friction at the motor. The
-simulator has one inertia, gravity, both frictions and a lag of the actuator, all free, so that a refit may hide the
-compliance behind damping and lag. Even seeds record the motor's angle, odd seeds the link's. Every third case is rigid,
-and complete. Values are drawn anew for every seed.
+The truth is a motor and a link on a spring and a damper, with viscous and dry friction at the motor. The simulator has
+one inertia, both frictions and a lag of the actuator, all free, so that a refit may hide the compliance behind damping
+and lag. Even seeds record the motor's speed, odd seeds the link's. Every third case is rigid, and complete. Values are
+drawn anew for every seed.
 
     python -m problems.elastic_joint                20 elastic cases, 10 rigid ones
     python -m problems.elastic_joint --cases 4      4 elastic cases, 2 rigid ones
@@ -31,7 +31,7 @@ def simulator(values: Mapping[str, float], seen: str) -> Simulator:
     """Make the rigid simulator: one inertia with friction behind an actuator with a lag; `seen` is its output."""
 
     def dynamics(x: Any, u: Any, p: Any) -> dict[str, Any]:
-        load = p.d * x.speed + p.F_c * ca.tanh(x.speed / KNEE) + p.G * ca.sin(x.angle)
+        load = p.d * x.speed + p.F_c * ca.tanh(x.speed / KNEE)
         return {"torque": (u.command - x.torque) / p.T, "angle": x.speed, "speed": (x.torque - load) / p.J}
 
     joint = Port(
@@ -42,17 +42,17 @@ def simulator(values: Mapping[str, float], seen: str) -> Simulator:
         unit="N m",
         across_unit="rad",
     )
-    bounds = {"J": (1e-3, 0.5), "d": (0.0, 5.0), "F_c": (0.0, 3.0), "G": (0.5, 20.0), "T": (1e-3, 0.05)}
-    units = {"J": "kg m^2", "d": "N m s/rad", "F_c": "N m", "G": "N m", "T": "s"}
+    bounds = {"J": (1e-3, 0.5), "d": (0.0, 5.0), "F_c": (0.0, 3.0), "T": (1e-3, 0.05)}
+    units = {"J": "kg m^2", "d": "N m s/rad", "F_c": "N m", "T": "s"}
     return Simulator(
         dynamics,
-        lambda x: {seen: x.angle},
+        lambda x: {seen: x.speed},
         states=("torque", "angle", "speed"),
         inputs=("command",),
         parameters={k: Parameter(values[k], unit=units[k], bounds=bounds[k]) for k in units},
         ports=(joint,),
         hold="zero",
-        units={"command": "N m", seen: "rad"},
+        units={"command": "N m", seen: "rad/s"},
     )
 
 
@@ -60,7 +60,6 @@ def recorded(seed: int, elastic: bool) -> tuple[Simulator, Recording, Recording]
     """Draw a machine; return its simulator, with values off by up to a quarter, a training and a test recording."""
     rng = np.random.default_rng([seed, elastic])
     true = {"J": rng.uniform(0.02, 0.06), "d": rng.uniform(0.1, 0.4), "F_c": rng.uniform(0.1, 0.4), "T": 0.003}
-    true["G"] = rng.uniform(3, 6)
     share = rng.uniform(0.3, 0.7)  # of the inertia that is the link's
     resonance, damping = 2 * np.pi * rng.uniform(4, 12), rng.uniform(0.02, 0.1)
     reduced = true["J"] * share * (1 - share)
@@ -84,16 +83,16 @@ def _run(
         friction = p["d"] * speed + p["F_c"] * np.tanh(speed / KNEE)
         lag = (command - torque) / p["T"]
         if spring is None:
-            faster = (torque - friction - p["G"] * np.sin(angle)) / p["J"]
+            faster = (torque - friction) / p["J"]
             return np.array([lag, speed, faster, speed, faster])
         k, c, share = spring
         across = k * (angle - link) + c * (speed - link_speed)
         faster = (torque - friction - across) / (p["J"] * (1 - share))
-        return np.array([lag, speed, faster, link_speed, (across - p["G"] * np.sin(link)) / (p["J"] * share)])
+        return np.array([lag, speed, faster, link_speed, across / (p["J"] * share)])
 
     x, h, y = np.zeros(5), DT / FINE, np.zeros(SAMPLES)
     for i in range(SAMPLES):
-        y[i] = x[1] if seen == "motor" else x[3]
+        y[i] = x[2] if seen == "motor" else x[4]
         for _ in range(FINE):
             k1 = flow(x, u[i])
             k2 = flow(x + h / 2 * k1, u[i])

@@ -16,7 +16,7 @@ import pilfr_casadi as pilfr
 
 ROOT = Path(__file__).parent.parent
 DEMO = ROOT / "pilfr_casadi" / "cli" / "demo_data"
-EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+EXAMPLES = sorted((ROOT / "examples").rglob("*.py"))
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 PAGES = sorted(p.relative_to(ROOT).as_posix() for p in (ROOT / "docs").rglob("*.md"))
 QUICK = {  # pages of about a second; all others are slow
@@ -28,10 +28,13 @@ QUICK = {  # pages of about a second; all others are slow
         "hold",
         "known_physics",
         "look",
+        "mujoco",
         "numpy",
+        "other_domains",
         "own_law",
         "ports",
         "unknown_start",
+        "varying_strength",
     )
 }
 SAID = {
@@ -56,12 +59,17 @@ LONG = {
     "own_law",
     "diagnose",
     "identify",
-}  # examples of more than some seconds
+}  # examples of more than some seconds, as all of the gallery but its quickest
+QUICK_PICTURES = {"plot_06_first_look", "plot_07_operators"}
 COMMAND = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
 
 
+def is_long(path):
+    return path.stem in LONG or (path.parent.name == "gallery" and path.stem not in QUICK_PICTURES)
+
+
 @pytest.mark.parametrize(
-    "path", [pytest.param(p, marks=[pytest.mark.slow] if p.stem in LONG else [], id=p.stem) for p in EXAMPLES]
+    "path", [pytest.param(p, marks=[pytest.mark.slow] if is_long(p) else [], id=p.stem) for p in EXAMPLES]
 )
 def test_example(path, tmp_path):
     done = subprocess.run([sys.executable, path], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True)

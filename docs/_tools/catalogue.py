@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
@@ -21,7 +22,19 @@ KINDS = {
     "curves": "Curves of actuators and sensors",
     "dynamic": "Delays, creep, modes and trends",
     "catalogue": "Forces of speed",
+    "thermal": "Heat flows",
+    "electrical": "Currents and voltages",
 }
+# units of w and z, by the name of a law or by its first domain
+UNITS = {
+    "Overpotential": ("V", "A"),
+    "SaturatingInductance": ("V", "A"),
+    "FreeCurve": ("V", "1"),
+    "thermal": ("W", "K"),
+    "electrical": ("A", "V"),
+    "mechanical": ("N", "m"),
+}
+WARM, HOT = 200.0, 500.0  # amplitude of a temperature difference, and the middle of an absolute temperature, K
 NEAREST = 3  # look-alikes on a page
 SECOND, IN_SERIES = 0.4, 0.5  # in a picture: strengths after the first, and the change of a signal, over its size
 
@@ -34,6 +47,13 @@ def motion() -> Local:
     fade = fade**2 * (3 - 2 * fade)  # no jump of the rate
     z = (1 - 0.65 * fade) * np.sin(2 * np.pi * t) + 0.25 * fade
     return Local(z=z, dz=np.gradient(z, dt), dt=dt, lengths=(len(t),), max_stiffness=1e4, max_damping=1e2)
+
+
+def motion_of(law: type[Law], local: Local) -> Local:
+    """The motion that a law is shown on: temperatures in K for radiation, which is linear over a few K."""
+    if law.id != "radiation":
+        return local
+    return replace(local, z=WARM * local.z + (HOT if law.form == "absolute" else 0.0), dz=WARM * local.dz)
 
 
 def columns(law: type[Law], local: Local) -> np.ndarray:
@@ -78,7 +98,8 @@ def look_alikes(law: type[Law], force: np.ndarray, bases: dict[type[Law], np.nda
     left: dict[str, float] = {}
     size = np.linalg.norm(force)
     for other, base in bases.items():
-        if other.id == law.id or set(other.places).isdisjoint(law.places) or size < 1e-9:
+        apart = bool(other.domains and law.domains) and set(other.domains).isdisjoint(law.domains)
+        if other.id == law.id or apart or set(other.places).isdisjoint(law.places) or size < 1e-9:
             continue
         explained = np.max(np.sum(np.einsum("nsk,n->sk", base, force / size) ** 2, axis=1))
         left[other.id] = min(left.get(other.id, 1.0), float(np.sqrt(max(1 - explained, 0.0))))
@@ -114,9 +135,17 @@ def place(law: type[Law]) -> str:
     return "a sensor" if law.places == ("sensor",) else "an actuator or a sensor"
 
 
+def domains(law: type[Law]) -> str:
+    """Say in what domains a law is tried."""
+    if not law.domains:
+        return ""
+    return f" **Domains:** {', '.join(law.domains)}{'' if law.special else ', and where the domain is unknown'}."
+
+
 def parameter_table(law: type[Law]) -> str:
-    """Write the parameters with their units for a port in N and m, or for a signal in its own unit [u]."""
-    w, z = ("N", "m") if "parallel" in law.places else ("[u]", "[u]")
+    """Write the parameters with their units for a port of the law's domain, or for a signal in its own unit [u]."""
+    own = UNITS.get(law.__name__, UNITS[(*law.domains, "mechanical")[0]])
+    w, z = own if "parallel" in law.places else ("[u]", "[u]")
     rows = [
         (f"``{name}``", readable_unit(unit, w, z) or "1", "strength" if name in law.strength else "shape")
         for name, unit in law().units.items()
@@ -141,7 +170,7 @@ def form_section(law: type[Law], alike: list[tuple[str, float]], several: bool) 
         text.append(f"**Nearest laws** (what they leave of this force, rms): {said}.\n")
     source = f"**Source:** {law.source}. " if law.source else ""
     name = law.__name__ if not law.__name__.endswith("BehindGap") else "behind_gap(CoulombFriction)"
-    text.append(f"{source}**Stands at:** {place(law)}. **In Python:** ``pilfr.laws.{name}``\n")
+    text.append(f"{source}**Stands at:** {place(law)}.{domains(law)} **In Python:** ``pilfr.laws.{name}``\n")
     return "\n".join(text)
 
 
@@ -149,7 +178,8 @@ def page(law_id: str, laws: list[type[Law]], alike: dict[type[Law], list[tuple[s
     """Write the page of one id, with all its forms."""
     name = display_name(law_id)
     title = name[0].upper() + name[1:]
-    port = "ground-mass" if "parallel" in laws[0].places else "actuator:u"
+    force = {"thermal": "surface", "electrical": "coil"}.get((*laws[0].domains, "mechanical")[0], "ground-mass")
+    port = force if "parallel" in laws[0].places else "actuator:u"
     text = [
         heading(title),
         f"A diagnosis says: *The simulator leaves out {name} at {port}.* In results it is ``{law_id}``.\n",
@@ -180,11 +210,11 @@ def escape(text: str) -> str:
 
 
 INTRODUCTION = """\
-The physical laws that `diagnose` tries at each port. Every page has the equation, a picture, the parameters, and the
-laws that it is confused with. The pictures show one motion: two periods at full amplitude, then two small ones about
-another middle. *Nearest laws* are those that follow this law's force best on that motion, beside a free spring and
-damper (behind an actuator or sensor: a free gain and offset). Real recordings decide better than this: ask
-:func:`~pilfr_casadi.check`.
+The physical laws that `diagnose` tries at each port. Some belong to one :doc:`domain </howto/other_domains>` alone.
+Every page has the equation, a picture, the parameters, and the laws that it is confused with. The pictures show one
+motion: two periods at full amplitude, then two small ones about another middle. *Nearest laws* are those that follow
+this law's force best on that motion, beside a free spring and damper (behind an actuator or sensor: a free gain and
+offset). Real recordings decide better than this: ask :func:`~pilfr_casadi.check`.
 
 A law of your own takes :doc:`ten lines </howto/own_law>`. These pages are made from `pilfr.laws` by the build.
 """
@@ -193,7 +223,7 @@ A law of your own takes :doc:`ten lines </howto/own_law>`. These pages are made 
 def build() -> None:
     """Write all pages of the catalogue."""
     local = motion()
-    forces = {law: columns(law, local) for law in CATALOGUE}
+    forces = {law: columns(law, motion_of(law, local)) for law in CATALOGUE}
     bases = {
         law: orthonormal(projected(f, local, "parallel" in law.places))
         for law, f in forces.items()
@@ -203,7 +233,7 @@ def build() -> None:
     alike = {}
     for law, found in forces.items():
         shown = example(law, found)
-        write_figure(f"laws/{law.__name__}.svg", draw(law, shown, local))
+        write_figure(f"laws/{law.__name__}.svg", draw(law, shown, motion_of(law, local)))
         rest = projected(shown[:, None], local, "parallel" in law.places)[:, 0]
         alike[law] = look_alikes(law, rest, bases)
         by_id.setdefault(law.id, []).append(law)

@@ -23,6 +23,7 @@ SETTINGS = {
     "examples_dirs": str(FOLDER),
     "gallery_dirs": "gallery",
     "filename_pattern": "|".join(map(re.escape, RUN)) or "$^",
+    "within_subsection_order": "FileNameSortKey",
     "download_all_examples": False,
     "remove_config_comments": True,
     "show_memory": False,

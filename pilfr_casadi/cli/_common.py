@@ -136,7 +136,7 @@ def simulator_files(metavar: str) -> Any:
     """Make the argument that takes a simulator file and recordings."""
     text = (
         "A Python file that sets `simulator` (or a model.json, or an FMU, which is a program that runs), then training "
-        "recordings (.csv, .mat, .npz)."
+        "recordings (.csv, .mat, .npz, .parquet, .mf4)."
     )
     return typer.Argument(..., metavar=metavar, help=text)
 
@@ -189,17 +189,20 @@ class SimulatorOptions(DataOptions):
         check_given_once(self.recordings)
 
     def load_simulator(self) -> Any:
-        """Return the `simulator` of a Python file, the model of a model.json, or the simulator of an FMU."""
+        """Return the `simulator` of a Python file, the model of a model.json, or that of an FMU or a MuJoCo model."""
         from ..identify import load
-        from ..simulators import simulator_variable
+        from ..simulators import from_mujoco, simulator_variable
 
         path = self.files[0]
         kind = Path(path).suffix.lower()
         if kind == ".fmu":
             return self._load_fmu(path)
-        for name in ("port", "bound"):
+        mechanism = kind in (".xml", ".urdf")
+        for name in ("port",) if mechanism else ("port", "bound"):
             if getattr(self, name):
                 raise InputError(f"--{name} was given, which is for an FMU; {path} has its own, leave it out.")
+        if mechanism:
+            return from_mujoco(path, bounds=bounds_of(self.bound))
         return load(path) if kind == ".json" else simulator_variable(path)
 
     def _load_fmu(self, path: str) -> Any:

@@ -73,7 +73,9 @@ STRUCTURE_NAMES = {"bound": "bounds"}  # options with another name in the struct
 class FitOptions(DataOptions):
     """The options of `pilfr fit`; options of a search have no default, to show which ones were given."""
 
-    train: list[str] = typer.Argument(..., metavar="TRAIN", help="Training recordings (.csv, .mat, .npz).")
+    train: list[str] = typer.Argument(
+        ..., metavar="TRAIN", help="Training recordings (.csv, .mat, .npz, .parquet, .mf4)."
+    )
     inputs: str = option("Names of the inputs.", "NAME[,NAME]", ...)
     outputs: str = option("Names of the outputs.", "NAME[,NAME]", ...)
     test: list[str] = option("Test recording, never fitted (repeatable).", "FILE", [])
@@ -257,7 +259,8 @@ class SimulateOptions(DataOptions):
     data: str = typer.Argument(
         ...,
         metavar="DATA",
-        help="A recording (.csv, .mat, .npz), or several in one array (.npz, .npy: samples, channels, ...).",
+        help="A recording (.csv, .mat, .npz, .parquet, .mf4), or several in one array (.npz, .npy: samples, "
+        "channels, ...).",
     )
     out: str = option("CSV file; for several records also .npz or .npy.", "FILE", ...)
 

@@ -1,4 +1,4 @@
-"""Readers: CSV, ``.mat`` and ``.npz`` files, and frames of pandas or polars, into recordings.
+"""Readers: CSV, ``.mat``, ``.npz``, Parquet and MDF files, and frames of pandas or polars, into recordings.
 
 A file holds one recording: a time column (``t``, ``t_s`` or ``time``, in seconds, uniform) and one column for each
 input and output by name; other columns are ignored. Any fault of a file is reported in one sentence that names the
@@ -117,9 +117,12 @@ def read(path: Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
 def read(
     path: PathLike | Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
 ) -> Recording | tuple[Recording, ...]:
-    """Read recordings with the reader for the file's suffix: .csv, .tsv, .txt or .dat, .mat, .npz.
+    """Read recordings with the reader for the file's suffix.
 
-    Parameters, returned values and errors are those of :func:`read_csv`; files of different kinds may be mixed.
+    The suffixes are .csv, .tsv, .txt or .dat, .mat, .npz, .parquet, .mf4 and .mdf. Parquet files need
+    ``pilfr-casadi[parquet]``, MDF files ``pilfr-casadi[mdf]``. The times of an MDF file's channels are its column
+    ``t``; all channels that are read must have the same. Parameters, returned values and errors are those of
+    :func:`read_csv`; files of different kinds may be mixed.
     """
     return _read_each(path, _Request(inputs, outputs, **options))
 

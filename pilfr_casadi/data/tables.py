@@ -1,4 +1,4 @@
-"""Numbers by column name out of CSV, ``.mat`` and ``.npz`` files, or one sentence with file, column and line.
+"""Numbers by column name out of CSV, MATLAB, NumPy, Parquet and MDF files, or one sentence with file, column and line.
 
 A CSV file is read at once by NumPy, and cell by cell only if that fails, to find the bad cell. Commas, semicolons and
 tabs separate cells; a byte-order mark, Windows line ends, quoted cells and blank lines are accepted. Lines are counted
@@ -98,7 +98,7 @@ class CsvTable:
 
 @dataclass(frozen=True)
 class ArrayTable:
-    """The variables of a ``.mat`` or ``.npz`` file, or the error that reading one raised: it matters only if used."""
+    """The variables of a file other than CSV, or the error that reading one raised: it matters only if used."""
 
     path: Path
     names: tuple[str, ...]
@@ -229,11 +229,75 @@ def _open_npz(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:
     return ArrayTable(path, tuple(arrays), arrays)
 
 
+def _open_parquet(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:
+    """Read the names of a Parquet file's columns; a column is read when it is needed."""
+    with _parsing(path, "a Parquet file", "write it again"):
+        try:
+            from pyarrow import parquet
+        except ImportError:
+            raise InputError(f"{path} is a Parquet file; install pilfr-casadi[parquet] to read it.") from None
+        names = tuple(parquet.read_schema(path).names)
+    return ArrayTable(path, names, _Columns(names, lambda name: _parquet_column(path, names.index(name))))
+
+
+def _parquet_column(path: Path, index: int) -> Array:
+    from pyarrow import parquet
+
+    with parquet.ParquetFile(path) as file:
+        name = file.schema_arrow.names[index]
+        return np.asarray(file.read([name]).column(0).to_numpy())
+
+
+def _open_mdf(path: Path, wanted: Sequence[str] = ()) -> ArrayTable:
+    """Read the `wanted` channels of an MDF file, in physical units, and their common times as ``t``."""
+    with _parsing(path, "an MDF file", "save it again as MDF 4"):
+        try:
+            from asammdf import MDF
+        except ImportError:
+            raise InputError(f"{path} is an MDF file; install pilfr-casadi[mdf] to read it.") from None
+        with MDF(path) as mdf:
+            clocks = {mdf.groups[i].channels[k].name for i, k in mdf.masters_db.items()}
+            names = [name for name in mdf.channels_db if name not in clocks]
+            signals = {name: mdf.get(name) for name in dict.fromkeys(wanted) if name in names}
+            times = [signal.timestamps for signal in signals.values()] or [mdf.get_master(0)]
+    for name, t in zip(signals, times, strict=False):
+        if not np.array_equal(t, times[0]):
+            raise InputError(
+                f"{path}: the channels {next(iter(signals))!r} and {name!r} have different times ({len(times[0])} and "
+                f"{len(t)} samples); write them with one raster, as MDF.resample of asammdf does."
+            )
+    arrays = {"t": times[0], **{name: signal.samples for name, signal in signals.items()}}
+    return ArrayTable(path, tuple(dict.fromkeys(["t", *names])), arrays)
+
+
+class _Columns(Mapping[str, Any]):
+    """Columns that are read when they are needed; if reading one fails, the error is its value."""
+
+    def __init__(self, names: Sequence[str], read: Callable[[str], Array]) -> None:
+        self._names, self._read = names, read
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._names:
+            raise KeyError(name)
+        try:
+            return self._read(name)
+        except Exception as error:  # damaged files and odd types raise many kinds
+            return error
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
 # the function that opens a file, by the file's suffix
 OPENERS: dict[str, Callable[[Path, Sequence[str]], CsvTable | ArrayTable]] = {
     **dict.fromkeys((".csv", ".tsv", ".txt", ".dat"), _open_csv),
     ".mat": _open_mat,
     ".npz": _open_npz,
+    ".parquet": _open_parquet,
+    **dict.fromkeys((".mf4", ".mdf"), _open_mdf),
 }
 STACK_SUFFIXES = (".npz", ".npy")  # files that may hold several records in one array; see `read_stack`
 TABLE_SUFFIXES = (*OPENERS, ".npy")  # files of numbers, which are no simulators

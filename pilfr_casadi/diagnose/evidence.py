@@ -36,7 +36,7 @@ from .._base import InputError, side_by_side
 from ..identify import solve_within_bounds
 from ..laws import Law
 from ..optimise import GaussNewton, Problem
-from ..simulators import Placed
+from ..simulators import MECHANICAL, UNKNOWN, Placed
 from .floor import effective_size
 from .workbench import DIVERGED, Fitted, Workbench
 
@@ -49,6 +49,7 @@ from .workbench import DIVERGED, Fitted, Workbench
 EFFECT_PRIOR = np.log(0.5)  # log probability of each further effect: one more effect is as likely as not
 FLEXIBLE_PRIOR = np.log(0.2)  # the same of a law that can imitate others, relative to a law that cannot
 DOUBTFUL_PRIOR = np.log(0.01)  # the same of parameter values at which a law degenerates into another
+DOMAIN_PRIOR = np.log(4.0)  # the same of a law that belongs to the domain of its port, relative to a general one
 OUTSIDE = 0.1  # probability that missing physics is in no law of the catalogue
 STATE_PRIOR = 1e-9  # precision of initial states relative to the information of a sample: hardly any prior
 
@@ -222,11 +223,17 @@ def prior_width(size: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.nd
     return np.where(np.isfinite(spread) & (spread > 0), spread, size)
 
 
-def log_prior(laws: Sequence[Placed], alternatives: Mapping[str, Sequence[Law]], doubtful: bool = False) -> float:
+def log_prior(
+    laws: Sequence[Placed],
+    alternatives: Mapping[str, Sequence[Law]],
+    doubtful: bool = False,
+    domains: Mapping[str, str] | None = None,
+) -> float:
     """Compute the log prior probability of laws: all ports are alike, in a port all laws, and in a law all its forms.
 
-    One law in several sensors, such as a logger's filters, counts once. `alternatives` are the laws allowed in each
-    port; `doubtful` tells that a law degenerates at its fitted values.
+    At a port of a known domain (`domains`) the laws of that domain are likelier than general ones. One law in several
+    sensors, such as a logger's filters, counts once. `alternatives` are the laws allowed in each port; `doubtful` tells
+    that a law degenerates at its fitted values.
     """
     total = DOUBTFUL_PRIOR if doubtful else 0.0
     in_sensors = set[type[Law]]()
@@ -237,10 +244,20 @@ def log_prior(laws: Sequence[Placed], alternatives: Mapping[str, Sequence[Law]],
             in_sensors.add(type(e.law))
         there = alternatives.get(e.port, ())
         forms = sum(law.id == e.law.id for law in there)
-        total += EFFECT_PRIOR - np.log(max(len(alternatives), 1)) - np.log(max(len({law.id for law in there}), 1))
-        total -= np.log(max(forms, 1))
+        total += EFFECT_PRIOR - np.log(max(len(alternatives), 1)) - np.log(max(forms, 1))
+        total += _log_share(e.law.id, there, (domains or {}).get(e.port, UNKNOWN))
         total += FLEXIBLE_PRIOR if e.law.flexible else 0.0
     return float(total)
+
+
+def _log_share(law: str, there: Sequence[Law], domain: str) -> float:
+    """Compute the log probability of a law by its id among the laws allowed in a port of some domain.
+
+    At a mechanical port the general laws are at home as well.
+    """
+    own = {other.id for other in there if domain in other.domains} if domain != MECHANICAL else set[str]()
+    total = sum(np.exp(DOMAIN_PRIOR) if name in own else 1.0 for name in {other.id for other in there})
+    return float((DOMAIN_PRIOR if law in own else 0.0) - np.log(max(total, 1.0)))
 
 
 def log_evidence(v: float, information: np.ndarray, prior: float, n: float) -> float:

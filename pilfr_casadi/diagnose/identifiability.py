@@ -407,7 +407,7 @@ def assess_laws(
 
 def _laws_at(port: Port, laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
     """Return the laws allowed at a port; from the catalogue only the first form of each, since finer ones are alike."""
-    placed = [law for law in (CATALOGUE if laws is None else laws) if port.kinds & set(law.places)]
+    placed = [law for law in (CATALOGUE if laws is None else laws) if port.admits(law)]
     first = {law.id: law for law in reversed(placed)}
     return tuple(law for law in placed if laws is not None or law is first[law.id])
 

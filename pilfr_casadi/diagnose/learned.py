@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -29,7 +29,7 @@ from .._base import InputError, side_by_side
 from ..laws import SCALABLE, Law, Local, display_name, scheduled, unit_forces
 from ..models import Parameter, play
 from .force_recovery import law_signals
-from .linearise import linearised
+from .linearise import linearised, port_signals
 from .screen import Remainder, Task, fit_shapes, held_out_squares, lengths, ridge_solution, start_values, usable
 from .workbench import FEW, LONG, Fitted, Workbench
 
@@ -360,12 +360,12 @@ def nearest_to_learned(bench: Workbench, fitted: Fitted, laws: Collection[type[L
     """
     element = fitted.simulator.elements[-1]
     z, dz, force = signals_along(bench, fitted)
-    local = bench.local(z, dz)
-    kinds = bench.simulator.port(element.port).kinds
-    tried = [law for law in laws if kinds & set(law.places)]
-    for law in SCALABLE if "parallel" in kinds else ():
+    local = replace(bench.local(z, dz), inputs=port_signals(bench, fitted, element.port).inputs)
+    port = bench.simulator.port(element.port)
+    tried = [law for law in laws if port.admits(law)]
+    for law in SCALABLE if "parallel" in port.kinds else ():
         signals = [element.law.factor] * bool(element.law.factor) + ["z"] * law.dissipative
-        tried += [scheduled(law, by) for by in signals if law in laws]
+        tried += [scheduled(law, by) for by in signals if law in laws and port.admits(law)]
     return nearest_laws(local, force, tried)
 
 

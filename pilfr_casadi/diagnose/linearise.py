@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -111,6 +111,8 @@ class Run:
         Local signals.
     u : array, shape (M, n_u)
         Inputs.
+    own : array, shape (M, n)
+        The ports' own signals.
     sign : array, shape (n_ports,)
         +1 if a positive force opposes the port's motion, -1 if it drives it, 0 if neither.
     back : array, shape (n_ports,)
@@ -130,6 +132,7 @@ class Run:
     z: np.ndarray
     dz: np.ndarray
     u: np.ndarray
+    own: np.ndarray
     sign: np.ndarray
     back: np.ndarray
     lift: np.ndarray
@@ -176,17 +179,19 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
             whole[begin // n : begin // n + len(v)] = v
     a, b, c, d, y = kept
     mean = tuple(sum(v) / len(states) for v in zip(*means, strict=True))
-    z, dz, lift, push = local_signals(bench, probe.local, states[::n, : probe.n_x], r, p[: len(p) - len(probe.ports)])
+    along_run = states[::n, : probe.n_x]
+    z, dz, lift, push, own = local_signals(bench, probe.local, along_run, r, p[: len(p) - len(probe.ports)])
     moved, sign = np.abs(lift).max(axis=0) > 0, -np.sign(np.median(push, axis=0))
     sense = {"sign": np.where(moved, 0.0, sign), "back": np.where(moved, -np.sign(np.median(lift, axis=0)), sign)}
     felt = {"lift": np.abs(lift).max(axis=0), "push": np.abs(push).max(axis=0)}
-    return Run(a, b, c, d, mean, error=y - r.y, z=z, dz=dz, u=r.u, **sense, **felt, from_zero=r.begins == "zero")
+    rest = r.begins == "zero"
+    return Run(a, b, c, d, mean, error=y - r.y, z=z, dz=dz, u=r.u, own=own, **sense, **felt, from_zero=rest)
 
 
 def local_signals(
     bench: Workbench, local: ca.Function, states: np.ndarray, r: Recording, p: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Compute z, dz, lift and push of every port, (M, n_ports) each, along states (M, n_x) and a recording's inputs.
+    """Compute z, dz, lift, push (M, n_ports) and own signals of every port along states (M, n_x) and inputs.
 
     `local` is the function of `simulators.signals`.
     """
@@ -308,6 +313,28 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
     with np.errstate(divide="ignore", over="ignore"):  # a force that does not move the port has no limit
         max_stiffness, max_damping = np.where(lift > 0, rate / lift, rate**2 / push), rate / push
     inputs = dict(zip(bench.simulator.inputs, np.concatenate([r.u for r in runs]).T, strict=True))
+    own = own_signals(bench.simulator, np.concatenate([r.own for r in runs]))
     rest = tuple(r.from_zero for r in runs)
     pairs = enumerate(zip(max_stiffness.tolist(), max_damping.tolist(), strict=True))
-    return [Local(z[:, j], dz[:, j], bench.dt, lengths, k, d, inputs, rest) for j, (k, d) in pairs]
+    return [Local(z[:, j], dz[:, j], bench.dt, lengths, k, d, {**inputs, **own[j]}, rest) for j, (k, d) in pairs]
+
+
+def own_signals(simulator: Simulator, values: np.ndarray) -> list[dict[str, np.ndarray]]:
+    """Divide the ports' own signals (M, n) into those of each port, by name."""
+    columns = iter(values.T)
+    return [{name: next(columns) for name in port.signals} for port in simulator.all_ports()]
+
+
+def port_signals(bench: Workbench, fitted: Fitted, port: str) -> Local:
+    """Compute the local signals of a port along the fitted runs of all recordings."""
+    simulator, model = fitted.simulator, fitted.model
+    index = [p.name for p in simulator.all_ports()].index(port)
+    function, parts = signals(simulator), []
+    for r, state in zip(bench.recordings, fitted.initial, strict=True):
+        with np.errstate(over="ignore", invalid="ignore"):
+            x = states_along(model, model.drive(r), fitted.vector, state)[:: model.substeps, : len(simulator.states)]
+            z, dz, *_, own = local_signals(bench, function, x, r, fitted.vector)
+        parts.append((z[:, index], dz[:, index], own))
+    z, dz, own = (np.concatenate([part[k] for part in parts]) for k in (0, 1, 2))
+    local = bench.local(z, dz)
+    return replace(local, inputs={**local.inputs, **own_signals(simulator, own)[index]})

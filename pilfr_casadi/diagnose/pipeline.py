@@ -165,6 +165,7 @@ def diagnose_in_steps(
     if request.stretches is not None:
         with search.stage("fits to all recordings"):
             everything = Everything.of(search, request.stretches, ready.gates)
+        request = replace(request, notes=(request.stretches.note(everything is not None), *request.notes))
     with search.stage("conclusion"):
         found = conclude(search, (*request.notes, *ready.gates))
     final = _final_fits(request, ready, search, found, everything)
@@ -182,7 +183,7 @@ def _on_stretches(request: Request, most: int) -> Request:
     chosen = choose_stretches(request.simulator, recordings, hold, request.engine, most, request.workers)
     stretches = Stretches(recordings, chosen)
     request.say("choice of stretches", 1, 1)
-    notes = (*request.notes, stretches.note, *spikes, *transients)
+    notes = (*request.notes, *spikes, *transients)
     return replace(request, recordings=stretches.cut(), stretches=stretches, notes=notes)
 
 

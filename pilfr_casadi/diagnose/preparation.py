@@ -15,7 +15,7 @@ import numpy as np
 from .._base import InputError, Stages, listed
 from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
 from ..identify import match_channels
-from ..laws import CATALOGUE, SCALABLE, Law, scaled
+from ..laws import CATALOGUE, SCALABLE, Law, scaled, scheduled
 from ..simulators import Simulator, as_simulator
 from .floor import Floor, white_part
 from .gates import (
@@ -260,8 +260,13 @@ def check_laws(laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
 
 
 def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[type[Law], ...]:
-    """Return the laws, and scaled versions of some of them for each input that the equations do not read."""
-    return (*laws, *(scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs))
+    """Return the laws, and versions of some of them whose strength varies with a signal.
+
+    An input that the equations do not read may scale a law; with a port's own signals its strength may vary.
+    """
+    some, own = [law for law in SCALABLE if law in laws], {name for port in simulator.ports for name in port.signals}
+    by_input = (scaled(law, by) for law in some for by in simulator.idle_inputs)
+    return (*laws, *by_input, *(scheduled(law, by) for law in some for by in sorted(own)))
 
 
 def check_limits(simulator: Simulator, limits: Mapping[str, float] | None) -> None:

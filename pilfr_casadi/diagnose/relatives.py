@@ -27,9 +27,9 @@ from typing import Any
 import numpy as np
 
 from ..laws import Attached, Delay, Lag, Law, Local, Resonance, unit_forces
-from ..simulators import in_series, signals, states_along
+from ..simulators import in_series
 from .evidence import FAR, NEAR
-from .linearise import local_signals
+from .linearise import port_signals
 from .screen import HUGE, Dose, Pair, Remainder, Scored, fit_shapes, held_out, orthonormal, start_values
 from .trials import Trial, Trials, place_law
 from .workbench import BRIEF, FEW, Fitted, Workbench
@@ -185,20 +185,6 @@ def _matching_forces(bench: Workbench, trials: Sequence[Trial], scored: Sequence
         found = [(*_match_force(s.law, local, force), s) for s in entries]
     ranked = sorted((f for f in found if f[0] < 1), key=lambda f: f[0])[:FEW]
     return [replace(s, starts=(start, *s.starts)) for _, start, s in ranked]
-
-
-def port_signals(bench: Workbench, fitted: Fitted, port: str) -> Local:
-    """Compute the local signals of a port along the fitted runs of all recordings."""
-    simulator, model = fitted.simulator, fitted.model
-    index = [p.name for p in simulator.all_ports()].index(port)
-    own, parts = signals(simulator), []
-    for r, state in zip(bench.recordings, fitted.initial, strict=True):
-        with np.errstate(over="ignore", invalid="ignore"):
-            x = states_along(model, model.drive(r), fitted.vector, state)[:: model.substeps, : len(simulator.states)]
-            z, dz, *_ = local_signals(bench, own, x, r, fitted.vector)
-        parts.append((z[:, index], dz[:, index]))
-    z, dz = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
-    return bench.local(z, dz)
 
 
 def _match_force(law: Law, local: Local, force: np.ndarray) -> tuple[float, dict[str, Any]]:

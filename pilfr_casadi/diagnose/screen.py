@@ -187,7 +187,7 @@ def _tasks(bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list
         port = by_name[name]
         if not np.ptp(local.z) > 0 or name.removeprefix("equation:") in bench.simulator.kinematic:
             continue
-        chosen = [law() for law in laws if port.kinds & set(law.places)]
+        chosen = [law() for law in laws if port.admits(law)]
         pairs = [(law, list(law.shapes(local))) for law in chosen if usable(law, local)]
         if pairs:
             out.append(Task(j, port, local, part, pairs))

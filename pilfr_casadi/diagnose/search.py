@@ -196,7 +196,13 @@ class Search:
 
     def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
         known = trial.information if trial.information is not None else np.zeros(0)
-        return log_evidence(v + self.tolerance, known, log_prior(trial.laws, self.alternatives, trial.doubtful), n)
+        prior = log_prior(trial.laws, self.alternatives, trial.doubtful, self.domains)
+        return log_evidence(v + self.tolerance, known, prior, n)
+
+    @cached_property
+    def domains(self) -> dict[str, str]:
+        """The physical domain of each port, by name."""
+        return {port.name: port.domain for port in self.bench.simulator.all_ports()}
 
     def held_out(self, trial: Trial) -> HeldOut:
         """Compute the held-out errors of a hypothesis, once."""

@@ -10,8 +10,8 @@ each candidate stretch gets features, and the stretches are chosen far apart in 
   relaxation; the catalogue's laws are near their span.
 - Amplitude, rate and operating point of each channel.
 
-A stretch from within a recording begins with a warm-up, samples that are simulated but not scored, and its initial
-state is estimated.
+The initial state of a stretch from within a recording is estimated, with the memory of laws. All its samples are
+scored: a state before unscored samples is hardly determined, and could be far outside the recorded range.
 
 The leading hypotheses are then fitted to everything, by normal equations that are summed over the recordings piece by
 piece (`optimise.Problem.normal`), so that memory does not grow with their length. A hypothesis that everything refutes
@@ -42,12 +42,11 @@ from .screen import Remainder, Surface, Task, orthonormal
 from .search import Findings, Search, likeliest
 from .timing import Jump
 from .trials import Trial
-from .workbench import FEW, Fitted, Workbench
+from .workbench import DIVERGED, FEW, Fitted, Workbench
 
 MOST_SAMPLES = 60_000  # samples of the training recordings up to which everything is searched: effort
 SHARE, COUNT = 2 / 3, 10  # share of these samples that the stretches have together, and their largest number
 SHORTEST = 500  # least length of a stretch in samples: a law with memory needs some history
-WARM_UP = 0.05  # share of a stretch that is simulated before it and not scored
 CANDIDATES = 300  # stretches that are linearised at most
 LINEARISED = 1000  # samples of each that are linearised
 FAMILIES = (Surface, StopHysteresis, Creep)  # forces near whose span the catalogue's laws are
@@ -66,19 +65,13 @@ class Stretch:
     def __len__(self) -> int:
         return self.end - self.begin
 
-    @property
-    def first(self) -> int:
-        """First sample of the warm-up before it."""
-        return max(self.begin - int(WARM_UP * len(self)), 0)
-
     def cut(self, recordings: Sequence[Recording]) -> Recording:
-        """Cut the stretch out of its recording, with a warm-up before it; a whole recording is returned as it is."""
+        """Cut the stretch out of its recording; a whole recording is returned as it is."""
         r = recordings[self.recording]
         if len(self) == len(r):
             return r
-        piece = r.slice(self.first, self.end)
-        name = f"{r.name or f'recording {self.recording + 1}'} from {self.first * r.dt:.6g} s"
-        return piece.with_(skip=max(piece.skip, self.begin - self.first), name=name)
+        name = f"{r.name or f'recording {self.recording + 1}'} from {self.begin * r.dt:.6g} s"
+        return r.slice(self.begin, self.end).with_(name=name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,16 +85,21 @@ class Stretches:
         """Cut the chosen stretches out of the recordings."""
         return tuple(s.cut(self.recordings) for s in self.chosen)
 
-    @property
-    def note(self) -> Gate:
-        """Say how much was searched."""
+    def note(self, fitted_to_all: bool = True) -> Gate:
+        """Say how much was searched, and whether the final fits use everything."""
         lengths = sorted({len(s) for s in self.chosen})
         size = f"{lengths[0]}" if len(lengths) == 1 else f"{lengths[0]} to {lengths[-1]}"
         total, count = sum(map(len, self.recordings)), len(self.chosen)
         of = f"{total} samples" if len(self.recordings) == 1 else f"{len(self.recordings)} recordings, {total} samples"
         sentence = (
             f"The search ran on {count} stretch{'es' if count > 1 else ''} of {size} samples, chosen from {of} by what "
-            "they tell of missing forces; the final fits use everything."
+            "they tell of missing forces; "
+        )
+        sentence += (
+            "the final fits use everything."
+            if fitted_to_all
+            else "from the whole recordings the refitted simulation runs away, so that values and errors are those of "
+            "the stretches."
         )
         return Gate("recordings", "stretches", sum(map(len, self.chosen)), sentence, corrected=False)
 
@@ -118,7 +116,7 @@ class Stretches:
 
     def _cut_at_gaps(self, recordings: list[Recording], gap: Jump) -> list[Recording]:
         """Cut the recordings where samples are missing in a stretch."""
-        places = [(self.chosen[i].recording, self.chosen[i].first + k) for i, k in gap.places]
+        places = [(self.chosen[i].recording, self.chosen[i].begin + k) for i, k in gap.places]
         for i, k in sorted(places, reverse=True):
             r = recordings[i]
             later = r.slice(k).with_(initial="estimate", period=None, name=f"{r.name} from {k * r.dt:.6g} s".strip())
@@ -310,16 +308,24 @@ class Everything:
     fits: dict[Fitted, Fitted]
 
     @classmethod
-    def of(cls, search: Search, stretches: Stretches, gates: Sequence[Gate]) -> Everything:
+    def of(cls, search: Search, stretches: Stretches, gates: Sequence[Gate]) -> Everything | None:
         """Fit the leading hypotheses of a search to everything, and drop from its memo those that everything refutes.
 
-        After an interrupt, or past the deadline, their values stay as they are.
+        After an interrupt, or past the deadline, their values stay as they are. None if the refitted simulator runs
+        away from the whole recordings.
         """
         whole = stretches.everything(search.bench, gates)
         leading = [t for t in likeliest(list(search.memo.values()), search.evidence) if t.laws][:FEW]
         trials = [search.root, *leading]
         limit = _seconds_left(search) / 2  # the rest is for the simulators that the conclusion adds
-        fits = side_by_side(lambda t: fit_to_all(whole, t.fitted, limit), trials, search.workers)
+        try:
+            fits = side_by_side(lambda t: fit_to_all(whole, t.fitted, limit), trials, search.workers)
+        except KeyboardInterrupt:
+            search.interrupted = True
+            fits = [fit_to_all(whole, t.fitted, 0.0) for t in trials]
+        search.interrupted = search.interrupted or bool(whole.interrupted_fits)
+        if not fits[0].cost < DIVERGED:
+            return None
         there = replace(search, bench=whole, memo={}, steps=[], findings=defaultdict(Findings))
         for trial, fitted in zip(trials, fits, strict=True):
             there.keep(Trial(trial.laws, fitted, fitted.cost, fitted.cost, True))
@@ -336,6 +342,7 @@ class Everything:
         """Return the fit to everything of a simulator fitted to the stretches."""
         if fitted not in self.fits:
             self.fits[fitted] = fit_to_all(self.bench, fitted, _seconds_left(search))
+            search.interrupted = search.interrupted or bool(self.bench.interrupted_fits)
         return self.fits[fitted]
 
 

@@ -244,13 +244,15 @@ class Trials:
         starts: list[Mapping[str, Any]] = []
         # values from the observer's run, which may be near the truth if the simulation is not
         observed: list[Mapping[str, Any]] = []
+        given: list[Mapping[str, Any]] = []  # with the user's own values of the simulator's parameters
         for entry in entries:
             for i, own in enumerate(entry.starts):
                 _, named = place_law(base.simulator, entry, own)
                 starts.append({**base.values, **named})
                 if i == 0:
                     observed += [starts[-1]] if entry.source == "observer" else []
-                    starts.append({**nominal, **named})
+                    given.append({**nominal, **named})
+                starts.append(given[-1])
         if set(first.law.parameters()) == set(first.law.strength):  # at zero strength the simulator is unchanged
             _, named = place_law(base.simulator, first, {k: 0.0 * np.asarray(v) for k, v in first.starts[0].items()})
             starts.append({**base.values, **named})
@@ -260,6 +262,10 @@ class Trials:
         count = len(parent.laws) + 1
         options = {"states": base.begin, "model": model, "engine": engine}
         brief = self.fitted(placed, ranked[:1], count, solver=BRIEF, **options)
+        if first.law.special:  # the refit may be far off where the missing force is strongly curved
+            afresh = [s for s in ranked if any(s is n for n in given)][:1]
+            again = self.fitted(placed, afresh, count, solver=BRIEF, **{**options, "states": ()})
+            brief = min((t for t in (brief, again) if t is not None), key=lambda t: t.part, default=None)
         return _BriefFit(placed, options, ranked, count, brief)
 
     def _refine(self, pairs: Sequence[_BriefFit], observer: bool, pool: ThreadPoolExecutor) -> Iterator[Trial | None]:
@@ -312,12 +318,15 @@ def _head(r: Recording, share: float) -> Recording:
 
 
 def select_pairs(scored: Sequence[Scored], best: int) -> list[list[Scored]]:
-    """Select the pairs worth a full fit: the best of both lists and the best of each port."""
+    """Select the pairs worth a full fit: the best of both lists, the best of each port, and the laws of its domain.
+
+    The forces of these special laws are so curved that a small dose may tell little of them.
+    """
     chosen: dict[Pair, list[Scored]] = {}
     for source in ("simulation", "observer"):
         ports, passed = set[str](), list[Scored]()
         for s in (s for s in scored if s.source == source):
-            if len(passed) < best or s.port not in ports:
+            if len(passed) < best or s.port not in ports or s.law.special:
                 chosen.setdefault(s.pair, [])
             if not any(_is_redundant(s, other) for other in passed):  # two forms of one law are one hypothesis
                 passed.append(s)

@@ -2,8 +2,9 @@
 
 `base` holds the class `Law` and shows how to add a law in ten lines. Laws are grouped by kind: `stiffness` (springs,
 contacts, gaps, periodic forces), `friction` (forces of speed), `hysteresis` (loops), `curves` (saturation and other
-curves of actuators and sensors), and `dynamic` (delays, creep, modes, trends). `catalogue` lists the laws that a
-diagnosis tries and composes laws (scaled, scheduled, behind a gap); `forces` evaluates laws along given signals.
+curves of actuators and sensors), `dynamic` (delays, creep, modes, trends), and those of one domain, `thermal` and
+`electrical`. `catalogue` lists the laws that a diagnosis tries and composes laws (scaled, scheduled, behind a gap).
+`forces` evaluates laws along given signals.
 """
 
 from typing import TYPE_CHECKING
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
         AsymmetricSaturation as AsymmetricSaturation,
         Cubic as Cubic,
         DeadZone as DeadZone,
+        Exponential as Exponential,
+        FreeCurve as FreeCurve,
         GradualSaturation as GradualSaturation,
         Magnitude as Magnitude,
         Orifice as Orifice,
@@ -52,6 +55,13 @@ if TYPE_CHECKING:
         Swing as Swing,
         TwoStageCreep as TwoStageCreep,
         TwoStageRelaxation as TwoStageRelaxation,
+    )
+    from .electrical import (
+        Clamp as Clamp,
+        Diode as Diode,
+        Overpotential as Overpotential,
+        ReversedDiode as ReversedDiode,
+        SaturatingInductance as SaturatingInductance,
     )
     from .forces import count_columns as count_columns, unit_forces as unit_forces
     from .friction import (
@@ -99,6 +109,11 @@ if TYPE_CHECKING:
         SlackCoupling as SlackCoupling,
         SlackSpring as SlackSpring,
         SoftClearance as SoftClearance,
+    )
+    from .thermal import (
+        AbsoluteRadiation as AbsoluteRadiation,
+        Convection as Convection,
+        Radiation as Radiation,
     )
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -147,6 +147,12 @@ class Law:
         Values of parameters before any are given; otherwise strengths are zero and shapes one.
     places : tuple of {"parallel", "series", "sensor"}
         Allowed places: inside the dynamics, at an actuator or a sensor, or at a sensor alone.
+    domains : tuple of {"mechanical", "thermal", "electrical", "fluid"}
+        Physical domains in which it occurs; left out, all of them.
+    special : bool
+        It is tried at ports of its domains alone, and not where the domain is unknown.
+    across : str
+        Unit that the local coordinate of a special law can be converted to, such as "V"; left out, any.
     dissipative, restoring : bool
         The force always opposes the motion, or always pushes back towards z = 0. This fixes the sign of all strengths
         except those in `signed`.
@@ -195,6 +201,9 @@ class Law:
     ranges: ClassVar[Mapping[str, Tried]] = {}
     defaults: ClassVar[Mapping[str, Any]] = {}
     places: ClassVar[tuple[str, ...]] = ("parallel",)
+    domains: ClassVar[tuple[str, ...]] = ()
+    special: ClassVar[bool] = False
+    across: ClassVar[str] = ""
     dissipative: ClassVar[bool] = False
     restoring: ClassVar[bool] = False
     two_sided: ClassVar[bool] = False

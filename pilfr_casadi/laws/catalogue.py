@@ -12,10 +12,11 @@ from collections.abc import Iterator
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from .._base import InputError
 from ..models import Named, Parameter
-from . import curves, dynamic, friction, hysteresis, stiffness
+from . import curves, dynamic, electrical, friction, hysteresis, stiffness, thermal
 from .base import Law, Local, contact_onset
 
 GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
@@ -50,7 +51,7 @@ def scheduled(law: type[Law], by: str) -> type[Law]:
     law : class of Law
         Any law that may act in parallel, as a force.
     by : str
-        An input of the simulator, or "z", the local coordinate.
+        An input of the simulator, one of the port's own `signals`, or "z", the local coordinate.
 
     Raises
     ------
@@ -92,6 +93,13 @@ def _parallel(law: Any) -> Any:
     return law
 
 
+def _not_there(by: str, local: Local) -> str:
+    """Say why a signal cannot vary a strength at a port; empty if it can."""
+    if by not in local.inputs:
+        return f"the port has no signal {by}"
+    return "" if np.ptp(local.inputs[by]) > 0 else f"{by} is constant"
+
+
 @functools.cache  # the same class for the same arguments
 def _scaled(base: Any, by: str) -> Any:
     strengths = {name: f"{unit}/[{by}]" if name in base.strength else unit for name, unit in base.units.items()}
@@ -104,6 +112,10 @@ def _scaled(base: Any, by: str) -> Any:
         places = ("parallel",)
         dissipative = restoring = False  # the signal may have either sign
         scaled_by = by
+
+        def why_not(self, local: Local) -> str:
+            """Say why the data carries no information on this law; empty if it does."""
+            return super().why_not(local) or _not_there(by, local)
 
     return _name(Scaled, f"{base.__name__}ScaledBy_{by}", f"{base.__doc__}\n\n    Its strength is scaled by {by}.")
 
@@ -129,6 +141,10 @@ def _scheduled(base: Any, by: str) -> Any:
         strength = (*base.strength, *high.values())
         places = ("parallel",)
         scheduled_by = by
+
+        def why_not(self, local: Local) -> str:
+            """Say why the data carries no information on this law; empty if it does."""
+            return super().why_not(local) or ("" if by == "z" else _not_there(by, local))
 
         def parameters(self) -> dict[str, Parameter]:
             """Parameters, of which the ends of the signal's range are fixed."""
@@ -213,7 +229,7 @@ FINER: dict[type[Law], tuple[Any, ...]] = {
 CATALOGUE: tuple[type[Law], ...] = (
     *(
         law
-        for file in (stiffness, friction, hysteresis, curves, dynamic)
+        for file in (stiffness, friction, hysteresis, curves, dynamic, thermal, electrical)
         for law in vars(file).values()
         if isinstance(law, type) and issubclass(law, Law) and hasattr(law, "id") and (law,) not in FINER.values()
     ),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from ..models import Parameter
 from .base import Law, Local
 
 STRAIGHT = 0.03  # difference of a power from one, below which it is a gain
@@ -144,6 +146,72 @@ class Orifice(Root):
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Never: its power is known."""
         return False
+
+
+class Exponential(Polynomial):
+    """An exponential of the signal, such as an equal-percentage valve or a thermistor, from zero to its end R."""
+
+    form = "exponential"
+    equation = "w = R (exp(c u) - 1) / (exp(c R) - 1) - u"
+    source = (
+        "Liptak (2006), Instrument Engineers' Handbook, vol. 2, ch. 6; Steinhart & Hart (1968), Deep-Sea Res. 15(4)"
+    )
+    sentence = "a memoryless curve: the gain grows exponentially with the signal, as of an equal-percentage valve"
+    units = {"c": "1/z", "R": "z"}
+    strength = ()
+    domains = ("thermal", "electrical", "fluid")
+    special = True
+    starts = {
+        "c": lambda at: np.array([-3.0, -1.0, 1.0, 3.0]) / at.reach,
+        "R": lambda at: (at.high if at.high > -at.low else at.low,),
+    }
+    ranges = {"c": lambda at: (-8.0 / at.reach, 8.0 / at.reach)}
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.R * (ca.exp(p.c * z) - 1) / (ca.exp(p.c * p.R) - 1) - z
+
+    def parameters(self) -> dict[str, Parameter]:
+        """Curvature, and the fixed end of the signal."""
+        out = super().parameters()
+        return {**out, "R": replace(out["R"], fixed=True)}
+
+
+class FreeCurve(Law):
+    """A smooth curve through zero of a shape that no formula has, such as an open-circuit voltage over the charge."""
+
+    id = "static_curve"
+    flexible = True
+    form = "free"
+    equation = "w = sum_i c_i (T_i(x) - T_i(x_0)),  i = 2..9,  x = (z - z_m) / z_h,  x_0 = -z_m / z_h"
+    source = "Plett (2015), Battery Management Systems, vol. 1, sec. 2.2; Press et al. (2007), sec. 5.8"
+    sentence = "a memoryless curve of a free shape, such as an open-circuit voltage over the state of charge"
+    units = {"c": "w", "z_m": "z", "z_h": "z"}
+    strength = ("c",)
+    domains = ("electrical", "fluid")
+    special = True
+    degrees = tuple(range(2, 10))  # an offset and a slope are parameters of the simulator; nine follow a narrow knee
+
+    def force(self, z: Any, p: Any) -> Any:
+        terms, at_zero = (_chebyshev((at - p.z_m) / p.z_h, max(self.degrees)) for at in (z, 0.0))
+        return sum(p.c[k] * (terms[i] - at_zero[i]) for k, i in enumerate(self.degrees))
+
+    def parameters(self) -> dict[str, Parameter]:
+        """Coefficients, and the fixed middle and half of the range."""
+        out = super().parameters()
+        c = replace(out["c"], value=np.broadcast_to(out["c"].value, len(self.degrees)))
+        return {"c": c, **{k: replace(out[k], fixed=True) for k in ("z_m", "z_h")}}
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        low, high = min(local.low, 0.0), max(local.high, 0.0)
+        yield {"z_m": (low + high) / 2, "z_h": max((high - low) / 2, 1e-300)}
+
+
+def _chebyshev(x: Any, degree: int) -> list[Any]:
+    """Chebyshev polynomials of the first kind, from degree 0 to `degree`."""
+    out = [1.0, x]
+    for _ in range(degree - 1):
+        out.append(2 * x * out[-1] - out[-2])
+    return out
 
 
 class Saturation(Law):

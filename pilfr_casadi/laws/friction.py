@@ -30,6 +30,7 @@ class CoulombFriction(Law):
     source = "Armstrong-Hélouvry, Dupont & Canudas de Wit (1994), Automatica 30(7)"
     sentence = "dry friction: a force that opposes motion and hardly depends on speed"
     units = {"F_c": "w", "v_0": "z/s"}
+    domains: ClassVar[tuple[str, ...]] = ("mechanical",)
     dissipative = True
     knee = "v_0"
     starts = {"v_0": ("speed", 0.005, 0.02, 0.06, 0.15)}
@@ -82,6 +83,7 @@ class PreslidingFriction(Law):
     source = "Jenkins (1962); Al-Bender & Swevers (2008), IEEE Control Syst. 28(6)"
     sentence = "dry friction whose contact springs back a little before it slides"
     units = {"k_t": "w/z", "r": "z"}
+    domains: ClassVar[tuple[str, ...]] = ("mechanical",)
     dissipative = True
     memory = 1
     starts = {"r": ("half", 0.003, 0.01, 0.03, 0.1, 0.25)}

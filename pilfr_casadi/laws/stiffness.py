@@ -1,4 +1,8 @@
-"""Memoryless forces of the local coordinate: springs, contacts, gaps, and forces that repeat with position."""
+"""Memoryless forces of the local coordinate: springs, contacts, gaps, and forces that repeat with position.
+
+The plain powers, contacts and gaps occur in all domains (a curve, an overflow, a threshold); the finer forms of springs
+are mechanical. Elsewhere there is `FreeCurve`.
+"""
 
 from __future__ import annotations
 
@@ -52,6 +56,7 @@ class PowerStiffness(CubicStiffness):
     form = "power"
     equation = "w = k_n sign(z) |z|^n"
     units = {"k_n": "w/z^n", "n": ""}
+    domains = ("mechanical",)
     starts = {"n": ("", 2.0, 2.5, 4.0)}
     ranges = {"n": ("", 1.7, 6.0)}
 
@@ -66,6 +71,7 @@ class GeometricStiffness(CubicStiffness):
     equation = "w = k z (1 - L / sqrt(L^2 + z^2))"
     source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 2.1"
     units = {"k": "w/z", "L": "z"}
+    domains = ("mechanical",)
     restoring = True  # with either sign it could follow any curve together with a plain spring
     starts = {"L": ("reach", 0.15, 0.4, 1.0)}
     ranges = {"L": ("reach", 0.03, 3)}
@@ -80,6 +86,7 @@ class QuinticStiffness(CubicStiffness):
     form = "quintic"
     equation = "w = k_3 z^3 + k_5 z^5"
     units = {"k_3": "w/z^3", "k_5": "w/z^5"}
+    domains = ("mechanical",)
     two_sided = True  # on one side alone the powers follow any curve, such as contacts and weirs
 
     def force(self, z: Any, p: Any) -> Any:
@@ -105,6 +112,7 @@ class ProgressiveStiffness(QuadraticStiffness):
     form = "progressive"
     equation = "w = k_2 (z^2 + b z^3)"
     units = {"k_2": "w/z^2", "b": "1/z"}
+    domains = ("mechanical",)
     two_sided = True
     starts = {"b": lambda at: (-0.5 / at.reach, 0.5 / at.reach)}
     ranges = {"b": lambda at: (-1 / at.reach, 1 / at.reach)}  # the cubic part stays below the quadratic one
@@ -150,6 +158,7 @@ class HertzContact(PiecewiseStiffness):
     equation = "w = k_c max(z - g, 0)^1.5"
     source = "Johnson (1985), Contact Mechanics, ch. 4"
     units = {"k_c": "w/z^1.5", "g": "z"}
+    domains = ("mechanical",)
     ranges = {**PiecewiseStiffness.ranges, "k_c": _hertz_limits}
 
     def force(self, z: Any, p: Any) -> Any:
@@ -212,6 +221,7 @@ class SoftClearance(Clearance):
     equation = "w = k_g sign(z) max(|z| - g, 0)^1.5"
     source = "Johnson (1985), Contact Mechanics, ch. 4"
     units = {"k_g": "w/z^1.5", "g": "z"}
+    domains = ("mechanical",)
     ranges = {**Clearance.ranges, "k_g": _hertz_limits}
 
     def force(self, z: Any, p: Any) -> Any:
@@ -241,6 +251,7 @@ class PeriodicForce(Law):
     source = "Hanselman (2006), Brushless Permanent Magnet Motor Design, sec. 8.3"
     sentence = "a force that repeats with position, as from cogging or the pitch of a screw or gear"
     units = {"a": "w", "b": "w", "L": "z"}
+    domains = ("mechanical",)
     min_periods = 1.5  # smallest number of periods within the motion that is tried
     starts = {"L": lambda at: 2 * at.half / np.concatenate([np.arange(1.5, 8, 0.5), np.arange(8, 60.1, 1.0)])}
 

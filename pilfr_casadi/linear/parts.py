@@ -1,7 +1,8 @@
 """The linear models hidden in a closed model: in small and in large motions, or about a working point.
 
-A PI-LFR whose operators are plays loses its element in motions that are too small to cross a gap, `w` being constant,
-and has it as a gain `w = diag(Σ w) z` where all operators move. Stops are the other way round. With the gain K,
+In motions that are too small to cross a gap, plays stand still; where all operators move, they are a gain
+`w = diag(Σ w) z`. Stops are the other way round. An operator with the threshold zero has no gap: as a play it always
+moves, as a stop it is zero. With the gain K of the operators that move,
 
     A + B_w K C_z,   B_u + B_w K D_zu,   C_y + D_yw K C_z,   D_yu + D_yw K D_zu.
 
@@ -17,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, one_at_a_time
-from ..models import Model, Play, Stop
+from ..models import BLOCKS, Model, Play, Stop
 from .statespace import resolvent
 
 Array = np.ndarray
@@ -80,16 +81,23 @@ def linear_parts(
     names = ("A", "B_u", "C_y", "D_yu")
     if not set(names) <= set(model.parameters):
         return {"linearised": _about(model, dt, state, drive)}
-    a, b, c, d = (model.parameters[name].value for name in names)
     operator = getattr(model.element, "operator", None)
     if not isinstance(operator, Play | Stop):
+        a, b, c, d = (model.parameters[name].value for name in names)
         return {"linear part": LinearPart(a, b, c, d, dt)}
-    b_w, d_yw, c_z, d_zu, w = (model.parameters[name].value for name in ("B_w", "D_yw", "C_z", "D_zu", "w"))
-    gain = np.diag(w.sum(axis=1))
-    bare = LinearPart(a, b, c, d, dt)
-    moving = LinearPart(a + b_w @ gain @ c_z, b + b_w @ gain @ d_zu, c + d_yw @ gain @ c_z, d + d_yw @ gain @ d_zu, dt)
-    small, large = (bare, moving) if isinstance(operator, Play) else (moving, bare)
-    return {"small motions": small, "large motions": large}
+    w, r = (model.parameters[name].value for name in ("w", "r"))
+    waiting, every = (w * (r > 0)).sum(axis=1), w.sum(axis=1)
+    gains = (every - waiting, every) if isinstance(operator, Play) else (waiting, 0 * every)
+    motions = ("small motions", "large motions")
+    return {name: _with_gain(model, np.diag(gain), dt) for name, gain in zip(motions, gains, strict=True)}
+
+
+def _with_gain(model: Model, gain: Array, dt: float) -> LinearPart:
+    """Close a gain (n_w, n_w) into the port of a PI-LFR."""
+    a, b_u, b_w, c_y, d_yu, d_yw, c_z, d_zu = (model.parameters[name].value for name in BLOCKS if name != "y_0")
+    return LinearPart(
+        a + b_w @ gain @ c_z, b_u + b_w @ gain @ d_zu, c_y + d_yw @ gain @ c_z, d_yu + d_yw @ gain @ d_zu, dt
+    )
 
 
 @one_at_a_time

@@ -63,9 +63,9 @@ def residual_tests(recording: Recording, simulated: Simulated, *, lags: int | No
             for ax, (_, x) in zip(row[1:], tested, strict=True):
                 if np.ptp(x) > 0:
                     _draw(ax, correlation(e, x, most) / chance(e, x, most), -most, label, colour)
-        _finish(row[0], f"residual of {r.outputs[i]} with itself", r.name)
-        for ax, (name, _) in zip(row[1:], tested, strict=True):
-            _finish(ax, f"with {name}", "")
+        for ax, name in zip(row, ("itself", *(name for name, _ in tested)), strict=True):
+            finish(ax, "lag [samples]", "correlation [deviations]", f"residual of {r.outputs[i]} with {name}", 1)
+            ax.margins(x=0.01)
     return figure
 
 
@@ -73,8 +73,3 @@ def _draw(ax: Axes, values: np.ndarray, first: int, label: str, colour: str) -> 
     """Draw correlations in standard deviations over lags; the label says the share beyond the band."""
     beyond = float(np.mean(np.abs(values) > BAND))
     line(ax, first + np.arange(len(values)), values, f"{label}: {100 * beyond:.0f} % beyond", colour)
-
-
-def _finish(ax: Axes, y: str, title: str) -> None:
-    finish(ax, "lag [samples]", f"{y} [deviations]", title, 1)
-    ax.margins(x=0.01)

@@ -1,11 +1,11 @@
 """The user's equations with ports for missing physics.
 
 `equations` evaluates them with the laws in their ports, and `integration` discretises them to a `Model`. `simulator`
-holds the class `Simulator` and the state in which its laws begin at rest. `adapters` accept a Python file, a state
-space or a fitted model in its place. `fmu` wraps a functional mock-up unit as a simulator (`fmu_description`,
-`fmu_instance`). `numpy_function` makes a simulator from a NumPy function: `tracing` calls the function with `symbols`
-to obtain its equations. A function that cannot be traced is called with numbers (`black_box`). `external` lets
-equations call such a program.
+holds the class `Simulator` and the state in which its laws begin at rest. `domains` infers a port's physical domain.
+`adapters` accept a Python file, a state space or a fitted model in its place. `fmu` wraps a functional mock-up unit as
+a simulator (`fmu_description`, `fmu_instance`), and `mujoco` writes the equations of a MuJoCo model. `numpy_function`
+makes a simulator from a NumPy function: `tracing` calls the function with `symbols` to obtain its equations. A function
+that cannot be traced is called with numbers (`black_box`). `external` lets equations call such a program.
 """
 
 from typing import TYPE_CHECKING
@@ -20,6 +20,12 @@ if TYPE_CHECKING:
         user_variable as user_variable,
     )
     from .black_box import Numeric as Numeric
+    from .domains import (
+        DOMAINS as DOMAINS,
+        MECHANICAL as MECHANICAL,
+        UNKNOWN as UNKNOWN,
+        infer_domain as infer_domain,
+    )
     from .equations import Named as Named, Placed as Placed, Port as Port, in_series as in_series
     from .external import (
         PythonFunction as PythonFunction,
@@ -45,6 +51,7 @@ if TYPE_CHECKING:
         signals as signals,
         states_along as states_along,
     )
+    from .mujoco import from_mujoco as from_mujoco
     from .numpy_function import from_function as from_function
     from .simulator import (
         Simulator as Simulator,

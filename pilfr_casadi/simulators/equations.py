@@ -20,6 +20,7 @@ import numpy as np
 
 from .._base import InputError, listed
 from ..models import Named, Parameter, ParameterSet
+from .domains import DOMAINS, UNKNOWN, common_domain, infer_domain, may_convert
 
 Expression = Callable[..., Any]
 BUILT_IN = ("actuator:", "sensor:", "equation:")  # prefixes of the ports that need no declaration
@@ -68,11 +69,16 @@ class Port:
         angle both are the speed, which friction opposes.
     unit, across_unit : str
         Units of w and of z.
+    signals : mapping of str to callable, optional
+        Further quantities with which the strength of a law here may vary, besides the inputs and z: a load that the
+        contact transmits, a temperature, `{"load": lambda x, u: ca.fabs(u.torque)}`; from any of x, u, p.
+    domain : {"mechanical", "thermal", "electrical", "fluid", "unknown"}, optional
+        Physical domain, which decides what laws are tried; by default inferred from the units.
 
     Raises
     ------
     InputError
-        If an argument has the wrong type.
+        If an argument has the wrong type, or the domain is not one of these.
 
     Examples
     --------
@@ -87,6 +93,8 @@ class Port:
     unit: str = ""
     across_unit: str = ""
     series: bool = False
+    domain: str = ""
+    signals: Mapping[str, Expression] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -101,6 +109,16 @@ class Port:
         for option in ("unit", "across_unit"):
             if not isinstance(getattr(self, option), str):
                 raise InputError(f"`{option}` {what} is {getattr(self, option)!r}; give plain text, such as 'N'.")
+        if not isinstance(self.signals, Mapping) or not all(map(callable, self.signals.values())):
+            raise InputError(
+                f"`signals` {what} are {self.signals!r}; give functions by name, {{'load': lambda x: ...}}."
+            )
+        for name in self.signals:
+            if not isinstance(name, str) or not name.isidentifier() or name == "z":
+                raise InputError(f"A signal {what} is named {name!r}; give a name like 'load' (z is the coordinate).")
+        if self.domain not in ("", *DOMAINS, UNKNOWN):
+            raise InputError(f"The domain {what} is {self.domain!r}; give {', '.join(DOMAINS)} or {UNKNOWN}.")
+        object.__setattr__(self, "domain", self.domain or infer_domain(self.unit, self.across_unit))
 
     @property
     def kinds(self) -> set[str]:
@@ -108,6 +126,15 @@ class Port:
         if not self.series:
             return {"parallel"}
         return {"series", "sensor"} if self.name.startswith("sensor:") else {"series"}
+
+    def admits(self, law: Any) -> bool:
+        """Tell whether a law (or its class) may be missing here: by its places, physical domains and coordinate.
+
+        A port of unknown domain admits the laws of all domains, except special ones.
+        """
+        if not self.kinds & set(law.places) or (law.across and not may_convert(self.across_unit, law.across)):
+            return False
+        return self.domain in law.domains or not (law.special or (law.domains and self.domain != UNKNOWN))
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,6 +261,16 @@ class Equations:
         """Names of the outputs."""
         return tuple(self.measured(*self.symbols()))
 
+    def port_signals(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
+        """Evaluate a port's own signals by name."""
+        found = {}
+        for name, signal in port.signals.items():
+            what = f"signal {name!r} of port {port.name!r}"
+            if name in self.inputs:
+                raise InputError(f"The {what} has the name of an input; give it another one.")
+            found[name] = _scalar(call(signal, what, x=x, u=u, p=p, t=t), what)
+        return found
+
     def into(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
         """Evaluate the factors of w by state or output."""
         name = f"`into` of port {port.name!r}"
@@ -266,8 +303,9 @@ class Equations:
     @cached_property
     def _every_port(self) -> tuple[Port, ...]:
         inner = self.ports or (() if self.discrete else tuple(map(self._equation, self.states)))
-        actuators = (_series("actuator", n, lambda u, n=n: u[n], self.units) for n in self.inputs)
-        sensors = (_series("sensor", n, lambda: 0, self.units) for n in self.output_names)
+        domain = common_domain(port.domain for port in self.ports)  # a voltage is a signal in all domains
+        actuators = (_series("actuator", n, lambda u, n=n: u[n], self.units, domain) for n in self.inputs)
+        sensors = (_series("sensor", n, lambda: 0, self.units, domain) for n in self.output_names)
         return (*inner, *actuators, *sensors)
 
     def _equation(self, state: str) -> Port:
@@ -300,9 +338,9 @@ class Equations:
         return tuple(name for name in self.inputs if not ca.depends_on(read, u[name]))
 
 
-def _series(kind: str, name: str, across: Expression, units: Mapping[str, str]) -> Port:
+def _series(kind: str, name: str, across: Expression, units: Mapping[str, str], domain: str) -> Port:
     unit = units.get(name, "")
-    return Port(f"{kind}:{name}", {}, across, None, unit, unit, series=True)
+    return Port(f"{kind}:{name}", {}, across, None, unit, unit, series=True, domain=domain)
 
 
 def _check_expressions(found: Mapping[str, Any], known: list[Any]) -> None:

@@ -16,7 +16,7 @@ these are very fast, along a run from there.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, TypeVar
@@ -89,12 +89,12 @@ class ClosedEquations:
         flow: list[Any] = [ca.SX(n, 1) for n in self.n_q]
         memory: list[Any] = [ca.SX(n, 1) for n in self.n_s]
 
-        def apply(i: int, z: Any, dz: Any) -> Any:
-            e, now = simulator.elements[i], Named("input", u)
+        def apply(i: int, z: Any, dz: Any, beside: Mapping[str, Any] | None = None) -> Any:
+            e, now = simulator.elements[i], Named("input", {**u, **(beside or {})})
             have = {"z": z, "dz": dz, "q": q[i], "p": self._own(e), "t": t, "x": x, "u": now}
             if hasattr(e.law, "step"):
-                beside = {k: have[k] for k in ("dz", "u") if k in inspect.signature(e.law.step).parameters}
-                w, memory[i] = e.law.step(z, s[i], self._own(e), **beside)
+                read = {k: have[k] for k in ("dz", "u") if k in inspect.signature(e.law.step).parameters}
+                w, memory[i] = e.law.step(z, s[i], self._own(e), **read)
             else:
                 w = call(e.law.force, f"law {e.law.id!r}", **have)
                 if self.n_q[i]:
@@ -119,7 +119,7 @@ class ClosedEquations:
                 continue
             port = simulator.port(e.port)
             z = simulator.across(port, x, inputs, p, t)
-            w = apply(i, z, rates[self.rows[e.port]])
+            w = apply(i, z, rates[self.rows[e.port]], simulator.port_signals(port, x, inputs, p, t))
             for name, factor in simulator.into(port, x, inputs, p, t).items():
                 if name in simulator.states:
                     unit = ca.SX.zeros(f.shape)
@@ -261,11 +261,11 @@ def states_along(model: Model, drive: np.ndarray, p: np.ndarray, x: np.ndarray) 
 
 
 def signals(simulator: Equations) -> ca.Function:
-    """Make `(x, u, slope, t, p) -> (z, dz, lift, push)` of every port of `all_ports`, in its order, without laws.
+    """Make `(x, u, slope, t, p) -> (z, dz, lift, push, own)` of every port of `all_ports`, in its order, without laws.
 
-    x (n_x,), u (n_u,), slope = du/dt (n_u,), t and p as in `discretise`; each result has one row for each port. A unit
-    force in the port moves z at once at the rate `lift`, and dz at the rate `push`: where `lift` is zero and `push` is
-    negative, a positive force opposes the port's motion.
+    x (n_x,), u (n_u,), slope = du/dt (n_u,), t and p as in `discretise`; each result but the last has one row for each
+    port. A unit force in the port moves z at once at the rate `lift`, and dz at the rate `push`: where `lift` is zero
+    and `push` is negative, a positive force opposes the port's motion. `own` stacks the ports' own signals.
     """
     own = simulator.parameter_set
     vector = ca.SX.sym("p", own.size)
@@ -277,7 +277,9 @@ def signals(simulator: Equations) -> ca.Function:
     f = simulator.derivatives(x, u, p, t) if not simulator.discrete else ca.SX.zeros(n_x)
     y = simulator.measured(x, u, p, t)
     rows: list[list[Any]] = []
+    own_signals: list[Any] = [ca.SX(0, 1)]
     for port in simulator.all_ports():
+        own_signals += simulator.port_signals(port, x, u, p, t).values()
         here = y[port.name.removeprefix("sensor:")] if port.name.startswith("sensor:") else None
         z = simulator.across(port, x, u, p, t) if here is None else here
         if port.rate is not None:
@@ -291,8 +293,8 @@ def signals(simulator: Equations) -> ca.Function:
                     force[simulator.states.index(name)] = factor
         rows.append([z, dz, ca.jtimes(z, xs, force), ca.jtimes(dz, xs, force)])
     names = ["x", "u", "slope", "t", "p"]
-    columns = [ca.vertcat(*column) for column in zip(*rows, strict=True)]
-    return ca.Function("signals", [xs, us, slope, t, vector], columns, names, ["z", "dz", "lift", "push"])
+    columns = [*(ca.vertcat(*column) for column in zip(*rows, strict=True)), ca.vertcat(*own_signals)]
+    return ca.Function("signals", [xs, us, slope, t, vector], columns, names, ["z", "dz", "lift", "push", "own"])
 
 
 def _flow(simulator: Equations) -> ca.Function:

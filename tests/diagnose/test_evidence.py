@@ -47,6 +47,19 @@ def test_the_prior_is_shared_by_ports_laws_and_forms():
     assert log_prior(placed, one, doubtful=True) < log_prior(placed, one)
 
 
+def test_laws_of_the_domain_of_a_port_are_likelier_and_no_law_is_so_at_a_mechanical_one():
+    port = pilfr.Port("wall", {"T": -1.0}, lambda x: x.T, unit="W", across_unit="K")
+    warm = pilfr.Simulator(lambda x: {"T": -x.T}, lambda x: {"y": x.T}, states=("T",), ports=port)
+    there = {"wall": (laws.Radiation(), laws.CubicStiffness(), laws.ViscousDamping())}
+    own, general = (warm.with_element("wall", law).elements for law in there["wall"][:2])
+    for domains in (None, {"wall": "unknown"}, {"wall": "mechanical"}):
+        assert log_prior(own, there, domains=domains) == log_prior(general, there) == np.log(1 / 6)
+    known = {"wall": "thermal"}
+    assert log_prior(own, there, domains=known) == pytest.approx(log_prior(general, there, domains=known) + np.log(4))
+    ids = (log_prior(warm.with_element("wall", law).elements, there, domains=known) for law in there["wall"])
+    assert sum(map(np.exp, ids)) == pytest.approx(0.5)  # one more effect is as likely as not
+
+
 def test_a_parameters_unit_does_not_change_its_information():
     train = recordings(laws.CubicStiffness(values={"k_3": 3e5}), count=1)
     bench = Workbench.of(rig(OFF), train, "zero")

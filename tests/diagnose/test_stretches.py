@@ -11,24 +11,28 @@ from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, laws
+from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose.floor import noise_floor
 from pilfr_casadi.diagnose.gates import scale_channels
-from pilfr_casadi.diagnose.stretches import Stretch, Stretches, choose_stretches, divide, spread_out
+from pilfr_casadi.diagnose.search import Search
+from pilfr_casadi.diagnose.stretches import Everything, Stretch, Stretches, choose_stretches, divide, spread_out
 from pilfr_casadi.diagnose.timing import Jump
+from pilfr_casadi.diagnose.trials import Trial
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import discretise
 
 DT, CUBIC = 0.02, 4000.0
 
 
-def spring(k=90.0, d=1.5, least=20.0):
+def spring(k=90.0, d=1.5, least=20.0, least_damping=0.1):
     """A mass on a linear spring."""
     return Simulator(
         lambda x, u, p: {"pos": x.vel, "vel": u.force - p.k * x.pos - p.d * x.vel},
         lambda x: {"position": x.pos},
         states=("pos", "vel"),
         inputs=("force",),
-        parameters={"k": Parameter(k, bounds=(least, 400)), "d": Parameter(d, bounds=(0.1, 20))},
+        parameters={"k": Parameter(k, bounds=(least, 400)), "d": Parameter(d, bounds=(least_damping, 20))},
         ports=(Port("ground", into={"vel": -1}, across=lambda x: x.pos, rate=lambda x: x.vel, unit="N"),),
     )
 
@@ -62,11 +66,11 @@ def test_a_recording_is_divided_without_gaps():
     assert divide(0, 700, 0, 2000) == [Stretch(0, 0, 700)]
 
 
-def test_a_stretch_begins_with_a_warm_up_in_an_unknown_state():
+def test_a_stretch_begins_in_an_unknown_state():
     r = shaken(3000).with_(name="week")
     piece = Stretch(0, 1000, 2000).cut([r])
-    assert (len(piece), piece.skip, piece.begins, piece.name) == (1050, 50, "estimate", "week from 19 s")
-    assert np.array_equal(piece.y[piece.skip :], r.y[1000:2000])
+    assert (len(piece), piece.skip, piece.begins, piece.name) == (1000, 0, "estimate", "week from 20 s")
+    assert np.array_equal(piece.y, r.y[1000:2000])
     assert Stretch(0, 0, 3000).cut([r]) is r
     assert Stretch(0, 0, 1000).cut([r]).begins == "zero"
 
@@ -160,12 +164,39 @@ def test_a_gap_in_a_stretch_cuts_the_whole_recording_there():
     bench = Workbench.of(rig(OFF), stretches.cut(), "zero")
     gap = replace(Jump("x2", "gap", None), places=((1, 130),))
     whole = stretches.everything(bench, [gap])
-    assert [len(r) for r in whole.recordings] == [2500, 1080, 1420]
+    assert [len(r) for r in whole.recordings] == [2500, 1130, 1370]
     assert [r.begins for r in whole.recordings] == ["zero", "zero", "estimate"]
-    assert whole.recordings[2].name == "b from 2.16 s"
+    assert whole.recordings[2].name == "b from 2.26 s"
     assert whole.scale == pytest.approx(np.std(np.concatenate([a.y, b.y])))
 
 
 def test_too_few_samples_for_a_search_are_refused():
     with pytest.raises(InputError, match="search_samples"):
         pilfr.diagnose(spring(), shaken(400), search_samples=3)
+
+
+def test_a_simulation_that_runs_away_over_a_whole_recording_leaves_the_answer_to_the_stretches():
+    r = shaken(3000, seed=4)
+    stretches = Stretches((r,), (Stretch(0, 0, 300),))
+    bench = Workbench.of(spring(k=100.0, d=2.0), stretches.cut(), "zero")
+    unstable = bench.run(spring(k=100.0, d=-1.5, least_damping=-3.0), {}, [np.zeros(2)])
+    search = Search(bench, unstable, noise_floor(bench.recordings, unstable.residual), (), 1, Stages(lambda *_: None))
+    search.keep(Trial((), unstable, unstable.cost, unstable.cost, True))
+    search.interrupted = True  # values stay as they are
+    assert Everything.of(search, stretches, ()) is None
+    assert "values and errors are those of the stretches" in stretches.note(False).sentence
+
+
+def test_after_an_interrupt_everything_has_the_values_of_the_stretches():
+    r = shaken(3000, 1500, seed=4)
+    stretches = Stretches((r,), (Stretch(0, 0, 500),))
+    bench = Workbench.of(spring(), stretches.cut(), "zero")
+    fitted = bench.fit(spring())
+    search = Search(bench, fitted, noise_floor(bench.recordings, fitted.residual), (), 1, Stages(lambda *_: None))
+    search.keep(Trial((), fitted, fitted.cost, fitted.cost, True))
+    search.interrupted = True
+    kept = Everything.of(search, stretches, ()).fitted(search, fitted)
+    assert kept.values == fitted.values and [len(e) for e in kept.residual] == [3000]
+    search.interrupted = False
+    moved = Everything.of(search, stretches, ()).fitted(search, fitted)
+    assert moved.cost < kept.cost

@@ -1,0 +1,22 @@
+"""
+A first look at a recording
+===========================
+
+Every channel over time and over frequency. Here the input ends at 6 Hz, and the output's noise begins at about 15 Hz.
+"""
+
+from importlib.resources import files
+
+import pilfr_casadi as pilfr
+
+data = files("pilfr_casadi") / "cli" / "demo_data"
+recording = pilfr.read_csv(data / "rig_train.csv", inputs="force", outputs="x2", units={"force": "N", "x2": "m"})
+whole = recording.plot()
+
+# %%
+# A part of it, without noise above 15 Hz, at half the rate. Both channels go through the same filter.
+
+quiet = recording.cut(2.0, 8.0).filter(15.0).resample(0.02)
+part = quiet.plot()
+print(quiet)
+assert len(quiet) == 300 and quiet.begins == "estimate"

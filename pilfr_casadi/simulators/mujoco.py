@@ -1,0 +1,407 @@
+"""Simulators from MuJoCo models of arms and mechanisms: trees of rigid bodies on hinges and slides.
+
+MuJoCo reads the file. The equations of motion
+
+    M(q) dv/dt + c(q, v) = τ_actuators - D v - K (q - q_spring) + w
+
+(Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 2) are then written for CasADi. So they are compiled, they have
+exact derivatives by states and by any of the model's numbers, and w may enter at every joint. They are compared with
+MuJoCo's own accelerations at several points. Contacts and joint limits are left out; everything else that the equations
+do not hold is refused.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .._base import InputError, existing_file, listed
+from ..models import Named, Parameter
+from .equations import Port
+from .simulator import Simulator
+
+POINTS = 8  # at which the equations are compared with MuJoCo
+SAME = 1e-8  # relative difference of accelerations that rounding may cause
+WITHIN = 10.0  # factor by which a parameter may move where no bounds are given
+AXES = ("x", "y", "z")
+
+
+def from_mujoco(
+    path: str | os.PathLike[str],
+    *,
+    parameters: Sequence[str] | Mapping[str, Parameter] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    hold: str | None = None,
+) -> Simulator:
+    """Make a simulator from a MuJoCo model (extra `pilfr-casadi[mujoco]`).
+
+    Every joint is a port, with its torque or force, position and speed. The states are the joints' positions, by their
+    names, and their speeds, as `elbow.speed`. The load that a joint transmits is a signal of its port, `load`.
+
+    Parameters
+    ----------
+    path : path
+        An MJCF or URDF file.
+    parameters : names, or mapping from names to Parameter, optional
+        Numbers of the model that a fit may change: `<body>.mass`, with which the inertia scales; `<body>.inertia`, a
+        factor on the inertia alone; `<body>.com_x`, `com_y`, `com_z`; `<joint>.damping`, `armature`, `stiffness`,
+        `spring`; `<actuator>.gain`; `gravity`. By default all masses and dampings. The others keep the model's values.
+    bounds : mapping, optional
+        `(lower, upper)` by parameter; by default a factor of ten either way, and from zero where the value is zero.
+    inputs : tuple of str, optional
+        Actuators that are recorded; by default all. The others are at zero.
+    outputs : tuple of str, optional
+        Sensors of joint positions and speeds, or joints, that are recorded; by default all such sensors, and the joints
+        where there is none.
+    hold : {"zero", "linear"}, optional
+        As of `Simulator`.
+
+    Raises
+    ------
+    InputError
+        If MuJoCo is not installed or cannot read the file, a name is unknown, or the model holds what the equations do
+        not follow, such as free bodies, tendons, equality constraints, muscles or dry friction.
+    """
+    tree = _Tree.load(Path(path))
+    own = parameters if parameters is not None else tree.usual_parameters
+    for names, there, kind in (
+        ((*own, *(bounds or {})), tuple(tree.numbers), "parameters"),
+        (inputs or (), tree.actuators, "actuators"),
+        (outputs or (), tuple(tree.sensors), "joints, and sensors of joints"),
+    ):
+        for name in names:
+            if name not in there:
+                raise InputError(f"{path} has no {name!r} among its {kind}; they are {listed(there) or 'none'}.")
+    given = {n: (bounds or {}).get(n) for n in own}
+    made = own if isinstance(own, Mapping) else {n: _parameter(n, tree.numbers[n], b) for n, b in given.items()}
+    drives = tuple(tree.actuators if inputs is None else inputs)
+    measured = tuple(tree.usual_outputs if outputs is None else outputs)
+    equations = _Equations(tree, frozenset(made), drives, measured)
+    equations.check()
+    return Simulator(
+        equations.dynamics,
+        equations.outputs,
+        (*tree.joints, *(f"{n}.speed" for n in tree.joints)),
+        drives,
+        made,
+        tuple(equations.port(i) for i in range(len(tree.joints))),
+        hold,
+        units=tree.units(measured),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Tree:
+    """A model as MuJoCo has compiled it, with its names."""
+
+    path: Path
+    mujoco: Any
+    model: Any
+
+    @classmethod
+    def load(cls, path: Path) -> _Tree:
+        """Read a file, and refuse what the equations do not hold."""
+        try:
+            import mujoco
+        except ImportError:
+            raise InputError("mujoco is not installed; install it with `pip install pilfr-casadi[mujoco]`.") from None
+        existing_file(path)
+        try:
+            model = mujoco.MjModel.from_xml_path(str(path))
+        except Exception as error:
+            reason = " ".join(str(error).split())
+            raise InputError(f"MuJoCo cannot read {path} ({reason}); correct the file.") from None
+        tree = cls(path, mujoco, model)
+        if lacks := tree._left_out():
+            raise InputError(
+                f"{path} has {lacks}, which the equations of a tree of rigid bodies do not hold; remove it."
+            )
+        return tree
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Read the file again in another process."""
+        return _Tree.load, (self.path,)
+
+    def _left_out(self) -> str:
+        """Say what the equations do not hold; empty if nothing."""
+        m, mj = self.model, self.mujoco
+        one_axis = (int(mj.mjtJoint.mjJNT_HINGE), int(mj.mjtJoint.mjJNT_SLIDE))
+        cases = {
+            "no joint": m.njnt == 0,
+            "a free or a ball joint": any(kind not in one_axis for kind in m.jnt_type),
+            "an equality constraint": m.neq > 0,
+            "a tendon": m.ntendon > 0,
+            "dry friction in a joint (frictionloss)": np.any(m.dof_frictionloss > 0),
+            "an actuator that acts on something else than a joint": any(
+                kind != int(mj.mjtTrn.mjTRN_JOINT) for kind in m.actuator_trntype
+            ),
+            "an actuator with a state of its own": any(
+                kind != int(mj.mjtDyn.mjDYN_NONE) for kind in m.actuator_dyntype
+            ),
+            "a muscle, or another curved actuator": any(
+                kind > int(mj.mjtBias.mjBIAS_AFFINE) for kind in m.actuator_biastype
+            )
+            or any(kind != int(mj.mjtGain.mjGAIN_FIXED) for kind in m.actuator_gaintype),
+        }
+        return next((what for what, found in cases.items() if found), "")
+
+    def _names(self, kind: str, count: int) -> tuple[str, ...]:
+        number = getattr(self.mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
+        found = [self.mujoco.mj_id2name(self.model, number, i) or f"{kind}{i}" for i in range(count)]
+        return tuple(name.replace(" ", "_") for name in found)
+
+    @cached_property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        return self._names("joint", self.model.njnt)
+
+    @cached_property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of the bodies, the world first."""
+        return self._names("body", self.model.nbody)
+
+    @cached_property
+    def actuators(self) -> tuple[str, ...]:
+        """Names of the actuators."""
+        return self._names("actuator", self.model.nu)
+
+    @cached_property
+    def sensors(self) -> dict[str, tuple[int, bool]]:
+        """Joint, and whether its speed is meant, by name of a sensor of a joint or of a joint."""
+        kinds = {int(self.mujoco.mjtSensor.mjSENS_JOINTPOS): False, int(self.mujoco.mjtSensor.mjSENS_JOINTVEL): True}
+        found = {
+            name: (int(self.model.sensor_objid[i]), kinds[int(self.model.sensor_type[i])])
+            for i, name in enumerate(self._names("sensor", self.model.nsensor))
+            if int(self.model.sensor_type[i]) in kinds
+        }
+        return {**{name: (i, False) for i, name in enumerate(self.joints)}, **found}
+
+    @property
+    def usual_outputs(self) -> tuple[str, ...]:
+        """The sensors of joints, or the joints where there is none."""
+        return tuple(n for n in self.sensors if n not in self.joints) or self.joints
+
+    def _moving(self) -> list[int]:
+        """Bodies that a joint moves and that have a mass."""
+        m, moves = self.model, [False] * self.model.nbody
+        for i in range(1, m.nbody):
+            moves[i] = bool(m.body_jntnum[i]) or moves[m.body_parentid[i]]
+        return [i for i in range(1, m.nbody) if moves[i] and m.body_mass[i] > 0]
+
+    @cached_property
+    def numbers(self) -> dict[str, float]:
+        """Every number that may be a parameter, by name."""
+        m, out = self.model, {"gravity": float(np.linalg.norm(self.model.opt.gravity))}
+        for i in self._moving():
+            out |= {f"{self.bodies[i]}.mass": float(m.body_mass[i]), f"{self.bodies[i]}.inertia": 1.0}
+            out |= {f"{self.bodies[i]}.com_{axis}": float(v) for axis, v in zip(AXES, m.body_ipos[i], strict=True)}
+        for i, name in enumerate(self.joints):
+            spring = float(m.qpos_spring[m.jnt_qposadr[i]])
+            out |= {f"{name}.damping": float(m.dof_damping[i]), f"{name}.armature": float(m.dof_armature[i])}
+            out |= {f"{name}.stiffness": float(m.jnt_stiffness[i]), f"{name}.spring": spring}
+        return out | {f"{name}.gain": 1.0 for name in self.actuators}
+
+    @property
+    def usual_parameters(self) -> tuple[str, ...]:
+        """Masses and dampings."""
+        return tuple(n for n in self.numbers if n.endswith((".mass", ".damping")))
+
+    def hinge(self, joint: int) -> bool:
+        """Tell whether a joint turns."""
+        return bool(self.model.jnt_type[joint] == int(self.mujoco.mjtJoint.mjJNT_HINGE))
+
+    def units(self, measured: Sequence[str]) -> dict[str, str]:
+        """Units of outputs."""
+        kinds = {n: (self.hinge(i), speed) for n, (i, speed) in self.sensors.items() if n in measured}
+        return {n: ("rad" if turns else "m") + ("/s" if speed else "") for n, (turns, speed) in kinds.items()}
+
+    def acceleration(self, q: np.ndarray, v: np.ndarray, control: np.ndarray) -> np.ndarray:
+        """Compute MuJoCo's own accelerations (n,), without contacts and joint limits."""
+        m, mj = self.model, self.mujoco
+        data, flags = mj.MjData(m), m.opt.disableflags
+        m.opt.disableflags = flags | mj.mjtDisableBit.mjDSBL_CONSTRAINT
+        try:
+            data.qpos[:], data.qvel[:], data.ctrl[:] = q, v, control
+            mj.mj_forward(m, data)
+            return np.array(data.qacc)
+        finally:
+            m.opt.disableflags = flags
+
+
+class _Equations:
+    """The equations of motion of a tree with some of its numbers, actuators and sensors as symbols."""
+
+    def __init__(self, tree: _Tree, free: frozenset[str], inputs: tuple[str, ...], measured: tuple[str, ...]) -> None:
+        self.tree, self.free, self.inputs, self.measured = tree, free, inputs, measured
+
+    def check(self) -> None:
+        """Compare with MuJoCo's accelerations at several points."""
+        tree, rng, n = self.tree, np.random.default_rng(0), len(self.tree.joints)
+        q, v, u = (ca.SX.sym(name, size) for name, size in (("q", n), ("v", n), ("u", len(tree.actuators))))
+        names = dict(zip(tree.actuators, ca.vertsplit(u) if tree.actuators else [], strict=True))
+        mass, rest = self._motion(q, v, names, lambda name: tree.numbers[name])
+        ours = ca.Function("acceleration", [q, v, u], [ca.solve(mass, rest)])
+        for _ in range(POINTS):
+            point = [rng.uniform(-0.7, 0.7, n), rng.normal(0, 1, n), rng.uniform(-0.5, 0.5, len(tree.actuators))]
+            wanted, found = tree.acceleration(*point), ours(*point).full().ravel()
+            if not np.max(np.abs(found - wanted)) <= SAME * max(np.max(np.abs(wanted)), 1.0):
+                raise InputError(
+                    f"{tree.path} moves otherwise than a tree of rigid bodies with linear springs, dampers and "
+                    "actuators; remove what else it has, such as a fluid, curved damping, or gravity compensation."
+                )
+
+    def _bodies(self, q: Any, number: Callable[[str], Any]) -> tuple[list[tuple[Any, Any, int]], list[Any]]:
+        """Return centre of mass, axes of the inertia (3, 3) and index of each moving body, and the joints' axes.
+
+        All are in the world's frame. A slide turns nothing, and its axis is zero.
+        """
+        m, out = self.tree.model, []
+        poses: list[tuple[Any, Any]] = [(ca.SX.zeros(3), ca.SX.eye(3))]
+        turning = [ca.SX.zeros(3) for _ in self.tree.joints]
+        for i in range(1, m.nbody):
+            p, r = poses[m.body_parentid[i]]
+            p, r = p + r @ ca.SX(ca.DM(m.body_pos[i])), r @ _rotation(m.body_quat[i])
+            for j in range(m.body_jntadr[i], m.body_jntadr[i] + m.body_jntnum[i]):
+                moved, axis = q[j] - m.qpos0[m.jnt_qposadr[j]], ca.DM(m.jnt_axis[j])
+                along = r @ ca.SX(axis)
+                if self.tree.hinge(j):
+                    turning[j] = along
+                    anchor = ca.SX(ca.DM(m.jnt_pos[j]))
+                    turned = r @ _turn(axis, moved)
+                    p, r = p + r @ anchor - turned @ anchor, turned
+                else:
+                    p = p + along * moved
+            poses.append((p, r))
+        for i in self.tree._moving():
+            p, r = poses[i]
+            centre = ca.vertcat(*(number(f"{self.tree.bodies[i]}.com_{axis}") for axis in AXES))
+            out.append((p + r @ centre, r @ _rotation(m.body_iquat[i]), i))
+        return out, turning
+
+    def _above(self, body: int) -> set[int]:
+        """Joints that move a body."""
+        m, out = self.tree.model, set[int]()
+        while body:
+            out |= set(range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body]))
+            body = int(m.body_parentid[body])
+        return out
+
+    def _motion(self, q: Any, v: Any, u: Mapping[str, Any], number: Callable[[str], Any]) -> tuple[Any, Any]:
+        """Return M(q), (n, n), and the rest of the equations M dv/dt = rest, (n,)."""
+        m, n, tree = self.tree.model, len(self.tree.joints), self.tree
+        down = m.opt.gravity / (np.linalg.norm(m.opt.gravity) or 1.0)
+        fall = number("gravity") * ca.SX(ca.DM(down))
+        mass, rest = ca.SX.zeros(n, n), ca.SX.zeros(n)
+        bodies, hinges = self._bodies(q, number)
+        for centre, axes, i in bodies:
+            above, name = self._above(i), tree.bodies[i]
+            turning = ca.horzcat(*(axis if j in above else ca.SX.zeros(3) for j, axis in enumerate(hinges)))
+            moving, weight = ca.jacobian(centre, q), number(f"{name}.mass")
+            share = number(f"{name}.inertia") * weight / float(m.body_mass[i])
+            inertia = axes @ ca.diag(ca.SX(ca.DM(m.body_inertia[i])) * share) @ axes.T
+            omega = turning @ v
+            bias, turned = (ca.jtimes(part @ v, q, v) for part in (moving, turning))
+            mass += weight * moving.T @ moving + turning.T @ inertia @ turning
+            torque = inertia @ turned + ca.cross(omega, inertia @ omega)
+            rest -= moving.T @ (weight * (bias - fall)) + turning.T @ torque
+        for j, name in enumerate(tree.joints):
+            mass[j, j] += number(f"{name}.armature")
+            rest[j] -= number(f"{name}.damping") * v[j]
+            rest[j] -= number(f"{name}.stiffness") * (q[j] - number(f"{name}.spring"))
+        for j, force in self._driven(q, v, u, number):
+            rest[j] += force
+        return mass, rest
+
+    def _driven(self, q: Any, v: Any, u: Mapping[str, Any], number: Callable[[str], Any]) -> list[tuple[int, Any]]:
+        """List the joint and the force or torque of every actuator."""
+        m, out = self.tree.model, []
+        for i, name in enumerate(self.tree.actuators):
+            j, gear = int(m.actuator_trnid[i, 0]), float(m.actuator_gear[i, 0])
+            control = u.get(name, 0.0)
+            if m.actuator_ctrllimited[i]:
+                control = ca.fmin(ca.fmax(control, m.actuator_ctrlrange[i, 0]), m.actuator_ctrlrange[i, 1])
+            b0, b1, b2 = m.actuator_biasprm[i, :3]
+            force = (
+                m.actuator_gainprm[i, 0] * number(f"{name}.gain") * control + b0 + b1 * gear * q[j] + b2 * gear * v[j]
+            )
+            if m.actuator_forcelimited[i]:
+                force = ca.fmin(ca.fmax(force, m.actuator_forcerange[i, 0]), m.actuator_forcerange[i, 1])
+            out.append((j, gear * force))
+        return out
+
+    def _given(self, x: Named, u: Named, p: Named) -> tuple[Any, Any, dict[str, Any], Callable[[str], Any]]:
+        """Return positions, speeds, controls, and the numbers by name, from the simulator's symbols."""
+        names = self.tree.joints
+        q, v = ca.vertcat(*(x[n] for n in names)), ca.vertcat(*(x[f"{n}.speed"] for n in names))
+        return q, v, {n: u[n] for n in self.inputs}, lambda n: p[n] if n in self.free else self.tree.numbers[n]
+
+    def _solved(self, x: Named, u: Named, p: Named) -> tuple[Any, Any]:
+        """Return M and the rest as functions of symbols: their Jacobians need q and v to be symbols of their own."""
+        n = len(self.tree.joints)
+        at, speeds, controls, number = self._given(x, u, p)
+        q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
+        mass, rest = self._motion(q, v, controls, number)
+        found = ca.substitute([mass, rest], [q, v], [at, speeds])
+        return found[0], found[1]
+
+    def dynamics(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
+        """Derivatives by state."""
+        names = self.tree.joints
+        faster = ca.vertsplit(ca.solve(*self._solved(x, u, p)))
+        return {n: x[f"{n}.speed"] for n in names} | {f"{n}.speed": a for n, a in zip(names, faster, strict=True)}
+
+    def outputs(self, x: Named) -> dict[str, Any]:
+        """Outputs by name."""
+        kinds = {n: self.tree.sensors[n] for n in self.measured}
+        return {n: x[self.tree.joints[i] + (".speed" if speed else "")] for n, (i, speed) in kinds.items()}
+
+    def port(self, joint: int) -> Port:
+        """Make the port of a joint; a positive force opposes motion."""
+        names, name = self.tree.joints, self.tree.joints[joint]
+
+        def into(x: Named, u: Named, p: Named) -> dict[str, Any]:
+            mass, _ = self._solved(x, u, p)
+            unit = ca.SX.zeros(len(names))
+            unit[joint] = -1.0
+            return {f"{n}.speed": a for n, a in zip(names, ca.vertsplit(ca.solve(mass, unit)), strict=True)}
+
+        def load(x: Named, u: Named, p: Named) -> Any:
+            q, v, controls, number = self._given(x, u, p)
+            return ca.fabs(sum((force for j, force in self._driven(q, v, controls, number) if j == joint), ca.SX(0)))
+
+        unit = ("N m", "rad") if self.tree.hinge(joint) else ("N", "m")
+        driven = any(int(j) == joint for j in self.tree.model.actuator_trnid[:, 0])
+        across, rate = (lambda x: x[name]), (lambda x: x[f"{name}.speed"])
+        return Port(name, into, across, rate, *unit, signals={"load": load} if driven else {})
+
+
+def _turn(axis: ca.DM, angle: Any) -> Any:
+    """Rotation (3, 3) about a unit axis (Rodrigues)."""
+    k = ca.SX(ca.skew(axis))
+    return ca.SX.eye(3) + ca.sin(angle) * k + (1 - ca.cos(angle)) * (k @ k)
+
+
+def _rotation(quaternion: np.ndarray) -> Any:
+    """Rotation (3, 3) of a unit quaternion w, x, y, z."""
+    w, v = float(quaternion[0]), ca.DM(quaternion[1:])
+    k = ca.skew(v)
+    return ca.SX(ca.DM.eye(3) + 2 * w * k + 2 * k @ k)
+
+
+def _parameter(name: str, value: float, bounds: tuple[float, float] | None) -> Parameter:
+    """Make a parameter with given or usual bounds."""
+    usual = (0.0, np.inf) if value == 0 else tuple(sorted((value / WITHIN, value * WITHIN)))
+    usual = (-np.inf, np.inf) if ".com_" in name or name.endswith(".spring") else usual
+    low, high = usual if bounds is None else bounds
+    if not low <= value <= high:
+        raise InputError(f"The parameter {name!r} is {value:g}, outside of its bounds {low:g} to {high:g}; widen them.")
+    return Parameter(value, bounds=(low, high))

@@ -1,0 +1,102 @@
+"""Recordings in Parquet and MDF files, and one sentence for what cannot be used there."""
+
+import sys
+import warnings
+
+import numpy as np
+import pytest
+
+from pilfr_casadi import InputError, read
+from pilfr_casadi.data import column_names
+
+T, FORCE, X2 = 0.1 * np.arange(5), np.array([1.0, 2, 3, 4, 5]), np.array([10.0, 20, 30, 40, 50])
+
+
+@pytest.fixture
+def parquet(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    def write(**columns):
+        path = tmp_path / "rig.parquet"
+        parquet.write_table(pyarrow.table(columns), path)
+        return path
+
+    return write
+
+
+@pytest.fixture
+def mdf(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        asammdf = pytest.importorskip("asammdf")
+
+    def write(*groups, name="rig.mf4"):
+        with asammdf.MDF(version="4.10") as file:
+            for t, channels in groups:
+                file.append([asammdf.Signal(samples=v, timestamps=t, name=k) for k, v in channels.items()])
+            path = tmp_path / name
+            file.save(path, overwrite=True)
+        return path
+
+    return write
+
+
+def refused(path, says, inputs="force", outputs="x2"):
+    with pytest.raises(InputError) as caught:
+        read(path, inputs, outputs)
+    text = str(caught.value)
+    assert "\n" not in text and text.endswith(".") and str(path) in text
+    assert says in text, text
+
+
+def same(r):
+    assert r.dt == pytest.approx(0.1) and (r.inputs, r.outputs, r.name) == (("force",), ("x2",), "rig")
+    assert np.array_equal(r.u[:, 0], FORCE) and np.array_equal(r.y[:, 0], X2)
+
+
+def test_a_parquet_file_is_read(parquet):
+    path = parquet(t=T, force=FORCE.astype(int), x2=X2, note=list("abcde"))
+    same(read(path, "force", "x2"))
+    assert column_names(path) == ("t", "force", "x2", "note")
+    named = read(parquet(**{"time": T, "force": FORCE, "x.2": X2}), "force", "x.2")
+    assert np.array_equal(named.y[:, 0], X2)
+
+
+def test_what_a_parquet_file_lacks_is_said(parquet, tmp_path):
+    refused(parquet(t=T, force=FORCE), "has no column 'x2'")
+    refused(parquet(t=T, force=FORCE, x2=list("abcde")), "'x2' holds")
+    refused(parquet(t=T, force=[1.0, None, 3.0, 4.0, 5.0], x2=X2), "'force', sample 1 is nan")
+    damaged = tmp_path / "damaged.parquet"
+    damaged.write_bytes(b"PAR1 and no more")
+    refused(damaged, "cannot be read as a Parquet file")
+
+
+def test_an_mdf_file_is_read(mdf):
+    path = mdf((T, {"force": FORCE, "x2": X2}), (T[::2], {"slow": FORCE[::2]}))
+    same(read(path, "force", "x2"))
+    assert set(column_names(path)) == {"t", "force", "x2", "slow"}
+
+
+def test_what_an_mdf_file_lacks_is_said(mdf, tmp_path):
+    path = mdf((T, {"force": FORCE}), (T[::2], {"slow": FORCE[::2]}))
+    refused(path, "has no column 'x2'")
+    refused(path, "'force' and 'slow' have different times (5 and 3 samples)", outputs="slow")
+    refused(mdf((T**2, {"force": FORCE, "x2": X2})), "is not uniform")
+    damaged = tmp_path / "damaged.mf4"
+    damaged.write_bytes(b"MDF and no more")
+    refused(damaged, "cannot be read as an MDF file")
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "extra"), [("a.parquet", "pyarrow", "parquet"), ("a.mf4", "asammdf", "mdf")]
+)
+def test_a_missing_package_is_named(monkeypatch, tmp_path, name, package, extra):
+    monkeypatch.setitem(sys.modules, package, None)
+    (tmp_path / name).write_bytes(b"x")
+    refused(tmp_path / name, f"install pilfr-casadi[{extra}]")
+
+
+@pytest.mark.parametrize("name", ["none.parquet", "none.mf4"])
+def test_a_missing_file_is_named(tmp_path, name):
+    refused(tmp_path / name, "")

@@ -1,0 +1,153 @@
+"""Simulators from MuJoCo models: the same motion as MuJoCo's own, numbers as parameters, plain refusals."""
+
+import pickle
+
+import casadi as ca
+import numpy as np
+import pytest
+from command_line import refused
+
+from pilfr_casadi import InputError, Parameter, Recording, from_mujoco
+from pilfr_casadi.laws import CoulombFriction
+
+mujoco = pytest.importorskip("mujoco")
+STEP, SAMPLES = 0.002, 400
+ARM = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="0.002" integrator="RK4"/>
+  <worldbody>
+    <body name="upper" pos="0 0 1" quat="1 0.1 0 0.2">
+      <joint name="shoulder" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" fromto="0 0 0 0 0.1 -.4" size=".03" mass="1.2"/>
+      <body name="lower" pos="0 0 -.4" quat="1 0 0.3 0">
+        <joint name="elbow" axis="1 1 0" pos="0 0 .02" damping=".05" armature=".01" stiffness="1" springref=".2"/>
+        <geom type="capsule" fromto="0 0 0 0 0.05 -.3" size=".02" mass=".8"/>
+        <body name="tip" pos="0 0 -.3">
+          <joint name="slide" type="slide" axis="0 1 1" pos="0.1 0 0" damping="4" stiffness="300"/>
+          <geom type="sphere" size=".05" pos=".01 .02 .03" mass=".3"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="m1" joint="shoulder" gear="3"/><position name="m2" joint="elbow" kp="5" kv=".3"/></actuator>
+  <sensor><jointpos name="q1" joint="shoulder"/><jointvel name="w2" joint="elbow"/></sensor>
+</mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    path = tmp_path_factory.mktemp("arm") / "arm.xml"
+    path.write_text(ARM, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def recording():
+    t = STEP * np.arange(SAMPLES)
+    u = np.column_stack([np.sin(5 * t), 0.5 * np.cos(9 * t)])
+    return Recording(u, np.zeros((SAMPLES, 2)), STEP, ("m1", "m2"), ("q1", "w2"), initial="zero", hold="zero")
+
+
+def by_mujoco(path, recording, push=None):
+    model = mujoco.MjModel.from_xml_path(str(path))
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    data, out = mujoco.MjData(model), np.zeros((len(recording), 2))
+    for k, control in enumerate(recording.u):
+        out[k] = data.qpos[0], data.qvel[1]
+        data.ctrl[:] = control
+        if push is not None:
+            data.qfrc_applied[:] = push(data)
+        mujoco.mj_step(model, data)
+    return out
+
+
+def test_it_moves_as_mujoco_does(arm, recording):
+    simulator = from_mujoco(arm)
+    assert simulator.states == ("shoulder", "elbow", "slide", "shoulder.speed", "elbow.speed", "slide.speed")
+    wanted = by_mujoco(arm, recording)
+    # MuJoCo holds a servo's force during a step, the equations do not
+    assert np.max(np.abs(simulator.simulate(recording) - wanted)) < 2e-5 * np.max(np.abs(wanted))
+
+
+def test_a_law_in_a_joint_is_an_applied_torque(arm, recording):
+    law = CoulombFriction({"F_c": 0.4, "v_0": 0.3})
+    simulator = from_mujoco(arm).with_element("shoulder", law)
+    wanted = by_mujoco(arm, recording, lambda data: [-0.4 * np.tanh(data.qvel[0] / 0.3), 0, 0])
+    free = from_mujoco(arm).simulate(recording)
+    found = simulator.simulate(recording)
+    assert np.max(np.abs(found - wanted)) < 2e-2 * np.max(np.abs(free - wanted))  # a torque that is held for a step
+
+
+def test_numbers_of_the_model_are_parameters(arm, recording, tmp_path):
+    chosen = ("lower.mass", "lower.com_z", "elbow.stiffness", "m1.gain", "gravity")
+    simulator = from_mujoco(arm, parameters=chosen, bounds={"gravity": (9, 10)})
+    values = {name: p.value for name, p in simulator.parameters.items()}
+    assert values["lower.mass"] == pytest.approx(0.8) and values["gravity"] == pytest.approx(9.81)
+    assert simulator.parameters["gravity"].bounds == (9, 10)
+    other = {"lower.mass": Parameter(1.6), "elbow.stiffness": Parameter(2.0)}
+    changed = simulator.with_parameters({**simulator.parameters, **other})
+    path = tmp_path / "changed.xml"
+    path.write_text(ARM.replace('mass=".8"', 'mass="1.6"').replace('stiffness="1"', 'stiffness="2"'), encoding="utf-8")
+    wanted = by_mujoco(path, recording)
+    assert np.max(np.abs(changed.simulate(recording) - wanted)) < 2e-5 * np.max(np.abs(wanted))
+
+
+def test_ports_load_and_units(arm):
+    simulator = from_mujoco(arm, outputs=("q1", "slide"), inputs=("m1",))
+    ports = {port.name: port for port in simulator.ports}
+    assert (ports["shoulder"].unit, ports["slide"].unit, ports["shoulder"].domain) == ("N m", "N", "mechanical")
+    assert list(ports["shoulder"].signals) == ["load"] and not ports["slide"].signals
+    assert simulator.units == {"q1": "rad", "slide": "m"}
+    x, u, p, t = simulator.symbols()
+    load = simulator.port_signals(ports["shoulder"], x, u, p, t)["load"]
+    assert float(ca.Function("load", [u["m1"]], [load])(-2.0)) == pytest.approx(6.0)
+
+
+def test_it_may_be_sent_to_another_process(arm, recording):
+    import cloudpickle
+
+    again = pickle.loads(cloudpickle.dumps(from_mujoco(arm)))
+    np.testing.assert_array_equal(again.simulate(recording), from_mujoco(arm).simulate(recording))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ('damping="0.1"', 'damping="0.1" frictionloss="1"', "dry friction in a joint"),
+        ('<joint name="shoulder" axis="0 1 0" damping="0.1"/>', "<freejoint/>", "a free or a ball joint"),
+        ("<motor ", '<intvelocity name="m0" joint="elbow" kp="1" actrange="0 1"/><motor ', "a state of its own"),
+        ("<worldbody>", "<worldbody", "MuJoCo cannot read"),
+        ('integrator="RK4"', 'integrator="RK4" density="100"', "moves otherwise than a tree of rigid bodies"),
+    ],
+)  # fmt: skip
+def test_what_the_equations_do_not_hold_is_refused(tmp_path, before, after, said):
+    path = tmp_path / "arm.xml"
+    assert before in ARM
+    text = ARM.replace(before, after)
+    if "freejoint" in after:
+        text = text.replace('<motor name="m1" joint="shoulder" gear="3"/>', "").replace(
+            '<jointpos name="q1" joint="shoulder"/>', ""
+        )
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=said):
+        from_mujoco(path)
+
+
+def test_unknown_names_are_refused(arm):
+    with pytest.raises(InputError, match=r"has no 'wrist.mass' among its parameters; they are gravity, upper.mass"):
+        from_mujoco(arm, parameters=["wrist.mass"])
+    with pytest.raises(InputError, match=r"has no 'm9' among its actuators; they are m1, m2"):
+        from_mujoco(arm, inputs=["m9"])
+    with pytest.raises(InputError, match="outside of its bounds 2 to 3; widen them"):
+        from_mujoco(arm, bounds={"upper.mass": (2, 3)})
+
+
+def test_the_command_takes_a_model(arm, tmp_path, capsys, recording):
+    table = np.column_stack([recording.t, recording.u, recording.y])
+    np.savetxt(tmp_path / "train.csv", table, delimiter=",", header="t,m1,m2,q1,w2", comments="")
+    train, out = str(tmp_path / "train.csv"), ["--out", str(tmp_path / "out")]
+    refused(capsys, "diagnose", str(tmp_path / "none.xml"), train, *out, says="none.xml")
+    refused(capsys, "diagnose", str(arm), train, "--bound", "wrist.mass=1:2", *out, says="'wrist.mass'")
+    refused(capsys, "diagnose", str(arm), train, "--port", "a=b:c", *out, says="--port was given")
+    assert not (tmp_path / "out").exists()
