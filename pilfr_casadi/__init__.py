@@ -148,7 +148,7 @@ if TYPE_CHECKING:
         from_function as from_function,
         from_mujoco as from_mujoco,
     )
-    from .studies import campaign as campaign, read_run as read_run, run as run
+    from .studies import campaign as campaign, fleet as fleet, read_run as read_run, run as run
 else:
     __getattr__, __dir__, _listed = lazy_face(__name__, __file__)
 # Reached through their folders (`pilfr.models.to_plays`); these spellings still work.
@@ -171,6 +171,7 @@ _ELSEWHERE = {
     "do_mpc_controller",
     "do_mpc_model",
     "feedforward",
+    "fleet",
     "fit_report",
     "frequency_subspace",
     "from_mujoco",

@@ -22,7 +22,7 @@ FOLDERS = {
     "export": "Export",
     "control": "Control",
     "laws": "Laws",
-    "studies": "Run files and campaigns",
+    "studies": "Run files, campaigns and fleets",
     "report": "Reports",
     "plots": "Figures",
     "_base": "Errors",

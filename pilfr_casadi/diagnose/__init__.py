@@ -18,6 +18,7 @@ about. The files by stage:
 - Other explanations: `other_explanations` (a pinned value, an undeclared port, a machine that changed).
 - Proof: `proof` (errors before and after, placebo, next experiment), `force_recovery`, `mismatch_map`.
 - Result: `result`, and `refinement`: a Prandtl-Ishlinskii layer in place of the hysteresis that was found.
+- After a diagnosis: `replication` fits laws that were found to the recordings of further machines.
 - Before a diagnosis: `blind_spots` (`check`: what the recordings cannot reveal), based on `identifiability` (which
   parameters are identifiable, and which laws detectable).
 """
@@ -35,11 +36,23 @@ if TYPE_CHECKING:
     from ..identify import surrogate as surrogate
     from ..laws import Law
     from .blind_spots import BlindSpot as BlindSpot, Check as Check, check as check
+    from .evidence import SURE as SURE, log_prior as log_prior
     from .force_recovery import HiddenForce as HiddenForce, hidden_force as hidden_force
     from .gates import Gate as Gate
     from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
     from .mismatch_map import mismatch as mismatch
+    from .preparation import (
+        add_scaled_laws as add_scaled_laws,
+        check_laws as check_laws,
+        match_recordings as match_recordings,
+    )
     from .refinement import Refinement as Refinement
+    from .replication import (
+        Replication as Replication,
+        Values as Values,
+        refit_error as refit_error,
+        replicate as replicate,
+    )
     from .result import (
         STEPS as STEPS,
         BeforeAfter as BeforeAfter,

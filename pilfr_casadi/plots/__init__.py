@@ -33,6 +33,12 @@ if TYPE_CHECKING:
         virgin_curve as virgin_curve,
         weights as weights,
     )
+    from .fleet import (
+        machine_map as machine_map,
+        machine_strips as machine_strips,
+        machine_trends as machine_trends,
+        small_multiples as small_multiples,
+    )
     from .linear_parts import bode as bode, pole_zero as pole_zero
     from .signals import (
         Simulated as Simulated,

@@ -119,7 +119,8 @@ def _subtitle(case: _Case) -> str:
     parts = [f"{len(d.train)} training recording{'s' * (len(d.train) != 1)}, {sum(map(len, d.train))} samples"]
     parts += [f"{len(d.test)} held out, {sum(map(len, d.test))} samples"] if d.test else ["none held out"]
     between = {"zero": "held", "linear": "interpolated"}.get(d.hold, d.hold)
-    parts += [f"step {r.dt:.4g} s", f"inputs {between} between samples", f"computed in {d.seconds:.1f} s"]
+    parts += [f"step {r.dt:.4g} s", f"inputs {between} between samples"]
+    parts += [f"computed in {d.seconds:.1f} s"] if d.seconds else []
     return "; ".join(parts)
 
 

@@ -74,13 +74,26 @@ class Code:
     kind: str = field(init=False, default="code")
 
 
+class Link(str):
+    """Text of a table's cell that leads to another page, by an address relative to this one."""
+
+    address: str
+
+    def __new__(cls, text: str, address: str) -> Link:
+        """Make it of the text and the address."""
+        link = super().__new__(cls, text)
+        link.address = address
+        return link
+
+
 @dataclass(frozen=True)
 class Table:
     """A table; the first column names the rows.
 
-    Cells are text, or numbers, which are written with `digits` significant digits; None and nan become a dash. Rows
-    whose index is in `emphasis` are bold. `caption` stands above the table, `note` below; a `folded` table is closed
-    until the reader opens it. A row whose number of cells differs from the number of columns raises an `InputError`.
+    Cells are text, a `Link`, or numbers, which are written with `digits` significant digits; None and nan become a
+    dash. Rows whose index is in `emphasis` are bold. `caption` stands above the table, `note` below; a `folded` table
+    is closed until the reader opens it. A row whose number of cells differs from the number of columns raises an
+    `InputError`.
     """
 
     columns: Sequence[str]

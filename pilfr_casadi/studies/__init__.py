@@ -1,4 +1,9 @@
-"""Scripted identification runs and campaigns: a file describes the jobs, a folder holds the results."""
+"""Many jobs, kept in a folder: runs and campaigns, which a file describes, and fleets of machines.
+
+`executor` runs jobs of any kind side by side, `folder` keeps their results. Of runs: `schema` (the file), `jobs`,
+`execution`, `summary`. Of fleets: `fleets` (the steps), `machines` (the work at one machine), `population` (statistics
+over machines), `fleet_result`.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -13,9 +18,16 @@ if TYPE_CHECKING:
         run as run,
         seeds_advice as seeds_advice,
     )
-    from .executor import AHEAD as AHEAD, dask_executor as dask_executor
+    from .executor import (
+        AHEAD as AHEAD,
+        Effort as Effort,
+        Outcome as Outcome,
+        dask_executor as dask_executor,
+        run_side_by_side as run_side_by_side,
+    )
+    from .fleet_result import Fleet as Fleet, Machine as Machine, read_fleet as read_fleet
+    from .fleets import FLEET as FLEET, common_physics as common_physics, fleet as fleet
     from .folder import (
-        MODEL as MODEL,
         PAGE as PAGE,
         PICTURE as PICTURE,
         SUMMARY as SUMMARY,
@@ -24,7 +36,13 @@ if TYPE_CHECKING:
         check_own as check_own,
         lock_folder as lock_folder,
     )
-    from .jobs import fold as fold, input_digests as input_digests, jobs_of as jobs_of
+    from .jobs import MODEL as MODEL, fold as fold, input_digests as input_digests, jobs_of as jobs_of
+    from .population import (
+        Population as Population,
+        combine as combine,
+        estimate_population as estimate_population,
+        slope as slope,
+    )
     from .schema import (
         LARGEST_SIZE as LARGEST_SIZE,
         ROLES as ROLES,

@@ -11,6 +11,7 @@ read at any time, and a campaign ends with a summary and box plots.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -24,9 +25,9 @@ from ..data import Recording, keeps_its_period, read
 from ..identify import Fit, is_drawn
 from ..models import PILFR, places
 from ..optimise import Status
-from .executor import AHEAD, run_side_by_side
-from .folder import MODEL, PAGE, PICTURE, SUMMARY, TABLE, Store, check_own, lock_folder, read_times
-from .jobs import Batch, RunJob, fold, input_digests, jobs_of, outcome
+from .executor import AHEAD, Batch, Effort, run_side_by_side
+from .folder import PAGE, PICTURE, SUMMARY, TABLE, Store, check_own, lock_folder, read_times
+from .jobs import MODEL, RunJob, fold, input_digests, jobs_of, outcome
 from .schema import ROLES, Cell, Run, read_run
 from .summary import (
     CellSummary,
@@ -205,7 +206,9 @@ def campaign(
             raise InputError(f"{given.file}: {len(given.seeds)} seeds were given, but {advice}.")
 
     def run_in_processes(store: Store, jobs: Sequence[RunJob]) -> Iterator[Batch]:
-        return run_side_by_side(given, store.recordings, jobs, executor, ahead)
+        work = functools.partial(outcome, given, store.recordings)
+        effort = Effort(given.workers, given.time_limit, given.retries)
+        return run_side_by_side(work, jobs, effort, executor, ahead)
 
     return _execute(given, run_in_processes, overwrite, progress, tell, campaign=True)
 

@@ -10,9 +10,10 @@ import contextlib
 import functools
 import logging
 import pickle
+import platform
 import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -22,31 +23,118 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
-from .._base import InputError, Reply, close_workers, run_in_worker
-from .jobs import LOST, TIMED_OUT, Batch, Outcome, Recordings, RunJob, attempt, outcome_without_model, versions
-from .schema import Run
+import numpy as np
+
+from .._base import InputError, Reply, __version__, close_workers, run_in_worker
 
 AHEAD = 64  # jobs submitted to an executor at a time
 SCHEDULER_TIMEOUT = 10.0  # seconds to wait for a Dask scheduler
+RETRIES = 2  # trials of a job whose worker was lost, after the first
+FAILED, TIMED_OUT, LOST = "FAILED", "TIMED_OUT", "LOST"  # endings of a job without a result
+
+
+class Job(Protocol):
+    """An independent piece of work."""
+
+    @property
+    def id(self) -> str:
+        """Name of the job, the same in every execution."""
+
+    @property
+    def key(self) -> str:
+        """Digest of everything that its result depends on."""
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """Facts about the job for its entry in the manifest."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """The result of a job.
+
+    Attributes
+    ----------
+    entry : dict
+        Its entry in the manifest, with `status` and `sentence`.
+    seconds : float
+        The time it took.
+    files : mapping
+        Its files by name, below the folder of the job.
+    errors : mapping
+        NRMSE by recording, of a job of a run.
+    """
+
+    entry: dict[str, Any]
+    seconds: float = 0.0
+    files: Mapping[str, str | bytes] = field(default_factory=dict)
+    errors: Mapping[str, float | None] = field(default_factory=dict)
+
+
+Work = Callable[[Any], Outcome]  # executes a job
+Batch = list[tuple[Any, Outcome]]  # jobs that ended together
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Processes for jobs without an executor, the time limit of a job in seconds, and retries of a lost job."""
+
+    workers: int = 1
+    time_limit: float | None = None
+    retries: int = RETRIES
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that the numbers of a job depend on."""
+    import casadi
+    import scipy
+
+    return {
+        "pilfr_casadi": __version__,
+        "casadi": casadi.__version__,
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+    }
+
+
+def failure(status: str, sentence: str, **more: Any) -> Outcome:
+    """Make the outcome of a job without a result."""
+    return Outcome({"status": status, "sentence": sentence, **more})
+
+
+def attempt(work: Work, job: Any) -> Outcome:
+    """Execute a job; a failure is an outcome too."""
+    try:
+        return work(job)
+    except Exception as error:
+        if isinstance(error, InputError):
+            return failure(FAILED, f"Failed: {error}", refused=True)
+        return failure(FAILED, f"Failed: {type(error).__name__}: {error}")
 
 
 def run_side_by_side(
-    run: Run, recordings: Recordings, jobs: Sequence[RunJob], executor: Executor | None, ahead: int
+    work: Work, jobs: Sequence[Any], effort: Effort, executor: Executor | None = None, ahead: int = AHEAD
 ) -> Iterator[Batch]:
-    """Run jobs on an executor, else in processes, else (one worker without a time limit) in this process."""
+    """Run jobs on an executor, else in processes, else (one worker without a time limit) in this process.
+
+    `work` and the jobs are sent to the processes, `work` once to each.
+    """
     if executor is not None:
-        yield from _outcomes(run, recordings, jobs, executor, ahead)
-    elif run.workers > 1 or run.time_limit is not None:
-        pool = ThreadPoolExecutor(run.workers)
+        yield from _outcomes(work, jobs, effort, executor, ahead)
+    elif effort.workers > 1 or effort.time_limit is not None:
+        pool = ThreadPoolExecutor(effort.workers)
         try:
-            yield from _outcomes(run, recordings, jobs, pool, 2 * run.workers)
+            yield from _outcomes(work, jobs, effort, pool, 2 * effort.workers)
         finally:
             _end(pool)
     else:
         for job in jobs:
-            yield [(job, attempt(run, recordings, job))]
+            yield [(job, attempt(work, job))]
 
 
 def _end(pool: ThreadPoolExecutor) -> None:
@@ -60,23 +148,21 @@ def _end(pool: ThreadPoolExecutor) -> None:
     close_workers()
 
 
-def _outcomes(
-    run: Run, recordings: Recordings, jobs: Sequence[RunJob], executor: Executor, ahead: int
-) -> Iterator[Batch]:
+def _outcomes(work: Work, jobs: Sequence[Any], effort: Effort, executor: Executor, ahead: int) -> Iterator[Batch]:
     """Yield outcomes as they arrive; keep `ahead` jobs submitted at a time."""
-    shared = _pickle(functools.partial(_attempt_with_versions, run, recordings))
-    waiting, running = deque((job, 1) for job in jobs), dict[Future[Reply], tuple[RunJob, int]]()
+    shared = _pickle(functools.partial(_attempt_with_versions, work))
+    waiting, running = deque((job, 1) for job in jobs), dict[Future[Reply], tuple[Any, int]]()
     try:
         while waiting or running:
             while waiting and len(running) < ahead:
                 job, trial = waiting.popleft()
-                running[executor.submit(run_in_worker, shared, _pickle(job), run.time_limit)] = job, trial
+                running[executor.submit(run_in_worker, shared, _pickle(job), effort.time_limit)] = job, trial
             batch: Batch = []
             stop: Exception | None = None
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, trial = running.pop(future)
                 try:
-                    outcome = _outcome(future, trial > run.retries, run.time_limit)
+                    outcome = _outcome(future, trial > effort.retries, effort.time_limit)
                     if outcome is None:
                         waiting.appendleft((job, trial + 1))
                     else:
@@ -84,7 +170,7 @@ def _outcomes(
                 except (InputError, BrokenExecutor, CancelledError) as error:
                     stop = error
             if batch:
-                yield batch  # results that have arrived are kept, whatever stops the campaign
+                yield batch  # results that have arrived are kept, whatever stops the others
             if stop is not None:
                 raise stop
     except (BrokenExecutor, CancelledError, RuntimeError, OSError) as error:
@@ -107,15 +193,13 @@ def _outcome(future: Future[Reply], last: bool, time_limit: float | None) -> Out
         name = type(error).__name__
         reply = Reply(lost=f"{name}: {error}".splitlines()[0], begun=name == "KilledWorker")
     if reply.timed_out:
-        return outcome_without_model(
-            TIMED_OUT, f"Failed: ended after its time limit of {time_limit:g} s.", time_limit=time_limit
-        )
+        return failure(TIMED_OUT, f"Failed: ended after its time limit of {time_limit:g} s.", time_limit=time_limit)
     if reply.lost:
         if not last:
             return None
         if not reply.begun:
             raise InputError(f"The workers cannot start a job ({reply.lost}); check that they can import this package.")
-        return outcome_without_model(LOST, f"Failed: its worker was lost in every trial, lastly {reply.lost}.")
+        return failure(LOST, f"Failed: its worker was lost in every trial, lastly {reply.lost}.")
     outcome, used = reply.result
     for name, version in versions().items():
         if used.get(name) != version:
@@ -126,23 +210,26 @@ def _outcome(future: Future[Reply], last: bool, time_limit: float | None) -> Out
     return outcome
 
 
-def _attempt_with_versions(run: Run, recordings: Recordings, job: RunJob) -> tuple[Outcome, dict[str, str]]:
+def _attempt_with_versions(work: Work, job: Any) -> tuple[Outcome, dict[str, str]]:
     """Compute the outcome of a job in a worker; return it with the versions in use there."""
-    return attempt(run, recordings, job), versions()
+    return attempt(work, job), versions()
 
 
 def _pickle(thing: Any) -> bytes:
     try:
-        return pickle.dumps(thing)
+        data = pickle.dumps(thing)
+        if b"__main__" not in data:
+            return data
+        reason: object = "the script that runs defines it"  # a worker has another main script
     except Exception as error:
         reason = error
-    try:  # workers cannot import code of a run file in Python; cloudpickle sends it
+    try:  # workers cannot import code of a run file, a simulator file or a notebook; cloudpickle sends it
         import cloudpickle
 
         return bytes(cloudpickle.dumps(thing))
     except Exception:
         raise InputError(
-            f"The model or a constraint cannot be sent to other processes ({reason}); install "
+            f"The model, the simulator or a constraint cannot be sent to other processes ({reason}); install "
             "pilfr-casadi[dask], which can send code, or use workers=1 without a time limit."
         ) from None
 

@@ -13,7 +13,7 @@ import os
 import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,60 +22,74 @@ import numpy as np
 from .._base import InputError, digest, listed, make_folder, write_atomically
 from ..identify import load
 from ..models import Model
-from .jobs import (
-    BAD_ENDS,
-    FAILED,
-    LOST,
-    TIMED_OUT,
-    Outcome,
-    Recordings,
-    RunJob,
-    error_of,
-    file_digest,
-    scored_files,
-    versions,
-)
+from .executor import FAILED, LOST, TIMED_OUT, Batch, versions
+from .jobs import BAD_ENDS, MODEL, Recordings, RunJob, error_of, file_digest, scored_files
 from .schema import Run
 from .summary import Score, results_table
 
-FORMAT, VERSION, MANIFEST = "pilfr_casadi run", 1, "manifest.json"
-TABLE, PAGE, MODEL, TIMES, JOBS, LOCK = "results.csv", "report.html", "model.json", "times.json", "jobs", ".lock"
+VERSION, MANIFEST = 1, "manifest.json"
+TABLE, PAGE, TIMES, JOBS, LOCK = "results.csv", "report.html", "times.json", "jobs", ".lock"
 SUMMARY, PICTURE = "summary.csv", "spread.png"  # of a campaign
-OWN = (MANIFEST, TABLE, PAGE, MODEL, SUMMARY, PICTURE, TIMES, JOBS)
 TABLE_PAUSE = 1.0  # seconds between two tables of a running campaign
 ADVICE = "restore it, or give --overwrite to compute everything again"
 
 
-def check_own(folder: Path, file: Path, overwrite: bool) -> None:
-    """Refuse a folder that holds the run file, or files that no run wrote."""
-    target = os.path.realpath(folder)
-    if target in map(str, Path(os.path.realpath(file)).parents):
-        raise InputError(f"The folder {folder} holds the run file {file.name}; give the results another folder.")
+@dataclass(frozen=True)
+class Layout:
+    """What a folder of results holds: the `kind` of study, its files, and the names of files of its jobs.
+
+    `source` names the file that a study starts from, in messages.
+    """
+
+    kind: str
+    source: str
+    files: tuple[str, ...]
+    of_jobs: tuple[str, ...]
+
+    @property
+    def format(self) -> str:
+        """Name of the format in the manifest."""
+        return f"pilfr_casadi {self.kind}"
+
+    @property
+    def own(self) -> tuple[str, ...]:
+        """Names of files and folders that the study writes."""
+        return (MANIFEST, *self.files, TIMES, JOBS)
+
+    def is_half_written(self, name: str) -> bool:
+        """Tell whether a file is half-written, by the names that `write_atomically` gives."""
+        names = "|".join(map(re.escape, (*self.own, *self.of_jobs)))
+        return re.fullmatch(rf"\.({names})\.[0-9a-f]{{8}}\.tmp", name) is not None
+
+
+RUN = Layout("run", "run file", (TABLE, PAGE, MODEL, SUMMARY, PICTURE), (MODEL,))
+
+
+def check_own(folder: Path, file: Path | None, overwrite: bool, layout: Layout = RUN) -> None:
+    """Refuse a folder that holds the file that the study starts from, or files that no such study wrote."""
+    target, kind = os.path.realpath(folder), layout.kind
+    if file is not None and target in map(str, Path(os.path.realpath(file)).parents):
+        raise InputError(f"The folder {folder} holds the {layout.source} {file.name}; give the results another folder.")
     if not os.path.isdir(target):
         return
     try:
-        found = sorted(name for name in os.listdir(target) if name != LOCK and not _is_half_written(name))
+        found = sorted(name for name in os.listdir(target) if name != LOCK and not layout.is_half_written(name))
     except OSError as error:
         raise InputError(f"The folder {folder} cannot be read ({error.strerror}); give another one.") from None
     if MANIFEST in found:
         return
-    foreign = [name for name in found if name not in OWN]
+    foreign = [name for name in found if name not in layout.own]
     if foreign:
         raise InputError(
-            f"{folder} holds {listed(foreign, 3)} and no manifest of a run; give an empty or a new folder as --out."
+            f"{folder} holds {listed(foreign, 3)} and no manifest of a {kind}; give an empty or a new folder as --out."
         )
     if found and not overwrite:
-        raise InputError(f"{folder} holds {found[0]} but no manifest of a run; give another --out, or --overwrite.")
-
-
-def _is_half_written(name: str) -> bool:
-    """Tell whether a file is the half-written file of a run, by the names that `write_atomically` gives."""
-    return re.fullmatch(rf"\.({'|'.join(map(re.escape, OWN))})\.[0-9a-f]{{8}}\.tmp", name) is not None
+        raise InputError(f"{folder} holds {found[0]} but no manifest of a {kind}; give another --out, or --overwrite.")
 
 
 @contextlib.contextmanager
-def lock_folder(folder: Path) -> Iterator[None]:
-    """Lock a folder against other runs, and remove half-written files."""
+def lock_folder(folder: Path, layout: Layout = RUN) -> Iterator[None]:
+    """Lock a folder against other processes, and remove half-written files."""
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(ImportError):  # on systems without such locks
             import fcntl
@@ -87,9 +101,11 @@ def lock_folder(folder: Path) -> Iterator[None]:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
-                raise InputError(f"Another run is at work in {folder}; wait for it, or give another --out.") from None
+                raise InputError(
+                    f"Another {layout.kind} is at work in {folder}; wait for it, or give another --out."
+                ) from None
         for path in (*folder.iterdir(), *folder.glob(f"{JOBS}/*/.*")):
-            if _is_half_written(path.name):
+            if layout.is_half_written(path.name):
                 path.unlink(missing_ok=True)
         yield
 
@@ -106,28 +122,28 @@ def read_times(folder: Path) -> dict[str, float]:
 class Manifest:
     """The manifest in a folder, rewritten atomically after every step."""
 
-    def __init__(self, folder: Path, content: dict[str, Any] | None = None) -> None:
+    def __init__(self, folder: Path, content: dict[str, Any] | None = None, layout: Layout = RUN) -> None:
         tables: dict[str, Any] = {key: {} for key in ("jobs", "scores", "files", "inputs")}
-        self.folder = folder
-        self.content = content or {"format": FORMAT, "version": VERSION, **tables}
+        self.folder, self.layout = folder, layout
+        self.content = content or {"format": layout.format, "version": VERSION, **tables}
 
     @classmethod
-    def read(cls, folder: Path) -> Manifest:
-        """Read the manifest of an earlier run, or start an empty one; refuse one that was changed."""
-        path = folder / MANIFEST
+    def read(cls, folder: Path, layout: Layout = RUN) -> Manifest:
+        """Read the manifest of an earlier study, or start an empty one; refuse one that was changed."""
+        path, kind = folder / MANIFEST, layout.kind
         if not path.exists():
-            return cls(folder)
+            return cls(folder, layout=layout)
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError, RecursionError):
             content = None
         if not isinstance(content, dict):
-            raise InputError(f"{path} is not a manifest of a run; {ADVICE}.")
-        if content.get("format") != FORMAT or content.get("version") != VERSION:
+            raise InputError(f"{path} is not a manifest of a {kind}; {ADVICE}.")
+        if content.get("format") != layout.format or content.get("version") != VERSION:
             raise InputError(f"{path} is not a manifest that this release writes; {ADVICE}.")
         if content.pop("sha256", None) != digest(content):
-            raise InputError(f"{path} was changed after the run wrote it; {ADVICE}.")
-        return cls(folder, content)
+            raise InputError(f"{path} was changed after the {kind} wrote it; {ADVICE}.")
+        return cls(folder, content, layout)
 
     def write(self) -> None:
         """Write it, with its digest."""
@@ -136,7 +152,7 @@ class Manifest:
         write_atomically(self.folder / MANIFEST, text + "\n")
 
     def holds(self, name: str) -> bool:
-        """Tell whether a file of the run is there; refuse one that was changed."""
+        """Tell whether a file of the study is there; refuse one that was changed."""
         path = self.folder / name
         if name not in self.content["files"] or not path.is_file():
             return False
@@ -144,13 +160,13 @@ class Manifest:
         expected = self.content["files"][name], self.content.get("writing", {}).get(name)
         if file_digest(path) not in expected:
             raise InputError(
-                f"{path} was changed after the run wrote it; restore it, remove it, or give --overwrite to compute "
-                "everything again."
+                f"{path} was changed after the {self.layout.kind} wrote it; restore it, remove it, or give "
+                "--overwrite to compute everything again."
             )
         return True
 
     def put(self, name: str, content: str | bytes) -> None:
-        """Write a file of the run and its digest in the manifest, unless both are up to date."""
+        """Write a file of the study and its digest in the manifest, unless both are up to date."""
         data = content.encode() if isinstance(content, str) else content
         if self.content["files"].get(name) != digest(data) or not self.holds(name):
             self.put_all({name: data})
@@ -168,6 +184,14 @@ class Manifest:
         self.content["jobs"] |= jobs or {}
         self.write()
 
+    def record(self, batch: Batch) -> None:
+        """Write the times and files of finished jobs, then their entries."""
+        times = read_times(self.folder) | {job.id: round(found.seconds, 3) for job, found in batch}
+        write_atomically(self.folder / TIMES, json.dumps(times, indent=1, sort_keys=True) + "\n")
+        files = {f"{JOBS}/{job.id}/{name}": text for job, found in batch for name, text in found.files.items()}
+        data = {name: text.encode() if isinstance(text, str) else text for name, text in files.items()}
+        self.put_all(data, {job.id: {**job.parameters, "key": job.key, **found.entry} for job, found in batch})
+
 
 class Store:
     """The results of a run on disk, read and written; files that were changed afterwards are refused."""
@@ -180,7 +204,7 @@ class Store:
         for name in (TABLE, MODEL, PAGE, SUMMARY, PICTURE):
             self.manifest.holds(name)
         if campaign:
-            _refuse_other_versions(self.manifest)
+            refuse_other_versions(self.manifest)
         described = {"file": run.file.name, "said": run.plain_tables}
         self.manifest.content |= {"run": described, "versions": versions(), "inputs": dict(inputs)}
         self.manifest.write()
@@ -211,16 +235,13 @@ class Store:
         """Tell whether the folder has a model of a job."""
         return job.fold is None and self.ended_well(job)
 
-    def record(self, batch: Sequence[tuple[RunJob, Outcome]]) -> None:
-        """Write the models of finished jobs, then their entries in the manifest."""
-        entries = {job.id: {**job.parameters, "key": job.key, **found.entry} for job, found in batch}
-        models = {job.model_file: found.model.encode() for job, found in batch if found.model is not None}
-        for job, found in batch:
+    def record(self, batch: Batch) -> None:
+        """Note the errors of finished jobs, and record them in the manifest."""
+        for _, found in batch:
             for name, error in found.errors.items():
-                self.manifest.content["scores"][self._score_key(digest(models[job.model_file]), name)] = error
-        times = read_times(self.path) | {job.id: round(found.seconds, 3) for job, found in batch}
-        write_atomically(self.path / TIMES, json.dumps(times, indent=1, sort_keys=True) + "\n")
-        self.manifest.put_all(models, entries)
+                model = digest(str(found.files[MODEL]).encode())
+                self.manifest.content["scores"][self._score_key(model, name)] = error
+        self.manifest.record(batch)
 
     def scores(self, jobs: Sequence[RunJob], last: bool = False) -> list[Score]:
         """Return the errors of the jobs' models, computed where the manifest lacks them; `last` drops other entries."""
@@ -259,7 +280,7 @@ class Store:
         self.written = time.monotonic()
 
 
-def _refuse_other_versions(manifest: Manifest) -> None:
+def refuse_other_versions(manifest: Manifest) -> None:
     """Refuse to mix results of different versions in one campaign, which compares its results."""
     before, now = manifest.content.get("versions", {}), versions()
     for name in now:

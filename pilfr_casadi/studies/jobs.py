@@ -14,27 +14,26 @@ other blocks contain the same input.
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, __version__, digest, existing_file
+from .._base import InputError, Progress, digest, existing_file
 from ..data import NOTHING_SENTENCE, Recording, explains_nothing, fingerprint, group_by_input, repeats_itself
 from ..export import model_text
 from ..identify import Fit, fit as identify, operators_used, prune, regularization_path
 from ..models import Model
 from ..optimise import Solution, Status
+from .executor import FAILED, LOST, TIMED_OUT, Outcome, versions
 from .schema import ROLES, Run
 
 Recordings = Mapping[str, tuple[Recording, ...]]
-# endings of a job of a campaign besides a solver's status
-FAILED, TIMED_OUT, LOST = "FAILED", "TIMED_OUT", "LOST"
 BAD_ENDS = (FAILED, TIMED_OUT, LOST, Status.INFEASIBLE.name)  # without a model
+MODEL = "model.json"
 FEWEST_SAMPLES = 20  # in a block of a cross-validation: needed to estimate its initial state
 
 
@@ -59,20 +58,7 @@ class RunJob:
     @property
     def model_file(self) -> str:
         """Path of its model file below the folder of the run."""
-        return f"jobs/{self.id}/model.json"
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """The result of a job: its entry in the manifest, the time it took, its model file, its NRMSE by recording."""
-
-    entry: dict[str, Any]
-    seconds: float = 0.0
-    model: str | None = None
-    errors: Mapping[str, float | None] = field(default_factory=dict)
-
-
-Batch = list[tuple[RunJob, Outcome]]  # jobs that ended together
+        return f"jobs/{self.id}/{MODEL}"
 
 
 def file_digest(path: Path) -> str:
@@ -81,21 +67,6 @@ def file_digest(path: Path) -> str:
         return digest(existing_file(path).read_bytes())
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}); check its permissions.") from None
-
-
-def versions() -> dict[str, str]:
-    """Return the versions that the numbers of a run depend on."""
-    import casadi
-    import scipy
-
-    return {
-        "pilfr_casadi": __version__,
-        "casadi": casadi.__version__,
-        "numpy": np.__version__,
-        "scipy": scipy.__version__,
-        "python": platform.python_version(),
-        "machine": f"{platform.system()} {platform.machine()}",
-    }
 
 
 def input_digests(run: Run) -> dict[str, str]:
@@ -196,22 +167,7 @@ def outcome(
     if job.fold is not None:
         return Outcome({**about, "held": fit.nrmse(fold(recordings["train"], job.fold, run.folds)[1])}, found.seconds)
     errors = {name: error_of(fit, recording) for _, name, recording in scored_files(run, recordings)}
-    return Outcome(about, found.seconds, model_text(fit.content()), errors)
-
-
-def attempt(run: Run, recordings: Recordings, job: RunJob) -> Outcome:
-    """Execute a job of a campaign; a failure is an outcome too."""
-    try:
-        return outcome(run, recordings, job)
-    except Exception as error:
-        if isinstance(error, InputError):
-            return outcome_without_model(FAILED, f"Failed: {error}", refused=True)
-        return outcome_without_model(FAILED, f"Failed: {type(error).__name__}: {error}")
-
-
-def outcome_without_model(status: str, sentence: str, **more: Any) -> Outcome:
-    """Make the outcome of a job without a model."""
-    return Outcome({"status": status, "sentence": sentence, "operators_used": "", **more})
+    return Outcome(about, found.seconds, {MODEL: model_text(fit.content())}, errors)
 
 
 def scored_files(run: Run, recordings: Recordings) -> Iterator[tuple[str, str, Recording]]:

@@ -62,7 +62,9 @@ def results_table(scores: Sequence[Score], jobs: Sequence[RunJob], entries: Mapp
         entry = entries[job.id]
         about = [job.id, job.parameters["seed"], int(job.id == best), *(job.parameters.get(k, "") for k in keys)]
         for s in by_job.get(job.id, [Score(job.id, "", "", np.nan)]):
-            writer.writerow([*about, entry["status"], entry["operators_used"], s.role, s.recording, repr(s.nrmse)])
+            writer.writerow(
+                [*about, entry["status"], entry.get("operators_used", ""), s.role, s.recording, repr(s.nrmse)]
+            )
     return text.getvalue()
 
 

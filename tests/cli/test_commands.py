@@ -284,7 +284,7 @@ def test_version_and_help(capsys):
     assert run(capsys, "--version") == (0, f"pilfr {pilfr.__version__}\n", "")
     status, out, err = run(capsys, "--help")
     assert status == 0 and "pilfr: " not in err
-    for name in ("fit", "check", "diagnose", "simulate", "export", "run", "campaign", "demo"):
+    for name in ("fit", "check", "diagnose", "simulate", "export", "run", "campaign", "fleet", "demo"):
         assert f"\n  {name} " in out
         status, text, _ = run(capsys, name, "--help")
         assert status == 0

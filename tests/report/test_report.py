@@ -17,6 +17,7 @@ from pilfr_casadi.optimise import Iteration, Solution, Status
 from pilfr_casadi.plots import new_figure
 from pilfr_casadi.report import (
     Code,
+    Link,
     Page,
     Picture,
     Section,
@@ -141,6 +142,13 @@ def test_tables_write_numbers_for_people():
     assert uncertain_text(0.25, np.nan) == "0.25"
     with pytest.raises(InputError, match="has 1 cells and its table 2 columns"):
         Table(["a", "b"], [["x"]])
+
+
+def test_a_cell_may_lead_to_another_page():
+    cell = Link("a & <b>", 'jobs/a b/report.html?"x"')
+    html = Page("links", [Section("s", [Table(["machine", "n"], [[cell, 1], ["plain", 2]])])]).html()
+    (link,) = (m for m in re.findall(r'<a href="([^"]*)">([^<]*)</a>', html) if not m[0].startswith("#"))
+    assert link == ("jobs/a b/report.html?&#34;x&#34;", "a &amp; &lt;b&gt;") and cell == "a & <b>"
 
 
 def test_an_unknown_tone():

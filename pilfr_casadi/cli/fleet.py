@@ -1,0 +1,164 @@
+"""`pilfr fleet`: read the recordings of many machines; print what all of them lack, and which differ."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from .._base import InputError, deferred_interrupt, progress_bar
+from ..simulators import as_simulator
+from ..studies import AHEAD, LARGEST_SIZE, NoModel, RunInterrupted, dask_executor
+from ._common import (
+    DONE,
+    INTERRUPTED,
+    NO_RESULT,
+    SimulatorOptions,
+    flag,
+    option,
+    say,
+    seconds,
+    takes_options,
+    whole,
+)
+
+if TYPE_CHECKING:
+    from ..data import Recording
+    from ..studies import Fleet
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetOptions(SimulatorOptions):
+    """The options of `pilfr fleet`."""
+
+    files: list[str] = typer.Argument(
+        ...,
+        metavar="SIMULATOR FOLDER",
+        help="The simulator, as for `pilfr diagnose`, then a folder with a recording (.csv, .mat, .npz), or a folder "
+        "of recordings in the order of their names, for each machine.",
+    )
+    sample: int = whole("Number of machines that are diagnosed to find the common physics (default: 4).", 1, 1000, 4)
+    workers: int | None = whole(
+        "Number of processes; it does not change the results (default: one per processor).", 1, LARGEST_SIZE["workers"]
+    )
+    dask: str | None = option("Work on the Dask cluster of this scheduler.", "ADDRESS")
+    time_limit: float | None = seconds("Give up the work at a machine after this time (default: no limit).")
+    out: str | None = option("Folder of the results (default: fleet).", "DIR")
+    overwrite: bool = flag("Compute everything again, even finished jobs.", "--overwrite")
+    against: str | None = option("Judge the machines against the fleet in this folder, and write nothing.", "DIR")
+
+    @property
+    def target(self) -> str:
+        """The folder of the results."""
+        return "fleet" if self.out is None else self.out
+
+    @cached_property
+    def machines(self) -> dict[str, list[str]]:
+        """The files of each machine."""
+        from ..data import TABLE_SUFFIXES
+
+        if len(self.files) != 2:
+            raise InputError(f"{len(self.files)} paths were given; give the simulator file, then a folder of machines.")
+        folder = Path(self.files[1])
+        if not folder.is_dir():
+            raise InputError(f"{folder} is no folder; give a folder with a recording, or a folder, for each machine.")
+
+        def tables(where: Path) -> list[Path]:
+            return sorted(p for p in where.iterdir() if p.is_file() and p.suffix.lower() in TABLE_SUFFIXES)
+
+        alone = {p.stem: [str(p)] for p in tables(folder)}
+        inside = {p.name: [str(q) for q in tables(p)] for p in sorted(folder.iterdir()) if p.is_dir()}
+        several = {name: paths for name, paths in inside.items() if paths}
+        if twice := sorted(set(alone) & set(several)):
+            raise InputError(f"{folder} has both a file and a folder for the machine {twice[0]!r}; leave one out.")
+        if len({path.stem for path in tables(folder)}) < len(tables(folder)):
+            raise InputError(
+                f"{folder} has two files for one machine; put recordings of a machine into a folder of it."
+            )
+        found = alone | several
+        if not found:
+            raise InputError(f"{folder} holds no recording (.csv, .mat, .npz), nor a folder with one.")
+        return dict(sorted(found.items()))
+
+    @property
+    def train(self) -> list[str]:
+        """All recordings."""
+        return [path for paths in self.machines.values() for path in paths]
+
+    def check_folder(self) -> None:
+        """Refuse results among the recordings, where the next call would take them for a machine."""
+        if Path(self.files[1]).resolve() in (Path(self.target).resolve(), *Path(self.target).resolve().parents):
+            raise InputError(f"The folder {self.target} is inside {self.files[1]}; give the results another --out.")
+
+
+@takes_options
+def fleet_command(options: FleetOptions) -> int:
+    """Writes report.html, fleet.json and fleet.csv to DIR. The same command continues after an interrupt."""
+    if options.dask and options.workers is not None:
+        raise InputError("--workers and --dask were given; the cluster has its own workers, so leave one of them out.")
+    if options.against is not None and options.out is not None:
+        raise InputError("--against and --out were given; --against writes nothing, so leave one of them out.")
+    options.check_files()
+    if options.against is None:
+        options.check_folder()
+    given = options.load_simulator()
+    simulator = as_simulator(given)
+    inputs, outputs = simulator.inputs, simulator.output_names
+    machines = {
+        name: [options.read(path, inputs, outputs) for path in paths] for name, paths in options.machines.items()
+    }
+    with deferred_interrupt():
+        from ..studies import fleet
+    if options.against is not None:
+        return _judge(options, given, machines)
+    count = sum(map(len, machines.values()))
+    print(f"fleet: {len(machines)} machines, {count} recordings, results in {options.target}", flush=True)
+    try:
+        with contextlib.ExitStack() as stack:
+            executor, _, ahead = None, 0, AHEAD
+            if options.dask:
+                executor, _, ahead = stack.enter_context(dask_executor(options.dask))
+            progress = stack.enter_context(progress_bar())
+            result = fleet(
+                given,
+                machines,
+                sample=options.sample,
+                hold=options.hold,
+                workers=options.workers,
+                executor=executor,
+                ahead=ahead,
+                time_limit=options.time_limit,
+                out=options.target,
+                overwrite=options.overwrite,
+                progress=progress,
+                tell=lambda line: print(line, flush=True),
+            )
+    except RunInterrupted as stop:
+        return say(f"Interrupted; {stop}, the same command continues from there.", INTERRUPTED)
+    except NoModel as missed:
+        return say(str(missed), NO_RESULT)
+    return _report(result, Path(options.target))
+
+
+def _report(result: Fleet, folder: Path) -> int:
+    """Print the result and its files."""
+    print(result)
+    for name in ("report.html", "fleet.json", "fleet.csv"):
+        print(folder / name)
+    return DONE
+
+
+def _judge(options: FleetOptions, simulator: object, machines: dict[str, list[Recording]]) -> int:
+    """Print how each machine compares with an earlier fleet."""
+    from ..studies import read_fleet
+
+    fleet = read_fleet(options.against, simulator)
+    for name, recordings in machines.items():
+        found = fleet.judge(name, recordings)
+        said = "; ".join(f"{text} ({p:.2f})" for text, p in found.reasons) or "as the others"
+        print(f"{name}: {said}", flush=True)
+    return DONE

@@ -1,0 +1,256 @@
+"""Fit laws that were found elsewhere to further recordings: on another machine of the same kind, or on another day.
+
+Nothing is searched. The simulator is fitted as given and with the laws in its ports. The log evidence of both says
+whether the machine has these laws. With several recordings, each is then fitted alone from the common values, so that
+values may drift from one to the next; the errors that remain say whether something else is missing. They are compared
+with the noise by the logarithm of their ratio,
+
+    l = log(e / σ),
+
+with e the rms error and σ the noise, both in units of the outputs' deviation. For a machine that lacks nothing else it
+scatters because both are estimated from N samples: the variance of log e is 1/(2 n), with n the independent samples of
+the residual; that of log σ is 1/(2 N) times the correlation of third differences, 1 + 2 Σ ρ² = 2.31.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from .._base import InputError, one_blas_thread
+from ..data import Recording
+from ..laws import Law
+from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
+from .evidence import FORMULA, Sample, deviations, information, log_evidence, log_prior, prior_width
+from .floor import effective_size, measured_floor
+from .linearise import along
+from .preparation import match_recordings, stated_hold
+from .proof import mean_nrmse
+from .trials import Trials
+from .workbench import FINER, THOROUGH, Fitted, Workbench
+
+ACCURATE = 0.25  # standard errors by which finer steps may change a value: 3 % of the uncertainty, added in squares
+THIRD_DIFFERENCES = 2.31  # 1 + 2 Σ ρ² of third differences of white noise
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """Free parameters by label with their standard errors; nan at bounds."""
+
+    values: Mapping[str, float]
+    errors: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Replication:
+    """A simulator with known laws, fitted to recordings of a machine.
+
+    Attributes
+    ----------
+    without, after : Fitted
+        The simulator as given, and with the laws; both refitted.
+    estimate : Values
+        Of `after`, on all recordings.
+    by_recording : tuple of Values
+        Of each recording alone, if there are several.
+    widths : mapping
+        Width of each parameter's prior range.
+    nrmse_before, nrmse_after : float
+        NRMSE (Eq. 27) without and with the laws; the last with values of each recording.
+    noise : float
+        Noise over the outputs' deviation.
+    remainder, remainder_error : float
+        `l` of the module docstring, and its standard error.
+    gain : float
+        Log evidence of the laws minus that of none, prior included; 0 without laws.
+    residuals : tuple of array
+        Simulated minus measured outputs of each recording, over the outputs' deviation.
+    """
+
+    without: Fitted
+    after: Fitted
+    estimate: Values
+    by_recording: tuple[Values, ...]
+    widths: Mapping[str, float]
+    nrmse_before: float
+    nrmse_after: float
+    noise: float
+    remainder: float
+    remainder_error: float
+    gain: float
+    residuals: tuple[np.ndarray, ...]
+
+    @property
+    def simulator(self) -> Simulator:
+        """The simulator with the laws, at the fitted values."""
+        return self.after.corrected()
+
+
+@one_blas_thread
+def refit_error(simulator: Any, recordings: Any, *, hold: str | None = None, engine: str = "auto") -> float:
+    """Refit a simulator as given to recordings; return the NRMSE (Eq. 27), averaged over outputs and recordings.
+
+    The arguments and errors are those of `replicate`.
+    """
+    bench = _bench(simulator, recordings, hold, engine)
+    fitted = bench.fit(bench.simulator, solver=THOROUGH)
+    _pass_on_interrupt(bench)
+    return mean_nrmse(bench, fitted)
+
+
+def _pass_on_interrupt(bench: Workbench) -> None:
+    """Raise KeyboardInterrupt if Ctrl-C has ended a fit, which then returned its best values so far."""
+    if bench.interrupted_fits:
+        raise KeyboardInterrupt
+
+
+def _bench(simulator: Any, recordings: Any, hold: str | None, engine: str) -> Workbench:
+    own, given = match_recordings(as_simulator(simulator), recordings, hold)
+    return Workbench.of(own, given, stated_hold(own, given, hold) or "zero", engine)
+
+
+@one_blas_thread
+def replicate(
+    simulator: Any,
+    recordings: Recording | Sequence[Recording],
+    laws: Sequence[tuple[str, Law]] = (),
+    starts: Sequence[Mapping[str, Any]] = (),
+    *,
+    hold: str | None = None,
+    engine: str = "auto",
+) -> Replication:
+    """Fit a simulator with known laws to recordings of a machine.
+
+    Parameters
+    ----------
+    laws : sequence of (port, Law)
+        The laws with start values and limits.
+    starts : sequence of mapping
+        Values by name from which to fit besides the user's own.
+    hold, engine
+        As for `diagnose`; a hold that nobody states is zero-order.
+
+    Raises
+    ------
+    InputError
+        If simulator and recordings do not fit each other, or the simulation diverges.
+    KeyboardInterrupt
+        On Ctrl-C.
+    """
+    bench = _bench(simulator, recordings, hold, engine)
+    plain = bench.fit(bench.simulator, [{}, *starts], solver=THOROUGH)
+    bench = replace(bench, typical=along(bench, plain))
+    after = _with_laws(bench, plain, laws, starts) if laws else plain
+    after = _on_accurate_steps(bench, after)
+    alone, values = _each_recording(bench, after)
+    _pass_on_interrupt(bench)
+    residuals = tuple((e / bench.scale)[r.skip :] for e, r in zip(alone, bench.recordings, strict=True))
+    noise2 = _noise2(bench, residuals)
+    square = float(np.mean(np.concatenate(residuals) ** 2))
+    total = sum(e.size for e in residuals)
+    # repeats and periods tell the noise of as many samples as third differences, or more
+    variance = 0.5 / max(effective_size(residuals), 1.0) + 0.5 * THIRD_DIFFERENCES / total
+    return Replication(
+        without=plain,
+        after=after,
+        estimate=_values(bench, after),
+        by_recording=values,
+        widths=_widths(after),
+        nrmse_before=mean_nrmse(bench, plain),
+        nrmse_after=float(np.mean(np.sqrt(np.mean(np.concatenate(residuals) ** 2, axis=0)))),
+        noise=float(np.sqrt(noise2)),
+        remainder=float(0.5 * np.log(max(square, 1e-300) / max(noise2, 1e-300))),
+        remainder_error=float(np.sqrt(variance)),
+        gain=_gain(bench, plain, after, after.last_elements(len(laws)), noise2) if laws else 0.0,
+        residuals=residuals,
+    )
+
+
+def _with_laws(
+    bench: Workbench, plain: Fitted, laws: Sequence[tuple[str, Law]], starts: Sequence[Mapping[str, Any]]
+) -> Fitted:
+    """Fit the simulator with the laws, to convergence and on steps fine enough for a sharp knee."""
+    placed = plain.simulator
+    for port, law in laws:
+        placed = placed.with_element(port, law)
+    trials = Trials(bench, workers=1)
+    nominal = {name: p.value for name, p in placed.parameters.items()}
+    quick = bench.fit(placed, [nominal, *({**nominal, **start} for start in starts)])
+    found = trials.polish(trials.make_trial(quick, len(laws)))
+    return found.fitted if np.isfinite(found.whole) else quick
+
+
+def _on_accurate_steps(bench: Workbench, fitted: Fitted) -> Fitted:
+    """Refit on finer integration steps until the values no longer depend on them.
+
+    In a search, steps are fine enough if their error is below the noise. Values are means over many samples, so their
+    standard errors are smaller than that by far.
+    """
+    most = min(FINER**2 * bench.chosen, MOST_SUBSTEPS)
+    while fitted.model.substeps < most and not fitted.simulator.discrete and np.any(fitted.model.parameters.free):
+        before, error = fitted, fitted.model.parameters.pack(deviations(bench, fitted))
+        steps = min(FINER * fitted.model.substeps, most)
+        finer = replace(bench, substeps=steps, at_least=steps, chosen=max(bench.chosen, -(-steps // FINER)))
+        try:
+            fitted = finer.fit(fitted.simulator, [fitted.values], states=fitted.initial, solver=THOROUGH)
+        except InputError:
+            return before
+        change = np.abs(fitted.vector - before.vector) / error
+        if not np.any(change > ACCURATE):
+            break
+    return fitted
+
+
+def _each_recording(bench: Workbench, after: Fitted) -> tuple[list[np.ndarray], tuple[Values, ...]]:
+    """Fit each of several recordings alone from the common values; return the residuals and the values."""
+    if len(bench.recordings) < 2:
+        return after.residual, ()
+    residuals, values = [], []
+    for i, r in enumerate(bench.recordings):
+        own = bench.on([r])
+        fitted = own.fit(
+            after.simulator,
+            [after.values],
+            states=after.initial[i : i + 1],
+            solver=THOROUGH,
+            model=after.model,
+            engine=after.engine,
+        )
+        residuals.append(fitted.residual[0])
+        values.append(_values(own, fitted))
+    return residuals, tuple(values)
+
+
+def _noise2(bench: Workbench, residuals: Sequence[np.ndarray]) -> float:
+    """Return the mean square noise in units of the outputs' variance: measured, else by third differences."""
+    measured = measured_floor(bench.recordings)
+    if measured is not None:
+        return float(np.mean((measured.deviation / bench.scale) ** 2))
+    return float(np.mean(np.concatenate([np.diff(e, 3, axis=0) ** 2 for e in residuals])) / 20)
+
+
+def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ...], noise2: float) -> float:
+    """Compute the log evidence of the laws minus that of the simulator as given."""
+    tolerance = FORMULA * max(plain.cost - noise2, 0.0)
+    costs = plain.cost + tolerance, after.cost + tolerance
+    n = Sample(noise2 + tolerance, max(effective_size(after.residual), 1.0)).effective(min(costs))
+    known = information(bench, after, laws)
+    return log_evidence(costs[1], known, log_prior(laws, {}), n) - log_evidence(costs[0], np.zeros(0), 0.0, n)
+
+
+def _values(bench: Workbench, fitted: Fitted) -> Values:
+    """Return the free parameters by label."""
+    own = fitted.model.parameters
+    values, errors = fitted.vector, own.pack(deviations(bench, fitted))
+    free = [(k, label) for k, label in enumerate(own.labels) if own.free[k]]
+    return Values({label: float(values[k]) for k, label in free}, {label: float(errors[k]) for k, label in free})
+
+
+def _widths(fitted: Fitted) -> dict[str, float]:
+    """Return the width of the prior range of each free parameter: that of a uniform distribution as wide."""
+    own, vector = fitted.model.parameters, fitted.vector
+    width = np.sqrt(12) * prior_width(np.maximum(np.abs(vector), 1e-300), own.lower, own.upper)
+    return {label: float(width[k]) for k, label in enumerate(own.labels) if own.free[k]}

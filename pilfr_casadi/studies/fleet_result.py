@@ -1,0 +1,496 @@
+"""The result of a fleet: what all its machines lack, how their values are distributed, and which machines differ.
+
+One scale decides: the probabilities of `population`. A machine differs in a value, drifts in a value, or lacks more
+than the common physics, if that is more likely than not.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._base import InputError, existing_file, make_folder, to_json, write_atomically
+from ..data import Recording
+from ..diagnose import SURE, add_scaled_laws, check_laws, replicate
+from ..laws import Law, display_name
+from ..simulators import as_simulator
+from .machines import DONE, PAGE, RESIDUAL, LawAt, MachineWork, measured_entry
+from .population import Population, combine, estimate_population, slope
+
+CONTENT, TABLE = "fleet.json", "fleet.csv"
+SCHEMA = 1
+MOST_SHOWN = 20  # machines that are printed
+SHARED, OWN = "shared", "per machine"
+
+
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """Change of a value per unit of time, its standard error, and the probability that it is not zero."""
+
+    slope: float
+    error: float
+    probability: float
+
+
+@dataclass(frozen=True, eq=False)
+class Machine:
+    """A machine beside the others.
+
+    Attributes
+    ----------
+    values, errors : mapping
+        Each free parameter by label, with its standard error.
+    differs : mapping
+        Probability that each value is not one of a regular machine.
+    trends : mapping
+        Trend of each value over the recordings.
+    beyond : float
+        Probability that the machine lacks more than the common physics.
+    ratio : float
+        The error that remains, over the noise.
+    gain : float
+        Log evidence that the machine has the common physics.
+    nrmse_before, nrmse_after, noise : float
+        NRMSE refitted, and with the common physics; the noise on the same scale.
+    failed : str
+        The sentence about a machine that could not be fitted.
+    rest : mapping
+        The diagnosis of what remains: `verdict`, `sentence`, `effects`; empty if there was none.
+    report : str
+        Path of the machine's own report below the folder of the fleet, if there is one.
+    """
+
+    name: str
+    values: Mapping[str, float] = field(default_factory=dict)
+    errors: Mapping[str, float] = field(default_factory=dict)
+    differs: Mapping[str, float] = field(default_factory=dict)
+    trends: Mapping[str, Trend] = field(default_factory=dict)
+    beyond: float = np.nan
+    ratio: float = np.nan
+    gain: float = np.nan
+    nrmse_before: float = np.nan
+    nrmse_after: float = np.nan
+    noise: float = np.nan
+    failed: str = ""
+    rest: Mapping[str, Any] = field(default_factory=dict)
+    report: str = ""
+
+    @property
+    def probability(self) -> float:
+        """Probability of the surest difference to a regular machine; 1 for a machine that could not be fitted."""
+        every = [self.beyond, *self.differs.values(), *(t.probability for t in self.trends.values())]
+        return 1.0 if self.failed else max((p for p in every if np.isfinite(p)), default=0.0)
+
+    @property
+    def reasons(self) -> tuple[tuple[str, float], ...]:
+        """What is more likely than not about the machine, in words, with its probability; the surest first."""
+        found = [(self._rest(), self.beyond)] if self.beyond > SURE else []
+        found += [
+            (f"{name} = {_with_error(self.values[name], self.errors[name])}", p)
+            for name, p in self.differs.items()
+            if p > SURE
+        ]
+        found += [
+            (f"{name} drifts by {_with_error(t.slope, t.error)} per unit of time", t.probability)
+            for name, t in self.trends.items()
+            if t.probability > SURE
+        ]
+        return tuple(sorted(found, key=lambda r: -r[1]))
+
+    def _rest(self) -> str:
+        said = f"lacks more: its error is {self.ratio:.3g} times the noise"
+        named = ", ".join(f"{display_name(e['law'])} at {e['port']}" for e in self.rest.get("effects", ()))
+        return f"{said}; {named}" if named else said
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content for JSON."""
+        own = {k: v for k, v in vars(self).items() if k != "trends"}
+        trends = {name: vars(t) for name, t in self.trends.items()}
+        content: dict[str, Any] = to_json({**own, "trends": trends, "probability": self.probability})
+        return content
+
+    @classmethod
+    def of(cls, content: Mapping[str, Any]) -> Machine:
+        """Read it from JSON."""
+        known = {k: v for k, v in content.items() if k not in ("trends", "probability")}
+        numbers: dict[str, Any] = {k: np.nan if v is None else v for k, v in known.items()}
+        for name in ("values", "errors", "differs"):
+            numbers[name] = {k: np.nan if v is None else v for k, v in known[name].items()}
+        trends = {
+            name: Trend(*(np.nan if t[k] is None else t[k] for k in ("slope", "error", "probability")))
+            for name, t in content["trends"].items()
+        }
+        return cls(**numbers, trends=trends)
+
+
+@dataclass(frozen=True, eq=False)
+class FleetValue:
+    """A parameter over the fleet: its distribution over regular machines, and that of its trends.
+
+    `kind` is "shared" if a deviation between machines is not more likely than not, else "per machine".
+    """
+
+    name: str
+    unit: str
+    population: Population
+    trends: Population
+
+    @property
+    def kind(self) -> str:
+        """Whether regular machines share the value."""
+        return OWN if self.population.varies > SURE else SHARED
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content for JSON."""
+        both = {"population": self.population.to_dict(), "trends": self.trends.to_dict()}
+        return {"name": self.name, "unit": self.unit, "kind": self.kind, **both}
+
+
+@dataclass(frozen=True, eq=False)
+class Common:
+    """The physics that all machines lack: laws with their ports, and how sure they are.
+
+    Attributes
+    ----------
+    laws : tuple of LawAt
+        Empty if nothing is missing in common.
+    probability : float
+        Posterior probability, from the sampled machines, of these laws (whatever their form).
+    sample : tuple of str
+        The machines that were diagnosed alone.
+    starts : tuple of mapping
+        Values by name from which every machine is fitted, besides the user's.
+    """
+
+    laws: tuple[LawAt, ...]
+    probability: float
+    sample: tuple[str, ...]
+    starts: tuple[Mapping[str, Any], ...] = ()
+
+    @property
+    def words(self) -> str:
+        """The laws in words."""
+        return " and ".join(f"{display_name(law.id, law.form)} at {law.port}" for law in self.laws)
+
+
+@dataclass(frozen=True, eq=False)
+class Fleet:
+    """Result of `fleet`.
+
+    Attributes
+    ----------
+    common : Common
+        The physics that all machines lack.
+    confirmed : int
+        Number of machines with more evidence for the common physics than against it.
+    values : tuple of FleetValue
+        The free parameters over the fleet.
+    remainder : Population
+        Of the logarithm of the remaining error over the noise.
+    machines : tuple of Machine
+        All machines, the surest to differ first.
+    work : MachineWork
+        The simulator and the options.
+    files : mapping
+        Pages and other files of jobs, by path below a folder.
+    """
+
+    common: Common
+    confirmed: int
+    values: tuple[FleetValue, ...]
+    remainder: Population
+    machines: tuple[Machine, ...]
+    work: MachineWork
+    files: Mapping[str, bytes] = field(default_factory=dict, repr=False)
+    histories: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, repr=False)
+
+    def __getitem__(self, name: str) -> Machine:
+        for machine in self.machines:
+            if machine.name == name:
+                return machine
+        raise InputError(f"There is no machine {name!r} in the fleet; it has {len(self.machines)}.")
+
+    @property
+    def differing(self) -> tuple[Machine, ...]:
+        """Machines that lack more, or differ in a value, or could not be fitted; the surest first."""
+        return tuple(
+            m for m in self.machines if m.failed or m.beyond > SURE or any(p > SURE for p in m.differs.values())
+        )
+
+    @property
+    def drifting(self) -> tuple[Machine, ...]:
+        """Machines with a value that drifts."""
+        return tuple(m for m in self.machines if any(t.probability > SURE for t in m.trends.values()))
+
+    @property
+    def summary(self) -> str:
+        """The result in a sentence or two."""
+        n, sampled = len(self.machines), len(self.common.sample)
+        if self.common.laws:
+            said = (
+                f"The machines lack {self.common.words} (probability {self.common.probability:.2f} on a sample of "
+                f"{sampled}; confirmed on {self.confirmed} of {n})."
+            )
+        else:
+            said = f"The machines lack nothing in common (probability {self.common.probability:.2f} on {sampled})."
+        counts = [(len(self.differing), "differ"), (len(self.drifting), "drift")]
+        return f"{said} Of {n} machines, " + " and ".join(f"{count} {word}" for count, word in counts) + "."
+
+    def judge(
+        self,
+        name: str,
+        recordings: Recording | Sequence[Recording],
+        times: Sequence[float] | None = None,
+    ) -> Machine:
+        """Judge a new machine against the fleet; nothing of the fleet changes.
+
+        Parameters
+        ----------
+        name : str
+            Name of the machine.
+        recordings : Recording or sequence of Recording
+            Its recordings, with the simulator's channels.
+        times : sequence of float, optional
+            Time of each recording, in the unit of the fleet's; by default 0, 1, 2, ...
+
+        Raises
+        ------
+        InputError
+            If simulator and recordings do not fit each other.
+        """
+        work, laws = self.work, [law.build(self.work.known) for law in self.common.laws]
+        found = replicate(work.simulator, recordings, laws, self.common.starts, hold=work.hold, engine=work.engine)
+        return judge_entry(name, measured_entry(found), self.values, self.remainder, times)
+
+    def table(self) -> list[dict[str, Any]]:
+        """List the machines as rows, the surest to differ first: the content of fleet.csv."""
+        rows = []
+        for m in self.machines:
+            row: dict[str, Any] = {"machine": m.name, "probability": m.probability, "beyond": m.beyond}
+            row |= {"error_over_noise": m.ratio, "nrmse_before": m.nrmse_before, "nrmse_after": m.nrmse_after}
+            row |= {"log_evidence": m.gain}
+            for v in self.values:
+                row |= {v.name: m.values.get(v.name, np.nan), f"{v.name} error": m.errors.get(v.name, np.nan)}
+                row |= {f"{v.name} differs": m.differs.get(v.name, np.nan)}
+                if v.name in m.trends:
+                    row |= {f"{v.name} slope": m.trends[v.name].slope, f"{v.name} drifts": m.trends[v.name].probability}
+            rows.append({**row, "findings": m.failed or "; ".join(text for text, _ in m.reasons)})
+        return rows
+
+    def plot(self) -> Any:
+        """Draw the map of the machines: see `plots.machine_map`, with one value `plots.machine_strips`."""
+        from ..report import fleet_map
+
+        return fleet_map(self.to_dict())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of fleet.json; numbers that are not finite are None."""
+        common = self.common
+        raw = {
+            "schema": SCHEMA,
+            "sentence": self.summary,
+            "common": {
+                "laws": [law.to_dict() for law in common.laws],
+                "words": common.words,
+                "probability": common.probability,
+                "sample": common.sample,
+                "starts": common.starts,
+            },
+            "confirmed": self.confirmed,
+            "hold": self.work.hold,
+            "values": [v.to_dict() for v in self.values],
+            "remainder": self.remainder.to_dict(),
+            "machines": [{**m.to_dict(), "reasons": m.reasons} for m in self.machines],
+            "differing": [m.name for m in self.differing],
+            "drifting": [m.name for m in self.drifting],
+            "histories": self.histories,
+        }
+        content: dict[str, Any] = to_json(raw)
+        return content
+
+    def documents(self) -> dict[str, str]:
+        """Make the files of the fleet as a whole: fleet.json, fleet.csv and report.html."""
+        from ..report import fleet_page
+
+        content, rows, text = self.to_dict(), self.table(), io.StringIO()
+        names = list(dict.fromkeys(key for row in rows for key in row))
+        writer = csv.DictWriter(text, names, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        residuals = {
+            m.name: json.loads(self.files[path])
+            for m in self.machines
+            if (path := f"jobs/measure-{m.name}/{RESIDUAL}") in self.files
+        }
+        return {
+            CONTENT: json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n",
+            TABLE: text.getvalue(),
+            PAGE: fleet_page(content, residuals).html(),
+        }
+
+    def report(self, folder: Any) -> Path:
+        """Write fleet.json, fleet.csv, report.html and the machines' own reports; return the page's path."""
+        target = make_folder(folder)
+        contents: dict[str, str | bytes] = {**self.files, **self.documents()}
+        for name, data in contents.items():
+            make_folder((target / name).parent)
+            write_atomically(target / name, data)
+        return target / PAGE
+
+    def __str__(self) -> str:
+        lines = [self.summary, "values of regular machines:"]
+        for v in self.values:
+            mean = f"{_with_error(v.population.mean, v.population.mean_error)} {v.unit}".rstrip()
+            between = f", deviation between machines {v.population.deviation:.2g}" if v.kind == OWN else ""
+            lines.append(f"  {v.name} = {mean}, {v.kind}{between}")
+        shown = [m for m in self.machines if m.failed or m.reasons]
+        lines += ["machines that differ or drift, the surest first:"] if shown else []
+        for m in shown[:MOST_SHOWN]:
+            lines.append(f"  {m.name}: {m.failed or '; '.join(f'{text} ({p:.2f})' for text, p in m.reasons)}")
+        return "\n".join([*lines, f"  and {len(shown) - MOST_SHOWN} more"] if len(shown) > MOST_SHOWN else lines)
+
+    __repr__ = __str__
+
+
+def judge_entry(
+    name: str,
+    entry: Mapping[str, Any],
+    values: Sequence[FleetValue],
+    remainder: Population,
+    times: Sequence[float] | None,
+) -> Machine:
+    """Judge the numbers of a machine by the distributions over the fleet."""
+    found = {v.name: trend_of(entry, v.name, times) for v in values}
+    trends = {
+        v.name: Trend(*found[v.name][:2], v.trends.probability(*found[v.name]))
+        for v in values
+        if np.isfinite(found[v.name][0])
+    }
+    estimates = estimates_of(entry, any(t.probability > SURE for t in trends.values()))
+    differs = {
+        v.name: v.population.probability(*estimates[v.name], float(entry["widths"][v.name]))
+        for v in values
+        if np.all(np.isfinite(estimates.get(v.name, np.nan))) and np.isfinite(v.population.mean)
+    }
+    above = entry["remainder"] > remainder.mean
+    width = remainder_width(entry)
+    beyond = remainder.probability(entry["remainder"], entry["remainder_error"], width) if above else 0.0
+    return Machine(
+        name,
+        values={label: value for label, (value, _) in estimates.items()},
+        errors={label: error for label, (_, error) in estimates.items()},
+        differs=differs,
+        trends=trends,
+        beyond=beyond,
+        ratio=float(np.exp(entry["remainder"])),
+        gain=entry["gain"],
+        nrmse_before=entry["nrmse_before"],
+        nrmse_after=entry["nrmse_after"],
+        noise=entry["noise"],
+    )
+
+
+def estimates_of(entry: Mapping[str, Any], drifts: bool) -> dict[str, tuple[float, float]]:
+    """Return value and standard error of each parameter: of the fit to all recordings, or means if values drift.
+
+    A fit to all recordings with the same values is bent by those that drift.
+    """
+    out = {}
+    for label, value in entry["values"].items():
+        rows = entry["by_recording"] if drifts else []
+        alone = (np.array([r[kind].get(label) for r in rows], dtype=float) for kind in ("values", "errors"))
+        mean, error = combine(*alone)
+        fitted = tuple(np.nan if x is None else float(x) for x in (value, entry["errors"].get(label)))
+        out[label] = (mean, error) if np.isfinite(mean) else (fitted[0], fitted[1])
+    return out
+
+
+def remainder_width(entry: Mapping[str, Any]) -> float:
+    """Return the range of log(error / noise): from the noise to the outputs' deviation."""
+    return max(-float(np.log(max(entry["noise"], 1e-300))), 0.0)
+
+
+def trend_of(entry: Mapping[str, Any], name: str, times: Sequence[float] | None) -> tuple[float, float, float]:
+    """Return slope, its standard error, and the width of its range: a change across the prior range; nan if unknown."""
+    rows = entry["by_recording"]
+    if len(rows) < 2:
+        return np.nan, np.nan, np.nan
+    t = np.arange(len(rows), dtype=float) if times is None else np.asarray(times, dtype=float)
+    v, e = (np.array([r[kind].get(name) for r in rows], dtype=float) for kind in ("values", "errors"))
+    return *slope(t, v, e), float(entry["widths"][name] / max(np.ptp(t), 1e-300))
+
+
+def distributions(
+    entries: Mapping[str, Mapping[str, Any]], units: Mapping[str, str], times: Mapping[str, Sequence[float]]
+) -> tuple[tuple[FleetValue, ...], Population]:
+    """Estimate the distribution of every value, and of the remaining error, over the machines of a fleet.
+
+    `units` are those of the parameters by label, in the order in which they are shown.
+    """
+    good = {name: e for name, e in entries.items() if e["status"] == DONE}
+    labels = [label for label in units if any(label in e["values"] for e in good.values())]
+    slopes = {label: np.array([trend_of(e, label, times.get(name)) for name, e in good.items()]) for label in labels}
+    trends = {label: estimate_population(*slopes[label].T, centre=0.0) for label in labels}
+    drifting = [any(t.differs[i] > SURE for t in trends.values()) for i in range(len(good))]
+    estimates = [estimates_of(e, drifts) for e, drifts in zip(good.values(), drifting, strict=True)]
+    values = []
+    for label in labels:
+        v, s = np.array([e.get(label, (np.nan, np.nan)) for e in estimates]).T
+        d = np.array([e["widths"].get(label) for e in good.values()], dtype=float)
+        values.append(FleetValue(label, units[label], estimate_population(v, s, d), trends[label]))
+    left, error = (np.array([e[k] for e in good.values()]) for k in ("remainder", "remainder_error"))
+    return tuple(values), estimate_population(left, error, [remainder_width(e) for e in good.values()])
+
+
+def read_fleet(folder: Any, simulator: Any, laws: Sequence[type[Law]] | None = None) -> Fleet:
+    """Read a fleet from its folder, to judge new machines.
+
+    Parameters
+    ----------
+    folder : path
+        The folder of the fleet, or its fleet.json.
+    simulator, laws
+        As they were given to `fleet`.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is not of a fleet.
+    """
+    own = as_simulator(simulator)
+    tried = add_scaled_laws(check_laws(laws), own)
+    path = Path(folder) / CONTENT if Path(folder).is_dir() else Path(folder)
+    try:
+        content = json.loads(existing_file(path).read_text(encoding="utf-8"))
+        if content["schema"] != SCHEMA:
+            raise KeyError
+        common = content["common"]
+        found = tuple(LawAt.of(law) for law in common["laws"])
+        starts = tuple({k: np.asarray(v, dtype=float) for k, v in s.items()} for s in common["starts"])
+        values = tuple(
+            FleetValue(v["name"], v["unit"], Population.of(v["population"]), Population.of(v["trends"]))
+            for v in content["values"]
+        )
+        machines = tuple(Machine.of({k: v for k, v in m.items() if k != "reasons"}) for m in content["machines"])
+        return Fleet(
+            Common(found, common["probability"], tuple(common["sample"]), starts),
+            content["confirmed"],
+            values,
+            Population.of(content["remainder"]),
+            machines,
+            MachineWork(own, content["hold"], tried, None, "auto"),
+            histories=content["histories"],
+        )
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise InputError(f"{path} is not a fleet.json that this release writes; give the folder of a fleet.") from None
+
+
+def _with_error(value: float, error: float) -> str:
+    return f"{value:.5g} ± {error:.2g}" if np.isfinite(error) else f"{value:.5g}"
