@@ -166,7 +166,7 @@ def _hypotheses_with_laws(search: Search) -> list[Trial]:
         if trial.thorough or i < FEW:
             with suppress(InputError):
                 found.append(search.thorough(trial))
-    return [t for t in found if np.isfinite(t.whole)]
+    return [t for t in found if np.isfinite(t.mean_square)]
 
 
 def _make_candidate(search: Search, trial: Trial) -> _Candidate:
@@ -204,7 +204,7 @@ def _may_recur(search: Search, trial: Trial) -> bool:
 
 def _shares(search: Search, named: Fitted, whole: Fitted) -> dict[str, float]:
     """Compute the shares of the refit's mean square error above the noise; all are zero if there is none."""
-    if not search.root.whole > search.floor2:
+    if not search.root.mean_square > search.floor2:
         return {"named": 0.0, "learned": 0.0, "left": 0.0}
     beside_names, left = (share_left(search, f.cost) for f in (named, whole))
     left = min(beside_names, left)

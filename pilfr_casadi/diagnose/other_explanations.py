@@ -49,7 +49,7 @@ def find_pinned_parameter(search: Search, answer: Posterior) -> PinnedParameter 
     bench, without = search.bench, search.root.fitted
     if not linear and without.cost < USELESS_FIT:
         return None
-    as_well = SAME**2 * answer.best.whole if named else np.inf
+    as_well = SAME**2 * answer.best.mean_square if named else np.inf
     # a larger error means that something else is missing
     enough = min(as_well, (FAR if named else AT_FLOOR) ** 2 * search.floor2)
     best: tuple[str, Fitted] | None = None

@@ -70,7 +70,7 @@ from .result import Diagnosis, Effect
 from .search import Search
 from .stretches import MOST_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
 from .trials import Trial
-from .verdict import Named, Posterior, Verdict, judge, names, posterior
+from .verdict import NamedEffect, Posterior, Verdict, judge, names, posterior
 from .workbench import Fitted, RunsAway, Workbench
 
 SEARCHING = 0.7  # share of the remaining time for preparation and search; the rest is for the correction
@@ -110,7 +110,7 @@ class Conclusion:
         The corrected simulator, or the refitted one if there is nothing to correct.
     correction : Correction
         The elements that `fitted` has beside the refitted simulator.
-    effects : tuple of Named
+    effects : tuple of NamedEffect
         The named effects.
     freed : str
         The pinned parameter whose other value explains as much as the named law.
@@ -120,7 +120,7 @@ class Conclusion:
     gates: tuple[Gate, ...]
     fitted: Fitted
     correction: Correction
-    effects: tuple[Named, ...] = ()
+    effects: tuple[NamedEffect, ...] = ()
     freed: str = ""
 
 
@@ -214,10 +214,10 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
     except InputError:  # the simulator cannot be run with this hold
         return ready, search.resume(request.most_effects)
     only_refitted = again.interrupted and len(again.memo) < 2
-    if again.best.whole > search.best.whole or only_refitted:
+    if again.best.mean_square > search.best.mean_square or only_refitted:
         search.interrupted = again.interrupted
         return ready, search.resume(request.most_effects)
-    ratio = float(np.sqrt(search.best.whole / max(again.best.whole, 1e-300)))
+    ratio = float(np.sqrt(search.best.mean_square / max(again.best.mean_square, 1e-300)))
     return replace(other, gates=(*other.gates, hold_note(request.simulator, hold, ratio))), again
 
 
@@ -228,7 +228,7 @@ def _search(request: Request) -> tuple[Prepared, Search]:
     if not seemed_early or search.interrupted or search.out_of_time or not search.can_improve(search.best):
         return ready, search
     other, again = _search_once(request, shift_early=False)
-    if again.best.whole < AS_GIVEN * search.best.whole:
+    if again.best.mean_square < AS_GIVEN * search.best.mean_square:
         return other, again
     search.interrupted = again.interrupted
     return ready, search
@@ -329,7 +329,7 @@ def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: S
     if named and answer.sure >= SURE:
         return None
     refitted = search.root.fitted
-    left = answer.best.whole / search.root.whole if named else 1.0
+    left = answer.best.mean_square / search.root.mean_square if named else 1.0
     clipping = clipped_input(search.bench, refitted, left)
     if clipping is None:
         return None
@@ -460,7 +460,7 @@ def _blind_spots(request: Request, ready: Prepared, search: Search) -> tuple[Bli
     return ()
 
 
-def _effect(search: Search, named: Named, fitted: Fitted, std: dict[str, np.ndarray]) -> Effect:
+def _effect(search: Search, named: NamedEffect, fitted: Fitted, std: dict[str, np.ndarray]) -> Effect:
     bench = search.bench
     element = next(e for e in fitted.simulator.elements if (e.port, e.law.id) == named.name)  # its form may differ
     law = element.law
@@ -491,7 +491,7 @@ def _effect(search: Search, named: Named, fitted: Fitted, std: dict[str, np.ndar
     )
 
 
-def _next(search: Search, effects: Sequence[Named], limits: Mapping[str, float] | None) -> dict[str, Any] | None:
+def _next(search: Search, effects: Sequence[NamedEffect], limits: Mapping[str, float] | None) -> dict[str, Any] | None:
     """Design the experiment that would separate the first tie, if there is one."""
     if search.bench.simulator.observer is not None:  # a proposed input has no outputs to be led by
         return None

@@ -180,7 +180,7 @@ def _with_laws(
     nominal = {name: p.value for name, p in placed.parameters.items()}
     quick = bench.fit(placed, [nominal, *({**nominal, **start} for start in starts)])
     found = trials.polish(trials.make_trial(quick, len(laws)))
-    return found.fitted if np.isfinite(found.whole) else quick
+    return found.fitted if np.isfinite(found.mean_square) else quick
 
 
 def _on_accurate_steps(bench: Workbench, fitted: Fitted) -> Fitted:

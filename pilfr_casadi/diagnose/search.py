@@ -147,7 +147,7 @@ class Search:
     @property
     def samples(self) -> float:
         """Effective samples, shared by all hypotheses."""
-        return self.sample.effective(min(t.whole for t in self.memo.values()) + self.tolerance)
+        return self.sample.effective(min(t.mean_square for t in self.memo.values()) + self.tolerance)
 
     @property
     def floor2(self) -> float:
@@ -157,7 +157,7 @@ class Search:
     @property
     def tolerance(self) -> float:
         """Mean square error that the formulas of laws leave of any mismatch, because no machine follows one exactly."""
-        return FORMULA * max(self.root.whole - self.floor2, 0.0)
+        return FORMULA * max(self.root.mean_square - self.floor2, 0.0)
 
     @property
     def sample(self) -> Sample:
@@ -176,7 +176,7 @@ class Search:
 
     def optimistic_evidence(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis as if the missing rest were found: samples count as at the noise."""
-        return self._log_evidence(trial, trial.whole, self.sample.effective(0.0))
+        return self._log_evidence(trial, trial.mean_square, self.sample.effective(0.0))
 
     def evidence(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis, from its error on held-out blocks if that is known.
@@ -184,13 +184,13 @@ class Search:
         Where all models are wrong, the spread of predictions for other inputs counts as an error.
         """
         known = self.findings[trial.key].held_out
-        v = known.error**2 if known else trial.whole * self._held_out_ratio()
+        v = known.error**2 if known else trial.mean_square * self._held_out_ratio()
         v += known.spread if known and self._all_wrong else 0.0
         return self._log_evidence(trial, v, self.samples)
 
     def _held_out_ratio(self) -> float:
         """Compute the usual ratio of held-out to fit error (mean squares), for hypotheses that were not predicted."""
-        known = [(self.findings[key].held_out, trial.whole) for key, trial in self.memo.items()]
+        known = [(self.findings[key].held_out, trial.mean_square) for key, trial in self.memo.items()]
         ratios = [h.error**2 / fit for h, fit in known if h and np.isfinite(h.error) and fit > 0]
         return float(np.median(ratios)) if ratios else 1.0
 
@@ -338,7 +338,7 @@ class Search:
 
     def can_improve(self, trial: Trial) -> bool:
         """Tell whether a law that removes all but the noise would be worth its prior beside a hypothesis."""
-        left, noise = (v + self.tolerance for v in (trial.whole, self.floor2))
+        left, noise = (v + self.tolerance for v in (trial.mean_square, self.floor2))
         most = 0.5 * self.sample.effective(0.0) * np.log(max(left / noise, 1.0))
         return bool(most > np.log(max(len(self.alternatives), 1)) - EFFECT_PRIOR)
 
@@ -365,7 +365,7 @@ class Search:
         """Fit the laws that the screen selects beside a hypothesis, fewer if `again`; polish those that may win."""
         scored, gain = self.screened(parent)
         scored = [s for s in scored if _may_stand_beside(parent.laws, s.port, s.law)]
-        enough = float(np.sqrt(self.floor2 + NEARLY * max(parent.whole - self.floor2, 0.0)))
+        enough = float(np.sqrt(self.floor2 + NEARLY * max(parent.mean_square - self.floor2, 0.0)))
         trials = self._fitted(parent, scored, gain, enough, again)
         more = relatives(self.bench, trials, scored) if self._in_time() else []
         if more:
@@ -539,7 +539,7 @@ class Search:
                 alone = bench.fit(bench.simulator, [best.values], states=best.begin, solver=THOROUGH)
             except InputError:
                 return False
-        if alone.cost > CLEARLY * self.root.whole:
+        if alone.cost > CLEARLY * self.root.mean_square:
             return False
         self.without, self.memo, self.steps = alone, {}, []
         self.findings.clear()

@@ -33,7 +33,7 @@ from ..data import Recording
 from ..engine import Engine
 from ..laws import Creep, Law, StopHysteresis
 from ..models import Model
-from ..optimise import GaussNewton, first_state, samples_for_state
+from ..optimise import GaussNewton, estimate_initial_state, samples_for_state
 from ..simulators import Simulator
 from .floor import FEWEST, effective_size
 from .gates import Gate
@@ -273,7 +273,7 @@ def _explained(rest: Remainder, task: Task) -> list[tuple[Law, float]]:
 def _first_state(model: Model, engine: Engine, r: Recording) -> np.ndarray:
     """Find the state at a recording's first sample at the model's start values; zero if that diverges."""
     try:
-        return np.asarray(first_state(model, engine, r, min(samples_for_state(model), len(r) // 3) or None))
+        return np.asarray(estimate_initial_state(model, engine, r, min(samples_for_state(model), len(r) // 3) or None))
     except (InputError, RuntimeError, FloatingPointError, np.linalg.LinAlgError):
         return np.zeros(model.n_state)
 

@@ -51,9 +51,9 @@ class Trial:
     ----------
     laws : tuple of Placed
         The added laws, in their order.
-    part : float
+    part_mean_square : float
         Mean square error on the part of the recordings used by the fit, in units of the outputs' variance.
-    whole : float
+    mean_square : float
         The same on all recordings.
     thorough : bool
         Whether it was fitted to convergence and to all samples.
@@ -63,8 +63,8 @@ class Trial:
 
     laws: tuple[Placed, ...]
     fitted: Fitted
-    part: float
-    whole: float
+    part_mean_square: float
+    mean_square: float
     thorough: bool = False
     information: np.ndarray | None = None
 
@@ -81,8 +81,8 @@ class Trial:
     def supersedes(self, other: Trial) -> bool:
         """Tell whether this fit of a hypothesis replaces another; a thorough one has priority."""
         if self.thorough != other.thorough:
-            return self.thorough or self.whole < other.whole / AGREEING
-        return self.whole < other.whole
+            return self.thorough or self.mean_square < other.mean_square / AGREEING
+        return self.mean_square < other.mean_square
 
     @property
     def element(self) -> Placed:
@@ -117,7 +117,7 @@ class Trial:
     @property
     def error(self) -> float:
         """Root of the mean square error."""
-        return float(self.whole**0.5)
+        return float(self.mean_square**0.5)
 
     @property
     def knee(self) -> str:
@@ -183,7 +183,7 @@ class Trials:
                 starts, states = [quick.values], quick.initial
             fitted = bench.fit(placed, starts, states=states, solver=THOROUGH, model=model, engine=engine)
         except InputError:
-            return replace(trial, whole=np.inf, thorough=True)
+            return replace(trial, mean_square=np.inf, thorough=True)
         fitted = refit_on_finer_steps(bench, fitted, trial.knee) if trial.knee else fitted
         return Trial(fitted.last_elements(len(trial.laws)), fitted, fitted.cost, fitted.cost, thorough=True)
 
@@ -265,7 +265,7 @@ class Trials:
         if first.law.special:  # the refit may be far off where the missing force is strongly curved
             afresh = [s for s in ranked if any(s is n for n in given)][:1]
             again = self.fitted(placed, afresh, count, solver=BRIEF, **{**options, "states": ()})
-            brief = min((t for t in (brief, again) if t is not None), key=lambda t: t.part, default=None)
+            brief = min((t for t in (brief, again) if t is not None), key=lambda t: t.part_mean_square, default=None)
         return _BriefFit(placed, options, ranked, count, brief)
 
     def _refine(self, pairs: Sequence[_BriefFit], observer: bool, pool: ThreadPoolExecutor) -> Iterator[Trial | None]:
@@ -284,7 +284,7 @@ class Trials:
             running.append((pair, found, [] if _agree(found) else submit(pair, slice(3, None))))
         for pair, found, tasks in running:
             every = [pair.trial, *found, *(task.result() for task in tasks)]
-            yield min((t for t in every if t is not None), key=lambda t: t.part, default=None)
+            yield min((t for t in every if t is not None), key=lambda t: t.part_mean_square, default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,7 +307,7 @@ class _BriefFit:
 
 def _agree(found: Sequence[Trial | None]) -> bool:
     """Tell whether three fits came to the same minimum."""
-    costs = sorted(t.part for t in found if t)
+    costs = sorted(t.part_mean_square for t in found if t)
     return len(costs) > 2 and costs[2] < AGREEING * costs[0]
 
 

@@ -55,7 +55,7 @@ Name = tuple[str, str]  # port and law id
 
 
 @dataclass(frozen=True, eq=False)
-class Named:
+class NamedEffect:
     """An effect of the likeliest hypothesis.
 
     Attributes
@@ -86,7 +86,7 @@ class Posterior:
         The likeliest hypothesis.
     named : float
         Probability that the laws of the best hypothesis are the physics, given this hypothesis.
-    effects : tuple of Named
+    effects : tuple of NamedEffect
         Its laws, strongest first.
     nothing : float
         Probability of the simulator alone.
@@ -94,7 +94,7 @@ class Posterior:
 
     best: Trial
     named: float
-    effects: tuple[Named, ...]
+    effects: tuple[NamedEffect, ...]
     nothing: float
 
     @property
@@ -124,12 +124,12 @@ def explainable_remainder(search: Search, trial: Trial) -> float:
     A remainder that no force at a port explains counts little: it may be a disturbance that acts beside the law.
     """
     share = float(np.clip(max(search.flexible(trial).values(), default=0.0), 0.0, 1.0))
-    return share_left(search, trial.whole) * (share + DISTURBED * (1 - share))
+    return share_left(search, trial.mean_square) * (share + DISTURBED * (1 - share))
 
 
 def share_left(search: Search, mean_square: float) -> float:
     """Compute the share of the refit's mismatch above the noise that a mean square error is."""
-    excess = max(search.root.whole - search.floor2, 1e-300)
+    excess = max(search.root.mean_square - search.floor2, 1e-300)
     return float(np.clip((mean_square - search.floor2) / excess, 0.0, 1.0))
 
 
@@ -163,14 +163,16 @@ def posterior(search: Search) -> Posterior:
     return Posterior(best, named, effects, by_names.get(frozenset(), 0.0))
 
 
-def _make_effect(search: Search, best: Trial, element: Placed, by_names: Mapping[frozenset[Name], float]) -> Named:
+def _make_effect(
+    search: Search, best: Trial, element: Placed, by_names: Mapping[frozenset[Name], float]
+) -> NamedEffect:
     """Make an effect, with its inclusion probability given that the physics is in the catalogue."""
     twins = _indistinguishable(search, best, element)
     same = {
         (element.port, element.law.id),
         *(n for name in twins if name[1] == element.law.id for n in _single_effects(name)),
     }
-    return Named(element, sum(w for n, w in by_names.items() if n & same), twins)
+    return NamedEffect(element, sum(w for n, w in by_names.items() if n & same), twins)
 
 
 def _weights(search: Search, trials: Sequence[Trial]) -> np.ndarray:
@@ -241,7 +243,7 @@ def judge(search: Search, found: Posterior, gates: Sequence[Gate], closest: Tria
         )
     faults = [g for g in gates if g.fault]
     cured = min((g.left for g in faults), default=1.0) < FORMULA
-    if cured and search.root.whole < FAR**2 * found.best.whole:  # beside the fault, an effect is negligible
+    if cured and search.root.mean_square < FAR**2 * found.best.mean_square:  # beside the fault, an effect is negligible
         return Verdict("recording-fault", faults[0].sentence)
     if found.effects and found.named > SURE:
         return Verdict("missing-physics", _describe_effects(search, found))
@@ -272,11 +274,11 @@ def _is_noise(search: Search, steady: Sequence[Gate], share: float, mode: float 
     times = quiet / float(np.sqrt(np.mean((white / search.bench.scale) ** 2)))
     if times < AT_FLOOR:
         return True
-    unexplained = share < (CHANCE if root.whole < QUIET**2 else SILENT)
+    unexplained = share < (CHANCE if root.mean_square < QUIET**2 else SILENT)
     if search.floor.source != "estimated":
         like = times < ABOVE_NOISE and unexplained
     else:
-        like = times < SOMEWHAT or (times < COLOURED and unexplained and root.whole < LOUDEST**2)
+        like = times < SOMEWHAT or (times < COLOURED and unexplained and root.mean_square < LOUDEST**2)
     return like and mode is None and not _swells(search)
 
 
@@ -327,7 +329,7 @@ def _describe_unexplained(search: Search, closest: Trial, shares: dict[str, floa
             f"{100 * noise:.3g} %.{at}{rings}"
         )
     port = where if shares.get(laws[0].port, 0.0) < 0.5 * share else laws[0].port
-    left = share_left(search, closest.whole)
+    left = share_left(search, closest.mean_square)
     rest = max(search.flexible(closest).values(), default=0.0)
     words = " and ".join(f"{display_name(e.law.id, e.law.form)} at {e.port}" for e in laws)
     named = f"laws, {words}, remove" if laws[1:] else f"law, {words}, removes"

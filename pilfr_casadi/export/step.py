@@ -24,7 +24,7 @@ from .._base import LARGEST, InputError, is_number, numbers, path_text, positive
 from ..data import Recording
 from ..engine import calls_external, make_engine
 from ..models import Model, ParameterSet, PrandtlIshlinskii
-from ..optimise import first_state
+from ..optimise import estimate_initial_state
 from ..simulators import ClosedEquations, Instant, Simulator, choose_substeps, discretise, on_grid
 from .c_code import check_name, make_unique, write_c
 from .fmu import FmuContent, write_fmu
@@ -510,7 +510,7 @@ def _start_state(model: Any, closed: Model, step: Exported, start: Any) -> np.nd
             state = model.initial_state(start)
         else:
             _check_recording(closed, step, start)
-            state = first_state(closed, make_engine(closed), start)
+            state = estimate_initial_state(closed, make_engine(closed), start)
         if not np.all(np.isfinite(state)):
             raise InputError("The state at the recording's first sample is not finite; give another start.")
         return np.append(state, np.zeros(size - n))

@@ -23,7 +23,7 @@ from .._base import InputError, later
 from ..data import Recording, rmse_per_output
 from ..engine import Engine, make_engine
 from ..models import Model
-from ..optimise import first_state, samples_for_state
+from ..optimise import estimate_initial_state, samples_for_state
 from ..simulators import as_simulator, choose_substeps, discretise
 from .result import Fit, match_channels
 
@@ -216,7 +216,7 @@ def run_free(
     used = min(samples_for_state(model), len(recording) // 3) if estimated else 0
     with np.errstate(all="ignore"):
         try:
-            state = first_state(model, engine, recording, used or None, starts=starts)
+            state = estimate_initial_state(model, engine, recording, used or None, starts=starts)
             y = engine.simulate(model.drive(recording), model.parameters.start, state)[0]
         except (RuntimeError, FloatingPointError):  # a quadratic program of huge numbers
             y = np.full(recording.y.shape, np.nan)

@@ -23,7 +23,7 @@ from .._base import InputError, one_blas_thread
 from ..data import Recording, as_recordings, group_by_input, mean_period, repeats_itself
 from ..engine import Engine, make_engine
 from ..models import NARX, PILFR, Lagged, Model, lagged_start, reading_output
-from ..optimise import Candidate, GaussNewton, Ipopt, Problem, Progress, Solution, Status, first_state
+from ..optimise import Candidate, GaussNewton, Ipopt, Problem, Progress, Solution, Status, estimate_initial_state
 from .context import FitContext, check_recordings, report_iterations
 from .multistart import EXPLORE, judge, run_tasks
 from .result import Fit, with_solution
@@ -151,7 +151,7 @@ def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution
         fitted, n = with_solution(model, problem, solution), problem.n_free
         others = [r for r in search.context.recordings[len(known) :] if r.begins == "estimate"]
         after = theta if known else theta[:n]
-        theta = np.concatenate([after, *(first_state(fitted, engine, r) for r in others)])
+        theta = np.concatenate([after, *(estimate_initial_state(fitted, engine, r) for r in others)])
         bounds, rest = np.split(solution.multipliers, [len(solution.theta)])
         bounds = np.concatenate([bounds[: len(after)], np.zeros(len(theta) - len(after))])
         solution = replace(solution, multipliers=np.concatenate([bounds, rest]))

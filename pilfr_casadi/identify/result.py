@@ -33,7 +33,7 @@ from ..optimise import (
     Status,
     check_weights,
     describe_unknown_multipliers,
-    first_state,
+    estimate_initial_state,
     samples_for_state,
     stability_limits,
 )
@@ -207,7 +207,9 @@ class Fit:
         """
         recording = self.matched(recording)
         known = self.initial.get(fingerprint(recording))
-        return first_state(self.model, self._engine, recording, samples, state_prior=True) if known is None else known
+        if known is not None:
+            return known
+        return estimate_initial_state(self.model, self._engine, recording, samples, state_prior=True)
 
     def simulate(self, recording: Recording) -> np.ndarray:
         """Simulate the outputs for a recording's inputs, shape (M, n_y).

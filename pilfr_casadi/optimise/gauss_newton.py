@@ -13,8 +13,6 @@ General constraints enter an exact penalty `μ Σ violation` (`ExactPenalty`), w
 along their tangent violates them. A run may stray into a region where violating the constraints lowers the merit and
 linear steps do not lead back. A run that ends worse than its cheapest feasible point (`BestFeasible`) is continued from
 that point, with more damping and a larger penalty.
-
-`first_state` uses the solver to fit the state at the beginning of a recording to a model with known parameters.
 """
 
 from __future__ import annotations

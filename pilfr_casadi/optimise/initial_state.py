@@ -26,7 +26,7 @@ def samples_for_state(model: Model) -> int:
     return max(10 * model.n_state, 50)
 
 
-def first_state(
+def estimate_initial_state(
     model: Model,
     engine: Engine,
     recording: Recording,

@@ -97,7 +97,7 @@ def test_a_hypothesis_fitted_to_a_part_is_judged_on_everything(monkeypatch):
     trial = search.fits.fitted(placed, [{}], 1)
     (whole,) = search.bench.recordings
     assert [len(e) for e in trial.fitted.residual] == [len(whole)]
-    assert trial.whole == trial.fitted.cost != trial.part
+    assert trial.mean_square == trial.fitted.cost != trial.part_mean_square
 
 
 def test_a_law_that_only_led_the_simulator_out_of_a_dead_end_is_no_physics():
@@ -107,7 +107,7 @@ def test_a_law_that_only_led_the_simulator_out_of_a_dead_end_is_no_physics():
     search.without = stuck
     found = search.run(1)
     assert found.best is found.root
-    assert found.root.whole < 1e-3 * stuck.cost
+    assert found.root.mean_square < 1e-3 * stuck.cost
 
 
 @pytest.fixture
