@@ -93,9 +93,8 @@ def simulator(root: bool) -> Simulator:
                 lambda x: x.upper,
                 unit="level/s",
                 across_unit="level",
-                domain="fluid",
             ),
-            Port("lower-tank", {"lower": -1.0}, lambda x: x.lower, None, "level/s", "level", domain="fluid"),
+            Port("lower-tank", {"lower": -1.0}, lambda x: x.lower, unit="level/s", across_unit="level"),
         ),
     )
 

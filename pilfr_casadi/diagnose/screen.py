@@ -180,12 +180,13 @@ def _windows(bench: Workbench, runs: Sequence[Run]) -> list[slice]:
 
 def _tasks(bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list[Run], short: list[Run]) -> list[Task]:
     by_name = {port.name: port for port in bench.simulator.all_ports()}
+    definitions = {f"equation:{state}" for state in bench.simulator.kinematic}
     out = []
     for j, (name, local, part) in enumerate(
         zip(probe.ports, locals_of(bench, runs), locals_of(bench, short), strict=True)
     ):
         port = by_name[name]
-        if not np.ptp(local.z) > 0 or name.removeprefix("equation:") in bench.simulator.kinematic:
+        if not np.ptp(local.z) > 0 or name in definitions:
             continue
         chosen = [law() for law in laws if port.admits(law)]
         pairs = [(law, list(law.shapes(local))) for law in chosen if usable(law, local)]

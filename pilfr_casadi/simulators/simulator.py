@@ -10,6 +10,7 @@ that no recording shows, and that bends a fit of the law's parameters before the
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -182,11 +183,15 @@ class Simulator(Equations):
             raise InputError(f"The element has {law.channels} channels, the port {port!r} has one; give as many.")
         if lacks := getattr(law, "lacks", ""):
             raise InputError(f"The law {law.id!r} cannot be closed in at {port!r} yet: {lacks}.")
-        count = sum(e.port == port for e in self.elements)
-        prefix = f"{port}." if not count else f"{port}#{count + 1}."
-        placed = Placed(port, law, prefix)
+        placed = Placed(port, law, self._free_prefix(port))
         own = self.parameter_set | placed.named(law.parameters())
         return self._with(parameters=own, elements=(*self.elements, placed))
+
+    def _free_prefix(self, port: str) -> str:
+        """Choose the prefix of a further law's parameters at a port; no other parameter's name begins with it."""
+        taken = (*self.parameters, *(e.prefix for e in self.elements))
+        prefixes = itertools.chain([f"{port}."], (f"{port}#{k}." for k in itertools.count(2)))
+        return next(p for p in prefixes if not any(name.startswith(p) for name in taken))
 
     def without_last_element(self) -> Simulator:
         """Copy without the law of the last `with_element`."""

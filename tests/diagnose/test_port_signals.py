@@ -11,7 +11,7 @@ from pilfr_casadi.laws import CoulombFriction, ViscousDamping, scheduled
 DT = 0.01
 
 
-def servo(**options):
+def servo(name="gear", **options):
     port = {
         "into": {"speed": -1.0},
         "across": lambda x: x.angle,
@@ -24,7 +24,7 @@ def servo(**options):
         states=("angle", "speed"),
         inputs=("torque",),
         parameters={"d": Parameter(0.5, bounds=(0.0, 5.0))},
-        ports=(Port("gear", **{**port, **options}),),
+        ports=(Port(name, **{**port, **options}),),
     )
 
 
@@ -62,10 +62,11 @@ def test_a_law_varies_with_a_signal_of_its_port(loaded):
     assert np.std(simulated - loaded.y) < 0.01 * np.std(loaded.y)
 
 
-def test_friction_that_grows_with_the_load_is_named(loaded):
-    found = diagnose(servo(), loaded, laws=(CoulombFriction, ViscousDamping), effects=1, workers=1)
+@pytest.mark.parametrize("name", ["gear", "angle"])  # the name of a state too
+def test_friction_that_grows_with_the_load_is_named(loaded, name):
+    found = diagnose(servo(name), loaded, laws=(CoulombFriction, ViscousDamping), effects=1, workers=1)
     (effect,) = found.effects
-    assert (effect.port, effect.law) == ("gear", "coulomb_friction") and "load" in effect.form
+    assert (effect.port, effect.law) == (name, "coulomb_friction") and "load" in effect.form
     assert effect.confidence > 0.9
     assert found.errors["train"]["after"] < 0.02 * found.errors["train"]["before"]
 

@@ -151,3 +151,10 @@ def test_the_command_takes_a_model(arm, tmp_path, capsys, recording):
     refused(capsys, "diagnose", str(arm), train, "--bound", "wrist.mass=1:2", *out, says="'wrist.mass'")
     refused(capsys, "diagnose", str(arm), train, "--port", "a=b:c", *out, says="--port was given")
     assert not (tmp_path / "out").exists()
+
+
+def test_laws_have_parameters_of_their_own_beside_the_joints(arm):
+    simulator = from_mujoco(arm).with_element("shoulder", CoulombFriction()).with_element("shoulder", CoulombFriction())
+    added = [name for name in simulator.parameters if name not in from_mujoco(arm).parameters]
+    assert added == ["shoulder#2.F_c", "shoulder#2.v_0", "shoulder#3.F_c", "shoulder#3.v_0"]
+    assert "shoulder.damping" in simulator.without_last_element().parameters
