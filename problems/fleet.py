@@ -38,6 +38,7 @@ FINE = 40  # sub-steps of the truth per sample
 PORT, STIFFNESS, DAMPING, FRICTION, KNEE = "ground-mass", 1300.0, 12.0, 5.0, 5e-3
 SPREAD, WEAR = 0.05, 0.01  # between machines, and per day
 FAULTY, WORN = 0.03, 0.10  # shares of the machines
+SHARE_FOR_SPEED = 0.1  # of faulty machines: with one of them alone, its diagnosis would be all that is left to do
 LAWS = (CoulombFriction, CubicStiffness, Clearance)
 
 
@@ -64,12 +65,13 @@ def rig() -> pilfr.Simulator:
 
 @dataclass(frozen=True)
 class Truth:
-    """The values of a machine on its first day, its fault ("", "cubic" or "gap"), and its wear per day."""
+    """The values of a machine on its first day, its fault ("", "cubic" or "gap") and wear per day."""
 
     k: float
     friction: float
     fault: str
     wear: float
+    strength: float = 1.0
 
     @property
     def middle(self) -> float:
@@ -78,9 +80,9 @@ class Truth:
 
 
 def simulated_fleet(
-    count: int, seed: int = 0, share: float = FAULTY
+    count: int, seed: int = 0, share: float = FAULTY, strength: float = 1.0
 ) -> tuple[dict[str, list[pilfr.Recording]], dict[str, Truth]]:
-    """Draw a fleet with a share of faulty machines: recordings and truth by machine."""
+    """Draw a fleet with a share of faulty machines, whose faults have a strength: recordings and truth by machine."""
     rng = np.random.default_rng(seed)
     order = rng.permutation(count)
     faulty, worn = max(round(share * count), 1), max(round(WORN * count), 1)
@@ -91,7 +93,7 @@ def simulated_fleet(
         wear = WEAR if faulty <= place < faulty + worn else 0.0
         k, friction = (mean * (1 + SPREAD * rng.standard_normal()) for mean in (STIFFNESS, FRICTION))
         name = f"m{i:03d}"
-        truths[name] = Truth(k, friction, fault, wear)
+        truths[name] = Truth(k, friction, fault, wear, strength)
         recordings[name] = [_day(truths[name], day, rng) for day in range(DAYS)]
     return recordings, truths
 
@@ -100,9 +102,9 @@ def _day(truth: Truth, day: int, rng: np.random.Generator) -> pilfr.Recording:
     """Record a machine on a day, driven by a multisine that swells and ebbs."""
     true = rig().with_element(PORT, CoulombFriction({"F_c": truth.friction, "v_0": KNEE}))
     if truth.fault == "cubic":
-        true = true.with_element(PORT, CubicStiffness({"k_3": 4e4}))
+        true = true.with_element(PORT, CubicStiffness({"k_3": truth.strength * 4e4}))
     elif truth.fault == "gap":
-        true = true.with_element(PORT, Clearance({"k_g": 600.0, "g": 0.03}))
+        true = true.with_element(PORT, Clearance({"k_g": truth.strength * 600.0, "g": 0.03}))
     t, f = np.arange(SAMPLES) * DT, np.linspace(0.5, 8, 20)
     v = np.sum(np.cos(2 * np.pi * f[:, None] * t + rng.uniform(0, 2 * np.pi, (20, 1))), axis=0)
     u = (30 * v / np.std(v) * (0.4 + 0.6 * np.sin(np.pi * t / t[-1])))[:, None]
@@ -194,17 +196,18 @@ def main() -> None:
     parser.add_argument("--machines", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--faulty", type=float, default=FAULTY, help="share of the machines with a second fault")
+    parser.add_argument("--strength", type=float, default=1.0, help="of the second faults")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--speed", type=int, default=0, help="machines on which one and two processes are compared")
     parser.add_argument("--kill", action="store_true", help="also kill and resume a run of at most 20 machines")
     parser.add_argument("--out", type=Path, help="folder of the results; a run that was ended is continued")
     options = parser.parse_args()
-    recordings, truths = simulated_fleet(options.machines, options.seed, options.faulty)
+    recordings, truths = simulated_fleet(options.machines, options.seed, options.faulty, options.strength)
     fleet, seconds = run(recordings, options.out, options.workers)
     print(fleet)
     print(f"\n{score(fleet, truths)}\n{options.machines} machines of {DAYS} days in {seconds:.0f} s")
     if options.speed:
-        few = simulated_fleet(options.speed, options.seed)[0]
+        few = simulated_fleet(options.speed, options.seed, SHARE_FOR_SPEED)[0]
         one, two = (run(few, None, workers)[1] for workers in (1, 2))
         print(f"{options.speed} machines: one process {one:.0f} s, two {two:.0f} s, {one / two:.2f} times as fast")
     if options.kill:
