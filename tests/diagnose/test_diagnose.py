@@ -47,7 +47,7 @@ def test_the_catalogue_holds_every_law_of_the_contract():
 @pytest.mark.parametrize(
     ("port", "law"),
     [
-        ("ground-m1", CubicStiffness().at({"k_3": 4e5})),
+        pytest.param("ground-m1", CubicStiffness().at({"k_3": 4e5}), marks=pytest.mark.slow),
         pytest.param("m1-m2", CoulombFriction().at({"F_c": 4.0, "v_0": 1e-3}), marks=pytest.mark.slow),
         pytest.param("sensor:x2", Backlash().at({"r": 0.002}), marks=pytest.mark.slow),
     ],

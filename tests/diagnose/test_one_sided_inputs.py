@@ -57,12 +57,14 @@ def opened():
     return pilfr.diagnose(stage(), records[0], test=records[1])
 
 
+@pytest.mark.slow
 def test_a_dead_zone_is_found_from_one_side(opened):
     assert [(e.port, e.law) for e in opened.effects] == [("actuator:drive", "dead_zone")]
     assert opened.effects[0].parameters["g"]["value"] == pytest.approx(3, rel=0.01)
     assert opened.errors["test"]["after"] < 0.01
 
 
+@pytest.mark.slow
 def test_what_the_dead_zone_made_look_like_an_offset_is_none(opened):
     assert not [g for g in opened.gates if g.finding == "offset"]
 

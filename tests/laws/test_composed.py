@@ -82,6 +82,7 @@ def test_a_composed_law_is_found(law, values, form):
         assert found.effects[0].parameters[name]["value"] == pytest.approx(values[name], rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "values"),
     [
@@ -89,10 +90,9 @@ def test_a_composed_law_is_found(law, values, form):
             scheduled(PreslidingFriction, "voltage"),
             {"k_t": 600.0, "k_t_high": 3000.0, "r": 0.002, "low": 0.5, "high": 4},
         ),
-        pytest.param(
+        (
             scheduled(CoulombFriction, "z"),
             {"F_c": 0.5, "F_c_high": 5.0, "v_0": 5e-3, "low": -0.15, "high": 0.15},
-            marks=pytest.mark.slow,
         ),
     ],
     ids=("with an input", "with the coordinate"),

@@ -195,7 +195,7 @@ def test_plain_bla_removes_leakage(n_u, lengths):
         assert ratio > 10 * np.linalg.norm(bla.G - true) / np.linalg.norm(true)
 
 
-@pytest.mark.parametrize(("n_u", "n_rec"), [(1, 1), (2, 1), (2, 4)])
+@pytest.mark.parametrize(("n_u", "n_rec"), [(1, 1), (2, 1), pytest.param(2, 4, marks=pytest.mark.slow)])
 def test_plain_bla_variance_matches_the_true_error(n_u, n_rec):
     rng, model = np.random.default_rng(6), system(n_u, 1)
     ratios = []

@@ -92,6 +92,7 @@ def records():
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", [lambda n: PILFR(n, PrandtlIshlinskii(Play, 3)), lambda n: PILFR(n), "hammerstein"])
 def test_fits_are_as_good_as_with_everything_free(build):
     full = hammerstein(3, PrandtlIshlinskii(Play, 3)) if build == "hammerstein" else build(3)
