@@ -158,7 +158,7 @@ class HertzContact(PiecewiseStiffness):
     equation = "w = k_c max(z - g, 0)^1.5"
     source = "Johnson (1985), Contact Mechanics, ch. 4"
     units = {"k_c": "w/z^1.5", "g": "z"}
-    domains = ("mechanical",)
+    domains = ("mechanical", "fluid")  # the flow over a weir grows with the same power of the head
     ranges = {**PiecewiseStiffness.ranges, "k_c": _hertz_limits}
 
     def force(self, z: Any, p: Any) -> Any:

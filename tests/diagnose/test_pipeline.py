@@ -38,7 +38,7 @@ def test_what_seems_early_beside_something_unexplained_is_searched_as_it_is(monk
         def __init__(self, *given, **more):
             self.interrupted, self.out_of_time = interrupted, False
             whole = 1.0 if early_or_not[-1] else 0.1 if nearer else 0.9
-            self.best = SimpleNamespace(whole=whole)
+            self.best = SimpleNamespace(mean_square=whole)
 
         def run(self, effects):
             return self
@@ -62,7 +62,7 @@ class Searched:
     """A finished search, as far as the choice of a hold reads it."""
 
     def __init__(self, whole, interrupted=False, fits=3):
-        self.best, self.interrupted, self.out_of_time = SimpleNamespace(whole=whole), interrupted, False
+        self.best, self.interrupted, self.out_of_time = SimpleNamespace(mean_square=whole), interrupted, False
         self.bench = SimpleNamespace(with_other_hold=lambda: SimpleNamespace(hold="linear"))
         self.memo = dict.fromkeys(range(fits))
 
@@ -108,7 +108,7 @@ def test_an_answer_that_is_there_outlives_an_interrupt_of_what_adds_to_it(monkey
         search.interrupted = True
         return ()
 
-    best = SimpleNamespace(fitted=None, whole=1.0)
+    best = SimpleNamespace(fitted=None, mean_square=1.0)
     search = SimpleNamespace(interrupted=unfinished, out_of_time=False, bench=None, root=best)
     answer = SimpleNamespace(best=best, sure=0.0, effects=())
     monkeypatch.setattr(pipeline, "posterior", lambda search: answer)
