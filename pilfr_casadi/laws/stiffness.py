@@ -1,7 +1,7 @@
 """Memoryless forces of the local coordinate: springs, contacts, gaps, and forces that repeat with position.
 
-The plain powers, contacts and gaps occur in all domains (a curve, an overflow, a threshold); the finer forms of springs
-are mechanical. Elsewhere there is `FreeCurve`.
+The plain powers, contacts and gaps occur in all domains (a curve, an overflow, a threshold). The finer forms of springs
+are mechanical; those that follow powers also describe flows. Elsewhere there is `FreeCurve`.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class PowerStiffness(CubicStiffness):
     form = "power"
     equation = "w = k_n sign(z) |z|^n"
     units = {"k_n": "w/z^n", "n": ""}
-    domains = ("mechanical",)
+    domains = ("mechanical", "fluid")
     starts = {"n": ("", 2.0, 2.5, 4.0)}
     ranges = {"n": ("", 1.7, 6.0)}
 
@@ -86,7 +86,7 @@ class QuinticStiffness(CubicStiffness):
     form = "quintic"
     equation = "w = k_3 z^3 + k_5 z^5"
     units = {"k_3": "w/z^3", "k_5": "w/z^5"}
-    domains = ("mechanical",)
+    domains = ("mechanical", "fluid")
     two_sided = True  # on one side alone the powers follow any curve, such as contacts and weirs
 
     def force(self, z: Any, p: Any) -> Any:
@@ -112,7 +112,7 @@ class ProgressiveStiffness(QuadraticStiffness):
     form = "progressive"
     equation = "w = k_2 (z^2 + b z^3)"
     units = {"k_2": "w/z^2", "b": "1/z"}
-    domains = ("mechanical",)
+    domains = ("mechanical", "fluid")
     two_sided = True
     starts = {"b": lambda at: (-0.5 / at.reach, 0.5 / at.reach)}
     ranges = {"b": lambda at: (-1 / at.reach, 1 / at.reach)}  # the cubic part stays below the quadratic one
