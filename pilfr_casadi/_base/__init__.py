@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from .errors import (
         LARGEST as LARGEST,
         InputError as InputError,
+        check_known as check_known,
         existing_file as existing_file,
         filled as filled,
         in_words as in_words,

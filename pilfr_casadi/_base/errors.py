@@ -18,6 +18,13 @@ def listed(names: Sequence[Any], most: int = 20) -> str:
     return ", ".join(map(str, names[:most])) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
+def check_known(names: Sequence[str], there: Sequence[str], kind: str, owner: Any) -> None:
+    """Refuse names that are not among those of a kind; `owner` has them."""
+    for name in names:
+        if name not in there:
+            raise InputError(f"{owner} has no {name!r} among its {kind}; they are {listed(there) or 'none'}.")
+
+
 def in_words(names: Sequence[str], most: int = 8) -> str:
     """Join names as a sentence has them, "a, b and c"; of many, the first ones."""
     if len(names) > most:

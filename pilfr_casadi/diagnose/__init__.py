@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from ..identify import surrogate as surrogate
     from ..laws import Law
     from .blind_spots import BlindSpot as BlindSpot, Check as Check, check as check
-    from .evidence import SURE as SURE, log_prior as log_prior
+    from .evidence import SURE as SURE
     from .force_recovery import HiddenForce as HiddenForce, hidden_force as hidden_force
     from .gates import Gate as Gate
     from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force

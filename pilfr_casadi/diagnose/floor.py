@@ -74,9 +74,14 @@ def _from_periods(r: Recording) -> np.ndarray | None:
     return np.asarray(np.sqrt(np.mean(np.var(folded, axis=0, ddof=1), axis=0)))
 
 
+def third_differences(residual: np.ndarray) -> np.ndarray:
+    """Return third differences (M - 3, n_y), normalised so that white noise keeps its deviation."""
+    return np.asarray(np.diff(residual, 3, axis=0) / np.sqrt(20))
+
+
 def white_part(residuals: Sequence[np.ndarray]) -> np.ndarray:
     """Estimate the white noise inside residuals, (n_y,): third differences, the smallest over recordings."""
-    return np.asarray(np.min([np.sqrt(np.mean(np.diff(e, 3, axis=0) ** 2, axis=0) / 20) for e in residuals], axis=0))
+    return np.asarray(np.min([np.sqrt(np.mean(third_differences(e) ** 2, axis=0)) for e in residuals], axis=0))
 
 
 def effective_size(residuals: Sequence[np.ndarray]) -> float:

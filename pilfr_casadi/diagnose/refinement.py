@@ -58,7 +58,7 @@ HYSTERETIC = ("hysteresis", "backlash")  # ids of laws with rate-independent mem
 
 
 class Answer(Protocol):
-    """What is used of a `Diagnosis`, whose file imports this one."""
+    """The part of a `Diagnosis` that a refinement reads; the file of the class imports this one."""
 
     @property
     def corrected(self) -> Simulator:

@@ -25,7 +25,7 @@ from ..data import Recording
 from ..laws import Law
 from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
 from .evidence import FORMULA, Sample, deviations, information, log_evidence, log_prior, prior_width
-from .floor import effective_size, measured_floor
+from .floor import effective_size, measured_floor, third_differences
 from .linearise import along
 from .preparation import match_recordings, stated_hold
 from .proof import mean_nrmse
@@ -229,7 +229,7 @@ def _noise2(bench: Workbench, residuals: Sequence[np.ndarray]) -> float:
     measured = measured_floor(bench.recordings)
     if measured is not None:
         return float(np.mean((measured.deviation / bench.scale) ** 2))
-    return float(np.mean(np.concatenate([np.diff(e, 3, axis=0) ** 2 for e in residuals])) / 20)
+    return float(np.mean(np.concatenate([third_differences(e) for e in residuals]) ** 2))
 
 
 def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ...], noise2: float) -> float:

@@ -196,8 +196,11 @@ class Search:
 
     def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
         known = trial.information if trial.information is not None else np.zeros(0)
-        prior = log_prior(trial.laws, self.alternatives, trial.doubtful, self.domains)
-        return log_evidence(v + self.tolerance, known, prior, n)
+        return log_evidence(v + self.tolerance, known, self.log_prior(trial), n)
+
+    def log_prior(self, trial: Trial) -> float:
+        """Compute the log prior probability of a hypothesis."""
+        return log_prior(trial.laws, self.alternatives, trial.doubtful, self.domains)
 
     @cached_property
     def domains(self) -> dict[str, str]:

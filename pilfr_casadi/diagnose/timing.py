@@ -27,7 +27,7 @@ import numpy as np
 
 from ..data import Recording
 from ..simulators import states_along
-from .floor import ABOVE_NOISE
+from .floor import ABOVE_NOISE, third_differences
 from .gates import (
     AT_NOISE,
     CLEARLY,
@@ -330,8 +330,8 @@ def _describe_gaps(jump: Jump, origins: Sequence[tuple[Recording, int]]) -> Gate
 
 def _quiet_noise2(now: Checked) -> float:
     """Estimate the mean square of white noise from third differences, not disturbed by a few jumps."""
-    thirds = np.concatenate([np.diff(e, 3, axis=0) for e in now.fitted.residual])
-    return float(np.mean((robust_deviation(thirds) / now.bench.scale) ** 2) / 20)
+    thirds = np.concatenate([third_differences(e) for e in now.fitted.residual])
+    return float(np.mean((robust_deviation(thirds) / now.bench.scale) ** 2))
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -51,6 +51,8 @@ if TYPE_CHECKING:
         ParameterSet as ParameterSet,
         check_size as check_size,
         or_one as or_one,
+        parameter_within as parameter_within,
+        within_a_factor as within_a_factor,
     )
     from .pilfr import (
         BLOCKS as BLOCKS,

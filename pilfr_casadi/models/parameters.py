@@ -21,6 +21,14 @@ Array = np.ndarray
 LARGEST_MODEL = 20_000
 
 
+def parameter_within(name: str, value: float, bounds: tuple[float, float], unit: str = "") -> Parameter:
+    """Make a parameter of somebody else's model; refuse a value outside of the bounds with its name."""
+    low, high = bounds
+    if not low <= value <= high:
+        raise InputError(f"The parameter {name!r} is {value:g}, outside of its bounds {low:g} to {high:g}; widen them.")
+    return Parameter(value, unit, (low, high))
+
+
 def check_size(owner: str, count: int) -> None:
     """Refuse a model whose number of parameters no fit could handle, before anything of that size is allocated."""
     if count > LARGEST_MODEL:
@@ -28,6 +36,12 @@ def check_size(owner: str, count: int) -> None:
             f"{owner} of this size has at least {float(count):.3g} parameters, and the matrix that a fit solves for "
             f"takes {8e-9 * float(count) ** 2:.3g} GB of memory; give at most {LARGEST_MODEL} parameters."
         )
+
+
+def within_a_factor(value: float, factor: float = 10.0) -> tuple[float, float]:
+    """Return usual bounds of a value of which nothing is known but its size: a factor of ten either way."""
+    low, high = sorted((value / factor, value * factor))
+    return low, high
 
 
 @dataclass(frozen=True, eq=False)

@@ -297,7 +297,7 @@ class Ipopt:
             settings = {"ipopt": {name: value, "sb": "yes"}, "print_time": False}
             try:
                 ca.nlpsol("check", "ipopt", {"x": x, "f": x**2}, settings)
-            except (RuntimeError, TypeError, NotImplementedError):
+            except (RuntimeError, TypeError):
                 raise InputError(
                     f"IPOPT rejects the option {name!r} with the value {value!r}; see its list of options."
                 ) from None

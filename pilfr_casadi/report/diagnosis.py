@@ -72,9 +72,8 @@ class _Case:
     @classmethod
     def of(cls, d: Diagnosis) -> _Case:
         search = d.evidence.get("search")
-        recordings = (
-            d.train if search is None else search.bench.recordings
-        )  # of long recordings, the searched stretches
+        # of long recordings, the searched stretches
+        recordings = d.train if search is None else search.bench.recordings
         bench = Workbench.of(d.refitted, recordings, d.hold)
         noise = float(d.floor["nrmse"]) * bench.scale if search is None else np.asarray(search.floor.deviation)
         return cls(d, bench, d.evidence["without"], d.evidence["after"], np.nan_to_num(noise))

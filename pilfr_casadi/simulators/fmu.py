@@ -26,8 +26,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, listed, run_in_worker
-from ..models import Named, Parameter
+from .._base import InputError, check_known, listed, run_in_worker
+from ..models import Named, Parameter, parameter_within, within_a_factor
 from .equations import Port
 from .external import NOMINAL, SAME, call_external, equal_state, external, keep_leaf
 from .fmu_description import Variable, check_file, describe, tidy
@@ -36,7 +36,6 @@ from .simulator import Simulator
 
 POINTS = 8  # at which a trial compares derivatives and outputs with states, and looks at what ports do
 TIMES = (0.0, 0.7, 13.0, 400.0)  # s, at which a trial looks for a dependence on time
-WITHIN = 10.0  # factor by which a parameter may move where the unit states no bounds
 PATIENCE = 60.0  # seconds that loading may take
 
 
@@ -154,7 +153,7 @@ def from_fmu(
         (outputs or (), unit.outputs, "outputs"),
         ((*own, *(bounds or {})), unit.parameters, "tunable parameters"),
     ):
-        _check_names(names, there, kind, path)
+        check_known(names, there, kind, path)
     free = tuple(own)
     drives = tuple(inputs) if inputs is not None else tuple(n for n in unit.inputs if n not in used)
     measured = tuple(outputs) if outputs is not None else unit.outputs
@@ -309,19 +308,9 @@ def _factors(into: Any) -> dict[str, float]:
 def _parameter(variable: Variable, bounds: tuple[float, float] | None) -> Parameter:
     value = 0.0 if np.isnan(variable.start) else variable.start
     low, high = bounds if bounds is not None else (variable.low, variable.high)
-    ends = sorted((value / WITHIN, value * WITHIN)) if value else (-np.inf, np.inf)
-    low, high = (end if np.isnan(given) else given for given, end in zip((low, high), ends, strict=True))
-    if not low <= value <= high:
-        raise InputError(
-            f"The parameter {variable.name!r} is {value:g}, outside of its bounds {low:g} to {high:g}; widen them."
-        )
-    return Parameter(value, variable.unit, (low, high))
-
-
-def _check_names(names: Sequence[str], there: Sequence[str], kind: str, path: Path) -> None:
-    for name in names:
-        if name not in there:
-            raise InputError(f"{path} has no {name!r} among its {kind}; they are {listed(there) or 'none'}.")
+    usual = within_a_factor(value) if value else (-np.inf, np.inf)
+    low, high = (end if np.isnan(given) else given for given, end in zip((low, high), usual, strict=True))
+    return parameter_within(variable.name, value, (low, high), variable.unit)
 
 
 def _check_program(path: Path) -> None:

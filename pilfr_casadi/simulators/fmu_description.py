@@ -1,4 +1,4 @@
-"""What a functional mock-up unit says of itself: its file and `modelDescription.xml`, read without running it."""
+"""Read a functional mock-up unit without running it: its file and its `modelDescription.xml`."""
 
 from __future__ import annotations
 

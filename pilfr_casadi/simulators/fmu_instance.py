@@ -63,7 +63,7 @@ class _Fmu(ctypes.Structure):
 
 @dataclass(frozen=True, eq=False)
 class FmuFile:
-    """What an instance is made from: the unpacked file, the names of its description, and value references by role."""
+    """An unpacked unit: the names of its description, and the value references by role, to make instances from."""
 
     folder: Path
     version: int

@@ -13,7 +13,7 @@ do not hold is refused.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,14 +22,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, existing_file, listed
-from ..models import Named, Parameter
+from .._base import InputError, check_known, existing_file
+from ..models import Named, Parameter, parameter_within, within_a_factor
 from .equations import Port
 from .simulator import Simulator
 
 POINTS = 8  # at which the equations are compared with MuJoCo
 SAME = 1e-8  # relative difference of accelerations that rounding may cause
-WITHIN = 10.0  # factor by which a parameter may move where no bounds are given
 AXES = ("x", "y", "z")
 
 
@@ -45,7 +44,8 @@ def from_mujoco(
     """Make a simulator from a MuJoCo model (extra `pilfr-casadi[mujoco]`).
 
     Every joint is a port, with its torque or force, position and speed. The states are the joints' positions, by their
-    names, and their speeds, as `elbow.speed`. The load that a joint transmits is a signal of its port, `load`.
+    names, and their speeds, as `elbow.speed`. The size of the force that actuators put on a joint is a signal of its
+    port, `load`, with which friction may grow.
 
     Parameters
     ----------
@@ -78,14 +78,15 @@ def from_mujoco(
         (inputs or (), tree.actuators, "actuators"),
         (outputs or (), tuple(tree.sensors), "joints, and sensors of joints"),
     ):
-        for name in names:
-            if name not in there:
-                raise InputError(f"{path} has no {name!r} among its {kind}; they are {listed(there) or 'none'}.")
-    given = {n: (bounds or {}).get(n) for n in own}
-    made = own if isinstance(own, Mapping) else {n: _parameter(n, tree.numbers[n], b) for n, b in given.items()}
+        check_known(names, there, kind, path)
+    given = {n: (bounds or {}).get(n) or _usual_bounds(n, tree.numbers[n]) for n in own}
+    if isinstance(own, Mapping):
+        made = dict(own)
+    else:
+        made = {n: parameter_within(n, tree.numbers[n], ends) for n, ends in given.items()}
     drives = tuple(tree.actuators if inputs is None else inputs)
     measured = tuple(tree.usual_outputs if outputs is None else outputs)
-    equations = _Equations(tree, frozenset(made), drives, measured)
+    equations = _Equations(tree, tuple(made), drives, measured)
     equations.check()
     return Simulator(
         equations.dynamics,
@@ -240,26 +241,38 @@ class _Tree:
 class _Equations:
     """The equations of motion of a tree with some of its numbers, actuators and sensors as symbols."""
 
-    def __init__(self, tree: _Tree, free: frozenset[str], inputs: tuple[str, ...], measured: tuple[str, ...]) -> None:
+    def __init__(self, tree: _Tree, free: tuple[str, ...], inputs: tuple[str, ...], measured: tuple[str, ...]) -> None:
         self.tree, self.free, self.inputs, self.measured = tree, free, inputs, measured
+        n = len(tree.joints)
+        q, v, u, p = (ca.SX.sym(name, size) for name, size in zip("qvup", (n, n, len(inputs), len(free)), strict=True))
+        controls = {name: u[i] for i, name in enumerate(inputs)}
+        numbers = {**tree.numbers, **{name: p[i] for i, name in enumerate(free)}}
+        driven = self._driven(q, v, controls, numbers)
+        mass, rest = self._motion(q, v, driven, numbers)
+        # M, the rest of the equations M dv/dt = rest, and the actuators' forces on the joints
+        self.motion = ca.Function("motion", [q, v, u, p], [mass, rest, driven])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Write the equations again in another process."""
+        return _Equations, (self.tree, self.free, self.inputs, self.measured)
 
     def check(self) -> None:
         """Compare with MuJoCo's accelerations at several points."""
         tree, rng, n = self.tree, np.random.default_rng(0), len(self.tree.joints)
-        q, v, u = (ca.SX.sym(name, size) for name, size in (("q", n), ("v", n), ("u", len(tree.actuators))))
-        names = dict(zip(tree.actuators, ca.vertsplit(u) if tree.actuators else [], strict=True))
-        mass, rest = self._motion(q, v, names, lambda name: tree.numbers[name])
-        ours = ca.Function("acceleration", [q, v, u], [ca.solve(mass, rest)])
+        drives = [tree.actuators.index(name) for name in self.inputs]
+        values = [tree.numbers[name] for name in self.free]
         for _ in range(POINTS):
-            point = [rng.uniform(-0.7, 0.7, n), rng.normal(0, 1, n), rng.uniform(-0.5, 0.5, len(tree.actuators))]
-            wanted, found = tree.acceleration(*point), ours(*point).full().ravel()
+            q, v, u = rng.uniform(-0.7, 0.7, n), rng.normal(0, 1, n), np.zeros(len(tree.actuators))
+            u[drives] = rng.uniform(-0.5, 0.5, len(drives))
+            mass, rest, _ = self.motion(q, v, u[drives], values)
+            wanted, found = tree.acceleration(q, v, u), np.linalg.solve(mass.full(), rest.full().ravel())
             if not np.max(np.abs(found - wanted)) <= SAME * max(np.max(np.abs(wanted)), 1.0):
                 raise InputError(
                     f"{tree.path} moves otherwise than a tree of rigid bodies with linear springs, dampers and "
                     "actuators; remove what else it has, such as a fluid, curved damping, or gravity compensation."
                 )
 
-    def _bodies(self, q: Any, number: Callable[[str], Any]) -> tuple[list[tuple[Any, Any, int]], list[Any]]:
+    def _bodies(self, q: Any, numbers: Mapping[str, Any]) -> tuple[list[tuple[Any, Any, int]], list[Any]]:
         """Return centre of mass, axes of the inertia (3, 3) and index of each moving body, and the joints' axes.
 
         All are in the world's frame. A slide turns nothing, and its axis is zero.
@@ -283,7 +296,7 @@ class _Equations:
             poses.append((p, r))
         for i in self.tree._moving():
             p, r = poses[i]
-            centre = ca.vertcat(*(number(f"{self.tree.bodies[i]}.com_{axis}") for axis in AXES))
+            centre = ca.vertcat(*(numbers[f"{self.tree.bodies[i]}.com_{axis}"] for axis in AXES))
             out.append((p + r @ centre, r @ _rotation(m.body_iquat[i]), i))
         return out, turning
 
@@ -295,18 +308,18 @@ class _Equations:
             body = int(m.body_parentid[body])
         return out
 
-    def _motion(self, q: Any, v: Any, u: Mapping[str, Any], number: Callable[[str], Any]) -> tuple[Any, Any]:
-        """Return M(q), (n, n), and the rest of the equations M dv/dt = rest, (n,)."""
+    def _motion(self, q: Any, v: Any, driven: Any, numbers: Mapping[str, Any]) -> tuple[Any, Any]:
+        """Return M(q), (n, n), and the rest of the equations M dv/dt = rest, (n,), with the actuators' forces."""
         m, n, tree = self.tree.model, len(self.tree.joints), self.tree
         down = m.opt.gravity / (np.linalg.norm(m.opt.gravity) or 1.0)
-        fall = number("gravity") * ca.SX(ca.DM(down))
-        mass, rest = ca.SX.zeros(n, n), ca.SX.zeros(n)
-        bodies, hinges = self._bodies(q, number)
+        fall = numbers["gravity"] * ca.SX(ca.DM(down))
+        mass, rest = ca.SX.zeros(n, n), 1 * driven
+        bodies, hinges = self._bodies(q, numbers)
         for centre, axes, i in bodies:
             above, name = self._above(i), tree.bodies[i]
             turning = ca.horzcat(*(axis if j in above else ca.SX.zeros(3) for j, axis in enumerate(hinges)))
-            moving, weight = ca.jacobian(centre, q), number(f"{name}.mass")
-            share = number(f"{name}.inertia") * weight / float(m.body_mass[i])
+            moving, weight = ca.jacobian(centre, q), numbers[f"{name}.mass"]
+            share = numbers[f"{name}.inertia"] * weight / float(m.body_mass[i])
             inertia = axes @ ca.diag(ca.SX(ca.DM(m.body_inertia[i])) * share) @ axes.T
             omega = turning @ v
             bias, turned = (ca.jtimes(part @ v, q, v) for part in (moving, turning))
@@ -314,49 +327,42 @@ class _Equations:
             torque = inertia @ turned + ca.cross(omega, inertia @ omega)
             rest -= moving.T @ (weight * (bias - fall)) + turning.T @ torque
         for j, name in enumerate(tree.joints):
-            mass[j, j] += number(f"{name}.armature")
-            rest[j] -= number(f"{name}.damping") * v[j]
-            rest[j] -= number(f"{name}.stiffness") * (q[j] - number(f"{name}.spring"))
-        for j, force in self._driven(q, v, u, number):
-            rest[j] += force
+            mass[j, j] += numbers[f"{name}.armature"]
+            rest[j] -= numbers[f"{name}.damping"] * v[j]
+            rest[j] -= numbers[f"{name}.stiffness"] * (q[j] - numbers[f"{name}.spring"])
         return mass, rest
 
-    def _driven(self, q: Any, v: Any, u: Mapping[str, Any], number: Callable[[str], Any]) -> list[tuple[int, Any]]:
-        """List the joint and the force or torque of every actuator."""
-        m, out = self.tree.model, []
+    def _driven(self, q: Any, v: Any, controls: Mapping[str, Any], numbers: Mapping[str, Any]) -> Any:
+        """Return the force or torque of the actuators on every joint, (n,)."""
+        m, out = self.tree.model, ca.SX.zeros(len(self.tree.joints))
         for i, name in enumerate(self.tree.actuators):
             j, gear = int(m.actuator_trnid[i, 0]), float(m.actuator_gear[i, 0])
-            control = u.get(name, 0.0)
+            control = controls.get(name, 0.0)
             if m.actuator_ctrllimited[i]:
                 control = ca.fmin(ca.fmax(control, m.actuator_ctrlrange[i, 0]), m.actuator_ctrlrange[i, 1])
             b0, b1, b2 = m.actuator_biasprm[i, :3]
-            force = (
-                m.actuator_gainprm[i, 0] * number(f"{name}.gain") * control + b0 + b1 * gear * q[j] + b2 * gear * v[j]
-            )
+            gain = m.actuator_gainprm[i, 0] * numbers[f"{name}.gain"]
+            force = gain * control + b0 + b1 * gear * q[j] + b2 * gear * v[j]
             if m.actuator_forcelimited[i]:
                 force = ca.fmin(ca.fmax(force, m.actuator_forcerange[i, 0]), m.actuator_forcerange[i, 1])
-            out.append((j, gear * force))
+            out[j] += gear * force
         return out
 
-    def _given(self, x: Named, u: Named, p: Named) -> tuple[Any, Any, dict[str, Any], Callable[[str], Any]]:
-        """Return positions, speeds, controls, and the numbers by name, from the simulator's symbols."""
-        names = self.tree.joints
-        q, v = ca.vertcat(*(x[n] for n in names)), ca.vertcat(*(x[f"{n}.speed"] for n in names))
-        return q, v, {n: u[n] for n in self.inputs}, lambda n: p[n] if n in self.free else self.tree.numbers[n]
-
-    def _solved(self, x: Named, u: Named, p: Named) -> tuple[Any, Any]:
-        """Return M and the rest as functions of symbols: their Jacobians need q and v to be symbols of their own."""
-        n = len(self.tree.joints)
-        at, speeds, controls, number = self._given(x, u, p)
-        q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
-        mass, rest = self._motion(q, v, controls, number)
-        found = ca.substitute([mass, rest], [q, v], [at, speeds])
-        return found[0], found[1]
+    def _at(self, x: Named, u: Named, p: Named) -> Any:
+        """Evaluate `motion` for the simulator's symbols."""
+        names, none = self.tree.joints, ca.SX(0, 1)
+        return self.motion(
+            ca.vertcat(*(x[n] for n in names)),
+            ca.vertcat(*(x[f"{n}.speed"] for n in names)),
+            ca.vertcat(none, *(u[n] for n in self.inputs)),
+            ca.vertcat(none, *(p[n] for n in self.free)),
+        )
 
     def dynamics(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
         """Derivatives by state."""
         names = self.tree.joints
-        faster = ca.vertsplit(ca.solve(*self._solved(x, u, p)))
+        mass, rest, _ = self._at(x, u, p)
+        faster = ca.vertsplit(ca.solve(mass, rest))
         return {n: x[f"{n}.speed"] for n in names} | {f"{n}.speed": a for n, a in zip(names, faster, strict=True)}
 
     def outputs(self, x: Named) -> dict[str, Any]:
@@ -369,14 +375,13 @@ class _Equations:
         names, name = self.tree.joints, self.tree.joints[joint]
 
         def into(x: Named, u: Named, p: Named) -> dict[str, Any]:
-            mass, _ = self._solved(x, u, p)
+            mass = self._at(x, u, p)[0]
             unit = ca.SX.zeros(len(names))
             unit[joint] = -1.0
             return {f"{n}.speed": a for n, a in zip(names, ca.vertsplit(ca.solve(mass, unit)), strict=True)}
 
         def load(x: Named, u: Named, p: Named) -> Any:
-            q, v, controls, number = self._given(x, u, p)
-            return ca.fabs(sum((force for j, force in self._driven(q, v, controls, number) if j == joint), ca.SX(0)))
+            return ca.fabs(self._at(x, u, p)[2][joint])
 
         unit = ("N m", "rad") if self.tree.hinge(joint) else ("N", "m")
         driven = any(int(j) == joint for j in self.tree.model.actuator_trnid[:, 0])
@@ -397,11 +402,8 @@ def _rotation(quaternion: np.ndarray) -> Any:
     return ca.SX(ca.DM.eye(3) + 2 * w * k + 2 * k @ k)
 
 
-def _parameter(name: str, value: float, bounds: tuple[float, float] | None) -> Parameter:
-    """Make a parameter with given or usual bounds."""
-    usual = (0.0, np.inf) if value == 0 else tuple(sorted((value / WITHIN, value * WITHIN)))
-    usual = (-np.inf, np.inf) if ".com_" in name or name.endswith(".spring") else usual
-    low, high = usual if bounds is None else bounds
-    if not low <= value <= high:
-        raise InputError(f"The parameter {name!r} is {value:g}, outside of its bounds {low:g} to {high:g}; widen them.")
-    return Parameter(value, bounds=(low, high))
+def _usual_bounds(name: str, value: float) -> tuple[float, float]:
+    """Return the bounds of a number of the model for which none are given."""
+    if ".com_" in name or name.endswith(".spring"):
+        return -np.inf, np.inf
+    return within_a_factor(value) if value else (0.0, np.inf)

@@ -90,7 +90,7 @@ class Machine:
 
     @property
     def reasons(self) -> tuple[tuple[str, float], ...]:
-        """What is more likely than not about the machine, in words, with its probability; the surest first."""
+        """Findings about the machine that are more likely than not, each with its probability; the surest first."""
         found = [(self._rest(), self.beyond)] if self.beyond > SURE else []
         found += [
             (f"{name} = {_with_error(self.values[name], self.errors[name])}", p)

@@ -24,7 +24,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -212,23 +212,23 @@ def _opened(out: Any, overwrite: bool) -> Iterator[Manifest]:
         yield manifest
 
 
+@dataclass(eq=False)
 class _Steps:
     """The execution of the steps; `done` of `total` jobs are complete."""
 
-    def __init__(
-        self,
-        work: MachineWork,
-        machines: Mapping[str, tuple[Recording, ...]],
-        manifest: Manifest,
-        effort: Effort,
-        executor: Executor | None,
-        ahead: int,
-        *report: Any,
-    ) -> None:
-        self.work, self.machines, self.manifest, self.effort = work, machines, manifest, effort
-        self.executor, self.ahead = executor, ahead
-        self.progress, self.print_line = report
-        self.done, self.total, self.used = 0, 2 * len(machines), dict[str, MachineJob]()
+    work: MachineWork
+    machines: Mapping[str, tuple[Recording, ...]]
+    manifest: Manifest
+    effort: Effort
+    executor: Executor | None
+    ahead: int
+    progress: Progress
+    print_line: PrintLine
+    done: int = 0
+    used: dict[str, MachineJob] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.total = 2 * len(self.machines)
 
     def execute(self, sample: int, times: Mapping[str, Sequence[float]]) -> Fleet:
         """Execute the steps of the module docstring."""

@@ -36,7 +36,7 @@ ADVICE = "restore it, or give --overwrite to compute everything again"
 
 @dataclass(frozen=True)
 class Layout:
-    """What a folder of results holds: the `kind` of study, its files, and the names of files of its jobs.
+    """The layout of a folder of results: the `kind` of study, its files, and the names of files of its jobs.
 
     `source` names the file that a study starts from, in messages.
     """

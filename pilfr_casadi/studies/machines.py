@@ -17,7 +17,7 @@ import numpy as np
 
 from .._base import InputError, digest, to_json
 from ..data import Recording, fingerprint
-from ..diagnose import Diagnosis, Replication, diagnose, log_prior, refit_error, replicate
+from ..diagnose import Diagnosis, Replication, diagnose, refit_error, replicate
 from ..laws import Law
 from ..simulators import Simulator
 from .executor import Outcome
@@ -90,7 +90,7 @@ class MachineJob:
 
 @dataclass(frozen=True, eq=False)
 class MachineWork:
-    """What all jobs share: the simulator, and the options of `diagnose`."""
+    """The simulator and the options of `diagnose`, which all jobs share."""
 
     simulator: Simulator
     hold: str | None
@@ -166,7 +166,7 @@ class MachineWork:
         for trial in search.memo.values():
             if any(known.get(type(e.law).__name__) is not type(e.law) for e in trial.laws):
                 continue
-            prior = log_prior(trial.laws, search.alternatives, trial.doubtful)
+            prior = search.log_prior(trial)
             gain = search.evidence(trial) - search.evidence(search.root)
             if not np.isfinite(gain):
                 continue
@@ -244,15 +244,16 @@ def simulator_digest(simulator: Simulator) -> str:
     parts = [simulator.derivatives(x, u, p, t), *simulator.measured(x, u, p, t).values()]
     for port in simulator.all_ports():
         into = simulator.into(port, x, u, p, t) if not port.series else {}
-        ports[port.name] = list(into)
+        ports[port.name] = [*into, port.domain, *port.signals]
         parts += [*into.values(), simulator.across(port, x, u, p, t)]
+        parts += simulator.port_signals(port, x, u, p, t).values()
         parts += [simulator.across(replace(port, across=port.rate), x, u, p, t)] if port.rate else []
     symbols = [ca.vertcat(*names._values.values()) for names in (x, u)]
     symbols += [ca.vertcat(*(ca.vec(v) for v in p._values.values())), t]
     expressions = ca.vertcat(*parts)
     try:
         equations = ca.Function("simulator", symbols, [expressions]).serialize()
-    except (RuntimeError, NotImplementedError):  # a program that is called with numbers
+    except RuntimeError:  # a program that is called with numbers
         equations = str(expressions)
     parameters = {
         name: to_json([q.value, np.nan_to_num(q.bounds[0]), np.nan_to_num(q.bounds[1]), q.fixed])

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from pilfr_casadi._base import InputError, close_workers
 from pilfr_casadi.cli import main
 from pilfr_casadi.report import Page
 from pilfr_casadi.studies import Manifest, RunInterrupted, common_physics, read_fleet
+from pilfr_casadi.studies.machines import simulator_digest
 
 OPTIONS = {"laws": LAWS, "effects": 1, "sample": 1}
 FRICTION = f"{PORT}.F_c"
@@ -156,6 +158,21 @@ def hypothesis(evidence, *laws, prior=-1.0):
 
 def sampled(*hypotheses):
     return {"status": "DONE", "hold": "zero", "hypotheses": list(hypotheses)}
+
+
+def test_finished_jobs_count_only_for_the_same_simulator():
+    simulator = rig()
+    first, *others = simulator.ports
+    changes = [
+        {"signals": {"load": lambda x: x[simulator.states[0]]}},
+        {"signals": {"load": lambda x: 2 * x[simulator.states[0]]}},
+        {"domain": "fluid"},
+        {"across": lambda x: 2 * x[simulator.states[0]]},
+    ]
+    changed = [replace(simulator, ports=(replace(first, **change), *others)) for change in changes]
+    digests = [simulator_digest(s) for s in (simulator, *changed)]
+    assert len(set(digests)) == len(digests)
+    assert simulator_digest(rig()) == digests[0]
 
 
 def test_evidence_adds_up_over_the_sample():
