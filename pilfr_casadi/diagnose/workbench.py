@@ -29,14 +29,12 @@ from ..simulators import (
     Placed,
     Simulator,
     choose_substeps,
-    compute_equilibrium,
     discretise,
     fastest_rates,
     growth_rate,
     least_substeps,
     needed_substeps,
     rate_at_start,
-    resting_elements,
 )
 from .floor import white_part
 
@@ -301,7 +299,7 @@ class Workbench:
         vector = start_vector(model, start)
         states = None
         if len(guess):
-            unknown = zip(self.recordings, self.initial_states(simulator, model, vector, guess), strict=True)
+            unknown = zip(self.recordings, self.initial_states(model, vector, guess), strict=True)
             states = np.concatenate([np.zeros(0), *(state for r, state in unknown if r.begins == "estimate")])
         problem: Problem | None = None
         for gamma in (*path, 0.0):
@@ -332,17 +330,14 @@ class Workbench:
         cost = problem.cost(theta)
         return (cost, theta, problem) if cost < DIVERGED else None
 
-    def initial_states(
-        self, simulator: Simulator, model: Model, vector: np.ndarray, states: Sequence[np.ndarray]
-    ) -> list[np.ndarray]:
+    def initial_states(self, model: Model, vector: np.ndarray, states: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Complete initial states (n_state,) from their first entries; laws begin at rest at the first inputs."""
         out, n = [], model.n_state
         for r, given in zip(self.recordings, states, strict=True):
             state = np.asarray(given, dtype=float)[:n]
-            full = np.zeros(n)
-            if r.begins == "estimate" and len(state) < n and resting_elements(simulator):
-                full = compute_equilibrium(simulator, self.dt / model.substeps, vector, state, r.u[0])
-            out.append(np.append(state, full[len(state) :]))
+            if r.begins in ("estimate", "given"):
+                state = model.rest_at(state, r.u[0], vector)
+            out.append(np.append(state, np.zeros(n - len(state))))
         return out
 
     def by_cost(
@@ -354,7 +349,7 @@ class Workbench:
         states: Sequence[np.ndarray],
     ) -> list[Mapping[str, Any]]:
         """Order starts by their error before a fit, from the same initial states."""
-        initial = self.initial_states(simulator, model, start_vector(model, starts[0]), states)
+        initial = self.initial_states(model, start_vector(model, starts[0]), states)
 
         def cost(start: Mapping[str, Any]) -> float:
             values = model.parameters.unpack(start_vector(model, start))
@@ -373,7 +368,7 @@ class Workbench:
         """Run a simulator at values by name, from the simulator's own initial states."""
         model, engine = self.compile(simulator)
         vector = start_vector(model, values)
-        initial = self.initial_states(simulator, model, vector, states)
+        initial = self.initial_states(model, vector, states)
         return self.result(simulator, model.parameters.unpack(vector), initial, engine, model)
 
     def result(
