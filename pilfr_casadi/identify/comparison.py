@@ -1,8 +1,7 @@
 """Models of any kind beside one recording, all treated alike: `compare`.
 
-An error depends on where a simulation begins. `Simulator.nrmse` begins at zero and `Fit.nrmse` at the state that the
-fit estimated, so the two cannot be compared: on one rig they are 0.63 and 0.0055. `compare` gives every model the same
-start, by the recording's `initial`:
+An error depends on where a simulation begins; from zero and from a fitted state one rig has 0.63 and 0.0055. `compare`
+gives every model the same start, by the recording's `initial`:
 
 - `"estimate"`: each model's state is fitted to the first samples alone, as many as it needs for its states, at the
   model's parameters; a state that a fit has found from the whole recording is not used. These samples, as many as the

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, later
-from ..data import Recording, as_recordings, nrmse
+from ..data import Recording, as_recordings
 from ..laws import readable_unit
 from ..models import Parameter, ParameterSet, accumulate_steps
 from .equations import Equations, Placed
@@ -105,19 +105,22 @@ class Simulator(Equations):
     def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
         """Compute the NRMSE (Krikelis et al. 2024, Eq. 27) of a simulation, averaged over outputs and recordings.
 
+        As `Fit.nrmse` does, it fits an initial state that a recording does not give to the first samples, which are
+        then not scored.
+
         Raises
         ------
         InputError
             As `simulate`, and if the recording lacks an output of the simulator.
         """
-        given = as_recordings(recordings)
-        return float(np.mean([nrmse(self._measured(r), self.simulate(r), r.skip) for r in given]))
+        given = [r.with_(y=self._measured(r), outputs=self.output_names) for r in as_recordings(recordings)]
+        return float(np.mean([later("compare")(r, self).nrmse["simulated"] for r in given]))
 
     def plot(self, recording: Recording) -> Any:
         """Draw the simulator beside a recording: a row for each output, the largest swing and all residuals.
 
         An initial state that the recording does not give is fitted to the first samples; see `compare`, whose figure
-        this is. `nrmse` begins at zero instead.
+        this is.
 
         Returns
         -------

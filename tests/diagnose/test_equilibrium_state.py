@@ -68,7 +68,9 @@ def test_a_law_begins_as_if_the_signal_had_stood_still(kind):
     np.testing.assert_allclose(after, state, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", [k for k in CATALOGUE if (k.order and k.follows) or k.shifts], ids=lambda k: k.__name__)
+@pytest.mark.parametrize(
+    "kind", [k for k in CATALOGUE if (k.order and k.follows) or k.shifts], ids=lambda k: k.__name__
+)
 def test_the_screen_sees_nothing_where_the_signal_stands(kind):
     z = np.full(50, 7.0)
     shapes = list(kind().shapes(Local(z, 0 * z, DT, (50,))))
