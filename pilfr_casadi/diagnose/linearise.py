@@ -316,7 +316,10 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
     own = own_signals(bench.simulator, np.concatenate([r.own for r in runs]))
     rest = tuple(r.from_zero for r in runs)
     pairs = enumerate(zip(max_stiffness.tolist(), max_damping.tolist(), strict=True))
-    return [Local(z[:, j], dz[:, j], bench.dt, lengths, k, d, {**inputs, **own[j]}, rest) for j, (k, d) in pairs]
+    shown = [bench.simulator.shown_states(port) is not None for port in bench.simulator.all_ports()]
+    return [
+        Local(z[:, j], dz[:, j], bench.dt, lengths, k, d, {**inputs, **own[j]}, rest, shown[j]) for j, (k, d) in pairs
+    ]
 
 
 def own_signals(simulator: Simulator, values: np.ndarray) -> list[dict[str, np.ndarray]]:
@@ -337,4 +340,5 @@ def port_signals(bench: Workbench, fitted: Fitted, port: str) -> Local:
         parts.append((z[:, index], dz[:, index], own))
     z, dz, own = (np.concatenate([part[k] for part in parts]) for k in (0, 1, 2))
     local = bench.local(z, dz)
-    return replace(local, inputs={**local.inputs, **own_signals(simulator, own)[index]})
+    shown = simulator.shown_states(simulator.port(port)) is not None
+    return replace(local, inputs={**local.inputs, **own_signals(simulator, own)[index]}, shown=shown)

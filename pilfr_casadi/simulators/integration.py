@@ -15,6 +15,7 @@ these are very fast, along a run from there.
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +27,7 @@ import numpy as np
 
 from .._base import InputError
 from ..data import Recording
-from ..models import Model, StepExpressions, accumulate_steps, from_expressions
+from ..models import Model, StepExpressions, accumulate_steps, from_expressions, map_points
 from .equations import Equations, Named, Placed, call, in_series
 
 LARGEST_STEP = 0.25  # largest |λ| h: a phase error of (λh)⁴/120 = 3e-5 of the angle of a cycle
@@ -112,7 +113,7 @@ class ClosedEquations:
                 u[name] = u[name] + apply(i, u[name], v.slope[at])
         inputs = Named("input", u)
         f = simulator.derivatives(x, inputs, p, t)
-        y = simulator.measured(x, inputs, p, t)
+        seen, more = dict(x._values), list[tuple[str, Any]]()
         rates = self.local(x_only, ca.vertcat(*u.values()), v.slope, t, self.vector)[1]
         for i, e in placed:
             if in_series(e.port):
@@ -126,7 +127,13 @@ class ClosedEquations:
                     unit[simulator.states.index(name)] = factor
                     f = f + unit * w
                 else:
-                    y[name] = y[name] + factor * w
+                    more.append((name, factor * w))
+            if getattr(e.law, "sensed", False):
+                shown = simulator.shown_states(port) or ()
+                seen |= zip(shown, e.law.far_side(q[i], self._own(e)), strict=False)
+        y = simulator.measured(Named("state", seen), inputs, p, t)
+        for name, part in more:
+            y[name] = y[name] + part
         for i, e in placed:
             if e.port.startswith("sensor:"):
                 name = e.port.removeprefix("sensor:")
@@ -324,6 +331,7 @@ def signals(simulator: Equations) -> ca.Function:
     return ca.Function("signals", [xs, us, slope, t, vector], columns, names, ["z", "dz", "lift", "push", "own"])
 
 
+@functools.lru_cache(maxsize=8)  # several rates of one simulator are looked at in turn
 def _flow(simulator: Equations) -> ca.Function:
     """Make `(x, u, p) -> (f, ∂f/∂x)` of [x; laws' states], memory at rest."""
     vector = ca.SX.sym("p", simulator.parameter_set.size)
@@ -332,17 +340,16 @@ def _flow(simulator: Equations) -> ca.Function:
     x, u = ca.SX.sym("x", n_x), ca.SX.sym("u", len(simulator.inputs))
     s = ca.SX.zeros(sum(equations.n_s))
     f = equations.evaluate(Instant(x, s, u, ca.SX.zeros(u.shape), ca.SX(0.0)))[0]
-    return ca.Function("flow", [x, u, vector], [f, ca.densify(ca.jacobian(f, x))])
+    return ca.Function("flow", [x, u, vector], [ca.densify(f), ca.densify(ca.jacobian(f, x))])
 
 
 def _eigenvalues(simulator: Equations, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Eigenvalues of ∂f/∂x at x (K, n_x) and u (K, n_u), (K, n); nan where ∂f/∂x is not finite."""
     flow = _flow(simulator)
-    out = np.full((len(x), flow.size1_in(0)), np.nan, dtype=complex)
-    for k, (row, inputs) in enumerate(zip(x, u, strict=True)):
-        a = np.asarray(flow(_padded(row, out.shape[1]), inputs, p)[1])
-        if np.all(np.isfinite(a)):
-            out[k] = np.linalg.eigvals(a)
+    states = np.stack([_padded(row, flow.size1_in(0)) for row in x])
+    slopes = map_points(flow, states, u, p)[1]
+    out, finite = np.full(states.shape, np.nan, dtype=complex), np.all(np.isfinite(slopes), axis=(1, 2))
+    out[finite] = np.linalg.eigvals(slopes[finite])
     return out
 
 

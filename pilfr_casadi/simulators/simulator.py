@@ -175,6 +175,11 @@ class Simulator(Equations):
         if not place.kinds & set(allowed):
             kind = "series" if place.series else "parallel"
             raise InputError(f"The law {law.id!r} cannot stand in {kind} at {port!r}; choose another port or law.")
+        if getattr(law, "sensed", False) and not self.shown_states(place):
+            raise InputError(
+                f"The law {law.id!r} ({law.form}) changes what outputs read of {port!r}, but none reads its coordinate "
+                "as a state, or that state's rate; choose another port or law."
+            )
         if getattr(law, "channels", 1) != 1:
             raise InputError(f"The element has {law.channels} channels, the port {port!r} has one; give as many.")
         if lacks := getattr(law, "lacks", ""):
