@@ -73,18 +73,19 @@ class Effect:
 
 @dataclass(frozen=True, eq=False)
 class BeforeAfter:
-    """A recording beside the refitted and the corrected simulator.
+    """A recording beside the simulator as given, refitted, and corrected.
 
     Attributes
     ----------
     recording : Recording
         The recording with the corrections of the diagnosis (sign, unit, shift).
-    before, after : array, shape (M, n_y), or None
-        Outputs of the refitted and of the corrected simulator. None if the simulation diverges; `after` is also None
-        if nothing was added to the simulator.
+    given, before, after : array, shape (M, n_y), or None
+        Outputs of the simulator as given, refitted, and corrected. None if the simulation diverges; `after` is also
+        None if nothing was added to the simulator.
     """
 
     recording: Recording
+    given: np.ndarray | None
     before: np.ndarray | None
     after: np.ndarray | None
 
@@ -254,10 +255,13 @@ class Diagnosis:
         return plot_comparison(r, simulated, self.floor["nrmse"] * np.std(r.y[r.skip :], axis=0))
 
     def before_and_after(self, recording: Recording) -> BeforeAfter:
-        """Simulate the refitted and the corrected simulator along a recording; see `simulate`."""
+        """Simulate the simulator as given, refitted, and corrected along a recording; see `simulate`."""
+        own = self.refitted.parameter_set
+        values = own.change(**{name: {"value": p["nominal"]} for name, p in self.parameters.items()})
+        given = self.run(recording, self.refitted.with_parameters(values))[1]
         r, before, _ = self.run(recording, self.refitted)
         after = self.run(recording)[1] if self._changed else None
-        finite = (y if y is not None and np.all(np.isfinite(y)) else None for y in (before, after))
+        finite = (y if y is not None and np.all(np.isfinite(y)) else None for y in (given, before, after))
         return BeforeAfter(r, *finite)
 
     compare = before_and_after  # the earlier name

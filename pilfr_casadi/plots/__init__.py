@@ -10,6 +10,7 @@ from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
     from .canvas import new_figure as new_figure
+    from .chart import chart as chart
     from .correlations import residual_tests as residual_tests
     from .diagnosis import (
         Signal as Signal,

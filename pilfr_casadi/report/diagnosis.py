@@ -30,8 +30,8 @@ def diagnosis_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pa
 
     Each file is written atomically, the page last. Figures of an earlier diagnosis are removed.
     """
-    page, figures = _draw(diagnosis_page(diagnosis))
-    html = page.html()
+    page = diagnosis_page(diagnosis)
+    html, figures = page.html(), _figures(page)
     target = make_folder(Path(folder) / "figures").parent
     for name, png in figures.items():
         write_atomically(target / "figures" / name, png)
@@ -44,19 +44,14 @@ def diagnosis_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pa
     return path
 
 
-def _draw(page: Page) -> tuple[Page, dict[str, bytes]]:
-    """Draw each picture once; return the page with its pictures drawn, and the PNG files by name."""
+def _figures(page: Page) -> dict[str, bytes]:
+    """Draw the pictures of a page; return PNG files by name."""
     files: dict[str, bytes] = {}
-
-    def draw(block: Block) -> Block:
-        if not isinstance(block, Picture):
-            return block
-        png = block.png
-        short = "".join(c if c.isascii() and c.isalnum() else "-" for c in block.alt.lower())[:50].strip("-")
-        files[f"diagnosis-{len(files) + 1:02d}-{short}.png"] = png
-        return replace(block, figure=png)
-
-    return replace(page, sections=[Section(s.title, [draw(b) for b in s.blocks]) for s in page.sections]), files
+    for block in (block for section in page.sections for block in section.blocks):
+        if isinstance(block, Picture):
+            short = "".join(c if c.isascii() and c.isalnum() else "-" for c in block.alt.lower())[:50].strip("-")
+            files[f"diagnosis-{len(files) + 1:02d}-{short}.png"] = block.png
+    return files
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,35 +316,37 @@ def _draw_comparison(case: _Case, c: BeforeAfter, i: int) -> list[Block]:
     """Draw one output of a recording: two stretches, the errors over time, and the spectra."""
     r, name = c.recording, c.recording.outputs[i]
     unit, floor = case.unit(name), float(case.noise[i])
-    simulated: plots.Simulated = [("refitted", c.before)]
+    simulated: plots.Simulated = [("as given", c.given), ("refitted", c.before)]
     if correction := tables.correction_words(case.diagnosis):
         simulated.append((correction.removesuffix(" put back").removesuffix(" added"), c.after))
     diverging = [label for label, y in simulated if y is None]
     note = f" The simulation diverges: {', '.join(diverging)}." if diverging else ""
     where = f"{name} in {r.name}"
-    drawn = (
-        (
-            plots.compared_traces(r, simulated, i, unit),
+    largest, quiet = (plots.compared_traces(r, simulated, i, unit, quiet=calm) for calm in (False, True))
+    return [
+        Picture(
+            largest,
             f"{where}: measured and simulated, around the largest swing.{note}",
             f"Measured and simulated {where}.",
+            views={"largest swing": largest, "little motion": quiet},
         ),
-        (
-            plots.compared_traces(r, simulated, i, unit, quiet=True),
+        Picture(
+            quiet,
             f"{where}: a stretch with little motion.",
             f"Measured and simulated {where}, little motion.",
+            replaced=True,
         ),
-        (
+        Picture(
             plots.compared_residuals(r, simulated, i, unit, floor),
             f"{where}: the error over the whole recording.",
             f"Errors of {where}.",
         ),
-        (
+        Picture(
             plots.compared_spectra(r, simulated, i, unit, floor),
             f"{where}: output and errors over frequency, beside the noise.",
             f"Spectra of {where}.",
         ),
-    )
-    return [Picture(*picture) for picture in drawn]
+    ]
 
 
 def _next_experiment(d: Diagnosis) -> list[Block]:
