@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, later
-from ..data import Recording, rmse_per_output
+from ..data import Recording, as_recordings, rmse_per_output
 from ..engine import Engine, make_engine
 from ..models import Model
 from ..optimise import estimate_initial_state, samples_for_state
-from ..simulators import as_simulator, choose_substeps, discretise
+from ..simulators import Simulator, as_simulator, choose_substeps, discretise
 from .result import Fit, match_channels
 
 RUN_AWAY = 1e4  # error from which its size says nothing
@@ -164,6 +164,12 @@ def compare(recording: Recording, models: Mapping[str, Any] | Any) -> Comparison
             raise InputError(f"the output {name!r} never changes where it is scored, so its NRMSE does not exist.")
     errors = {name: rmse_per_output(recording.y, y, recording.skip) / sigma for name, y in simulated.items()}
     return Comparison(recording, simulated, errors)
+
+
+def simulator_nrmse(simulator: Simulator, recordings: Recording | Sequence[Recording]) -> float:
+    """Compute `Simulator.nrmse`: the mean over recordings of the error in `compare`, of its outputs alone."""
+    given = [match_channels(simulator, r) for r in as_recordings(recordings)]
+    return float(np.mean([compare(r, simulator).nrmse["simulated"] for r in given]))
 
 
 def _residual(model: Any, recording: Recording) -> tuple[np.ndarray, int]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, later
-from ..data import Recording, as_recordings
+from ..data import Recording
 from ..laws import readable_unit
 from ..models import Parameter, ParameterSet, accumulate_steps
 from .equations import Equations, Placed
@@ -113,8 +113,7 @@ class Simulator(Equations):
         InputError
             As `simulate`, and if the recording lacks an output of the simulator.
         """
-        given = [r.with_(y=self._measured(r), outputs=self.output_names) for r in as_recordings(recordings)]
-        return float(np.mean([later("compare")(r, self).nrmse["simulated"] for r in given]))
+        return later("simulator_nrmse")(self, recordings)
 
     def plot(self, recording: Recording) -> Any:
         """Draw the simulator beside a recording: a row for each output, the largest swing and all residuals.
