@@ -44,7 +44,7 @@ from ..laws import Law, readable_unit
 from ..simulators import Simulator
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction, find_correction, named_correction
-from .evidence import AS_GIVEN, SURE, deviations
+from .evidence import AS_GIVEN_RATIO, SURE, deviations
 from .floor import Floor, measured_floor
 from .gates import USELESS_FIT, Gate, Offset, final_gates, offset_gates, without_idle_offsets
 from .identifiability import port_units
@@ -73,7 +73,7 @@ from .trials import Trial
 from .verdict import NamedEffect, Posterior, Verdict, judge, names, posterior
 from .workbench import Fitted, RunsAway, Workbench
 
-SEARCHING = 0.7  # share of the remaining time for preparation and search; the rest is for the correction
+SEARCH_SHARE = 0.7  # share of the remaining time for preparation and search; the rest is for the correction
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +228,7 @@ def _search(request: Request) -> tuple[Prepared, Search]:
     if not seemed_early or search.interrupted or search.out_of_time or not search.can_improve(search.best):
         return ready, search
     other, again = _search_once(request, shift_early=False)
-    if again.best.mean_square < AS_GIVEN * search.best.mean_square:
+    if again.best.mean_square < AS_GIVEN_RATIO * search.best.mean_square:
         return other, again
     search.interrupted = again.interrupted
     return ready, search
@@ -257,7 +257,7 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         request.say,
         hold_said=request.hold_said,
         stand_in_error=request.stand_in_error,
-        until=began + SEARCHING * (request.deadline - began),
+        until=began + SEARCH_SHARE * (request.deadline - began),
         deadline=request.deadline,
         times={CHECKS: time.perf_counter() - began},
     )

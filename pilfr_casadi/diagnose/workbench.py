@@ -43,14 +43,14 @@ THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
 FEW = 3  # ports, laws, starts or fits that are tried at each choice of a search, which saves time
-LONG = 8000  # samples on which fits and forces are compared first
+COMPARED_SAMPLES = 8000  # samples on which fits and forces are compared first
 
 # Steps of the integration
-FINER = 4  # largest factor on the sub-steps for a law, and factor of each refinement of steps and knees
-DEPENDS = 0.3  # least change by finer steps, over the noise, for which they are used
+FINER_STEPS = 4  # largest factor on the sub-steps for a law, and factor of each refinement of steps and knees
+STEP_ERROR = 0.3  # least change by finer steps, over the noise, for which they are used
 LEAST_NOISE = 3e-4  # least noise, over the outputs' deviation, that the steps are compared with
-CHANGED = 0.1  # share by which finer steps may change the mean square
-NARROW = 0.05  # share of the widest knee that is tried, below which a knee is sharp
+COST_CHANGE = 0.1  # share by which finer steps may change the mean square
+SHARP_KNEE = 0.05  # share of the widest knee that is tried, below which a knee is sharp
 
 # Diverging runs
 HUGE, DIVERGED = 1e6, 1e20  # bounds: output over the largest measured value, and mean square error
@@ -191,8 +191,8 @@ class Workbench:
                 wanted = max(wanted, int(np.ceil(float(np.nanquantile(rates, 0.95)) * self.dt / LARGEST_STEP)))
         least = max(self.substeps, self.at_least, least_substeps(simulator))
         if any(getattr(e.law, "shifts", False) for e in simulator.elements):  # its memory has an entry for every step
-            least = min(least, FINER * self.chosen)
-        return int(np.clip(wanted, least, max(FINER * self.chosen, least)))
+            least = min(least, FINER_STEPS * self.chosen)
+        return int(np.clip(wanted, least, max(FINER_STEPS * self.chosen, least)))
 
     def problem(self, model: Model, engine: Engine, scored: Sequence[np.ndarray] | None = None) -> Problem:
         """Make the simulation-error problem of a model; `scored` marks the samples that count, all by default."""
@@ -398,13 +398,13 @@ def start_vector(model: Model, start: Mapping[str, Any]) -> np.ndarray:
 def refine_steps(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
     """Refine the steps until their error is less than the noise; return the bench and the fit there."""
     noise2 = max(float(np.mean((white_part(fitted.residual) / bench.scale) ** 2)), LEAST_NOISE**2)
-    most, steps = min(FINER**2 * bench.chosen, MOST_SUBSTEPS), fitted.model.substeps
-    while FINER * steps <= most and not fitted.simulator.discrete:
-        steps = FINER * steps
+    most, steps = min(FINER_STEPS**2 * bench.chosen, MOST_SUBSTEPS), fitted.model.substeps
+    while FINER_STEPS * steps <= most and not fitted.simulator.discrete:
+        steps = FINER_STEPS * steps
         tried = replace(bench, substeps=steps)
         try:
             there = tried.run(fitted.simulator, fitted.values, fitted.begin)
-            if _difference2(bench, there, fitted) < DEPENDS**2 * noise2:
+            if _difference2(bench, there, fitted) < STEP_ERROR**2 * noise2:
                 break
             fitted = tried.fit(
                 fitted.simulator,
@@ -429,9 +429,9 @@ def _difference2(bench: Workbench, one: Fitted, other: Fitted) -> float:
 def knee_starts(fitted: Fitted, knee: str) -> list[dict[str, Any]]:
     """Return the fitted values, and if there is a sharp knee also those with a sharper and a wider one."""
     values = fitted.values
-    if not knee or values[knee] > NARROW * fitted.model.parameters[knee].bounds[1]:
+    if not knee or values[knee] > SHARP_KNEE * fitted.model.parameters[knee].bounds[1]:
         return [values]
-    return [values, *({**values, knee: times * values[knee]} for times in (1 / FINER, FINER))]
+    return [values, *({**values, knee: times * values[knee]} for times in (1 / FINER_STEPS, FINER_STEPS))]
 
 
 def refit_on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
@@ -441,14 +441,14 @@ def refit_on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
     """
     given = fitted.simulator.parameters[knee]
     low, high = given.bounds
-    if fitted.model.substeps * FINER > FINER**2 * bench.chosen:
+    if fitted.model.substeps * FINER_STEPS > FINER_STEPS**2 * bench.chosen:
         return fitted
-    finer, placed = replace(bench, at_least=FINER * fitted.model.substeps), fitted.corrected()
-    sharper = replace(given, value=fitted.values[knee], bounds=(low / FINER, high))
+    finer, placed = replace(bench, at_least=FINER_STEPS * fitted.model.substeps), fitted.corrected()
+    sharper = replace(given, value=fitted.values[knee], bounds=(low / FINER_STEPS, high))
     placed = placed.with_parameters({**placed.parameters, knee: sharper})
     there = finer.run(placed, fitted.values, fitted.begin)
     held = fitted.values[knee] <= low
-    if not held and abs(there.cost / fitted.cost - 1) < CHANGED:
+    if not held and abs(there.cost / fitted.cost - 1) < COST_CHANGE:
         return fitted
     starts = [fitted.values, *([{**fitted.values, knee: low / 2}] if held else [])]
     states, model, engine = fitted.begin, there.model, there.engine

@@ -23,9 +23,9 @@ from ..models import Parameter, play
 from .base import Law, Local
 
 PARTS = 4  # parts into which a step of a held signal is divided
-THIN = 0.1  # ratio of the loops' width to the bend beside them, below which a fit is a curve without memory
+THIN_LOOPS = 0.1  # ratio of the loops' width to the bend beside them, below which a fit is a curve without memory
 DIRECT = 0.05  # ratio of the direct gain to the plays' total weight, below which they may be a mere backlash
-ALIKE = 0.15  # ratio of the thresholds' spread to their mean, below which the plays are one
+EQUAL_THRESHOLDS = 0.15  # ratio of the thresholds' spread to their mean, below which the plays are one
 NODES = 24  # stops that stand for the smooth density
 # edges of cells that hold equal shares of the curve of a = 1; each cell is one stop at its centre of gravity
 _LOW = -2 * np.log(1 - np.arange(NODES) / NODES)
@@ -103,7 +103,7 @@ class PlayHysteresis(StopHysteresis):
         if abs(1 + float(values["w"][0])) > DIRECT * total:
             return False
         mean = float(w @ r) / max(total, 1e-300)
-        return bool(w @ np.abs(r - mean) < ALIKE * mean * total)
+        return bool(w @ np.abs(r - mean) < EQUAL_THRESHOLDS * mean * total)
 
     @classmethod
     def finer_starts(cls, values: Mapping[str, Any], local: Local) -> Iterator[dict[str, Any]]:
@@ -145,7 +145,7 @@ class GeneralizedHysteresis(PlayHysteresis):
         """Tell whether it is a backlash, or its loops are thin beside the memoryless part."""
         reach = self.parameters()["r"].bounds[1]
         wide = np.abs(values["w"]) * np.clip(np.minimum(values["r"], reach - values["r"]), 0.0, None)
-        return super().doubtful(values) or bool(np.sum(wide) < THIN * np.max(reach) ** 2 * abs(values["b_2"]))
+        return super().doubtful(values) or bool(np.sum(wide) < THIN_LOOPS * np.max(reach) ** 2 * abs(values["b_2"]))
 
 
 class FineGeneralized(GeneralizedHysteresis):

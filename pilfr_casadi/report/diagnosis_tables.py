@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .._base import to_json
-from ..diagnose import STEPS, Diagnosis, learned_force
+from ..diagnose import ERROR_NAMES, Diagnosis, learned_force
 from ..identify import RUN_AWAY
 from ..laws import display_name, scaled, scheduled
 from ..models import Parameter, ParameterSet
@@ -54,7 +54,7 @@ def tone(diagnosis: Diagnosis) -> str:
 def _steps(diagnosis: Diagnosis) -> dict[str, str]:
     """Return the keys of the errors to show, with their names."""
     last = correction_words(diagnosis)
-    return STEPS | {"after": last} if last else {k: name for k, name in STEPS.items() if k != "after"}
+    return ERROR_NAMES | {"after": last} if last else {k: name for k, name in ERROR_NAMES.items() if k != "after"}
 
 
 def errors_that_count(diagnosis: Diagnosis) -> tuple[str, Mapping[str, float]]:
