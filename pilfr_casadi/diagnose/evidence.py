@@ -59,7 +59,7 @@ WRONG_MODEL_SAMPLES = 8.0  # effective samples of a model whose whole error is m
 LEAST_MODEL_ERROR = 0.05  # least share of the error that counts as model error
 LARGE_MODEL_ERROR = 0.2  # share of model error in the error above which models are judged on held-out blocks
 DISTURBANCE_WEIGHT = 0.2  # of a law's remainder that no force at a port explains: a disturbance may act beside the law
-INPUT_FACTOR = 0.7  # factor on the inputs for which the spread is computed: well inside the recorded range
+INPUT_FACTOR = 0.7  # factor on the inputs' deviation for which the spread is computed: well inside their range
 
 # Comparison of hypotheses
 SURE = 0.5  # probability above which an answer is stated: it is more likely than not
@@ -125,16 +125,18 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
 def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n: float) -> float:
     """Compute the mean square uncertainty of predictions for other inputs, in units of the outputs' variance.
 
-    The other inputs are the recorded ones times INPUT_FACTOR. The parameters have the covariance (n H / v + P)^-1 of
-    Laplace's approximation, with H the Fisher information of a sample and P the precision of the prior. With H' the
-    information of a sample for the other inputs, the spread is tr(H' (n H / v + P)^-1). Initial states are among the
-    parameters, because the two may make up for each other. The spread reveals parameters that the recordings hardly
-    determine, such as a curve of a pressure that had two levels; a cross-validation on the same recordings cannot.
+    The other inputs are the recorded ones, their deviation from the mean times INPUT_FACTOR. The parameters have the
+    covariance (n H / v + P)^-1 of Laplace's approximation, with H the Fisher information of a sample and P the
+    precision of the prior. With H' the information of a sample for the other inputs, the spread is
+    tr(H' (n H / v + P)^-1). Initial states are among the parameters, because the two may make up for each other. The
+    spread reveals parameters that the recordings hardly determine, such as a curve of a pressure that had two levels; a
+    cross-validation on the same recordings cannot.
     """
     if not np.any(fitted.model.parameters.free):
         return 0.0
     problem, _, recorded = _hessian(bench, fitted)
-    *_, other = _hessian(bench.on([r.with_(u=INPUT_FACTOR * r.u) for r in bench.recordings]), fitted)
+    smaller = [r.with_(u=r.u + (INPUT_FACTOR - 1) * (r.u - np.mean(r.u, axis=0))) for r in bench.recordings]
+    *_, other = _hessian(bench.on(smaller), fitted)
     free = int(problem.free.sum())
     if not (np.all(np.isfinite(recorded)) and np.all(np.isfinite(other))):
         return np.inf

@@ -31,7 +31,7 @@ from ..engine import make_engine
 from ..laws import Law
 from ..optimise import GaussNewton
 from ..simulators import Simulator
-from .floor import FEWEST, Floor, effective_size, noise_floor
+from .floor import ABOVE_NOISE, FEWEST, Floor, effective_size, noise_floor
 from .linearise import Probe, Run, linearised
 from .screen import followed, lengths, moved, project_off
 from .workbench import QUICK, THOROUGH, Fitted, Workbench
@@ -242,6 +242,32 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
 def _satisfies_rule(now: Checked, after: Checked, fault: Gate) -> bool:
     gained = gain(now.cost, after.cost, after.fitted.residual, fault.parameters)
     return gained > LEAST_GAIN and after.cost < min(fault.most_left * now.cost, USELESS_FIT)
+
+
+@dataclass(frozen=True)
+class WrongStart(Gate):
+    """Initial states that are not as stated."""
+
+    remedy: ClassVar[str] = "with them estimated"
+
+
+def find_wrong_start(now: Checked) -> Checked:
+    """Estimate the initial states if the stated ones contradict the recordings and no constant explains it as well."""
+    stated = [r for r in now.bench.recordings if r.begins in ("zero", "given")]
+    unknown = len(stated) * len(now.bench.simulator.states)
+    if not unknown or now.cost < ABOVE_NOISE**2 * now.noise2:
+        return now
+    words = "The initial states are not as stated"
+    fault = WrongStart("initial state", "start", stated[0].begins, words, change=_with_unknown_start)
+    after = correct(now, fault, [now.fitted.values, {}])
+    if after is None or gain(now.cost, after.cost, after.fitted.residual, unknown) < LEAST_GAIN:
+        return now
+    found = accept(now, after, fault)
+    return found if found.cost * EQUAL_RATIO < find_offsets(now).cost else now
+
+
+def _with_unknown_start(r: Recording) -> Recording:
+    return r.with_(initial="estimate") if r.begins in ("zero", "given") else r
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,7 @@ from .gates import (
     Gate,
     find_offsets,
     find_slips,
+    find_wrong_start,
     open_bench,
     refit,
 )
@@ -114,7 +115,8 @@ class _Checks:
 
     def run(self, bench: Workbench, part: float) -> Checked:
         """Refit, and correct one fault after the other; `part` is the unit of shifts in samples, see `timing`."""
-        now = self._report(2, Checked(bench, refitted(bench, self.starts), self.gates))
+        now = self._report(2, find_wrong_start(Checked(bench, refitted(bench, self.starts), self.gates)))
+        bench = now.bench
         if now.cost > max(NEAR_NOISE_RATIO**2 * now.noise2, CHECKED_ABOVE):
             found = self._slips(now, part)
             if len(found.gates) > len(now.gates):

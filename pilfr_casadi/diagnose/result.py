@@ -215,7 +215,8 @@ class Diagnosis:
         Returns
         -------
         array, shape (M, n_y)
-            Outputs in the simulator's order; not finite where the simulation diverges.
+            Outputs in the simulator's order, at the samples of the recording as the diagnosis has corrected it (a shift
+            cuts samples off); not finite where the simulation diverges.
 
         Raises
         ------

@@ -26,6 +26,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from ..data import Recording
+from ..laws import Lag
 from ..simulators import states_along
 from .floor import ABOVE_NOISE, third_differences
 from .gates import (
@@ -39,6 +40,7 @@ from .gates import (
     Gate,
     accept,
     correct,
+    refit,
     robust_deviation,
     settle,
 )
@@ -158,8 +160,8 @@ def in_steps(value: float, dt: float, part: float = 1.0) -> bool:
 def find_time_shift(now: Checked, part: float = 1.0, early: bool = True) -> Checked:
     """Find a shifted channel or clock, and correct it if it is a fault of the recording.
 
-    A late channel counts as a fault if it is late by a multiple of `part` samples and nothing else is wrong. Without
-    `early`, an early channel also counts as a fault only if nothing else is wrong.
+    A late channel counts as a fault if it is late by a multiple of `part` samples, nothing else is wrong, and no lag
+    follows it as well. Without `early`, an early channel also counts as a fault only if nothing else is wrong.
     """
     bench, noise2 = now.bench, now.noise2
     if now.cost < ABOVE_NOISE**2 * noise2:
@@ -186,7 +188,20 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True) -> Chec
     late = fault.finding == "clock" or fault.value > 0
     more_is_wrong = after.cost > NEAR_NOISE_RATIO**2 * noise2  # then a late channel or a slow clock may be physics
     may_be_physics = fault.is_like_delay(bench.dt, part) or (more_is_wrong and (late or not early))
-    return now if may_be_physics else found
+    return now if may_be_physics or _is_lag(now, after, fault) else found
+
+
+def _is_lag(now: Checked, after: Checked, fault: TimeShift) -> bool:
+    """Tell whether lags follow a late channel better than the shift that was found."""
+    if fault.finding == "clock" or (fault.value > 0) != (fault.kind == "y"):  # an early input looks like late outputs
+        return False
+    simulator = now.bench.simulator
+    names, place = (simulator.output_names, "sensor") if fault.kind == "y" else (simulator.inputs, "actuator")
+    slow = Lag().at({"T": abs(fault.value)}, {"T": (now.bench.dt / 10, 10 * abs(fault.value))})
+    for i in fault.columns:
+        simulator = simulator.with_element(f"{place}:{names[i]}", slow)
+    lagging = refit(now.bench, [after.fitted.values, {}], simulator, states=now.fitted.begin)
+    return lagging is not None and lagging.cost < after.cost
 
 
 def run_as_given(bench: Workbench, plain: Fitted) -> Fitted:

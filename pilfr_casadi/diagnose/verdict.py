@@ -6,7 +6,7 @@ is noise; so it is weighed with samples that count in full (`search.Search.optim
 The right law leaves little of the mismatch for a flexible force to explain. Let s be the share of the mismatch that the
 law leaves and that a flexible force at some port would explain. The density of s is
 
-    1 / (s log(1 / s_0)) for s from s_0 to 1, if the physics has no name: log-uniform,
+    1 / (max(s, s_0) (1 + log(1 / s_0))), if the physics has no name: log-uniform above s_0,
     2 / (π s_0 (1 + (s / s_0)²)), if the law is the physics: half-Cauchy,
 
 and the probability of a hypothesis is divided between a named and an unnamed answer in this ratio. s_0 is the share
@@ -136,7 +136,7 @@ def share_left(search: Search, mean_square: float) -> float:
 def share_named(s: float) -> float:
     """Compute the probability that a law which leaves the share s is the physics."""
     law = (1 - OUTSIDE_CATALOGUE) * 2 / (np.pi * FORMULA_ERROR * (1 + (s / FORMULA_ERROR) ** 2))
-    other = OUTSIDE_CATALOGUE / (max(s, FORMULA_ERROR) * np.log(1 / FORMULA_ERROR))
+    other = OUTSIDE_CATALOGUE / (max(s, FORMULA_ERROR) * (1 - np.log(FORMULA_ERROR)))
     return float(law / (law + other))
 
 

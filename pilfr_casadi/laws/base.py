@@ -357,7 +357,7 @@ def display_name(law: str, form: str = "") -> str:
     """Write the id of a law, and its form, as words: "coulomb_friction" -> "Coulomb friction"."""
     text = PROPER_NAMES.get(law, law.replace("_", " "))
     text = text.capitalize() if text.split(" ")[0] in PEOPLE else text
-    return f"{text} ({display_name(form)})" if form else text
+    return f"{text} ({', '.join(map(display_name, form.split(', ')))})" if form else text
 
 
 def readable_unit(unit: str, w: str, z: str) -> str:

@@ -21,8 +21,10 @@ RANKED = 12  # rows of the ranked table above the fold
 
 
 def percent(value: float | None) -> str:
-    """Write a relative error as a percentage."""
-    if value is None or not value < RUN_AWAY:
+    """Write a relative error as a percentage; a dash where it was not computed."""
+    if value is None:
+        return "\u2014"
+    if not value < RUN_AWAY:
         return "diverges"
     return f"{number_text(100 * value, 3)}\u00a0%"
 
