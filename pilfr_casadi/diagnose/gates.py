@@ -31,7 +31,7 @@ from ..engine import make_engine
 from ..laws import Law
 from ..optimise import GaussNewton
 from ..simulators import Simulator
-from .floor import ABOVE_NOISE, FEWEST, Floor, effective_size, noise_floor
+from .floor import FEWEST, Floor, effective_size, noise_floor
 from .linearise import Probe, Run, linearised
 from .screen import followed, lengths, moved, project_off
 from .workbench import QUICK, THOROUGH, Fitted, Workbench
@@ -252,13 +252,17 @@ class WrongStart(Gate):
 
 
 def find_wrong_start(now: Checked) -> Checked:
-    """Estimate the initial states if the stated ones contradict the recordings and no constant explains it as well."""
-    stated = [r for r in now.bench.recordings if r.begins in ("zero", "given")]
+    """Estimate the initial states if the stated ones contradict the first samples and no constant explains it as well.
+
+    A first sample depends on no dynamics: missing physics cannot contradict it.
+    """
+    both = zip(now.bench.recordings, now.fitted.residual, strict=True)
+    stated = [(r, e[0]) for r, e in both if r.begins in ("zero", "given")]
     unknown = len(stated) * len(now.bench.simulator.states)
-    if not unknown or now.cost < ABOVE_NOISE**2 * now.noise2:
+    if not any(np.any(np.abs(first) > CERTAIN_ERRORS * now.floor.deviation) for _, first in stated) or not unknown:
         return now
     words = "The initial states are not as stated"
-    fault = WrongStart("initial state", "start", stated[0].begins, words, change=_with_unknown_start)
+    fault = WrongStart("initial state", "start", stated[0][0].begins, words, change=_with_unknown_start)
     after = correct(now, fault, [now.fitted.values, {}])
     if after is None or gain(now.cost, after.cost, after.fitted.residual, unknown) < LEAST_GAIN:
         return now

@@ -7,6 +7,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.gates import Offset
+from pilfr_casadi.diagnose.preparation import prepare
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
     CATALOGUE,
@@ -97,6 +98,25 @@ def test_a_stated_level_is_no_transient_of_a_law(law):
     y = simulator.simulate(still)
     np.testing.assert_allclose(y, np.broadcast_to(y[0], y.shape), rtol=1e-9)
     assert y[0, 0] >= 7
+
+
+def findings(r, off=1.15):
+    return [(g.channel, g.finding) for g in prepare(tank(off), [r], "zero", "auto").gates]
+
+
+def test_a_lag_is_not_taken_for_a_late_recorder():
+    lagging, r = tank().with_element("sensor:lower", Lag().at({"T": 8 * DT})), recorded(30.0)
+    r = r.with_(initial=[30.0, 30.0])
+    noise = 2e-3 * np.random.default_rng(1).standard_normal(r.y.shape)
+    assert findings(r.with_(y=lagging.simulate(r) + noise)) == []
+    late = tank().simulate(r)
+    late[:, 1] = np.append(np.full(8, 30.0), late[:-8, 1])
+    assert findings(r.with_(y=late + noise)) == [("lower", "alignment")]
+
+
+def test_a_stated_start_that_the_first_sample_contradicts_is_estimated():
+    assert findings(recorded(30.0).with_(initial="zero")) == [("initial state", "start")]
+    assert findings(recorded(30.0).with_(initial=[30.0, 30.0])) == []
 
 
 @pytest.mark.slow
