@@ -494,13 +494,12 @@ def port_units(port: Port, recording: Recording) -> tuple[str, str]:
 
 @one_at_a_time
 def _local_levels(bench: Workbench, fitted: Fitted, runs: list[Run]) -> list[float | None]:
-    """Compute the largest rms of the simulator's own terms in the equation of each port of `all_ports`.
+    """Compute the largest deviation of a term in the equation of each port of `all_ports`, in the force's unit.
 
-    A term is the equation's derivative with respect to a state or input, times that signal's deviation from its mean.
-    For a port in series it is the signal's own deviation. Ports where nothing moves have None.
+    Terms are the summands of the equation as it is written, such as the force of a spring. For a port in series it is
+    the deviation of the signal. Ports where nothing moves have None.
     """
     simulator, z, at = bench.simulator, np.concatenate([r.z for r in runs]), along(bench, fitted)
-    swing = np.hstack([v - v.mean(axis=0) for v in at])
     own = simulator.parameter_set
     values = own.pack({k: v for k, v in fitted.values.items() if k in own})
     symbols = x, u, p, _ = (*simulator.symbols()[:3], ca.SX(0))
@@ -512,11 +511,24 @@ def _local_levels(bench: Workbench, fitted: Fitted, runs: list[Run]) -> list[flo
         if port.series:
             value = float(np.std(z[:, j]))
         else:
-            into = simulator.into(port, *symbols)
-            slopes = ca.jacobian(ca.vertcat(*(equations[name] for name in into)), ca.vertcat(*vectors[:2]))
-            terms = ca.Function("terms", [*vectors], [ca.densify(slopes), ca.densify(ca.vertcat(*into.values()))])
-            slope, factor = map_points(terms, *at, values)
-            force = slope * swing[:, None, :] / np.where(factor == 0, np.inf, np.abs(factor))
-            value = float(np.max(np.sqrt(np.mean(force**2, axis=0)), initial=0.0))
+            into = simulator.into(port, *symbols).items()
+            forces = [term / factor for name, factor in into for term in _summands(equations[name])]
+            rows = map_points(ca.Function("forces", [*vectors], [ca.densify(ca.vertcat(*forces))]), *at, values)[0]
+            spread = np.std(rows, axis=0)
+            value = float(np.max(spread[np.isfinite(spread)], initial=0.0))
         found.append(value if np.isfinite(value) and value > 0 else None)
+    return found
+
+
+def _summands(expression: ca.SX) -> list[ca.SX]:
+    """Split a sum into its terms, also one that is divided by a mass."""
+    found, left = [], [(ca.SX(expression), ca.SX(1))]
+    while left:
+        e, factor = left.pop()
+        if e.is_leaf() or e.op() not in (ca.OP_ADD, ca.OP_SUB, ca.OP_NEG, ca.OP_DIV):
+            found.append(e * factor)
+        elif e.op() == ca.OP_DIV:
+            left.append((e.dep(0), factor / e.dep(1)))
+        else:
+            left += [(e.dep(k), factor) for k in range(e.n_dep())]  # a sign does not matter
     return found

@@ -29,6 +29,7 @@ from ..laws import display_name
 from ..simulators import Placed
 from .evidence import (
     AT_NOISE_RATIO,
+    BETTER_RATIO,
     COLOURED_NOISE_RATIO,
     DISTURBANCE_WEIGHT,
     EXPLAINED_NOISE,
@@ -149,7 +150,7 @@ def posterior(search: Search) -> Posterior:
         by_names[names(t)] = by_names.get(names(t), 0.0) + float(w)
     said = max(by_names, key=lambda n: by_names[n])
     while True:
-        best = max((t for t in trials if names(t) == said), key=search.evidence)
+        best = _plainest(search, [t for t in trials if names(t) == said])
         if not said:
             return Posterior(best, 0.0, (), by_names[said])
         found = [_make_effect(search, best, e, by_names) for e in best.effects]
@@ -161,6 +162,18 @@ def posterior(search: Search) -> Posterior:
     named = share_named(explainable_remainder(search, best))
     effects = tuple(replace(e, confidence=named * e.confidence) for e in found)
     return Posterior(best, named, effects, by_names.get(frozenset(), 0.0))
+
+
+def _plainest(search: Search, trials: Sequence[Trial]) -> Trial:
+    """Choose the likeliest hypothesis, or one with fewer parameters that is about as likely and follows as well."""
+    best = max(trials, key=search.evidence)
+    least, most = search.evidence(best) - INDISTINGUISHABLE_NATS, BETTER_RATIO**2 * best.mean_square
+    alike = (t for t in trials if search.evidence(t) >= least and t.mean_square <= most)
+    return min(alike, key=lambda t: (sum(map(_count_parameters, t.laws)), -search.evidence(t)))
+
+
+def _count_parameters(placed: Placed) -> int:
+    return sum(p.size for p in placed.law.parameters().values())
 
 
 def _make_effect(
