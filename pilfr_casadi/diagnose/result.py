@@ -53,6 +53,16 @@ class Effect:
     form: str = ""
     placebo: Mapping[str, float] = field(default_factory=dict)
 
+    @property
+    def defined(self) -> dict[str, dict[str, Any]]:
+        """Quantities that the equation defines as a product, such as `F_c = k_t r` of friction with presliding."""
+        found = re.search(r",  (\w+) = (\w+) (\w+)$", self.equation)
+        if not found or not all(name in self.parameters for name in found.groups()[1:]):
+            return {}
+        a, b = (self.parameters[key] for key in found.groups()[1:])
+        unit = a["unit"].removesuffix(f"/{b['unit']}") if a["unit"].endswith(f"/{b['unit']}") else ""
+        return {found[1]: {"value": a["value"] * b["value"], "std": None, "unit": unit}}
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content for diagnosis.json."""
         out: dict[str, Any] = {
@@ -484,14 +494,9 @@ def _effect_lines(e: Effect) -> list[str]:
         f"  {e.sentence}: {e.equation}",
         f"  {symbols}",
     ]
-    for name, p in e.parameters.items():
+    for name, p in (e.parameters | e.defined).items():
         std = "" if p["std"] is None else f" ± {p['std']:.2g}"
         lines.append(f"  {name} = {p['value']:.5g}{std} {p['unit']}".rstrip())
-    defined = re.search(r",  (\w+) = (\w+) (\w+)$", e.equation)  # such as F_c = k_t r for friction with presliding
-    if defined and all(name in e.parameters for name in defined.groups()[1:]):
-        name, (a, b) = defined[1], (e.parameters[key] for key in defined.groups()[1:])
-        unit = a["unit"].removesuffix(f"/{b['unit']}") if a["unit"].endswith(f"/{b['unit']}") else ""
-        lines.append(f"  {name} = {a['value'] * b['value']:.5g} {unit}".rstrip())
     if e.indistinguishable:
         others = ", ".join(f"{display_name(law)} at {port}" for port, law in e.indistinguishable)
         lines.append(f"  cannot be told apart from {others}")

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
         mismatch_level as mismatch_level,
         mismatch_map as mismatch_map,
         mismatch_time as mismatch_time,
-        port_law_map as port_law_map,
         refined_hysteresis as refined_hysteresis,
     )
     from .fits import (

@@ -154,7 +154,8 @@ def test_the_lines_of_code_run(port, law, tmp_path, monkeypatch):
 
 
 @needs_chromium
-@pytest.mark.parametrize("width", [390, pytest.param(1280, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [390, 1280])
 def test_in_a_browser(width, tmp_path):
     d = example(outputs=("pos", "vel"), law="hysteresis", port="a_port_with_a_name_that_goes_on_and_on_without_a_blank")
     long_name = "a_recording_with_a_name_that_goes_on_and_on_without_a_single_blank_in_it"

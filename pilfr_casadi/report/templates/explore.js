@@ -21,6 +21,15 @@ function nearest(x, at) {  // of increasing x
   return at - x[low] < x[high] - at ? low : high;
 }
 
+function ticks(low, high) {  // of a logarithmic axis: few enough to name each
+  const decades = Math.log10(high / low), out = [];
+  const steps = decades > 3 ? [1] : decades > 1.4 ? [1, 3] : decades > 0.7 ? [1, 2, 5] : [1, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9];
+  const every = Math.ceil(decades / 6);
+  for (let k = Math.floor(Math.log10(low)); k <= Math.log10(high); k++)
+    for (const step of k % every ? [] : steps) if (step * 10 ** k >= low && step * 10 ** k <= high) out.push(+(step * 10 ** k).toPrecision(6));
+  return out;
+}
+
 function colour(line) {
   const name = (line.area ? AREA : INK)[line.colour];
   return name ? style(name) : line.colour;
@@ -149,7 +158,8 @@ function explore(figure) {
   }
 
   const size = () => ({ width: plot.clientWidth, height: Math.round(Math.max(250, Math.min(0.62 * plot.clientWidth, 380))) });
-  const axis = label => ({
+  const axis = (label, logged) => ({
+    ...(logged ? { splits: (_, __, low, high) => ticks(low, high), values: (_, at) => at.map(digits), filter: (_, at) => at } : {}),
     label, labelSize: 20, font: "13px system-ui, sans-serif", labelFont: "13px system-ui, sans-serif", labelGap: 2,
     stroke: () => style("--ink"), grid: { stroke: () => style("--line"), width: 1 }, ticks: { stroke: () => style("--line"), width: 1, size: 5 },
   });
@@ -161,8 +171,8 @@ function explore(figure) {
       x: { time: false, auto: false, distr: log.x ? 3 : 1, min: x[0], max: x[1], range: (_, a, b) => [a, b] },
       y: { auto: false, distr: log.y ? 3 : 1, min: y[0], max: y[1], range: (_, a, b) => [a, b] },
     },
-    axes: [{ ...axis(spec.x.label), size: 30 }, {
-      ...axis(spec.y.label),
+    axes: [{ ...axis(spec.x.label, log.x), size: 30 }, {
+      ...axis(spec.y.label, log.y),
       size: (_, values) => 14 + 8 * Math.max(3, ...(values || []).map(v => v == null ? 0 : String(v).length)),
     }],
     series: [null, ...lines.map(l => ({
