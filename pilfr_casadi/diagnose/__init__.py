@@ -58,7 +58,7 @@ if TYPE_CHECKING:
         replicate as replicate,
     )
     from .result import (
-        STEPS as STEPS,
+        ERROR_NAMES as ERROR_NAMES,
         BeforeAfter as BeforeAfter,
         Diagnosis as Diagnosis,
         Effect as Effect,

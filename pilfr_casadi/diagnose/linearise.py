@@ -24,7 +24,7 @@ from ..laws import Law, Local
 from ..linear import steady_state_gain, with_output_injection
 from ..models import Model, map_points
 from ..simulators import Simulator, discretise, signals, states_along
-from .workbench import FINER, Fitted, Workbench
+from .workbench import FINER_STEPS, Fitted, Workbench
 
 WALL = 1.0  # largest |λ| h of a contact on the finest steps
 
@@ -308,7 +308,7 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
     """Return the local signals of every port over all recordings."""
     lengths = tuple(len(r.z) for r in runs)
     z, dz = np.concatenate([r.z for r in runs]), np.concatenate([r.dz for r in runs])
-    rate = WALL * FINER * bench.substeps / bench.dt
+    rate = WALL * FINER_STEPS * bench.substeps / bench.dt
     lift, push = (np.max([getattr(r, name) for r in runs], axis=0) for name in ("lift", "push"))
     with np.errstate(divide="ignore", over="ignore"):  # a force that does not move the port has no limit
         max_stiffness, max_damping = np.where(lift > 0, rate / lift, rate**2 / push), rate / push
@@ -316,7 +316,10 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
     own = own_signals(bench.simulator, np.concatenate([r.own for r in runs]))
     rest = tuple(r.from_zero for r in runs)
     pairs = enumerate(zip(max_stiffness.tolist(), max_damping.tolist(), strict=True))
-    return [Local(z[:, j], dz[:, j], bench.dt, lengths, k, d, {**inputs, **own[j]}, rest) for j, (k, d) in pairs]
+    shown = [bench.simulator.shown_states(port) is not None for port in bench.simulator.all_ports()]
+    return [
+        Local(z[:, j], dz[:, j], bench.dt, lengths, k, d, {**inputs, **own[j]}, rest, shown[j]) for j, (k, d) in pairs
+    ]
 
 
 def own_signals(simulator: Simulator, values: np.ndarray) -> list[dict[str, np.ndarray]]:
@@ -337,4 +340,5 @@ def port_signals(bench: Workbench, fitted: Fitted, port: str) -> Local:
         parts.append((z[:, index], dz[:, index], own))
     z, dz, own = (np.concatenate([part[k] for part in parts]) for k in (0, 1, 2))
     local = bench.local(z, dz)
-    return replace(local, inputs={**local.inputs, **own_signals(simulator, own)[index]})
+    shown = simulator.shown_states(simulator.port(port)) is not None
+    return replace(local, inputs={**local.inputs, **own_signals(simulator, own)[index]}, shown=shown)

@@ -19,8 +19,8 @@ How an answer comes about:
    else unexplained.
 5. `find_correction` compares named laws with a learned force on held-out parts of the recordings. If the named law
    predicts worse than the force, the name is withdrawn and the verdict is chosen again.
-   There are explanations without a law: a parameter pinned to a wrong value, and a clipped input. They are tried if
-   there is time, and count if they explain as much.
+   Before that, if there is time, explanations without a law are tried: a parameter pinned to a wrong value, and a
+   clipped input. They count if they explain as much.
    If the recordings are long, steps 1 to 5 see only their most informative stretches (`stretches`). The leading
    hypotheses are then fitted to everything before step 3, and the answer's simulator before step 6.
 6. The proof (`proof`) adds errors on test recordings, placebos and standard errors. It changes no verdict. Offsets that
@@ -44,7 +44,7 @@ from ..laws import Law, readable_unit
 from ..simulators import Simulator
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction, find_correction, named_correction
-from .evidence import AS_GIVEN, SURE, deviations
+from .evidence import AS_GIVEN_RATIO, SURE, deviations
 from .floor import Floor, measured_floor
 from .gates import USELESS_FIT, Gate, Offset, final_gates, offset_gates, without_idle_offsets
 from .identifiability import port_units
@@ -73,7 +73,7 @@ from .trials import Trial
 from .verdict import NamedEffect, Posterior, Verdict, judge, names, posterior
 from .workbench import Fitted, RunsAway, Workbench
 
-SEARCHING = 0.7  # share of the remaining time for preparation and search; the rest is for the correction
+SEARCH_SHARE = 0.7  # share of the remaining time for preparation and search; the rest is for the correction
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,13 +222,13 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
 
 
 def _search(request: Request) -> tuple[Prepared, Search]:
-    """Prepare and search; repeat without shifting early channels if these were shifted, and keep the better search."""
+    """Prepare and search; if an early channel was shifted, repeat without, and keep that if it is clearly better."""
     ready, search = _search_once(request, shift_early=True)
     seemed_early = any(g.finding == "alignment" and g.value < 0 for g in ready.gates)
     if not seemed_early or search.interrupted or search.out_of_time or not search.can_improve(search.best):
         return ready, search
     other, again = _search_once(request, shift_early=False)
-    if again.best.mean_square < AS_GIVEN * search.best.mean_square:
+    if again.best.mean_square < AS_GIVEN_RATIO * search.best.mean_square:
         return other, again
     search.interrupted = again.interrupted
     return ready, search
@@ -257,7 +257,7 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         request.say,
         hold_said=request.hold_said,
         stand_in_error=request.stand_in_error,
-        until=began + SEARCHING * (request.deadline - began),
+        until=began + SEARCH_SHARE * (request.deadline - began),
         deadline=request.deadline,
         times={CHECKS: time.perf_counter() - began},
     )

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
         Creep as Creep,
         Delay as Delay,
         Drift as Drift,
+        ElasticJoint as ElasticJoint,
         Lag as Lag,
         Mode as Mode,
         Relaxation as Relaxation,

@@ -70,6 +70,8 @@ class Local:
         The simulator's inputs, for laws whose strength is scaled by one of them.
     from_zero : tuple of bool
         Whether each recording begins with everything at zero; else a law begins as if z had stood still before.
+    shown : bool
+        Whether z is a state that outputs read, itself or its rate.
     """
 
     z: np.ndarray
@@ -80,6 +82,7 @@ class Local:
     max_damping: float = np.inf
     inputs: Mapping[str, np.ndarray] = field(default_factory=dict)
     from_zero: tuple[bool, ...] = ()
+    shown: bool = False
 
     # old spellings, which laws of users may name in `starts` and `ranges`
     stiffest = property(lambda self: self.max_stiffness)
@@ -165,11 +168,14 @@ class Law:
     two_sided : bool
         The data carries information on the law only if z is both above and below zero.
     order, follows : int
-        `order` is the number of its own states. If the signal stands still, the first `follows` of them settle at
-        the signal's value, the others at zero.
+        `order` is the number of its own states. If the signal stands still, the first `follows` of its states or its
+        memory are at the signal's value, the others at zero. A play is then in the middle of its gap.
     memory, shifts : int, bool
         `memory` is the length of its discrete memory. `shifts` says that the memory is a shift register, which takes
         in the signal at the beginning of a step.
+    sensed : bool
+        Outputs that read the port's coordinate or its rate read `far_side(q, p)` in their place. The law is tried only
+        where the coordinate is a state that outputs read.
     substeps : int
         Smallest number of integration steps per sample.
     knee : str
@@ -214,6 +220,7 @@ class Law:
     follows: ClassVar[int] = 0
     memory: ClassVar[Any] = 0
     shifts: ClassVar[bool] = False
+    sensed: ClassVar[bool] = False
     substeps: ClassVar[int] = 1
     knee: ClassVar[str] = ""
     scaled_by: ClassVar[str] = ""
@@ -259,6 +266,8 @@ class Law:
 
     def why_not(self, local: Local) -> str:
         """Say why the data carries no information on this law; empty if it does."""
+        if self.sensed and not local.shown:
+            return "no output reads the coordinate"
         hidden = self.two_sided and min(-local.low, local.high) <= MIN_SIDE * local.reach
         return "one side of zero is hardly visited" if hidden else ""
 
@@ -348,7 +357,7 @@ def display_name(law: str, form: str = "") -> str:
     """Write the id of a law, and its form, as words: "coulomb_friction" -> "Coulomb friction"."""
     text = PROPER_NAMES.get(law, law.replace("_", " "))
     text = text.capitalize() if text.split(" ")[0] in PEOPLE else text
-    return f"{text} ({display_name(form)})" if form else text
+    return f"{text} ({', '.join(map(display_name, form.split(', ')))})" if form else text
 
 
 def readable_unit(unit: str, w: str, z: str) -> str:

@@ -241,6 +241,21 @@ class Attached(Resonance):
         return ca.vertcat(p.W * q[1], p.W * _pull(z, dz, q, p))
 
 
+class ElasticJoint(Attached):
+    """A mass behind a spring and a damper, whose motion the sensors see (a gear with a sensor at its output)."""
+
+    form = "elastic joint"
+    equation = f"{Attached.equation},  outputs read q in place of z"
+    source = "Spong (1987), Journal of Dynamic Systems, Measurement, and Control 109(4)"
+    sentence = "an elastic joint: the sensor sees the far side of a spring that the simulator takes for rigid"
+    sensed = True
+    starts = {"W": lambda at: np.geomspace(0.03, 1.0, 8) / at.dt, "D": ("", 0.05)}
+
+    def far_side(self, q: Any, p: Any) -> tuple[Any, Any]:
+        """Travel and speed of the mass."""
+        return q[0], p.W * q[1]
+
+
 def _pull(z: Any, dz: Any, q: Any, p: Any) -> Any:
     """Force of spring and damper over the spring's stiffness."""
     return z - q[0] + 2 * p.D * (dz / p.W - q[1])

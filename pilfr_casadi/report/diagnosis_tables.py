@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .._base import to_json
-from ..diagnose import STEPS, Diagnosis, Effect, learned_force
+from ..diagnose import ERROR_NAMES, Diagnosis, Effect, learned_force
 from ..identify import RUN_AWAY
 from ..laws import display_name, scaled, scheduled
 from ..models import Parameter, ParameterSet
@@ -21,8 +21,10 @@ RANKED = 12  # rows of the ranked table above the fold
 
 
 def percent(value: float | None) -> str:
-    """Write a relative error as a percentage."""
-    if value is None or not value < RUN_AWAY:
+    """Write a relative error as a percentage; a dash where it was not computed."""
+    if value is None:
+        return "\u2014"
+    if not value < RUN_AWAY:
         return "diverges"
     return f"{number_text(100 * value, 3)}\u00a0%"
 
@@ -54,7 +56,7 @@ def tone(diagnosis: Diagnosis) -> str:
 def _steps(diagnosis: Diagnosis) -> dict[str, str]:
     """Return the keys of the errors to show, with their names."""
     last = correction_words(diagnosis)
-    return STEPS | {"after": last} if last else {k: name for k, name in STEPS.items() if k != "after"}
+    return ERROR_NAMES | {"after": last} if last else {k: name for k, name in ERROR_NAMES.items() if k != "after"}
 
 
 def errors_that_count(diagnosis: Diagnosis) -> tuple[str, Mapping[str, float]]:

@@ -288,6 +288,19 @@ class Equations:
         name = f"`across` of port {port.name!r}"
         return _scalar(call(port.across, name, x=x, u=u, p=p, t=t), name)
 
+    def shown_states(self, port: Port) -> tuple[str, str] | None:
+        """Find the two states that are a port's coordinate and its rate, if an output reads one of them."""
+        if port.series or self.discrete:
+            return None
+        x, u, p, t = self.symbols()
+        z = self.across(port, x, u, p, t)
+        name = z.name() if z.is_symbolic() else ""
+        rate = self._integrals.get(name, "")
+        if rate not in self.states or rate == name:
+            return None
+        read = ca.vertcat(*self.measured(x, u, p, t).values())
+        return (name, rate) if ca.depends_on(read, ca.vertcat(x[name], x[rate])) else None
+
     def port(self, name: str) -> Port:
         """Find a port by name: declared, `actuator:<input>`, `sensor:<output>` or `equation:<state>`."""
         for port in self.all_ports():
