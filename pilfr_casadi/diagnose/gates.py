@@ -566,6 +566,14 @@ def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
     return fitted
 
 
+def without_zero_offsets(simulator: Simulator) -> Simulator:
+    """Return a simulator without the offsets that are fixed at zero."""
+    for i, e in reversed(list(enumerate(simulator.elements))):
+        if isinstance(e.law, Offset) and np.all(simulator.parameters[f"{e.prefix}w_0"].fixed):
+            simulator = simulator.without_element(i)
+    return simulator
+
+
 def final_gates(
     gates: Sequence[Gate], after: Fitted, std: Mapping[str, np.ndarray], effects: bool, sure: bool
 ) -> tuple[Gate, ...]:

@@ -46,7 +46,7 @@ from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction, find_correction, named_correction
 from .evidence import AS_GIVEN_RATIO, SURE, deviations
 from .floor import Floor, measured_floor
-from .gates import USELESS_FIT, Gate, Offset, final_gates, offset_gates, without_idle_offsets
+from .gates import USELESS_FIT, Gate, Offset, final_gates, offset_gates, without_idle_offsets, without_zero_offsets
 from .identifiability import port_units
 from .mismatch_map import mismatch
 from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
@@ -426,7 +426,7 @@ def _build_diagnosis(
         parameters=parameter_table(request.simulator, without, after, std),
         errors=errors,
         floor={"nrmse": search.floor.nrmse(bench.scale), "source": search.floor.source},
-        corrected=after.corrected(),
+        corrected=without_zero_offsets(after.corrected()),
         refitted=without.corrected(),
         hold=bench.hold,
         train=bench.recordings,

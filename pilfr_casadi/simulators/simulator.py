@@ -193,8 +193,9 @@ class Simulator(Equations):
         prefixes = itertools.chain([f"{port}."], (f"{port}#{k}." for k in itertools.count(2)))
         return next(p for p in prefixes if not any(name.startswith(p) for name in taken))
 
-    def without_last_element(self) -> Simulator:
-        """Copy without the law of the last `with_element`."""
-        *kept, last = self.elements
-        own = {k: p for k, p in self.parameters.items() if not k.startswith(last.prefix)}
+    def without_element(self, index: int = -1) -> Simulator:
+        """Copy without one of the `elements`, by default the last."""
+        kept = list(self.elements)
+        gone = kept.pop(index)
+        own = {k: p for k, p in self.parameters.items() if not k.startswith(gone.prefix)}
         return self._with(parameters=ParameterSet(own), elements=tuple(kept))
