@@ -89,10 +89,10 @@ class Compliance(_InLine):
         if found := super().why_not(local):
             return found
         assert local.term is not None
-        rest, forth, back = (local.term(local.z, side * local.dz) for side in (0, 1, -1))
-        if np.median((forth - rest) * local.dz) <= 0:
+        rest, once, twice = (local.term(local.z, times * local.dz) for times in (0, 1, 2))
+        if np.median((once - rest) * local.dz) <= 0:
             return "the term has no damper, and a spring in line with a spring is one spring"
-        return "" if _alike(forth + back, 2 * rest) else "the term is not linear in the rate"
+        return "" if _alike(twice - rest, 2 * (once - rest)) else "the term is not linear in the rate"
 
     def force(self, z: Any, dz: Any, q: Any, p: Any, term: Any) -> Any:
         return p.k * (z - q) - term(z, dz)

@@ -315,7 +315,7 @@ class Equations:
         return ca.jtimes(self.across(port, x, u, p, t), states, self.derivatives(x, u, p, t))
 
     def _check_term(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> None:
-        """Refuse a term that the equations hold with the other sign: its own symbols change them the other way."""
+        """Refuse a term that the equations hold with the other sign: its symbols change them the other way."""
         if port.term is None:
             return
         known = ca.vertcat(*(ca.vec(v) for names in (x, u, p) for v in names._values.values()), t)
@@ -329,10 +329,11 @@ class Equations:
             np.array([s.full().ravel() for s in column]) for column in zip(*(slopes(v) for v in values), strict=True)
         )
         moving = np.any(own != 0, axis=0) & ~np.any(scale != 0, axis=0)
-        if np.any(moving) and np.allclose(all_of[:, moving], -own[:, moving], rtol=1e-6):
+        same, opposite = (np.any(np.all(np.isclose(all_of, sign * own, atol=0.0), axis=0) & moving) for sign in (1, -1))
+        if opposite and not same:
             raise InputError(
-                f"The equations hold the term of port {port.name!r} with the other sign; give it so that `into` times the "
-                "term stands in them."
+                f"The equations hold the term of port {port.name!r} with the other sign; give it so that `into` times "
+                "the term stands in them."
             )
 
     def shown_states(self, port: Port) -> tuple[str, str] | None:
