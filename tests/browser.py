@@ -1,32 +1,82 @@
-"""A page in a real browser without a window, for the tests of both reports."""
+"""A page in a real browser without a window, for the tests of reports: seen, zoomed, pointed at and switched.
+
+axe-core, which checks accessibility, is run where the environment variable AXE_CORE names its script (axe.min.js of the
+npm package `axe-core`).
+"""
 
 import functools
 import http.server
 import json
+import os
 import re
 import shutil
 import subprocess
 import threading
+from pathlib import Path
+
+import pytest
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 WRAPPER = """<!DOCTYPE html><html><body><iframe src="report.html" style="width:%dpx;height:900px;border:0"></iframe>
 <pre id="out"></pre><script>
-addEventListener("load", () => {
-  const inner = document.querySelector("iframe"), page = inner.contentDocument, images = [...page.images];
-  const colours = images.map(image => {
-    const canvas = document.createElement("canvas"), pen = canvas.getContext("2d");
-    canvas.width = image.naturalWidth; canvas.height = image.naturalHeight; pen.drawImage(image, 0, 0);
-    return new Set(new Uint32Array(pen.getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size;
-  });
-  const texts = [...page.querySelectorAll("p, td, th, figcaption, dt, a, summary")];
-  const root = page.documentElement;
-  document.getElementById("out").textContent = JSON.stringify({
-    images: images.length, shown: images.filter(i => i.complete && i.naturalWidth > 0 && i.clientWidth > 100).length,
-    colours: Math.min(...colours), overflow: root.scrollWidth - root.clientWidth, width: root.clientWidth,
-    font: Math.min(...texts.map(e => parseFloat(getComputedStyle(e).fontSize))),
-    columns: new Set(images.slice(0, 2).map(i => Math.round(i.getBoundingClientRect().left))).size,
-    title: page.title
-  });
+const wait = time => new Promise(done => setTimeout(done, time));
+const colours = canvas => new Set(new Uint32Array(
+  canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size;
+function drawn(image) {
+  const canvas = document.createElement("canvas");
+  canvas.width = image.naturalWidth; canvas.height = image.naturalHeight;
+  canvas.getContext("2d").drawImage(image, 0, 0);
+  return canvas;
+}
+async function used(frame, chart) {  // what a reader does with a chart, and what comes of it
+  const over = chart.querySelector(".u-over"), place = over.getBoundingClientRect(), range = () => chart.dataset.range;
+  const mouse = (type, x, y, target = over) => target.dispatchEvent(new frame.MouseEvent(type, {
+    bubbles: true, buttons: 1, movementX: 9,
+    clientX: place.left + x * place.width, clientY: place.top + y * place.height }));
+  const key = key => chart.dispatchEvent(new frame.KeyboardEvent("keydown", { key, bubbles: true }));
+  const home = range(), out = {};
+  mouse("mousemove", 0.5, 0.5); await wait(60);
+  out.tip = chart.querySelector(".tip").textContent;
+  mouse("mousedown", 0.2, 0.5); mouse("mousemove", 0.6, 0.52); mouse("mouseup", 0.6, 0.52, frame.document);
+  await wait(60);
+  out.zoomed = range() !== home;
+  mouse("dblclick", 0.5, 0.5); await wait(60);
+  out.returned = range() === home;
+  key("+"); out.keys = range() !== home;
+  key("0"); key("ArrowRight"); await wait(60);
+  out.spoken = chart.querySelector("output").textContent;
+  const button = chart.querySelector(".legend button"), canvas = chart.querySelector("canvas");
+  const before = canvas.toDataURL();
+  if (button) {
+    button.click(); await wait(60);
+    out.off = button.getAttribute("aria-pressed") === "false" && canvas.toDataURL() !== before;
+    button.click(); await wait(60);
+    out.on = button.getAttribute("aria-pressed") === "true";
+  }
+  return out;
+}
+addEventListener("load", async () => {
+  const frame = document.querySelector("iframe").contentWindow, page = frame.document, root = page.documentElement;
+  await wait(200);
+  const charts = [...page.querySelectorAll(".chart")];
+  const images = [...page.images].filter(i => i.clientWidth > 0), plots = [...page.querySelectorAll(".chart canvas")];
+  const texts = [...page.querySelectorAll("p, td, th, figcaption, dt, a, summary, button")].filter(e => e.clientWidth);
+  const seen = {
+    title: page.title, width: root.clientWidth, overflow: root.scrollWidth - root.clientWidth,
+    pictures: page.querySelectorAll("figure:not(.replaced)").length,
+    carried: page.querySelectorAll("[data-chart]").length,
+    charts: plots.filter(c => c.clientWidth > 200 && colours(c) > 20).length,
+    images: images.filter(i => i.complete && i.clientWidth > 100 && colours(drawn(i)) > 20).length,
+    font: Math.min(...texts.map(e => parseFloat(frame.getComputedStyle(e).fontSize))),
+    columns: new Set([...page.querySelectorAll(".pictures:not(.wide):not(.alone) > figure")].slice(0, 2).map(
+      i => Math.round(i.getBoundingClientRect().left))).size,
+    used: [], violations: [],
+  };
+  for (const chart of charts) seen.used.push(await used(frame, chart));
+  const grave = v => ["serious", "critical"].includes(v.impact);
+  if (frame.axe) seen.violations = (await frame.axe.run()).violations.filter(grave).map(v => [v.id, v.nodes[0].html]);
+  document.getElementById("out").textContent = JSON.stringify(seen);
 });
 </script></body></html>"""
 
@@ -37,7 +87,12 @@ class Quiet(http.server.SimpleHTTPRequestHandler):
 
 
 def in_a_browser(folder, width):
-    """What a script finds in `folder/report.html` at a width; no error may stand in the console."""
+    """What a script finds in `folder/report.html` at a width; the console is clean and every chart works."""
+    if axe := os.environ.get("AXE_CORE"):  # the page's policy would not let it in
+        html = (folder / "report.html").read_text()
+        head = f"<head><script>{Path(axe).read_text()}</script>"
+        html = re.sub('<meta http-equiv="Content-Security-Policy".*?>', "", html).replace("<head>", head)
+        (folder / "report.html").write_text(html)
     (folder / "wrapper.html").write_text(WRAPPER % width)
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=folder))
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -55,7 +110,13 @@ def in_a_browser(folder, width):
     assert "CONSOLE" not in done.stderr, done.stderr
     seen = json.loads(re.search(r'<pre id="out">(.*?)</pre>', done.stdout, re.S).group(1))
     assert seen["width"] == width and seen["overflow"] <= 0
-    assert seen["colours"] > 20
     assert seen["font"] >= 13
     assert seen["columns"] == (1 if width == 390 else 2)
+    assert seen["charts"] == seen["carried"] == len(seen["used"]) > 0
+    assert seen["charts"] + seen["images"] == seen["pictures"]
+    works = ("zoomed", "returned", "keys", "off", "on")
+    broken = [u for u in seen["used"] if not all(u.get(k, True) for k in works)]
+    assert not broken, broken
+    assert sum(bool(u["tip"]) for u in seen["used"]) > len(seen["used"]) / 2  # a cloud may have no point in its middle
+    assert seen["violations"] == []
     return seen

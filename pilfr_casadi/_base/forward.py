@@ -19,6 +19,7 @@ LATER_VERBS = {  # verb -> the folder whose face has it
     "plot_recording": "plots",
     "recording_card": "report",
     "simulator_card": "report",
+    "simulator_nrmse": "identify",
 }
 
 

@@ -50,17 +50,17 @@ def takes_options(function: Callable[[Any], int]) -> Callable[..., int]:
 def whole(text: str, least: int, most: int, default: int | None = None, metavar: str = "N") -> Any:
     """Make an option that takes a whole number."""
     wanted = f"a whole number from {least} to {most}"
-    return _numeric(int, lambda value: least <= value <= most, wanted, default, metavar, text)
+    return _parsed(int, lambda value: least <= value <= most, wanted, default, metavar, text)
 
 
 def seconds(text: str) -> Any:
     """Make an option that takes a time above zero."""
     wanted = "a number of seconds above zero"
-    return _numeric(float, lambda value: 0 < value < math.inf, wanted, None, "SECONDS", text)
+    return _parsed(float, lambda value: 0 < value < math.inf, wanted, None, "SECONDS", text)
 
 
-def _numeric(kind: Any, accepts: Callable[[Any], bool], wanted: str, default: Any, metavar: str, text: str) -> Any:
-    """Make an option that takes a number of a kind, if it `accepts` it."""
+def _parsed(kind: Any, accepts: Callable[[Any], bool], wanted: str, default: Any, metavar: str, text: str) -> Any:
+    """Make an option that takes a value of a kind, if it `accepts` it."""
 
     def parse(given: str) -> Any:
         try:
@@ -72,6 +72,22 @@ def _numeric(kind: Any, accepts: Callable[[Any], bool], wanted: str, default: An
         return value
 
     return typer.Option(default, parser=parse, metavar=metavar, help=text, show_default=False)
+
+
+def initial_state(text: str) -> Any:
+    """Make an option that takes the name of an initial state, or its numbers separated by commas."""
+    names, wanted = (
+        ("estimate", "zero", "periodic"),
+        "estimate, zero, periodic, or a number for each state, as in 20,0.5",
+    )
+
+    def read(given: str) -> Any:
+        return given if given in names else tuple(map(float, given.split(",")))
+
+    def accepts(value: Any) -> bool:
+        return value in names or (isinstance(value, tuple) and all(map(math.isfinite, value)))
+
+    return _parsed(read, accepts, wanted, None, "STATE", text)
 
 
 def option(text: str, metavar: str | None = None, default: Any = None, name: str | None = None) -> Any:
@@ -91,8 +107,9 @@ class DataOptions:
     inputs: str | None = option("Names of the inputs (default: the model's or simulator's).", "NAME[,NAME]")
     outputs: str | None = option("Names of the outputs (default: the model's or simulator's).", "NAME[,NAME]")
     column: list[str] = option("Column of a name, or of the time t, where they differ (repeatable).", "NAME=COLUMN", [])
-    initial: Literal["estimate", "zero", "periodic"] | None = option(
-        "State at the first sample (default: estimate; zero where no outputs were measured)."
+    initial: Any = initial_state(
+        "State at the first sample: estimate, zero, periodic, or the states' values, such as 20,0.5 (default: "
+        "estimate; zero where no outputs were measured)."
     )
     period: int | None = whole("Samples per period; needs --initial.", 0, MOST_SAMPLES, metavar="SAMPLES")
     hold: Literal["zero", "linear"] | None = option("Course of the inputs between samples.")

@@ -295,7 +295,7 @@ def simulate_command(options: SimulateOptions) -> int:
     if measured:
         print(_error_line(fitted, recording, y))
     else:
-        state = "zero" if options.initial == "zero" else "periodic steady state"
+        state = {"zero": "zero", "periodic": "periodic steady state"}.get(options.initial, "as given")
         print(f"{options.data} has no outputs ({listed(outputs)}) to compare with; initial state: {state}")
     print(f"simulated outputs: {options.out}")
     return DONE

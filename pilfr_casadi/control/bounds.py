@@ -22,7 +22,7 @@ from ..identify import Fit
 from ..models import element_bound
 
 Array = np.ndarray
-STEPS = 200_000  # longest impulse response, samples: enough for a pole at 0.9999, within a second
+LONGEST_RESPONSE = 200_000  # longest impulse response, samples: enough for a pole at 0.9999, within a second
 TAIL = 1e-6  # share of the impulse response that is bounded by its decay instead of summed
 
 
@@ -106,7 +106,7 @@ def _absolute_sum(A: Array, B: Array, C: Array) -> Array:
     left, right = np.abs(C @ V), np.abs(np.linalg.inv(V) @ B)
     size, total, state = np.abs(values), np.zeros((len(C), B.shape[1])), B
     whole = (left / (1 - size)) @ right
-    for k in range(1, STEPS + 1):
+    for k in range(1, LONGEST_RESPONSE + 1):
         total += np.abs(C @ state)
         state = A @ state
         rest = (left * (size**k / (1 - size))) @ right

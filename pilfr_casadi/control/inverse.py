@@ -54,15 +54,15 @@ from .estimation import KalmanFilter, ModelSource, Rollout, function_of_observer
 
 Array = np.ndarray
 FARTHEST = 12  # samples of look-ahead beyond the delay that are tried; longer ones gain nothing on the benchmarks
-LONGEST = 1000  # largest look-ahead, samples: each sample unrolls the model once
-STABLE = 0.999  # spectral radius of an accepted inverse: disturbances fade within some thousand samples
+LONGEST_PREVIEW = 1000  # largest look-ahead, samples: each sample unrolls the model once
+STABLE_RADIUS = 0.999  # spectral radius of an accepted inverse: disturbances fade within some thousand samples
 FAINT = 0.02  # of the largest gain over the look-aheads and along the recording: smaller gains are model error
-STEPS = 40  # Newton or bisection steps: bisection alone then reaches 1e-12 of the bracket
-NOTHING = 1e-9  # of the largest response: an earlier one below this is rounding
+NEWTON_STEPS = 40  # Newton or bisection steps: bisection alone then reaches 1e-12 of the bracket
+RESPONSE_ROUNDING = 1e-9  # of the largest response: an earlier one below this is rounding
 INPUTS = 31  # inputs between the limits at which the sign of the gain is checked
-POINTS = 60  # states along the recording at which the model is linearised
-SAMPLES = 100  # length of the impulse response
-ERRORS = 4.0  # standard errors above which a Markov parameter counts
+LINEARISED_STATES = 60  # states along the recording at which the model is linearised
+RESPONSE_SAMPLES = 100  # length of the impulse response
+COUNTED_ERRORS = 4.0  # standard errors above which a Markov parameter counts
 SMALL, UNKNOWN = 1e-3, 0.02  # of the largest Markov parameter: smaller ones count as zero; second: errors unknown
 
 
@@ -162,7 +162,7 @@ def feedforward(
     if found == delay and _gain_changes_sign(run, recording, response, ends):
         why = "within the limits the output rises with the input in places and falls in others, so that several inputs "
         why += "give the same output"
-    elif found == delay and response.early > NOTHING:
+    elif found == delay and response.early > RESPONSE_ROUNDING:
         why = f"it has {_percent(response.early)} of its largest response before, counted as a model error"
     step = inverse_step(planned, found, ends, delay)
     return Feedforward(step, found, ends, delay, _unstable_zeros(response), _note(found, delay, why))
@@ -213,7 +213,7 @@ def inverse_step(function: ca.Function, ahead: int, limits: tuple[float, float],
     newton = u - error / (sign * slope)
     inside = ca.logic_and(newton >= below, newton <= above)  # false for nan
     following = ca.vertcat(ca.if_else(inside, newton, (below + above) / 2), below, above, whole[3:])
-    narrowed = ca.Function("narrowed", [whole], [following]).fold(STEPS)
+    narrowed = ca.Function("narrowed", [whole], [following]).fold(NEWTON_STEPS)
     x, before, wanted = ca.MX.sym("x", n), ca.MX.sym("u_before"), ca.MX.sym("wanted")
     ends = [reached(x, before, limit)[0] for limit in limits]
     begin = ca.vertcat(ca.fmin(ca.fmax(before, limits[0]), limits[1]), *limits)
@@ -235,8 +235,10 @@ def _output_ahead(function: ca.Function, ahead: int, delay: int) -> ca.Function:
 
 def _choose_look_ahead(run: Rollout, recording: Recording, response: Response, ahead: int | None) -> tuple[int, str]:
     """Check the look-ahead, or find the shortest stable one; also say why its inverse is approximate."""
-    if ahead is not None and not is_whole(ahead, 0, LONGEST):
-        raise InputError(f"A look-ahead of {ahead!r} samples was given; give a whole number from 0 to {LONGEST}.")
+    if ahead is not None and not is_whole(ahead, 0, LONGEST_PREVIEW):
+        raise InputError(
+            f"A look-ahead of {ahead!r} samples was given; give a whole number from 0 to {LONGEST_PREVIEW}."
+        )
     n = response.delay
     if n is None:
         raise InputError(
@@ -307,7 +309,7 @@ def _unstable_zeros(response: Response) -> Array:
 def _stability_limit(response: Response) -> float:
     """Return the largest spectral radius of a stable inverse: nearer to 1 for slow poles that zeros nearly cancel."""
     slowest = max(float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) for a, *_ in response.linear)
-    return max(STABLE, 1 - (1 - min(slowest, 1.0)) / 10)
+    return max(STABLE_RADIUS, 1 - (1 - min(slowest, 1.0)) / 10)
 
 
 def _explain_instability(response: Response, radius: float) -> str:
@@ -340,7 +342,7 @@ class Response:
 
     at: Array
     linear: tuple[tuple[Array, ...], ...]  # (A, B, C, D) of the linear states at each point, with the memory constant
-    markov: Array  # (SAMPLES,)
+    markov: Array  # (RESPONSE_SAMPLES,)
     errors: Array  # standard errors of these, nan where unknown
     delay: int | None  # samples after which the input reaches the output; None where it never does
     early: float  # largest Markov parameter before the delay at any of the points, over the largest median
@@ -361,16 +363,18 @@ class Response:
 def analyse_response(given: Any, run: Rollout, recording: Recording) -> Response:
     """Linearise a model of one input and one output along its run of a recording."""
     function, states = run.model.step, run.states
-    at = np.unique(np.linspace(min(1, len(recording) - 1), len(recording) - 1, POINTS).astype(int))
+    at = np.unique(np.linspace(min(1, len(recording) - 1), len(recording) - 1, LINEARISED_STATES).astype(int))
     slopes = jacobians_of(function)
     linear = tuple(_linear_blocks(slopes(states[:, k], recording.u[k]), run.linear) for k in at)
-    each = np.array([_markov(point, SAMPLES) for point in linear])
+    each = np.array([_markov(point, RESPONSE_SAMPLES) for point in linear])
     markov = np.median(np.abs(each), axis=0)
     typical = int(np.argmin(np.sum(np.abs(np.abs(each) - markov), axis=1)))
     point = states[:, at[typical]], recording.u[at[typical]]
-    errors = _markov_errors(given, recording, *point) if isinstance(given, Fit) else np.full(SAMPLES, np.nan)
+    errors = _markov_errors(given, recording, *point) if isinstance(given, Fit) else np.full(RESPONSE_SAMPLES, np.nan)
     largest = np.max(markov)
-    counts = markov > np.where(np.isnan(errors), UNKNOWN * largest, np.maximum(ERRORS * errors, SMALL * largest))
+    counts = markov > np.where(
+        np.isnan(errors), UNKNOWN * largest, np.maximum(COUNTED_ERRORS * errors, SMALL * largest)
+    )
     reached = largest > 1e-12 * np.ptp(recording.y) / max(float(np.ptp(recording.u)), 1e-300) and np.any(counts)
     delay = int(np.argmax(counts)) if reached else None
     early = float(np.max(np.abs(each[:, :delay]), initial=0.0) / largest) if reached else 0.0
@@ -400,7 +404,7 @@ def _markov_errors(fit: Fit, recording: Recording, state: Array, drive: Array) -
     try:
         problem = Problem(model, known, engine=fit.engine)
     except InputError:  # everything is fixed
-        return np.full(SAMPLES, np.nan)
+        return np.full(RESPONSE_SAMPLES, np.nan)
     x, u, p = ca.SX.sym("x", model.n_state), ca.SX.sym("u"), ca.SX.sym("p", parameters.size)
     blocks = [ca.densify(ca.jacobian(f, v)) for f in model.closed(x, u, p) for v in (x, u)]
     slopes = ca.Function("slopes", [x, u, p], blocks)
@@ -409,7 +413,8 @@ def _markov_errors(fit: Fit, recording: Recording, state: Array, drive: Array) -
         step = 1e-6 * max(abs(parameters.start[i]), 1e-3 * np.max(np.abs(parameters.start)))
         moved = [parameters.start + sign * step * (np.arange(parameters.size) == i) for sign in (1, -1)]
         up, down = (
-            _markov(_linear_blocks(slopes(state, drive, value), list(range(model.n_x))), SAMPLES) for value in moved
+            _markov(_linear_blocks(slopes(state, drive, value), list(range(model.n_x))), RESPONSE_SAMPLES)
+            for value in moved
         )
         derivatives.append((up - down) / (2 * step))
     spread = np.diag(variance(covariance(problem, problem.start, fit.structure), np.array(derivatives).T))

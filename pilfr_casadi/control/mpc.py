@@ -50,7 +50,7 @@ UNLIMITED_SHARE = 0.1  # of an output's range: the scale without limits, so that
 PROBE = 2.0  # u_scale from zero: the range of inputs over which an output's range is probed
 LARGEST, SMALLEST = 1e15, 1e-300  # limits and ranges beyond these count as unknown
 FIRST = 10  # times as many iterations for the first plan, which starts from a held input
-KEPT = 1e-5  # of y_scale: smaller violations of an output limit lie within the solver's tolerance
+LIMIT_TOLERANCE = 1e-5  # of y_scale: smaller violations of an output limit lie within the solver's tolerance
 SLACK_CURVATURE = 0.1  # Hessian of the slacks: makes the QP strictly convex, small against the price of 30
 QUIET = {"print_time": False, "error_on_fail": False}
 SQP = {
@@ -214,7 +214,7 @@ class PredictiveController:
                 u, cost, y = start, kept, y_kept
         self._plan = u
         beyond = task.beyond(y)
-        slack = float(np.max(beyond[beyond > KEPT * task.y_scale], initial=0.0))
+        slack = float(np.max(beyond[beyond > LIMIT_TOLERANCE * task.y_scale], initial=0.0))
         shaped = u.reshape(-1, n_u), y.reshape(-1, n_y)
         converged = converged and bool(np.isfinite(cost))
         return Plan(*shaped, cost, slack, perf_counter() - begin, converged, task.limited)

@@ -13,7 +13,7 @@ import numpy as np
 
 from .._base import InputError
 
-NOTHING = 0.99  # NRMSE above which a simulation is no better than a constant, whose NRMSE is 1
+CONSTANT_ERROR = 0.99  # NRMSE above which a simulation is no better than a constant, whose NRMSE is 1
 NOTHING_SENTENCE = "The model explains nothing of the training recordings: it is no better than a constant."
 
 
@@ -74,8 +74,8 @@ def nrmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> float:
 
 
 def explains_nothing(errors: Sequence[float]) -> bool:
-    """Tell whether the NRMSEs on all recordings are those of a constant, `NOTHING` or more."""
-    return bool(errors) and min(errors) >= NOTHING
+    """Tell whether the NRMSEs on all recordings are those of a constant, `CONSTANT_ERROR` or more."""
+    return bool(errors) and min(errors) >= CONSTANT_ERROR
 
 
 def _scored(y: np.ndarray, y_hat: np.ndarray, skip: int) -> tuple[np.ndarray, np.ndarray]:

@@ -5,8 +5,8 @@ With P periods the variance of one sample is `Σ (y_p - mean)² / (P - 1)`, and 
 (Pintelon & Schoukens 2012, chapter 2). This needs no knowledge of the system.
 
 Data held out prove nothing if their input is in the data that are fitted: a model that has memorised one period
-predicts the next. Two stretches of input are the same if the root mean square of their difference is at most `ALIKE` of
-their standard deviation.
+predicts the next. Two stretches of input are the same if the root mean square of their difference is at most
+`SAME_INPUT` of their standard deviation.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from .recording import Recording, as_recordings
 
 Array = np.ndarray
 
-ALIKE = 0.02  # rms difference over standard deviation of the same input; a measured input is never quite the same
+SAME_INPUT = 0.02  # rms difference over standard deviation of the same input; a measured input is never quite the same
 UNLIKE = 0.5  # the same ratio above which the stated period is wrong; two unrelated stretches give 1.4
 LARGEST_LAG = 2 / 3  # share of a recording: largest lag at which it is compared with itself
-STILL = 1e-9  # standard deviation over largest value up to which a channel counts as constant
+CONSTANT_CHANNEL = 1e-9  # standard deviation over largest value up to which a channel counts as constant
 
 
 def mean_period(recording: Recording) -> Recording:
@@ -97,7 +97,7 @@ def repeats_itself(recording: Recording) -> bool:
     size = float(u.shape[1])
     away = np.argmax(apart > size)  # a slow input resembles itself a moment later: the first lag where it does not
     last = int(LARGEST_LAG * m)
-    return bool(away and away < last and np.min(apart[away : last + 1]) <= ALIKE**2 * size)
+    return bool(away and away < last and np.min(apart[away : last + 1]) <= SAME_INPUT**2 * size)
 
 
 def keeps_its_period(recording: Recording) -> bool:
@@ -134,20 +134,20 @@ def group_by_input(recordings: Sequence[Recording]) -> list[list[int]]:
 def _contains(u: Array, wanted: Array) -> bool:
     """Tell whether a stretch (L, n_u) that is not constant is contained in an input (M, n_u)."""
     middle, size = wanted.mean(axis=0), wanted.std(axis=0)
-    moving = size > STILL * np.max(np.abs(u), initial=1e-300)
+    moving = size > CONSTANT_CHANNEL * np.max(np.abs(u), initial=1e-300)
     if len(u) < len(wanted) or not np.any(moving):
         return False
     a, b = ((x - middle)[:, moving] / size[moving] for x in (wanted, u))
     power = np.concatenate([[0.0], np.cumsum(np.sum(b**2, axis=1))])
     lags = len(u) - len(a) + 1
     apart = np.sum(a**2) + power[len(a) :] - power[:lags] - 2 * _correlate(b, a)[:lags]
-    return bool(np.min(apart) <= ALIKE**2 * a.size)
+    return bool(np.min(apart) <= SAME_INPUT**2 * a.size)
 
 
 def _standardise(u: Array) -> Array | None:
     """Return the channels that vary, (M, n), with mean 0 and standard deviation 1; None where none does."""
     size = u.std(axis=0)
-    moving = size > STILL * np.max(np.abs(u), axis=0, initial=1e-300)
+    moving = size > CONSTANT_CHANNEL * np.max(np.abs(u), axis=0, initial=1e-300)
     return (u - u.mean(axis=0))[:, moving] / size[moving] if np.any(moving) else None
 
 

@@ -24,7 +24,7 @@ Array = np.ndarray
 TRENDS = ("constant", "linear")
 FILTERS = ("lowpass", "highpass", "bandpass", "bandstop")
 LARGEST_FACTOR = 1000  # numerator and denominator up to which a change of step is a ratio of whole numbers
-EXACT = 1e-9  # relative error of that ratio, far below a sample over the longest recordings
+RATIO_ERROR = 1e-9  # relative error of that ratio, far below a sample over the longest recordings
 PASSED = 0.8  # share of the new Nyquist frequency that an anti-alias filter passes: the rest is its transition
 ORDER = 8  # order of the Butterworth filter before a step that is no ratio of whole numbers
 LONGEST_GAP = 10  # usual steps; over a longer gap interpolated samples would be an invention
@@ -95,12 +95,12 @@ def change_step(values: Array, dt: float, step: float) -> Array:
     spline. The first sample stays the first.
     """
     ratio = Fraction(dt / step).limit_denominator(LARGEST_FACTOR)
-    count = int(np.floor((len(values) - 1) * dt / step * (1 + EXACT))) + 1
+    count = int(np.floor((len(values) - 1) * dt / step * (1 + RATIO_ERROR))) + 1
     if count < 2:
         raise InputError(
             f"a step of {step:g} s leaves {count} sample of {(len(values) - 1) * dt:g} s; give a shorter one."
         )
-    if ratio.numerator in range(1, LARGEST_FACTOR + 1) and abs(float(ratio) * step / dt - 1) < EXACT:
+    if ratio.numerator in range(1, LARGEST_FACTOR + 1) and abs(float(ratio) * step / dt - 1) < RATIO_ERROR:
         if ratio == 1:
             return values
         from scipy.signal import resample_poly
@@ -114,7 +114,7 @@ def sample_at(values: Array, dt: float, times: Array, step: float) -> Array:
     """Sample every column of (M, n) at times in s after its first sample, for a later step of `step` seconds."""
     from scipy.interpolate import CubicSpline
 
-    if step > dt * (1 + EXACT):
+    if step > dt * (1 + RATIO_ERROR):
         values = _zero_phase(values, dt, PASSED * 0.5 / step, "lowpass", ORDER)
     known = np.arange(len(values)) * dt
     return np.asarray(CubicSpline(known, values, axis=0)(np.clip(times, 0.0, known[-1])))
@@ -141,7 +141,7 @@ def even_grid(t: Array, values: Array, step: float, label: str) -> Array:
             f"{label} has a gap of {gaps[worst]:.3g} s after {t[worst]:.6g} s, where {usual:.3g} s is usual; cut the "
             "record there into two."
         )
-    fine = step / max(int(np.ceil(step / usual - EXACT)), 1)
-    grid = t[0] + np.arange(int(np.floor((t[-1] - t[0]) / fine * (1 + EXACT))) + 1) * fine
+    fine = step / max(int(np.ceil(step / usual - RATIO_ERROR)), 1)
+    grid = t[0] + np.arange(int(np.floor((t[-1] - t[0]) / fine * (1 + RATIO_ERROR))) + 1) * fine
     even = np.column_stack([np.interp(grid, t, column) for column in values.T])
     return change_step(even, fine, step)

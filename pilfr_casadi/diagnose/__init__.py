@@ -37,7 +37,11 @@ if TYPE_CHECKING:
     from ..laws import Law
     from .blind_spots import BlindSpot as BlindSpot, Check as Check, check as check
     from .evidence import SURE as SURE
-    from .force_recovery import HiddenForce as HiddenForce, hidden_force as hidden_force
+    from .force_recovery import (
+        HiddenForce as HiddenForce,
+        hidden_force as hidden_force,
+        law_signals as law_signals,
+    )
     from .gates import Gate as Gate
     from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
     from .mismatch_map import mismatch as mismatch
@@ -54,7 +58,7 @@ if TYPE_CHECKING:
         replicate as replicate,
     )
     from .result import (
-        STEPS as STEPS,
+        ERROR_NAMES as ERROR_NAMES,
         BeforeAfter as BeforeAfter,
         Diagnosis as Diagnosis,
         Effect as Effect,

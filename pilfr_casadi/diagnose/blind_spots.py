@@ -21,7 +21,7 @@ from ..laws import LINEAR, Law, display_name
 from ..simulators import in_series
 from .floor import ABOVE_NOISE, Floor, noise_floor
 from .identifiability import (
-    TENTH,
+    SMALL_SHARE,
     LawRow,
     ParameterRow,
     Sensitivity,
@@ -41,7 +41,7 @@ LEAST_NOISE = 1e-6  # least noise assumed, as a share of the output's deviation:
 # mean square error over the outputs' power above which the linearisation may be far from the machine: the simulator
 # then explains less of the outputs than it misses
 ROUGH = 0.5
-SMALLEST_SWING = TENTH / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
+SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
 
 IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the blind spot
     "identifiable": ("yes", ""),
@@ -379,7 +379,7 @@ def _followed_laws(found: Check, port: str) -> Iterator[BlindSpot]:
     followed = [r for r in found.laws if r.port == port and r.status == "followed" and r.law not in LINEAR]
     for why in dict.fromkeys(r.why for r in followed):
         own = tuple(r.law for r in followed if r.why == why)
-        what = f"a change of {why}" if any(why == p.name for p in found.parameters) else why
+        what = _describe_change(why) if any(why == p.name for p in found.parameters) else why
         names = in_words([display_name(name) for name in own])
         text = f"{names[0].upper()}{names[1:]} at {port} cannot be distinguished from {what}."
         yield BlindSpot("followed", (port, *own), text)
@@ -442,7 +442,8 @@ def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator
             turns = _turning_points(z, least)
             reversals += max(len(turns) - 2, 0)
             swings += np.abs(np.diff(z[turns])).tolist()
-            rests += _rests(z, least, 2 * float(np.median(np.diff(turns))) if len(turns) > 2 else TENTH * len(z))
+            longest = 2 * float(np.median(np.diff(turns))) if len(turns) > 2 else SMALL_SHARE * len(z)
+            rests += _rests(z, least, longest)
         unit = port_units(port, bench.recordings[0])[1]
         yield Excitation(port.name, travel, unit, reversals, _distinct(np.array(swings)), rests)
 
@@ -467,13 +468,13 @@ def _distinct(swings: np.ndarray) -> int:
     if not len(swings):
         return 0
     left, counts = np.sort(swings)[::-1], list[int]()
-    apart = TENTH * float(left[0])
+    apart = SMALL_SHARE * float(left[0])
     while len(left):
         own = left > left[0] - apart
         counts.append(int(np.sum(own)))
         left = left[~own]
     share = np.cumsum(sorted(counts, reverse=True)) / sum(counts)
-    return int(np.searchsorted(share, 1 - TENTH - 1e-9) + 1)
+    return int(np.searchsorted(share, 1 - SMALL_SHARE - 1e-9) + 1)
 
 
 def _rests(z: np.ndarray, least: float, samples: float) -> int:
@@ -485,3 +486,9 @@ def _rests(z: np.ndarray, least: float, samples: float) -> int:
             count += k - begin > samples
             begin, low, high = k, value, value
     return count
+
+
+def _describe_change(parameter: str) -> str:
+    """Describe a change of a parameter, or of the constant that a check has added at a channel."""
+    port, _, name = parameter.rpartition(".")
+    return f"an offset of {port.partition(':')[2]}" if name == "w_0" and ":" in port else f"a change of {parameter}"

@@ -20,7 +20,7 @@ import numpy as np
 from .._base import InputError
 from ..laws import CATALOGUE, display_name
 from ..simulators import Placed
-from .evidence import FORMULA, SURE, HeldOut
+from .evidence import FORMULA_ERROR, SURE, HeldOut
 from .learned import Learned, LearnedForce, describe_learned, refit_learned
 from .search import Search, likeliest
 from .trials import Trial
@@ -120,7 +120,7 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     deadline nothing more is fitted.
     """
     best_laws = answer.best
-    if named and answer.sure > SURE and explainable_remainder(search, best_laws) < FORMULA:
+    if named and answer.sure > SURE and explainable_remainder(search, best_laws) < FORMULA_ERROR:
         return named_correction(search, best_laws.fitted), best_laws.fitted
     refitted = _predict(search, [_make_candidate(search, search.root)], [])
     tried = [search.thorough(best_laws)] if named else _hypotheses_with_laws(search)

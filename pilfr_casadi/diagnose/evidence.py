@@ -50,36 +50,39 @@ EFFECT_PRIOR = np.log(0.5)  # log probability of each further effect: one more e
 FLEXIBLE_PRIOR = np.log(0.2)  # the same of a law that can imitate others, relative to a law that cannot
 DOUBTFUL_PRIOR = np.log(0.01)  # the same of parameter values at which a law degenerates into another
 DOMAIN_PRIOR = np.log(4.0)  # the same of a law that belongs to the domain of its port, relative to a general one
-OUTSIDE = 0.1  # probability that missing physics is in no law of the catalogue
+OUTSIDE_CATALOGUE = 0.1  # probability that missing physics is in no law of the catalogue
 STATE_PRIOR = 1e-9  # precision of initial states relative to the information of a sample: hardly any prior
 
 # Model error: no machine follows a formula exactly
-FORMULA = 1e-3  # share of a mismatch that the right explanation may leave: 3 % of its force
-EXACT = 8.0  # effective samples of a model whose whole error is model error (n_0)
-LEAST_WRONG = 0.05  # least share of the error that counts as model error
-WRONG = 0.2  # share of model error in the error above which models are judged on held-out blocks
-DISTURBED = 0.2  # weight of a law's remainder that no force at a port explains: a disturbance may act beside the law
-INPUT_FACTOR = 0.7  # factor on the inputs for which the spread is computed: well inside the recorded range
+FORMULA_ERROR = 1e-3  # share of a mismatch that the right explanation may leave: 3 % of its force
+WRONG_MODEL_SAMPLES = 8.0  # effective samples of a model whose whole error is model error (n_0)
+LEAST_MODEL_ERROR = 0.05  # least share of the error that counts as model error
+LARGE_MODEL_ERROR = 0.2  # share of model error in the error above which models are judged on held-out blocks
+DISTURBANCE_WEIGHT = 0.2  # of a law's remainder that no force at a port explains: a disturbance may act beside the law
+INPUT_FACTOR = 0.7  # factor on the inputs' deviation for which the spread is computed: well inside their range
 
 # Comparison of hypotheses
 SURE = 0.5  # probability above which an answer is stated: it is more likely than not
-ALIKE = 3.0  # nats within which two hypotheses are indistinguishable: odds of 20 (Kass & Raftery 1995)
-REACH = 8.0  # nats below the best within which a hypothesis may still win after more fits
-BETTER = 1.05  # ratio of rms errors from which one is better than another
-NEAR = 1.5  # ratio of rms errors within which one comes near another: more fits may reverse their order
-FAR = 3.0  # ratio of rms errors from which one is far behind another: more fits cannot reverse their order
-AS_GIVEN = 0.5  # largest ratio of mean squares of a search with channels as given to one with shifted channels
+INDISTINGUISHABLE_NATS = 3.0  # nats within which two hypotheses are indistinguishable: odds of 20 (Kass & Raftery 1995)
+CONTENDING_NATS = 8.0  # nats below the best within which a hypothesis may still win after more fits
+BETTER_RATIO = 1.05  # ratio of rms errors from which one is better than another
+NEAR_RATIO = 1.5  # ratio of rms errors within which one comes near another: more fits may reverse their order
+FAR_RATIO = 3.0  # ratio of rms errors from which one is far behind another: more fits cannot reverse their order
+AS_GIVEN_RATIO = 0.5  # largest ratio of mean squares of a search with channels as given to one with shifted channels
 
 # Noise, by rms ratios to the noise and by shares of an output's deviation
-AT_FLOOR = 1.15  # ratio to the noise that counts as at the noise
-SOMEWHAT, COLOURED = 4.0, 9.0  # largest ratio to the estimated (white) noise; the same if no force explains the error
-LOUDEST, QUIET = 0.05, 0.01  # shares of the deviation: above, an error is not sensor noise; below, it does not matter
-SILENT, CHANCE = 0.01, 0.05  # largest share of noise that a force may explain; the same of noise that does not matter
-HINT = 0.1  # least share of a residual that a flexible force has to explain to count
+AT_NOISE_RATIO = 1.15  # ratio to the noise that counts as at the noise
+WHITE_NOISE_RATIO = 4.0  # largest ratio of an error that is noise to the estimated (white) noise
+COLOURED_NOISE_RATIO = 9.0  # the same if no force explains the error
+LOUDEST_NOISE = 0.05  # share of the deviation above which an error is not sensor noise
+NEGLIGIBLE_ERROR = 0.01  # share of the deviation below which an error does not matter
+EXPLAINED_NOISE = 0.01  # largest share of noise that a force may explain
+EXPLAINED_QUIET_NOISE = 0.05  # the same of noise that does not matter
+LEAST_EXPLAINED = 0.1  # least share of a residual that a flexible force has to explain to count
 
 # Held-out data
 FOLDS, ROUNDS = 4, 2  # folds, and blocks of a recording in each fold: eight blocks, spread over the recording
-LEAD = 0.5  # share of a block that is never held out at the start of a recording: it determines the initial state
+LEAD_SHARE = 0.5  # share of a block that is never held out at the start of a recording: it determines the initial state
 # The fit to all blocks is near each of these fits; a fit that has not converged after so many steps is used as it is.
 REFIT = GaussNewton(max_iterations=8, tolerance=1e-2, patience=2)
 
@@ -93,8 +96,8 @@ class Sample:
 
     def effective(self, v: float) -> float:
         """Compute the effective samples n if the best hypothesis leaves the mean square error v."""
-        wrong = float(np.clip(1 - self.noise2 / max(v, 1e-300), LEAST_WRONG, 1.0))
-        return EXACT * self.count / (EXACT + wrong * self.count)
+        wrong = float(np.clip(1 - self.noise2 / max(v, 1e-300), LEAST_MODEL_ERROR, 1.0))
+        return WRONG_MODEL_SAMPLES * self.count / (WRONG_MODEL_SAMPLES + wrong * self.count)
 
 
 def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
@@ -122,16 +125,18 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
 def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n: float) -> float:
     """Compute the mean square uncertainty of predictions for other inputs, in units of the outputs' variance.
 
-    The other inputs are the recorded ones times INPUT_FACTOR. The parameters have the covariance (n H / v + P)^-1 of
-    Laplace's approximation, with H the Fisher information of a sample and P the precision of the prior. With H' the
-    information of a sample for the other inputs, the spread is tr(H' (n H / v + P)^-1). Initial states are among the
-    parameters, because the two may make up for each other. The spread reveals parameters that the recordings hardly
-    determine, such as a curve of a pressure that had two levels; a cross-validation on the same recordings cannot.
+    The other inputs are the recorded ones, their deviation from the mean times INPUT_FACTOR. The parameters have the
+    covariance (n H / v + P)^-1 of Laplace's approximation, with H the Fisher information of a sample and P the
+    precision of the prior. With H' the information of a sample for the other inputs, the spread is
+    tr(H' (n H / v + P)^-1). Initial states are among the parameters, because the two may make up for each other. The
+    spread reveals parameters that the recordings hardly determine, such as a curve of a pressure that had two levels; a
+    cross-validation on the same recordings cannot.
     """
     if not np.any(fitted.model.parameters.free):
         return 0.0
     problem, _, recorded = _hessian(bench, fitted)
-    *_, other = _hessian(bench.on([r.with_(u=INPUT_FACTOR * r.u) for r in bench.recordings]), fitted)
+    smaller = [r.with_(u=r.u + (INPUT_FACTOR - 1) * (r.u - np.mean(r.u, axis=0))) for r in bench.recordings]
+    *_, other = _hessian(bench.on(smaller), fitted)
     free = int(problem.free.sum())
     if not (np.all(np.isfinite(recorded)) and np.all(np.isfinite(other))):
         return np.inf
@@ -298,7 +303,7 @@ def blocks_of(bench: Workbench) -> list[np.ndarray]:
     """Return the number of each sample's block, (M,) for each recording; -1 for samples in no block."""
     out = []
     for r in bench.recordings:
-        lead = int(LEAD * (len(r) - r.skip) / (FOLDS * ROUNDS)) if r.begins == "estimate" else 0
+        lead = int(LEAD_SHARE * (len(r) - r.skip) / (FOLDS * ROUNDS)) if r.begins == "estimate" else 0
         numbers, begin = np.full(len(r), -1), r.skip + lead
         numbers[begin:] = np.arange(len(r) - begin) * FOLDS * ROUNDS // max(len(r) - begin, 1)
         out.append(numbers)

@@ -7,9 +7,9 @@ faults that a refit can confirm take the same steps.
    orthonormal directions that parameters and initial states can follow, an error e leaves `e - base baseᵀ e`.
 2. Correct the fault and refit (`correct`). If the fault has a size or a place, relocate and refit in turn (`settle`).
 3. Accept the fault by one rule (`accept`). The gain in log evidence has to exceed the BIC cost of the parameters
-   (Schwarz 1978) by the prior odds against a fault, `LEAST_GAIN`, and at most the share `CURED` of the mean square
-   error may be left: other physics hardly mimics a fault so closely. If the recordings as given are followed from the
-   corrected refit's values so well that the rule no longer holds, there is no fault.
+   (Schwarz 1978) by the prior odds against a fault, `LEAST_GAIN`, and at most the share `CURED_SHARE` of the mean
+   square error may be left: other physics hardly mimics a fault so closely. If the recordings as given are followed
+   from the corrected refit's values so well that the rule no longer holds, there is no fault.
 
 The faults of whole channels are sign, unit or gain, exchange, unit of time, and offset.
 """
@@ -39,16 +39,16 @@ from .workbench import QUICK, THOROUGH, Fitted, Workbench
 Change = Callable[[Recording], Recording]
 
 LEAST_GAIN = 12.0  # least gain of a correction beyond the BIC cost of its parameters, in nats: odds of about 1e5
-CERTAIN = (2 * LEAST_GAIN) ** 0.5  # the same in standard errors of one parameter
-CURED = 0.25  # largest share of the mean square that the correction of a fault leaves: it halves the error
-USELESS_FIT = CURED  # the same share of the outputs' variance: a worse refit says nothing
+CERTAIN_ERRORS = (2 * LEAST_GAIN) ** 0.5  # the same in standard errors of one parameter
+CURED_SHARE = 0.25  # largest share of the mean square that the correction of a fault leaves: it halves the error
+USELESS_FIT = CURED_SHARE  # the same share of the outputs' variance: a worse refit says nothing
 POOR_FIT = 0.04  # share of the outputs' variance from which a refit may be in a wrong minimum
-CLEARLY = 0.8  # share left by an edit that is clearly better than another edit, or than none
-RARE = 0.02  # share of a mean square, or of the samples, up to which something is an exception
-SAME = 1.02  # ratio of errors that count as equal
-AT_NOISE = 5.0  # rms error over the noise up to which nothing else is wrong
-STILL = 0.1  # share of its first value that an offset must keep beside effects to be reported
-TURNS = 8  # alternations of edit and refit at most
+CLEARLY_BETTER = 0.8  # share left by an edit that is clearly better than another edit, or than none
+EXCEPTION_SHARE = 0.02  # share of a mean square, or of the samples, up to which something is an exception
+EQUAL_RATIO = 1.02  # ratio of errors that count as equal
+NEAR_NOISE_RATIO = 5.0  # rms error over the noise up to which nothing else is wrong
+KEPT_OFFSET = 0.1  # share of its first value that an offset must keep beside effects to be reported
+MOST_ROUNDS = 8  # alternations of edit and refit at most
 
 # metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
 UNITS = (1e3, 1e6, 1e2, 180 / np.pi, 9.80665, 30 / np.pi, 3.6, 1e5, 60.0, 4.4482216, 25.4, 1 / 0.0254, 6894.757)
@@ -57,9 +57,9 @@ FAHRENHEIT = (1.8, 1 / 1.8)  # Fahrenheit's zero differs as well: this unit come
 # factors on the time: ms, minutes, µs, hours, and the reverse of the first two
 TIME_UNITS = (1e-3, 1 / 60, 1e-6, 1 / 3600, 60.0, 1e3)
 SIZE_RATIO = 6.0  # a factor is tried if it brings the simulated size within this ratio of the measured one
-BENT = 0.3  # share of the parameters at their bounds above which a refit does not confirm a unit of time
+MOST_AT_BOUNDS = 0.3  # share of the parameters at their bounds above which a refit does not confirm a unit of time
 # first refit of each trial, only to discard hopeless ones
-GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
+FIRST_REFIT = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Gate:
 
     # for the rule: parameters that the correction adds, the largest share that it may leave, and how it is described
     parameters: ClassVar[int] = 0
-    most_left: ClassVar[float] = CURED
+    most_left: ClassVar[float] = CURED_SHARE
     remedy: ClassVar[str] = "with it corrected"
 
     def to_dict(self) -> dict[str, Any]:
@@ -205,7 +205,7 @@ def settle(now: Checked, fault: G, solver: GaussNewton = QUICK) -> tuple[G, Chec
     """Refit and relocate a fault in turn until it stays, because a refit without it may be in a wrong minimum."""
     best: tuple[G, Checked] | None = None
     previous = now.fitted
-    for _ in range(TURNS):
+    for _ in range(MOST_ROUNDS):
         after = correct(now, fault, [previous.values, {}], fault.begin(previous), solver)
         if after is None:
             break
@@ -223,8 +223,8 @@ def settle(now: Checked, fault: G, solver: GaussNewton = QUICK) -> tuple[G, Chec
 def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
     """Return the corrected state with its finding if the rule accepts the fault, else the state before.
 
-    If the recordings as given are followed as well from the corrected refit's values, the correction only led the refit
-    out of a local minimum; that refit is returned.
+    The simulator is also refitted to the recordings as given, from the corrected refit's values. If that follows as
+    well, the correction only led the refit out of a local minimum, and that refit is returned.
     """
     if after is None or not _satisfies_rule(now, after, fault):
         return now
@@ -233,7 +233,7 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
         return now.then(now.bench, back)
     sentence = f"{fault.sentence}; {fault.remedy} {describe_fall(now.cost, after.cost)}"
     noises = (after.cost / max(now.noise2, 1e-300)) ** 0.5
-    if noises > AT_NOISE:
+    if noises > NEAR_NOISE_RATIO:
         sentence += f", still {noises:.2g} times the noise: more is wrong"
     told = replace(fault, sentence=f"{sentence}.", fault=True, left=after.cost / now.cost)
     return now.then(after.bench, after.fitted, told)
@@ -242,6 +242,36 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
 def _satisfies_rule(now: Checked, after: Checked, fault: Gate) -> bool:
     gained = gain(now.cost, after.cost, after.fitted.residual, fault.parameters)
     return gained > LEAST_GAIN and after.cost < min(fault.most_left * now.cost, USELESS_FIT)
+
+
+@dataclass(frozen=True)
+class WrongStart(Gate):
+    """Initial states that are not as stated."""
+
+    remedy: ClassVar[str] = "with them estimated"
+
+
+def find_wrong_start(now: Checked) -> Checked:
+    """Estimate the initial states if the stated ones contradict the first samples and no constant explains it as well.
+
+    A first sample depends on no dynamics: missing physics cannot contradict it.
+    """
+    both = zip(now.bench.recordings, now.fitted.residual, strict=True)
+    stated = [(r, e[0]) for r, e in both if r.begins in ("zero", "given")]
+    unknown = len(stated) * len(now.bench.simulator.states)
+    if not any(np.any(np.abs(first) > CERTAIN_ERRORS * now.floor.deviation) for _, first in stated) or not unknown:
+        return now
+    words = "The initial states are not as stated"
+    fault = WrongStart("initial state", "start", stated[0][0].begins, words, change=_with_unknown_start)
+    after = correct(now, fault, [now.fitted.values, {}])
+    if after is None or gain(now.cost, after.cost, after.fitted.residual, unknown) < LEAST_GAIN:
+        return now
+    found = accept(now, after, fault)
+    return found if found.cost * EQUAL_RATIO < find_offsets(now).cost else now
+
+
+def _with_unknown_start(r: Recording) -> Recording:
+    return r.with_(initial="estimate") if r.begins in ("zero", "given") else r
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,7 +398,7 @@ def find_slips(now: Checked, workers: int) -> Checked:
         factors = [f for f in (-1.0, *FACTORS, *FAHRENHEIT) if f < 0 or near("y", [i], f)]
         faults = [scale_channels("y", bench.simulator.output_names, [i], f, " and an offset") for f in factors]
         beside = _accept_best(level, faults, workers)
-        if len(beside.gates) > len(now.gates) and beside.cost < CURED * found.cost:
+        if len(beside.gates) > len(now.gates) and beside.cost < CURED_SHARE * found.cost:
             found = replace(beside, bench=replace(beside.bench, simulator=bench.simulator))
     return found
 
@@ -412,18 +442,18 @@ def _accept_best(now: Checked, faults: Sequence[Gate], workers: int) -> Checked:
     for fault, after in zip(faults, side_by_side(partial(_try, now), faults, workers), strict=True):
         # for a linear simulator, a unit of all outputs is equivalent to a unit of its input, or of its only output
         joint = fault.finding == "unit" and "," in fault.channel
-        if after is not None and (best is None or after.cost < (CLEARLY if joint else 1 - 1e-6) * best[1].cost):
+        if after is not None and (best is None or after.cost < (CLEARLY_BETTER if joint else 1 - 1e-6) * best[1].cost):
             best = fault, after
     return now if best is None else accept(now, best[1], best[0])
 
 
 def _try(now: Checked, fault: Gate) -> Checked | None:
     """Correct a fault and refit from the user's values; None if it is hopeless."""
-    glanced = correct(now, fault, solver=GLANCE)
+    glanced = correct(now, fault, solver=FIRST_REFIT)
     if glanced is None or not glanced.cost < now.cost:
         return None
     after = correct(now, fault, [{}, glanced.fitted.values], glanced.fitted.begin)
-    bent = fault.finding == "time-unit" and after is not None and after.fitted.at_bounds > BENT
+    bent = fault.finding == "time-unit" and after is not None and after.fitted.at_bounds > MOST_AT_BOUNDS
     return None if bent else after
 
 
@@ -488,7 +518,7 @@ def find_offsets(now: Checked) -> Checked:
     while ports:
         share = share_of_constants(now.bench, now.fitted, ports)
         port = max(share, key=lambda name: share[name])
-        if share[port] < RARE:
+        if share[port] < EXCEPTION_SHARE:
             break
         after = correct(now, constant_at(port), [now.fitted.values], now.fitted.initial, THOROUGH)
         if after is None:
@@ -498,7 +528,7 @@ def find_offsets(now: Checked) -> Checked:
         if now.bench is before.bench:
             break
         ports.remove(port)
-    fault = now.cost < CURED * begin.cost
+    fault = now.cost < CURED_SHARE * begin.cost
     # a constant load acts alike, so that the share that is left does not prove a fault
     found = (replace(g, fault=fault, left=1.0) for g in now.gates[len(begin.gates) :])
     return begin.then(now.bench, now.fitted, *found)
@@ -536,6 +566,14 @@ def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
     return fitted
 
 
+def without_zero_offsets(simulator: Simulator) -> Simulator:
+    """Return a simulator without the offsets that are fixed at zero."""
+    for i, e in reversed(list(enumerate(simulator.elements))):
+        if isinstance(e.law, Offset) and np.all(simulator.parameters[f"{e.prefix}w_0"].fixed):
+            simulator = simulator.without_element(i)
+    return simulator
+
+
 def final_gates(
     gates: Sequence[Gate], after: Fitted, std: Mapping[str, np.ndarray], effects: bool, sure: bool
 ) -> tuple[Gate, ...]:
@@ -547,8 +585,8 @@ def final_gates(
             out.append(gate)
             continue
         remaining = fitted[gate.parameter]
-        certain = abs(remaining.value) > CERTAIN * float(std[gate.parameter])
-        if not (certain and abs(remaining.value) > STILL * abs(gate.value)):
+        certain = abs(remaining.value) > CERTAIN_ERRORS * float(std[gate.parameter])
+        if not (certain and abs(remaining.value) > KEPT_OFFSET * abs(gate.value)):
             continue
         sentence = remaining.sentence if effects else gate.sentence  # fitted without the effects, it says little
         if not sure:

@@ -34,11 +34,11 @@ from .screen import Remainder, Task, lengths, orthonormal, own_changes, project_
 from .workbench import Fitted, Workbench
 
 LARGEST_EXPONENT = 3  # in numerators and denominators; physical laws have small exponents
-STEP = 1.1  # factor of a trial step that tells a product from a sum; they differ by a twentieth of the step
-SAME = 0.01  # share of a change that counts as zero: steps along any other curve leave more
-DETECTED = 3.29  # standard errors: 5 % false alarms and 5 % misses (Currie 1968)
-TENTH = 0.1  # share of an effect; real machines follow a catalogue formula no more closely than this
-FOLLOWED = TENTH**2  # share of a response below which a remainder comes from holding forces over samples
+TRIAL_FACTOR = 1.1  # factor of a trial step that tells a product from a sum; they differ by a twentieth of the step
+ZERO_SHARE = 0.01  # share of a change that counts as zero: steps along any other curve leave more
+DETECTION_ERRORS = 3.29  # standard errors: 5 % false alarms and 5 % misses (Currie 1968)
+SMALL_SHARE = 0.1  # of an effect: real machines follow a catalogue formula no more closely
+HOLD_REMAINDER = SMALL_SHARE**2  # share of a response below which a remainder comes from holding forces
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ def _groups(scaled: np.ndarray) -> list[list[int]]:
         if len(_undetermined(scaled[:, others])) == len(free):
             members = others
     free = _undetermined(scaled[:, members])
-    count, group = connected_components(np.abs(free.T @ free) > SAME, directed=False)
+    count, group = connected_components(np.abs(free.T @ free) > ZERO_SHARE, directed=False)
     return [[j for j, own in zip(members, group, strict=True) if own == k] for k in range(count)]
 
 
@@ -226,7 +226,7 @@ def _only_as(response: Sensitivity, group: np.ndarray) -> tuple[str, ...]:
             change = _finite_change(response, group, rows, write is _monomial)
             found.append((change, tuple(write(names, row) for row in rows)))
     change, best = min(found, default=(np.inf, ()))
-    return best if change < SAME else ()
+    return best if change < ZERO_SHARE else ()
 
 
 def _whole(columns: np.ndarray, span: np.ndarray) -> np.ndarray | None:
@@ -296,11 +296,11 @@ def _finite_change(response: Sensitivity, group: np.ndarray, rows: np.ndarray, l
     """
     bench, fitted, value = response.bench, response.fitted, response.values[group]
     direction, alone = _complement(rows)[0], np.eye(len(group))[0]
-    step = (STEP - 1) * np.min(np.abs(value))
+    step = (TRIAL_FACTOR - 1) * np.min(np.abs(value))
     sizes = []
     for way in (direction / np.max(np.abs(direction)), alone):
         vector = fitted.vector.copy()
-        vector[response.places[group]] = value * STEP**way if logarithmic else value + step * way
+        vector[response.places[group]] = value * TRIAL_FACTOR**way if logarithmic else value + step * way
         values = fitted.model.parameters.unpack(vector)
         there = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model)
         if not np.isfinite(there.cost):
@@ -421,12 +421,12 @@ def _at_port(
     for law, doses in rest.doses(task):
         left = [project_off(d.phi, base) for d in doses]
         for phi, d in zip(left, doses, strict=True):
-            phi[:, lengths(phi) < FOLLOWED * lengths(d.phi)] = 0.0
+            phi[:, lengths(phi) < HOLD_REMAINDER * lengths(d.phi)] = 0.0
         sizes = np.array([lengths(phi).max() for phi in left])
         shapes = np.flatnonzero(sizes) if np.any(sizes) else np.arange(len(sizes))
         middle = int(shapes[np.argsort(sizes[shapes], kind="stable")[len(shapes) // 2]])
         dose, size = doses[middle], float(sizes[middle])
-        force = DETECTED / size if size > 0 else None
+        force = DETECTION_ERRORS / size if size > 0 else None
         share = force / level if force and level else None
         row = LawRow(task.port.name, law.id, "detectable", force, w_unit, share)
         if force is None or force > most:
@@ -443,10 +443,10 @@ def _undetectable(row: LawRow, phi: np.ndarray, most: float, own: np.ndarray, na
     """Say why a law is not detectable: it is weak at the largest local force, or own parameters imitate it."""
     response = phi[:, np.argmax(lengths(phi))]
     size = float(np.linalg.norm(response))
-    if size == 0 or size * most < DETECTED:
+    if size == 0 or size * most < DETECTION_ERRORS:
         return replace(row, status="weak")
     cosines = np.abs(response @ own) / np.maximum(lengths(own), 1e-300)
-    alike = np.max(cosines, initial=0.0) > TENTH
+    alike = np.max(cosines, initial=0.0) > SMALL_SHARE
     return replace(row, status="followed", why=names[int(np.argmax(cosines))] if alike else "the unknown start")
 
 
@@ -458,7 +458,7 @@ def _classes(responses: list[_Response]) -> tuple[tuple[tuple[str, str], ...], .
     whole = np.column_stack([r.left / max(np.linalg.norm(r.left), 1e-300) for r in order])
     explained = np.array([np.max([np.sum((q.T @ whole) ** 2, axis=0) for q in r.spans], axis=0) for r in order])
     missed = np.sqrt(np.maximum(1 - explained, 0.0))
-    alike = (missed < TENTH) | (missed * [r.most for r in order] < DETECTED)
+    alike = (missed < SMALL_SHARE) | (missed * [r.most for r in order] < DETECTION_ERRORS)
     groups = group_alike(range(len(order)), lambda i, j: bool(alike[i, j] and alike[j, i]))
     return tuple(tuple(order[i].name for i in group) for group in groups if len(group) > 1)
 
@@ -494,13 +494,12 @@ def port_units(port: Port, recording: Recording) -> tuple[str, str]:
 
 @one_at_a_time
 def _local_levels(bench: Workbench, fitted: Fitted, runs: list[Run]) -> list[float | None]:
-    """Compute the largest rms of the simulator's own terms in the equation of each port of `all_ports`.
+    """Compute the largest deviation of a term in the equation of each port of `all_ports`, in the force's unit.
 
-    A term is the equation's derivative with respect to a state or input, times that signal's deviation from its mean.
-    For a port in series it is the signal's own deviation. Ports where nothing moves have None.
+    Terms are the summands of the equation as it is written, such as the force of a spring. For a port in series it is
+    the deviation of the signal. Ports where nothing moves have None.
     """
     simulator, z, at = bench.simulator, np.concatenate([r.z for r in runs]), along(bench, fitted)
-    swing = np.hstack([v - v.mean(axis=0) for v in at])
     own = simulator.parameter_set
     values = own.pack({k: v for k, v in fitted.values.items() if k in own})
     symbols = x, u, p, _ = (*simulator.symbols()[:3], ca.SX(0))
@@ -512,11 +511,24 @@ def _local_levels(bench: Workbench, fitted: Fitted, runs: list[Run]) -> list[flo
         if port.series:
             value = float(np.std(z[:, j]))
         else:
-            into = simulator.into(port, *symbols)
-            slopes = ca.jacobian(ca.vertcat(*(equations[name] for name in into)), ca.vertcat(*vectors[:2]))
-            terms = ca.Function("terms", [*vectors], [ca.densify(slopes), ca.densify(ca.vertcat(*into.values()))])
-            slope, factor = map_points(terms, *at, values)
-            force = slope * swing[:, None, :] / np.where(factor == 0, np.inf, np.abs(factor))
-            value = float(np.max(np.sqrt(np.mean(force**2, axis=0)), initial=0.0))
+            into = simulator.into(port, *symbols).items()
+            forces = [term / factor for name, factor in into for term in _summands(equations[name])]
+            rows = map_points(ca.Function("forces", [*vectors], [ca.densify(ca.vertcat(*forces))]), *at, values)[0]
+            spread = np.std(rows, axis=0)
+            value = float(np.max(spread[np.isfinite(spread)], initial=0.0))
         found.append(value if np.isfinite(value) and value > 0 else None)
+    return found
+
+
+def _summands(expression: ca.SX) -> list[ca.SX]:
+    """Split a sum into its terms, also one that is divided by a mass."""
+    found, left = [], [(ca.SX(expression), ca.SX(1))]
+    while left:
+        e, factor = left.pop()
+        if e.is_leaf() or e.op() not in (ca.OP_ADD, ca.OP_SUB, ca.OP_NEG, ca.OP_DIV):
+            found.append(e * factor)
+        elif e.op() == ca.OP_DIV:
+            left.append((e.dep(0), factor / e.dep(1)))
+        else:
+            left += [(e.dep(k), factor) for k in range(e.n_dep())]  # a sign does not matter
     return found

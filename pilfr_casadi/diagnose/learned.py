@@ -31,7 +31,7 @@ from ..models import Parameter, play
 from .force_recovery import law_signals
 from .linearise import linearised, port_signals
 from .screen import Remainder, Task, fit_shapes, held_out_squares, lengths, ridge_solution, start_values, usable
-from .workbench import FEW, LONG, Fitted, Workbench
+from .workbench import COMPARED_SAMPLES, FEW, Fitted, Workbench
 
 STOPS = 8  # number of stops
 # thresholds over half the range of z: from presliding to a stop that slips in every large motion and so forgets its
@@ -374,7 +374,7 @@ def nearest_laws(local: Local, force: np.ndarray, laws: Sequence[type[Law]]) -> 
 
     A constant is free, because the zero of z is arbitrary. Of several forms of a law, the best one counts.
     """
-    most = max(LONG // len(local.lengths), 1)
+    most = max(COMPARED_SAMPLES // len(local.lengths), 1)
     ends = np.cumsum((0, *local.lengths))
     kept = np.concatenate([np.arange(a, min(b, a + most)) for a, b in pairwise(ends)])
     part = Local(

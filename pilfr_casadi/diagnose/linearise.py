@@ -24,7 +24,7 @@ from ..laws import Law, Local
 from ..linear import steady_state_gain, with_output_injection
 from ..models import Model, map_points
 from ..simulators import Port, Simulator, discretise, signals, states_along, term_function
-from .workbench import FINER, Fitted, Workbench
+from .workbench import FINER_STEPS, Fitted, Workbench
 
 WALL = 1.0  # largest |λ| h of a contact on the finest steps
 
@@ -313,7 +313,7 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
     """Return the local signals of every port over all recordings."""
     lengths = tuple(len(r.z) for r in runs)
     z, dz = np.concatenate([r.z for r in runs]), np.concatenate([r.dz for r in runs])
-    rate = WALL * FINER * bench.substeps / bench.dt
+    rate = WALL * FINER_STEPS * bench.substeps / bench.dt
     lift, push = (np.max([getattr(r, name) for r in runs], axis=0) for name in ("lift", "push"))
     with np.errstate(divide="ignore", over="ignore"):  # a force that does not move the port has no limit
         max_stiffness, max_damping = np.where(lift > 0, rate / lift, rate**2 / push), rate / push

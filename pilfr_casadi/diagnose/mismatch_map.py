@@ -19,9 +19,9 @@ from ..data import Recording
 
 BINS = 6  # bins of amplitude, rate and level
 MOST_BANDS = 24  # frequency bands at most, so that the map stays readable
-STRETCHES = 24  # pieces of a recording in the picture over time
-EXCITED = 1e-3  # share of the largest line below which an input line counts as omitted
-CLEAR = 1.5  # ratio that the sentence mentions
+TIME_PIECES = 24  # pieces of a recording in the picture over time
+OMITTED_SHARE = 1e-3  # share of the largest line below which an input line counts as omitted
+CLEAR_RATIO = 1.5  # ratio that the sentence mentions
 
 
 def mismatch(
@@ -169,7 +169,7 @@ def _map(
 
 
 def _over_time(r: Recording, e: np.ndarray, y: np.ndarray) -> dict[str, Any]:
-    edges = np.linspace(0, len(e), min(STRETCHES, len(e)) + 1).astype(int)
+    edges = np.linspace(0, len(e), min(TIME_PIECES, len(e)) + 1).astype(int)
     pieces = [slice(a, b) for a, b in pairwise(edges)]
     centred = y - np.mean(y, axis=0)
     return {
@@ -199,7 +199,7 @@ def _distortion(recordings: Sequence[Recording], e: Sequence[np.ndarray]) -> dic
             continue
         count = len(v) // n
         u = np.mean(np.abs(np.fft.rfft(r.u[r.skip : r.skip + count * n].reshape(count, n, -1), axis=1)), axis=0)
-        excited = np.any(u > EXCITED * np.max(u[1:], axis=0), axis=1)
+        excited = np.any(u > OMITTED_SHARE * np.max(u[1:], axis=0), axis=1)
         excited[0] = False
         lines = np.fft.rfft(v[: count * n].reshape(count, n, -1), axis=1) / n
         mean = np.mean(np.abs(np.mean(lines, axis=0)) ** 2, axis=1)
@@ -233,14 +233,14 @@ def sentence(found: dict[str, Any]) -> str:
     elif growth is not None:
         parts.append("grows about in proportion to the motion")
     speed = _ratio(found["rate"])
-    if speed is not None and not CLEAR > speed > 1 / CLEAR:
+    if speed is not None and not CLEAR_RATIO > speed > 1 / CLEAR_RATIO:
         parts.append("is larger at high speed" if speed > 1 else "is larger near standstill")
     thirds = found["thirds"]
     own = thirds["rms"][2] / max(thirds["rms"][0], 1e-300)
     beside = own * thirds["output"][0] / max(thirds["output"][2], 1e-300)
-    if min(own, beside) > CLEAR:
+    if min(own, beside) > CLEAR_RATIO:
         parts.append("grows toward the end of the recording")
-    elif max(own, beside) < 1 / CLEAR:
+    elif max(own, beside) < 1 / CLEAR_RATIO:
         parts.append("fades toward the end of the recording")
     text = parts[0]
     if len(parts) > 1:
@@ -252,7 +252,8 @@ def sentence(found: dict[str, Any]) -> str:
     distortion = found["distortion"]
     if distortion and distortion["even"] and distortion["odd"]:
         ratio = distortion["even"] / distortion["odd"]
-        kind = "both even and odd" if 1 / CLEAR < ratio < CLEAR else "mostly even" if ratio > 1 else "mostly odd"
+        clear = "mostly even" if ratio > 1 else "mostly odd"
+        kind = "both even and odd" if 1 / CLEAR_RATIO < ratio < CLEAR_RATIO else clear
         why = {"mostly even": " (a law that differs with the direction)", "mostly odd": " (a symmetric law)"}
         text += f". The distortion at lines that the input leaves out is {kind}{why.get(kind, '')}"
     return text + "."

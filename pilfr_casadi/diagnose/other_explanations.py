@@ -19,8 +19,19 @@ from .._base import InputError
 from ..data import Recording
 from ..laws import LINEAR, display_name
 from ..simulators import states_along
-from .evidence import AT_FLOOR, FAR, SURE, deviations
-from .gates import CERTAIN, CURED, LEAST_GAIN, SAME, USELESS_FIT, Gate, describe_fall, gain, open_start, refit
+from .evidence import AT_NOISE_RATIO, FAR_RATIO, SURE, deviations
+from .gates import (
+    CERTAIN_ERRORS,
+    CURED_SHARE,
+    EQUAL_RATIO,
+    LEAST_GAIN,
+    USELESS_FIT,
+    Gate,
+    describe_fall,
+    gain,
+    open_start,
+    refit,
+)
 from .search import Search
 from .verdict import Posterior, posterior
 from .workbench import FEW, THOROUGH, Fitted, Workbench
@@ -49,9 +60,9 @@ def find_pinned_parameter(search: Search, answer: Posterior) -> PinnedParameter 
     bench, without = search.bench, search.root.fitted
     if not linear and without.cost < USELESS_FIT:
         return None
-    as_well = SAME**2 * answer.best.mean_square if named else np.inf
+    as_well = EQUAL_RATIO**2 * answer.best.mean_square if named else np.inf
     # a larger error means that something else is missing
-    enough = min(as_well, (FAR if named else AT_FLOOR) ** 2 * search.floor2)
+    enough = min(as_well, (FAR_RATIO if named else AT_NOISE_RATIO) ** 2 * search.floor2)
     best: tuple[str, Fitted] | None = None
     for name, p in bench.simulator.parameters.items():
         stays = bool((linear and np.all(p.fixed)) or np.all(without.at_bound(name)))
@@ -164,7 +175,7 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
     more_starts = sum(len(part.recordings) for part in benches) - len(bench.recordings)
     more = whole.model.parameters.free.sum() * (len(fits) - 1) + len(whole.initial[0]) * more_starts
     residual = [e for f in fits for e in f.residual]
-    if cost > CURED * whole.cost or gain(whole.cost, max(cost, search.floor2), residual, more) < LEAST_GAIN:
+    if cost > CURED_SHARE * whole.cost or gain(whole.cost, max(cost, search.floor2), residual, more) < LEAST_GAIN:
         return None
     values = _clearest_differences(whole, fits, benches)
     if not values:
@@ -192,6 +203,6 @@ def _clearest_differences(
         errors = [float(np.ravel(s[name])[0]) for s in spreads]
         error = np.sqrt(np.nanmean(np.square(errors))) if np.any(np.isfinite(errors)) else np.inf
         clear = np.ptp(values) / max(error, 1e-300)
-        if clear > CERTAIN:
+        if clear > CERTAIN_ERRORS:
             out.append((clear, name, values))
     return [(name, values) for _, name, values in sorted(out, reverse=True)[:FEW]]

@@ -2,29 +2,32 @@
 
 How an answer comes about:
 
-0. Steps 1 and 2 are done once as a rule. They are repeated in three cases: with an observer if the simulator is
-   unstable and runs away from the recordings (`prediction`); with the other hold if nobody stated it and the best
-   hypothesis follows better with it; without a shift if a channel seemed to be early, because missing physics can look
-   like a lead. Each search fits different data. Its evidence is therefore not comparable; the smaller error decides.
 1. `prepare` corrects faults of the recordings, refits the simulator, and measures the noise. The refitted simulator is
    the hypothesis that nothing is missing. What it leaves above the noise is the mismatch.
 2. `Search.run` fits further hypotheses: the simulator with laws in its ports, with all parameters estimated together.
-   Each of them gets a log evidence: how well it follows the recordings, less the cost of its parameters, plus its prior
+   Each gets a log evidence: how well it follows the recordings, less the cost of its parameters, plus its prior
    (`evidence`, which lists the numbers on which an answer rests).
 3. `posterior` turns the evidences into probabilities. An effect's confidence is the probability of all hypotheses that
-   have it, times the probability that its law is the physics (`share_named`). That probability is small if a flexible
-   force explains much of the rest. Step 5 reduces it if a learned force stays beside the laws (`Posterior.within`).
+   have it, times the probability that its law is the physics (`share_named`): a rest that a flexible force could
+   explain lowers it. Of forms of a law that follow alike, the plainest is stated.
 4. `judge` chooses the verdict. It is a recording fault if its correction removed the mismatch; missing physics if the
    law of the likeliest hypothesis is more likely than not the physics; complete if the refit's residual can be noise;
    else unexplained.
-5. `find_correction` compares named laws with a learned force on held-out parts of the recordings. If the named law
-   predicts worse than the force, the name is withdrawn and the verdict is chosen again.
-   There are explanations without a law: a parameter pinned to a wrong value, and a clipped input. They are tried if
-   there is time, and count if they explain as much.
-   If the recordings are long, steps 1 to 5 see only their most informative stretches (`stretches`). The leading
-   hypotheses are then fitted to everything before step 3, and the answer's simulator before step 6.
-6. The proof (`proof`) adds errors on test recordings, placebos and standard errors. It changes no verdict. Offsets that
+5. If there is time, explanations without a law are tried: a parameter pinned to a wrong value, and a clipped input.
+   They count if they explain as much as the law.
+6. `find_correction` compares named laws with a learned force on held-out parts of the recordings. If the named law
+   predicts worse than the force, the name is withdrawn and the verdict is chosen again. A learned force that stays
+   beside the laws lowers their confidence (`Posterior.within`).
+7. The proof (`proof`) adds errors on test recordings, placebos and standard errors. It changes no verdict. Offsets that
    no longer improve the fit beside the effects are set to zero.
+
+**Long recordings.** Steps 1 to 6 see only their most informative stretches (`stretches`). The leading hypotheses are
+then fitted to everything before step 3, and the answer's simulator before step 7.
+
+**Repetitions.** Steps 1 and 2 are repeated in three cases: with an observer if the simulator is unstable and runs away
+from the recordings (`prediction`); with the other hold if nobody stated it and the best hypothesis follows better with
+it; without a shift if a channel seemed to be early, because missing physics can look like a lead. Each search fits
+different data. Its evidence is therefore not comparable; the smaller error decides.
 """
 
 from __future__ import annotations
@@ -44,9 +47,9 @@ from ..laws import Law, readable_unit
 from ..simulators import Simulator
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction, find_correction, named_correction
-from .evidence import AS_GIVEN, SURE, deviations
+from .evidence import AS_GIVEN_RATIO, SURE, deviations
 from .floor import Floor, measured_floor
-from .gates import USELESS_FIT, Gate, Offset, final_gates, offset_gates, without_idle_offsets
+from .gates import USELESS_FIT, Gate, Offset, final_gates, offset_gates, without_idle_offsets, without_zero_offsets
 from .identifiability import port_units
 from .mismatch_map import mismatch
 from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
@@ -73,7 +76,7 @@ from .trials import Trial
 from .verdict import NamedEffect, Posterior, Verdict, judge, names, posterior
 from .workbench import Fitted, RunsAway, Workbench
 
-SEARCHING = 0.7  # share of the remaining time for preparation and search; the rest is for the correction
+SEARCH_SHARE = 0.7  # share of the remaining time for preparation and search; the rest is for the correction
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,13 +225,13 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
 
 
 def _search(request: Request) -> tuple[Prepared, Search]:
-    """Prepare and search; repeat without shifting early channels if these were shifted, and keep the better search."""
+    """Prepare and search; if an early channel was shifted, repeat without, and keep that if it is clearly better."""
     ready, search = _search_once(request, shift_early=True)
     seemed_early = any(g.finding == "alignment" and g.value < 0 for g in ready.gates)
     if not seemed_early or search.interrupted or search.out_of_time or not search.can_improve(search.best):
         return ready, search
     other, again = _search_once(request, shift_early=False)
-    if again.best.mean_square < AS_GIVEN * search.best.mean_square:
+    if again.best.mean_square < AS_GIVEN_RATIO * search.best.mean_square:
         return other, again
     search.interrupted = again.interrupted
     return ready, search
@@ -257,7 +260,7 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         request.say,
         hold_said=request.hold_said,
         stand_in_error=request.stand_in_error,
-        until=began + SEARCHING * (request.deadline - began),
+        until=began + SEARCH_SHARE * (request.deadline - began),
         deadline=request.deadline,
         times={CHECKS: time.perf_counter() - began},
     )
@@ -426,7 +429,7 @@ def _build_diagnosis(
         parameters=parameter_table(request.simulator, without, after, std),
         errors=errors,
         floor={"nrmse": search.floor.nrmse(bench.scale), "source": search.floor.source},
-        corrected=after.corrected(),
+        corrected=without_zero_offsets(after.corrected()),
         refitted=without.corrected(),
         hold=bench.hold,
         train=bench.recordings,

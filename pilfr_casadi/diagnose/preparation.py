@@ -19,24 +19,25 @@ from ..laws import CATALOGUE, SCALABLE, Law, scaled, scheduled
 from ..simulators import Simulator, as_simulator
 from .floor import Floor, white_part
 from .gates import (
-    AT_NOISE,
-    CURED,
+    CURED_SHARE,
+    EQUAL_RATIO,
+    NEAR_NOISE_RATIO,
     POOR_FIT,
-    SAME,
     Checked,
     Gate,
     find_offsets,
     find_slips,
+    find_wrong_start,
     open_bench,
     refit,
 )
 from .linearise import along, linearised, observer_gain
 from .proof import errors_of
 from .recording_faults import find_stale_samples, open_unsettled, remove_glitches, unclip
-from .timing import AVERAGED, find_gaps, find_time_shift, in_steps, run_as_given
+from .timing import AVERAGED_NOISE, find_gaps, find_time_shift, in_steps, run_as_given
 from .workbench import THOROUGH, Fitted, Workbench, refine_steps
 
-SMALL = 4e-4  # mean square error up to which signs and units are not checked
+CHECKED_ABOVE = 4e-4  # mean square error up to which signs and units are not checked
 CHECKS, CHECKED = "checks and refit", 6  # the stage's name, and the number of its parts that are reported
 OBSERVER_GAINS = (1.0, 0.3, 0.1, 0.03, 0.01)  # gains of the observer, in turn
 
@@ -114,8 +115,9 @@ class _Checks:
 
     def run(self, bench: Workbench, part: float) -> Checked:
         """Refit, and correct one fault after the other; `part` is the unit of shifts in samples, see `timing`."""
-        now = self._report(2, Checked(bench, refitted(bench, self.starts), self.gates))
-        if now.cost > max(AT_NOISE**2 * now.noise2, SMALL):
+        now = self._report(2, find_wrong_start(Checked(bench, refitted(bench, self.starts), self.gates)))
+        bench = now.bench
+        if now.cost > max(NEAR_NOISE_RATIO**2 * now.noise2, CHECKED_ABOVE):
             found = self._slips(now, part)
             if len(found.gates) > len(now.gates):
                 bench = Workbench.of(bench.simulator, found.bench.recordings, bench.hold, bench.engine)
@@ -136,7 +138,7 @@ class _Checks:
         if len(found.gates) == len(now.gates) or found.cost <= POOR_FIT:
             return found
         late = find_time_shift(now, part, self.early)
-        return late if late.cost < CURED * found.cost else found
+        return late if late.cost < CURED_SHARE * found.cost else found
 
 
 def _with_better_hold(
@@ -153,7 +155,7 @@ def _with_better_hold(
     costs = [_comparable_cost(found) for found in both]
     now = both[int(costs[1] < costs[0])]
     ratio = (max(costs) / max(min(costs), 1e-300)) ** 0.5
-    held = [hold_note(now.bench.simulator, now.bench.hold, ratio)] if ratio > SAME else []
+    held = [hold_note(now.bench.simulator, now.bench.hold, ratio)] if ratio > EQUAL_RATIO else []
     if any(v > 0 and not in_steps(v, now.bench.dt) for v in _shifts(now)):  # a delay is physics
         now = checks.run(replace(bench, hold=now.bench.hold), 1.0)
     return now, held
@@ -166,7 +168,7 @@ def _shifts(found: Checked) -> list[float]:
 def _comparable_cost(found: Checked) -> float:
     """Compute the mean square error without the noise reduction by interpolating a channel between its samples."""
     between = any(not in_steps(v, found.bench.dt) for v in _shifts(found))
-    return found.cost / (AVERAGED if between else 1)
+    return found.cost / (AVERAGED_NOISE if between else 1)
 
 
 def refitted(bench: Workbench, starts: Sequence[Mapping[str, Any]] = ()) -> Fitted:
@@ -199,7 +201,7 @@ def _choose_hold(bench: Workbench) -> tuple[Workbench, Sequence[Gate]]:
     both = bench, bench.with_other_hold()
     costs = [np.inf if (found := refit(b)) is None else found.cost for b in both]
     ratio = float(np.sqrt(max(costs) / max(min(costs), 1e-300)))
-    if not ratio >= SAME:
+    if not ratio >= EQUAL_RATIO:
         return bench, ()
     best = both[int(costs[1] < costs[0])]
     return best, [hold_note(best.simulator, best.hold, ratio)]

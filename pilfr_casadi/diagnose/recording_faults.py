@@ -27,29 +27,41 @@ import numpy as np
 
 from ..data import Recording
 from ..laws import AsymmetricSaturation
-from .gates import CURED, LEAST_GAIN, RARE, Checked, FirstOrder, Gate, accept, correct, open_start, robust_deviation
+from .gates import (
+    CURED_SHARE,
+    EXCEPTION_SHARE,
+    LEAST_GAIN,
+    Checked,
+    FirstOrder,
+    Gate,
+    accept,
+    correct,
+    open_start,
+    robust_deviation,
+)
 from .linearise import linearised
 from .screen import folds, held_out
 from .workbench import Fitted, Workbench
 
-REACH = 6  # widths on either side of a glitch or a spectral line with which it is compared
+NEIGHBOURHOOD = 6  # widths on either side of a glitch or a spectral line with which it is compared
 
 CUBIC, STENCIL = np.array([-1, 4, 0, 4, -1]) / 6, 2  # through the neighbours at -2, -1, 1, 2
 GLITCH_SIZE = 0.1  # least distance of a glitch over the output's deviation
-ALONE = 0.12  # largest distance of neighbours, and deviation nearby, over a glitch's distance; a kink leaves 1/6
+ISOLATED_SHARE = 0.12  # distance of neighbours, and deviation nearby, over a glitch's distance; a kink leaves 1/6
 
 ROUNDING = 1e-6  # relative rounding of distances, far above what occurs
 
-CONTINUOUS = 0.5  # share of the samples with distinct values above which a signal is not quantised
-STANDING = 5  # longest rest of an encoder or a machine, in samples; largest motion of an encoder in a sample, in steps
+DISTINCT_SHARE = 0.5  # share of the samples with distinct values above which a signal is not quantised
+LONGEST_REST = 5  # longest rest of an encoder or a machine, in samples
+LARGEST_MOTION = 5  # largest motion of an encoder in a sample, in steps
 MOST_LEFT = 0.5  # largest share of the mismatch left by what an input may have been beyond its limit, a guess
-BY_CHANCE = 3.0  # factor on the number of repeats that noise causes
+CHANCE_FACTOR = 3.0  # factor on the number of repeats that noise causes
 
-OWN = 5  # spectral lines on either side that may belong to a tone
-STEADY = 0.5  # largest change of the amplitude in a quarter of the record, over the amplitude
+TONE_LINES = 5  # spectral lines on either side that may belong to a tone
+AMPLITUDE_CHANGE = 0.5  # largest change of the amplitude in a quarter of the record, over the amplitude
 # for mixtures of an input's lines: most lines; highest order of mixtures, and of harmonics
 LINES, ORDER, HARMONICS = 3, 7, 60
-LIGHT = 0.15  # damping ratio below which a mode rings
+LIGHT_DAMPING = 0.15  # damping ratio below which a mode rings
 
 
 # glitches
@@ -71,7 +83,7 @@ def remove_glitches(recordings: Sequence[Recording]) -> tuple[tuple[Recording, .
             f"t = {first:.6g} s. What lies between their neighbours is taken instead."
         )
         before, after = (sum(float(np.sum(distances(y) ** 2)) for y in ys) for ys in zip(*pairs, strict=True))
-        gates.append(Gate(name, "glitch", count, sentence, fault=after < CURED * before, change=mend))
+        gates.append(Gate(name, "glitch", count, sentence, fault=after < CURED_SHARE * before, change=mend))
     return (mended if gates else tuple(recordings)), gates
 
 
@@ -83,7 +95,7 @@ def mend(r: Recording) -> Recording:
 def find_glitches(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find single samples far off their neighbours, shape (k,); return them and the output without them."""
     clean, found, deviation = np.array(y), np.zeros(0, dtype=int), float(np.std(y))
-    while len(y) > 4 * REACH * STENCIL and len(found) < RARE * len(y):
+    while len(y) > 4 * NEIGHBOURHOOD * STENCIL and len(found) < EXCEPTION_SHARE * len(y):
         d = distances(clean)
         large = np.flatnonzero(np.abs(d) > GLITCH_SIZE * deviation)
         more = [k for k in large[_may_stand_alone(d, large)] if _stands_alone(clean, d, int(k))]
@@ -108,19 +120,21 @@ def _may_stand_alone(d: np.ndarray, large: np.ndarray) -> np.ndarray:
         beside = large + step
         inside = (beside >= STENCIL) & (beside < len(d) - STENCIL)  # the ends have no distance
         after = d[beside] + CUBIC[STENCIL + step] * d[large]
-        possible &= ~inside | (np.abs(after) < (1 + ROUNDING) * ALONE * np.abs(d[large]))
+        possible &= ~inside | (np.abs(after) < (1 + ROUNDING) * ISOLATED_SHARE * np.abs(d[large]))
     return possible
 
 
 def _stands_alone(y: np.ndarray, d: np.ndarray, k: int) -> bool:
     """Tell whether a sample stands out, and its neighbours do not once it is replaced."""
-    around = np.arange(max(k - REACH * STENCIL, STENCIL), min(k + REACH * STENCIL + 1, len(y) - STENCIL))
-    if robust_deviation(d[around[np.abs(around - k) > STENCIL]]) >= ALONE * abs(d[k]):
+    around = np.arange(
+        max(k - NEIGHBOURHOOD * STENCIL, STENCIL), min(k + NEIGHBOURHOOD * STENCIL + 1, len(y) - STENCIL)
+    )
+    if robust_deviation(d[around[np.abs(around - k) > STENCIL]]) >= ISOLATED_SHARE * abs(d[k]):
         return False
     whole = slice(max(k - 2 * STENCIL, 0), min(k + 2 * STENCIL + 1, len(y)))
     other = np.array(y[whole])
     other[k - whole.start] -= d[k]
-    return bool(np.max(np.abs(distances(other))) < ALONE * abs(d[k]))
+    return bool(np.max(np.abs(distances(other))) < ISOLATED_SHARE * abs(d[k]))
 
 
 # stale samples
@@ -135,7 +149,9 @@ def find_stale_samples(recordings: Sequence[Recording]) -> list[Gate]:
         step = np.min(np.diff(levels), initial=np.inf)
         repeated = float(np.mean(np.concatenate([_find_repeats(y, step) for y in columns])))
         up = float(np.mean(np.abs(np.concatenate(list(map(np.diff, columns))) - step) < 0.5 * step))
-        if repeated > max(RARE, BY_CHANCE * up) and len(levels) > CONTINUOUS * sum(map(len, columns)):
+        if repeated > max(EXCEPTION_SHARE, CHANCE_FACTOR * up) and len(levels) > DISTINCT_SHARE * sum(
+            map(len, columns)
+        ):
             sentence = (
                 f"{repeated:.0%} of the samples of {name} repeat the one before, as from lost or stale samples; the "
                 "error that this makes is taken for noise: record again, or leave them out."
@@ -153,7 +169,7 @@ def _find_repeats(y: np.ndarray, step: float) -> np.ndarray:
     """Mark samples that repeat the one before, away from the limits, in short runs followed by a jump."""
     same = np.append(False, y[1:] == y[:-1]) & (y > np.min(y)) & (y < np.max(y))
     for begin, end in find_stretches(same):
-        if end - begin > STANDING or abs(y[min(end, len(y) - 1)] - y[begin]) < STANDING * step:
+        if end - begin > LONGEST_REST or abs(y[min(end, len(y) - 1)] - y[begin]) < LARGEST_MOTION * step:
             same[begin:end] = False
     return same
 
@@ -232,13 +248,13 @@ def find_clipping(recordings: Sequence[Recording], kind: str) -> list[Clipping]:
     out = []
     for i, name in enumerate(recordings[0].inputs if kind == "u" else recordings[0].outputs):
         y = np.concatenate([getattr(r, kind)[:, i] for r in recordings])
-        if np.mean(np.diff(y) == 0) >= CONTINUOUS:
+        if np.mean(np.diff(y) == 0) >= DISTINCT_SHARE:
             continue
         limits, count = [-np.inf, np.inf], 0
         for j, extreme in enumerate((y.min(), y.max())):
             at = y == extreme
             runs = np.diff(find_stretches(at)).ravel()
-            if runs.max() >= 3 and np.sum(runs > 1) > 1 and at.mean() > BY_CHANCE * _share_at_level(y):
+            if runs.max() >= 3 and np.sum(runs > 1) > 1 and at.mean() > CHANCE_FACTOR * _share_at_level(y):
                 limits[j], count = float(extreme), count + int(at.sum())
         if count:
             finite = [v for v in limits if np.isfinite(v)]
@@ -251,7 +267,7 @@ def find_clipping(recordings: Sequence[Recording], kind: str) -> list[Clipping]:
 def _share_at_level(y: np.ndarray) -> float:
     """Compute the share of samples at a level of a quantised signal near its extremes; 0 for a continuous one."""
     values, counts = np.unique(y, return_counts=True)
-    if len(values) > CONTINUOUS * len(y):
+    if len(values) > DISTINCT_SHARE * len(y):
         return 0.0
     return float(np.median(np.concatenate([counts[1:6], counts[-6:-1]])) / len(y))
 
@@ -263,7 +279,7 @@ def open_unsettled(recordings: Sequence[Recording]) -> tuple[tuple[Recording, ..
     """Estimate the initial states of recordings that settle only within the record, and note this."""
     pairs = ((r, zip(r.outputs, _settled_shares(r), strict=True)) for r in recordings)
     share, name, r = min(((float(s), name, r) for r, shares in pairs for name, s in shares), key=lambda f: f[0])
-    if share > CURED:
+    if share > CURED_SHARE:
         return tuple(recordings), []
     ratio = share**-0.5
     sentence = (
@@ -292,7 +308,7 @@ def tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
     found = []
     for i, name in enumerate(bench.simulator.output_names):
         pairs = zip(fitted.residual, bench.recordings, strict=True)
-        each = [find_tone(e[r.skip :, i], r) for e, r in pairs if len(r) - r.skip >= 8 * REACH * OWN]
+        each = [find_tone(e[r.skip :, i], r) for e, r in pairs if len(r) - r.skip >= 8 * NEIGHBOURHOOD * TONE_LINES]
         told = [t for t in each if t is not None]
         longest = max((len(r) for r in bench.recordings), default=0) * bench.dt
         if not told or len(told) < len(each) or np.ptp([f for f, _ in told]) > 2 / longest:
@@ -312,14 +328,14 @@ def find_tone(e: np.ndarray, r: Recording) -> tuple[float, float] | None:
     """Find frequency, Hz, and amplitude of the tone in the residual of one output; None if there is none."""
     n, e = len(e), e - np.mean(e)
     power = _spectrum(e)
-    k = 2 * OWN + int(np.argmax(power[2 * OWN : -OWN]))
-    if not _stands_out(power, k, OWN, len(power)):
+    k = 2 * TONE_LINES + int(np.argmax(power[2 * TONE_LINES : -TONE_LINES]))
+    if not _stands_out(power, k, TONE_LINES, len(power)):
         return None
     f = _refine_frequency(e, k)
     whole = _fit_wave(e, f, slice(None))
     quarters = [_fit_wave(e, f, slice(q * n // 4, (q + 1) * n // 4)) for q in range(4)]
-    unsteady = max(abs(q - whole) for q in quarters) > STEADY * abs(whole)
-    if unsteady or abs(whole) ** 2 / 2 < RARE * float(np.mean(e**2)):
+    unsteady = max(abs(q - whole) for q in quarters) > AMPLITUDE_CHANGE * abs(whole)
+    if unsteady or abs(whole) ** 2 / 2 < EXCEPTION_SHARE * float(np.mean(e**2)):
         return None
     return None if any(_comes_from_input(u, f, r) for u in r.u[r.skip :].T) else (f / r.dt, abs(whole))
 
@@ -333,8 +349,8 @@ def _stands_out(power: np.ndarray, k: int, width: int, tried: int = 1) -> bool:
 
     The power of noise is exponentially distributed about its level, so that the ratio is the gain in nats.
     """
-    below = power[max(k - REACH * width, 1) : max(k - width, 1)]
-    above = power[k + width + 1 : k + REACH * width + 1]
+    below = power[max(k - NEIGHBOURHOOD * width, 1) : max(k - width, 1)]
+    above = power[k + width + 1 : k + NEIGHBOURHOOD * width + 1]
     level = max(float(np.median(v)) for v in (below, above) if len(v)) / np.log(2)
     return bool(power[k] > (LEAST_GAIN + np.log(tried)) * level)
 
@@ -361,15 +377,15 @@ def _comes_from_input(u: np.ndarray, f: float, r: Recording) -> bool:
 
     n, power = len(u), _spectrum(u)
     k = round(f * n)
-    if _stands_out(power, max(k - 1, 0) + int(np.argmax(power[max(k - 1, 0) : k + 2])), OWN):
+    if _stands_out(power, max(k - 1, 0) + int(np.argmax(power[max(k - 1, 0) : k + 2])), TONE_LINES):
         return True
     if r.period and abs(f * r.period - round(f * r.period)) * n < r.period:
         return True
-    strong = find_peaks(power, RARE * np.max(power), distance=2 * OWN)[0]
+    strong = find_peaks(power, EXCEPTION_SHARE * np.max(power), distance=2 * TONE_LINES)[0]
     lines = [_refine_frequency(u, j) for j in strong[: LINES + 1]]
     order = ORDER
     if lines and all(abs(v / lines[0] - round(v / lines[0])) < 0.05 for v in lines):
-        lines, order = lines[:1], HARMONICS if lines[0] * n > REACH * OWN else ORDER
+        lines, order = lines[:1], HARMONICS if lines[0] * n > NEIGHBOURHOOD * TONE_LINES else ORDER
     if not 0 < len(lines) <= LINES:
         return False
     orders = itertools.product(range(-order, order + 1), repeat=len(lines))
@@ -383,7 +399,7 @@ def ringing(bench: Workbench, fitted: Fitted) -> float | None:
     a = linearised(bench, fitted)[1][0].mean[0]
     with np.errstate(divide="ignore"):
         poles = np.log(np.linalg.eigvals(a).astype(complex)) * fitted.model.substeps / bench.dt
-    modes = [abs(s) / (2 * np.pi) for s in poles if s.imag > 0 and -s.real < LIGHT * abs(s)]
+    modes = [abs(s) / (2 * np.pi) for s in poles if s.imag > 0 and -s.real < LIGHT_DAMPING * abs(s)]
     rest = [e[r.skip :, i] for e, r in zip(fitted.residual, bench.recordings, strict=True) for i in range(r.n_y)]
     return next((f for f in sorted(modes) if any(_rings(e, f * bench.dt) for e in rest)), None)
 
@@ -391,8 +407,8 @@ def ringing(bench: Workbench, fitted: Fitted) -> float | None:
 def _rings(e: np.ndarray, f: float) -> bool:
     """Tell whether a mode at the frequency f, a share of the sampling rate, stands out of the spectrum of e."""
     k = round(f * len(e))
-    width = int(LIGHT * k)  # lines of a mode on either side
-    if k < 2 * OWN or k + 2 * width >= len(e) // 2:
+    width = int(LIGHT_DAMPING * k)  # lines of a mode on either side
+    if k < 2 * TONE_LINES or k + 2 * width >= len(e) // 2:
         return False
     power = np.convolve(_spectrum(e), np.ones(width) / width, mode="same")
     highest = k - width + int(np.argmax(power[k - width : k + width + 1]))

@@ -43,15 +43,15 @@ from .proof import mean_nrmse
 from .search import Search
 from .workbench import THOROUGH, Fitted, Workbench
 
-FINE = 40  # thresholds of each of the two fine grids from which the density of weights is estimated
+FINE_THRESHOLDS = 40  # thresholds of each of the two fine grids from which the density of weights is estimated
 BENDS = (-0.2, 0.0, 0.2)  # tried bends of generalized plays, a_2 times the largest |z|, as in the catalogue
 SPLIT = 0.2  # distance of the thresholds that one threshold of the diagnosed law is split into, over this threshold
-FLOOR = 0.01  # least weight of an operator at a start, over the mean weight
-IDLE = 1e-9  # deviation of an operator's output, over that of the strongest, below which it is idle
+LEAST_START_WEIGHT = 0.01  # least weight of an operator at a start, over the mean weight
+IDLE_SHARE = 1e-9  # deviation of an operator's output, over that of the strongest, below which it is idle
 EXTENT = 1.2  # range in which thresholds are spread, over the threshold below which 99 % of the weight lies
 ROUNDS, GAIN = 3, 0.99  # rounds of spreading thresholds anew; ratio of costs above which there is no further round
-USED = 1e-3  # weight of an operator, over the largest, below which it is not printed
-GRID = 201  # points of a loading curve
+PRINTED_WEIGHT = 1e-3  # weight of an operator, over the largest, below which it is not printed
+CURVE_POINTS = 201  # points of a loading curve
 PER_OPERATOR = 10  # least samples for each operator: its weight, its threshold and their standard errors
 DIAGNOSED = "diagnosed"  # key of the law that the diagnosis has found
 HYSTERETIC = ("hysteresis", "backlash")  # ids of laws with rate-independent memory; friction with presliding has it too
@@ -200,7 +200,7 @@ class Refinement:
             lines.append(f"  {name.replace('_', ' '):<22}{found.error:>9.4g}{found.mean_square**0.5:>11.4g}")
         port = self.layer.port(self.port)
         unit = f" [{port.across_unit}]" if port.across_unit else ""
-        used = self.weights > USED * np.max(self.weights)
+        used = self.weights > PRINTED_WEIGHT * np.max(self.weights)
         lines.append(f"{np.sum(used)} of {len(used)} operators are in use; threshold{unit} and weight:")
         lines += [f"  {r:11.5g}{w:13.5g}" for r, w in zip(self.thresholds[used], self.weights[used], strict=True)]
         return "\n".join(lines)
@@ -322,7 +322,7 @@ def _start_values(law: Any, local: Local, force: np.ndarray, found: Mapping[str,
     such a fit on a fine grid.
     """
     n = law.parameters()["r"].size
-    fine = local.half * np.union1d(np.linspace(0.0, 0.95, FINE), np.geomspace(0.003, 0.95, FINE))
+    fine = local.half * np.union1d(np.linspace(0.0, 0.95, FINE_THRESHOLDS), np.geomspace(0.003, 0.95, FINE_THRESHOLDS))
     bends: list[dict[str, Any]] = [{}]
     if "a_2" in law.units:
         bends = [{"a_2": bend / local.reach, "a_3": 0.0} for bend in BENDS]
@@ -358,12 +358,12 @@ def _fit_weights(law: Any, local: Local, force: np.ndarray, shape: dict[str, Any
     a = np.column_stack([columns, *linear.values()])
     a = a - a.mean(axis=0)
     size = np.linalg.norm(a, axis=0)
-    size = np.where(size > IDLE * np.max(size), size, np.inf)  # an idle operator gets no weight
+    size = np.where(size > IDLE_SHARE * np.max(size), size, np.inf)  # an idle operator gets no weight
     low = np.append(np.zeros(len(r)), np.full(len(linear), -np.inf))
     found = lsq_linear(a / size, force - force.mean(), (low, np.inf))
     w = found.x[: len(r)] / size[: len(r)]
     values = dict(zip(linear, (found.x / size)[len(r) :], strict=True))
-    return float(found.cost), {**shape, **values, "w": np.maximum(w, FLOOR * np.mean(w))}
+    return float(found.cost), {**shape, **values, "w": np.maximum(w, LEAST_START_WEIGHT * np.mean(w))}
 
 
 def _spread_anew(r: np.ndarray, w: np.ndarray, half: float, n: int) -> dict[str, np.ndarray]:
@@ -372,7 +372,7 @@ def _spread_anew(r: np.ndarray, w: np.ndarray, half: float, n: int) -> dict[str,
     mass = np.cumsum(w[order])
     reach = min(EXTENT * float(r[order][np.searchsorted(mass, 0.99 * mass[-1])]), 0.95 * half)
     r, w = regrid(r, w, reach, extent=1.0, count=n)
-    return {"r": r, "w": np.maximum(w, FLOOR * np.mean(w))}
+    return {"r": r, "w": np.maximum(w, LEAST_START_WEIGHT * np.mean(w))}
 
 
 def _exchange(simulator: Simulator, number: int, law: Law) -> Simulator:
@@ -380,7 +380,7 @@ def _exchange(simulator: Simulator, number: int, law: Law) -> Simulator:
     kept = {k: p for k, p in simulator.parameters.items() if not k.startswith(simulator.elements[number].prefix)}
     bare = simulator
     for _ in simulator.elements:
-        bare = bare.without_last_element()
+        bare = bare.without_element()
     for i, e in enumerate(simulator.elements):
         bare = bare.with_element(e.port, law if i == number else e.law)
     return bare.with_parameters({**bare.parameters, **kept})
@@ -417,7 +417,7 @@ def _build(
         errors["test"] = {DIAGNOSED: diagnosis.nrmse(diagnosis.test), "refined": refined.nrmse(diagnosis.test)}
     loops = [signals_along(bench, one, number) for one in (fitted, after)]
     signal = in_series(port)
-    z = np.linspace(0.0, float(np.ptp(loops[0][0])) / 2, GRID)
+    z = np.linspace(0.0, float(np.ptp(loops[0][0])) / 2, CURVE_POINTS)
     order = np.argsort(values["r"])
     improves = held_out[kind].mean_square < held_out[DIAGNOSED].mean_square
     old = after.simulator.elements[number].law

@@ -28,18 +28,18 @@ import numpy as np
 
 from ..laws import Attached, Delay, Lag, Law, Local, Resonance, unit_forces
 from ..simulators import in_series
-from .evidence import FAR, NEAR
+from .evidence import FAR_RATIO, NEAR_RATIO
 from .linearise import port_signals
 from .screen import HUGE, Dose, Pair, Remainder, Scored, fit_shapes, held_out, orthonormal, start_values
 from .trials import Trial, Trials, place_law
 from .workbench import BRIEF, FEW, Fitted, Workbench
 
-DAMPED = (0.25, 0.6)  # damping ratios of the resonances tried in place of a delay or a lag
-SHAPES = 5  # shapes of each law at each port: the best alone
+RESONANCE_DAMPINGS = (0.25, 0.6)  # damping ratios of the resonances tried in place of a delay or a lag
+SHAPES_OF_A_LAW = 5  # shapes of each law at each port: the best alone
 PLACES, LAWS = 4, 2  # pairs of ports that are tried, and pairs of laws at each pair of ports
-LOOKED_AT = 60  # pairs of laws whose share is cross-validated
+MOST_PAIRS = 60  # pairs of laws whose share is cross-validated
 RIDGE = 1e-4  # on the gram matrix of orthonormal columns, against nearly parallel laws
-SEEN = 4000  # approximate number of samples on which forces are compared
+COMPARED_SAMPLES = 4000  # approximate number of samples on which forces are compared
 
 
 def complements(one: Law, other: Law) -> bool:
@@ -76,7 +76,7 @@ def relatives(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored
 
 def _near(trials: Sequence[Trial]) -> set[Pair]:
     """Return the pairs of port and law that came near the best error."""
-    return {t.pair for t in trials if t.error < NEAR * trials[0].error}
+    return {t.pair for t in trials if t.error < NEAR_RATIO * trials[0].error}
 
 
 def _special_cases(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
@@ -113,11 +113,11 @@ def _damped_resonances(trials: Sequence[Trial], scored: Sequence[Scored]) -> lis
     """Select damped resonances in place of a delay or a lag T that came near: at low frequencies T = 2 D / W."""
     late: dict[str, float] = {}
     for t in trials:
-        if isinstance(t.law, Delay | Lag) and t.error < FAR * trials[0].error and t.port not in late:
+        if isinstance(t.law, Delay | Lag) and t.error < FAR_RATIO * trials[0].error and t.port not in late:
             late[t.port] = float(np.ravel(t.own["T"])[0])
     out = []
     for port, time in late.items():
-        starts = [{"W": 2 * damping / time, "D": damping} for damping in DAMPED]
+        starts = [{"W": 2 * damping / time, "D": damping} for damping in RESONANCE_DAMPINGS]
         out += _with_starts((s for s in scored if isinstance(s.law, Resonance) and s.port == port), starts)
     return out
 
@@ -190,7 +190,7 @@ def _matching_forces(bench: Workbench, trials: Sequence[Trial], scored: Sequence
 def _match_force(law: Law, local: Local, force: np.ndarray) -> tuple[float, dict[str, Any]]:
     """Compute the share of a force that a law leaves, beside gains of the signal and its rate, and its start values."""
     shapes = list(law.shapes(local))
-    every = max(len(force) // SEEN, 1)
+    every = max(len(force) // COMPARED_SAMPLES, 1)
     base = np.column_stack([np.ones_like(local.z), local.z, local.dz])[::every]
     q = np.linalg.svd(base / np.maximum(np.linalg.norm(base, axis=0), 1e-300), full_matrices=False)[0]
     target = force[::every] - q @ (q.T @ force[::every])
@@ -218,7 +218,7 @@ def _blocks(rest: Remainder) -> Iterator[_Block]:
         for law, doses in rest.doses(task):
             felt, sense = [d for d in doses if np.any(d.phi)], rest.runs[0].sense(law, task.index)
             shares = [float(np.sum((orthonormal(d.phi).T @ rest.left) ** 2)) for d in felt]
-            for k in np.argsort(shares)[::-1][:SHAPES]:
+            for k in np.argsort(shares)[::-1][:SHAPES_OF_A_LAW]:
                 scored = Scored(task.port.name, law, shares[k], (), task.local, sense)
                 yield _Block(scored, replace(felt[k], phi=felt[k].phi.copy()))
 
@@ -254,7 +254,7 @@ def choose_pairs(rest: Remainder) -> list[tuple[_Block, _Block]]:
     seen: dict[tuple[Any, ...], tuple[float, tuple[_Block, _Block]]] = {}
     for flat in np.argsort(worth, axis=None):
         i, j = np.unravel_index(flat, worth.shape)
-        if len(seen) >= LOOKED_AT or not np.isfinite(worth[i, j]):
+        if len(seen) >= MOST_PAIRS or not np.isfinite(worth[i, j]):
             break
         pair = blocks[min(i, j)], blocks[max(i, j)]
         key = tuple(b.scored.pair for b in pair)

@@ -24,15 +24,15 @@ from .._base import InputError, one_blas_thread
 from ..data import Recording
 from ..laws import Law
 from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
-from .evidence import FORMULA, Sample, deviations, information, log_evidence, log_prior, prior_width
+from .evidence import FORMULA_ERROR, Sample, deviations, information, log_evidence, log_prior, prior_width
 from .floor import effective_size, measured_floor, third_differences
 from .linearise import along
 from .preparation import match_recordings, stated_hold
 from .proof import mean_nrmse
 from .trials import Trials
-from .workbench import FINER, THOROUGH, Fitted, Workbench
+from .workbench import FINER_STEPS, THOROUGH, Fitted, Workbench
 
-ACCURATE = 0.25  # standard errors by which finer steps may change a value: 3 % of the uncertainty, added in squares
+STEP_ACCURACY = 0.25  # standard errors by which finer steps may change a value: 3 % of it, added in squares
 THIRD_DIFFERENCES = 2.31  # 1 + 2 Σ ρ² of third differences of white noise
 
 
@@ -189,17 +189,17 @@ def _on_accurate_steps(bench: Workbench, fitted: Fitted) -> Fitted:
     In a search, steps are fine enough if their error is below the noise. Values are means over many samples, so their
     standard errors are smaller than that by far.
     """
-    most = min(FINER**2 * bench.chosen, MOST_SUBSTEPS)
+    most = min(FINER_STEPS**2 * bench.chosen, MOST_SUBSTEPS)
     while fitted.model.substeps < most and not fitted.simulator.discrete and np.any(fitted.model.parameters.free):
         before, error = fitted, fitted.model.parameters.pack(deviations(bench, fitted))
-        steps = min(FINER * fitted.model.substeps, most)
-        finer = replace(bench, substeps=steps, at_least=steps, chosen=max(bench.chosen, -(-steps // FINER)))
+        steps = min(FINER_STEPS * fitted.model.substeps, most)
+        finer = replace(bench, substeps=steps, at_least=steps, chosen=max(bench.chosen, -(-steps // FINER_STEPS)))
         try:
             fitted = finer.fit(fitted.simulator, [fitted.values], states=fitted.initial, solver=THOROUGH)
         except InputError:
             return before
         change = np.abs(fitted.vector - before.vector) / error
-        if not np.any(change > ACCURATE):
+        if not np.any(change > STEP_ACCURACY):
             break
     return fitted
 
@@ -234,7 +234,7 @@ def _noise2(bench: Workbench, residuals: Sequence[np.ndarray]) -> float:
 
 def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ...], noise2: float) -> float:
     """Compute the log evidence of the laws minus that of the simulator as given."""
-    tolerance = FORMULA * max(plain.cost - noise2, 0.0)
+    tolerance = FORMULA_ERROR * max(plain.cost - noise2, 0.0)
     costs = plain.cost + tolerance, after.cost + tolerance
     n = Sample(noise2 + tolerance, max(effective_size(after.residual), 1.0)).effective(min(costs))
     known = information(bench, after, laws)

@@ -21,7 +21,7 @@ from ..models import ParameterSet
 from ..simulators import Simulator, discretise, in_series
 from .blind_spots import BlindSpot
 from .correction import Correction
-from .evidence import BETTER, FAR, SURE
+from .evidence import BETTER_RATIO, FAR_RATIO, SURE
 from .floor import ABOVE_NOISE
 from .gates import Gate
 from .learned import Learned
@@ -31,10 +31,10 @@ from .workbench import Fitted
 
 VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
-STEPS = {"nominal": "as given", "before": "refitted", "after": "corrected"}  # the errors that are printed
-MOST = 8  # parameters and blind spots that are printed at most
-GRAVEST = 2  # blind spots that are told right after the verdict
-CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
+ERROR_NAMES = {"nominal": "as given", "before": "refitted", "after": "corrected"}  # the errors that are printed
+MOST_PRINTED = 8  # parameters and blind spots that are printed at most
+GRAVEST_SPOTS = 2  # blind spots that are told right after the verdict
+CONSTANT_ERROR = 0.9  # error above which a refitted simulator is hardly better than a constant
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
 OUT_OF_TIME = "The time limit ended the search: the answer rests on the fits made until then."
 
@@ -52,6 +52,16 @@ class Effect:
     indistinguishable: tuple[tuple[str, str], ...] = ()
     form: str = ""
     placebo: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def defined(self) -> dict[str, dict[str, Any]]:
+        """Quantities that the equation defines as a product, such as `F_c = k_t r` of friction with presliding."""
+        found = re.search(r",  (\w+) = (\w+) (\w+)$", self.equation)
+        if not found or not all(name in self.parameters for name in found.groups()[1:]):
+            return {}
+        a, b = (self.parameters[key] for key in found.groups()[1:])
+        unit = a["unit"].removesuffix(f"/{b['unit']}") if a["unit"].endswith(f"/{b['unit']}") else ""
+        return {found[1]: {"value": a["value"] * b["value"], "std": None, "unit": unit}}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for diagnosis.json."""
@@ -73,18 +83,19 @@ class Effect:
 
 @dataclass(frozen=True, eq=False)
 class BeforeAfter:
-    """A recording beside the refitted and the corrected simulator.
+    """A recording beside the simulator as given, refitted, and corrected.
 
     Attributes
     ----------
     recording : Recording
         The recording with the corrections of the diagnosis (sign, unit, shift).
-    before, after : array, shape (M, n_y), or None
-        Outputs of the refitted and of the corrected simulator. None if the simulation diverges; `after` is also None
-        if nothing was added to the simulator.
+    given, before, after : array, shape (M, n_y), or None
+        Outputs of the simulator as given, refitted, and corrected. None if the simulation diverges; `after` is also
+        None if nothing was added to the simulator.
     """
 
     recording: Recording
+    given: np.ndarray | None
     before: np.ndarray | None
     after: np.ndarray | None
 
@@ -158,7 +169,7 @@ class Diagnosis:
         if not errors or not self._changed:
             return ""
         before, after = errors["before"], errors["after"]
-        if not after <= BETTER * before:
+        if not after <= BETTER_RATIO * before:
             return "worse"
         return "better" if after < before else "same"
 
@@ -214,7 +225,8 @@ class Diagnosis:
         Returns
         -------
         array, shape (M, n_y)
-            Outputs in the simulator's order; not finite where the simulation diverges.
+            Outputs in the simulator's order, at the samples of the recording as the diagnosis has corrected it (a shift
+            cuts samples off); not finite where the simulation diverges.
 
         Raises
         ------
@@ -254,10 +266,13 @@ class Diagnosis:
         return plot_comparison(r, simulated, self.floor["nrmse"] * np.std(r.y[r.skip :], axis=0))
 
     def before_and_after(self, recording: Recording) -> BeforeAfter:
-        """Simulate the refitted and the corrected simulator along a recording; see `simulate`."""
+        """Simulate the simulator as given, refitted, and corrected along a recording; see `simulate`."""
+        own = self.refitted.parameter_set
+        values = own.change(**{name: {"value": p["nominal"]} for name, p in self.parameters.items()})
+        given = self.run(recording, self.refitted.with_parameters(values))[1]
         r, before, _ = self.run(recording, self.refitted)
         after = self.run(recording)[1] if self._changed else None
-        finite = (y if y is not None and np.all(np.isfinite(y)) else None for y in (before, after))
+        finite = (y if y is not None and np.all(np.isfinite(y)) else None for y in (given, before, after))
         return BeforeAfter(r, *finite)
 
     compare = before_and_after  # the earlier name
@@ -382,7 +397,7 @@ class Diagnosis:
                 f"{'it has' if one else 'they have'} too little room."
             )
         test, train = self.errors["test"], self.errors["train"]
-        if train and train["before"] > CONSTANT and self.verdict in ("missing-physics", "unexplained"):
+        if train and train["before"] > CONSTANT_ERROR and self.verdict in ("missing-physics", "unexplained"):
             out.append(
                 f"Refitted, the simulator alone is hardly better than a constant (error {train['before']:.2g} of the "
                 "outputs' deviation). Check its values, units and bounds before you trust a name."
@@ -390,7 +405,7 @@ class Diagnosis:
         times = train["after"] / max(self.floor["nrmse"], 1e-300) if train and self.effects else 1.0
         if times > ABOVE_NOISE:
             out.append(f"The remaining error is {times:.2g} times the noise: more is missing, or a law is only near.")
-        far = test and train and test["after"] > FAR * max(train["after"], self.floor["nrmse"])
+        far = test and train and test["after"] > FAR_RATIO * max(train["after"], self.floor["nrmse"])
         if far and self.outcome != "worse":
             out.append(
                 "The test error is far above the training error: the model is only near the truth, or the test "
@@ -432,22 +447,23 @@ class Diagnosis:
 
     def _error_lines(self) -> list[str]:
         """Format the errors as a table, with the noise floor below it."""
-        lines = [f"{'NRMSE':<12}" + "".join(f"{name:>11}" for name in STEPS.values())]
+        lines = [f"{'NRMSE':<12}" + "".join(f"{name:>11}" for name in ERROR_NAMES.values())]
         for kind in ("train", "test", "free_run"):
             errors = self.errors.get(kind)
             if errors:
-                shown = (f"{errors[k]:.4f}" if errors[k] < RUN_AWAY else "runs away" for k in STEPS)
+                shown = (f"{errors[k]:.4f}" if errors[k] < RUN_AWAY else "runs away" for k in ERROR_NAMES)
                 lines.append(f"  {kind.replace('_', ' '):<10}" + "".join(f"{text:>11}" for text in shown))
         return [*lines, f"  noise floor {self.floor['nrmse']:.4f} ({self.floor['source']})"]
 
     def gravest_blind_spots(self) -> list[str]:
         """Describe the gravest facts that the recordings cannot reveal, one a line."""
-        return [f"Blind spot of these recordings: {b.sentence}" for b in self.blind_spots[:GRAVEST]]
+        return [f"Blind spot of these recordings: {b.sentence}" for b in self.blind_spots[:GRAVEST_SPOTS]]
 
     def _blind_lines(self) -> list[str]:
         """List the blind spots that are not told after the verdict."""
-        told = [f"  {b.sentence}" for b in self.blind_spots[GRAVEST:MOST]]
-        more = [f"  and {len(self.blind_spots) - MOST} more, see pilfr check"] if len(self.blind_spots) > MOST else []
+        told = [f"  {b.sentence}" for b in self.blind_spots[GRAVEST_SPOTS:MOST_PRINTED]]
+        left = len(self.blind_spots) - MOST_PRINTED
+        more = [f"  and {left} more, see pilfr check"] if left > 0 else []
         return ["further blind spots of these recordings:", *told, *more] if told else []
 
     def _own(self) -> list[str]:
@@ -456,12 +472,12 @@ class Diagnosis:
         free = {k: p for k, p in self.parameters.items() if not own[k].fixed.all() and own[k].value.ndim == 0}
         moved = sorted(free, key=lambda k: -abs(_change(free[k])))
         lines = []
-        for name in moved[:MOST]:
+        for name in moved[:MOST_PRINTED]:
             p = free[name]
             std = "" if p["std"] is None else f" ± {float(p['std']):.2g}"
             value, nominal = float(p["refit_with"]), float(p["nominal"])
             lines.append(f"  {name} = {value:.5g}{std} {p['unit']}".rstrip() + f", given as {nominal:.5g}")
-        more = [f"  and {len(moved) - MOST} more"] if len(moved) > MOST else []
+        more = [f"  and {len(moved) - MOST_PRINTED} more"] if len(moved) > MOST_PRINTED else []
         return ["the simulator's own values, refitted:", *lines, *more] if lines else []
 
 
@@ -478,14 +494,9 @@ def _effect_lines(e: Effect) -> list[str]:
         f"  {e.sentence}: {e.equation}",
         f"  {symbols}",
     ]
-    for name, p in e.parameters.items():
+    for name, p in (e.parameters | e.defined).items():
         std = "" if p["std"] is None else f" ± {p['std']:.2g}"
         lines.append(f"  {name} = {p['value']:.5g}{std} {p['unit']}".rstrip())
-    defined = re.search(r",  (\w+) = (\w+) (\w+)$", e.equation)  # such as F_c = k_t r for friction with presliding
-    if defined and all(name in e.parameters for name in defined.groups()[1:]):
-        name, (a, b) = defined[1], (e.parameters[key] for key in defined.groups()[1:])
-        unit = a["unit"].removesuffix(f"/{b['unit']}") if a["unit"].endswith(f"/{b['unit']}") else ""
-        lines.append(f"  {name} = {a['value'] * b['value']:.5g} {unit}".rstrip())
     if e.indistinguishable:
         others = ", ".join(f"{display_name(law)} at {port}" for port, law in e.indistinguishable)
         lines.append(f"  cannot be told apart from {others}")

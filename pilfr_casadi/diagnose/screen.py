@@ -32,7 +32,7 @@ from .linearise import Probe, Run, linearised, locals_of, loudest_stretch, obser
 from .workbench import FEW, Fitted, Workbench
 
 Pair = tuple[str, type[Law]]  # a port and the class of a law
-USED = 6000  # samples used at most
+SCREENED_SAMPLES = 6000  # samples used at most
 HUGE = 1e60  # ratio to an output's deviation above which a response diverges
 BLOCKS = 10  # blocks a recording; every second block is held out in turn
 RIDGES = (1e-6, 1e-3)  # strengths of the ridge regression of flexible forces, relative to a column of unit length
@@ -171,7 +171,7 @@ def own_changes(
 
 def _windows(bench: Workbench, runs: Sequence[Run]) -> list[slice]:
     """Choose the stretch of each recording that is used: the one with the largest error."""
-    share = max(USED // len(runs) // len(bench.scale), 200)
+    share = max(SCREENED_SAMPLES // len(runs) // len(bench.scale), 200)
     return [
         loudest_stretch(np.sum((r.error / bench.scale) ** 2, axis=1), share, recording.skip)
         for r, recording in zip(runs, bench.recordings, strict=True)

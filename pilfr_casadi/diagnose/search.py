@@ -23,14 +23,14 @@ from .._base import InputError, Stages, side_by_side
 from ..laws import FINER, Law
 from ..simulators import Placed, Simulator
 from .evidence import (
-    BETTER,
+    BETTER_RATIO,
+    CONTENDING_NATS,
     EFFECT_PRIOR,
-    EXACT,
-    FORMULA,
-    LOUDEST,
-    NEAR,
-    REACH,
-    WRONG,
+    FORMULA_ERROR,
+    LARGE_MODEL_ERROR,
+    LOUDEST_NOISE,
+    NEAR_RATIO,
+    WRONG_MODEL_SAMPLES,
     HeldOut,
     Sample,
     held_out_errors,
@@ -40,7 +40,7 @@ from .evidence import (
     spread,
 )
 from .floor import FEWEST, Floor, effective_size, white_part
-from .gates import CLEARLY
+from .gates import CLEARLY_BETTER
 from .learned import learn_forces, nearest_to_learned
 from .linearise import linearised
 from .relatives import choose_pairs, complements, fit_pair, relatives
@@ -49,10 +49,10 @@ from .trials import Key, Trial, Trials
 from .workbench import FEW, THOROUGH, Fitted, Workbench
 
 # Effort
-POLISHED = 5  # trials of a step that are fitted to convergence at most
-NEARLY = 0.05  # share of the excess left by one law below which far worse laws are not refined
-PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
-LEARNED = 2  # learned forces that are kept: those with the smallest error
+MOST_CONVERGED = 5  # trials of a step that are fitted to convergence at most
+NEARLY_EXPLAINED = 0.05  # share of the excess left by one law below which far worse laws are not refined
+MOST_PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
+MOST_LEARNED = 2  # learned forces that are kept: those with the smallest error
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ class Search:
     @property
     def tolerance(self) -> float:
         """Mean square error that the formulas of laws leave of any mismatch, because no machine follows one exactly."""
-        return FORMULA * max(self.root.mean_square - self.floor2, 0.0)
+        return FORMULA_ERROR * max(self.root.mean_square - self.floor2, 0.0)
 
     @property
     def sample(self) -> Sample:
@@ -226,7 +226,7 @@ class Search:
     @property
     def _all_wrong(self) -> bool:
         """Whether even the best model's error is mostly model error."""
-        return self.samples < EXACT / WRONG
+        return self.samples < WRONG_MODEL_SAMPLES / LARGE_MODEL_ERROR
 
     def _judge_on_held_out_data(self) -> None:
         """Compute the held-out errors of the likeliest hypotheses.
@@ -242,7 +242,7 @@ class Search:
             for done in itertools.count():
                 likely = self._likeliest()
                 left = [t for t in likely if self.findings[t.key].held_out is None]
-                if not left or (done >= PREDICTED and left[0] is not likely[0]) or not self._in_time():
+                if not left or (done >= MOST_PREDICTED and left[0] is not likely[0]) or not self._in_time():
                     break
                 self.held_out(left[0])
 
@@ -337,7 +337,7 @@ class Search:
             )
         except InputError:
             return False
-        return other.cost * BETTER**2 < best.cost
+        return other.cost * BETTER_RATIO**2 < best.cost
 
     def can_improve(self, trial: Trial) -> bool:
         """Tell whether a law that removes all but the noise would be worth its prior beside a hypothesis."""
@@ -368,7 +368,7 @@ class Search:
         """Fit the laws that the screen selects beside a hypothesis, fewer if `again`; polish those that may win."""
         scored, gain = self.screened(parent)
         scored = [s for s in scored if _may_stand_beside(parent.laws, s.port, s.law)]
-        enough = float(np.sqrt(self.floor2 + NEARLY * max(parent.mean_square - self.floor2, 0.0)))
+        enough = float(np.sqrt(self.floor2 + NEARLY_EXPLAINED * max(parent.mean_square - self.floor2, 0.0)))
         trials = self._fitted(parent, scored, gain, enough, again)
         more = relatives(self.bench, trials, scored) if self._in_time() else []
         if more:
@@ -412,7 +412,7 @@ class Search:
             self.keep(trial)
         kept = {t.key: self.memo[t.key] for t in trials}.values()
         ranked = sorted(kept, key=self.optimistic_evidence, reverse=True)
-        near = [t for t in ranked[:POLISHED] if not t.thorough and t.error < NEAR * ranked[0].error]
+        near = [t for t in ranked[:MOST_CONVERGED] if not t.thorough and t.error < NEAR_RATIO * ranked[0].error]
         for trial in side_by_side(self.fits.polish, near, self.workers):
             self.keep(trial)
 
@@ -436,7 +436,7 @@ class Search:
         error = np.concatenate([e[r.skip :] for e, r in pairs])
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
         share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
-        rest = np.minimum(np.sqrt(share * np.mean(error**2, axis=0)), LOUDEST * self.bench.scale)
+        rest = np.minimum(np.sqrt(share * np.mean(error**2, axis=0)), LOUDEST_NOISE * self.bench.scale)
         known, white = self.stand_in_error * self.bench.scale, white_part(best.fitted.residual)
         self.floor = Floor(np.hypot(np.maximum(white, rest), known), "estimated")
 
@@ -446,7 +446,7 @@ class Search:
         if len(best.laws) != len(parent.laws) + 1:
             return
         element, base = best.element, best.fitted
-        bare = base.simulator.without_last_element()
+        bare = base.simulator.without_element()
         local = next((s.local for step in self.steps for s in step.scored if s.port == best.port), None)
         for kind in FINER.get(type(element.law), ()) if local is not None else ():
             shapes = list(kind.finer_starts(best.own, local))
@@ -465,7 +465,7 @@ class Search:
                 shares = self.flexible(base)
                 ports = sorted(shares, key=lambda name: -shares[name])[:FEW]
                 try:
-                    known.learned = learn_forces(self.fits.part, base.fitted, ports, self.workers)[:LEARNED]
+                    known.learned = learn_forces(self.fits.part, base.fitted, ports, self.workers)[:MOST_LEARNED]
                 except (InputError, np.linalg.LinAlgError):
                     known.learned = []
         return known.learned
@@ -542,7 +542,7 @@ class Search:
                 alone = bench.fit(bench.simulator, [best.values], states=best.begin, solver=THOROUGH)
             except InputError:
                 return False
-        if alone.cost > CLEARLY * self.root.mean_square:
+        if alone.cost > CLEARLY_BETTER * self.root.mean_square:
             return False
         self.without, self.memo, self.steps = alone, {}, []
         self.findings.clear()
@@ -563,7 +563,7 @@ class Search:
 def likeliest(trials: Sequence[Trial], evidence: Callable[[Trial], float]) -> list[Trial]:
     """List the hypotheses that may be the likeliest by an evidence, the likeliest first."""
     ranked = sorted(trials, key=evidence, reverse=True)
-    return [t for t in ranked if evidence(t) > evidence(ranked[0]) - REACH]
+    return [t for t in ranked if evidence(t) > evidence(ranked[0]) - CONTENDING_NATS]
 
 
 def _may_stand_beside(laws: Sequence[Placed], port: str, law: Law) -> bool:

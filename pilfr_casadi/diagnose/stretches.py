@@ -46,9 +46,9 @@ from .workbench import DIVERGED, FEW, Fitted, Workbench
 
 MOST_SAMPLES = 60_000  # samples of the training recordings up to which everything is searched: effort
 SHARE, COUNT = 2 / 3, 10  # share of these samples that the stretches have together, and their largest number
-SHORTEST = 500  # least length of a stretch in samples: a law with memory needs some history
-CANDIDATES = 300  # stretches that are linearised at most
-LINEARISED = 1000  # samples of each that are linearised
+SHORTEST_STRETCH = 500  # least length of a stretch in samples: a law with memory needs some history
+MOST_LINEARISED = 300  # stretches that are linearised at most
+LINEARISED_SAMPLES = 1000  # samples of each that are linearised
 FAMILIES = (Surface, StopHysteresis, Creep)  # forces near whose span the catalogue's laws are
 # the stretches' fits are near those to everything, so that few steps suffice
 FINAL = GaussNewton(max_iterations=40, tolerance=1e-5, patience=3)
@@ -139,12 +139,12 @@ def choose_stretches(
     most : int
         Samples up to which everything would be searched; the stretches have two thirds of it together at most.
     """
-    length = max(int(SHARE * most) // COUNT, SHORTEST)
+    length = max(int(SHARE * most) // COUNT, SHORTEST_STRETCH)
     count = int(np.clip(int(SHARE * most) // length, 1, COUNT))
     stretches = [s for i, r in enumerate(recordings) for s in divide(i, len(r), r.skip, length)]
     signals = signal_features(recordings, stretches)
-    if len(stretches) > CANDIDATES:
-        kept = spread_out(signals, CANDIDATES, int(np.argmax(np.sum(signals**2, axis=1))))
+    if len(stretches) > MOST_LINEARISED:
+        kept = spread_out(signals, MOST_LINEARISED, int(np.argmax(np.sum(signals**2, axis=1))))
         kept = sorted(kept)
         stretches, signals = [stretches[k] for k in kept], signals[kept]
     explained = force_features(simulator, recordings, stretches, hold, engine, workers)
@@ -253,7 +253,7 @@ def _loudest(
         y, after = simulate(s.begin, s.end, state)
         with np.errstate(all="ignore"):
             power = np.nan_to_num(np.sum(((y - r.y[s.begin : s.end]) / bench.scale) ** 2, axis=1), nan=0.0, posinf=0.0)
-        part = loudest_stretch(power, LINEARISED, 0)
+        part = loudest_stretch(power, LINEARISED_SAMPLES, 0)
         yield (
             r.slice(s.begin + part.start, s.begin + part.stop),
             simulate(s.begin, s.begin + part.start, state)[1],

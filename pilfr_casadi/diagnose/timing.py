@@ -26,19 +26,21 @@ from typing import ClassVar, Self
 import numpy as np
 
 from ..data import Recording
+from ..laws import Lag
 from ..simulators import states_along
 from .floor import ABOVE_NOISE, third_differences
 from .gates import (
-    AT_NOISE,
-    CLEARLY,
-    CURED,
+    CLEARLY_BETTER,
+    CURED_SHARE,
+    EQUAL_RATIO,
+    NEAR_NOISE_RATIO,
     POOR_FIT,
-    SAME,
     Checked,
     FirstOrder,
     Gate,
     accept,
     correct,
+    refit,
     robust_deviation,
     settle,
 )
@@ -48,14 +50,14 @@ from .workbench import THOROUGH, Fitted, Workbench
 SHIFTS = np.union1d(np.arange(-64.0, 65.0), np.linspace(-2.0, 2.0, 17))  # samples
 # clock rates tried, as relative errors: 0.01 % to 5 %
 RATES = np.concatenate([-np.geomspace(1e-4, 0.05, 28)[::-1], np.geomspace(1e-4, 0.05, 28)])
-WHOLE = 0.12  # distance in samples within which a shift counts as whole
-LONG = 4.5  # shift in samples above which a whole shift is a fault of the recording
-AVERAGED = 0.5  # largest share of a channel's noise that interpolation between its samples removes
+WHOLE_SHIFT = 0.12  # distance in samples within which a shift counts as whole
+LONG_SHIFT = 4.5  # shift in samples above which a whole shift is a fault of the recording
+AVERAGED_NOISE = 0.5  # largest share of a channel's noise that interpolation between its samples removes
 
 MOST_GAPS = 3  # gaps that are sought at most
-SHORTEST = 40  # samples of a piece at least
-BESIDE = 5  # samples around a jump at which rivals are tried, and at which a drift would explain as much
-BETWEEN = (-0.5, 0.0, 0.5)  # delays of a shock that are tried, in samples
+SHORTEST_PIECE = 40  # samples of a piece at least
+RIVAL_DISTANCE = 5  # samples around a jump at which rivals are tried, and at which a drift would explain as much
+SHOCK_DELAYS = (-0.5, 0.0, 0.5)  # delays of a shock that are tried, in samples
 RIDGE = 1e-6  # on the normal equations, against jumps that initial states can follow
 
 
@@ -126,8 +128,8 @@ class TimeShift(Gate):
 
     def is_like_delay(self, dt: float, part: float) -> bool:
         """Tell whether it is late as by a delay: by a fraction of `part` samples, or by little."""
-        late = self.finding == "alignment" and self.value > -WHOLE * dt
-        return late and not (in_steps(self.value, dt, part) and self.value > LONG * dt)
+        late = self.finding == "alignment" and self.value > -WHOLE_SHIFT * dt
+        return late and not (in_steps(self.value, dt, part) and self.value > LONG_SHIFT * dt)
 
 
 def _interpolate(r: Recording, v: np.ndarray, at: np.ndarray, wraps: bool, smooth: bool) -> np.ndarray:
@@ -152,14 +154,14 @@ def _minimise(left: Callable[[float], float], low: float, high: float) -> tuple[
 
 def in_steps(value: float, dt: float, part: float = 1.0) -> bool:
     """Tell whether a shift is a multiple of `part` samples."""
-    return abs(value / dt - part * round(value / dt / part)) < WHOLE
+    return abs(value / dt - part * round(value / dt / part)) < WHOLE_SHIFT
 
 
 def find_time_shift(now: Checked, part: float = 1.0, early: bool = True) -> Checked:
     """Find a shifted channel or clock, and correct it if it is a fault of the recording.
 
-    A late channel counts as a fault if it is late by a multiple of `part` samples and nothing else is wrong. Without
-    `early`, an early channel also counts as a fault only if nothing else is wrong.
+    A late channel counts as a fault if it is late by a multiple of `part` samples, nothing else is wrong, and no lag
+    follows it as well. Without `early`, an early channel also counts as a fault only if nothing else is wrong.
     """
     bench, noise2 = now.bench, now.noise2
     if now.cost < ABOVE_NOISE**2 * noise2:
@@ -173,7 +175,7 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True) -> Chec
         if fault.finding == "alignment":
             whole = fault.at(round(fault.value / bench.dt) * bench.dt, bench.dt)
             near = correct(now, whole, [after.fitted.values, {}], after.fitted.begin)
-            if near is not None and near.cost < SAME * after.cost + AVERAGED * noise2:
+            if near is not None and near.cost < EQUAL_RATIO * after.cost + AVERAGED_NOISE * noise2:
                 fault, after = whole, near
         if best is None or after.cost < best[1].cost:
             best = fault, after
@@ -184,9 +186,22 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True) -> Chec
     if len(found.gates) == len(now.gates):
         return found
     late = fault.finding == "clock" or fault.value > 0
-    more_is_wrong = after.cost > AT_NOISE**2 * noise2  # then a late channel or a slow clock may be physics
+    more_is_wrong = after.cost > NEAR_NOISE_RATIO**2 * noise2  # then a late channel or a slow clock may be physics
     may_be_physics = fault.is_like_delay(bench.dt, part) or (more_is_wrong and (late or not early))
-    return now if may_be_physics else found
+    return now if may_be_physics or _is_lag(now, after, fault) else found
+
+
+def _is_lag(now: Checked, after: Checked, fault: TimeShift) -> bool:
+    """Tell whether lags follow a late channel better than the shift that was found."""
+    if fault.finding == "clock" or (fault.value > 0) != (fault.kind == "y"):  # an early input looks like late outputs
+        return False
+    simulator = now.bench.simulator
+    names, place = (simulator.output_names, "sensor") if fault.kind == "y" else (simulator.inputs, "actuator")
+    slow = Lag().at({"T": abs(fault.value)}, {"T": (now.bench.dt / 10, 10 * abs(fault.value))})
+    for i in fault.columns:
+        simulator = simulator.with_element(f"{place}:{names[i]}", slow)
+    lagging = refit(now.bench, [after.fitted.values, {}], simulator, states=now.fitted.begin)
+    return lagging is not None and lagging.cost < after.cost
 
 
 def run_as_given(bench: Workbench, plain: Fitted) -> Fitted:
@@ -217,7 +232,7 @@ def _screen_shifts(bench: Workbench, plain: Fitted) -> list[TimeShift]:
                 value, share = float(values[k]), shares[k]
                 if finding == "clock":  # over a whole record, one step of a rate is many samples
                     value, share = _minimise(left, values[max(k - 1, 0)], values[min(k + 1, len(values) - 1)])
-                if share < CLEARLY * left(0.0):
+                if share < CLEARLY_BETTER * left(0.0):
                     found.append((share / left(0.0), fault.at(value, bench.dt)))
     best = dict[tuple[str, str], TimeShift]()
     for _, fault in sorted(found, key=lambda pair: pair[0]):
@@ -291,15 +306,15 @@ def find_gaps(now: Checked) -> Checked:
     last, found = now, now
     while len(origins) - len(now.bench.recordings) < MOST_GAPS and last.cost > ABOVE_NOISE**2 * noise2:
         settled = settle_jump(last)
-        if settled is None or not settled[0].beats(settled[0].rival, 1 / SAME**2):
+        if settled is None or not settled[0].beats(settled[0].rival, 1 / EQUAL_RATIO**2):
             break
         jump, last = settled
         i, k = jump.value
         r, begin = origins[i]
         origins.insert(i + 1, (r, begin + k))
         # jumps around a drift also imitate it
-        sharp = jump.beats(jump.beside, CLEARLY) or last.cost < AT_NOISE**2 * noise2
-        if sharp and jump.beats(jump.rival, CURED):
+        sharp = jump.beats(jump.beside, CLEARLY_BETTER) or last.cost < NEAR_NOISE_RATIO**2 * noise2
+        if sharp and jump.beats(jump.rival, CURED_SHARE):
             accepted = accept(now, _name_pieces(last, origins), _describe_gaps(jump, origins))
             found = accepted if len(accepted.gates) > len(now.gates) else found
     return found
@@ -348,19 +363,19 @@ def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
     for i, (r, one) in enumerate(zip(bench.recordings, first.runs, strict=True)):
         rows = slice(at, at + (len(r) - r.skip) * r.n_y)
         at = rows.stop
-        if r.begins == "periodic" or len(r) - r.skip < 2 * SHORTEST:
+        if r.begins == "periodic" or len(r) - r.skip < 2 * SHORTEST_PIECE:
             continue
         read = np.column_stack([first.base, error])[rows].reshape(-1, r.n_y, first.base.shape[1] + 1)
         shares, rivals, sizes = _jump_shares(one, bench.scale, read, r.skip, len(simulator.states), moved)
         shares, rivals = shares / total, rivals / total
-        shares[: r.skip + SHORTEST] = shares[len(r) - SHORTEST :] = 0.0
+        shares[: r.skip + SHORTEST_PIECE] = shares[len(r) - SHORTEST_PIECE :] = 0.0
         k = int(np.argmax(shares))
         if shares[k] > best.share:
-            around = slice(max(k - BESIDE, 0), k + BESIDE + 1)
-            rival, beside = float(np.max(rivals[around])), float(max(shares[around.start], shares[k + BESIDE]))
+            around = slice(max(k - RIVAL_DISTANCE, 0), k + RIVAL_DISTANCE + 1)
+            rival, beside = float(np.max(rivals[around])), float(max(shares[around.start], shares[k + RIVAL_DISTANCE]))
             best = replace(best, value=(i, k), share=float(shares[k]), rival=rival, beside=beside)
             best_size = sizes[k]
-    if best.share < 1 - CLEARLY:
+    if best.share < 1 - CLEARLY_BETTER:
         return None
     (i, k), model = best.value, fitted.model
     run = states_along(model, model.drive(bench.recordings[i]), fitted.vector, fitted.initial[i])
@@ -392,7 +407,7 @@ def _jump_shares(
     removed, size = _solve_jumps(left, size2, along, unit[:, :n_x])
     later = a - np.eye(full)
     later[:, :, n:] = 0.0
-    rivals = [shock + part * later @ shock for part in BETWEEN] + [unit[:, [j]] for j in range(n, full)]
+    rivals = [shock + part * later @ shock for part in SHOCK_DELAYS] + [unit[:, [j]] for j in range(n, full)]
     return removed, np.max([_solve_jumps(left, size2, along, way)[0] for way in rivals], axis=0), size
 
 

@@ -20,13 +20,13 @@ from .._base import InputError
 from ..data import Recording
 from ..laws import Law
 from ..simulators import Placed, Simulator
-from .evidence import FAR, FORMULA
+from .evidence import FAR_RATIO, FORMULA_ERROR
 from .gates import Offset, open_start
 from .screen import Pair, Scored
 from .workbench import (
     BRIEF,
+    COMPARED_SAMPLES,
     FEW,
-    LONG,
     QUICK,
     THOROUGH,
     Fitted,
@@ -37,8 +37,8 @@ from .workbench import (
 
 # Effort: pairs of each list of the screen that are fitted, besides the best of each port; the same if `again`
 BEST, BEST_AGAIN = 10, 4
-REFINED = 8  # pairs fitted from several starts; only FEW if `again`
-AGREEING = 1.02  # ratio of mean square errors within which fits count as equal
+MOST_REFINED = 8  # pairs fitted from several starts; only FEW if `again`
+EQUAL_COSTS = 1.02  # ratio of mean square errors within which fits count as equal
 LEAST_SHARE = 0.01  # ratio to the larger share of the two runs below which a run's start values are not used
 Key = frozenset[Pair]
 
@@ -81,7 +81,7 @@ class Trial:
     def supersedes(self, other: Trial) -> bool:
         """Tell whether this fit of a hypothesis replaces another; a thorough one has priority."""
         if self.thorough != other.thorough:
-            return self.thorough or self.mean_square < other.mean_square / AGREEING
+            return self.thorough or self.mean_square < other.mean_square / EQUAL_COSTS
         return self.mean_square < other.mean_square
 
     @property
@@ -147,8 +147,8 @@ class Trials:
     @functools.cached_property
     def part(self) -> Workbench:
         """The bench with the part of the recordings that brief fits use."""
-        total = sum(map(len, self.bench.recordings))
-        return self.bench.on([_head(r, LONG / total) for r in self.bench.recordings]) if total > LONG else self.bench
+        share = COMPARED_SAMPLES / sum(map(len, self.bench.recordings))
+        return self.bench if share >= 1 else self.bench.on([_head(r, share) for r in self.bench.recordings])
 
     def fitted(
         self, simulator: Simulator, starts: Sequence[Mapping[str, Any]], count: int, **options: Any
@@ -202,7 +202,7 @@ class Trials:
         of a known law, fewer pairs are fitted.
         """
         pairs = select_pairs(scored, BEST_AGAIN if again else BEST)
-        most = FEW if again else REFINED
+        most = FEW if again else MOST_REFINED
         done, total = 0, len(pairs) + min(len(pairs), most)
 
         def step(found: Sequence[Trial | None]) -> None:
@@ -223,7 +223,7 @@ class Trials:
             found: list[Trial | None] = []
             for group in (prepared[:FEW], prepared[FEW:most]):
                 best = min((t.error for t in found if t), default=np.inf)
-                near = [p for p in group if best > enough or (p.trial and p.trial.error < FAR * best)]
+                near = [p for p in group if best > enough or (p.trial and p.trial.error < FAR_RATIO * best)]
                 near = [] if self.over else near
                 found += [p.trial for p in group if p not in near]
                 for refined in self._refine(near, gain is not None, pool):
@@ -310,7 +310,7 @@ class _BriefFit:
 def _agree(found: Sequence[Trial | None]) -> bool:
     """Tell whether three fits came to the same minimum."""
     costs = sorted(t.part_mean_square for t in found if t)
-    return len(costs) > 2 and costs[2] < AGREEING * costs[0]
+    return len(costs) > 2 and costs[2] < EQUAL_COSTS * costs[0]
 
 
 def _head(r: Recording, share: float) -> Recording:
@@ -343,7 +343,7 @@ def select_pairs(scored: Sequence[Scored], best: int) -> list[list[Scored]]:
 def _is_redundant(one: Scored, other: Scored) -> bool:
     """Tell whether, of two laws at a port, one refines the other and they score the same."""
     a, b = type(one.law), type(other.law)
-    return one.port == other.port and (issubclass(a, b) or issubclass(b, a)) and other.share - one.share < FORMULA
+    return one.port == other.port and (issubclass(a, b) or issubclass(b, a)) and other.share - one.share < FORMULA_ERROR
 
 
 def place_law(simulator: Simulator, entry: Scored, start: Mapping[str, Any]) -> tuple[Simulator, dict[str, Any]]:

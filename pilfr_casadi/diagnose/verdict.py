@@ -6,7 +6,7 @@ is noise; so it is weighed with samples that count in full (`search.Search.optim
 The right law leaves little of the mismatch for a flexible force to explain. Let s be the share of the mismatch that the
 law leaves and that a flexible force at some port would explain. The density of s is
 
-    1 / (s log(1 / s_0)) for s from s_0 to 1, if the physics has no name: log-uniform,
+    1 / (max(s, s_0) (1 + log(1 / s_0))), if the physics has no name: log-uniform above s_0,
     2 / (π s_0 (1 + (s / s_0)²)), if the law is the physics: half-Cauchy,
 
 and the probability of a hypothesis is divided between a named and an unnamed answer in this ratio. s_0 is the share
@@ -28,21 +28,22 @@ import numpy as np
 from ..laws import display_name
 from ..simulators import Placed
 from .evidence import (
-    ALIKE,
-    AT_FLOOR,
-    CHANCE,
-    COLOURED,
-    DISTURBED,
-    FAR,
-    FORMULA,
-    HINT,
-    LOUDEST,
-    NEAR,
-    OUTSIDE,
-    QUIET,
-    SILENT,
-    SOMEWHAT,
+    AT_NOISE_RATIO,
+    BETTER_RATIO,
+    COLOURED_NOISE_RATIO,
+    DISTURBANCE_WEIGHT,
+    EXPLAINED_NOISE,
+    EXPLAINED_QUIET_NOISE,
+    FAR_RATIO,
+    FORMULA_ERROR,
+    INDISTINGUISHABLE_NATS,
+    LEAST_EXPLAINED,
+    LOUDEST_NOISE,
+    NEAR_RATIO,
+    NEGLIGIBLE_ERROR,
+    OUTSIDE_CATALOGUE,
     SURE,
+    WHITE_NOISE_RATIO,
 )
 from .floor import ABOVE_NOISE, swells_with, white_part
 from .gates import Gate
@@ -124,7 +125,7 @@ def explainable_remainder(search: Search, trial: Trial) -> float:
     A remainder that no force at a port explains counts little: it may be a disturbance that acts beside the law.
     """
     share = float(np.clip(max(search.flexible(trial).values(), default=0.0), 0.0, 1.0))
-    return share_left(search, trial.mean_square) * (share + DISTURBED * (1 - share))
+    return share_left(search, trial.mean_square) * (share + DISTURBANCE_WEIGHT * (1 - share))
 
 
 def share_left(search: Search, mean_square: float) -> float:
@@ -135,8 +136,8 @@ def share_left(search: Search, mean_square: float) -> float:
 
 def share_named(s: float) -> float:
     """Compute the probability that a law which leaves the share s is the physics."""
-    law = (1 - OUTSIDE) * 2 / (np.pi * FORMULA * (1 + (s / FORMULA) ** 2))
-    other = OUTSIDE / (max(s, FORMULA) * np.log(1 / FORMULA))
+    law = (1 - OUTSIDE_CATALOGUE) * 2 / (np.pi * FORMULA_ERROR * (1 + (s / FORMULA_ERROR) ** 2))
+    other = OUTSIDE_CATALOGUE / (max(s, FORMULA_ERROR) * (1 - np.log(FORMULA_ERROR)))
     return float(law / (law + other))
 
 
@@ -149,7 +150,7 @@ def posterior(search: Search) -> Posterior:
         by_names[names(t)] = by_names.get(names(t), 0.0) + float(w)
     said = max(by_names, key=lambda n: by_names[n])
     while True:
-        best = max((t for t in trials if names(t) == said), key=search.evidence)
+        best = _plainest(search, [t for t in trials if names(t) == said])
         if not said:
             return Posterior(best, 0.0, (), by_names[said])
         found = [_make_effect(search, best, e, by_names) for e in best.effects]
@@ -161,6 +162,18 @@ def posterior(search: Search) -> Posterior:
     named = share_named(explainable_remainder(search, best))
     effects = tuple(replace(e, confidence=named * e.confidence) for e in found)
     return Posterior(best, named, effects, by_names.get(frozenset(), 0.0))
+
+
+def _plainest(search: Search, trials: Sequence[Trial]) -> Trial:
+    """Choose the likeliest hypothesis, or one with fewer parameters that is about as likely and follows as well."""
+    best = max(trials, key=search.evidence)
+    least, most = search.evidence(best) - INDISTINGUISHABLE_NATS, BETTER_RATIO**2 * best.mean_square
+    alike = (t for t in trials if search.evidence(t) >= least and t.mean_square <= most)
+    return min(alike, key=lambda t: (sum(map(_count_parameters, t.laws)), -search.evidence(t)))
+
+
+def _count_parameters(placed: Placed) -> int:
+    return sum(p.size for p in placed.law.parameters().values())
 
 
 def _make_effect(
@@ -203,7 +216,7 @@ def _indistinguishable(search: Search, best: Trial, element: Placed) -> dict[Nam
     """
     own = (element.port, element.law.id)
     rest, out = names(best) - {own}, dict[Name, Trial]()
-    least = search.evidence(best) - ALIKE
+    least = search.evidence(best) - INDISTINGUISHABLE_NATS
     every = [f"sensor:{name}" for name in search.bench.simulator.output_names]
     for t in sorted(search.memo.values(), key=search.evidence, reverse=True):
         other = names(t) - rest
@@ -235,15 +248,16 @@ def judge(search: Search, found: Posterior, gates: Sequence[Gate], closest: Tria
     `closest` is the hypothesis that an unexplained mismatch is compared with, by default the likeliest one.
     """
     off = mean_nrmse(search.bench, search.root.fitted)
-    if search.stand_in_error and off < NEAR * search.stand_in_error:
+    if search.stand_in_error and off < NEAR_RATIO * search.stand_in_error:
         return Verdict(
             "complete",
             "Nothing is seen that the simulation lacks: refitted, what stands for it follows the recordings to "
             f"{off:.3g} of the outputs' deviation, and the simulation itself to {search.stand_in_error:.3g}.",
         )
     faults = [g for g in gates if g.fault]
-    cured = min((g.left for g in faults), default=1.0) < FORMULA
-    if cured and search.root.mean_square < FAR**2 * found.best.mean_square:  # beside the fault, an effect is negligible
+    cured = min((g.left for g in faults), default=1.0) < FORMULA_ERROR
+    # beside the fault, an effect is negligible
+    if cured and search.root.mean_square < FAR_RATIO**2 * found.best.mean_square:
         return Verdict("recording-fault", faults[0].sentence)
     if found.effects and found.named > SURE:
         return Verdict("missing-physics", _describe_effects(search, found))
@@ -252,9 +266,9 @@ def judge(search: Search, found: Posterior, gates: Sequence[Gate], closest: Tria
     steady = [g for g in gates if g.finding == "tone" and not found.effects]
     mode = ringing(search.bench, search.root.fitted)
     noise = not found.effects and _is_noise(search, steady, share, mode)
-    if faults and (noise or cured or (share < HINT and not found.effects)):
+    if faults and (noise or cured or (share < LEAST_EXPLAINED and not found.effects)):
         return Verdict("recording-fault", faults[0].sentence)
-    if noise and share < HINT:
+    if noise and share < LEAST_EXPLAINED:
         beside = f" but a steady tone in {' and '.join(g.channel for g in steady)}" if steady else ""
         return Verdict(
             "complete",
@@ -272,13 +286,14 @@ def _is_noise(search: Search, steady: Sequence[Gate], share: float, mode: float 
     quiet = root.error * max(1 - sum(1 - g.left for g in steady), 0.0) ** 0.5
     white = white_part(root.fitted.residual) if search.floor.source == "estimated" else search.floor.deviation
     times = quiet / float(np.sqrt(np.mean((white / search.bench.scale) ** 2)))
-    if times < AT_FLOOR:
+    if times < AT_NOISE_RATIO:
         return True
-    unexplained = share < (CHANCE if root.mean_square < QUIET**2 else SILENT)
+    unexplained = share < (EXPLAINED_QUIET_NOISE if root.mean_square < NEGLIGIBLE_ERROR**2 else EXPLAINED_NOISE)
     if search.floor.source != "estimated":
         like = times < ABOVE_NOISE and unexplained
     else:
-        like = times < SOMEWHAT or (times < COLOURED and unexplained and root.mean_square < LOUDEST**2)
+        coloured = times < COLOURED_NOISE_RATIO and unexplained and root.mean_square < LOUDEST_NOISE**2
+        like = times < WHITE_NOISE_RATIO or coloured
     return like and mode is None and not _swells(search)
 
 
@@ -321,7 +336,7 @@ def _describe_unexplained(search: Search, closest: Trial, shares: dict[str, floa
             if mode
             else ""
         )
-        at = f" A force at {where} could explain {share:.0%} of the rest." if share > HINT else ""
+        at = f" A force at {where} could explain {share:.0%} of the rest." if share > LEAST_EXPLAINED else ""
         noise = search.floor.nrmse(search.bench.scale)
         return (
             "Physics is missing, and no law of the catalogue explains it. The refitted simulator is off by "

@@ -29,14 +29,12 @@ from ..simulators import (
     Placed,
     Simulator,
     choose_substeps,
-    compute_equilibrium,
     discretise,
     fastest_rates,
     growth_rate,
     least_substeps,
     needed_substeps,
     rate_at_start,
-    resting_elements,
 )
 from .floor import white_part
 
@@ -45,14 +43,14 @@ THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
 FEW = 3  # ports, laws, starts or fits that are tried at each choice of a search, which saves time
-LONG = 8000  # samples on which fits and forces are compared first
+COMPARED_SAMPLES = 8000  # samples on which fits and forces are compared first
 
 # Steps of the integration
-FINER = 4  # largest factor on the sub-steps for a law, and factor of each refinement of steps and knees
-DEPENDS = 0.3  # least change by finer steps, over the noise, for which they are used
+FINER_STEPS = 4  # largest factor on the sub-steps for a law, and factor of each refinement of steps and knees
+STEP_ERROR = 0.3  # least change by finer steps, over the noise, for which they are used
 LEAST_NOISE = 3e-4  # least noise, over the outputs' deviation, that the steps are compared with
-CHANGED = 0.1  # share by which finer steps may change the mean square
-NARROW = 0.05  # share of the widest knee that is tried, below which a knee is sharp
+COST_CHANGE = 0.1  # share by which finer steps may change the mean square
+SHARP_KNEE = 0.05  # share of the widest knee that is tried, below which a knee is sharp
 
 # Diverging runs
 HUGE, DIVERGED = 1e6, 1e20  # bounds: output over the largest measured value, and mean square error
@@ -193,8 +191,8 @@ class Workbench:
                 wanted = max(wanted, int(np.ceil(float(np.nanquantile(rates, 0.95)) * self.dt / LARGEST_STEP)))
         least = max(self.substeps, self.at_least, least_substeps(simulator))
         if any(getattr(e.law, "shifts", False) for e in simulator.elements):  # its memory has an entry for every step
-            least = min(least, FINER * self.chosen)
-        return int(np.clip(wanted, least, max(FINER * self.chosen, least)))
+            least = min(least, FINER_STEPS * self.chosen)
+        return int(np.clip(wanted, least, max(FINER_STEPS * self.chosen, least)))
 
     def problem(self, model: Model, engine: Engine, scored: Sequence[np.ndarray] | None = None) -> Problem:
         """Make the simulation-error problem of a model; `scored` marks the samples that count, all by default."""
@@ -301,7 +299,7 @@ class Workbench:
         vector = start_vector(model, start)
         states = None
         if len(guess):
-            unknown = zip(self.recordings, self.initial_states(simulator, model, vector, guess), strict=True)
+            unknown = zip(self.recordings, self.initial_states(model, vector, guess), strict=True)
             states = np.concatenate([np.zeros(0), *(state for r, state in unknown if r.begins == "estimate")])
         problem: Problem | None = None
         for gamma in (*path, 0.0):
@@ -332,17 +330,14 @@ class Workbench:
         cost = problem.cost(theta)
         return (cost, theta, problem) if cost < DIVERGED else None
 
-    def initial_states(
-        self, simulator: Simulator, model: Model, vector: np.ndarray, states: Sequence[np.ndarray]
-    ) -> list[np.ndarray]:
+    def initial_states(self, model: Model, vector: np.ndarray, states: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Complete initial states (n_state,) from their first entries; laws begin at rest at the first inputs."""
         out, n = [], model.n_state
         for r, given in zip(self.recordings, states, strict=True):
             state = np.asarray(given, dtype=float)[:n]
-            full = np.zeros(n)
-            if r.begins == "estimate" and len(state) < n and resting_elements(simulator):
-                full = compute_equilibrium(simulator, self.dt / model.substeps, vector, state, r.u[0])
-            out.append(np.append(state, full[len(state) :]))
+            if r.begins in ("estimate", "given"):
+                state = model.rest_at(state, r.u[0], vector)
+            out.append(np.append(state, np.zeros(n - len(state))))
         return out
 
     def by_cost(
@@ -354,7 +349,7 @@ class Workbench:
         states: Sequence[np.ndarray],
     ) -> list[Mapping[str, Any]]:
         """Order starts by their error before a fit, from the same initial states."""
-        initial = self.initial_states(simulator, model, start_vector(model, starts[0]), states)
+        initial = self.initial_states(model, start_vector(model, starts[0]), states)
 
         def cost(start: Mapping[str, Any]) -> float:
             values = model.parameters.unpack(start_vector(model, start))
@@ -373,7 +368,7 @@ class Workbench:
         """Run a simulator at values by name, from the simulator's own initial states."""
         model, engine = self.compile(simulator)
         vector = start_vector(model, values)
-        initial = self.initial_states(simulator, model, vector, states)
+        initial = self.initial_states(model, vector, states)
         return self.result(simulator, model.parameters.unpack(vector), initial, engine, model)
 
     def result(
@@ -403,13 +398,13 @@ def start_vector(model: Model, start: Mapping[str, Any]) -> np.ndarray:
 def refine_steps(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
     """Refine the steps until their error is less than the noise; return the bench and the fit there."""
     noise2 = max(float(np.mean((white_part(fitted.residual) / bench.scale) ** 2)), LEAST_NOISE**2)
-    most, steps = min(FINER**2 * bench.chosen, MOST_SUBSTEPS), fitted.model.substeps
-    while FINER * steps <= most and not fitted.simulator.discrete:
-        steps = FINER * steps
+    most, steps = min(FINER_STEPS**2 * bench.chosen, MOST_SUBSTEPS), fitted.model.substeps
+    while FINER_STEPS * steps <= most and not fitted.simulator.discrete:
+        steps = FINER_STEPS * steps
         tried = replace(bench, substeps=steps)
         try:
             there = tried.run(fitted.simulator, fitted.values, fitted.begin)
-            if _difference2(bench, there, fitted) < DEPENDS**2 * noise2:
+            if _difference2(bench, there, fitted) < STEP_ERROR**2 * noise2:
                 break
             fitted = tried.fit(
                 fitted.simulator,
@@ -434,9 +429,9 @@ def _difference2(bench: Workbench, one: Fitted, other: Fitted) -> float:
 def knee_starts(fitted: Fitted, knee: str) -> list[dict[str, Any]]:
     """Return the fitted values, and if there is a sharp knee also those with a sharper and a wider one."""
     values = fitted.values
-    if not knee or values[knee] > NARROW * fitted.model.parameters[knee].bounds[1]:
+    if not knee or values[knee] > SHARP_KNEE * fitted.model.parameters[knee].bounds[1]:
         return [values]
-    return [values, *({**values, knee: times * values[knee]} for times in (1 / FINER, FINER))]
+    return [values, *({**values, knee: times * values[knee]} for times in (1 / FINER_STEPS, FINER_STEPS))]
 
 
 def refit_on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
@@ -446,14 +441,14 @@ def refit_on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
     """
     given = fitted.simulator.parameters[knee]
     low, high = given.bounds
-    if fitted.model.substeps * FINER > FINER**2 * bench.chosen:
+    if fitted.model.substeps * FINER_STEPS > FINER_STEPS**2 * bench.chosen:
         return fitted
-    finer, placed = replace(bench, at_least=FINER * fitted.model.substeps), fitted.corrected()
-    sharper = replace(given, value=fitted.values[knee], bounds=(low / FINER, high))
+    finer, placed = replace(bench, at_least=FINER_STEPS * fitted.model.substeps), fitted.corrected()
+    sharper = replace(given, value=fitted.values[knee], bounds=(low / FINER_STEPS, high))
     placed = placed.with_parameters({**placed.parameters, knee: sharper})
     there = finer.run(placed, fitted.values, fitted.begin)
     held = fitted.values[knee] <= low
-    if not held and abs(there.cost / fitted.cost - 1) < CHANGED:
+    if not held and abs(there.cost / fitted.cost - 1) < COST_CHANGE:
         return fitted
     starts = [fitted.values, *([{**fitted.values, knee: low / 2}] if held else [])]
     states, model, engine = fitted.begin, there.model, there.engine

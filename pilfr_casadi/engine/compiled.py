@@ -200,12 +200,12 @@ def _table(name: str, kind: str, starts: str, rows: list[list[str]]) -> tuple[st
 
 # without fused multiply-adds the generated step gives the bits of the virtual machine, so the same operators slip
 COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
-FLAGS = (("-march=native", *COMMON), COMMON)  # the second if the compiler refuses the first
+COMPILER_FLAGS = (("-march=native", *COMMON), COMMON)  # the second if the compiler refuses the first
 # optimising long straight-line code takes seconds and gains nothing, unlike the loops; the code tests every output for
 # being wanted, and GCC needs minutes to thread thousands of such jumps
 PLAIN, LOOPS = ("-O1", "-fno-thread-jumps"), ("-O2",)
-KEPT = 40  # libraries in each of the cache's 256 folders: some hundred megabytes
-PATIENCE = 600.0  # seconds for one compilation
+KEPT_LIBRARIES = 40  # libraries in each of the cache's 256 folders: some hundred megabytes
+COMPILATION_SECONDS = 600.0  # seconds for one compilation
 _failures: dict[str, str] = {}  # sources that did not compile; this process does not try them again
 
 
@@ -232,7 +232,7 @@ def _machine(cc: str) -> str:
     if info.exists():
         lines = info.read_text(errors="replace").splitlines()
         cpu += "".join(sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))}))
-    return "|".join((cc, version, cpu, ca.__version__, str(FLAGS), platform.platform()))
+    return "|".join((cc, version, cpu, ca.__version__, str(COMPILER_FLAGS), platform.platform()))
 
 
 def _is_private(directory: Path) -> bool:
@@ -281,15 +281,15 @@ def _compile(cc: str, source: str, key: str, level: tuple[str, ...]) -> Path:
     with tempfile.TemporaryDirectory(dir=cache_directory()) as folder:
         c_file, partial = Path(folder) / "model.c", Path(folder) / "model.so"
         c_file.write_text(source, encoding="utf-8")
-        for some, flags in zip((level, level[:1]), FLAGS, strict=True):
+        for some, flags in zip((level, level[:1]), COMPILER_FLAGS, strict=True):
             command = [cc, *some, *flags, str(c_file), "-o", str(partial), "-lm"]
-            done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
+            done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=COMPILATION_SECONDS)
             if not done.returncode and partial.exists():
                 library = _shelf(key) / f"{key}-{_digest(partial)}.so"
                 library.parent.mkdir(mode=0o700, exist_ok=True)
                 os.replace(partial, library)
                 with contextlib.suppress(OSError):  # keep the folder's most recently used; loaded ones need no file
-                    for old in sorted(library.parent.glob("*.so"), key=lambda p: p.stat().st_mtime)[:-KEPT]:
+                    for old in sorted(library.parent.glob("*.so"), key=lambda p: p.stat().st_mtime)[:-KEPT_LIBRARIES]:
                         old.unlink()
                 return library
     raise OSError((done.stderr.strip().splitlines() or ["it wrote no library"])[0][:300])

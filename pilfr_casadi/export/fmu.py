@@ -30,8 +30,8 @@ from .c_code import fill_template, generate_code, make_unique
 
 VERSIONS = ("2.0", "3.0")
 # -O1: see `engine.compiled`; no fused products, so that the numbers are those of `simulate`
-FLAGS = ("-O1", "-fno-thread-jumps", "-fPIC", "-shared", "-std=c99", "-ffp-contract=off", "-fvisibility=hidden")
-PATIENCE = 600.0  # seconds for the compilation
+OPTIONS = "-O1 -fno-thread-jumps -fPIC -shared -std=c99 -ffp-contract=off -fvisibility=hidden"
+COMPILATION_SECONDS = 600.0  # seconds for the compilation
 EPOCH = (1980, 1, 1, 0, 0, 0)  # time of all files in the archive, so that the same model gives the same bytes
 UNUSED_TYPES = (  # of FMI 3.0
     *((f"Int{n}", f"int{n}_t") for n in (8, 16, 32, 64)),
@@ -171,9 +171,11 @@ def _compile(source: str) -> bytes:
         raise InputError("An FMU holds a compiled program, and no C compiler was found; install cc, gcc or clang.")
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "fmu.c").write_text(source, encoding="utf-8")
-        command = [cc, *FLAGS, "fmu.c", "-o", "fmu.lib", "-lm"]
+        command = [cc, *OPTIONS.split(), "fmu.c", "-o", "fmu.lib", "-lm"]
         try:
-            done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=PATIENCE)
+            done = subprocess.run(
+                command, cwd=folder, capture_output=True, text=True, check=False, timeout=COMPILATION_SECONDS
+            )
             if done.returncode == 0:
                 return (Path(folder) / "fmu.lib").read_bytes()
             said = " ".join(done.stderr.split())[:200]

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         Comparison as Comparison,
         compare as compare,
         run_free as run_free,
+        simulator_nrmse as simulator_nrmse,
     )
     from .context import (
         FitContext as FitContext,

@@ -1,8 +1,7 @@
 """Models of any kind beside one recording, all treated alike: `compare`.
 
-An error depends on where a simulation begins. `Simulator.nrmse` begins at zero and `Fit.nrmse` at the state that the
-fit estimated, so the two cannot be compared: on one rig they are 0.63 and 0.0055. `compare` gives every model the same
-start, by the recording's `initial`:
+An error depends on where a simulation begins; from zero and from a fitted state one rig has 0.63 and 0.0055. `compare`
+gives every model the same start, by the recording's `initial`:
 
 - `"estimate"`: each model's state is fitted to the first samples alone, as many as it needs for its states, at the
   model's parameters; a state that a fit has found from the whole recording is not used. These samples, as many as the
@@ -20,11 +19,11 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, later
-from ..data import Recording, rmse_per_output
+from ..data import Recording, as_recordings, rmse_per_output
 from ..engine import Engine, make_engine
 from ..models import Model
 from ..optimise import estimate_initial_state, samples_for_state
-from ..simulators import as_simulator, choose_substeps, discretise
+from ..simulators import Simulator, as_simulator, choose_substeps, discretise
 from .result import Fit, match_channels
 
 RUN_AWAY = 1e4  # error from which its size says nothing
@@ -165,6 +164,12 @@ def compare(recording: Recording, models: Mapping[str, Any] | Any) -> Comparison
             raise InputError(f"the output {name!r} never changes where it is scored, so its NRMSE does not exist.")
     errors = {name: rmse_per_output(recording.y, y, recording.skip) / sigma for name, y in simulated.items()}
     return Comparison(recording, simulated, errors)
+
+
+def simulator_nrmse(simulator: Simulator, recordings: Recording | Sequence[Recording]) -> float:
+    """Compute `Simulator.nrmse`: the mean over recordings of the error in `compare`, of its outputs alone."""
+    given = [match_channels(simulator, r) for r in as_recordings(recordings)]
+    return float(np.mean([compare(r, simulator).nrmse["simulated"] for r in given]))
 
 
 def _residual(model: Any, recording: Recording) -> tuple[np.ndarray, int]:

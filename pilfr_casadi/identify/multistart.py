@@ -50,7 +50,7 @@ EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
 DEFAULT_SOLVER: GaussNewton = GaussNewton(max_iterations=200, tolerance=1e-4)  # of `fit`, and of every polish
 START_KINDS: tuple[str, ...] = ("grid", "paper", "plain")
 KEEP = 4  # candidates that are polished
-MARGIN = 1.1  # on the smallest error, up to which the fit with the density prior wins
+PRIOR_MARGIN = 1.1  # on the smallest error, up to which the fit with the density prior wins
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +142,7 @@ def judge(seed: int, model: Model, problem: Problem, solution: Solution, note: s
 def polish(search: StartSearch, candidate: Candidate) -> Candidate:
     """Spread the thresholds of a candidate anew and solve, with and without a prior that smooths the weights.
 
-    The candidate with the prior (see its `note`) is returned if its training error is at most `MARGIN` times the
+    The candidate with the prior (see its `note`) is returned if its training error is at most `PRIOR_MARGIN` times the
     smallest.
     """
     parameters, recordings = candidate.model.parameters, search.context.recordings
@@ -177,7 +177,7 @@ def polish(search: StartSearch, candidate: Candidate) -> Candidate:
         return _best_so_far(candidates)
     best = min(candidates, key=_merit)
     usable = _merit(smooth)[0] == _merit(best)[0]
-    return smooth if usable and smooth.error <= MARGIN * best.error else best
+    return smooth if usable and smooth.error <= PRIOR_MARGIN * best.error else best
 
 
 def _best_so_far(candidates: list[Candidate]) -> Candidate:

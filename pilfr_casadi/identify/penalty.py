@@ -12,7 +12,7 @@ a mechanical system and can be restored at almost no cost. Therefore
 2. the weights of each channel are scaled to a sum of one, with `B_w` and `D_yw` scaled inversely, unless an entry is
    fixed, bounded or has a prior: `l1` then is in units of the cost, for the sum of a channel's weights;
 3. plays or stops of a channel with nearly the same threshold are merged as long as the objective grows by at most the
-   share `SLACK` in all, because the penalty does not distinguish one large weight from two halves of it;
+   share `OBJECTIVE_GROWTH` in all, because the penalty does not distinguish one large weight from two halves of it;
 4. the problem is solved with the penalty from there. Weights, thresholds, `y_0` and the initial states are free; the
    linear blocks, other parameters of the operators, and operators of zero weight are fixed.
 
@@ -34,7 +34,7 @@ from ..optimise import Problem, Solution, Status
 from .context import FitContext, Stage
 from .result import with_solution
 
-SLACK = 0.02  # relative growth of the objective that merging operators may cause before the last solve
+OBJECTIVE_GROWTH = 0.02  # relative growth of the objective that merging operators may cause before the last solve
 
 
 def check_penalty(l1: dict[str, float], parameters: ParameterSet, linear: bool) -> None:
@@ -97,7 +97,7 @@ def merge_operators(fixed_problem: Problem, theta: np.ndarray) -> np.ndarray:
     w_at, r_at = (place[parameters.position(name)].reshape(shape, order="F") for name in LAYER)
     size, n_x = fixed_problem.model.n_state, fixed_problem.model.n_x
     state_starts = range(fixed_problem.n_free, fixed_problem.size, size)
-    limit = (1 + SLACK) * fixed_problem.cost(theta)
+    limit = (1 + OBJECTIVE_GROWTH) * fixed_problem.cost(theta)
 
     def trial(i: int, a: int, b: int) -> np.ndarray:
         """Replace two operators of channel i by one."""

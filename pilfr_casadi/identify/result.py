@@ -449,8 +449,8 @@ def match_channels(simulator: Simulator, recording: Recording) -> Recording:
         for name in names:
             if name not in own:
                 raise InputError(
-                    f"The recording {recording.label} has no {kind} {name!r}, which the simulator has; "
-                    f"it has {', '.join(own) or 'none'}. Map a column to it by name."
+                    f"{recording.label} has no {kind} {name!r}; it has {', '.join(own) or 'none'}. Map a column to "
+                    "it by name."
                 )
         changes["u" if kind == "input" else "y"] = values[:, [own.index(n) for n in names]]
         changes[f"{kind}s"] = tuple(names)

@@ -77,7 +77,7 @@ START_BASES = 30  # start bases of the search for the nearest one
 # training error over two records of the two-mass rig and two sizes; no test recording was used.
 START_DEVIATION = 0.1
 OUTLINE_BINS = 40  # bins of z for the outline of a loop
-OUTSIDE = 0.03  # share of the samples at one z that lie outside each envelope
+OUTLYING_SHARE = 0.03  # share of the samples at one z that lie outside each envelope
 DAMPING = 0.05  # damping of the inverse of the linear model, in units of its largest gain
 LEAST_SHARE = 0.01  # least height of each neuron, as a share of the curve's height, so that every neuron has a slope
 
@@ -490,7 +490,7 @@ def loop_outline(z: Array, v: Array) -> tuple[Array, Array, Array]:
     for k in range(OUTLINE_BINS):
         here = bins == k
         if np.count_nonzero(here) >= 8:
-            low[k], high[k] = np.quantile(v[here], [OUTSIDE, 1 - OUTSIDE])
+            low[k], high[k] = np.quantile(v[here], [OUTLYING_SHARE, 1 - OUTLYING_SHARE])
             if np.any(here & rising) and np.any(here & ~rising):
                 turn += float(np.mean(v[here & ~rising]) - np.mean(v[here & rising]))
     seen = ~np.isnan(low)

@@ -26,9 +26,9 @@ from .modes import Mode, modes, to_continuous
 
 POOR_SURROGATE = 0.02  # NRMSE above which a simulation is too nonlinear for a surrogate
 FREE = 0.3  # range of the parameters, as a share of their values
-EXACT = 1e-3  # NRMSE below which no higher order is tried
+EXACT_ERROR = 1e-3  # NRMSE below which no higher order is tried
 HIGHEST = 8  # highest order that is tried
-SMALL = 1e-3  # share of an output below which a coefficient is fixed
+NEGLIGIBLE_SHARE = 1e-3  # share of an output below which a coefficient is fixed
 # names of the inputs' gains on a mode's displacement and rate, and of these in the outputs
 GAINS, SEEN = ("gain on the displacement of", "gain of"), ("seen in", "rate seen in")
 Array = np.ndarray
@@ -64,7 +64,7 @@ def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = N
     for n in range(HIGHEST + 1) if nx is None else (nx,):  # a simulation has no noise, so its order is evident
         one = _identify(records, n, hold)
         found += [one] if one is not None else []
-        if found and found[-1][0] < EXACT:
+        if found and found[-1][0] < EXACT_ERROR:
             break
     if not found:
         raise InputError(
@@ -72,7 +72,7 @@ def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = N
             "at a shorter step."
         )
     least = min(error for error, _ in found)
-    error, simulator = next(f for f in found if f[0] <= max(1.1 * least, EXACT))
+    error, simulator = next(f for f in found if f[0] <= max(1.1 * least, EXACT_ERROR))
     return simulator, error
 
 
@@ -136,7 +136,7 @@ def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, 
 
     def free(name: str, value: float, unit: str = "", size: float = 0.0) -> None:
         reach = FREE * max(abs(value), 0.1 * size)
-        held = abs(value) <= SMALL * size
+        held = abs(value) <= NEGLIGIBLE_SHARE * size
         parameters[name] = Parameter(value, unit=unit, bounds=(value - reach, value + reach), fixed=held)
 
     for i, (name, mode) in enumerate(zip(names, found, strict=True), 1):

@@ -171,8 +171,8 @@ class Law:
     two_sided : bool
         The data carries information on the law only if z is both above and below zero.
     order, follows : int
-        `order` is the number of its own states. If the signal stands still, the first `follows` of them settle at
-        the signal's value, the others at zero.
+        `order` is the number of its own states. If the signal stands still, the first `follows` of its states or its
+        memory are at the signal's value, the others at zero. A play is then in the middle of its gap.
     memory, shifts : int, bool
         `memory` is the length of its discrete memory. `shifts` says that the memory is a shift register, which takes
         in the signal at the beginning of a step.
@@ -363,7 +363,7 @@ def display_name(law: str, form: str = "") -> str:
     """Write the id of a law, and its form, as words: "coulomb_friction" -> "Coulomb friction"."""
     text = PROPER_NAMES.get(law, law.replace("_", " "))
     text = text.capitalize() if text.split(" ")[0] in PEOPLE else text
-    return f"{text} ({display_name(form)})" if form else text
+    return f"{text} ({', '.join(map(display_name, form.split(', ')))})" if form else text
 
 
 def readable_unit(unit: str, w: str, z: str) -> str:

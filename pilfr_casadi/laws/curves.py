@@ -12,8 +12,8 @@ import numpy as np
 from ..models import Parameter
 from .base import Law, Local
 
-STRAIGHT = 0.03  # difference of a power from one, below which it is a gain
-NARROW = 0.05  # half the range over its middle, below which any curve is a gain and an offset
+LINEAR_POWER = 0.03  # difference of a power from one, below which it is a gain
+NARROW_RANGE = 0.05  # half the range over its middle, below which any curve is a gain and an offset
 
 
 class Polynomial(Law):
@@ -32,7 +32,7 @@ class Polynomial(Law):
         return p.a_2 * z**2 + p.a_3 * z**3
 
     def why_not(self, local: Local) -> str:
-        narrow = local.half < NARROW * abs(local.low + local.high) / 2
+        narrow = local.half < NARROW_RANGE * abs(local.low + local.high) / 2
         return "the signal stays where any curve is straight" if narrow else super().why_not(local)
 
 
@@ -105,7 +105,7 @@ class Power(Polynomial):
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether the power is one, which makes it a gain, as from a wrong unit."""
-        return bool(abs(values["n"] - 1) < STRAIGHT)
+        return bool(abs(values["n"] - 1) < LINEAR_POWER)
 
 
 class PowerWithGain(Power):

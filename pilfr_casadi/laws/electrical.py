@@ -8,7 +8,7 @@ import casadi as ca
 
 from .base import Law, Local
 
-SHARPEST = 0.005  # smallest width of a knee that is tried, over the largest |z|
+SHARPEST_KNEE = 0.005  # smallest width of a knee that is tried, over the largest |z|
 
 
 class Diode(Law):
@@ -25,7 +25,7 @@ class Diode(Law):
     across = "V"
     restoring = True  # it takes power
     starts = {"V_0": ("reach", 0.1, 0.2, 0.35, 0.6, 0.9), "V_T": ("reach", 0.02, 0.08)}
-    ranges = {"G": ("max_stiffness", -1.0, 1.0), "V_0": ("reach", 0.01, 1.5), "V_T": ("reach", SHARPEST, 0.5)}
+    ranges = {"G": ("max_stiffness", -1.0, 1.0), "V_0": ("reach", 0.01, 1.5), "V_T": ("reach", SHARPEST_KNEE, 0.5)}
 
     def force(self, z: Any, p: Any) -> Any:
         return p.G * p.V_T * (_rise((z - p.V_0) / p.V_T) - _rise(-p.V_0 / p.V_T))

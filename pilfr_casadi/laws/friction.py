@@ -16,8 +16,8 @@ FALL = 0.05  # smallest excess of friction at rest over dry friction
 SPRINGY = 0.08  # threshold of presliding over half the travel; above it the element is a stop of a hysteresis
 MAX_THRESHOLD = 0.6  # largest threshold tried, over half the travel
 SHARP = 2e-3  # narrowest reversal that is tried in any case, over the speed
-SHARPEST = 1e-4  # narrowest reversal that is tried where the steps resolve it, over the speed
-STABLE = 2.5  # |λ| h up to which a Runge-Kutta step is stable
+SHARPEST_REVERSAL = 1e-4  # narrowest reversal that is tried where the steps resolve it, over the speed
+STABLE_STEP = 2.5  # |λ| h up to which a Runge-Kutta step is stable
 WIDE = 0.4  # width of the reversal over the widest that is tried; above it the force is damping that saturates
 
 
@@ -85,7 +85,7 @@ class PreslidingFriction(Law):
     units = {"k_t": "w/z", "r": "z"}
     domains: ClassVar[tuple[str, ...]] = ("mechanical",)
     dissipative = True
-    memory = 1
+    follows = memory = 1
     starts = {"r": ("half", 0.003, 0.01, 0.03, 0.1, 0.25)}
     ranges = {"r": ("half", 0.0005, MAX_THRESHOLD)}
 
@@ -155,10 +155,10 @@ def _narrowest_reversal(law: Law, local: Local) -> float:
     force = sum(
         abs(float(law.values.get(name, 0.0))) for name in law.strength if name.startswith("F") and name != "F_0"
     )
-    followed = 0.0 if law.scaled_by else force / (STABLE * local.max_damping)
+    followed = 0.0 if law.scaled_by else force / (STABLE_STEP * local.max_damping)
     if not followed:
         return SHARP * local.speed
-    return float(np.clip(followed, SHARPEST * local.speed, SHARP * local.speed))
+    return float(np.clip(followed, SHARPEST_REVERSAL * local.speed, SHARP * local.speed))
 
 
 def _hardly_falls(law: Law, values: Mapping[str, Any]) -> bool:

@@ -23,9 +23,9 @@ from ..models import Parameter, play
 from .base import Law, Local
 
 PARTS = 4  # parts into which a step of a held signal is divided
-THIN = 0.1  # ratio of the loops' width to the bend beside them, below which a fit is a curve without memory
+THIN_LOOPS = 0.1  # ratio of the loops' width to the bend beside them, below which a fit is a curve without memory
 DIRECT = 0.05  # ratio of the direct gain to the plays' total weight, below which they may be a mere backlash
-ALIKE = 0.15  # ratio of the thresholds' spread to their mean, below which the plays are one
+EQUAL_THRESHOLDS = 0.15  # ratio of the thresholds' spread to their mean, below which the plays are one
 NODES = 24  # stops that stand for the smooth density
 # edges of cells that hold equal shares of the curve of a = 1; each cell is one stop at its centre of gravity
 _LOW = -2 * np.log(1 - np.arange(NODES) / NODES)
@@ -47,7 +47,7 @@ class StopHysteresis(Law):
     sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
     units = {"w": "w/z", "r": "z"}
     dissipative = True
-    n = memory = 6
+    n = follows = memory = 6
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
         following = [play(z, s[i], p["r"][i]) for i in range(self.n)]
@@ -103,7 +103,7 @@ class PlayHysteresis(StopHysteresis):
         if abs(1 + float(values["w"][0])) > DIRECT * total:
             return False
         mean = float(w @ r) / max(total, 1e-300)
-        return bool(w @ np.abs(r - mean) < ALIKE * mean * total)
+        return bool(w @ np.abs(r - mean) < EQUAL_THRESHOLDS * mean * total)
 
     @classmethod
     def finer_starts(cls, values: Mapping[str, Any], local: Local) -> Iterator[dict[str, Any]]:
@@ -116,7 +116,7 @@ class PlayHysteresis(StopHysteresis):
 class FinePlays(PlayHysteresis):
     """Hysteresis of an actuator or a sensor with more plays."""
 
-    n = memory = 11
+    n = follows = memory = 11
 
 
 class GeneralizedHysteresis(PlayHysteresis):
@@ -145,13 +145,13 @@ class GeneralizedHysteresis(PlayHysteresis):
         """Tell whether it is a backlash, or its loops are thin beside the memoryless part."""
         reach = self.parameters()["r"].bounds[1]
         wide = np.abs(values["w"]) * np.clip(np.minimum(values["r"], reach - values["r"]), 0.0, None)
-        return super().doubtful(values) or bool(np.sum(wide) < THIN * np.max(reach) ** 2 * abs(values["b_2"]))
+        return super().doubtful(values) or bool(np.sum(wide) < THIN_LOOPS * np.max(reach) ** 2 * abs(values["b_2"]))
 
 
 class FineGeneralized(GeneralizedHysteresis):
     """Asymmetric hysteresis with more plays."""
 
-    n = memory = 11
+    n = follows = memory = 11
 
 
 class SmoothHysteresis(Law):
@@ -166,7 +166,7 @@ class SmoothHysteresis(Law):
     sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
     units = {"k_h": "w/z", "R": "z", "a": ""}
     dissipative = True
-    memory = NODES
+    follows = memory = NODES
     starts = {"R": ("half", 0.02, 0.06, 0.15, 0.4), "a": ("", 1.0)}
     ranges = {"R": ("half", 0.002, 2), "a": ("", 0.3, 12.0)}
 
@@ -217,15 +217,15 @@ class BoucWenActuator(BoucWen):
     places = ("series",)
     dissipative = False
     order = 0
-    memory = 2  # q, and the z at which it was reached
+    follows, memory = 1, 2  # the last z, and the q that was reached there
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
         """Integrate along the chord from the last z, in parts."""
-        q, part = s[0], (z - s[1]) / PARTS
+        q, part = s[1], (z - s[0]) / PARTS
         for _ in range(PARTS):
             middle = q + self.flow(part, q, p) / 2
             q = q + self.flow(part, middle, p)
-        return p["b"] * z + p["k_h"] * q, ca.vertcat(q, z)
+        return p["b"] * z + p["k_h"] * q, ca.vertcat(z, q)
 
 
 class Backlash(Law):
@@ -237,7 +237,7 @@ class Backlash(Law):
     sentence = "backlash: on every reversal the signal is lost until the play is taken up"
     units = {"r": "z"}
     places = ("series",)
-    memory = 1
+    follows = memory = 1
     starts = {"r": ("half", 0.01, 0.03, 0.08, 0.18, 0.35, 0.6)}
     ranges = {"r": ("half", 0.001, 0.9)}
 
@@ -304,7 +304,7 @@ def _layer(kind: str, operators: int, in_signal: bool) -> Any:
         signed = ("k_0", "b_2") if in_signal else ()
         places = ("series",) if in_signal else ("parallel",)
         dissipative = not in_signal
-        n = memory = operators
+        n = follows = memory = operators
         operator, sign = kind, -1 if minus else 1
 
         def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:

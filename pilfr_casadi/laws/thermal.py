@@ -10,7 +10,7 @@ from .base import Law, Local
 
 ROOM = 293.0  # temperature of the surroundings that is tried first, K
 COLDEST = 150.0  # K, below which a temperature is taken for a difference and not for an absolute one
-STRAIGHT = 0.05  # range over the absolute temperature within which radiation is linear
+LINEAR_RANGE = 0.05  # range over the absolute temperature within which radiation is linear
 
 
 class Radiation(Law):
@@ -32,7 +32,7 @@ class Radiation(Law):
         return p.G * ((z + p.T_a) ** 4 - p.T_a**4) / (4 * p.T_a**3)
 
     def why_not(self, local: Local) -> str:
-        straight = local.high - local.low < STRAIGHT * ROOM
+        straight = local.high - local.low < LINEAR_RANGE * ROOM
         return "the temperature stays where radiation is linear" if straight else ""
 
 

@@ -35,7 +35,7 @@ from ..data import Recording, check_for_identification
 
 Array = np.ndarray
 
-EXCITED = 1e-3  # share of the largest input amplitude below which a line counts as not excited
+EXCITED_SHARE = 1e-3  # share of the largest input amplitude below which a line counts as not excited
 EXCITED_OVER_NOISE = 20  # power of a line over the input's own noise power above which the line counts as excited
 SINGULAR = 1e4  # condition number of the input matrix above which a line is left out
 UNCERTAIN = 0.5  # relative standard deviation above which an estimate is useless
@@ -359,7 +359,7 @@ def _find_lines(U: Array) -> Array:
     """Find the harmonics that all inputs excite, from spectra (M, n_u, P, F, n_u) that start at frequency zero."""
     n_periods = U.shape[2]
     power = np.mean(np.abs(U.mean(axis=2)) ** 2, axis=(0, 1))
-    limit = EXCITED**2 * power[1:].max(axis=0, initial=0.0) * np.ones_like(power)
+    limit = EXCITED_SHARE**2 * power[1:].max(axis=0, initial=0.0) * np.ones_like(power)
     if n_periods > 1:
         noise = np.mean(np.var(U, axis=2, ddof=1), axis=(0, 1)) / n_periods
         limit = np.maximum(limit, EXCITED_OVER_NOISE * moving_mean(noise, 10))

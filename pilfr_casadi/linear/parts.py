@@ -22,7 +22,7 @@ from ..models import BLOCKS, Model, Play, Stop
 from .statespace import resolvent
 
 Array = np.ndarray
-FAR = 1e6  # zeros beyond are those at infinity, to rounding
+INFINITE_ZERO = 1e6  # zeros beyond are those at infinity, to rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class LinearPart:
         mass[:n, :n] = np.eye(n)
         with np.errstate(all="ignore"):
             found = np.asarray(eigvals(pencil, mass), dtype=complex)
-        return found[np.isfinite(found) & (np.abs(found) < FAR)]
+        return found[np.isfinite(found) & (np.abs(found) < INFINITE_ZERO)]
 
 
 def linear_parts(

@@ -59,6 +59,9 @@ class Model:
     stages : casadi.Function, optional
         `(x, u, w, p, c) -> (values of c, c by c, x_next by c)`: the step by way of intermediate values c (n_c,), where
         each depends only on earlier ones. Its derivatives are sparse where those of `step` are dense.
+    resting : casadi.Function, optional
+        `(x, u, p) -> state`: the whole state from the states in `states` alone, as if their signals had stood still
+        before; without it, the rest is zero.
     """
 
     step: ca.Function
@@ -72,6 +75,7 @@ class Model:
     reads: tuple[str, ...] = ("u",)
     substeps: int = 1
     stages: ca.Function | None = None
+    resting: ca.Function | None = None
 
     def drive(self, recording: Recording) -> np.ndarray:
         """Make the signals that the step reads along a recording, shape (M * substeps, n_u), in the order of `reads`.
@@ -97,6 +101,33 @@ class Model:
                 a, b = np.repeat(values, n, axis=0), np.repeat(np.vstack([values[1:], after]), n, axis=0)
                 columns.append(a + (b - a) * (share + (1 / n if signal == "next" else 0.0))[:, None])
         return np.ascontiguousarray(np.hstack(columns)) if len(columns) != 1 else columns[0]
+
+    def rest_at(self, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """Compute the whole state (n_state,) from the entries x known of it; see `resting`.
+
+        u (n_u,) are the first inputs; p are the parameters, with further ones behind them where the caller has some.
+        """
+        whole = np.zeros(self.n_state)
+        if self.resting is not None and len(x) < self.n_state:
+            whole = self.resting(x[: len(self.states)], u, p[: self.resting.size1_in(2)]).full().ravel()
+        return np.append(x[: self.n_state], whole[len(x) :])
+
+    def first_state(self, recording: Recording) -> np.ndarray:
+        """Return the state (n_state,) that a recording gives at its first sample; zero if it gives none.
+
+        Raises
+        ------
+        InputError
+            If it gives neither the states nor the states with memory.
+        """
+        if isinstance(recording.initial, str):
+            return np.zeros(self.n_state)
+        given = np.asarray(recording.initial, dtype=float).ravel()
+        if given.size not in (len(self.states), self.n_state):
+            raise InputError(
+                f"An initial state of {given.size} numbers was given; expected {len(self.states)} or {self.n_state}."
+            )
+        return self.rest_at(given, recording.u[0], self.parameters.start)
 
     @property
     def n_x(self) -> int:
@@ -225,6 +256,8 @@ class StepExpressions:
         symbols by which `x_next` and `y` read the moved memory; each as long as s. Without a port, s is empty.
     stages : (c, values, by_c, x_next), optional
         Symbols of intermediate values, and the outputs of `Model.stages`.
+    resting : casadi.Function, optional
+        That of `Model`.
     """
 
     x: Any
@@ -236,6 +269,7 @@ class StepExpressions:
     y: Any
     port: tuple[Any, Any, Any] | None = None
     stages: tuple[Any, Any, Any, Any] | None = None
+    resting: ca.Function | None = None
 
 
 def from_expressions(
@@ -265,6 +299,7 @@ def from_expressions(
         reads=reads,
         substeps=substeps,
         stages=ca.Function("stages", [x, u, moved, p, c], staged) if e.stages else None,
+        resting=e.resting,
     )
 
 
@@ -312,6 +347,7 @@ def close_loop(model: Any, element: Element, port: str | None = None) -> Any:
         parameters=parameters,
         element=element,
         stages=None,
+        resting=None,
     )
 
 

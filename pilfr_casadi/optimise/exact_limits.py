@@ -50,7 +50,7 @@ from .solution import ACTIVE_MULTIPLIER, Progress, Solution, Status
 
 Array = np.ndarray
 Solve = Callable[[Problem, "Array | None"], Solution]
-NEAR = 1e-3  # distance of log ρ from its bound within which a start counts as lying at the bound
+NEAR_BOUND = 1e-3  # distance of log ρ from its bound within which a start counts as lying at the bound
 MARGINS = (2e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)  # shares by which radii stay inside, tried in turn
 CLOSEST = 1e-3  # distance of log ρ from the unit circle at which tightening begins, at least
 SCHUR_ROUNDS = 6  # Schur forms taken at the bound, at most
@@ -281,7 +281,7 @@ def solve_within_radii(
 
 def near_radius(problem: Problem, theta: Array) -> bool:
     """Tell whether a point is inside every exact bound on a radius and close to one; False if there are no bounds."""
-    return bool(radius_limits(problem)) and 0 <= _log_room(problem, theta) <= NEAR
+    return bool(radius_limits(problem)) and 0 <= _log_room(problem, theta) <= NEAR_BOUND
 
 
 def at_active_radius(problem: Problem, theta: Array, solution: Solution) -> bool:

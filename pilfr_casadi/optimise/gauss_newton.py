@@ -31,7 +31,7 @@ from ..models import Neighbours
 from .constraints import TOLERATED
 from .solution import Iteration, Progress, Solution, Status, check_solver_options
 
-FEASIBLE = 1e-9  # violation, in units of the constraints, up to which a point is feasible
+FEASIBLE_VIOLATION = 1e-9  # violation, in units of the constraints, up to which a point is feasible
 ROUNDING_VIOLATION = 1e-12  # violation that rounding alone can cause
 MOST_RETURNS = 4  # returns of a run that has strayed to its best feasible point, at most
 ENDED = (Status.CONVERGED, Status.SMALL_STEP, Status.SOLVER_FAILED)  # the run got as far as it can
@@ -436,7 +436,7 @@ class _Run:
                 if self.watch and self.watch(self.theta):
                     return Status.STOPPED_EARLY
                 if self._has_converged(recent):
-                    return Status.CONVERGED if violation <= FEASIBLE else Status.INFEASIBLE
+                    return Status.CONVERGED if violation <= FEASIBLE_VIOLATION else Status.INFEASIBLE
             damped = hessian + self.damping.value * np.diag(floor)
             step = self._step(damped, gradient, slope)
             if step.good:
@@ -454,7 +454,11 @@ class _Run:
                 )
                 self._record(length)
                 continue
-            if step.good and expected < NEGLIGIBLE * options.tolerance * abs(self.cost) and violation <= FEASIBLE:
+            if (
+                step.good
+                and expected < NEGLIGIBLE * options.tolerance * abs(self.cost)
+                and violation <= FEASIBLE_VIOLATION
+            ):
                 return self._judge_stalled(hessian, floor, gradient, slope)
             self.damping = self.damping.after_failure()
             if self.damping.value > MOST_DAMPING:
@@ -465,7 +469,7 @@ class _Run:
     def _has_converged(self, recent: list[tuple[float, float]]) -> bool:
         """Tell whether the last steps changed the cost by less than the tolerance, at an unchanged violation."""
         options = self.options
-        if self.cost <= ZERO_COST and recent[-1][1] <= FEASIBLE:
+        if self.cost <= ZERO_COST and recent[-1][1] <= FEASIBLE_VIOLATION:
             return True
         if len(recent) <= options.patience:
             return False
@@ -474,7 +478,7 @@ class _Run:
             mu = self.penalty.weight
             merits = cost + mu * violation, now + mu * left
             return violation - left < options.tolerance * left and merits[0] - merits[1] < options.tolerance * merits[1]
-        return max(violation, left) <= FEASIBLE and cost - now < options.tolerance * abs(now)
+        return max(violation, left) <= FEASIBLE_VIOLATION and cost - now < options.tolerance * abs(now)
 
     def _judge_stalled(self, hessian: np.ndarray, floor: np.ndarray, gradient: np.ndarray, slope: np.ndarray) -> Status:
         """Tell a minimum from a point where only the damping makes the step so small.

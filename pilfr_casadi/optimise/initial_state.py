@@ -14,7 +14,7 @@ from ..data import Recording
 from ..engine import Engine
 from ..models import Model
 from .gauss_newton import GaussNewton
-from .problem import STATE_NOISE, Penalties, Problem, given_state, state_precision
+from .problem import STATE_NOISE, Penalties, Problem, state_precision
 from .steady_state import steady_state
 
 STATE_ROUNDS = 20  # solves for a first state, at most, each with a wider prior
@@ -41,7 +41,7 @@ def estimate_initial_state(
     With `state_prior` it has a prior around rest, on the scale of the states in a run over all inputs
     (`state_precision`), and is fitted from rest alone.
     """
-    n, values, state = model.n_state, model.parameters.start, given_state(model, recording)
+    n, values, state = model.n_state, model.parameters.start, model.first_state(recording)
     if recording.begins == "periodic":
         period = model.drive(recording)[: (recording.period or 1) * model.substeps]
         return steady_state(engine, period, values, state)

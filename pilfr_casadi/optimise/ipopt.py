@@ -50,7 +50,7 @@ ENDINGS = {
     "Infeasible_Problem_Detected": Status.INFEASIBLE,
 }
 Sparsities = dict[str, ca.Sparsity]
-FEASIBLE = 1e-8  # violation up to which a point is feasible, in units of the change that one scaled variable causes
+FEASIBLE_VIOLATION = 1e-8  # up to which a point is feasible, in units of the change that one scaled variable causes
 INFEASIBLE_FROM = 1e-6  # the same, above which the end of a run is infeasible
 MOST_SOLVES = 4  # when IPOPT's line search fails, the next solve starts from the best point with more damping
 MORE_DAMPING, LEAST_RAISED = 100.0, 1e-2  # factor on λ for the next solve, and the λ that is raised at least
@@ -360,9 +360,9 @@ class _Run:
     def _status_of(self, message: str, violation: float, cost: float) -> Status | None:
         """Translate IPOPT's return status, given violation and cost before; None to try again."""
         status = self.stopped or ENDINGS.get(message)
-        if status is Status.INFEASIBLE and self.violation <= FEASIBLE:
+        if status is Status.INFEASIBLE and self.violation <= FEASIBLE_VIOLATION:
             return None
-        if status is None and violation <= FEASIBLE and cost - self.cost < self.options.tolerance * self.cost:
+        if status is None and violation <= FEASIBLE_VIOLATION and cost - self.cost < self.options.tolerance * self.cost:
             return Status.SMALL_STEP
         return status
 
@@ -402,7 +402,7 @@ class _Run:
     def _keep(self, theta: np.ndarray, cost: float, margin: float = 0.0) -> np.ndarray:
         """Keep θ if it is the best so far: feasible with the lowest cost, else least violated; returns G there."""
         g = self.scaled.constraints(theta)
-        violation = max(float(np.max(np.abs(self.scaled.excess(g)), initial=0.0)), FEASIBLE)
+        violation = max(float(np.max(np.abs(self.scaled.excess(g)), initial=0.0)), FEASIBLE_VIOLATION)
         if np.isfinite(cost) and (violation, cost) < (self.violation, self.cost * (1.0 + margin)):
             self.theta, self.cost, self.violation = theta, cost, violation
         return g
@@ -457,7 +457,7 @@ class _Run:
         span = options.patience * (1 if options.hessian == "gauss-newton" else QUASI_NEWTON_PATIENCE)
         recent = [entry.cost for entry in self.history[-1 - span :]]
         calm = len(recent) > span and max(recent) - min(recent) < options.tolerance * cost
-        feasible = np.max(np.abs(scaled.excess(g)), initial=0.0) <= FEASIBLE
+        feasible = np.max(np.abs(scaled.excess(g)), initial=0.0) <= FEASIBLE_VIOLATION
         if calm and feasible and barrier < 10 * options.tolerance * cost:
             self.stopped = self.stopped or Status.CONVERGED
         return [int(self.stopped is not None)]
@@ -472,7 +472,7 @@ class _Run:
         loose = (theta > problem.lower) & (theta < problem.upper)
         for _ in range(MOST_CORRECTIONS):
             excess = scaled.excess(scaled.constraints(theta))
-            rows = np.abs(excess) > 0.1 * FEASIBLE
+            rows = np.abs(excess) > 0.1 * FEASIBLE_VIOLATION
             if not np.any(rows):
                 break
             slope = scaled.slope(theta * scaled.s)[np.ix_(rows, loose)]

@@ -78,23 +78,8 @@ def place_recordings(
         if steady and r.period is None:
             raise InputError("A recording in periodic steady state needs its period in samples; give `period=`.")
         period = (r.period or len(r)) * model.substeps
-        yield PlacedRecording(
-            r, at if estimated else None, given_state(model, r), model.drive(r), scale, steady, period
-        )
+        yield PlacedRecording(r, at if estimated else None, model.first_state(r), model.drive(r), scale, steady, period)
         at += estimated * model.n_state
-
-
-def given_state(model: Model, recording: Recording) -> Array:
-    """Return the given state with memory (n_state,) at a recording's first sample, zero where nothing is given."""
-    state = np.zeros(model.n_state)
-    if not isinstance(recording.initial, str):
-        given = np.asarray(recording.initial, dtype=float).ravel()
-        if given.size not in (len(model.states), model.n_state):
-            raise InputError(
-                f"An initial state of {given.size} numbers was given; expected {len(model.states)} or {model.n_state}."
-            )
-        state[: given.size] = given
-    return state
 
 
 def check_weights(given: Sequence[float] | Array | None, count: int) -> Array:
@@ -493,9 +478,12 @@ class Problem:
             y = y[:, len(warm_up) :: model.substeps]
             initial.append(state)
             simulated.append(y)
-            residual.append(ca.vec(((y - r.y.T) / np.tile(part.scale[:, None], (1, len(r))))[:, r.skip :]))
+            scored = np.arange(len(r))[part.rows(0, len(r))].tolist()
+            residual.append(ca.vec(((y - r.y.T) / np.tile(part.scale[:, None], (1, len(r))))[:, scored]))
         e, penalties = ca.vertcat(*residual), self.penalties
         prior = 0.5 * ca.dot(penalties.weight, (theta - penalties.mean) ** 2) + ca.dot(penalties.slope, theta)
+        for own, square in penalties.states:
+            prior += 0.5 * ca.bilin(ca.DM(square), theta[own], theta[own])
         return Horizon(
             x=theta,
             f=0.5 * ca.sumsqr(e) / self.residuals + prior,

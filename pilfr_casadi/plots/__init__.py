@@ -10,6 +10,7 @@ from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
     from .canvas import new_figure as new_figure
+    from .chart import chart as chart
     from .correlations import residual_tests as residual_tests
     from .diagnosis import (
         Signal as Signal,
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
         mismatch_level as mismatch_level,
         mismatch_map as mismatch_map,
         mismatch_time as mismatch_time,
-        port_law_map as port_law_map,
         refined_hysteresis as refined_hysteresis,
     )
     from .fits import (

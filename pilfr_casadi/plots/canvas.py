@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.textpath import TextPath
 
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
@@ -26,6 +27,7 @@ MOST_POINTS = 3000  # points of a line before it is thinned: more than a page ha
 LONGEST_TITLE = 46  # letters that fit above a figure of the usual width
 DEPTH = 200.0  # dB below the largest value down to which curves are drawn; rounding errors lie deeper
 RUNAWAY = 1e3  # times the span of the measured signal above which a simulation is not drawn
+ALL = slice(None)
 
 
 class ShownFigure(Figure):
@@ -124,18 +126,22 @@ def scale_axis(name: str, values: np.ndarray, unit: str = "") -> tuple[float, st
 def thin(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.ndarray, np.ndarray]:
     """Keep about `most` points that draw the same picture: the smallest and largest of each stretch, in their order.
 
-    x has to increase; shorter lines come back unchanged, and a stretch of gaps (nan) stays a gap.
+    Where x turns back, as in a loop, these are the extremes of both x and y. Shorter lines come back unchanged, and a
+    stretch of gaps (nan) stays a gap.
     """
     if len(y) <= most:
         return x, y
-    length = -(-2 * len(y) // most)
+    columns = (x, y) if np.any(np.diff(x) < 0) else (y,)
+    length = -(-2 * len(columns) * len(y) // most)
     rows = -(-len(y) // length)
-    padded = np.concatenate([y, np.full(rows * length - len(y), y[-1])]).reshape(rows, length)
-    low = np.argmin(np.where(np.isnan(padded), np.inf, padded), axis=1)
-    high = np.argmax(np.where(np.isnan(padded), -np.inf, padded), axis=1)
-    index = np.sort(np.stack([low, high], axis=1), axis=1) + length * np.arange(rows)[:, None]
-    index = np.unique(np.minimum(np.concatenate([[0], index.ravel(), [len(y) - 1]]), len(y) - 1))
-    return x[index], y[index]
+    index = [np.array([0, len(y) - 1])]
+    for column in columns:
+        padded = np.concatenate([column, np.full(rows * length - len(y), column[-1])]).reshape(rows, length)
+        ends = (np.argmin(np.where(np.isnan(padded), np.inf, padded), axis=1),
+                np.argmax(np.where(np.isnan(padded), -np.inf, padded), axis=1))  # fmt: skip
+        index += [end + length * np.arange(rows) for end in ends]
+    kept = np.unique(np.minimum(np.concatenate(index), len(y) - 1))
+    return x[kept], y[kept]
 
 
 def mask_divergence(values: np.ndarray, span: float) -> np.ndarray:
@@ -144,11 +150,21 @@ def mask_divergence(values: np.ndarray, span: float) -> np.ndarray:
         return np.where(np.abs(values) <= RUNAWAY * span, values, np.nan)
 
 
-def line(ax: Axes, x: np.ndarray, y: np.ndarray, label: str, colour: str, **style: Any) -> None:
-    """Draw a line, thinned where it is dense; the legend notes a line without finite values."""
-    if not np.any(np.isfinite(y)):
+class SampledLine(Line2D):
+    """A line that is drawn thinned, or in part, and keeps its samples (x, y), (M,) each."""
+
+    samples: tuple[np.ndarray, np.ndarray]
+
+
+def line(ax: Axes, x: np.ndarray, y: np.ndarray, label: str, colour: str, *, part: slice = ALL, **style: Any) -> None:
+    """Draw a line, or a part of it, thinned where it is dense; the legend notes a line without finite values."""
+    x, y = np.asarray(x), np.asarray(y)
+    if not np.any(np.isfinite(y[part])):
         label = f"{label}: nothing to draw"
-    ax.plot(*thin(np.asarray(x), np.asarray(y)), label=plain(label), color=colour, **{"linewidth": 1.2, **style})
+    shown = SampledLine(*thin(x[part], y[part]), label=plain(label), color=colour, **{"linewidth": 1.2, **style})
+    shown.samples = x, y
+    ax.add_line(shown)
+    ax.autoscale_view()
 
 
 def decibel(power: np.ndarray) -> np.ndarray:

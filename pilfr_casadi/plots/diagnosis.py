@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from .canvas import (
@@ -156,71 +154,6 @@ def mismatch_time(found: Mapping[str, Any]) -> Axes:
     return finish(ax, "time [s]", "rms [% of deviation]", "over time", 3)
 
 
-def port_law_map(
-    rows: Sequence[tuple[str, str, float]],
-    best: Sequence[tuple[str, str]] = (),
-    without: float | None = None,
-    floor: float | None = None,
-) -> Axes:
-    """Draw the error after the fit for every port and law; grey where no fit was made.
-
-    Parameters
-    ----------
-    rows : sequence of (port, law, error)
-        Errors; the smallest of several forms of a law is drawn.
-    best : sequence of (port, law)
-        Pairs to frame.
-    without, floor : float, optional
-        Ends of the scale: error of the simulator without a law, and error of noise alone.
-    """
-    ports = list(dict.fromkeys(p for p, _, _ in rows))
-    smallest: dict[tuple[str, str], float] = {}
-    for port, law, error in rows:
-        if np.isfinite(error) and error > 0:
-            smallest[port, law] = min(error, smallest.get((port, law), np.inf))
-    by_law = {law: min((v for (_, k), v in smallest.items() if k == law), default=np.inf) for _, law, _ in rows}
-    laws = sorted(by_law, key=by_law.__getitem__)
-    grid = np.full((len(laws), len(ports)), np.nan)
-    for (port, law), error in smallest.items():
-        grid[laws.index(law), ports.index(port)] = 100 * error
-    figure = new_figure(max(2.4 + 0.95 * len(ports), 5.2), max(1.4 + 0.28 * len(laws), 2.7))
-    ax = figure.add_subplot()
-    top = 100 * without if without else float(np.nanmax(grid, initial=1e-9))
-    low = min(float(np.nanmin(grid, initial=top)), 100 * floor if floor else np.inf, top / 2)
-    norm = LogNorm(low, top)
-    mesh = ax.pcolormesh(np.ma.masked_invalid(grid), norm=norm, cmap=SHADES, edgecolors="white", linewidth=1)
-    for i, j in np.argwhere(np.isfinite(grid)):
-        dark = norm(grid[i, j]) < 0.55
-        text = f"{grid[i, j]:.2g}" if grid[i, j] < 100 else f"{grid[i, j]:.0f}"
-        framed = (ports[j], laws[i]) in best
-        ax.text(j + 0.5, i + 0.5, text, ha="center", va="center", fontsize=FONT - 1,
-                color="white" if dark else INK, fontweight="bold" if framed else "normal")  # fmt: skip
-        if framed:
-            ax.add_patch(Rectangle((j + 0.03, i + 0.05), 0.94, 0.9, fill=False, edgecolor=VERMILLION, linewidth=2.2,
-                                   zorder=5))  # fmt: skip
-    ax.set_xticks(np.arange(len(ports)) + 0.5, [_wrap(p) for p in ports], fontsize=FONT - 1)
-    ax.set_yticks(np.arange(len(laws)) + 0.5, [plain(law) for law in laws], fontsize=FONT - 1)
-    ax.invert_yaxis()
-    ax.xaxis.tick_top()
-    ax.tick_params(length=0)
-    ax.set_facecolor(PALE_GREY)
-    for side in ax.spines.values():
-        side.set_visible(False)
-    _colour_bar(ax, mesh, "error after the fit [%]")
-    return ax
-
-
-def _wrap(name: str, most: int = 12, lines: int = 3) -> str:
-    """Break a long name after colons, hyphens and underscores, and shorten a longer one."""
-    rows = [""]
-    for piece in re.findall(r"[^:_-]*[:_-]*", name):
-        if rows[-1] and len(rows[-1] + piece) > most:
-            rows.append("")
-        rows[-1] += piece
-    short = [row if len(row) <= most else row[: most - 1] + "…" for row in rows if row]
-    return plain("\n".join([*short[: lines - 1], "…"] if len(short) > lines else short))
-
-
 def _colour_bar(ax: Axes, mesh: Any, label: str, **style: Any) -> None:
     """Draw the logarithmic scale of a map's colours beside it."""
     bar = ax.figure.colorbar(mesh, ax=ax, pad=0.02, **style)
@@ -345,9 +278,9 @@ def force_time(t: np.ndarray, recovered: Signal, std: np.ndarray, law: np.ndarra
     part = slice(begin, begin + window)
     low, high = (force - std)[part] / size, (force + std)[part] / size
     ax.fill_between(t[part], low, high, color=BLUE, alpha=0.25, linewidth=0, label="± one standard deviation")
-    line(ax, t[part], force[part] / size, "recovered from the recording", BLUE, linewidth=1.6)
+    line(ax, t, force / size, "recovered from the recording", BLUE, part=part, linewidth=1.6)
     if len(law):
-        line(ax, t[part], law[: len(t)][part] / size, name, VERMILLION, linewidth=1.3)
+        line(ax, t, law[: len(t)] / size, name, VERMILLION, part=part, linewidth=1.3)
     ax.set_ylim(*_robust_limits(force[part] / size, law[: len(t)][part] / size))
     ax.margins(x=0.01)
     return finish(ax, "time [s]", up, "", 3)

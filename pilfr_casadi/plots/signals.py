@@ -114,13 +114,13 @@ def traces(
         )
     plain_unit = _unit(fit, recording, recording.outputs[output])
     size, label = scale_axis(recording.outputs[output], y[part], plain_unit)
-    line(ax, recording.t[part], y[part] / size, "measured", BLUE, linewidth=3.2, alpha=0.55)
+    line(ax, recording.t, y / size, "measured", BLUE, part=part, linewidth=3.2, alpha=0.55)
     models = [("this model", fit.simulate(recording), INK)]
     if compares_linear(fit):
         models.insert(0, ("linear model", linear_simulation(fit, recording), VERMILLION))
     for model, simulated, colour in models:
         error, note = _without_offset(mask_divergence((simulated[:, output] - y), np.ptp(y)), np.ptp(y), plain_unit)
-        line(ax, recording.t[part], (y + error)[part] / size, model + note, colour)
+        line(ax, recording.t, (y + error) / size, model + note, colour, part=part)
     ax.margins(x=0.01)
     return finish(ax, "time [s]", label, recording.name, 3)
 
@@ -370,10 +370,11 @@ def compared_traces(
     part = slice(first, max(round(end / r.dt), first + 2))
     part = _quiet(y, part.stop - part.start, r.skip) if quiet else part
     size, up = scale_axis(r.outputs[output], y[part], unit)
-    line(ax, r.t[part], y[part] / size, "measured", BLUE, linewidth=4.0, alpha=0.45)
+    line(ax, r.t, y / size, "measured", BLUE, part=part, linewidth=4.0, alpha=0.45)
     for (label, values), colour in zip(simulated, cycle(SIMULATED_COLOURS), strict=False):
         if values is not None:
-            line(ax, r.t[part], mask_divergence(values[part, output], np.ptp(y)) / size, label, colour, linewidth=1.4)
+            drawn = mask_divergence(values[:, output], np.ptp(y)) / size
+            line(ax, r.t, drawn, label, colour, part=part, linewidth=1.4)
     ax.margins(x=0.01)
     return finish(ax, "time [s]", up, r.name, 3)
 

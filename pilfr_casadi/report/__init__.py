@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .fit_sections import mode_tables as mode_tables
     from .fleet import fleet_map as fleet_map, fleet_page as fleet_page
     from .page import (
+        Bar as Bar,
         Code as Code,
         Link as Link,
         Page as Page,

@@ -14,15 +14,23 @@ import numpy as np
 
 from .. import plots
 from .._base import InputError, make_folder, write_atomically
-from ..diagnose import BeforeAfter, Diagnosis, Fitted, HiddenForce, Learned, Workbench, hidden_force
+from ..diagnose import (
+    BeforeAfter,
+    Diagnosis,
+    Fitted,
+    HiddenForce,
+    Learned,
+    Workbench,
+    hidden_force,
+)
 from ..laws import display_name
 from ..plots import Signal
 from ..simulators import Port
 from . import diagnosis_tables as tables
-from .page import Block, Code, Page, Picture, Section, Text, numbered
+from .action import Action, element_of, measure_action
+from .page import Block, Code, Page, Picture, Section, Table, Text, numbered
 
 MOST_DRAWN = 3  # outputs and recordings that are drawn; the tables have all of them
-WIDE_MAP = 6  # ports from which the map of ports and laws fills the page
 
 
 def diagnosis_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Path:
@@ -30,8 +38,8 @@ def diagnosis_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pa
 
     Each file is written atomically, the page last. Figures of an earlier diagnosis are removed.
     """
-    page, figures = _draw(diagnosis_page(diagnosis))
-    html = page.html()
+    page = diagnosis_page(diagnosis)
+    html, figures = page.html(), _figures(page)
     target = make_folder(Path(folder) / "figures").parent
     for name, png in figures.items():
         write_atomically(target / "figures" / name, png)
@@ -44,19 +52,14 @@ def diagnosis_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pa
     return path
 
 
-def _draw(page: Page) -> tuple[Page, dict[str, bytes]]:
-    """Draw each picture once; return the page with its pictures drawn, and the PNG files by name."""
+def _figures(page: Page) -> dict[str, bytes]:
+    """Draw the pictures of a page; return PNG files by name."""
     files: dict[str, bytes] = {}
-
-    def draw(block: Block) -> Block:
-        if not isinstance(block, Picture):
-            return block
-        png = block.png
-        short = "".join(c if c.isascii() and c.isalnum() else "-" for c in block.alt.lower())[:50].strip("-")
-        files[f"diagnosis-{len(files) + 1:02d}-{short}.png"] = png
-        return replace(block, figure=png)
-
-    return replace(page, sections=[Section(s.title, [draw(b) for b in s.blocks]) for s in page.sections]), files
+    for block in (block for section in page.sections for block in section.blocks):
+        if isinstance(block, Picture):
+            short = "".join(c if c.isascii() and c.isalnum() else "-" for c in block.alt.lower())[:50].strip("-")
+            files[f"diagnosis-{len(files) + 1:02d}-{short}.png"] = block.png
+    return files
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,12 +90,15 @@ class _Case:
 def diagnosis_page(diagnosis: Diagnosis) -> Page:
     """Fill the page of a diagnosis; see `diagnosis_report`."""
     case, d = _Case.of(diagnosis), diagnosis
-    checks = tables.check_table(d)
+    actions, checks = (
+        [measure_action(case.bench, case.after, e, element_of(d, e)) for e in d.effects],
+        tables.check_table(d),
+    )
     notes = Section("What the recordings' checks found", [checks] if checks else [])
     faulty = d.verdict == "recording-fault"
     sections = [
         *([notes] if faulty else []),
-        Section(_result_title(d), _result(d)),
+        Section(_result_title(d), _result(d, actions)),
         Section("Where the simulator is off", _mismatch(case)),
         Section("The hidden force", _hidden_forces(case)),
         Section("Candidates", _candidates(d)),
@@ -107,6 +113,7 @@ def diagnosis_page(diagnosis: Diagnosis) -> Page:
         f"Diagnosis of a simulator: {names}",
         [s for s in sections if s.blocks],
         subtitle=_subtitle(case),
+        answer=tables.answer(d, [a.strongest if a else "" for a in actions]),
         status=tables.headline(d),
         tone=tables.tone(d),
         facts=tables.facts(d),
@@ -129,10 +136,10 @@ def _result_title(d: Diagnosis) -> str:
     return "A correction without a certain name" if d.nameless else "How good the simulator is"
 
 
-def _result(d: Diagnosis) -> list[Block]:
+def _result(d: Diagnosis, actions: Sequence[Action | None]) -> list[Block]:
     out: list[Block] = [Text(line) for line in d.gravest_blind_spots()]
-    for k in range(len(d.effects)):
-        out += tables.effect_blocks(d, k)
+    for k, action in enumerate(actions):
+        out += tables.effect_blocks(d, k, action.table if action else None)
     if d.verdict == "complete" and not d.freed:
         out.append(Text("Refitted within its bounds, the simulator follows the recordings down to the noise."))
     elif d.verdict == "unexplained":
@@ -182,8 +189,7 @@ def _hidden_forces(case: _Case) -> list[Block]:
     """Draw the forces of the named effects; without a name, beside the nearest law and at the freest port."""
     d, out = case.diagnosis, [block for learned in case.diagnosis.learned for block in _learned_force(case, learned)]
     for e in d.effects:
-        number = next((i for i, p in enumerate(d.corrected.elements) if (p.port, p.law.id) == (e.port, e.law)), None)
-        if number is not None:
+        if (number := element_of(d, e)) is not None:
             out += _force_blocks(case, case.after, e.port, number, display_name(e.law))
     if d.verdict != "unexplained":
         return out
@@ -285,16 +291,7 @@ def _candidates(d: Diagnosis) -> list[Block]:
         title = "All fitted pairs of port and law"
         if before := tables.in_place(d, k):
             title = f"Fitted beside {before}"
-        cells = [(r["port"], display_name(r["law"]), tables.score(r)) for r in rows]
-        framed = [(port, display_name(law)) for port, law in chosen]
-        axes = plots.port_law_map(cells, framed, tables.error_before(d, k), d.floor["nrmse"] or None)
-        caption = (
-            f"{title}: the error on the training recordings after the fit, in %, by port and law (best form). "
-            " Grey: excluded by the quick test before the fits."
-        )
-        wide = len({r["port"] for r in rows}) > WIDE_MAP
-        out += [Picture(axes, caption, "Errors by port and law.", wide)]
-        out += tables.candidate_tables(rows, chosen, title)
+        out += tables.candidate_tables(rows, chosen, title, d.floor["nrmse"], tables.error_before(d, k))
     return out
 
 
@@ -321,35 +318,40 @@ def _draw_comparison(case: _Case, c: BeforeAfter, i: int) -> list[Block]:
     """Draw one output of a recording: two stretches, the errors over time, and the spectra."""
     r, name = c.recording, c.recording.outputs[i]
     unit, floor = case.unit(name), float(case.noise[i])
-    simulated: plots.Simulated = [("refitted", c.before)]
+    simulated: plots.Simulated = [("as given", c.given), ("refitted", c.before)]
     if correction := tables.correction_words(case.diagnosis):
         simulated.append((correction.removesuffix(" put back").removesuffix(" added"), c.after))
     diverging = [label for label, y in simulated if y is None]
     note = f" The simulation diverges: {', '.join(diverging)}." if diverging else ""
     where = f"{name} in {r.name}"
-    drawn = (
-        (
-            plots.compared_traces(r, simulated, i, unit),
+    wide = plots.new_figure(11.0, 3.8).add_subplot()
+    largest = plots.compared_traces(r, simulated, i, unit, ax=wide)
+    quiet = plots.compared_traces(r, simulated, i, unit, quiet=True)
+    return [
+        Picture(
+            largest,
             f"{where}: measured and simulated, around the largest swing.{note}",
             f"Measured and simulated {where}.",
+            wide=True,
+            views={"largest swing": largest, "little motion": quiet},
         ),
-        (
-            plots.compared_traces(r, simulated, i, unit, quiet=True),
+        Picture(
+            quiet,
             f"{where}: a stretch with little motion.",
             f"Measured and simulated {where}, little motion.",
+            replaced=True,
         ),
-        (
+        Picture(
             plots.compared_residuals(r, simulated, i, unit, floor),
             f"{where}: the error over the whole recording.",
             f"Errors of {where}.",
         ),
-        (
+        Picture(
             plots.compared_spectra(r, simulated, i, unit, floor),
             f"{where}: output and errors over frequency, beside the noise.",
             f"Spectra of {where}.",
         ),
-    )
-    return [Picture(*picture) for picture in drawn]
+    ]
 
 
 def _next_experiment(d: Diagnosis) -> list[Block]:
@@ -359,7 +361,7 @@ def _next_experiment(d: Diagnosis) -> list[Block]:
     settings = {k: v for k, v in d.next_experiment.items() if isinstance(v, str | int | float) and k != "sentence"}
     rows: Sequence[Sequence[Any]] = [[display_name(str(k)), v] for k, v in settings.items()]
     out: list[Block] = [Text(str(sentence))] if sentence else []
-    return [*out, *([tables.Table(["setting", "value"], rows)] if rows else [])]
+    return [*out, *([Table(["setting", "value"], rows)] if rows else [])]
 
 
 def _usage_title(d: Diagnosis) -> str:

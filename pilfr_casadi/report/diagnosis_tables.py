@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from .._base import to_json
-from ..diagnose import STEPS, Diagnosis, learned_force
+from ..diagnose import ERROR_NAMES, Diagnosis, learned_force
 from ..identify import RUN_AWAY
 from ..laws import display_name, scaled, scheduled
 from ..models import Parameter, ParameterSet
-from .page import Block, Code, Table, Text, number_text, render, uncertain_text
+from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
 ALIKE = 1.03  # ratio of two errors up to which two laws do equally well
@@ -21,8 +21,10 @@ RANKED = 12  # rows of the ranked table above the fold
 
 
 def percent(value: float | None) -> str:
-    """Write a relative error as a percentage."""
-    if value is None or not value < RUN_AWAY:
+    """Write a relative error as a percentage; a dash where it was not computed."""
+    if value is None:
+        return "\u2014"
+    if not value < RUN_AWAY:
         return "diverges"
     return f"{number_text(100 * value, 3)}\u00a0%"
 
@@ -54,13 +56,35 @@ def tone(diagnosis: Diagnosis) -> str:
 def _steps(diagnosis: Diagnosis) -> dict[str, str]:
     """Return the keys of the errors to show, with their names."""
     last = correction_words(diagnosis)
-    return STEPS | {"after": last} if last else {k: name for k, name in STEPS.items() if k != "after"}
+    return ERROR_NAMES | {"after": last} if last else {k: name for k, name in ERROR_NAMES.items() if k != "after"}
 
 
 def errors_that_count(diagnosis: Diagnosis) -> tuple[str, Mapping[str, float]]:
     """Return the role that the answer is judged on, test if there are any, and its errors."""
     errors = diagnosis.errors.get("test")
     return ("test", errors) if errors else ("training", diagnosis.errors["train"] or {})
+
+
+def answer(diagnosis: Diagnosis, forces: Sequence[str]) -> str:
+    """Write the result in a few words: what is missing, how strong (`forces`, one an effect), how sure; the gain."""
+    d = diagnosis
+    role, errors = errors_that_count(d)
+    named = [
+        f"{display_name(e.law)} at {e.port}{strong and ', ' + strong}, {100 * e.confidence:.0f}\u00a0% sure"
+        for e, strong in zip(d.effects, forces, strict=True)
+    ]
+    places = ", ".join(dict.fromkeys(f.port for f in d.learned))
+    nameless = f"A force without a name at {places}" if places else "Something is missing that has no name"
+    at_fault = dict.fromkeys(f"{display_name(g.finding)} of {g.channel}" for g in d.gates if g.corrected)
+    other = {
+        "complete": f"{d.freed} is not as stated" if d.freed else "Nothing is missing",
+        "recording-fault": f"The recordings are at fault: {', '.join(at_fault)}".removesuffix(": "),
+    }
+    words = "; ".join(named) or other.get(d.verdict, nameless)
+    last = "after" if correction_words(d) else "before"
+    gain = f"{percent(errors.get('nominal'))} → {percent(errors.get(last))}"
+    words = f"{words[0].upper()}{words[1:]}; error on {'unseen' if role == 'test' else 'the training'} data {gain}"
+    return f"{words}: worse than {percent(errors.get('before'))} refitted" if d.outcome == "worse" else words
 
 
 def headline(diagnosis: Diagnosis) -> str:
@@ -107,17 +131,17 @@ def error_table(diagnosis: Diagnosis) -> Table:
     return Table(["recordings", *steps.values(), "noise floor"], rows, note=note, emphasis=[len(rows) - 1 - led])
 
 
-def effect_blocks(diagnosis: Diagnosis, number: int) -> list[Block]:
-    """Describe an effect: its law, its parameters, and the laws that cannot be told apart from it."""
+def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> list[Block]:
+    """Describe an effect: its law, how it acts, its parameters, and the laws that cannot be told apart from it."""
     e = diagnosis.effects[number]
     form = f" ({display_name(e.form)})" if e.form else ""
     out: list[Block] = [
         Text(f"At {e.port}: {display_name(e.law)}{form}. In words: {e.sentence}. Confidence {e.confidence:.2f} of 1."),
     ]
-    out.append(Code(e.equation))
+    out += [Code(e.equation), *([action] if action else [])]
     rows = [
         [name, uncertain_text(p["value"], float(_array(p["std"]))), p["unit"] or "–"]
-        for name, p in e.parameters.items()
+        for name, p in (e.defined | e.parameters).items()
     ]
     if rows:
         given = any(np.isfinite(float(_array(p["std"]))) for p in e.parameters.values())
@@ -180,11 +204,22 @@ def _parent(diagnosis: Diagnosis, number: int) -> Any:
     return steps[number].parent if number < len(steps) else None
 
 
-def candidate_tables(rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, str]], title: str) -> list[Block]:
-    """Rank the candidates with their margins, best first; fold the tail."""
+def candidate_tables(
+    rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, str]], title: str, floor: float, without: float | None
+) -> list[Block]:
+    """Rank the candidates with their margins, best first; fold the tail.
+
+    Bars reach from the noise `floor` to the error `without` a law, on a logarithmic scale.
+    """
     winner = next((i for i, r in enumerate(rows) if (r["port"], r["law"]) in chosen), None)
     best = score(rows[winner or 0])
     cells = []
+    errors = [score(r) for r in rows if 0 < score(r) < np.inf]
+    low, top = min([*errors, floor or np.inf]) / ALIKE, max([*errors, without or 0.0])
+
+    def share(error: float | None) -> float:
+        return float(np.log(error / low) / np.log(top / low)) if error and low < error < np.inf else 0.0
+
     for i, r in enumerate(rows):
         form = f" ({display_name(r['form'])})" if r.get("form") else ""
         margin = score(r) / best if best > 0 and np.isfinite(score(r)) else np.inf
@@ -193,8 +228,8 @@ def candidate_tables(rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, s
             [
                 f"{i + 1}. {display_name(r['law'])}{form}",
                 r["port"],
-                percent(r["nrmse_train"]),
-                percent(r["nrmse_validation"]),
+                Bar(percent(r["nrmse_train"]), share(r["nrmse_train"]), share(r["nrmse_validation"])),
+                percent(r["nrmse_validation"]) if r["nrmse_validation"] is not None else "–",
                 f"{margin:.2f} ×" if margin < 10 else f"{margin:.3g} ×" if np.isfinite(margin) else "–",
                 f"{gain:+.0f}".replace("-", "−") if np.isfinite(gain) else "–",
             ]
@@ -203,8 +238,9 @@ def candidate_tables(rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, s
     columns = ["law", "port", "error of the fit", "error, held-out blocks", "margin", "ΔBIC"]
     note = (
         "Each law is fitted together with the simulator's own parameters. Where a model is wrong, the likeliest also "
-        "predict blocks that they are not fitted to. Margin: error of the fit divided by the winner's. ΔBIC: twice the "
-        "log evidence lost; below zero is better than no law."
+        "predict blocks that they are not fitted to. Bars: from the noise to the error without a law, logarithmic; the "
+        "thin line reaches to the error on held-out blocks, where it was computed. Margin: error of the fit divided by "
+        "the winner's. ΔBIC: twice the log evidence lost; below zero is better than no law."
     )
     out: list[Block] = [
         Table(columns, cells[:RANKED], caption=title, note=note, emphasis=[i for i in emphasis if i < RANKED])

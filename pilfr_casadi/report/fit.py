@@ -54,13 +54,14 @@ def fit_page(fit: Fit, train: Records, tests: Records, *, model_file: str = "mod
         Section("Parameters", parameter_blocks(fit)),
         Section("How to use it", [Code(render("use_fit.txt", fit=fit, model_file=model_file))]),
     ]
-    status = fit.status
+    status, rows_judged = fit.status, [r for r in rows if r["role"] == "test"] or rows
     return Page(
         f"Identified model: {', '.join(fit.model.inputs)} → {', '.join(fit.model.outputs)}",
         [s for s in sections if s.blocks],
         subtitle=_subtitle(fit),
+        answer=_answer(rows_judged),
         status=f"{status.value} {status.advice}".strip(),
-        tone=status_tone(status),
+        tone=_tone(status, rows_judged),
         facts=_facts(fit, rows),
     )
 
@@ -139,6 +140,24 @@ def _verdict(rows: list[dict[str, Any]]) -> str:
         else ""
     )
     return f"{text}{linear}."
+
+
+def _answer(judged: list[dict[str, Any]]) -> str:
+    """Write the headline: the error of the output that is followed worst, and that of a linear model there."""
+    where = "unseen data" if judged[0]["role"] == "test" else "the training data; no other data was given"
+    worst = max(judged, key=lambda r: r["nrmse"])
+    if not worst["nrmse"] < RUNAWAY:
+        return f"The model diverges on {where}"
+    linear = f"; a linear model {100 * worst['linear']:.2g}\u00a0%" if np.isfinite(worst["linear"]) else ""
+    return f"{100 * worst['nrmse']:.2g}\u00a0% error on {where}{linear}"
+
+
+def _tone(status: Status, judged: list[dict[str, Any]]) -> str:
+    """Choose the colour of the headline: good only if the fit converged and follows the data it is judged on."""
+    if not all(r["nrmse"] < RUNAWAY for r in judged):
+        return "bad"
+    helps = all(r["nrmse"] < min(1.0, r["linear"] if np.isfinite(r["linear"]) else 1.0) for r in judged)
+    return status_tone(status) if helps or not status.converged else "warning"
 
 
 def _facts(fit: Fit, rows: list[dict[str, Any]]) -> dict[str, str]:

@@ -43,8 +43,9 @@ def _draw_output(fit: Fit, r: Recording, i: int) -> list[Block]:
         whole = Picture(plots.time(fit, r, output=i), caption, f"Output and errors of {name} over time.")
     around = f"{name}, measured and simulated, around the largest excursion."
     over = f"{name}: output and errors over frequency."
+    swings = plots.traces(fit, r, output=i)
     return [
-        Picture(plots.traces(fit, r, output=i), around, f"Simulated over measured {name}."),
+        Picture(swings, around, f"Simulated over measured {name}.", views={"largest swing": swings}),
         whole,
         Picture(
             plots.remains(fit, r, output=i),
@@ -88,6 +89,9 @@ def hysteresis(fit: Fit, recordings: Sequence[Recording]) -> list[Block]:
 def linear_part(fit: Fit, train: Sequence[Recording]) -> list[Block]:
     """Tabulate the modes, and draw the linear model of the start over the best linear approximation of the data."""
     out = mode_tables(fit)
+    if out:
+        caption = "Poles in the z-plane with frequency and damping ratio, and zeros from the first input to the output."
+        out.append(Picture(plots.pole_zero(fit.linear_parts()), caption, "Poles and zeros."))
     linear = fit.linear if fit.linear is not None else fit.model if fit.model.element is None else None
     if linear is None or "A" not in linear.parameters:
         return out

@@ -54,10 +54,6 @@ if TYPE_CHECKING:
     )
     from .mujoco import from_mujoco as from_mujoco
     from .numpy_function import from_function as from_function
-    from .simulator import (
-        Simulator as Simulator,
-        compute_equilibrium as compute_equilibrium,
-        resting_elements as resting_elements,
-    )
+    from .simulator import Simulator as Simulator
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

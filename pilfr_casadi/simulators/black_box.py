@@ -13,7 +13,7 @@ from .._base import InputError
 from ..models import Named
 from .external import NOMINAL, PythonFunction, call_external, equal_state, external
 
-KEPT = 16  # matrices of derivatives that are kept: those of the stages of a step, for all directions
+KEPT_DERIVATIVES = 16  # matrices of derivatives that are kept: those of the stages of a step, for all directions
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def _slope(jacobian: Callable[[np.ndarray], np.ndarray], n: int, m: int) -> Pyth
             found = np.asarray(jacobian(z), dtype=float)
             if found.shape != (m, n - 1):
                 raise InputError(f"The Jacobian has the shape {found.shape}; give {(m, n - 1)}: columns of x, u and p.")
-            while len(kept) >= KEPT:
+            while len(kept) >= KEPT_DERIVATIVES:
                 kept.pop(next(iter(kept)), None)
             kept[key] = found
         return kept[key] @ s[1:]

@@ -23,9 +23,9 @@ import numpy as np
 
 from .fmu_instance import FmuFile
 
-STEP = float(np.sqrt(np.finfo(float).eps))  # relative step at which rounding and curvature disturb a difference alike
+RELATIVE_STEP = float(np.sqrt(np.finfo(float).eps))  # at which rounding and curvature disturb a difference alike
 NOMINAL = 1e-3  # size of an argument that is zero: small beside values in SI units, far above rounding
-SAME = 1e-9  # relative difference that rounding may cause
+ROUNDING = 1e-9  # relative difference that rounding may cause
 TINY = 1e-100  # against division by zero along a direction of zeros
 leaves: dict[str, ca.Function] = {}  # by name; CasADi itself does not keep callbacks alive
 units: dict[str, FmuFile] = {}  # of leaves that are functional mock-up units
@@ -67,7 +67,7 @@ def external(evaluate: Expression, nominal: np.ndarray, results: int, slope: Exp
     def along(s: Any) -> Any:
         if slope is not None:
             return slope(z, s)
-        h = STEP / (ca.dot(ca.fabs(s), r[m:]) + TINY)
+        h = RELATIVE_STEP / (ca.dot(ca.fabs(s), r[m:]) + TINY)
         return (evaluate(z + h * s) - r[:m]) * (1 / h)
 
     def across(row: Any) -> Any:  # along each argument in turn: CasADi asks for it only where results are few
@@ -100,7 +100,7 @@ def call_external(function: ca.Function, *arguments: Any) -> Any:
 
 def equal_state(values: np.ndarray, states: np.ndarray, names: Sequence[str]) -> str:
     """Return the name of the state that equals some values at all points, else ""; values (K,), states (K, n)."""
-    same = np.all(np.abs(values[:, None] - states) <= SAME * np.abs(states), axis=0) & np.any(states, axis=0)
+    same = np.all(np.abs(values[:, None] - states) <= ROUNDING * np.abs(states), axis=0) & np.any(states, axis=0)
     return names[int(np.argmax(same))] if np.any(same) else ""
 
 

@@ -29,14 +29,14 @@ import numpy as np
 from .._base import InputError, check_known, listed, run_in_worker
 from ..models import Named, Parameter, parameter_within, within_a_factor
 from .equations import Port
-from .external import NOMINAL, SAME, call_external, equal_state, external, keep_leaf
+from .external import NOMINAL, ROUNDING, call_external, equal_state, external, keep_leaf
 from .fmu_description import Variable, check_file, describe, tidy
 from .fmu_instance import FmuFile, unpack
 from .simulator import Simulator
 
-POINTS = 8  # at which a trial compares derivatives and outputs with states, and looks at what ports do
+COMPARED_POINTS = 8  # at which a trial compares derivatives and outputs with states, and looks at what ports do
 TIMES = (0.0, 0.7, 13.0, 400.0)  # s, at which a trial looks for a dependence on time
-PATIENCE = 60.0  # seconds that loading may take
+LOADING_SECONDS = 60.0  # seconds that loading may take
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +192,7 @@ class _Equations:
             row = rows[int(np.argmin(np.all(np.isfinite(found), axis=0)))]
             raise InputError(f"{unit.path} gives no finite number for {row!r} near its start values; check it.")
         later = np.array([[unit.values(t, *points[0][1:]), unit.values(t, *points[-1][1:])] for t in TIMES])
-        self.timed = bool(np.any(np.abs(later - later[0]) > SAME * np.max(np.abs(later))))
+        self.timed = bool(np.any(np.abs(later - later[0]) > ROUNDING * np.max(np.abs(later))))
         states = np.array([x - unit.starts(unit.states) for _, x, _, _ in points])
         equal = [equal_state(row, states, unit.states) for row in found.T]
         self.equal = {row: same for row, same in zip(rows, equal, strict=True) if same}
@@ -210,7 +210,7 @@ class _Equations:
         x, u, p = (unit.starts(names) for names in (unit.states, unit.inputs, unit.parameters))
         yield 0.0, x, u, p
         moves = np.array([n in self.free for n in unit.parameters], dtype=float)
-        for _ in range(1, POINTS):
+        for _ in range(1, COMPARED_POINTS):
             changes = [10 ** rng.uniform(-3, 0) * rng.standard_normal(len(a)) for a in (x, u)]
             yield 0.0, x + changes[0], u + changes[1], p * (1 + 0.1 * moves * rng.uniform(-1, 1, len(p)))
 
@@ -273,16 +273,16 @@ class _Equations:
             np.array([unit.values(t, x, u + k * step, p)[rows] for t, x, u, p in points]) for k in (0, 1, 2)
         )
         once, twice = once - none, twice - none
-        size = np.max(np.abs(once)) + SAME * np.max(np.abs(none))
-        if np.any(np.abs(twice - 2 * once) > np.sqrt(SAME) * size):
+        size = np.max(np.abs(once)) + ROUNDING * np.max(np.abs(none))
+        if np.any(np.abs(twice - 2 * once) > np.sqrt(ROUNDING) * size):
             raise InputError(
                 f"The force of port {port!r} does not add up in {listed(list(factors))}: twice the input has not twice "
                 "the effect; name an input that is a force."
             )
-        moved = {k: i for k, i in enumerate(rows) if np.any(np.abs(once[:, k]) > SAME * size)}
+        moved = {k: i for k, i in enumerate(rows) if np.any(np.abs(once[:, k]) > ROUNDING * size)}
         if not moved:
             raise InputError(f"The input {listed(list(factors))} of port {port!r} changes nothing; name another one.")
-        if np.all(np.abs(once - once[0]) <= np.sqrt(SAME) * size):
+        if np.all(np.abs(once - once[0]) <= np.sqrt(ROUNDING) * size):
             return {names[i]: float(once[0, k]) for k, i in moved.items()}
 
         def into(x: Named, u: Named, p: Named) -> dict[str, Any]:
@@ -316,9 +316,9 @@ def _parameter(variable: Variable, bounds: tuple[float, float] | None) -> Parame
 def _check_program(path: Path) -> None:
     """Refuse a unit whose program does not load and evaluate, in a process that it may end."""
     job = path.resolve(), unpack(path)[0]
-    reply = run_in_worker(pickle.dumps(_try), pickle.dumps(job), PATIENCE)
+    reply = run_in_worker(pickle.dumps(_try), pickle.dumps(job), LOADING_SECONDS)
     if reply.timed_out or reply.lost:
-        what = f"takes more than {PATIENCE:g} s to load" if reply.timed_out else "ends the process that loads it"
+        what = f"takes more than {LOADING_SECONDS:g} s to load" if reply.timed_out else "ends the process that loads it"
         raise InputError(f"The program inside {path} {what}; ask its maker for another one.")
     if reply.result:
         raise InputError(f"{path} cannot be evaluated ({reply.result}); check it with the tool that made it.")

@@ -195,7 +195,7 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
         if stages is not None:
             stages = stages[0], staged[0], staged[1], ca.vertcat(staged[2], begun)
     return from_expressions(
-        StepExpressions(x, s, ca.vertcat(*columns), step.vector, x_next, s_next, y, port, stages),
+        StepExpressions(x, s, ca.vertcat(*columns), step.vector, x_next, s_next, y, port, stages, step.resting()),
         simulator.parameter_set,
         states=simulator.states,
         inputs=simulator.inputs,
@@ -221,8 +221,9 @@ class _SubStep:
         now = {name: ca.SX.sym(name, n) for name, n in sizes}
         f, y, after, local = equations.evaluate(Instant(**now, slope=slope))
         z = ca.vertcat(ca.SX(0, 1), *(ca.repmat(local[i][0], n) for i, n in enumerate(equations.n_s) if n))
-        self.at = ca.Function("at", [*now.values(), self.u0, self.u1, self.vector], [f, y, after, z])
-        _, _, self.begun, self.z = self._at(self.x, self.s, self.u0, self.t)
+        signals = ca.vertcat(ca.SX(0, 1), *(local[i][0] for i in range(len(local))))
+        self.at = ca.Function("at", [*now.values(), self.u0, self.u1, self.vector], [f, y, after, z, signals])
+        _, _, self.begun, self.z, _ = self._at(self.x, self.s, self.u0, self.t)
         # a shift register takes in the signal at the beginning of the step, where it is measured; other memory has
         # already moved on with it
         self.moved = ca.SX.sym("moved", self.s.numel())
@@ -242,7 +243,7 @@ class _SubStep:
     def advance(self) -> tuple[Any, Any, tuple[Any, ...] | None]:
         """Make the next states, the outputs, and the stages of `Model`, from the moved memory."""
         x, h, own = self.x, self.h, len(self.simulator.states)
-        k1, y, _, _ = self._at(x, self.memory, self.u0, self.t)
+        k1, y, *_ = self._at(x, self.memory, self.u0, self.t)
         if self.simulator.discrete:  # the laws' own states move with z held over the sample
             return ca.vertcat(k1[:own], x[own:, 0] + h * k1[own:, 0]), y, None
         middle, end = (self.u0 + self.end) / 2, self.end
@@ -260,6 +261,32 @@ class _SubStep:
         by_c = ca.vertcat(c2, x + h / 2 * self._slope(s2, middle, 0.5), x + h * self._slope(s3, middle, 0.5))
         by_stages = (s2 + 2 * s3 + s4 - x) / 3 + h / 6 * self._slope(s4, end, 1.0)
         return x_next, y, (c, ca.vertcat(c2, c3, c4), by_c, by_stages)
+
+    def resting(self) -> ca.Function | None:
+        """Make `(x, u, p) -> [x; laws' states; memory]`: all laws at rest, as if their signals had stood still.
+
+        From zero, a delay or a lag of a signal about a working point would first have to come there: a transient that
+        no recording shows, and that bends a fit of the law's parameters. A play of a signal about a working point would
+        begin at one end of its gap.
+        """
+        counts = [n_q or n_s for n_q, n_s in zip(self.equations.n_q, self.equations.n_s, strict=True)]
+        shares = [_settled(e.law, n) for e, n in zip(self.simulator.elements, counts, strict=True)]
+        if not any(np.any(share) for share in shares):
+            return None
+        sizes = (("x", len(self.simulator.states)), ("u", self.u0.numel()), ("p", self.vector.numel()))
+        x, u, p = (ca.MX.sym(name, n) for name, n in sizes)
+        z = ca.MX.zeros(len(shares))
+        for _ in (*shares, None):  # one law's signal may be what another gives out
+            own = [share * z[i] for i, share in enumerate(shares)]
+            state = ca.vertcat(x, *(part for part, n in zip(own, self.equations.n_q, strict=True) if n))
+            memory = ca.vertcat(ca.MX(0, 1), *(part for part, n in zip(own, self.equations.n_s, strict=True) if n))
+            z = self.at(state, memory, u, 0, u, u, p)[4]
+        return ca.Function("resting", [x, u, p], [ca.densify(ca.vertcat(state, memory))])
+
+
+def _settled(law: Any, n: int) -> np.ndarray:
+    """Mark those of a law's n states or memories that come to rest at the value at which its signal stands."""
+    return np.asarray(law.standing(1.0)) if n and hasattr(law, "standing") else np.zeros(n)
 
 
 def states_along(model: Model, drive: np.ndarray, p: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -29,9 +29,9 @@ from .simulator import Simulator
 from .symbols import NotFollowed, expression, symbols
 from .tracing import Trace, accept_symbols, follow
 
-POINTS = 40  # at which the equations are compared with the function
-REACH = (-3.0, 2.0)  # powers of ten between which the sizes of states and inputs are drawn, in their own units
-SPREAD = 0.1  # relative change of parameters between these points
+COMPARED_POINTS = 40  # at which the equations are compared with the function
+SIZE_DECADES = (-3.0, 2.0)  # powers of ten between which the sizes of states and inputs are drawn, in their own units
+PARAMETER_CHANGE = 0.1  # relative change of parameters between these points
 AGREE = 1e-9  # relative difference that rounding may cause; the order of operations can differ
 ARGUMENTS = ("t", "x", "u", "p")
 
@@ -121,9 +121,9 @@ class _Names:
         """
         own, rng = self.parameters, np.random.default_rng(0)
         sizes, drawn = (len(self.states), len(self.inputs)), []
-        for i in range(1, POINTS):
-            x, u = (10 ** rng.uniform(*REACH) * rng.standard_normal(n) for n in sizes)
-            change = SPREAD * np.where(own.start == 0, 1.0, own.start) * rng.uniform(-1, 1, own.size)
+        for i in range(1, COMPARED_POINTS):
+            x, u = (10 ** rng.uniform(*SIZE_DECADES) * rng.standard_normal(n) for n in sizes)
+            change = PARAMETER_CHANGE * np.where(own.start == 0, 1.0, own.start) * rng.uniform(-1, 1, own.size)
             p = np.clip(own.start + change, own.lower, own.upper)
             drawn.append((float(rng.uniform(0, 10)), *((np.abs(x), np.abs(u)) if i % 2 else (x, u)), p))
         return [(0.0, np.zeros(sizes[0]), np.zeros(sizes[1]), own.start), *drawn]
@@ -212,9 +212,8 @@ def _equations(function: Any, kind: str, names: _Names, found: tuple[str, ...] |
     traced = ca.Function(kind, [t, x, u, p], [equations], [*ARGUMENTS], [kind])
     for point, row in values:
         _compare(traced, point, row, found, called)
-    note = (
-        f"{kind}: equations of {called}; called {calls + POINTS} times ({calls} for its branches, {POINTS} as a check)"
-    )
+    times = f"{calls + COMPARED_POINTS} times ({calls} for its branches, {COMPARED_POINTS} as a check)"
+    note = f"{kind}: equations of {called}; called {times}"
     return _Equations(traced, found, names.states, names.inputs, tuple(names.parameters), note)
 
 
@@ -235,7 +234,9 @@ def _evaluate(
     if failed is not None and (not values or _writes(failed)):
         raise InputError(_failure(called, failed, names)) from failed
     if found is None or not any(np.all(np.isfinite(row)) for _, row in values):
-        raise InputError(f"{called} gives no finite numbers at any of {POINTS} points around zero; check its formulas.")
+        raise InputError(
+            f"{called} gives no finite numbers at any of {COMPARED_POINTS} points around zero; check its formulas."
+        )
     return found, values
 
 

@@ -2,10 +2,6 @@
 
 `close_loop(simulator, law, port)` puts a law into a port and gives a simulator again; `discretise` makes it a `Model`
 like any other.
-
-`compute_equilibrium` gives the state with its laws at rest where a recording begins, as if their signals had stood
-still before. From zero, a delay or a lag of a signal about a working point would first have to come there: a transient
-that no recording shows, and that bends a fit of the law's parameters before the initial state has followed.
 """
 
 from __future__ import annotations
@@ -13,18 +9,16 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
-from .._base import InputError, later, one_at_a_time
-from ..data import Recording, as_recordings, nrmse
+from .._base import InputError, later
+from ..data import Recording
 from ..laws import readable_unit
-from ..models import Parameter, ParameterSet, accumulate_steps, map_points
+from ..models import Parameter, ParameterSet, accumulate_steps
 from .equations import Equations, Placed
-from .integration import ClosedEquations, Instant, choose_substeps, discretise, on_grid
+from .integration import choose_substeps, discretise
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -102,29 +96,30 @@ class Simulator(Equations):
             own = own.with_(y=self._measured(own), outputs=self.output_names)
         substeps = choose_substeps(self, [own])
         model = discretise(self, own.dt, own.hold or self.hold or "zero", substeps)
-        start = np.zeros(model.n_state)
+        drive, start = model.drive(own), np.zeros(model.n_state)
         if not isinstance(own.initial, str):
-            start[: len(self.states)] = own.initial[: len(self.states)]
-        drive = model.drive(own)
+            start = model.rest_at(np.asarray(own.initial, dtype=float), own.u[0], self.parameter_set.start)
         values = np.broadcast_to(self.parameter_set.start, (len(drive), self.parameter_set.size))
         return accumulate_steps(model.closed, start, drive, values)[1][::substeps]
 
     def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
         """Compute the NRMSE (Krikelis et al. 2024, Eq. 27) of a simulation, averaged over outputs and recordings.
 
+        As `Fit.nrmse` does, it fits an initial state that a recording does not give to the first samples, which are
+        then not scored.
+
         Raises
         ------
         InputError
             As `simulate`, and if the recording lacks an output of the simulator.
         """
-        given = as_recordings(recordings)
-        return float(np.mean([nrmse(self._measured(r), self.simulate(r), r.skip) for r in given]))
+        return later("simulator_nrmse")(self, recordings)
 
     def plot(self, recording: Recording) -> Any:
         """Draw the simulator beside a recording: a row for each output, the largest swing and all residuals.
 
         An initial state that the recording does not give is fitted to the first samples; see `compare`, whose figure
-        this is. `nrmse` begins at zero instead.
+        this is.
 
         Returns
         -------
@@ -203,44 +198,9 @@ class Simulator(Equations):
         prefixes = itertools.chain([f"{port}."], (f"{port}#{k}." for k in itertools.count(2)))
         return next(p for p in prefixes if not any(name.startswith(p) for name in taken))
 
-    def without_last_element(self) -> Simulator:
-        """Copy without the law of the last `with_element`."""
-        *kept, last = self.elements
-        own = {k: p for k, p in self.parameters.items() if not k.startswith(last.prefix)}
+    def without_element(self, index: int = -1) -> Simulator:
+        """Copy without one of the `elements`, by default the last."""
+        kept = list(self.elements)
+        gone = kept.pop(index)
+        own = {k: p for k, p in self.parameters.items() if not k.startswith(gone.prefix)}
         return self._with(parameters=ParameterSet(own), elements=tuple(kept))
-
-
-def resting_elements(simulator: Simulator) -> list[int]:
-    """Return the indices of elements whose states or memory come to rest where their signal does."""
-    laws = [e.law for e in simulator.elements]
-    return [i for i, law in enumerate(laws) if getattr(law, "follows", 0) or getattr(law, "shifts", False)]
-
-
-@one_at_a_time
-def compute_equilibrium(simulator: Simulator, h: float, vector: np.ndarray, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Compute the state with laws' own states and memory at rest, (n_state,), on steps of h seconds.
-
-    Parameters
-    ----------
-    vector : array
-        Parameters; those that the simulator does not know stand behind its own.
-    x : array
-        The simulator's own states.
-    u : array
-        Inputs.
-    """
-    simulator = on_grid(simulator, h)
-    p = ca.SX.sym("p", ParameterSet(dict(simulator.parameters)).size)
-    equations, n_x, moved = ClosedEquations(simulator, p), len(simulator.states), resting_elements(simulator)
-    n_q, n_s = equations.n_q, equations.n_s
-    n_xq = n_x + sum(n_q)
-    state = np.append(x[:n_x], np.zeros(sum(n_q) + sum(n_s)))
-    own_q, own_s = pairwise(np.cumsum([n_x, *n_q])), pairwise(np.cumsum([n_xq, *n_s]))
-    spans = [slice(*(q if q[0] < q[1] else s)) for q, s in zip(own_q, own_s, strict=True)]
-    at, now = ca.SX.sym("x", len(state)), ca.SX.sym("u", len(u))
-    local = equations.evaluate(Instant(at[:n_xq], at[n_xq:], now, ca.SX.zeros(len(u)), 0.0))[3]
-    z = ca.Function("z", [at, now, p], [ca.vertcat(*(local[i][0] for i in moved))])
-    for _ in moved:  # one law's signal may be what another gives out
-        for i, value in zip(moved, map_points(z, state[None], u, vector[: p.numel()])[0].ravel(), strict=True):
-            state[spans[i]] = simulator.elements[i].law.standing(float(value))
-    return state

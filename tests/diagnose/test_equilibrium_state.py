@@ -7,9 +7,11 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.gates import Offset
+from pilfr_casadi.diagnose.preparation import prepare
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
     CATALOGUE,
+    Backlash,
     Creep,
     Delay,
     Lag,
@@ -20,7 +22,7 @@ from pilfr_casadi.laws import (
     TwoStageCreep,
     unit_forces,
 )
-from pilfr_casadi.simulators import compute_equilibrium, discretise
+from pilfr_casadi.simulators import discretise
 
 DT, M = 0.05, 1500
 
@@ -59,7 +61,7 @@ def test_a_law_begins_as_if_the_signal_had_stood_still(kind):
     simulator = placed(law.at({**shape, **strengths}))
     model = discretise(simulator, DT, substeps=4)
     x, u = np.array([5.0, 5.0]), np.array([5.0])
-    state = compute_equilibrium(simulator, DT / 4, model.parameters.start, x, u)
+    state = model.rest_at(x, u, model.parameters.start)
     assert np.array_equal(state[:2], x) and len(state) == model.n_state and np.max(state[2:]) == 7
     r = recorded(5.0).with_(u=np.full((M, 1), 5.0))
     y, after = make_engine(model).simulate(model.drive(r), model.parameters.start, state)
@@ -67,7 +69,9 @@ def test_a_law_begins_as_if_the_signal_had_stood_still(kind):
     np.testing.assert_allclose(after, state, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", [k for k in CATALOGUE if k.follows or k.shifts], ids=lambda k: k.__name__)
+@pytest.mark.parametrize(
+    "kind", [k for k in CATALOGUE if (k.order and k.follows) or k.shifts], ids=lambda k: k.__name__
+)
 def test_the_screen_sees_nothing_where_the_signal_stands(kind):
     z = np.full(50, 7.0)
     shapes = list(kind().shapes(Local(z, 0 * z, DT, (50,))))
@@ -80,11 +84,39 @@ def test_the_screen_sees_nothing_where_the_signal_stands(kind):
 
 def test_only_what_begins_somehow_begins_where_its_signal_stands():
     simulator, r = placed(Lag().at({"T": 0.1})), recorded(5.0)
-    for initial, expected in (("estimate", 7.0), ("zero", 0.0)):
+    for initial, expected in (("estimate", 7.0), ("zero", 0.0), ([5.0, 5.0], 7.0)):
         bench = Workbench.of(simulator, [r.with_(initial=initial)], "zero")
         model = bench.model(simulator)
-        begun = bench.initial_states(simulator, model, model.parameters.start, [np.array([5.0, 5.0])])[0]
+        begun = bench.initial_states(model, model.parameters.start, [np.array([5.0, 5.0])])[0]
         assert begun[2] == expected
+
+
+@pytest.mark.parametrize("law", [Lag().at({"T": 0.1}), Creep().at({"T": 2.0, "c": 0.3}), Backlash().at({"r": 1.0})])
+def test_a_stated_level_is_no_transient_of_a_law(law):
+    simulator = placed(law)
+    still = recorded(5.0).with_(u=np.full((M, 1), 5.0), initial=[5.0, 5.0])
+    y = simulator.simulate(still)
+    np.testing.assert_allclose(y, np.broadcast_to(y[0], y.shape), rtol=1e-9)
+    assert y[0, 0] >= 7
+
+
+def findings(r, off=1.15):
+    return [(g.channel, g.finding) for g in prepare(tank(off), [r], "zero", "auto").gates]
+
+
+def test_a_lag_is_not_taken_for_a_late_recorder():
+    lagging, r = tank().with_element("sensor:lower", Lag().at({"T": 8 * DT})), recorded(30.0)
+    r = r.with_(initial=[30.0, 30.0])
+    noise = 2e-3 * np.random.default_rng(1).standard_normal(r.y.shape)
+    assert findings(r.with_(y=lagging.simulate(r) + noise)) == []
+    late = tank().simulate(r)
+    late[:, 1] = np.append(np.full(8, 30.0), late[:-8, 1])
+    assert findings(r.with_(y=late + noise)) == [("lower", "alignment")]
+
+
+def test_a_stated_start_that_the_first_sample_contradicts_is_estimated():
+    assert findings(recorded(30.0).with_(initial="zero")) == [("initial state", "start")]
+    assert findings(recorded(30.0).with_(initial=[30.0, 30.0])) == []
 
 
 @pytest.mark.slow

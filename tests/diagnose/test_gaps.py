@@ -11,7 +11,7 @@ from diagnosis_rig import OFF, recordings, rig
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.gates import CURED, Checked
+from pilfr_casadi.diagnose.gates import CURED_SHARE, Checked
 from pilfr_casadi.diagnose.preparation import prepare, refitted
 from pilfr_casadi.diagnose.timing import find_gaps, find_jump, settle_jump
 from pilfr_casadi.engine import make_engine
@@ -90,7 +90,7 @@ def test_a_shock_is_no_gap(samples):
     push[1200 : 1200 + samples] = 5000 / samples
     made, plain = bench(*pushed(push))
     jump, pieces = settle_jump(Checked(made, plain))
-    assert pieces.cost < 0.1 * plain.cost and not jump.beats(jump.rival, CURED)  # cutting would cure it, and yet
+    assert pieces.cost < 0.1 * plain.cost and not jump.beats(jump.rival, CURED_SHARE)  # cutting would cure it, and yet
     assert not find_gaps(Checked(made, plain)).gates
 
 

@@ -130,3 +130,12 @@ def test_a_law_that_leaves_nothing_is_the_physics_and_one_that_leaves_all_is_non
     shares = [share_named(s) for s in np.linspace(0, 1, 200)]
     assert all(0 <= s <= 1 for s in shares) and np.all(np.diff(shares) <= 1e-12)
     assert shares[0] == SURE and shares[-1] < 0.1
+
+
+def test_of_forms_that_follow_alike_the_plainest_is_stated():
+    plain, finer = trial(DRY, left=1e-4), trial(("a", DirectionalFriction()), left=0.97e-4)
+    told = [(trial(left=1.0), 0.0), (plain, 59.0), (finer, 60.0)]
+    assert posterior(searched(told)).best is plain
+    assert posterior(searched([*told[:2], (finer, 70.0)])).best is finer
+    better = trial(("a", DirectionalFriction()), left=0.5e-4)
+    assert posterior(searched([*told[:2], (better, 60.0)])).best is better

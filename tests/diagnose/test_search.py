@@ -91,7 +91,7 @@ def test_an_answer_that_rests_on_an_interrupted_fit_is_concluded():
 
 
 def test_a_hypothesis_fitted_to_a_part_is_judged_on_everything(monkeypatch):
-    monkeypatch.setitem(vars(sys.modules[Trials.__module__]), "LONG", 300)
+    monkeypatch.setitem(vars(sys.modules[Trials.__module__]), "COMPARED_SAMPLES", 300)
     search = searching(recordings(FRICTION, count=1))
     placed = rig(OFF).with_element("ground-m1", FRICTION)
     trial = search.fits.fitted(placed, [{}], 1)

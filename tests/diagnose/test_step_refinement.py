@@ -8,7 +8,7 @@ from diagnosis_rig import DT
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.workbench import FINER, THOROUGH, refine_steps
+from pilfr_casadi.diagnose.workbench import FINER_STEPS, THOROUGH, refine_steps
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import CoulombFriction, Delay, Polynomial
 from pilfr_casadi.simulators import Simulator, discretise
@@ -73,7 +73,7 @@ def sharp(friction=F_C, **own):
 def test_friction_that_is_in_the_simulator_already_gets_the_steps_that_it_asks_for():
     found = pilfr.diagnose(sharp(5.0, mass=1.7, drag=5.0), ran(0, 1e-4), test=ran(1, 1e-4), laws=(CoulombFriction,))
     assert (found.verdict, found.effects) == ("complete", ()), str(found)
-    assert found.substeps >= FINER
+    assert found.substeps >= FINER_STEPS
     assert found.errors["test"]["after"] < 2 * found.floor["nrmse"]
     assert found.corrected.parameters["F"].value == pytest.approx(F_C, rel=2e-3)
 
@@ -91,7 +91,7 @@ def test_finer_steps_only_where_the_run_depends_on_them_whatever_else_is_missing
         bench = Workbench.of(sharp(), records, "zero")
         coarse = bench.fit(sharp(), solver=THOROUGH)
         finer, found = refine_steps(bench, coarse)
-        assert finer.substeps == found.model.substeps >= FINER * bench.substeps
+        assert finer.substeps == found.model.substeps >= FINER_STEPS * bench.substeps
         law = CoulombFriction(values={"F_c": F_C, "v_0": 1e-6})  # counted from the steps that were chosen first
         assert finer.model(sharp().with_element("guide", law)).substeps == finer.substeps
 
@@ -127,4 +127,4 @@ def test_a_sharp_knee_gets_finer_steps_whatever_its_sharpness():
     for v_0 in (1e-2, 1e-3, 1e-4, 1e-6):
         law = CoulombFriction(values={"F_c": F_C, "v_0": v_0})
         counts = bench.model(bench.simulator.with_element("guide", law)).substeps
-        assert counts == FINER * bench.substeps or v_0 > 1e-3
+        assert counts == FINER_STEPS * bench.substeps or v_0 > 1e-3

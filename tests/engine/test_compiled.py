@@ -182,7 +182,7 @@ def test_damaged_library_is_built_anew(model, fresh, harm):
 
 @needs_compiler
 def test_the_cache_does_not_grow_without_end(fresh, monkeypatch):
-    monkeypatch.setattr(compiled, "KEPT", 2)
+    monkeypatch.setattr(compiled, "KEPT_LIBRARIES", 2)
     monkeypatch.setattr(compiled, "_shelf", lambda key: cache_directory() / "00")
     sources = [f"int number(void) {{ return {k}; }}" for k in range(4)]
     first = compiled.build(sources[0])

@@ -404,23 +404,6 @@ def test_what_cannot_be_drawn_is_one_sentence(draw, words, fitted, data):
         draw(fitted, data)
 
 
-def test_the_map_of_ports_and_laws_shows_the_errors_it_is_given():
-    rows = [("ground", "hysteresis", 0.02), ("ground", "hysteresis", 0.5), ("sensor:x", "hysteresis", 0.3)]
-    rows += [("ground", "drift", 0.25), ("sensor:x", "drift", np.inf)]
-    ax = plots.port_law_map(rows, best=[("ground", "hysteresis")], without=0.4, floor=0.01)
-    ports = [t.get_text().replace("\n", "") for t in ax.get_xticklabels()]
-    laws = [t.get_text() for t in ax.get_yticklabels()]
-    shown = {(ports[int(t.get_position()[0])], laws[int(t.get_position()[1])]): t for t in ax.texts}
-    assert {key: float(t.get_text()) for key, t in shown.items()} == {
-        ("ground", "hysteresis"): 2.0,  # of two forms the better one, in %
-        ("sensor:x", "hysteresis"): 30.0,
-        ("ground", "drift"): 25.0,
-    }
-    assert [key for key, t in shown.items() if t.get_fontweight() == "bold"] == [("ground", "hysteresis")]
-    assert ax.figure.axes[1].get_ylabel() == "error after the fit [%]"
-    pixels(ax.figure)
-
-
 # ------------------------------------------------------------------------------------- linear parts and residual tests
 
 

@@ -1,5 +1,7 @@
 """The page is one file that says what it should, escapes what users wrote, and works in a real browser."""
 
+import base64
+import hashlib
 import io
 import re
 from dataclasses import replace
@@ -7,14 +9,15 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, in_a_browser
+from browser import in_a_browser, needs_chromium
 
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording
 from pilfr_casadi.identify import Fit, load
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, block_shapes
 from pilfr_casadi.optimise import Iteration, Solution, Status
-from pilfr_casadi.plots import new_figure
+from pilfr_casadi.plots import chart, new_figure
+from pilfr_casadi.plots.canvas import BLUE, INK, finish, line
 from pilfr_casadi.report import (
     Code,
     Link,
@@ -99,6 +102,16 @@ class Reader(HTMLParser):
         return [attrs for name, attrs in self.tags if name == tag]
 
 
+def own_scripts_alone(html):
+    """Whether the policy allows exactly the scripts of a page by their hash, and nothing points to a network."""
+    rest = re.sub(r"<script>.*?</script>", "", html, flags=re.S)
+    scripts = re.findall(r"<script>(.*?)</script>", html, re.S)
+    policy = re.search(r'Content-Security-Policy" content="(.*?)"', html)[1]
+    allowed = re.findall(r"'sha256-(.*?)'", policy)
+    hashes = [base64.b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts]
+    return allowed == hashes and len(scripts) == 2 and not re.search(r"<script|https?://|@import|url\(", rest)
+
+
 def test_users_text_is_text():
     blocks = [Text(EVIL), Code(EVIL, EVIL), Table([EVIL], [[EVIL]], EVIL, EVIL), Table(["a"], [[1]], EVIL, folded=True)]
     blocks += [Picture(square(), EVIL, EVIL)]
@@ -180,7 +193,7 @@ def test_the_page_of_a_fit(tmp_path):
     assert "Modes in small motions" in reader.text and "Operators, by threshold" in reader.text
     assert "pilfr.load('model.json')" in reader.text
     images = reader.all("img")
-    assert len(images) == 2 * 4 + 4 + 1 + 1 and all(i["alt"] for i in images)
+    assert len(images) == 2 * 4 + 4 + 1 + 1 + 1 and all(i["alt"] for i in images)
     assert len(reader.all("figcaption")) == len(images)
     assert len(html) < 3_000_000
 
@@ -223,7 +236,7 @@ def test_modes_are_eigenvalues():
 def test_a_fit_that_did_not_converge_says_so(status, tone, tmp_path):
     fitted = example(status=status)
     html = fit_report(fitted, record(fitted), [], tmp_path).read_text()
-    assert f'class="status {tone}">{status.value}' in html
+    assert f'class="status {tone}">' in html and status.value in html
     assert "on its training recordings" in html
 
 
@@ -248,12 +261,64 @@ def test_a_folder_that_cannot_be_made(tmp_path):
         fit_report(fitted, record(fitted), [], tmp_path / "file" / "folder")
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-@pytest.mark.parametrize("width", [390, pytest.param(1280, marks=pytest.mark.slow)])
+def chart_page(samples=20_000):
+    """A page with a line over time with a spike, points beside a loop, and steps on logarithmic axes."""
+    t = np.linspace(0, 50, samples)
+    axes = [new_figure().add_subplot() for _ in range(3)]
+    line(axes[0], t, np.where(np.arange(samples) == 7777, 5.0, np.sin(9 * t)), "measured", BLUE, part=slice(100, 900))
+    line(axes[0], t, np.cos(9 * t), "costs $", INK, part=slice(100, 900))
+    axes[1].plot(np.cos(t), np.sin(t), label="loop")
+    axes[1].plot(np.cos(t[::50]), np.sin(t[::50]) + 0.1, ".", label="points")
+    axes[2].stairs([1.0, 300.0, 4.0], [1.0, 10.0, 50.0, 900.0], baseline=None, label="steps")
+    axes[2].set(xscale="log", yscale="log")
+    for ax, labels in zip(axes, (("time [s]", "y [m]"), ("z [m]", "w [N]"), ("frequency [Hz]", "power")), strict=True):
+        finish(ax, *labels, "title")
+    drawn = [Picture(ax, "caption", f"Picture {k}.") for k, ax in enumerate(axes)]
+    drawn[0] = replace(drawn[0], views={"start": axes[0]})
+    return axes, Page("charts", [Section("part", [*drawn, Picture(axes[0], "again", "Again.", replaced=True)])])
+
+
+def test_a_picture_becomes_a_chart_of_all_samples():
+    (over_time, loop, steps), page = chart_page()
+    content = chart(over_time, {"start": over_time}, 500)
+    x, y = (unpacked(content["lines"][0][k]) for k in "xy")
+    assert 900 < len(x) < 2500 and np.all(np.diff(x) > 0) and (x[0], x[-1]) == (0, 50)
+    assert np.max(y) == 5.0 and np.count_nonzero((x > 0.25) & (x < 2.25)) > 350  # spikes stay, and windows are dense
+    assert [line["label"] for line in content["lines"]] == ["measured", "costs $"]
+    assert content["x"] == {"label": "time [s]", "log": False} and list(content["views"]) == ["", "start"]
+    around, points = chart(loop, {}, 500)["lines"]
+    assert len(unpacked(around["x"])) <= 510 and points["mark"] == "dot" and points["width"] == 0
+    assert np.max(unpacked(around["x"])) == np.max(unpacked(around["y"])) == pytest.approx(1, abs=1e-6)
+    (line,) = chart(steps, {}, 500)["lines"]
+    assert unpacked(line["y"]).tolist() == [1, 1, 300, 300, 4, 4]
+    figure = new_figure()
+    first, _ = figure.subplots(1, 2)
+    assert chart(first, {}, 500) is None
+    html = page.html()
+    assert html.count("data-chart=") == 3 and own_scripts_alone(html)
+
+
+def unpacked(packed):
+    if isinstance(packed, list):
+        return packed[0] + packed[1] * np.arange(packed[2])
+    return np.frombuffer(base64.b64decode(packed), "<f4").astype(float)
+
+
+@needs_chromium
+def test_charts_in_a_browser(tmp_path):
+    (tmp_path / "report.html").write_text(chart_page()[1].html())
+    seen = in_a_browser(tmp_path, 390)
+    assert seen["pictures"] == seen["charts"] == 3
+    assert re.fullmatch(r"time [\d.]+ smeasured: \S+ mcosts \$: \S+ m", seen["used"][0]["tip"])
+
+
+@needs_chromium
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [390, 1280])
 def test_in_a_browser(width, tmp_path):
     fitted = example(n_u=2, n_y=2, channels=2)
     long_name = "a_recording_with_a_name_that_goes_on_and_on_without_a_single_blank_in_it"
     fit_report(fitted, record(fitted), [record(fitted, long_name, seed=2)], tmp_path)
     seen = in_a_browser(tmp_path, width)
     assert seen["title"] == "Identified model: u0, u1 → y0, y1"
-    assert seen["images"] == seen["shown"] > 10
+    assert seen["pictures"] > 10
