@@ -174,6 +174,11 @@ class Simulator(Equations):
         if not place.kinds & set(allowed):
             kind = "series" if place.series else "parallel"
             raise InputError(f"The law {law.id!r} cannot stand in {kind} at {port!r}; choose another port or law.")
+        if getattr(law, "in_line", False) and place.term is None:
+            raise InputError(
+                f"The law {law.id!r} ({law.form or 'plain'}) stands in line with a term of the equations, and the port "
+                f"{port!r} names none; give Port(..., term=...), or choose another law."
+            )
         if getattr(law, "sensed", False) and not self.shown_states(place):
             raise InputError(
                 f"The law {law.id!r} ({law.form}) changes what outputs read of {port!r}, but none reads its coordinate "
