@@ -22,6 +22,7 @@ KINDS = {
     "curves": "Curves of actuators and sensors",
     "dynamic": "Delays, creep, modes and trends",
     "catalogue": "Forces of speed",
+    "in_line": "In line with a force of the equations",
     "thermal": "Heat flows",
     "electrical": "Currents and voltages",
 }
@@ -50,7 +51,10 @@ def motion() -> Local:
 
 
 def motion_of(law: type[Law], local: Local) -> Local:
-    """The motion that a law is shown on: temperatures in K for radiation, which is linear over a few K."""
+    """The motion that a law is shown on: temperatures in K for radiation, and a term for a law in line with it."""
+    if law.in_line:
+        drive = -np.cos(7 * local.dt * np.arange(len(local.z)))
+        return replace(local, shown=True, term=lambda z, dz: drive if law.order == 2 else z + 0.05 * dz)
     if law.id != "radiation":
         return local
     return replace(local, z=WARM * local.z + (HOT if law.form == "absolute" else 0.0), dz=WARM * local.dz)

@@ -379,7 +379,7 @@ def _followed_laws(found: Check, port: str) -> Iterator[BlindSpot]:
     followed = [r for r in found.laws if r.port == port and r.status == "followed" and r.law not in LINEAR]
     for why in dict.fromkeys(r.why for r in followed):
         own = tuple(r.law for r in followed if r.why == why)
-        what = f"a change of {why}" if any(why == p.name for p in found.parameters) else why
+        what = _describe_change(why) if any(why == p.name for p in found.parameters) else why
         names = in_words([display_name(name) for name in own])
         text = f"{names[0].upper()}{names[1:]} at {port} cannot be distinguished from {what}."
         yield BlindSpot("followed", (port, *own), text)
@@ -486,3 +486,9 @@ def _rests(z: np.ndarray, least: float, samples: float) -> int:
             count += k - begin > samples
             begin, low, high = k, value, value
     return count
+
+
+def _describe_change(parameter: str) -> str:
+    """Describe a change of a parameter, or of the constant that a check has added at a channel."""
+    port, _, name = parameter.rpartition(".")
+    return f"an offset of {port.partition(':')[2]}" if name == "w_0" and ":" in port else f"a change of {parameter}"

@@ -223,8 +223,8 @@ def settle(now: Checked, fault: G, solver: GaussNewton = QUICK) -> tuple[G, Chec
 def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
     """Return the corrected state with its finding if the rule accepts the fault, else the state before.
 
-    If the recordings as given are followed as well from the corrected refit's values, the correction only led the refit
-    out of a local minimum; that refit is returned.
+    The simulator is also refitted to the recordings as given, from the corrected refit's values. If that follows as
+    well, the correction only led the refit out of a local minimum, and that refit is returned.
     """
     if after is None or not _satisfies_rule(now, after, fault):
         return now
@@ -564,6 +564,14 @@ def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
         if found is not None and gain(found.cost, fitted.cost, fitted.residual) <= LEAST_GAIN:
             fitted = found
     return fitted
+
+
+def without_zero_offsets(simulator: Simulator) -> Simulator:
+    """Return a simulator without the offsets that are fixed at zero."""
+    for i, e in reversed(list(enumerate(simulator.elements))):
+        if isinstance(e.law, Offset) and np.all(simulator.parameters[f"{e.prefix}w_0"].fixed):
+            simulator = simulator.without_element(i)
+    return simulator
 
 
 def final_gates(

@@ -23,7 +23,7 @@ from ..data import Recording
 from ..laws import Law, Local
 from ..linear import steady_state_gain, with_output_injection
 from ..models import Model, map_points
-from ..simulators import Simulator, discretise, signals, states_along
+from ..simulators import Port, Simulator, discretise, signals, states_along, term_function
 from .workbench import FINER_STEPS, Fitted, Workbench
 
 WALL = 1.0  # largest |λ| h of a contact on the finest steps
@@ -109,8 +109,10 @@ class Run:
         Simulated (or predicted) minus measured output.
     z, dz : array, shape (M, n_ports)
         Local signals.
-    u : array, shape (M, n_u)
-        Inputs.
+    x, u : array, shapes (M, n_x) and (M, n_u)
+        The simulator's own states, and inputs.
+    p : array
+        Parameter vector, the simulator's own first.
     own : array, shape (M, n)
         The ports' own signals.
     sign : array, shape (n_ports,)
@@ -131,7 +133,9 @@ class Run:
     error: np.ndarray
     z: np.ndarray
     dz: np.ndarray
+    x: np.ndarray
     u: np.ndarray
+    p: np.ndarray
     own: np.ndarray
     sign: np.ndarray
     back: np.ndarray
@@ -185,7 +189,8 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     sense = {"sign": np.where(moved, 0.0, sign), "back": np.where(moved, -np.sign(np.median(lift, axis=0)), sign)}
     felt = {"lift": np.abs(lift).max(axis=0), "push": np.abs(push).max(axis=0)}
     rest = r.begins == "zero"
-    return Run(a, b, c, d, mean, error=y - r.y, z=z, dz=dz, u=r.u, own=own, **sense, **felt, from_zero=rest)
+    beside = {"z": z, "dz": dz, "x": along_run, "u": r.u, "p": p, "own": own}
+    return Run(a, b, c, d, mean, error=y - r.y, **beside, **sense, **felt, from_zero=rest)
 
 
 def local_signals(
@@ -316,10 +321,24 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
     own = own_signals(bench.simulator, np.concatenate([r.own for r in runs]))
     rest = tuple(r.from_zero for r in runs)
     pairs = enumerate(zip(max_stiffness.tolist(), max_damping.tolist(), strict=True))
-    shown = [bench.simulator.shown_states(port) is not None for port in bench.simulator.all_ports()]
-    return [
-        Local(z[:, j], dz[:, j], bench.dt, lengths, k, d, {**inputs, **own[j]}, rest, shown[j]) for j, (k, d) in pairs
-    ]
+    x, u = (np.concatenate([getattr(r, name) for r in runs]) for name in ("x", "u"))
+    found = [Local(z[:, j], dz[:, j], bench.dt, lengths, k, d, {**inputs, **own[j]}, rest) for j, (k, d) in pairs]
+    ports = bench.simulator.all_ports()
+    return [_with_equations(bench.simulator, q, v, x, u, runs[0].p) for q, v in zip(ports, found, strict=True)]
+
+
+def _with_equations(
+    simulator: Simulator, port: Port, local: Local, x: np.ndarray, u: np.ndarray, p: np.ndarray
+) -> Local:
+    """Add what the equations say of a port: whether outputs read it, and its term along states, inputs and values."""
+    term = term_function(simulator, port) if port.term else None
+    own = p[: simulator.parameter_set.size]
+
+    def along(z: np.ndarray, dz: np.ndarray) -> np.ndarray:
+        assert term is not None
+        return np.asarray(map_points(term, z[:, None], dz[:, None], x, u, own)[0][:, 0, 0])
+
+    return replace(local, shown=simulator.shown_states(port) is not None, term=along if term is not None else None)
 
 
 def own_signals(simulator: Simulator, values: np.ndarray) -> list[dict[str, np.ndarray]]:
@@ -337,8 +356,8 @@ def port_signals(bench: Workbench, fitted: Fitted, port: str) -> Local:
         with np.errstate(over="ignore", invalid="ignore"):
             x = states_along(model, model.drive(r), fitted.vector, state)[:: model.substeps, : len(simulator.states)]
             z, dz, *_, own = local_signals(bench, function, x, r, fitted.vector)
-        parts.append((z[:, index], dz[:, index], own))
-    z, dz, own = (np.concatenate([part[k] for part in parts]) for k in (0, 1, 2))
+        parts.append((z[:, index], dz[:, index], own, x, r.u))
+    z, dz, own, x, u = (np.concatenate([part[k] for part in parts]) for k in range(5))
     local = bench.local(z, dz)
-    shown = simulator.shown_states(simulator.port(port)) is not None
-    return replace(local, inputs={**local.inputs, **own_signals(simulator, own)[index]}, shown=shown)
+    local = replace(local, inputs={**local.inputs, **own_signals(simulator, own)[index]})
+    return _with_equations(simulator, simulator.port(port), local, x, u, fitted.vector)

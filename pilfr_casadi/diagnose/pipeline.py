@@ -2,29 +2,32 @@
 
 How an answer comes about:
 
-0. Steps 1 and 2 are done once as a rule. They are repeated in three cases: with an observer if the simulator is
-   unstable and runs away from the recordings (`prediction`); with the other hold if nobody stated it and the best
-   hypothesis follows better with it; without a shift if a channel seemed to be early, because missing physics can look
-   like a lead. Each search fits different data. Its evidence is therefore not comparable; the smaller error decides.
 1. `prepare` corrects faults of the recordings, refits the simulator, and measures the noise. The refitted simulator is
    the hypothesis that nothing is missing. What it leaves above the noise is the mismatch.
 2. `Search.run` fits further hypotheses: the simulator with laws in its ports, with all parameters estimated together.
-   Each of them gets a log evidence: how well it follows the recordings, less the cost of its parameters, plus its prior
+   Each gets a log evidence: how well it follows the recordings, less the cost of its parameters, plus its prior
    (`evidence`, which lists the numbers on which an answer rests).
 3. `posterior` turns the evidences into probabilities. An effect's confidence is the probability of all hypotheses that
-   have it, times the probability that its law is the physics (`share_named`). That probability is small if a flexible
-   force explains much of the rest. Step 5 reduces it if a learned force stays beside the laws (`Posterior.within`).
+   have it, times the probability that its law is the physics (`share_named`): a rest that a flexible force could
+   explain lowers it. Of forms of a law that follow alike, the plainest is stated.
 4. `judge` chooses the verdict. It is a recording fault if its correction removed the mismatch; missing physics if the
    law of the likeliest hypothesis is more likely than not the physics; complete if the refit's residual can be noise;
    else unexplained.
-5. `find_correction` compares named laws with a learned force on held-out parts of the recordings. If the named law
-   predicts worse than the force, the name is withdrawn and the verdict is chosen again.
-   Before that, if there is time, explanations without a law are tried: a parameter pinned to a wrong value, and a
-   clipped input. They count if they explain as much.
-   If the recordings are long, steps 1 to 5 see only their most informative stretches (`stretches`). The leading
-   hypotheses are then fitted to everything before step 3, and the answer's simulator before step 6.
-6. The proof (`proof`) adds errors on test recordings, placebos and standard errors. It changes no verdict. Offsets that
+5. If there is time, explanations without a law are tried: a parameter pinned to a wrong value, and a clipped input.
+   They count if they explain as much as the law.
+6. `find_correction` compares named laws with a learned force on held-out parts of the recordings. If the named law
+   predicts worse than the force, the name is withdrawn and the verdict is chosen again. A learned force that stays
+   beside the laws lowers their confidence (`Posterior.within`).
+7. The proof (`proof`) adds errors on test recordings, placebos and standard errors. It changes no verdict. Offsets that
    no longer improve the fit beside the effects are set to zero.
+
+**Long recordings.** Steps 1 to 6 see only their most informative stretches (`stretches`). The leading hypotheses are
+then fitted to everything before step 3, and the answer's simulator before step 7.
+
+**Repetitions.** Steps 1 and 2 are repeated in three cases: with an observer if the simulator is unstable and runs away
+from the recordings (`prediction`); with the other hold if nobody stated it and the best hypothesis follows better with
+it; without a shift if a channel seemed to be early, because missing physics can look like a lead. Each search fits
+different data. Its evidence is therefore not comparable; the smaller error decides.
 """
 
 from __future__ import annotations
@@ -46,7 +49,7 @@ from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction, find_correction, named_correction
 from .evidence import AS_GIVEN_RATIO, SURE, deviations
 from .floor import Floor, measured_floor
-from .gates import USELESS_FIT, Gate, Offset, final_gates, offset_gates, without_idle_offsets
+from .gates import USELESS_FIT, Gate, Offset, final_gates, offset_gates, without_idle_offsets, without_zero_offsets
 from .identifiability import port_units
 from .mismatch_map import mismatch
 from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
@@ -426,7 +429,7 @@ def _build_diagnosis(
         parameters=parameter_table(request.simulator, without, after, std),
         errors=errors,
         floor={"nrmse": search.floor.nrmse(bench.scale), "source": search.floor.source},
-        corrected=after.corrected(),
+        corrected=without_zero_offsets(after.corrected()),
         refitted=without.corrected(),
         hold=bench.hold,
         train=bench.recordings,

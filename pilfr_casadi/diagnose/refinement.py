@@ -380,7 +380,7 @@ def _exchange(simulator: Simulator, number: int, law: Law) -> Simulator:
     kept = {k: p for k, p in simulator.parameters.items() if not k.startswith(simulator.elements[number].prefix)}
     bare = simulator
     for _ in simulator.elements:
-        bare = bare.without_last_element()
+        bare = bare.without_element()
     for i, e in enumerate(simulator.elements):
         bare = bare.with_element(e.port, law if i == number else e.law)
     return bare.with_parameters({**bare.parameters, **kept})

@@ -91,7 +91,7 @@ class Remainder:
     @classmethod
     def of(cls, bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]], at: str = "") -> Remainder:
         """Project the error along some runs, for the laws that the data can determine; with `at`, for one port only."""
-        signals = ("a", "b", "c", "d", "error", "z", "dz", "u")
+        signals = ("a", "b", "c", "d", "error", "z", "dz", "x", "u", "own")
         short = [
             replace(r, **{k: getattr(r, k)[w] for k in signals}, from_zero=r.from_zero and w.start == 0)
             for r, w in zip(runs, _windows(bench, runs), strict=True)

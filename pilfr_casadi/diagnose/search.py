@@ -446,7 +446,7 @@ class Search:
         if len(best.laws) != len(parent.laws) + 1:
             return
         element, base = best.element, best.fitted
-        bare = base.simulator.without_last_element()
+        bare = base.simulator.without_element()
         local = next((s.local for step in self.steps for s in step.scored if s.port == best.port), None)
         for kind in FINER.get(type(element.law), ()) if local is not None else ():
             shapes = list(kind.finer_starts(best.own, local))

@@ -262,7 +262,9 @@ class Trials:
         count = len(parent.laws) + 1
         options = {"states": base.begin, "model": model, "engine": engine}
         brief = self.fitted(placed, ranked[:1], count, solver=BRIEF, **options)
-        if first.law.special:  # the refit may be far off where the missing force is strongly curved
+        if (
+            first.law.special or first.law.in_line
+        ):  # the refit may be far off where the missing force is strongly curved
             afresh = [s for s in ranked if any(s is n for n in given)][:1]
             again = self.fitted(placed, afresh, count, solver=BRIEF, **{**options, "states": ()})
             brief = min((t for t in (brief, again) if t is not None), key=lambda t: t.part_mean_square, default=None)
@@ -318,15 +320,16 @@ def _head(r: Recording, share: float) -> Recording:
 
 
 def select_pairs(scored: Sequence[Scored], best: int) -> list[list[Scored]]:
-    """Select the pairs worth a full fit: the best of both lists, the best of each port, and the laws of its domain.
+    """Select the pairs worth a full fit: the best of both lists and of each port, and the laws that belong to a port.
 
-    The forces of these special laws are so curved that a small dose may tell little of them.
+    These are laws of its domain, and laws in line with its term. Their forces are so curved that a small dose may tell
+    little of them.
     """
     chosen: dict[Pair, list[Scored]] = {}
     for source in ("simulation", "observer"):
         ports, passed = set[str](), list[Scored]()
         for s in (s for s in scored if s.source == source):
-            if len(passed) < best or s.port not in ports or s.law.special:
+            if len(passed) < best or s.port not in ports or s.law.special or s.law.in_line:
                 chosen.setdefault(s.pair, [])
             if not any(_is_redundant(s, other) for other in passed):  # two forms of one law are one hypothesis
                 passed.append(s)

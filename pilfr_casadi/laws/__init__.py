@@ -2,7 +2,8 @@
 
 `base` holds the class `Law` and shows how to add a law in ten lines. Laws are grouped by kind: `stiffness` (springs,
 contacts, gaps, periodic forces), `friction` (forces of speed), `hysteresis` (loops), `curves` (saturation and other
-curves of actuators and sensors), `dynamic` (delays, creep, modes, trends), and those of one domain, `thermal` and
+curves of actuators and sensors), `dynamic` (delays, creep, modes, trends), `in_line` (in line with a term of the
+equations), and those of one domain, `thermal` and
 `electrical`. `catalogue` lists the laws that a diagnosis tries and composes laws (scaled, scheduled, behind a gap).
 `forces` evaluates laws along given signals.
 """
@@ -90,6 +91,12 @@ if TYPE_CHECKING:
         SmoothHysteresis as SmoothHysteresis,
         StopHysteresis as StopHysteresis,
         hysteresis_layer as hysteresis_layer,
+    )
+    from .in_line import (
+        Compliance as Compliance,
+        ElasticDrive as ElasticDrive,
+        ElasticDriveSeenAtLoad as ElasticDriveSeenAtLoad,
+        LineGap as LineGap,
     )
     from .stiffness import (
         Clearance as Clearance,

@@ -72,6 +72,8 @@ class Local:
         Whether each recording begins with everything at zero; else a law begins as if z had stood still before.
     shown : bool
         Whether z is a state that outputs read, itself or its rate.
+    term : callable, optional
+        Force (M,) that the equations have at the port already, from another z and dz (M,); see `Port`.
     """
 
     z: np.ndarray
@@ -83,6 +85,7 @@ class Local:
     inputs: Mapping[str, np.ndarray] = field(default_factory=dict)
     from_zero: tuple[bool, ...] = ()
     shown: bool = False
+    term: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
 
     # old spellings, which laws of users may name in `starts` and `ranges`
     stiffest = property(lambda self: self.max_stiffness)
@@ -173,6 +176,8 @@ class Law:
     memory, shifts : int, bool
         `memory` is the length of its discrete memory. `shifts` says that the memory is a shift register, which takes
         in the signal at the beginning of a step.
+    in_line : bool
+        The law stands in line with the port's `term`, which `force` and `flow` may call: `term(z, dz)`.
     sensed : bool
         Outputs that read the port's coordinate or its rate read `far_side(q, p)` in their place. The law is tried only
         where the coordinate is a state that outputs read.
@@ -220,6 +225,7 @@ class Law:
     follows: ClassVar[int] = 0
     memory: ClassVar[Any] = 0
     shifts: ClassVar[bool] = False
+    in_line: ClassVar[bool] = False
     sensed: ClassVar[bool] = False
     substeps: ClassVar[int] = 1
     knee: ClassVar[str] = ""

@@ -16,7 +16,7 @@ import numpy as np
 
 from .._base import InputError
 from ..models import Named, Parameter
-from . import curves, dynamic, electrical, friction, hysteresis, stiffness, thermal
+from . import curves, dynamic, electrical, friction, hysteresis, in_line, stiffness, thermal
 from .base import Law, Local, contact_onset
 
 GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
@@ -229,7 +229,7 @@ FINER: dict[type[Law], tuple[Any, ...]] = {
 CATALOGUE: tuple[type[Law], ...] = (
     *(
         law
-        for file in (stiffness, friction, hysteresis, curves, dynamic, thermal, electrical)
+        for file in (stiffness, friction, hysteresis, curves, dynamic, in_line, thermal, electrical)
         for law in vars(file).values()
         if isinstance(law, type) and issubclass(law, Law) and hasattr(law, "id") and (law,) not in FINER.values()
     ),

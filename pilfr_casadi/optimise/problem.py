@@ -478,9 +478,12 @@ class Problem:
             y = y[:, len(warm_up) :: model.substeps]
             initial.append(state)
             simulated.append(y)
-            residual.append(ca.vec(((y - r.y.T) / np.tile(part.scale[:, None], (1, len(r))))[:, r.skip :]))
+            scored = np.arange(len(r))[part.rows(0, len(r))].tolist()
+            residual.append(ca.vec(((y - r.y.T) / np.tile(part.scale[:, None], (1, len(r))))[:, scored]))
         e, penalties = ca.vertcat(*residual), self.penalties
         prior = 0.5 * ca.dot(penalties.weight, (theta - penalties.mean) ** 2) + ca.dot(penalties.slope, theta)
+        for own, square in penalties.states:
+            prior += 0.5 * ca.bilin(ca.DM(square), theta[own], theta[own])
         return Horizon(
             x=theta,
             f=0.5 * ca.sumsqr(e) / self.residuals + prior,

@@ -50,6 +50,7 @@ if TYPE_CHECKING:
         rate_at_start as rate_at_start,
         signals as signals,
         states_along as states_along,
+        term_function as term_function,
     )
     from .mujoco import from_mujoco as from_mujoco
     from .numpy_function import from_function as from_function

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self, cast
 
@@ -23,6 +23,7 @@ from ..models import Named, Parameter, ParameterSet
 from .domains import DOMAINS, UNKNOWN, common_domain, infer_domain, may_convert
 
 Expression = Callable[..., Any]
+SIGN_POINTS = 3  # at which the sign of a term is looked at
 BUILT_IN = ("actuator:", "sensor:", "equation:")  # prefixes of the ports that need no declaration
 
 
@@ -72,13 +73,19 @@ class Port:
     signals : mapping of str to callable, optional
         Further quantities with which the strength of a law here may vary, besides the inputs and z: a load that the
         contact transmits, a temperature, `{"load": lambda x, u: ca.fabs(u.torque)}`; from any of x, u, p.
+    term : callable, optional
+        Force that the equations have here already, with the sign of w, so that they hold `into * term`: the force of a
+        spring, `lambda z, p: p.k * z`, or minus the torque of a motor, `lambda u: -u.torque`. It takes any of z, dz, x,
+        u, p by name, where z and dz are the local coordinate and its rate. Laws in line with it (a gap, a compliance, a
+        rotor on a spring) are then tried: they give it another z and dz.
     domain : {"mechanical", "thermal", "electrical", "fluid", "unknown"}, optional
         Physical domain, which decides what laws are tried; by default inferred from the units.
 
     Raises
     ------
     InputError
-        If an argument has the wrong type, or the domain is not one of these.
+        If an argument has the wrong type, or the domain is not one of these. A simulator refuses a term that its
+        equations hold with the other sign.
 
     Examples
     --------
@@ -95,6 +102,7 @@ class Port:
     series: bool = False
     domain: str = ""
     signals: Mapping[str, Expression] = field(default_factory=dict)
+    term: Expression | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -106,6 +114,8 @@ class Port:
             given = getattr(self, option)
             if not callable(given) and not (option == "rate" and given is None):
                 raise InputError(f"`{option}` {what} is {given!r}; give a function, such as {wanted}.")
+        if self.term is not None and not callable(self.term):
+            raise InputError(f"`term` {what} is {self.term!r}; give a function, such as lambda z, p: p.k * z.")
         for option in ("unit", "across_unit"):
             if not isinstance(getattr(self, option), str):
                 raise InputError(f"`{option}` {what} is {getattr(self, option)!r}; give plain text, such as 'N'.")
@@ -132,6 +142,8 @@ class Port:
 
         A port of unknown domain admits the laws of all domains, except special ones.
         """
+        if law.in_line and self.term is None:
+            return False
         if not self.kinds & set(law.places) or (law.across and not may_convert(self.across_unit, law.across)):
             return False
         return self.domain in law.domains or not (law.special or (law.domains and self.domain != UNKNOWN))
@@ -202,6 +214,7 @@ class Equations:
         for port in self.ports:
             self.into(port, x, u, p, t)
             self.across(port, x, u, p, t)
+            self._check_term(port, x, u, p, t)
         if self.observer is not None:
             object.__setattr__(self, "observer", self._checked_gain(self.observer))
 
@@ -288,6 +301,41 @@ class Equations:
         name = f"`across` of port {port.name!r}"
         return _scalar(call(port.across, name, x=x, u=u, p=p, t=t), name)
 
+    def term(self, port: Port, z: Any, dz: Any, x: Named, u: Named, p: Named) -> Any:
+        """Evaluate a port's term at another coordinate and rate."""
+        assert port.term is not None
+        name = f"`term` of port {port.name!r}"
+        return _scalar(call(port.term, name, z=ca.SX(z), dz=ca.SX(dz), x=x, u=u, p=p), name)
+
+    def rate(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Any:
+        """Evaluate the rate dz/dt of a port inside the equations, inputs held."""
+        if port.rate is not None:
+            return _scalar(call(port.rate, f"`rate` of port {port.name!r}", x=x, u=u, p=p, t=t), "rate")
+        states = ca.vertcat(*(x[name] for name in self.states))
+        return ca.jtimes(self.across(port, x, u, p, t), states, self.derivatives(x, u, p, t))
+
+    def _check_term(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> None:
+        """Refuse a term that the equations hold with the other sign: its symbols change them the other way."""
+        if port.term is None:
+            return
+        known = ca.vertcat(*(ca.vec(v) for names in (x, u, p) for v in names._values.values()), t)
+        term = self.term(port, self.across(port, x, u, p, t), self.rate(port, x, u, p, t), x, u, p)
+        name, factor = next(iter(self.into(port, x, u, p, t).items()))
+        held = dict(zip(self.states, ca.vertsplit(self.derivatives(x, u, p, t)), strict=True)) if self.states else {}
+        whole = held[name] if name in held else self.measured(x, u, p, t)[name]
+        slopes = ca.Function("slopes", [known], [ca.jacobian(v, known) for v in (whole, factor * term, factor)])
+        values = np.random.default_rng(0).uniform(0.5, 1.5, (SIGN_POINTS, known.numel()))
+        all_of, own, scale = (
+            np.array([s.full().ravel() for s in column]) for column in zip(*(slopes(v) for v in values), strict=True)
+        )
+        moving = np.any(own != 0, axis=0) & ~np.any(scale != 0, axis=0)
+        same, opposite = (np.any(np.all(np.isclose(all_of, sign * own, atol=0.0), axis=0) & moving) for sign in (1, -1))
+        if opposite and not same:
+            raise InputError(
+                f"The equations hold the term of port {port.name!r} with the other sign; give it so that `into` times "
+                "the term stands in them."
+            )
+
     def shown_states(self, port: Port) -> tuple[str, str] | None:
         """Find the two states that are a port's coordinate and its rate, if an output reads one of them."""
         if port.series or self.discrete:
@@ -316,7 +364,10 @@ class Equations:
     @cached_property
     def _every_port(self) -> tuple[Port, ...]:
         inner = self.ports or (() if self.discrete else tuple(map(self._equation, self.states)))
-        domain = common_domain(port.domain for port in self.ports)  # a voltage is a signal in all domains
+        domain = common_domain(port.domain for port in inner)
+        if not self.ports:
+            inner = tuple(replace(port, domain=domain) if port.domain == UNKNOWN else port for port in inner)
+        # a voltage is a signal in all domains
         actuators = (_series("actuator", n, lambda u, n=n: u[n], self.units, domain) for n in self.inputs)
         sensors = (_series("sensor", n, lambda: 0, self.units, domain) for n in self.output_names)
         return (*inner, *actuators, *sensors)
@@ -324,12 +375,16 @@ class Equations:
     def _equation(self, state: str) -> Port:
         """Make the port of a state's equation: w is subtracted from its derivative.
 
-        Where the state is the derivative of another state (a velocity), the local coordinate is that other state.
+        Where the state is the derivative of another state (a velocity), the local coordinate is that other state. The
+        port has units if an output is the coordinate itself.
         """
-        integral = next((n for n, rate in self._integrals.items() if rate == state), None)
-        if integral is None or integral == state:
-            return Port(f"equation:{state}", {state: -1.0}, lambda x: x[state])
-        return Port(f"equation:{state}", {state: -1.0}, lambda x: x[integral], lambda x: x[state])
+        integral = next((n for n, rate in self._integrals.items() if rate == state), state)
+        x, u, p, t = self.symbols()
+        same = (n for n, y in self.measured(x, u, p, t).items() if y.is_symbolic() and y.name() == integral)
+        unit = next((self.units[n] for n in same if n in self.units), "")
+        own = f"{unit}/s" if integral == state else f"{unit}/s^2"
+        rate = None if integral == state else lambda x: x[state]
+        return Port(f"equation:{state}", {state: -1.0}, lambda x: x[integral], rate, own if unit else "", unit)
 
     @cached_property
     def _integrals(self) -> dict[str, str]:

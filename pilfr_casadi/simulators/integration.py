@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, TypeVar
@@ -25,10 +25,10 @@ from typing import Any, TypeVar
 import casadi as ca
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, one_at_a_time
 from ..data import Recording
 from ..models import Model, StepExpressions, accumulate_steps, from_expressions, map_points
-from .equations import Equations, Named, Placed, call, in_series
+from .equations import Equations, Named, Placed, Port, call, in_series
 
 LARGEST_STEP = 0.25  # largest |λ| h: a phase error of (λh)⁴/120 = 3e-5 of the angle of a cycle
 MOST_SUBSTEPS = 200  # per sample
@@ -90,9 +90,11 @@ class ClosedEquations:
         flow: list[Any] = [ca.SX(n, 1) for n in self.n_q]
         memory: list[Any] = [ca.SX(n, 1) for n in self.n_s]
 
-        def apply(i: int, z: Any, dz: Any, beside: Mapping[str, Any] | None = None) -> Any:
+        def apply(
+            i: int, z: Any, dz: Any, beside: Mapping[str, Any] | None = None, term: Callable[..., Any] | None = None
+        ) -> Any:
             e, now = simulator.elements[i], Named("input", {**u, **(beside or {})})
-            have = {"z": z, "dz": dz, "q": q[i], "p": self._own(e), "t": t, "x": x, "u": now}
+            have = {"z": z, "dz": dz, "q": q[i], "p": self._own(e), "t": t, "x": x, "u": now, "term": term}
             if hasattr(e.law, "step"):
                 read = {k: have[k] for k in ("dz", "u") if k in inspect.signature(e.law.step).parameters}
                 w, memory[i] = e.law.step(z, s[i], self._own(e), **read)
@@ -120,7 +122,8 @@ class ClosedEquations:
                 continue
             port = simulator.port(e.port)
             z = simulator.across(port, x, inputs, p, t)
-            w = apply(i, z, rates[self.rows[e.port]], simulator.port_signals(port, x, inputs, p, t))
+            term = functools.partial(simulator.term, port, x=x, u=inputs, p=p) if port.term else None
+            w = apply(i, z, rates[self.rows[e.port]], simulator.port_signals(port, x, inputs, p, t), term)
             for name, factor in simulator.into(port, x, inputs, p, t).items():
                 if name in simulator.states:
                     unit = ca.SX.zeros(f.shape)
@@ -317,7 +320,7 @@ def signals(simulator: Equations) -> ca.Function:
         here = y[port.name.removeprefix("sensor:")] if port.name.startswith("sensor:") else None
         z = simulator.across(port, x, u, p, t) if here is None else here
         if port.rate is not None:
-            dz = ca.SX(call(port.rate, f"rate of port {port.name!r}", x=x, u=u, p=p, t=t))
+            dz = simulator.rate(port, x, u, p, t)
         else:
             dz = ca.jtimes(z, ca.vertcat(xs, us), ca.vertcat(f, slope))
         force = ca.SX.zeros(n_x)
@@ -329,6 +332,18 @@ def signals(simulator: Equations) -> ca.Function:
     names = ["x", "u", "slope", "t", "p"]
     columns = [*(ca.vertcat(*column) for column in zip(*rows, strict=True)), ca.vertcat(*own_signals)]
     return ca.Function("signals", [xs, us, slope, t, vector], columns, names, ["z", "dz", "lift", "push", "own"])
+
+
+@one_at_a_time
+@functools.lru_cache(maxsize=64)
+def term_function(simulator: Equations, port: Port) -> ca.Function:
+    """Make `(z, dz, x, u, p) -> F` of a port's term, without laws."""
+    own = simulator.parameter_set
+    x, u, _, _ = simulator.symbols()
+    z, dz, vector = ca.SX.sym("z"), ca.SX.sym("dz"), ca.SX.sym("p", own.size)
+    force = simulator.term(port, z, dz, x, u, Named("parameter", own.symbols(vector)))
+    states, inputs = (ca.vertcat(*names._values.values()) for names in (x, u))
+    return ca.Function("term", [z, dz, states, inputs, vector], [ca.densify(force)])
 
 
 @functools.lru_cache(maxsize=8)  # several rates of one simulator are looked at in turn

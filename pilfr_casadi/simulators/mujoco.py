@@ -56,7 +56,8 @@ def from_mujoco(
         factor on the inertia alone; `<body>.com_x`, `com_y`, `com_z`; `<joint>.damping`, `armature`, `stiffness`,
         `spring`; `<actuator>.gain`; `gravity`. By default all masses and dampings. The others keep the model's values.
     bounds : mapping, optional
-        `(lower, upper)` by parameter; by default a factor of ten either way, and from zero where the value is zero.
+        `(lower, upper)` by parameter; by default a factor of ten either way; dampings, armatures, stiffnesses and
+        values of zero are bounded by zero below.
     inputs : tuple of str, optional
         Actuators that are recorded; by default all. The others are at zero.
     outputs : tuple of str, optional
@@ -383,10 +384,17 @@ class _Equations:
         def load(x: Named, u: Named, p: Named) -> Any:
             return ca.fabs(self._at(x, u, p)[2][joint])
 
+        def motor(dz: Any, x: Named, u: Named, p: Named) -> Any:
+            # the damping of a geared joint is mostly its motor's
+            loss = f"{name}.damping"
+            damping = p[loss] if loss in self.free else self.tree.numbers[loss]
+            return damping * dz - self._at(x, u, p)[2][joint]
+
         unit = ("N m", "rad") if self.tree.hinge(joint) else ("N", "m")
         driven = any(int(j) == joint for j in self.tree.model.actuator_trnid[:, 0])
         across, rate = (lambda x: x[name]), (lambda x: x[f"{name}.speed"])
-        return Port(name, into, across, rate, *unit, signals={"load": load} if driven else {})
+        own: dict[str, Any] = {"signals": {"load": load}, "term": motor} if driven else {}
+        return Port(name, into, across, rate, *unit, **own)
 
 
 def _turn(axis: ca.DM, angle: Any) -> Any:
@@ -406,4 +414,6 @@ def _usual_bounds(name: str, value: float) -> tuple[float, float]:
     """Return the bounds of a number of the model for which none are given."""
     if ".com_" in name or name.endswith(".spring"):
         return -np.inf, np.inf
+    if name.endswith((".damping", ".armature", ".stiffness")):  # a joint need not have any
+        return 0.0, within_a_factor(value)[1] or np.inf
     return within_a_factor(value) if value else (0.0, np.inf)

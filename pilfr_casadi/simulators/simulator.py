@@ -174,6 +174,11 @@ class Simulator(Equations):
         if not place.kinds & set(allowed):
             kind = "series" if place.series else "parallel"
             raise InputError(f"The law {law.id!r} cannot stand in {kind} at {port!r}; choose another port or law.")
+        if getattr(law, "in_line", False) and place.term is None:
+            raise InputError(
+                f"The law {law.id!r} ({law.form or 'plain'}) stands in line with a term of the equations, and the port "
+                f"{port!r} names none; give Port(..., term=...), or choose another law."
+            )
         if getattr(law, "sensed", False) and not self.shown_states(place):
             raise InputError(
                 f"The law {law.id!r} ({law.form}) changes what outputs read of {port!r}, but none reads its coordinate "
@@ -193,8 +198,9 @@ class Simulator(Equations):
         prefixes = itertools.chain([f"{port}."], (f"{port}#{k}." for k in itertools.count(2)))
         return next(p for p in prefixes if not any(name.startswith(p) for name in taken))
 
-    def without_last_element(self) -> Simulator:
-        """Copy without the law of the last `with_element`."""
-        *kept, last = self.elements
-        own = {k: p for k, p in self.parameters.items() if not k.startswith(last.prefix)}
+    def without_element(self, index: int = -1) -> Simulator:
+        """Copy without one of the `elements`, by default the last."""
+        kept = list(self.elements)
+        gone = kept.pop(index)
+        own = {k: p for k, p in self.parameters.items() if not k.startswith(gone.prefix)}
         return self._with(parameters=ParameterSet(own), elements=tuple(kept))

@@ -240,16 +240,17 @@ def _contents(recording: Recording) -> list[Any]:
 def simulator_digest(simulator: Simulator) -> str:
     """Compute the digest of a simulator: its equations with ports, and its parameters."""
     x, u, p, t = simulator.symbols()
-    ports = {}
+    ports, z = {}, ca.SX.sym("z", 2)
     parts = [simulator.derivatives(x, u, p, t), *simulator.measured(x, u, p, t).values()]
     for port in simulator.all_ports():
         into = simulator.into(port, x, u, p, t) if not port.series else {}
         ports[port.name] = [*into, port.domain, *port.signals]
         parts += [*into.values(), simulator.across(port, x, u, p, t)]
         parts += simulator.port_signals(port, x, u, p, t).values()
-        parts += [simulator.across(replace(port, across=port.rate), x, u, p, t)] if port.rate else []
+        parts += [simulator.rate(port, x, u, p, t)] if port.rate else []
+        parts += [simulator.term(port, z[0], z[1], x, u, p)] if port.term else []
     symbols = [ca.vertcat(*names._values.values()) for names in (x, u)]
-    symbols += [ca.vertcat(*(ca.vec(v) for v in p._values.values())), t]
+    symbols += [ca.vertcat(*(ca.vec(v) for v in p._values.values())), t, z]
     expressions = ca.vertcat(*parts)
     try:
         equations = ca.Function("simulator", symbols, [expressions]).serialize()

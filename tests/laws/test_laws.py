@@ -3,6 +3,7 @@
 import doctest
 import importlib
 import inspect
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -19,6 +20,7 @@ from pilfr_casadi.laws import (
     Clearance,
     CubicStiffness,
     Delay,
+    ElasticDrive,
     GeneralizedHysteresis,
     Local,
     Mode,
@@ -38,24 +40,34 @@ EVERY = (*CATALOGUE, *(finer for kinds in FINER.values() for finer in kinds))
 COMPILED = (CubicStiffness, StopHysteresis, BoucWen, Delay, StribeckFriction, Mode)  # one of each kind of step
 T = np.arange(M) * DT
 Z = 0.8 * np.sin(2 * np.pi * 1.3 * T) + 0.5 * np.sin(2 * np.pi * 3.1 * T + 1) + 0.05
-LOCAL = Local(Z, np.gradient(Z, DT), DT, (M,), np.inf)
+LOCAL = Local(Z, np.gradient(Z, DT), DT, (M,), np.inf, shown=True, term=lambda z, dz: 60 * z + dz)
+DRIVEN = replace(LOCAL, term=lambda z, dz: -20 * np.cos(9 * T))
 
 
 def simulator():
     def dynamics(x, u, p):
         return {"pos": x.vel, "vel": (u.force - 60 * x.pos - p.d * x.vel) / 1.2}
 
-    port = Port("ground", {"vel": -1 / 1.2}, lambda x: x.pos, lambda x: x.vel, "N", "m")
-    return Simulator(dynamics, lambda x: {"y": x.pos}, ("pos", "vel"), ("force",), {"d": Parameter(1.0)}, ports=(port,))
+    ground = Port(
+        "ground", {"vel": -1 / 1.2}, lambda x: x.pos, lambda x: x.vel, "N", "m", term=lambda z, dz, p: 60 * z + p.d * dz
+    )
+    drive = replace(ground, name="drive", term=lambda u: -u.force)
+    ports, own = (ground, drive), {"d": Parameter(1.0)}
+    return Simulator(dynamics, lambda x: {"y": x.pos}, ("pos", "vel"), ("force",), own, ports=ports)
+
+
+def local_of(law):
+    """The signals at the port where a law is tried."""
+    return DRIVEN if isinstance(law, ElasticDrive) else LOCAL
 
 
 def dose(kind, number=0):
     """A law with a shape from its own grid and strengths that matter."""
     law = kind()
-    shapes = list(law.shapes(LOCAL))
+    shapes = list(law.shapes(local_of(law)))
     law = law.at(shapes[min(number, len(shapes) - 1)])
     law = law.at({k: 1.03 * v for k, v in law.values.items()})  # off the kinks of a law's own grid
-    law = law.at({}, law.bounds(LOCAL))
+    law = law.at({}, law.bounds(local_of(law)))
     strengths = {}
     for name in law.strength:
         value = np.asarray(law.parameters()[name].value)
@@ -71,7 +83,7 @@ def record():
 
 
 def model_of(kind, hold):
-    port = "ground" if "parallel" in kind.places else "sensor:y"
+    port = "drive" if issubclass(kind, ElasticDrive) else "ground" if "parallel" in kind.places else "sensor:y"
     return discretise(simulator().with_element(port, dose(kind)), DT, hold, 2)
 
 
@@ -119,8 +131,8 @@ def test_slopes_by_way_of_the_stages_where_an_observer_leads_and_columns_are_lef
 @pytest.mark.parametrize("kind", EVERY, ids=lambda kind: kind.__name__)
 def test_the_force_is_linear_in_the_strengths(kind):
     law = dose(kind)
-    shapes = list(law.shapes(LOCAL))
-    found = unit_forces(law, LOCAL, shapes)
+    shapes = list(law.shapes(local_of(law)))
+    found = unit_forces(law, local_of(law), shapes)
     assert found.shape == (M, len(shapes), count_columns(law))
     assert np.all(np.isfinite(found))
     assert np.all(np.ptp(found, axis=0).max(axis=1) > 0), "a shape on the grid gives no force that changes"

@@ -157,4 +157,4 @@ def test_laws_have_parameters_of_their_own_beside_the_joints(arm):
     simulator = from_mujoco(arm).with_element("shoulder", CoulombFriction()).with_element("shoulder", CoulombFriction())
     added = [name for name in simulator.parameters if name not in from_mujoco(arm).parameters]
     assert added == ["shoulder#2.F_c", "shoulder#2.v_0", "shoulder#3.F_c", "shoulder#3.v_0"]
-    assert "shoulder.damping" in simulator.without_last_element().parameters
+    assert "shoulder.damping" in simulator.without_element().parameters

@@ -1,0 +1,179 @@
+"""Laws in line with a force that the equations have already: a gap, a compliance, a motor's rotor on a spring.
+
+Let F(z, dz/dt) be that force at a port, the port's `term`. In line with it stands an element that leaves F another
+coordinate q:
+
+    w = F(q, dq/dt) - F(z, dz/dt),
+
+so that the equations hold F(q, dq/dt) in its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from .base import Law, Local, contact_onset
+
+SAME = 1e-9  # relative difference that rounding may cause
+
+
+class _InLine(Law):
+    """The common part of laws in line with a term."""
+
+    in_line = True
+    strength: ClassVar[tuple[str, ...]] = ()
+    position: ClassVar[bool | None] = None  # whether the term has to vary with z; None for either
+
+    def why_not(self, local: Local) -> str:
+        """Say why the law cannot stand in line with the port's term; empty if it can."""
+        if local.term is None:
+            return "the port names no term of the equations"
+        moved = not _alike(local.term(local.z + local.half, local.dz), local.term(local.z, local.dz))
+        if self.position is not None and moved is not self.position:
+            return f"the term {'varies' if moved else 'does not vary'} with the coordinate"
+        return super().why_not(local)
+
+    def inner(self, local: Local, shape: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinate and rate (M,) that the term is left with along a port's signals."""
+        raise NotImplementedError
+
+    def forces_along(self, local: Local, shapes: Sequence[Mapping[str, Any]]) -> np.ndarray:
+        """Forces along a port's signals, shape (M, len(shapes), 1); roughly, because they only rank starts."""
+        assert local.term is not None
+        before = local.term(local.z, local.dz)
+        found = [local.term(*self.inner(local, shape)) - before for shape in shapes]
+        return np.column_stack(found)[:, :, None]
+
+
+class LineGap(_InLine):
+    """A gap in line with a spring or a coupling of the simulator, whatever its curve."""
+
+    id = "clearance"
+    form = "in line with a term"
+    equation = "w = F(z - clip(z, -g, g), dz/dt (|z| > g)) - F(z, dz/dt)"
+    source = "Nordin & Gutman (2002), Automatica 38(10)"
+    sentence = "a clearance in line with a modelled force F: it acts only beyond a gap"
+    units = {"g": "z"}
+    position = True
+    starts = {"g": ("reach", 0.05, 0.15, 0.3, 0.5, 0.75)}
+    ranges = {"g": ("reach", 0.002, 0.95)}
+
+    def force(self, z: Any, dz: Any, p: Any, term: Any) -> Any:
+        inner = z - ca.fmin(ca.fmax(z, -p.g), p.g)
+        return term(inner, contact_onset(z, p.g) * dz) - term(z, dz)
+
+    def inner(self, local: Local, shape: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Travel beyond the gap, and its rate."""
+        g = shape["g"]
+        return local.z - np.clip(local.z, -g, g), np.where(np.abs(local.z) > g, local.dz, 0.0)
+
+
+class Compliance(_InLine):
+    """A spring in line with a damper or a damped spring of the simulator (a mount, a hose, a rod that gives way)."""
+
+    id = "compliance"
+    equation = "w = k (z - q) - F(z, dz/dt),  F(q, dq/dt) = k (z - q)"
+    source = "Findley, Lai & Onaran (1976), Creep and Relaxation, ch. 5"
+    sentence = "a compliance in line with a modelled force F: both carry the same load, and share the travel"
+    units = {"k": "w/z"}
+    starts = {"k": lambda at: _stiffness(at) * np.geomspace(0.5, 50, 5)}
+    ranges = {"k": lambda at: (0.01 * _stiffness(at), 1e4 * _stiffness(at))}
+    order = follows = 1
+
+    def why_not(self, local: Local) -> str:
+        """Say why the law cannot stand in line with the port's term; empty if it can."""
+        if found := super().why_not(local):
+            return found
+        assert local.term is not None
+        rest, once, twice = (local.term(local.z, times * local.dz) for times in (0, 1, 2))
+        if np.median((once - rest) * local.dz) <= 0:
+            return "the term has no damper, and a spring in line with a spring is one spring"
+        return "" if _alike(twice - rest, 2 * (once - rest)) else "the term is not linear in the rate"
+
+    def force(self, z: Any, dz: Any, q: Any, p: Any, term: Any) -> Any:
+        return p.k * (z - q) - term(z, dz)
+
+    def flow(self, z: Any, q: Any, p: Any, term: Any) -> Any:
+        """Rate at which F carries the load of the spring; F is linear in it."""
+        rest = term(q, 0)
+        return (p.k * (z - q) - rest) / (term(q, 1) - rest)
+
+    def inner(self, local: Local, shape: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Travel less that of the spring under the present load."""
+        assert local.term is not None
+        inner = local.z - local.term(local.z, local.dz) / shape["k"]
+        return inner, np.gradient(inner, local.dt)
+
+
+class ElasticDrive(_InLine):
+    """A motor's rotor on a spring and a damper, between the torque that drives a joint and the joint."""
+
+    id = "extra_mode"
+    flexible = True
+    form = "elastic drive"
+    equation = "w = T - F,  T = k (z - q + 2 D / W (dz/dt - dq/dt)),  k / W^2 d2q/dt2 = T - F; outputs read q"
+    source = "Spong (1987), Journal of Dynamic Systems, Measurement, and Control 109(4)"
+    sentence = "an elastic drive: a spring stands between the motor, where the sensor is, and the joint"
+    units = {"k": "w/z", "W": "rad/s", "D": ""}
+    position = False
+    sensed = True
+    starts = {
+        "k": lambda at: _stiffness(at) * np.array([2.0, 10.0, 50.0]),
+        "W": lambda at: np.geomspace(0.03, 0.6, 4) / at.dt,
+        "D": ("", 0.05),
+    }
+    ranges = {
+        "k": lambda at: (0.01 * _stiffness(at), 1e4 * _stiffness(at)),
+        "W": lambda at: (8 / at.duration, 1.6 / at.dt),
+        "D": ("", 1e-3, 1.0),
+    }
+    order, follows = 2, 1
+
+    def force(self, z: Any, dz: Any, q: Any, p: Any, term: Any) -> Any:
+        return p.k * self._pull(z, dz, q, p) - term(z, dz)
+
+    def flow(self, z: Any, dz: Any, q: Any, p: Any, term: Any) -> Any:
+        """Rates of the rotor's angle and of its speed over W."""
+        return ca.vertcat(p.W * q[1], p.W * (self._pull(z, dz, q, p) - term(q[0], p.W * q[1]) / p.k))
+
+    def far_side(self, q: Any, p: Any) -> tuple[Any, Any]:
+        """Angle and speed of the rotor."""
+        return q[0], p.W * q[1]
+
+    def _pull(self, z: Any, dz: Any, q: Any, p: Any) -> Any:
+        """Force of spring and damper over the spring's stiffness."""
+        return z - q[0] + 2 * p.D * (dz / p.W - q[1])
+
+    def forces_along(self, local: Local, shapes: Sequence[Mapping[str, Any]]) -> np.ndarray:
+        """Forces of inertia of the rotor, which lies ahead of the joint by the spring's deflection."""
+        assert local.term is not None
+        ahead = -local.term(local.z, local.dz)
+        found = []
+        for shape in shapes:
+            rate = local.dz + np.gradient(ahead / shape["k"], local.dt)
+            found.append(shape["k"] / shape["W"] ** 2 * np.gradient(rate, local.dt))
+        return np.column_stack(found)[:, :, None]
+
+
+class ElasticDriveSeenAtLoad(ElasticDrive):
+    """A motor's rotor on a spring and a damper, before a joint that carries the sensor."""
+
+    form = "elastic drive, sensor at the load"
+    equation = ElasticDrive.equation.removesuffix("; outputs read q")
+    sentence = "an elastic drive: a spring stands between the motor and the joint, where the sensor is"
+    sensed = False
+
+
+def _stiffness(local: Local) -> float:
+    """Size of the term over that of the coordinate."""
+    if local.term is None:
+        return 1.0
+    return float(np.quantile(np.abs(local.term(local.z, local.dz)), 0.99)) / local.half or 1.0
+
+
+def _alike(one: np.ndarray, other: np.ndarray) -> bool:
+    return bool(np.max(np.abs(one - other)) <= SAME * max(np.max(np.abs(one)), np.max(np.abs(other)), 1e-300))
