@@ -54,13 +54,15 @@ def chart(axes: Axes, views: Mapping[str, Axes], most: int) -> dict[str, Any] | 
         "y": {"label": _text(axes.get_ylabel()), "log": axes.get_yscale() == "log"},
         "equal": axes.get_aspect() == 1.0,
         "views": ranges,
-        "notes": [[*map(float, a.xy), a.get_text()] for a in axes.texts if isinstance(a, Annotation) and _in_data(a)],
+        "notes": [_note(a) for a in axes.texts if isinstance(a, Annotation) and a.xycoords == "data"],
         "lines": [_packed_shape(shape, windows, most) for shape in shapes],
     }
 
 
-def _in_data(note: Annotation) -> bool:
-    return note.xycoords == "data"
+def _note(note: Any) -> dict[str, Any]:
+    (x, y), (right, up) = note.xy, note.xyann
+    place = {"x": float(x), "y": float(y), "right": float(right), "up": float(up), "align": note.get_ha()}
+    return {**place, "text": _text(note.get_text()), "colour": to_hex(note.get_color())}
 
 
 def _text(text: str) -> str:

@@ -284,14 +284,13 @@ def _force_pictures(h: HiddenForce, port: Port, name: str) -> list[Block]:
 
 
 def _candidates(d: Diagnosis) -> list[Block]:
-    out: list[Block] = []
-    for k, rows in enumerate(tables.candidates_by_pass(d)):
-        named = d.effects[k : k + 1] if k else d.effects[: max(len(d.effects), 1)]
-        chosen = {(e.port, e.law) for e in named}
-        title = "All fitted pairs of port and law"
-        if before := tables.in_place(d, k):
-            title = f"Fitted beside {before}"
-        out += tables.candidate_tables(rows, chosen, title, d.floor["nrmse"], tables.error_before(d, k))
+    passes = tables.candidates_by_pass(d)
+    out: list[Block] = [Text(tables.CANDIDATES)] if passes else []
+    for k, rows in enumerate(passes):
+        before = tables.in_place(d, k)
+        title = f"Fitted beside {before}" if before else "All fitted pairs of port and law"
+        named = d.effects[k : k + 1] if k else d.effects
+        out += tables.candidate_tables(rows, named, title, d.floor["nrmse"], tables.error_before(d, k))
     return out
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .._base import to_json
-from ..diagnose import ERROR_NAMES, Diagnosis, learned_force
+from ..diagnose import ERROR_NAMES, Diagnosis, Effect, learned_force
 from ..identify import RUN_AWAY
 from ..laws import display_name, scaled, scheduled
 from ..models import Parameter, ParameterSet
@@ -204,14 +204,24 @@ def _parent(diagnosis: Diagnosis, number: int) -> Any:
     return steps[number].parent if number < len(steps) else None
 
 
+CANDIDATES = (
+    "Each law is fitted together with the simulator's own parameters. Where a model is wrong, the likeliest also "
+    "predict blocks that they are not fitted to. Bars: from the noise to the error without a law, logarithmic; the "
+    "thin line reaches to the error on held-out blocks, where it was computed. Margin: error of the fit divided by "
+    "the winner's. ΔBIC: twice the log evidence lost; below zero is better than no law."
+)
+
+
 def candidate_tables(
-    rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, str]], title: str, floor: float, without: float | None
+    rows: Sequence[Mapping[str, Any]], chosen: Sequence[Effect], title: str, floor: float, without: float | None
 ) -> list[Block]:
     """Rank the candidates with their margins, best first; fold the tail.
 
     Bars reach from the noise `floor` to the error `without` a law, on a logarithmic scale.
     """
-    winner = next((i for i, r in enumerate(rows) if (r["port"], r["law"]) in chosen), None)
+    named = {(e.port, e.law): e.form for e in chosen}
+    alike = [i for i, r in enumerate(rows) if (r["port"], r["law"]) in named]
+    winner = min(alike, key=lambda i: rows[i].get("form", "") != named[rows[i]["port"], rows[i]["law"]], default=None)
     best = score(rows[winner or 0])
     cells = []
     errors = [score(r) for r in rows if 0 < score(r) < np.inf]
@@ -236,15 +246,7 @@ def candidate_tables(
         )
     emphasis = [] if winner is None else [winner]
     columns = ["law", "port", "error of the fit", "error, held-out blocks", "margin", "ΔBIC"]
-    note = (
-        "Each law is fitted together with the simulator's own parameters. Where a model is wrong, the likeliest also "
-        "predict blocks that they are not fitted to. Bars: from the noise to the error without a law, logarithmic; the "
-        "thin line reaches to the error on held-out blocks, where it was computed. Margin: error of the fit divided by "
-        "the winner's. ΔBIC: twice the log evidence lost; below zero is better than no law."
-    )
-    out: list[Block] = [
-        Table(columns, cells[:RANKED], caption=title, note=note, emphasis=[i for i in emphasis if i < RANKED])
-    ]
+    out: list[Block] = [Table(columns, cells[:RANKED], caption=title, emphasis=[i for i in emphasis if i < RANKED])]
     if len(cells) > RANKED:
         rest = [i - RANKED for i in emphasis if i >= RANKED]
         title = f"{len(cells) - RANKED} more, with larger errors"

@@ -96,8 +96,8 @@ def may_convert(unit: str, other: str) -> bool:
 
 
 def common_domain(domains: Iterable[str]) -> str:
-    """Return the domain that all of them are, else unknown."""
-    found = set(domains)
+    """Return the domain of all whose domain is known; unknown if there is none, or more than one."""
+    found = set(domains) - {UNKNOWN}
     return found.pop() if len(found) == 1 else UNKNOWN
 
 

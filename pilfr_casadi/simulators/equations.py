@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self, cast
 
@@ -364,7 +364,10 @@ class Equations:
     @cached_property
     def _every_port(self) -> tuple[Port, ...]:
         inner = self.ports or (() if self.discrete else tuple(map(self._equation, self.states)))
-        domain = common_domain(port.domain for port in self.ports)  # a voltage is a signal in all domains
+        domain = common_domain(port.domain for port in inner)
+        if not self.ports:
+            inner = tuple(replace(port, domain=domain) if port.domain == UNKNOWN else port for port in inner)
+        # a voltage is a signal in all domains
         actuators = (_series("actuator", n, lambda u, n=n: u[n], self.units, domain) for n in self.inputs)
         sensors = (_series("sensor", n, lambda: 0, self.units, domain) for n in self.output_names)
         return (*inner, *actuators, *sensors)
@@ -372,12 +375,16 @@ class Equations:
     def _equation(self, state: str) -> Port:
         """Make the port of a state's equation: w is subtracted from its derivative.
 
-        Where the state is the derivative of another state (a velocity), the local coordinate is that other state.
+        Where the state is the derivative of another state (a velocity), the local coordinate is that other state. The
+        port has units if an output is the coordinate itself.
         """
-        integral = next((n for n, rate in self._integrals.items() if rate == state), None)
-        if integral is None or integral == state:
-            return Port(f"equation:{state}", {state: -1.0}, lambda x: x[state])
-        return Port(f"equation:{state}", {state: -1.0}, lambda x: x[integral], lambda x: x[state])
+        integral = next((n for n, rate in self._integrals.items() if rate == state), state)
+        x, u, p, t = self.symbols()
+        same = (n for n, y in self.measured(x, u, p, t).items() if y.is_symbolic() and y.name() == integral)
+        unit = next((self.units[n] for n in same if n in self.units), "")
+        own = f"{unit}/s" if integral == state else f"{unit}/s^2"
+        rate = None if integral == state else lambda x: x[state]
+        return Port(f"equation:{state}", {state: -1.0}, lambda x: x[integral], rate, own if unit else "", unit)
 
     @cached_property
     def _integrals(self) -> dict[str, str]:

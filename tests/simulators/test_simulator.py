@@ -409,6 +409,23 @@ def test_equation_ports_stand_in_for_declared_ones(record):
     assert np.allclose(run(cubic, record), run(whole, record), rtol=0, atol=1e-12)
 
 
+def test_equation_ports_have_the_units_of_outputs_that_show_their_coordinate():
+    free = rig(ports=(), units={"position": "mm", "force": "N"})
+    shown = {p.name: (p.unit, p.across_unit, p.domain) for p in free.all_ports()}
+    assert shown["equation:vel"] == ("mm/s^2", "mm", "mechanical")
+    assert shown["equation:pos"] == ("mm/s", "mm", "mechanical")  # of its own it may be a level
+    oven = Simulator(
+        lambda x, u: dict(air=u.heat - x.air + x.wall, wall=x.air - x.wall),
+        lambda x: dict(temperature=x.air),
+        states=("air", "wall"),
+        inputs=("heat",),
+        parameters={},
+        units={"temperature": "degC"},
+    )
+    assert {p.domain for p in oven.all_ports()} == {"thermal"}
+    assert not oven.port("equation:wall").admits(CoulombFriction)
+
+
 def test_misplaced_laws_are_refused():
     with pytest.raises(InputError, match="in series"):
         rig().with_element("actuator:force", CubicStiffness())

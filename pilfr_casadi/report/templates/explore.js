@@ -135,7 +135,7 @@ function explore(figure) {
     const first = found[0], told_x = `${nameX} ${digits(first.line.x[first.k])}${unitX ? " " + unitX : ""}`;
     make("div", tip, { textContent: told_x });
     found.forEach(({ line, k }, i) => {
-      const row = make("div", tip), note = (spec.notes.find(n => Math.abs(n[0] - line.x[k]) + Math.abs(n[1] - line.y[k]) < 1e-5) || [])[2];
+      const row = make("div", tip), note = (spec.notes.find(n => Math.abs(n.x - line.x[k]) + Math.abs(n.y - line.y[k]) < 1e-5) || {}).text;
       make("span", row, { className: "swatch" }).style.background = colour(line);
       const value = `${digits(line.y[k])}${unitY ? " " + unitY : ""}`;
       make("span", row, { textContent: note ? `${line.label}: ${value}, ${note}` : line.label ? `${line.label}: ${value}` : `${nameY} ${value}` });
@@ -177,7 +177,7 @@ function explore(figure) {
     }],
     series: [null, ...lines.map(l => ({
       facets: [{ scale: "x", auto: false }, { scale: "y", auto: false }], paths: path(l, log), points: { show: false },
-      stroke: () => colour(l), fill: () => colour(l), width: l.width || (l.mark ? 1.6 : 0), dash: l.dash, alpha: l.area ? Math.min(l.alpha, 0.6) : l.alpha,
+      stroke: () => colour(l), fill: () => colour(l), width: l.width || (l.mark ? 1.6 : 0), dash: l.dash, alpha: l.area ? Math.min(l.alpha, 0.6) : l.mark ? Math.max(l.alpha, 0.6) : l.alpha,
     }))],
     hooks: { setCursor: [u => tell(u)], setSelect: [select], draw: [drawNotes] },
   }, [null, ...lines.map(l => [l.x, l.y])], plot);
@@ -186,11 +186,12 @@ function explore(figure) {
   function drawNotes(u) {
     const pen = u.ctx, scale = devicePixelRatio;
     pen.save();
-    pen.font = `${12 * scale}px system-ui, sans-serif`; pen.fillStyle = style("--ink");
-    for (const [nx, ny, text] of spec.notes) {
-      const px = u.valToPos(nx, "x", true), py = u.valToPos(ny, "y", true), width = pen.measureText(text).width;
+    pen.font = `${12 * scale}px system-ui, sans-serif`;
+    for (const note of spec.notes) {
+      const px = u.valToPos(note.x, "x", true), py = u.valToPos(note.y, "y", true);
       if (px < u.bbox.left || px > u.bbox.left + u.bbox.width || py < u.bbox.top || py > u.bbox.top + u.bbox.height) continue;
-      pen.fillText(text, px + 8 * scale + width > u.bbox.left + u.bbox.width ? px - width - 8 * scale : px + 8 * scale, py - 6 * scale);
+      pen.fillStyle = colour(note); pen.textAlign = note.align;
+      pen.fillText(note.text, px + 1.3 * note.right * scale, py - 1.3 * note.up * scale);
     }
     pen.restore();
   }
