@@ -58,6 +58,7 @@ class LineGap(_InLine):
     sentence = "a clearance in line with a modelled force F: it acts only beyond a gap"
     units = {"g": "z"}
     position = True
+    substeps = 4  # a damper sets in at once at the edge of the gap
     starts = {"g": ("reach", 0.05, 0.15, 0.3, 0.5, 0.75)}
     ranges = {"g": ("reach", 0.002, 0.95)}
 
