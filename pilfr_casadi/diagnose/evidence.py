@@ -135,7 +135,8 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     if not np.any(fitted.model.parameters.free):
         return 0.0
     problem, _, recorded = _hessian(bench, fitted)
-    smaller = [r.with_(u=r.u + (INPUT_FACTOR - 1) * (r.u - np.mean(r.u, axis=0))) for r in bench.recordings]
+    mean = np.mean(np.concatenate([r.u for r in bench.recordings]), axis=0)
+    smaller = [r.with_(u=mean + INPUT_FACTOR * (r.u - mean)) for r in bench.recordings]
     *_, other = _hessian(bench.on(smaller), fitted)
     free = int(problem.free.sum())
     if not (np.all(np.isfinite(recorded)) and np.all(np.isfinite(other))):

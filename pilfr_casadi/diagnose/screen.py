@@ -324,7 +324,8 @@ def _score(rest: Remainder, task: Task, source: str) -> list[Scored]:
             drop, strength = _gain(dose.phi, rest.left, law, sense)
             scores.append((drop / total, dose, -strength / dose.size))
         scores.sort(key=lambda s: -s[0])
-        starts = tuple(start_values(law, dose.shape, c) for _, dose, c in scores[:FEW])
+        kept = scores if law.in_line else scores[:FEW]  # a small dose hardly ranks the shapes of a law in line
+        starts = tuple(start_values(law, dose.shape, c) for _, dose, c in kept)
         # a law with the sign of a drive explains nothing
         share = min(held_out(scores[0][1].phi, rest.left, rest.odd), scores[0][0])
         out.append(Scored(task.port.name, law, share, starts, task.local, sense, source))

@@ -25,7 +25,6 @@ class _InLine(Law):
     """The common part of laws in line with a term."""
 
     in_line = True
-    strength: ClassVar[tuple[str, ...]] = ()
     position: ClassVar[bool | None] = None  # whether the term has to vary with z; None for either
 
     def why_not(self, local: Local) -> str:
@@ -42,7 +41,7 @@ class _InLine(Law):
         raise NotImplementedError
 
     def forces_along(self, local: Local, shapes: Sequence[Mapping[str, Any]]) -> np.ndarray:
-        """Forces along a port's signals, shape (M, len(shapes), 1); roughly, because they only rank starts."""
+        """Forces along a port's signals, shape (M, len(shapes), 1); roughly, because they only rank laws."""
         assert local.term is not None
         before = local.term(local.z, local.dz)
         found = [local.term(*self.inner(local, shape)) - before for shape in shapes]
@@ -59,6 +58,7 @@ class LineGap(_InLine):
     sentence = "a clearance in line with a modelled force F: it acts only beyond a gap"
     units = {"g": "z"}
     position = True
+    substeps = 4  # a damper sets in at once at the edge of the gap
     starts = {"g": ("reach", 0.05, 0.15, 0.3, 0.5, 0.75)}
     ranges = {"g": ("reach", 0.002, 0.95)}
 
@@ -80,6 +80,7 @@ class Compliance(_InLine):
     source = "Findley, Lai & Onaran (1976), Creep and Relaxation, ch. 5"
     sentence = "a compliance in line with a modelled force F: both carry the same load, and share the travel"
     units = {"k": "w/z"}
+    strength: ClassVar[tuple[str, ...]] = ()  # the force is not linear in k
     starts = {"k": lambda at: _stiffness(at) * np.geomspace(0.5, 50, 5)}
     ranges = {"k": lambda at: (0.01 * _stiffness(at), 1e4 * _stiffness(at))}
     order = follows = 1
@@ -119,11 +120,12 @@ class ElasticDrive(_InLine):
     source = "Spong (1987), Journal of Dynamic Systems, Measurement, and Control 109(4)"
     sentence = "an elastic drive: a spring stands between the motor, where the sensor is, and the joint"
     units = {"k": "w/z", "W": "rad/s", "D": ""}
+    strength: ClassVar[tuple[str, ...]] = ()  # the force is not linear in k
     position = False
     sensed = True
     starts = {
         "k": lambda at: _stiffness(at) * np.array([2.0, 10.0, 50.0]),
-        "W": lambda at: np.geomspace(0.03, 0.6, 4) / at.dt,
+        "W": lambda at: np.geomspace(0.04, 0.6, 5) / at.dt,
         "D": ("", 0.05),
     }
     ranges = {

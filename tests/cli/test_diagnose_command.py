@@ -12,12 +12,11 @@ import time
 import numpy as np
 import pytest
 from command_line import refused, run
-from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
 from pilfr_casadi import multisine
 from pilfr_casadi.cli.demo import diagnose_rig
-from pilfr_casadi.laws import CubicStiffness, Saturation
+from pilfr_casadi.laws import CubicStiffness, Saturation, display_name
 
 RIG = """
 from pilfr_casadi import Parameter, Port, Simulator
@@ -94,30 +93,7 @@ def arguments(folder, *more, simulator="rig.py", train="train.csv", test="test.c
     )
 
 
-@pytest.fixture
-def drawn(monkeypatch):
-    """Every figure that is written."""
-    figures, save = [], Figure.savefig
-
-    def savefig(figure, *arguments, **options):
-        figures.append(figure)
-        save(figure, *arguments, **options)
-
-    monkeypatch.setattr(Figure, "savefig", savefig)
-    return figures
-
-
-def heat_maps(figures):
-    """The numbers of every map of ports and laws: {(port, law): text}."""
-    for figure in figures:
-        ax, *bar = figure.axes
-        if bar and bar[0].get_ylabel() == "error after the fit [%]":
-            ports = [t.get_text().replace("\n", "") for t in ax.get_xticklabels()]
-            laws = [t.get_text().lower().replace(" ", "_") for t in ax.get_yticklabels()]
-            yield {(ports[int(t.get_position()[0])], laws[int(t.get_position()[1])]): t.get_text() for t in ax.texts}
-
-
-def test_a_whole_diagnosis(capsys, files, drawn):
+def test_a_whole_diagnosis(capsys, files):
     given = arguments(files, "--hold", "zero", "--initial", "zero")
     status, out, err = run(capsys, *given)
     assert status == 0 and "pilfr: " not in err
@@ -139,11 +115,8 @@ def test_a_whole_diagnosis(capsys, files, drawn):
     assert "<html" in (files / "out" / "report.html").read_text().lower()
     assert not list(files.rglob("__pycache__"))
     tried = [c for c in found["candidates"] if c["nrmse_train"] is not None]
-    shown = [(pair, float(text)) for numbers in heat_maps(drawn) for pair, text in numbers.items()]
-    assert {pair for pair, _ in shown} == {(c["port"], c["law"]) for c in tried} and len(shown) > 5
-    for pair, drawn_error in shown:  # the errors that the map's title speaks of
-        errors = [c["nrmse_train"] for c in tried if (c["port"], c["law"]) == pair]
-        assert np.min(np.abs(100 * np.array(errors) / drawn_error - 1)) < 0.06
+    page = (files / "out" / "report.html").read_text()
+    assert len(tried) > 5 and all(display_name(c["law"]) in page and c["port"] in page for c in tried)
     before = (files / "out" / "diagnosis.json").read_text()
     refused(capsys, *given, says=("diagnosis.json exists", "--overwrite"))
     assert (files / "out" / "diagnosis.json").read_text() == before
