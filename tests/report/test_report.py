@@ -92,7 +92,8 @@ class Reader(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        self.words.append(data)
+        if self.open[-1:] not in (["script"], ["style"]):
+            self.words.append(data)
 
     @property
     def text(self):
@@ -190,6 +191,7 @@ def test_the_page_of_a_fit(tmp_path):
     assert reader.all("h1") and len(reader.all("h2")) == 6
     assert Status.CONVERGED.value in reader.text and 'class="status good"' in html
     assert f"{fitted.nrmse(test):.3g}" in reader.text and "slow" in reader.text and "test 2" in reader.text
+    assert re.search(r"[\d.]+ % error on unseen data; a linear model [\d.]+ %", reader.text)
     assert "Modes in small motions" in reader.text and "Operators, by threshold" in reader.text
     assert "pilfr.load('model.json')" in reader.text
     images = reader.all("img")

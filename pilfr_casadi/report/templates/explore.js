@@ -173,7 +173,7 @@ function explore(figure) {
     },
     axes: [{ ...axis(spec.x.label, log.x), size: 30 }, {
       ...axis(spec.y.label, log.y),
-      size: (_, values) => 14 + 8 * Math.max(3, ...(values || []).map(v => v == null ? 0 : String(v).length)),
+      size: (_, values) => spec.equal ? 62 : 14 + 8 * Math.max(3, ...(values || []).map(v => v == null ? 0 : String(v).length)),
     }],
     series: [null, ...lines.map(l => ({
       facets: [{ scale: "x", auto: false }, { scale: "y", auto: false }], paths: path(l, log), points: { show: false },
@@ -235,6 +235,7 @@ function explore(figure) {
   new ResizeObserver(() => { if (plot.clientWidth && plot.clientWidth !== u.width) { u.setSize(size()); look(x, y); } }).observe(plot);
   repaint.push(() => u.redraw(false));
   look(...home);
+  if (spec.equal) setTimeout(() => look(...home));  // now that the axes have their size
 }
 
 const repaint = [];
