@@ -72,10 +72,9 @@ class Correction:
             f"Of the mismatch above the noise, named laws explain {named}, a learned force {learned}; {left} is left."
         )
         if not self.elements:
-            return (
-                "The corrected simulator is the refitted one: nothing that was tried is expected to predict other "
-                "recordings better."
-            )
+            why = "nothing that was tried is expected to predict other recordings better"
+            late = "there was no time left to compare it with others"
+            return f"The corrected simulator is the refitted one: {why if np.isfinite(self.after) else late}."
         if not np.isfinite(self.after):
             return shares
         return (
@@ -125,8 +124,9 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     refitted = _predict(search, [_make_candidate(search, search.root)], [])
     tried = [search.thorough(best_laws)] if named else _hypotheses_with_laws(search)
     predicted = _predict(search, [_make_candidate(search, t) for t in tried], refitted)
-    if named and len(predicted) == 1 and search.past_deadline:  # without a comparison the named laws stay
-        return named_correction(search, tried[0].fitted), tried[0].fitted
+    if len(predicted) == 1 and search.past_deadline:  # without a comparison the named laws, or the refit, stay
+        stays = tried[0] if named else search.root
+        return named_correction(search, stays.fitted), stays.fitted
     beside = best_laws if named else _choose(predicted)[0].base
     learned = _learned_candidates(search, search.memo[beside.key]) if beside.laws else []
     learned += _learned_candidates(search, search.root, {e.port for e in best_laws.laws} if named else ())

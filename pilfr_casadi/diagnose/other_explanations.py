@@ -1,7 +1,7 @@
 """Explanations other than a law at a declared port: a pinned parameter, an undeclared port, a machine that changed.
 
-- A missing spring or damper in a port that already has one is equivalent to another value of the existing one. It comes
-  out as missing only if that value is fixed, or if its bounds exclude the new one; then the pinned value is reported.
+- A missing law may be equivalent to another value of a parameter, as a spring beside a spring. It comes out as missing
+  only if that value is fixed, or if its bounds exclude the new one; then the pinned value is reported.
   If the bounds are in another unit, no law helps; values powers of ten away are tried.
 - A mismatch that no declared port explains may have a sure name in the equation of a state.
 - One set of values for all recordings is compared with one set for each, or with one for the first halves and one for
@@ -17,9 +17,9 @@ import numpy as np
 
 from .._base import InputError
 from ..data import Recording
-from ..laws import LINEAR, display_name
+from ..laws import display_name
 from ..simulators import states_along
-from .evidence import AT_NOISE_RATIO, FAR_RATIO, SURE, deviations
+from .evidence import AT_NOISE_RATIO, FAR_RATIO, NEAR_RATIO, SURE, deviations
 from .gates import (
     CERTAIN_ERRORS,
     CURED_SHARE,
@@ -53,27 +53,28 @@ class PinnedParameter:
 def find_pinned_parameter(search: Search, answer: Posterior) -> PinnedParameter | None:
     """Find the pinned parameter that explains as much, once freed, as the named laws; None if there is none.
 
-    Fixed parameters are tried only if a linear law was named, because that law is equivalent to another value.
+    A law is often equivalent to another value: a spring beside a spring, a gain at the input of a known capacity.
     """
     named = [e.element for e in answer.effects]
-    linear = len(named) == 1 and named[0].law.id in LINEAR
     bench, without = search.bench, search.root.fitted
-    if not linear and without.cost < USELESS_FIT:
-        return None
     as_well = EQUAL_RATIO**2 * answer.best.mean_square if named else np.inf
     # a larger error means that something else is missing
     enough = min(as_well, (FAR_RATIO if named else AT_NOISE_RATIO) ** 2 * search.floor2)
+    far = DECADES if without.cost >= USELESS_FIT else ()
     best: tuple[str, Fitted] | None = None
     for name, p in bench.simulator.parameters.items():
-        stays = bool((linear and np.all(p.fixed)) or np.all(without.at_bound(name)))
+        stays = bool(np.all(p.fixed) or np.all(without.at_bound(name)))
         if p.size != 1 or not stays or float(p.value) == 0:  # a zero parameter represents no physics
             continue
+        if search.past_deadline:
+            break
         free = replace(p, fixed=False, bounds=(0.0 if float(p.value) > 0 else -np.inf, np.inf))
         simulator = bench.simulator.with_parameters({**bench.simulator.parameters, name: free})
-        far = () if linear else DECADES
         starts = [without.values, *({**without.values, name: p.value * by} for by in far)]
         try:
-            found = refit(bench, starts, simulator, states=without.initial, solver=THOROUGH)
+            found = refit(bench, starts, simulator, states=without.initial)
+            if found is not None and found.cost < NEAR_RATIO**2 * enough:
+                found = refit(bench, [found.values], simulator, states=found.initial, solver=THOROUGH, like=found)
         except KeyboardInterrupt:
             found, search.interrupted = None, True
         search.interrupted = search.interrupted or bool(bench.interrupted_fits)

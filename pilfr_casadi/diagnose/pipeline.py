@@ -285,14 +285,14 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     3. Compare named laws with a learned force on held-out data. If the force predicts better, the name is refuted.
     4. If there is no name, check undeclared ports and varying values, and return the best predictor.
 
-    After Ctrl-C and at the time limit, step 2 and the first half of step 4 are skipped. After Ctrl-C, a name that was
+    At the time limit, the first half of step 4 is skipped. After Ctrl-C, step 2 is skipped as well, and a name that was
     found stays; otherwise the refitted simulator is returned.
     """
     answer, interrupted = posterior(search), search.interrupted
     finished = not (interrupted or search.out_of_time)
     gates = (*gates, *tones(search.bench, answer.best.fitted))
     verdict = judge(search, answer, gates)
-    if verdict.kind in ("missing-physics", "unexplained") and finished:
+    if verdict.kind in ("missing-physics", "unexplained") and not (interrupted or search.past_deadline):
         found = _without_a_law(search, answer, verdict, gates)
         if found is not None:
             return found

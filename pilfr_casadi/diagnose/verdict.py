@@ -245,7 +245,7 @@ class Verdict:
 def judge(search: Search, found: Posterior, gates: Sequence[Gate], closest: Trial | None = None) -> Verdict:
     """Choose the verdict: a fault if it was the mismatch, else the likeliest answer of the posterior.
 
-    `closest` is the hypothesis that an unexplained mismatch is compared with, by default the likeliest one.
+    `closest` is the hypothesis that an unexplained mismatch is compared with, by default the most promising with a law.
     """
     off = mean_nrmse(search.bench, search.root.fitted)
     if search.stand_in_error and off < NEAR_RATIO * search.stand_in_error:
@@ -275,9 +275,18 @@ def judge(search: Search, found: Posterior, gates: Sequence[Gate], closest: Tria
             f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {off:.3g} of the "
             "outputs' deviation, and no force at any port explains any of the rest.",
         )
-    return Verdict(
-        "unexplained", _describe_unexplained(search, closest if closest and closest.laws else found.best, shares, mode)
-    )
+    if closest is None or not closest.laws:
+        closest = closest_law(search, found.best)
+    return Verdict("unexplained", _describe_unexplained(search, closest, shares, mode))
+
+
+def closest_law(search: Search, likeliest: Trial) -> Trial:
+    """Return the most promising hypothesis with a law.
+
+    The likeliest one may explain nothing: where all are wrong, few samples count, and the
+    smallest claim is refuted least.
+    """
+    return max((t for t in search.memo.values() if t.laws), key=search.optimistic_evidence, default=likeliest)
 
 
 def _is_noise(search: Search, steady: Sequence[Gate], share: float, mode: float | None) -> bool:

@@ -35,6 +35,23 @@ def test_a_value_that_cannot_go_where_it_should_is_told(known):
     assert found.parameters["k1"]["refit_with"] == pytest.approx(1100, rel=0.03)
 
 
+def test_a_wrong_capacity_is_told_in_place_of_a_curve_of_the_inflow():
+    tank = Simulator(
+        lambda x, u, p: {"level": (u.inflow - p.a * x.level) / p.area},
+        lambda x: {"level": x.level},
+        states=("level",),
+        inputs=("inflow",),
+        parameters={"area": Parameter(1.0, fixed=True), "a": Parameter(0.8, bounds=(0.1, 5))},
+    )
+    rng = np.random.default_rng(5)
+    r = Recording(np.repeat(rng.uniform(0, 2, 40), 15), np.zeros(600), 0.05, ("inflow",), ("level",), hold="zero")
+    wide = tank.with_parameters({**tank.parameters, "area": Parameter(1.3, fixed=True)})
+    r = r.with_(y=wide.simulate(r) + 0.01 * rng.standard_normal((600, 1)))
+    found = pilfr.diagnose(tank, r, laws=(laws.PowerWithGain, laws.Cubic), effects=1, workers=1)
+    assert (found.verdict, found.effects, found.freed) == ("complete", (), "area"), str(found)
+    assert found.parameters["area"]["refit_with"] == pytest.approx(1.3, rel=0.02)
+
+
 def test_friction_where_no_port_is_declared_is_told_where_it_acts():
     friction = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
     full = rig(OFF)

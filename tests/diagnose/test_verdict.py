@@ -7,8 +7,9 @@ import pytest
 from diagnosis_rig import recordings, rig
 
 from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose.correction import Correction
 from pilfr_casadi.diagnose.gates import Offset, without_idle_offsets
-from pilfr_casadi.diagnose.verdict import _describe_vanished
+from pilfr_casadi.diagnose.verdict import _describe_vanished, closest_law
 from pilfr_casadi.laws import CoulombFriction
 
 
@@ -34,3 +35,17 @@ def test_an_offset_that_earns_nothing_beside_a_law_is_held_at_nothing(offset):
     assert bool(np.all(found.simulator.parameters["actuator:force.w_0"].fixed)) is (offset == 0)
     assert found.values["actuator:force.w_0"] == pytest.approx(offset, abs=0.02 * offset)
     assert found.values["ground-m1.F_c"] == pytest.approx(4.0, rel=0.03)
+
+
+def test_a_refit_that_was_compared_with_nothing_is_not_said_to_predict_best():
+    shares = {"named": 0.0, "learned": 0.0, "left": 1.0}
+    assert "no time left to compare" in Correction((), shares).sentence
+    assert "nothing that was tried" in Correction((), shares, before=0.1, after=0.1).sentence
+
+
+def test_the_closest_law_is_the_one_that_promises_most():
+    """A delay that explains nothing may be the likeliest where hardly any sample counts."""
+    cube, delay = (SimpleNamespace(laws=("law",), ms=ms) for ms in (0.5, 1.0))
+    search = SimpleNamespace(memo={0: SimpleNamespace(laws=(), ms=1.1), 1: delay, 2: cube})
+    search.optimistic_evidence = lambda t: -t.ms
+    assert closest_law(search, delay) is cube
