@@ -85,7 +85,7 @@ class PreslidingFriction(Law):
     units = {"k_t": "w/z", "r": "z"}
     domains: ClassVar[tuple[str, ...]] = ("mechanical",)
     dissipative = True
-    follows = memory = 1
+    memory = 1
     starts = {"r": ("half", 0.003, 0.01, 0.03, 0.1, 0.25)}
     ranges = {"r": ("half", 0.0005, MAX_THRESHOLD)}
 

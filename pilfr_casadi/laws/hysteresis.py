@@ -47,7 +47,7 @@ class StopHysteresis(Law):
     sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
     units = {"w": "w/z", "r": "z"}
     dissipative = True
-    n = follows = memory = 6
+    n = memory = 6
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
         following = [play(z, s[i], p["r"][i]) for i in range(self.n)]
@@ -116,7 +116,7 @@ class PlayHysteresis(StopHysteresis):
 class FinePlays(PlayHysteresis):
     """Hysteresis of an actuator or a sensor with more plays."""
 
-    n = follows = memory = 11
+    n = memory = 11
 
 
 class GeneralizedHysteresis(PlayHysteresis):
@@ -151,7 +151,7 @@ class GeneralizedHysteresis(PlayHysteresis):
 class FineGeneralized(GeneralizedHysteresis):
     """Asymmetric hysteresis with more plays."""
 
-    n = follows = memory = 11
+    n = memory = 11
 
 
 class SmoothHysteresis(Law):
@@ -166,7 +166,7 @@ class SmoothHysteresis(Law):
     sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
     units = {"k_h": "w/z", "R": "z", "a": ""}
     dissipative = True
-    follows = memory = NODES
+    memory = NODES
     starts = {"R": ("half", 0.02, 0.06, 0.15, 0.4), "a": ("", 1.0)}
     ranges = {"R": ("half", 0.002, 2), "a": ("", 0.3, 12.0)}
 
@@ -217,7 +217,7 @@ class BoucWenActuator(BoucWen):
     places = ("series",)
     dissipative = False
     order = 0
-    follows, memory = 1, 2  # the last z, and the q that was reached there
+    memory = 2  # the last z, and the q that was reached there
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
         """Integrate along the chord from the last z, in parts."""
@@ -237,7 +237,7 @@ class Backlash(Law):
     sentence = "backlash: on every reversal the signal is lost until the play is taken up"
     units = {"r": "z"}
     places = ("series",)
-    follows = memory = 1
+    memory = 1
     starts = {"r": ("half", 0.01, 0.03, 0.08, 0.18, 0.35, 0.6)}
     ranges = {"r": ("half", 0.001, 0.9)}
 
@@ -304,7 +304,7 @@ def _layer(kind: str, operators: int, in_signal: bool) -> Any:
         signed = ("k_0", "b_2") if in_signal else ()
         places = ("series",) if in_signal else ("parallel",)
         dissipative = not in_signal
-        n = follows = memory = operators
+        n = memory = operators
         operator, sign = kind, -1 if minus else 1
 
         def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:

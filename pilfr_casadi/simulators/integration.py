@@ -266,8 +266,7 @@ class _SubStep:
         """Make `(x, u, p) -> [x; laws' states; memory]`: all laws at rest, as if their signals had stood still.
 
         From zero, a delay or a lag of a signal about a working point would first have to come there: a transient that
-        no recording shows, and that bends a fit of the law's parameters. A play of a signal about a working point would
-        begin at one end of its gap.
+        no recording shows, and that bends a fit of the law's parameters.
         """
         counts = [n_q or n_s for n_q, n_s in zip(self.equations.n_q, self.equations.n_s, strict=True)]
         shares = [_settled(e.law, n) for e, n in zip(self.simulator.elements, counts, strict=True)]

@@ -97,7 +97,7 @@ def test_a_stated_level_is_no_transient_of_a_law(law):
     still = recorded(5.0).with_(u=np.full((M, 1), 5.0), initial=[5.0, 5.0])
     y = simulator.simulate(still)
     np.testing.assert_allclose(y, np.broadcast_to(y[0], y.shape), rtol=1e-9)
-    assert y[0, 0] >= 7
+    assert y[0, 0] >= 6
 
 
 def findings(r, off=1.15):
