@@ -494,17 +494,16 @@ class Search:
         self._record(base, entries, self._fitted(base, entries, None, float(np.sqrt(self.floor2)), True))
 
     def exchange(self) -> None:
-        """Try all other laws in place of each of several laws, the rest fixed in place, until none changes."""
+        """Try all other laws, and none, in place of each of several laws, the rest fixed in place, until none changes."""
         for _ in range(FEW):
             best = self.best
-            for element in best.effects:
-                if not self._in_time():
-                    return
+            for element in best.effects if len(best.effects) > 1 else ():
                 rest = self._beside([e for e in best.laws if e is not element], best)
-                if any(step.parent.key == rest.key for step in self.steps):  # the laws beside it were tried already
-                    continue
-                self.keep(rest)
-                self.add(rest, again=True)
+                if self._in_time() and not any(step.parent.key == rest.key for step in self.steps):
+                    self.keep(rest)
+                    self.add(rest, again=True)
+                if not self.past_deadline:  # a law that was found only beside another one may do without it
+                    self.keep(self.fits.polish(rest))
             if self.best.key == best.key:
                 return
 

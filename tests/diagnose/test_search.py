@@ -69,6 +69,22 @@ def test_hypotheses_are_not_compared_by_different_errors_where_time_ran_out(monk
     assert found.out_of_time and all(known.held_out is None for known in found.findings.values())
 
 
+def test_a_law_found_only_beside_another_one_may_do_without_it():
+    """Its own first fit was in a wrong minimum, and after the time limit the useless other law was sure."""
+    found = searching(recordings(FRICTION, count=1), until=0.0).run(0)
+    for kinds in ((FRICTION.at({"F_c": 0.1}),), (FRICTION, laws.CubicStiffness().at({"k_3": 1.0}))):
+        placed = rig(OFF)
+        for law in kinds:
+            placed = placed.with_element("ground-m1", law)
+        both = len(kinds) > 1
+        fitted = found.bench.fit(placed) if both else found.bench.run(placed, {}, found.without.begin)
+        found.keep(found.fits.make_trial(fitted, len(kinds)))
+    (single,) = [t for t in found.memo.values() if len(t.laws) == 1]
+    assert len(found.best.laws) == 2
+    found.exchange()
+    assert found.best.key == single.key and found.best.mean_square < 0.1 * single.mean_square
+
+
 def test_after_the_deadline_the_correction_fits_nothing_more(monkeypatch):
     found = searching(recordings(FRICTION, count=1)).run(1)
     found.memo = {key: replace(t, thorough=False) for key, t in found.memo.items()}
