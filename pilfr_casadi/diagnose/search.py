@@ -242,9 +242,17 @@ class Search:
             for done in itertools.count():
                 likely = self._likeliest()
                 left = [t for t in likely if self.findings[t.key].held_out is None]
-                if not left or (done >= MOST_PREDICTED and left[0] is not likely[0]) or not self._in_time():
+                if not left or (done >= MOST_PREDICTED and left[0] is not likely[0]):
+                    break
+                if not self._in_time():  # a comparison that was not finished favours what was not judged
+                    self._forget_held_out()
                     break
                 self.held_out(left[0])
+
+    def _forget_held_out(self) -> None:
+        """Forget the held-out errors, so that all hypotheses are compared by their fit errors."""
+        for known in self.findings.values():
+            known.held_out = None
 
     def _likeliest(self) -> list[Trial]:
         """List the hypotheses that may be the likeliest."""
@@ -285,6 +293,7 @@ class Search:
                 self._judge_on_held_out_data()
         except KeyboardInterrupt:
             self.interrupted = True
+            self._forget_held_out()
         return self
 
     def resume(self, effects: float) -> Search:

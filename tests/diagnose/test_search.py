@@ -59,6 +59,16 @@ def test_at_the_time_limit_the_search_answers_from_what_it_has():
         pilfr.diagnose(rig(OFF), recordings(FRICTION, count=1), time_limit=0)
 
 
+def test_hypotheses_are_not_compared_by_different_errors_where_time_ran_out(monkeypatch):
+    """Held-out errors are larger than fit errors: a law that was judged on them lost to one that was not."""
+    found = searching(recordings(FRICTION, count=1)).run(1)
+    found.held_out(found.best)
+    found.until = 0.0
+    monkeypatch.setattr(Search, "_likeliest", lambda self: [self.root, self.best])
+    found._judge_on_held_out_data()
+    assert found.out_of_time and all(known.held_out is None for known in found.findings.values())
+
+
 def test_after_the_deadline_the_correction_fits_nothing_more(monkeypatch):
     found = searching(recordings(FRICTION, count=1)).run(1)
     found.memo = {key: replace(t, thorough=False) for key, t in found.memo.items()}
