@@ -502,7 +502,9 @@ class Search:
                 if self._in_time() and not any(step.parent.key == rest.key for step in self.steps):
                     self.keep(rest)
                     self.add(rest, again=True)
-                if not self.past_deadline:  # a law that was found only beside another one may do without it
+                known = self.memo.get(rest.key)  # a law that was found only beside another one may do without it
+                converged = known is not None and known.thorough and known.mean_square <= rest.mean_square
+                if not converged and not self.past_deadline:
                     self.keep(self.fits.polish(rest))
             if self.best.key == best.key:
                 return

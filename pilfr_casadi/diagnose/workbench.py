@@ -38,9 +38,8 @@ from ..simulators import (
 )
 from .floor import white_part
 
-# Solvers: of the fits that results are based on; of other fits; of the first fit of a law, to rank the laws.
-# Along a curved valley, such as a resistance traded for an inertia, a fit takes hundreds of steps.
-THOROUGH = GaussNewton(max_iterations=500, tolerance=1e-6, patience=6)
+# Solvers: of the fits that results are based on; of other fits; of the first fit of a law, to rank the laws
+THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
 FEW = 3  # ports, laws, starts or fits that are tried at each choice of a search, which saves time

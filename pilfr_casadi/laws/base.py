@@ -172,7 +172,7 @@ class Law:
         The data carries information on the law only if z is both above and below zero.
     order, follows : int
         `order` is the number of its own states. If the signal stands still, the first `follows` of its states or its
-        memory are at the signal's value, the others at zero. A play is where the signal has left it on its way from zero.
+        memory are at the signal's value, the others at zero. A play is where the signal's way from zero has left it.
     memory, shifts : int, bool
         `memory` is the length of its discrete memory. `shifts` says that the memory is a shift register, which takes
         in the signal at the beginning of a step.
