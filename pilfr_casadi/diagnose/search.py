@@ -494,7 +494,7 @@ class Search:
         self._record(base, entries, self._fitted(base, entries, None, float(np.sqrt(self.floor2)), True))
 
     def exchange(self) -> None:
-        """Try all other laws, and none, in place of each of several laws, the rest fixed in place, until none changes."""
+        """Try all other laws, and none, in place of each of several laws, the rest in place, until none changes."""
         for _ in range(FEW):
             best = self.best
             for element in best.effects if len(best.effects) > 1 else ():
