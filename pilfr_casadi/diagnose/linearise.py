@@ -315,7 +315,7 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
     z, dz = np.concatenate([r.z for r in runs]), np.concatenate([r.dz for r in runs])
     rate = WALL * FINER_STEPS * bench.substeps / bench.dt
     lift, push = (np.max([getattr(r, name) for r in runs], axis=0) for name in ("lift", "push"))
-    with np.errstate(divide="ignore", over="ignore"):  # a force that does not move the port has no limit
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # a force that does not move it has no limit
         max_stiffness, max_damping = np.where(lift > 0, rate / lift, rate**2 / push), rate / push
     inputs = dict(zip(bench.simulator.inputs, np.concatenate([r.u for r in runs]).T, strict=True))
     own = own_signals(bench.simulator, np.concatenate([r.own for r in runs]))

@@ -57,6 +57,8 @@ def find_pinned_parameter(search: Search, answer: Posterior) -> PinnedParameter 
     """
     named = [e.element for e in answer.effects]
     bench, without = search.bench, search.root.fitted
+    if not named and without.cost < USELESS_FIT:
+        return None
     as_well = EQUAL_RATIO**2 * answer.best.mean_square if named else np.inf
     # a larger error means that something else is missing
     enough = min(as_well, (FAR_RATIO if named else AT_NOISE_RATIO) ** 2 * search.floor2)
@@ -64,7 +66,7 @@ def find_pinned_parameter(search: Search, answer: Posterior) -> PinnedParameter 
     best: tuple[str, Fitted] | None = None
     for name, p in bench.simulator.parameters.items():
         stays = bool(np.all(p.fixed) or np.all(without.at_bound(name)))
-        if p.size != 1 or not stays or float(p.value) == 0:  # a zero parameter represents no physics
+        if p.value.ndim or not stays or float(p.value) == 0:  # a matrix or a zero represents no physics
             continue
         if search.past_deadline:
             break

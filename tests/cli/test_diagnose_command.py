@@ -298,8 +298,8 @@ def test_a_saved_model_is_diagnosed_to_the_end(capsys, files, truth, monkeypatch
         importlib.import_module("pilfr_casadi.diagnose.preparation"), "CATALOGUE", (CubicStiffness, Saturation)
     )
     given = arguments(files, "--hold", "zero", "--initial", "zero", simulator="fit/model.json")
-    status, out, _ = run(capsys, *given)
-    assert status == 0 and "the simulator's own values, refitted" in out
+    status, out, err = run(capsys, *given)
+    assert status == 0 and "the simulator's own values, refitted" in out, out + err
     found = json.loads((files / "out" / "diagnosis.json").read_text())
     assert np.shape(found["parameters"]["A"]["refit_with"]) == (2, 2) and found["candidates"]
     assert (files / "out" / "report.html").exists()

@@ -70,7 +70,7 @@ def test_a_law_begins_as_if_the_signal_had_stood_still(kind):
 
 
 @pytest.mark.parametrize(
-    "kind", [k for k in CATALOGUE if (k.order and k.follows) or k.shifts], ids=lambda k: k.__name__
+    "kind", [k for k in CATALOGUE if not k.in_line and ((k.order and k.follows) or k.shifts)], ids=lambda k: k.__name__
 )
 def test_the_screen_sees_nothing_where_the_signal_stands(kind):
     z = np.full(50, 7.0)

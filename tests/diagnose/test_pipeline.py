@@ -109,7 +109,7 @@ def test_an_answer_that_is_there_outlives_an_interrupt_of_what_adds_to_it(monkey
         return ()
 
     best = SimpleNamespace(fitted=None, mean_square=1.0)
-    search = SimpleNamespace(interrupted=unfinished, out_of_time=False, bench=None, root=best)
+    search = SimpleNamespace(interrupted=unfinished, out_of_time=False, past_deadline=False, bench=None, root=best)
     answer = SimpleNamespace(best=best, sure=0.0, effects=())
     monkeypatch.setattr(pipeline, "posterior", lambda search: answer)
     monkeypatch.setattr(pipeline, "named_correction", lambda *given: None)
