@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..diagnose import Diagnosis, Effect, Fitted, Workbench, law_signals
+from ..diagnose import Effect, Fitted, Workbench, law_signals
 from ..laws import readable_unit
 from .page import Table, number_text
 
@@ -49,8 +49,7 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
     return Action(largest, Table(["how it acts in the training recordings", "value", "unit"], rows, digits=3))
 
 
-def element_of(d: Diagnosis, effect: Effect) -> int | None:
-    """Find the element of the corrected simulator that an effect is."""
-    return next(
-        (i for i, p in enumerate(d.corrected.elements) if (p.port, p.law.id) == (effect.port, effect.law)), None
-    )
+def element_of(fitted: Fitted, effect: Effect) -> int | None:
+    """Find the element of the fitted simulator that an effect is; offsets may stand before it."""
+    placed = enumerate(fitted.simulator.elements)
+    return next((i for i, p in placed if (p.port, p.law.id) == (effect.port, effect.law)), None)

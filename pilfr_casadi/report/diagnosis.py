@@ -91,7 +91,7 @@ def diagnosis_page(diagnosis: Diagnosis) -> Page:
     """Fill the page of a diagnosis; see `diagnosis_report`."""
     case, d = _Case.of(diagnosis), diagnosis
     actions, checks = (
-        [measure_action(case.bench, case.after, e, element_of(d, e)) for e in d.effects],
+        [measure_action(case.bench, case.after, e, element_of(case.after, e)) for e in d.effects],
         tables.check_table(d),
     )
     notes = Section("What the recordings' checks found", [checks] if checks else [])
@@ -189,7 +189,7 @@ def _hidden_forces(case: _Case) -> list[Block]:
     """Draw the forces of the named effects; without a name, beside the nearest law and at the freest port."""
     d, out = case.diagnosis, [block for learned in case.diagnosis.learned for block in _learned_force(case, learned)]
     for e in d.effects:
-        if (number := element_of(d, e)) is not None:
+        if (number := element_of(case.after, e)) is not None:
             out += _force_blocks(case, case.after, e.port, number, display_name(e.law))
     if d.verdict != "unexplained":
         return out
