@@ -444,7 +444,7 @@ def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator
             swings += np.abs(np.diff(z[turns])).tolist()
             longest = 2 * float(np.median(np.diff(turns))) if len(turns) > 2 else SMALL_SHARE * len(z)
             rests += _rests(z, least, longest)
-        unit = port_units(port, bench.recordings[0])[1]
+        unit = port.across_unit or port_units(port, bench.recordings[0])[1]
         yield Excitation(port.name, travel, unit, reversals, _distinct(np.array(swings)), rests)
 
 

@@ -485,9 +485,9 @@ def live_ports(simulator: Simulator) -> list[Port]:
 
 
 def port_units(port: Port, recording: Recording) -> tuple[str, str]:
-    """Return the units of a port's force and coordinate, in series both those of the signal; empty if unknown."""
+    """Return the units of a port's force and position, in series both those of the signal; empty if unknown."""
     if not port.series:
-        return port.unit, port.across_unit
+        return port.unit, port.position_unit
     unit = port.unit or recording.units.get(port.name.partition(":")[2], "")
     return unit, unit
 

@@ -186,7 +186,11 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     along_run = states[::n, : probe.n_x]
     z, dz, lift, push, own = local_signals(bench, probe.local, along_run, r, p[: len(p) - len(probe.ports)])
     moved, sign = np.abs(lift).max(axis=0) > 0, -np.sign(np.median(push, axis=0))
-    sense = {"sign": np.where(moved, 0.0, sign), "back": np.where(moved, -np.sign(np.median(lift, axis=0)), sign)}
+    speed = np.array([port.is_speed for port in bench.simulator.all_ports()])
+    sense = {
+        "sign": np.where(moved & ~speed, 0.0, sign),
+        "back": np.where(moved, -np.sign(np.median(lift, axis=0)), sign),
+    }
     felt = {"lift": np.abs(lift).max(axis=0), "push": np.abs(push).max(axis=0)}
     rest = r.begins == "zero"
     beside = {"z": z, "dz": dz, "x": along_run, "u": r.u, "p": p, "own": own}

@@ -74,7 +74,7 @@ from .search import Search
 from .stretches import MOST_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
 from .trials import Trial
 from .verdict import NamedEffect, Posterior, Verdict, judge, names, posterior
-from .workbench import Fitted, RunsAway, Workbench
+from .workbench import Fitted, RunsAway, Workbench, converge
 
 SEARCH_SHARE = 0.7  # share of the remaining time for preparation and search; the rest is for the correction
 
@@ -371,6 +371,9 @@ def _final_fits(
     if found.effects and not np.isfinite(found.correction.after):  # a held-out comparison chose what it compared
         after = without_idle_offsets(bench, after)
     if everything is None:
+        if not search.interrupted:
+            with search.stage("convergence"):
+                after = converge(bench, after, request.deadline - time.perf_counter())
         return FinalFits(bench, without, after, ready.nominal, (without, after))
     with search.stage("fits to all recordings"):
         whole, pair = everything.bench, (without, after)
@@ -417,6 +420,7 @@ def _build_diagnosis(
         ),
         gates=(
             *_surrogate_note(request.stand_in_error),
+            *_convergence_note(after),
             *final_gates(found.gates, after, std, bool(effects), settled),
         ),
         mismatch=mismatch(
@@ -455,6 +459,17 @@ def _surrogate_note(error: float) -> tuple[Gate, ...]:
     return (Gate("simulation", "surrogate", error, f"{words} {surrogate_warning(error)}".rstrip(), False),)
 
 
+def _convergence_note(after: Fitted) -> tuple[Gate, ...]:
+    """Note that the fit whose values are stated has not converged; no note if it has."""
+    if after.status.converged:
+        return ()
+    words = (
+        f"The fit of the corrected simulator ended early. {after.status.value} Its parameters may still change by more "
+        "than their standard errors; bound those that are known, or add a recording that tells them apart."
+    )
+    return (Gate("simulation", "convergence", after.status.name.lower(), words, False),)
+
+
 def _blind_spots(request: Request, ready: Prepared, search: Search) -> tuple[BlindSpot, ...]:
     """Find what the recordings cannot reveal of the refitted simulator; empty if that cannot be computed."""
     stated = search.bench.hold if request.hold_said else ""
@@ -486,7 +501,7 @@ def _effect(search: Search, named: NamedEffect, fitted: Fitted, std: dict[str, n
         law=law.id,
         confidence=named.confidence,
         sentence=law.sentence,
-        equation=law.equation,
+        equation=law.equation.replace("dz/dt", "v") if port.is_speed else law.equation,
         parameters=shown,
         indistinguishable=tuple(named.alike),
         form=law.form,

@@ -484,11 +484,11 @@ class Diagnosis:
 def _effect_lines(e: Effect) -> list[str]:
     """Describe an effect with its equation, its numbers, and the laws indistinguishable from it."""
     form = f" ({display_name(e.form)})" if e.form else ""
-    symbols = (
-        "where u or z is the signal, and w is added to it"
-        if in_series(e.port)
-        else "where w is the force and z the local coordinate at the port"
-    )
+    if in_series(e.port):
+        symbols = "where u or z is the signal, and w is added to it"
+    else:
+        local = "v the speed" if re.search(r"\bv\b", e.equation) else "z the local coordinate"
+        symbols = f"where w is the force and {local} at the port"
     lines = [
         f"{display_name(e.law)}{form} at {e.port}, confidence {e.confidence:.2f}",
         f"  {e.sentence}: {e.equation}",

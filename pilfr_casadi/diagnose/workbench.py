@@ -42,6 +42,7 @@ from .floor import white_part
 THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
+LAST = GaussNewton(max_iterations=1000, tolerance=1e-6, patience=6)  # of the fit whose values an answer states
 FEW = 3  # ports, laws, starts or fits that are tried at each choice of a search, which saves time
 COMPARED_SAMPLES = 8000  # samples on which fits and forces are compared first
 
@@ -77,6 +78,8 @@ class Fitted:
         Simulated minus measured outputs of each recording, unscored samples included.
     cost : float
         Mean square of the scored residuals, each output in units of its deviation.
+    status : Status
+        How the fit ended; a run at given values counts as converged.
     """
 
     simulator: Simulator
@@ -86,6 +89,7 @@ class Fitted:
     initial: list[np.ndarray]
     residual: list[np.ndarray]
     cost: float
+    status: Status = Status.CONVERGED
 
     @property
     def vector(self) -> np.ndarray:
@@ -229,7 +233,7 @@ class Workbench:
         estimated = any(r.begins == "estimate" for r in self.recordings)
         if not np.any(model.parameters.free) and not (estimated and model.n_state):
             return self._run_fixed(simulator, model, engine)
-        best: tuple[float, np.ndarray, Problem] | None = None
+        best: tuple[float, np.ndarray, Problem, Status] | None = None
         for start in starts:
             found = self._run(simulator, model, engine, start, states, tuple(anneal), solver)
             if found is not None and (best is None or found[0] < best[0]):
@@ -240,10 +244,10 @@ class Workbench:
                 f"The simulation diverges at the start values{self._describe_divergence(model, engine, starts[0])}; "
                 + (unstable or "check the parameters' values and units, and the hold.")
             )
-        _, theta, problem = best
+        _, theta, problem, status = best
         values = model.parameters.unpack(problem.parameters(theta))
         values.pop(INJECTION, None)
-        return self.result(simulator, values, problem.first_states(theta), engine, model)
+        return replace(self.result(simulator, values, problem.first_states(theta), engine, model), status=status)
 
     def _describe_divergence(self, model: Model, engine: Engine, start: Mapping[str, Any]) -> str:
         """Describe where a run from rest exceeds every bound."""
@@ -294,7 +298,7 @@ class Workbench:
         guess: Sequence[np.ndarray],
         path: tuple[float, ...],
         solver: GaussNewton,
-    ) -> tuple[float, np.ndarray, Problem] | None:
+    ) -> tuple[float, np.ndarray, Problem, Status] | None:
         parameters = model.parameters
         vector = start_vector(model, start)
         states = None
@@ -302,6 +306,7 @@ class Workbench:
             unknown = zip(self.recordings, self.initial_states(model, vector, guess), strict=True)
             states = np.concatenate([np.zeros(0), *(state for r, state in unknown if r.begins == "estimate")])
         problem: Problem | None = None
+        status = Status.SOLVER_FAILED
         for gamma in (*path, 0.0):
             at = parameters.at(vector)
             if INJECTION in parameters:
@@ -320,15 +325,16 @@ class Workbench:
                     solution = solve_within_bounds(problem, theta, solver)
             except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
                 continue
-            if solution.status is Status.INTERRUPTED:
-                self.interrupted_fits.append(solution.status)
+            status = solution.status
+            if status is Status.INTERRUPTED:
+                self.interrupted_fits.append(status)
             if np.all(np.isfinite(solution.theta)):
                 vector, states = problem.parameters(solution.theta), solution.theta[n_free:]
         if problem is None:
             return None
         theta = np.concatenate([vector[problem.free], states if states is not None else problem.start[n_free:]])
         cost = problem.cost(theta)
-        return (cost, theta, problem) if cost < DIVERGED else None
+        return (cost, theta, problem, status) if cost < DIVERGED else None
 
     def initial_states(self, model: Model, vector: np.ndarray, states: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Complete initial states (n_state,) from their first entries; laws begin at rest at the first inputs."""
@@ -424,6 +430,20 @@ def _difference2(bench: Workbench, one: Fitted, other: Fitted) -> float:
     """Compute the mean square of the difference of two runs."""
     both = zip(one.residual, other.residual, bench.recordings, strict=True)
     return float(np.mean(np.concatenate([((a - b) / bench.scale)[r.skip :] for a, b, r in both]) ** 2))
+
+
+def converge(bench: Workbench, fitted: Fitted, seconds: float) -> Fitted:
+    """Continue a fit that was stopped by its limit of iterations, for at most so many seconds."""
+    if fitted.status is not Status.MAX_ITERATIONS or seconds <= 0:
+        return fitted
+    solver, model, engine = replace(LAST, time_limit=seconds), fitted.model, fitted.engine
+    try:
+        found = bench.fit(
+            fitted.simulator, [fitted.values], states=fitted.initial, solver=solver, model=model, engine=engine
+        )
+    except InputError:
+        return fitted
+    return found if found.cost < fitted.cost else fitted
 
 
 def knee_starts(fitted: Fitted, knee: str) -> list[dict[str, Any]]:

@@ -23,7 +23,8 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
     """Measure the force of element `number` along the training recordings; None without one, or if its run diverges.
 
     The equivalent stiffness k and damping c are those of the line w = k z + c dz/dt nearest to the force (equivalent
-    linearisation, Krylov & Bogoliubov 1943); a cycle is one upward crossing of the mean of z.
+    linearisation, Krylov & Bogoliubov 1943); a cycle is one upward crossing of the mean of z. Where z is a speed, there
+    is the damping alone.
     """
     if number is None:
         return None
@@ -37,15 +38,19 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
     rows = [
         ["largest force" if not port.series else "largest change of the signal", float(np.max(np.abs(w))), port.unit]
     ]
-    if not port.series:
+    unit = readable_unit("w*s/z", port.unit, port.position_unit).replace(" *", "")
+    if port.is_speed:
+        damping = (w - np.mean(w)) @ z / (z @ z)
+        rows += [["equivalent damping", float(damping), unit if port.unit and port.across_unit else ""]]
+    elif not port.series:
         (stiffness, damping), *_ = np.linalg.lstsq(np.column_stack([z, dz]), w - np.mean(w), rcond=None)
         taken = sum(float(np.sum((f[1:] + f[:-1]) / 2 * np.diff(x))) for x, _, f in runs)
         cycles = sum(int(np.sum(np.diff(np.signbit(x - np.mean(x)).astype(int)) < 0)) for x, _, _ in runs)
-        units = [readable_unit(u, port.unit, port.across_unit).replace(" *", "") for u in ("w*z", "w/z", "w*s/z")]
+        units = [readable_unit(u, port.unit, port.across_unit).replace(" *", "") for u in ("w*z", "w/z")]
         known = bool(port.unit and port.across_unit)
         rows += [["energy taken per cycle, mean", taken / cycles, units[0] if known else ""]] if cycles else []
         rows += [["equivalent stiffness", float(stiffness), units[1] if known else ""]]
-        rows += [["equivalent damping", float(damping), units[2] if known else ""]]
+        rows += [["equivalent damping", float(damping), unit if known else ""]]
     return Action(largest, Table(["how it acts in the training recordings", "value", "unit"], rows, digits=3))
 
 

@@ -25,7 +25,7 @@ from ..diagnose import (
 )
 from ..laws import display_name
 from ..plots import Signal
-from ..simulators import Port
+from ..simulators import MECHANICAL, Port
 from . import diagnosis_tables as tables
 from .action import Action, element_of, measure_action
 from .page import Block, Code, Page, Picture, Section, Table, Text, numbered
@@ -236,6 +236,8 @@ def _learned_force(case: _Case, learned: Learned) -> list[Block]:
 
 def _local_signals(port: Port, z: np.ndarray, dz: np.ndarray) -> tuple[Signal, Signal | None]:
     """Label a port's local coordinate and its rate; no rate where it is zero throughout."""
+    if port.is_speed and port.domain == MECHANICAL:
+        return Signal("speed", z, port.across_unit), None
     channel = port.name.partition(":")[2]
     across, unit = channel if port.series and channel else "local coordinate z", port.across_unit
     rate = Signal(f"rate of {across}", dz, f"{unit}/s" if unit else "") if np.ptp(dz) > 0 else None

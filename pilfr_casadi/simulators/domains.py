@@ -53,7 +53,9 @@ _UNITS: dict[str, tuple[int, int, int, int, int]] = {
     "deg": (0, 0, 0, 0, 0),
     "1": (0, 0, 0, 0, 0),
     "%": (0, 0, 0, 0, 0),
+    "rpm": (0, 0, -1, 0, 0),
 }
+_ANGLES = {"rad", "mrad", "deg", "rpm"}  # units that occur in mechanics alone
 _PREFIXES = "pnuµμmcdhkMG"
 
 # domains of the dimensions that are neither thermal nor electrical; others may be anything
@@ -95,6 +97,15 @@ def may_convert(unit: str, other: str) -> bool:
     return None in sizes or sizes[0] == sizes[1]
 
 
+def may_be_speed(unit: str) -> bool:
+    """Tell whether a unit may be that of a speed or an angular speed: it is one, or not known.
+
+    >>> may_be_speed("rad/s"), may_be_speed("mm/s"), may_be_speed(""), may_be_speed("mm"), may_be_speed("K")
+    (True, True, True, False, False)
+    """
+    return _dimension(unit) in (None, (0, 1, -1, 0, 0), (0, 0, -1, 0, 0))
+
+
 def common_domain(domains: Iterable[str]) -> str:
     """Return the domain of all whose domain is known; unknown if there is none, or more than one."""
     found = set(domains) - {UNKNOWN}
@@ -106,6 +117,8 @@ def _allowed_domains(unit: str) -> tuple[str, ...]:
     size = _dimension(unit)
     if size is None:
         return DOMAINS
+    if _ANGLES & set(re.findall(r"[^\s*/·^()\d-]+", unit)):
+        return ("mechanical",)
     if size[4]:
         return ("thermal",)
     if size[3]:

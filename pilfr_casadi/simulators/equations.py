@@ -20,9 +20,10 @@ import numpy as np
 
 from .._base import InputError, listed
 from ..models import Named, Parameter, ParameterSet
-from .domains import DOMAINS, UNKNOWN, common_domain, infer_domain, may_convert
+from .domains import DOMAINS, MECHANICAL, UNKNOWN, common_domain, infer_domain, may_be_speed, may_convert
 
 Expression = Callable[..., Any]
+EQUAL_DEPTH = 5  # to which two expressions are compared
 SIGN_POINTS = 3  # at which the sign of a term is looked at
 BUILT_IN = ("actuator:", "sensor:", "equation:")  # prefixes of the ports that need no declaration
 
@@ -66,8 +67,9 @@ class Port:
     across : callable
         Local coordinate z, from any of x, u, p.
     rate : callable, optional
-        dz/dt, from any of x, u, p; by default `across` is differentiated along the dynamics. For a drive without an
-        angle both are the speed, which friction opposes.
+        dz/dt, from any of x, u, p; by default `across` is differentiated along the dynamics. Where there is no position
+        (a drive without an angle), both are the speed, which friction opposes. That is also the default where a force
+        changes z at once, unless units say that z is no speed.
     unit, across_unit : str
         Units of w and of z.
     signals : mapping of str to callable, optional
@@ -137,11 +139,27 @@ class Port:
             return {"parallel"}
         return {"series", "sensor"} if self.name.startswith("sensor:") else {"series"}
 
+    @property
+    def is_speed(self) -> bool:
+        """Whether z is a speed, so that there is no position."""
+        return self.rate is not None and self.rate is self.across
+
+    @property
+    def position_unit(self) -> str:
+        """Unit of the position at the port, in which laws are written: that of z, or if z is a speed that of z s."""
+        if not (self.is_speed and self.across_unit):
+            return self.across_unit
+        before, per_second, after = self.across_unit.rpartition("/s")
+        return before if per_second and not after else f"{self.across_unit} s"
+
     def admits(self, law: Any) -> bool:
         """Tell whether a law (or its class) may be missing here: by its places, physical domains and coordinate.
 
-        A port of unknown domain admits the laws of all domains, except special ones.
+        A port of unknown domain admits the laws of all domains, except special ones. Where z is a speed, a law of the
+        position cannot be told; if the domain is unknown, z may be something else, and a law of z alone is admitted.
         """
+        if self.is_speed and "z" in law.reads() and (self.domain == MECHANICAL or "dz" in law.reads()):
+            return False
         if law.in_line and self.term is None:
             return False
         if not self.kinds & set(law.places) or (law.across and not may_convert(self.across_unit, law.across)):
@@ -367,6 +385,7 @@ class Equations:
         domain = common_domain(port.domain for port in inner)
         if not self.ports:
             inner = tuple(replace(port, domain=domain) if port.domain == UNKNOWN else port for port in inner)
+        inner = tuple(map(self._with_speed, inner))
         # a voltage is a signal in all domains
         actuators = (_series("actuator", n, lambda u, n=n: u[n], self.units, domain) for n in self.inputs)
         sensors = (_series("sensor", n, lambda: 0, self.units, domain) for n in self.output_names)
@@ -385,6 +404,21 @@ class Equations:
         own = f"{unit}/s" if integral == state else f"{unit}/s^2"
         rate = None if integral == state else lambda x: x[state]
         return Port(f"equation:{state}", {state: -1.0}, lambda x: x[integral], rate, own if unit else "", unit)
+
+    def _with_speed(self, port: Port) -> Port:
+        """Mark a port whose z is a speed: a force changes it at once, and units do not deny it."""
+        if self.discrete or not self.states:
+            return port
+        x, u, p, t = self.symbols()
+        z = self.across(port, x, u, p, t)
+        if port.rate is not None:
+            speed = ca.is_equal(ca.SX(self.rate(port, x, u, p, t)), ca.SX(z), EQUAL_DEPTH)
+        else:
+            factors = self.into(port, x, u, p, t)
+            force = ca.vertcat(*(factors.get(name, 0) for name in self.states))
+            at_once = ca.jtimes(z, ca.vertcat(*(x[name] for name in self.states)), force)
+            speed = not at_once.is_zero() and port.domain in (MECHANICAL, UNKNOWN) and may_be_speed(port.across_unit)
+        return replace(port, rate=port.across) if speed else port
 
     @cached_property
     def _integrals(self) -> dict[str, str]:
