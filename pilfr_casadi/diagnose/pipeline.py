@@ -27,7 +27,9 @@ then fitted to everything before step 3, and the answer's simulator before step 
 **Repetitions.** Steps 1 and 2 are repeated in three cases: with an observer if the simulator is unstable and runs away
 from the recordings (`prediction`); with the other hold if nobody stated it and the best hypothesis follows better with
 it; without a shift if a channel seemed to be early, because missing physics can look like a lead. Each search fits
-different data. Its evidence is therefore not comparable; the smaller error decides.
+different data. Its evidence is therefore not comparable; the smaller error decides. If nothing has a name after step 6
+and the simulator drifts, the search is repeated in predictions, and the laws that are found there are refitted in free
+run (`_name_in_predictions`).
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ import numpy as np
 from .._base import InputError, Progress, Stages, one_blas_thread, processors, whole
 from ..data import Recording
 from ..identify import surrogate_warning
-from ..laws import Law, readable_unit
+from ..laws import Law, display_name, readable_unit
 from ..simulators import Simulator
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction, find_correction, named_correction
@@ -53,7 +55,7 @@ from .gates import USELESS_FIT, Gate, Offset, final_gates, offset_gates, without
 from .identifiability import port_units
 from .mismatch_map import mismatch
 from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
-from .prediction import FOCUS, can_be_led, prediction_note, predictor
+from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
 from .preparation import (
     CHECKS,
     FEWEST_SAMPLES,
@@ -117,6 +119,8 @@ class Conclusion:
         The named effects.
     freed : str
         The pinned parameter whose other value explains as much as the named law.
+    decided : Search, optional
+        The search that has named the effects, if it is another one.
     """
 
     verdict: Verdict
@@ -125,6 +129,7 @@ class Conclusion:
     correction: Correction
     effects: tuple[NamedEffect, ...] = ()
     freed: str = ""
+    decided: Search | None = None
 
 
 @one_blas_thread
@@ -171,6 +176,8 @@ def diagnose_in_steps(
         request = replace(request, notes=(request.stretches.note(everything is not None), *request.notes))
     with search.stage("conclusion"):
         found = conclude(search, (*request.notes, *ready.gates))
+    if found.verdict.kind == "unexplained" and request.focus is None and not (search.interrupted or search.out_of_time):
+        found = _name_in_predictions(request, search, found)
     final = _final_fits(request, ready, search, found, everything)
     return _build_diagnosis(request, ready, search, found, final, tests, limits, began)
 
@@ -296,9 +303,8 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
         found = _without_a_law(search, answer, verdict, gates)
         if found is not None:
             return found
-    corrected: tuple[Correction, Fitted] | None = None
     if verdict.kind == "missing-physics":
-        correction, fitted = corrected = find_correction(search, answer, named=True)
+        correction, fitted = find_correction(search, answer, named=True)
         answer = answer.within({(port, law) for port, law, _ in correction.elements}, correction.shares["learned"])
         verdict = judge(search, answer, gates)
         if verdict.kind == "missing-physics":
@@ -315,7 +321,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
         )
         verdict = Verdict(verdict.kind, sentence)
     elif verdict.kind == "unexplained" and not search.interrupted:
-        correction, fitted = corrected or find_correction(search, answer)
+        correction, fitted = find_correction(search, answer)
         verdict = judge(search, answer, gates, correction.closest)
         verdict = Verdict(verdict.kind, f"{verdict.sentence} {correction.sentence}")
         return Conclusion(verdict, gates, fitted, correction)
@@ -338,6 +344,46 @@ def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: S
         return None
     fault = Verdict("recording-fault", clipping.sentence)
     return Conclusion(fault, (*gates, clipping), refitted, named_correction(search, refitted))
+
+
+def _name_in_predictions(request: Request, search: Search, found: Conclusion) -> Conclusion:
+    """Search once more in predictions if the simulator drifts, so that errors of free runs hardly tell laws apart.
+
+    The laws that are named there are refitted in free run. They have to predict held-out data better than the refit.
+    """
+    if request.simulator.observer is not None or not drifts(request.simulator, request.recordings):
+        return found
+    say, hold = request.say.under("predictions: "), search.bench.hold
+    try:
+        led, memory = predictor(request.simulator, request.recordings, hold, request.engine)
+        leading = _search(replace(request, simulator=led, hold=hold, focus="prediction", say=say))[1]
+    except InputError:
+        return found
+    search.interrupted = leading.interrupted
+    if leading.interrupted:
+        return found
+    with leading.stage("conclusion"):
+        named = conclude(leading, ())
+    best = posterior(leading).best
+    if named.verdict.kind != "missing-physics" or {e.name for e in named.effects} != names(best):
+        return found
+    with search.stage("fit in free run"):
+        search.keep(search.beside(best.laws, best))
+        trial = search.thorough(search.memo[best.key])
+        before, after = search.held_out(search.root), search.held_out(trial)
+    if not after.error < before.error:
+        return found
+    correction = replace(named_correction(search, trial.fitted), before=before.error, after=after.error, closest=trial)
+    note = drift_note(request.simulator, memory, " and ".join(display_name(law) for _, law in sorted(names(trial))))
+    return replace(
+        found,
+        verdict=named.verdict,
+        gates=(*found.gates, note),
+        fitted=trial.fitted,
+        correction=correction,
+        effects=named.effects,
+        decided=leading,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -408,7 +454,8 @@ def _build_diagnosis(
     settled = found.verdict.kind in ("complete", "recording-fault") or (
         min((e.confidence for e in effects), default=0) > SURE
     )
-    experiment = _next(search, found.effects, limits)
+    decided = found.decided or search
+    experiment = _next(decided, found.effects, limits)
     request.say("proof", 1, 1)
     now = time.perf_counter()
     return Diagnosis(
@@ -416,7 +463,7 @@ def _build_diagnosis(
         sentence=found.verdict.sentence,
         effects=effects,
         candidates=tuple(
-            _row(search, search.memo.get(t.key, t), step.parent) for step in search.steps for t in step.trials
+            _row(decided, decided.memo.get(t.key, t), step.parent) for step in decided.steps for t in step.trials
         ),
         gates=(
             *_surrogate_note(request.stand_in_error),

@@ -47,6 +47,13 @@ def can_be_led(simulator: Simulator, recordings: Sequence[Recording]) -> bool:
     return growth_rate(simulator, recordings[0]) * recordings[0].dt < 1
 
 
+def drifts(simulator: Simulator, recordings: Sequence[Recording]) -> bool:
+    """Tell whether a simulator remembers longer than its recordings last: small forces add up in a free run."""
+    if not simulator.states or simulator.discrete:
+        return False
+    return growth_rate(simulator, recordings[0]) * max(len(r) * r.dt for r in recordings) > -1
+
+
 def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str) -> tuple[Simulator, float]:
     """Give a simulator the observer with the longest memory that follows the recordings; return it and its memory, s.
 
@@ -85,6 +92,16 @@ def prediction_note(simulator: Simulator, recordings: Sequence[Recording], memor
     sentence = (
         f"{why}The recordings lead the simulator: an observer lets it forget its past within {memory:.3g} s, and the "
         "errors are those of predictions one sample ahead, not of a free run."
+    )
+    return Gate(", ".join(simulator.output_names), "prediction", memory, sentence, corrected=False)
+
+
+def drift_note(simulator: Simulator, memory: float, what: str) -> Gate:
+    """Note that a law was found in predictions because the simulator drifts in a free run."""
+    sentence = (
+        "In a free run small forces add up over the whole recording, so that its errors hardly tell laws apart: "
+        f"{what} was found in predictions one sample ahead, for which an observer lets the simulator forget its past "
+        f"within {memory:.3g} s. The values and errors here are those of a fit in free run."
     )
     return Gate(", ".join(simulator.output_names), "prediction", memory, sentence, corrected=False)
 

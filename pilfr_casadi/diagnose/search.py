@@ -498,7 +498,7 @@ class Search:
         for _ in range(FEW):
             best = self.best
             for element in best.effects if len(best.effects) > 1 else ():
-                rest = self._beside([e for e in best.laws if e is not element], best)
+                rest = self.beside([e for e in best.laws if e is not element], best)
                 if self._in_time() and not any(step.parent.key == rest.key for step in self.steps):
                     self.keep(rest)
                     self.add(rest, again=True)
@@ -532,7 +532,7 @@ class Search:
             return
         with self.stage("every sensor"):
             source = filters[0]
-            joint = self._beside([e for e in best.laws if e is not source], best)
+            joint = self.beside([e for e in best.laws if e is not source], best)
             simulator, named = joint.fitted.simulator, dict[str, object](joint.fitted.values)
             for name in names:
                 simulator = simulator.with_element(f"sensor:{name}", source.law)
@@ -559,10 +559,10 @@ class Search:
         self.keep(Trial((), alone, alone.cost, alone.cost, True))
         return True
 
-    def _beside(self, laws: Sequence[Placed], joint: Trial) -> Trial:
-        """Make a trial of some laws of a hypothesis, at the values that they have beside the others."""
+    def beside(self, laws: Sequence[Placed], joint: Trial) -> Trial:
+        """Make a trial of some laws of a hypothesis, perhaps of another search, at the values that they have there."""
         simulator: Simulator = self.bench.simulator
-        named: dict[str, object] = {k: joint.fitted.values[k] for k in simulator.parameters}
+        named: dict[str, object] = {k: joint.fitted.values.get(k, v) for k, v in self.root.fitted.values.items()}
         for e in laws:
             simulator = simulator.with_element(e.port, e.law)
             named |= simulator.elements[-1].named(e.own(joint.fitted.values))

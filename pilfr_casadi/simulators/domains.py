@@ -98,12 +98,13 @@ def may_convert(unit: str, other: str) -> bool:
 
 
 def may_be_speed(unit: str) -> bool:
-    """Tell whether a unit may be that of a speed or an angular speed: it is one, or not known.
+    """Tell whether a unit may be that of a speed: of a length, an angle or a count per time, or not given.
 
-    >>> may_be_speed("rad/s"), may_be_speed("mm/s"), may_be_speed(""), may_be_speed("mm"), may_be_speed("K")
+    >>> may_be_speed("rad/s"), may_be_speed("counts/s"), may_be_speed(""), may_be_speed("mm"), may_be_speed("level")
     (True, True, True, False, False)
     """
-    return _dimension(unit) in (None, (0, 1, -1, 0, 0), (0, 0, -1, 0, 0))
+    size = _dimension(unit)
+    return not unit or (unit.endswith("/s") if size is None else size in ((0, 1, -1, 0, 0), (0, 0, -1, 0, 0)))
 
 
 def common_domain(domains: Iterable[str]) -> str:

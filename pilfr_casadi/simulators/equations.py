@@ -418,6 +418,7 @@ class Equations:
             force = ca.vertcat(*(factors.get(name, 0) for name in self.states))
             at_once = ca.jtimes(z, ca.vertcat(*(x[name] for name in self.states)), force)
             speed = not at_once.is_zero() and port.domain in (MECHANICAL, UNKNOWN) and may_be_speed(port.across_unit)
+            speed = speed and not (z.is_symbolic() and z.name() in self.kinematic)  # which are positions
         return replace(port, rate=port.across) if speed else port
 
     @cached_property
