@@ -17,18 +17,19 @@ samples, and n_0 the number of samples that a wholly wrong model is worth,
 
 Where models are wrong, v is an error on data that a model was not fitted to. Every recording is cut into blocks, and
 the blocks are dealt to a few folds in turn. For each fold, a simulator is refitted to the other folds, starting at its
-fitted values. It is simulated through the held-out blocks, whose samples are not scored. The state at the beginning of
-a block therefore needs no estimate: it follows from the inputs and the time before. Neighbouring samples are
-correlated, and so whole blocks are held out (Burman, Chow & Nolan 1994, Biometrika 81(2)). Samples after a block still
-constrain a simulation that drifts, for example behind a free integrator. Therefore the second half of every recording
-is also predicted, from a fit to the first half (Tashman 2000, Int. J. Forecasting 16(4)). The larger of both errors
-counts, plus the spread of predictions for other inputs (`spread`).
+fitted values. Parameters with a prior, such as the weights of a learned force, start at its mean; the held-out samples
+would otherwise decide what the others leave open. It is simulated through the held-out blocks, whose samples are not
+scored. The state at the beginning of a block therefore needs no estimate: it follows from the inputs and the time
+before. Neighbouring samples are correlated, and so whole blocks are held out (Burman, Chow & Nolan 1994, Biometrika
+81(2)). Samples after a block still constrain a simulation that drifts, for example behind a free integrator. Therefore
+the second half of every recording is also predicted, from a fit to the first half (Tashman 2000, Int. J. Forecasting
+16(4)). The larger of both errors counts, plus the spread of predictions for other inputs (`spread`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -322,11 +323,18 @@ def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldO
     return HeldOut(sum(squares) / max(scored, 1), second / max(ahead, 1))
 
 
+def _at_prior_means(fitted: Fitted) -> Fitted:
+    """Return a fit with its free parameters that have a prior at the prior's mean."""
+    means = {k: p.prior[0] for k, p in fitted.model.parameters.items() if p.prior is not None and not np.all(p.fixed)}
+    values = {k: np.where(fitted.model.parameters[k].fixed, fitted.values[k], mean) for k, mean in means.items()}
+    return replace(fitted, values={**fitted.values, **values})
+
+
 def _sum_of_squares(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]) -> float:
     """Refit without scoring the samples in `left`; return the sum of squares there, infinite if that diverges."""
     residual: Sequence[np.ndarray] = fitted.residual
     if np.any(fitted.model.parameters.free) or any(r.begins == "estimate" for r in bench.recordings):
-        problem, theta = bench.problem_at(fitted, [~mask for mask in left])
+        problem, theta = bench.problem_at(_at_prior_means(fitted), [~mask for mask in left])
         try:
             with np.errstate(all="ignore"):
                 simulated = problem.simulate(solve_within_bounds(problem, theta, REFIT).theta)
