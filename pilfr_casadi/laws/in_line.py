@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from .base import Law, Local, contact_onset
+from .base import Law, Local, beyond_gap
 
 SAME = 1e-9  # relative difference that rounding may cause
 
@@ -63,13 +63,12 @@ class LineGap(_InLine):
     ranges = {"g": ("reach", 0.002, 0.95)}
 
     def force(self, z: Any, dz: Any, p: Any, term: Any) -> Any:
-        inner = z - ca.fmin(ca.fmax(z, -p.g), p.g)
-        return term(inner, contact_onset(z, p.g) * dz) - term(z, dz)
+        return term(*beyond_gap(z, dz, p.g)) - term(z, dz)
 
     def inner(self, local: Local, shape: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Travel beyond the gap, and its rate."""
-        g = shape["g"]
-        return local.z - np.clip(local.z, -g, g), np.where(np.abs(local.z) > g, local.dz, 0.0)
+        travel, rate = beyond_gap(ca.DM(local.z), ca.DM(local.dz), shape["g"])
+        return travel.full().ravel(), rate.full().ravel()
 
 
 class Compliance(_InLine):

@@ -28,7 +28,7 @@ from ..optimise import Status
 from .executor import AHEAD, Batch, Effort, run_side_by_side
 from .folder import PAGE, PICTURE, SUMMARY, TABLE, Store, check_own, lock_folder, read_times
 from .jobs import MODEL, RunJob, fold, input_digests, jobs_of, outcome
-from .schema import ROLES, Cell, Run, read_run
+from .run_file import ROLES, Cell, Run, read_run
 from .summary import (
     CellSummary,
     Score,

@@ -24,7 +24,7 @@ from ..identify import load
 from ..models import Model
 from .executor import FAILED, LOST, TIMED_OUT, Batch, versions
 from .jobs import BAD_ENDS, MODEL, Recordings, RunJob, error_of, file_digest, scored_files
-from .schema import Run
+from .run_file import Run
 from .summary import Score, results_table
 
 VERSION, MANIFEST = 1, "manifest.json"
