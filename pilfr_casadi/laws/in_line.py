@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from .base import Law, Local, beyond_gap
+from .dynamic import SprungMass
 
 SAME = 1e-9  # relative difference that rounding may cause
 
@@ -109,7 +110,7 @@ class Compliance(_InLine):
         return inner, np.gradient(inner, local.dt)
 
 
-class ElasticDrive(_InLine):
+class ElasticDrive(SprungMass, _InLine):
     """A motor's rotor on a spring and a damper, between the torque that drives a joint and the joint."""
 
     id = "extra_mode"
@@ -135,19 +136,11 @@ class ElasticDrive(_InLine):
     order, follows = 2, 1
 
     def force(self, z: Any, dz: Any, q: Any, p: Any, term: Any) -> Any:
-        return p.k * self._pull(z, dz, q, p) - term(z, dz)
+        return p.k * self.pull(z, dz, q, p) - term(z, dz)
 
     def flow(self, z: Any, dz: Any, q: Any, p: Any, term: Any) -> Any:
         """Rates of the rotor's angle and of its speed over W."""
-        return ca.vertcat(p.W * q[1], p.W * (self._pull(z, dz, q, p) - term(q[0], p.W * q[1]) / p.k))
-
-    def far_side(self, q: Any, p: Any) -> tuple[Any, Any]:
-        """Angle and speed of the rotor."""
-        return q[0], p.W * q[1]
-
-    def _pull(self, z: Any, dz: Any, q: Any, p: Any) -> Any:
-        """Force of spring and damper over the spring's stiffness."""
-        return z - q[0] + 2 * p.D * (dz / p.W - q[1])
+        return ca.vertcat(p.W * q[1], p.W * (self.pull(z, dz, q, p) - term(q[0], p.W * q[1]) / p.k))
 
     def forces_along(self, local: Local, shapes: Sequence[Mapping[str, Any]]) -> np.ndarray:
         """Forces of inertia of the rotor, which lies ahead of the joint by the spring's deflection."""
