@@ -40,7 +40,8 @@ def random_sines(
     rng: np.random.Generator, t: np.ndarray, band: tuple[float, float], lines: int, peak: float, roll_off: float = 0.0
 ) -> np.ndarray:
     """Sum of sines at random frequencies in a band, Hz, with amplitudes ~ f^-roll_off, scaled to a peak; shape (M,)."""
-    f, phases = np.exp(rng.uniform(*np.log(band), lines)), rng.uniform(0, 2 * np.pi, lines)
+    low, high = np.log(band)
+    f, phases = np.exp(rng.uniform(low, high, lines)), rng.uniform(0, 2 * np.pi, lines)
     out = np.sum(np.sin(2 * np.pi * np.outer(t, f) + phases) / f**roll_off, axis=1)
     return np.asarray(out * (peak / np.max(np.abs(out))))
 
