@@ -10,22 +10,21 @@ simulator is unstable, so the errors are those of one-step predictions. Values a
 
 from __future__ import annotations
 
-import argparse
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from pilfr_casadi import Parameter, Port, Recording, Simulator, diagnose
+from pilfr_casadi import Parameter, Port, Recording, Simulator
+
+from .simulated_cases import Flow, advance, case_parser, diagnose_case
 
 DT, SAMPLES, FINE = 0.01, 2000, 20  # s, samples, steps of the truth in a sample
 GRAVITY = 9.81
 NOISE = np.array([2e-4, 5e-4])  # m, rad
 FRICTION = ("coulomb_friction", "stribeck_friction")
-Flow = Callable[[np.ndarray, float], np.ndarray]
 
 
 def simulator(values: Mapping[str, float]) -> Simulator:
@@ -104,7 +103,7 @@ def _controller(p: Mapping[str, float]) -> np.ndarray:
 
 def _run(flow: Flow, gain: np.ndarray, rng: np.random.Generator) -> Recording:
     """Balance the pendulum along a random reference, with a dither on the force."""
-    t, h, lines = DT * np.arange(SAMPLES), DT / FINE, rng.uniform(0.05, 0.6, 8)
+    t, lines = DT * np.arange(SAMPLES), rng.uniform(0.05, 0.6, 8)
     reference = np.sum(np.sin(2 * np.pi * np.outer(t, lines) + rng.uniform(0, 6.3, 8)), axis=1) / 8
     dither, noise = rng.normal(0, 1.0, SAMPLES), NOISE * rng.standard_normal((SAMPLES, 2))
     x, last = np.zeros(4), np.zeros(2)
@@ -115,40 +114,21 @@ def _run(flow: Flow, gain: np.ndarray, rng: np.random.Generator) -> Recording:
         last = y[k]
         seen = np.append(y[k] - [reference[k], 0.0], (rates + x[2:]) / 2)
         u[k] = dither[k] - gain @ seen
-        for _ in range(FINE):
-            k1 = flow(x, u[k, 0])
-            k2 = flow(x + h / 2 * k1, u[k, 0])
-            k3 = flow(x + h / 2 * k2, u[k, 0])
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + flow(x + h * k3, u[k, 0]))
+        x = advance(flow, x, u[k, 0], DT, FINE)
     return Recording(u, y, DT, ("force",), ("position", "tilt"), initial="estimate", hold="zero")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Diagnose every case; print one line each, and the number of right answers."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", type=int, default=20, help="cases with friction; a quarter as many without")
-    parser.add_argument("--first", type=int, default=0, help="first case to run")
-    parser.add_argument("--workers", type=int, default=2)
-    options = parser.parse_args(arguments)
+    options = case_parser(__doc__, 20, "cases with friction; a quarter as many without").parse_args(arguments)
     kinds = [FRICTION[i % 2] for i in range(options.cases)] + ["none"] * (options.cases // 4)
     right = exact = 0
     for seed, kind in list(enumerate(kinds))[options.first :]:
-        rig, train, test = recorded(seed, kind)
-        began = time.perf_counter()
-        found = diagnose(rig, train, test=test, workers=options.workers)
-        seconds = time.perf_counter() - began
-        named = [(e.port, e.law) for e in found.effects]
-        friction = len(named) == 1 and named[0][0] == "rail" and named[0][1] in FRICTION
-        right += friction if kind in FRICTION else found.verdict == "complete"
-        exact += named == [("rail", kind)] if kind in FRICTION else found.verdict == "complete"
-        errors = found.errors["test"]
-        assert errors is not None
-        told = ", ".join(f"{e.law} at {e.port} {e.confidence:.2f}" for e in found.effects) or found.verdict
-        print(
-            f"{seed:3} {kind:17} {told:45} test {errors['before']:.4f} -> {errors['after']:.4f}, "
-            f"noise {found.floor['nrmse']:.4f}, {seconds:.0f} s",
-            flush=True,
-        )
+        answer = diagnose_case(recorded(seed, kind), options.workers)
+        same = answer.is_right("rail", kind if kind in FRICTION else "")
+        exact += same
+        right += same or (kind in FRICTION and any(answer.is_right("rail", law) for law in FRICTION))
+        answer.show(f"{seed:3} {kind:17}")
     print(f"{right} of {len(kinds) - options.first} right, {exact} with the very law")
     return 0
 

@@ -18,6 +18,8 @@ import numpy as np
 
 from pilfr_casadi.data import Recording, multisine
 
+from .simulated_cases import trajectory
+
 DT, SAMPLES, NOISE, FINE = 0.01, 1000, 1e-4, 100
 FOLDER = Path(__file__).parent.parent / "pilfr_casadi" / "cli" / "demo_data"
 M1, M2, K1, K2, D1, D2 = 1.2, 0.8, 420.0, 900.0, 2.0, 1.5
@@ -38,15 +40,7 @@ def record(seed: int, name: str, samples: int = SAMPLES) -> Recording:
     """One experiment from rest: force in N, displacement of the second mass in m."""
     rng = np.random.default_rng(seed)
     force = 9.0 * multisine(samples, f_max=6.0, fs=1 / DT, rng=rng)
-    s, x2, h = np.zeros(5), np.zeros(samples), DT / FINE
-    for k in range(samples):
-        x2[k] = s[2]
-        for _ in range(FINE):
-            a = rates(s, force[k])
-            b = rates(s + h / 2 * a, force[k])
-            c = rates(s + h / 2 * b, force[k])
-            d = rates(s + h * c, force[k])
-            s = s + h / 6 * (a + 2 * b + 2 * c + d)
+    x2 = trajectory(rates, np.zeros(5), force, DT, FINE)[:, 2]
     measured = x2 + NOISE * rng.standard_normal(samples)
     return Recording(force, measured, DT, ("force",), ("x2",), initial="zero", hold="zero", name=name)
 

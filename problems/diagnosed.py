@@ -6,8 +6,10 @@ recording and the rest is simulated without looking at the output again.
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -16,6 +18,8 @@ from pilfr_casadi.diagnose import Diagnosis, Fitted, Workbench
 from pilfr_casadi.diagnose.workbench import THOROUGH
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import Simulator
+
+from .measured_data import measured
 
 
 def free_run(simulator: Simulator, recording: Recording, hold: str, first: int = 0) -> np.ndarray:
@@ -44,9 +48,21 @@ def rmse(error: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(error))))
 
 
-def answer(diagnosis: Diagnosis) -> list[tuple[str, str, str, float]]:
-    """(port, law, form, confidence) of each effect."""
-    return [(e.port, e.law, e.form, e.confidence) for e in diagnosis.effects]
+def given_folder(description: str | None, name: str, arguments: Sequence[str] | None) -> Path | None:
+    """Parse a command without options; return the folder of its recordings, or say where they have to be put."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.parse_args(arguments)
+    folder = measured(name)
+    if folder is None:
+        print(f"The recordings are not here; put them into DATA/{name} and run with PILFR_DATA=DATA.")
+    return folder
+
+
+def show(diagnosis: Diagnosis) -> None:
+    """Print a diagnosis, and a line for each effect."""
+    print(diagnosis)
+    for e in diagnosis.effects:
+        print(f"found: {e.law} ({e.form}) at {e.port}, confidence {e.confidence:.2f}")
 
 
 def table(title: str, rows: Sequence[tuple[str, Sequence[float | None]]], columns: Sequence[str]) -> str:

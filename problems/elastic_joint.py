@@ -11,15 +11,15 @@ drawn anew for every seed.
 
 from __future__ import annotations
 
-import argparse
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from pilfr_casadi import Parameter, Port, Recording, Simulator, diagnose
+from pilfr_casadi import Parameter, Port, Recording, Simulator
+
+from .simulated_cases import case_parser, diagnose_case, numbered, random_sines, trajectory
 
 DT, SAMPLES, FINE = 0.004, 2500, 20  # s, samples, steps of the truth in a sample
 KNEE = 0.02  # rad/s, within which the dry friction reverses
@@ -74,9 +74,7 @@ def _run(
     p: Mapping[str, float], spring: tuple[float, float, float] | None, seen: str, rng: np.random.Generator
 ) -> Recording:
     """Drive the machine with a random multisine; `spring` holds stiffness, damping, and the link's share of inertia."""
-    t, lines = DT * np.arange(SAMPLES), np.exp(rng.uniform(np.log(0.2), np.log(20), 30))
-    u = np.sum(np.sin(2 * np.pi * np.outer(t, lines) + rng.uniform(0, 2 * np.pi, 30)), axis=1)
-    u *= 4.0 / np.max(np.abs(u))
+    u = random_sines(rng, DT * np.arange(SAMPLES), (0.2, 20.0), 30, 4.0)
 
     def flow(x: np.ndarray, command: float) -> np.ndarray:
         torque, angle, speed, link, link_speed = x
@@ -90,45 +88,24 @@ def _run(
         faster = (torque - friction - across) / (p["J"] * (1 - share))
         return np.array([lag, speed, faster, link_speed, across / (p["J"] * share)])
 
-    x, h, y = np.zeros(5), DT / FINE, np.zeros(SAMPLES)
-    for i in range(SAMPLES):
-        y[i] = x[2] if seen == "motor" else x[4]
-        for _ in range(FINE):
-            k1 = flow(x, u[i])
-            k2 = flow(x + h / 2 * k1, u[i])
-            k3 = flow(x + h / 2 * k2, u[i])
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + flow(x + h * k3, u[i]))
+    y = trajectory(flow, np.zeros(5), u, DT, FINE)[:, 2 if seen == "motor" else 4]
     y += NOISE * np.std(y) * rng.standard_normal(SAMPLES)
     return Recording(u, y, DT, ("command",), (seen,), initial="zero", hold="zero")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Diagnose every case; print one line each, and the numbers of right answers and of delays in their place."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", type=int, default=20, help="elastic cases; half as many rigid ones")
-    parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--workers", type=int, default=2)
-    options = parser.parse_args(arguments)
-    seeds = range(options.first, options.first + options.cases)
+    options = case_parser(__doc__, 20, "elastic cases; half as many rigid ones").parse_args(arguments)
+    seeds = numbered(options)
     cases = [(seed, True) for seed in seeds] + [(seed, False) for seed in seeds[::2]]
     right, delays = {True: 0, False: 0}, 0
     for seed, elastic in cases:
-        rig, train, test = recorded(seed, elastic)
-        began = time.perf_counter()
-        found = diagnose(rig, train, test=test, workers=options.workers)
-        seconds = time.perf_counter() - began
-        laws = [e.law for e in found.effects]
-        right[elastic] += laws == [COMPLIANCE] if elastic else found.verdict == "complete"
-        shifted = any(g.finding == "alignment" for g in found.gates)
+        answer = diagnose_case(recorded(seed, elastic), options.workers)
+        laws = [law for _, law in answer.named]
+        right[elastic] += laws == [COMPLIANCE] if elastic else answer.found.verdict == "complete"
+        shifted = any(g.finding == "alignment" for g in answer.found.gates)
         delays += elastic and ("delay" in laws or shifted)
-        told = [f"{e.law} ({e.form or 'plain'}) at {e.port} {e.confidence:.2f}" for e in found.effects]
-        errors = found.errors["test"]
-        assert errors is not None
-        print(
-            f"{seed:3} {'elastic' if elastic else 'rigid':8} {', '.join(told) or found.verdict:55} "
-            f"{'shifted ' if shifted else ''}test {errors['before']:.4f} -> {errors['after']:.4f}, {seconds:.0f} s",
-            flush=True,
-        )
+        answer.show(f"{seed:3} {'elastic' if elastic else 'rigid':8}{'shifted ' if shifted else ''}")
     print(
         f"compliance named in {right[True]} of {len(seeds)}, a delay in {delays}; "
         f"complete in {right[False]} of {len(seeds[::2])} rigid cases"

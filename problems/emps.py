@@ -15,7 +15,6 @@ networks 74 to 220 mm.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,8 +27,7 @@ from pilfr_casadi.diagnose import Diagnosis, diagnose
 from pilfr_casadi.models import Parameter
 from pilfr_casadi.simulators import Port, Simulator
 
-from .diagnosed import answer, free_run, rmse, table
-from .measured_data import measured
+from .diagnosed import free_run, given_folder, rmse, show, table
 
 GAIN = 35.15065  # N/V, from the drive's voltage to the force
 K_P, K_V = 160.18, 243.45  # 1/s, V s/m
@@ -129,17 +127,11 @@ def run(folder: Path, **options: Any) -> tuple[Diagnosis, dict[str, dict[str, fl
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print what was found, and the errors beside the published ones."""
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args(
-        arguments
-    )
-    folder = measured("emps")
+    folder = given_folder(__doc__, "emps", arguments)
     if folder is None:
-        print("The EMPS recordings are not here; put them into DATA/emps and run with PILFR_DATA=DATA.")
         return 1
     diagnosis, errors = run(folder)
-    print(diagnosis)
-    for port, law, form, sure in answer(diagnosis):
-        print(f"found: {law} ({form}) at {port}, confidence {sure:.2f}")
+    show(diagnosis)
     kinds = ("train", "test", "closed loop")
     rows: list[tuple[str, Sequence[float | None]]] = [
         ("viscous friction only, refitted", [errors["before"][k] for k in kinds]),

@@ -10,14 +10,14 @@ the package.
 
 from __future__ import annotations
 
-import argparse
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from pilfr_casadi import Parameter, Port, Recording, Simulator, diagnose
+from pilfr_casadi import Parameter, Port, Recording, Simulator
+
+from .simulated_cases import case_parser, diagnose_case, numbered, random_sines, trajectory
 
 DT, SAMPLES, FINE = 0.005, 2000, 20  # s, samples, steps of the truth in a sample
 NOISE = 2e-3  # of the output's deviation
@@ -61,9 +61,7 @@ def recorded(seed: int, kind: str) -> tuple[Simulator, Recording, Recording]:
 
 def run(p: Mapping[str, float], kind: str, extra: float, rng: np.random.Generator) -> Recording:
     """Drive the machine with a random multisine; `extra` is the gap in m or the stiffness of the bracket in N/m."""
-    t, lines = DT * np.arange(SAMPLES), np.exp(rng.uniform(np.log(0.3), np.log(15), 30))
-    u = np.sum(np.sin(2 * np.pi * np.outer(t, lines) + rng.uniform(0, 2 * np.pi, 30)), axis=1)
-    u *= 25.0 / np.max(np.abs(u))
+    u = random_sines(rng, DT * np.arange(SAMPLES), (0.3, 15.0), 30, 25.0)
 
     def flow(x: np.ndarray, force: float) -> np.ndarray:
         z, dz, q = x
@@ -76,42 +74,20 @@ def run(p: Mapping[str, float], kind: str, extra: float, rng: np.random.Generato
         load = p["k"] * inner + p["k_3"] * inner**3 + p["d"] * rate
         return np.array([dz, (force - load) / p["m"], 0.0])
 
-    x, h, y = np.zeros(3), DT / FINE, np.zeros(SAMPLES)
-    for i in range(SAMPLES):
-        y[i] = x[0]
-        for _ in range(FINE):
-            k1 = flow(x, u[i])
-            k2 = flow(x + h / 2 * k1, u[i])
-            k3 = flow(x + h / 2 * k2, u[i])
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + flow(x + h * k3, u[i]))
+    y = trajectory(flow, np.zeros(3), u, DT, FINE)[:, 0]
     y += NOISE * np.std(y) * rng.standard_normal(SAMPLES)
     return Recording(u, y, DT, ("force",), ("travel",), initial="zero", hold="zero")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Diagnose every case; print one line each, and the number of right answers of each kind."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", type=int, default=20, help="of each kind")
-    parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--workers", type=int, default=2)
-    options = parser.parse_args(arguments)
+    options = case_parser(__doc__, 20, "of each kind").parse_args(arguments)
     right = dict.fromkeys(KINDS, 0)
-    for seed in range(options.first, options.first + options.cases):
+    for seed in numbered(options):
         for kind, law in KINDS.items():
-            rig, train, test = recorded(seed, kind)
-            began = time.perf_counter()
-            found = diagnose(rig, train, test=test, workers=options.workers)
-            seconds = time.perf_counter() - began
-            named = [(e.port, e.law) for e in found.effects]
-            right[kind] += named == [("mount", law)] if law else found.verdict == "complete"
-            told = [f"{e.law} ({e.form or 'plain'}) at {e.port} {e.confidence:.2f}" for e in found.effects]
-            errors = found.errors["test"]
-            assert errors is not None
-            print(
-                f"{seed:3} {kind:8} {', '.join(told) or found.verdict:55} "
-                f"test {errors['before']:.4f} -> {errors['after']:.4f}, {seconds:.0f} s",
-                flush=True,
-            )
+            answer = diagnose_case(recorded(seed, kind), options.workers)
+            right[kind] += answer.is_right("mount", law)
+            answer.show(f"{seed:3} {kind:8}")
     print(", ".join(f"{kind}: {right[kind]} of {options.cases}" for kind in KINDS))
     return 0
 

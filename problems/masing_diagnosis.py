@@ -17,7 +17,7 @@ from pilfr_casadi.diagnose import Diagnosis, diagnose
 from pilfr_casadi.models import Parameter
 from pilfr_casadi.simulators import Port, Simulator
 
-from .diagnosed import answer, rmse, table
+from .diagnosed import rmse, show, table
 from .masing import MasingRig
 from .masing_data import benchmark
 
@@ -91,9 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
     diagnosis, errors = run(options.seed)
-    print(diagnosis)
-    for port, law, form, sure in answer(diagnosis):
-        print(f"found: {law} ({form}) at {port}, confidence {sure:.2f}")
+    show(diagnosis)
     print("parameters off by " + ", ".join(f"{k} {v:+.2f} %" for k, v in off(diagnosis).items()))
     kinds = ("multisine", "sweep")
     rows: list[tuple[str, Sequence[float | None]]] = [

@@ -11,15 +11,15 @@ are recorded. Needs the package mujoco.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from pilfr_casadi import Recording, diagnose, from_mujoco
+from pilfr_casadi import Recording, from_mujoco
+
+from .simulated_cases import case_parser, diagnose_case, numbered
 
 DT, SAMPLES, FINE = 0.005, 2400, 10  # s, samples, steps of MuJoCo in a sample
 NOISE = 2e-4  # rad
@@ -96,13 +96,10 @@ def _run(values: dict[str, float], friction: tuple[float, float], elastic: bool,
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Diagnose every arm; print what was named and the errors."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", type=int, default=5)
-    parser.add_argument("--first", type=int, default=0, help="first case")
+    parser = case_parser(__doc__, 5)
     parser.add_argument("--elastic", action="store_true", help="with a spring in the elbow")
-    parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args(arguments)
-    for seed in range(options.first, options.first + options.cases):
+    for seed in numbered(options):
         values, (train, test) = truth(seed, options.elastic)
         rng = np.random.default_rng(seed)
         given = {name: value * rng.uniform(0.85, 1.18) for name, value in values.items()}
@@ -110,16 +107,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             path = Path(folder) / "arm.xml"
             path.write_text(arm(given), encoding="utf-8")
             free = ("upper.mass", "forearm.mass", "shoulder.damping", "elbow.damping", "elbow.armature")
-            began = time.perf_counter()
-            found = diagnose(from_mujoco(path, parameters=free), train, test=test, workers=options.workers)
-        errors = found.errors["test"]
-        assert errors is not None
-        told = "; ".join(f"{e.law} ({e.form or 'plain'}) at {e.port} {e.confidence:.2f}" for e in found.effects)
-        print(
-            f"{seed:3} {told or found.verdict}: test {errors['before']:.4f} -> {errors['after']:.4f}, "
-            f"{time.perf_counter() - began:.0f} s",
-            flush=True,
-        )
+            rigid = from_mujoco(path, parameters=free)
+            diagnose_case((rigid, train, test), options.workers).show(f"{seed:3}")
     return 0
 
 

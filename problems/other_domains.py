@@ -20,18 +20,17 @@ hidden law alone, at its place; a simulator that lacks nothing has to be called 
 
 from __future__ import annotations
 
-import argparse
-import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from pilfr_casadi import Parameter, Port, Recording, Simulator, diagnose
+from pilfr_casadi import Parameter, Port, Recording, Simulator
+
+from .simulated_cases import Flow, case_parser, diagnose_case, numbered, trajectory
 
 Array = np.ndarray
-Flow = Callable[[Array, Array], Array]
 SAMPLES, FINE = 1500, 20  # samples of a recording, steps of the truth in a sample
 OFF = 0.2  # largest error of a given value
 ROOM = 293.0  # K
@@ -62,18 +61,8 @@ class Rig:
 
     def record(self, rng: np.random.Generator) -> Recording:
         """Make a recording with noise."""
-        u, h = self.drive(rng), self.dt / FINE
-        x = np.empty((len(u), len(self.start)))
-        x[0] = self.start
-        for k in range(len(u) - 1):
-            now = x[k]
-            for _ in range(FINE):
-                k1 = self.flow(now, u[k])
-                k2 = self.flow(now + h / 2 * k1, u[k])
-                k3 = self.flow(now + h / 2 * k2, u[k])
-                now = now + h / 6 * (k1 + 2 * k2 + 2 * k3 + self.flow(now + h * k3, u[k]))
-            x[k + 1] = now
-        y = self.outputs(x, u)
+        u = self.drive(rng)
+        y = self.outputs(trajectory(self.flow, self.start, u, self.dt, FINE), u)
         noise = rng.uniform(1e-3, 5e-3) * np.std(y, axis=0) * rng.standard_normal(y.shape)
         own = self.simulator
         initial = self.start[: len(own.states)]
@@ -328,32 +317,18 @@ def judge(kind: str, verdict: str, named: Sequence[tuple[str, str]]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Diagnose every case; print one line each, and a table by kind."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    names = (*KINDS, *COMPLETE)
+    parser, names = case_parser(__doc__, 3, "of each kind that lacks something"), (*KINDS, *COMPLETE)
     parser.add_argument("kinds", nargs="*", choices=[*names, []], help="kinds; all by default")
-    parser.add_argument("--cases", type=int, default=3, help="cases of each kind that lacks something")
-    parser.add_argument("--first", type=int, default=0, help="number of the first case of each kind")
-    parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args(arguments)
     answers: dict[str, Counter[str]] = defaultdict(Counter)
     errors: dict[str, list[Array]] = defaultdict(list)
     for kind in options.kinds or names:
-        for number in range(options.first, options.first + (options.cases if kind in KINDS else 1)):
-            simulator, train, test = recorded(kind, number)
-            began = time.perf_counter()
-            found = diagnose(simulator, train, test=test, workers=options.workers)
-            seconds = time.perf_counter() - began
-            answer = judge(kind, found.verdict, [(e.port, e.law) for e in found.effects])
-            tested = found.errors["test"]
-            assert tested is not None
-            answers[kind][answer] += 1
-            errors[kind].append(np.array([tested["before"], tested["after"], found.floor["nrmse"]]))
-            told = ", ".join(f"{e.law} ({e.form}) at {e.port} {e.confidence:.2f}" for e in found.effects)
-            print(
-                f"{kind:16} {number:2} {answer:12} {told or found.verdict:60} test {tested['before']:.4f} -> "
-                f"{tested['after']:.4f}, noise {found.floor['nrmse']:.4f}, {seconds:.0f} s",
-                flush=True,
-            )
+        for number in numbered(options) if kind in KINDS else [options.first]:
+            answer = diagnose_case(recorded(kind, number), options.workers)
+            judged = judge(kind, answer.found.verdict, answer.named)
+            answers[kind][judged] += 1
+            errors[kind].append(np.array(answer.errors))
+            answer.show(f"{kind:16} {number:2} {judged:12}")
     print("\n" + table(answers, errors))
     return 0
 

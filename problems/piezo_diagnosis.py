@@ -9,7 +9,6 @@ and what twelve plays leave, identified from the same sine with no simulator.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,7 @@ from pilfr_casadi.diagnose import Diagnosis, diagnose
 from pilfr_casadi.models import Parameter
 from pilfr_casadi.simulators import Simulator
 
-from .diagnosed import answer, free_run, rmse, table
-from .measured_data import measured
+from .diagnosed import free_run, given_folder, rmse, show, table
 from .piezo_stack import identify, recordings, share_of_range
 
 FIRST = 40  # samples that may set the initial memory
@@ -66,17 +64,11 @@ def run(folder: Path, **options: Any) -> tuple[Diagnosis, dict[str, float]]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print what was found, and the errors beside that of a model without a simulator."""
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args(
-        arguments
-    )
-    folder = measured("piezo_dbo")
+    folder = given_folder(__doc__, "piezo_dbo", arguments)
     if folder is None:
-        print("The piezo recordings are not here; put them into DATA/piezo_dbo and run with PILFR_DATA=DATA.")
         return 1
     diagnosis, errors = run(folder)
-    print(diagnosis)
-    for port, law, form, sure in answer(diagnosis):
-        print(f"found: {law} ({form}) at {port}, confidence {sure:.2f}")
+    show(diagnosis)
     refined = diagnosis.refine()
     print(refined)
     data = recordings(folder)

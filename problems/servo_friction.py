@@ -12,20 +12,19 @@ so that the load is little more than what moves the inertia.
 
 from __future__ import annotations
 
-import argparse
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from pilfr_casadi import Parameter, Port, Recording, Simulator, diagnose
+from pilfr_casadi import Parameter, Port, Recording, Simulator
+
+from .simulated_cases import Flow, advance, case_parser, diagnose_case, numbered, random_sines
 
 DT, SAMPLES, FINE = 0.005, 2400, 20  # s, samples, steps of the truth in a sample
 KNEE = 0.01  # rad/s, within which the friction reverses
 NOISE = 3e-4  # rad
-Flow = Callable[[np.ndarray, float], np.ndarray]
 KINDS = ("coulomb_friction", "stribeck_friction", "load")
 
 
@@ -80,24 +79,15 @@ def _truth(p: Mapping[str, float], kind: str, rng: np.random.Generator) -> Flow:
     return flow
 
 
-def _run(
-    flow: Callable[[np.ndarray, float], np.ndarray], p: Mapping[str, float], rng: np.random.Generator
-) -> Recording:
+def _run(flow: Flow, p: Mapping[str, float], rng: np.random.Generator) -> Recording:
     """Follow a slow and a fast random reference under a stiff position controller, which is not known."""
-    t, h = DT * np.arange(SAMPLES), DT / FINE
-    lines, phases = np.exp(rng.uniform(np.log(0.1), np.log(2.0), 12)), rng.uniform(0, 2 * np.pi, 12)
-    reference = np.sum(np.sin(2 * np.pi * np.outer(t, lines) + phases) / np.sqrt(lines), axis=1)
-    reference *= 1.2 / np.max(np.abs(reference))
+    reference = random_sines(rng, DT * np.arange(SAMPLES), (0.1, 2.0), 12, 1.2, roll_off=0.5)
     stiffness, damping = 300 * p["J"], 25 * p["J"]
     x, y, u = np.array([reference[0], 0.0]), np.zeros(SAMPLES), np.zeros(SAMPLES)
     for i in range(SAMPLES):
         y[i] = x[0] + NOISE * rng.standard_normal()
         u[i] = stiffness * (reference[i] - y[i]) - damping * x[1]
-        for _ in range(FINE):
-            k1 = flow(x, u[i])
-            k2 = flow(x + h / 2 * k1, u[i])
-            k3 = flow(x + h / 2 * k2, u[i])
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + flow(x + h * k3, u[i]))
+        x = advance(flow, x, u[i], DT, FINE)
     return Recording(u, y, DT, ("torque",), ("encoder",), initial="estimate", hold="zero")
 
 
@@ -108,30 +98,16 @@ def describe(effect: Any) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Diagnose every servo; print one line each, and the numbers of right, unsure and wrong kinds."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", type=int, default=60)
-    parser.add_argument("--first", type=int, default=0, help="first case")
-    parser.add_argument("--workers", type=int, default=2)
-    options = parser.parse_args(arguments)
+    options = case_parser(__doc__, 60).parse_args(arguments)
     counts = dict.fromkeys(("right", "unsure", "wrong"), 0)
-    for case in range(options.first, options.first + options.cases):
+    for case in numbered(options):
         seed, kind = case // len(KINDS), KINDS[case % len(KINDS)]
-        rig, train, test = recorded(seed, kind)
-        began = time.perf_counter()
-        found = diagnose(rig, train, test=test, workers=options.workers)
-        seconds = time.perf_counter() - began
-        kinds = [describe(e) for e in found.effects]
-        right = kinds == [kind] and found.effects[0].port == "gear"
-        answer = "right" if right else "wrong" if kinds and found.sure else "unsure"
-        counts[answer] += 1
-        errors = found.errors["test"]
-        assert errors is not None
-        told = ", ".join(f"{k} at {e.port} {e.confidence:.2f}" for k, e in zip(kinds, found.effects, strict=True))
-        print(
-            f"{case:3} {kind:18} {told or found.verdict:60} {answer:7} "
-            f"test {errors['before']:.4f} -> {errors['after']:.4f}, {seconds:.0f} s",
-            flush=True,
-        )
+        answer = diagnose_case(recorded(seed, kind), options.workers)
+        kinds = [describe(e) for e in answer.found.effects]
+        right = kinds == [kind] and answer.named[0][0] == "gear"
+        judged = "right" if right else "wrong" if kinds and answer.found.sure else "unsure"
+        counts[judged] += 1
+        answer.show(f"{case:3} {kind:18} {judged:7}")
     print(", ".join(f"{name} {count}" for name, count in counts.items()))
     return 0
 

@@ -14,7 +14,6 @@ the arrow (arXiv 2405.10779), GRU 1.49 / 2.80 / 0.95, FIR network 18.9 / 20.2 / 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,8 +23,7 @@ from pilfr_casadi.diagnose import Diagnosis, diagnose
 from pilfr_casadi.models import Parameter
 from pilfr_casadi.simulators import Port, Simulator
 
-from .diagnosed import answer, free_run, rmse, table
-from .measured_data import measured
+from .diagnosed import free_run, given_folder, rmse, show, table
 
 ARROW = (100, 40575)
 INSIDE = 32000  # samples of the arrow that stay inside the trained amplitudes
@@ -97,19 +95,11 @@ def run(folder: Path, **options: Any) -> tuple[Diagnosis, dict[str, dict[str, fl
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print what was found, and the errors beside the published ones."""
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args(
-        arguments
-    )
-    folder = measured("silverbox")
+    folder = given_folder(__doc__, "silverbox", arguments)
     if folder is None:
-        print("The Silverbox recordings are not here; put them into DATA/silverbox and run with PILFR_DATA=DATA.")
         return 1
     diagnosis, errors = run(folder)
-    print(diagnosis)
-    for port, law, form, sure in answer(diagnosis):
-        print(
-            f"found: {law} ({form}) at {port}, confidence {sure:.2f}" if form else f"found: {law} at {port}, {sure:.2f}"
-        )
+    show(diagnosis)
     kinds = ("multisine", "arrow", "arrow inside")
     rows: list[tuple[str, Sequence[float | None]]] = [
         ("linear circuit, refitted", [errors["before"][k] for k in kinds]),

@@ -15,7 +15,6 @@ NLSS2 0.34, PNLSS 0.45, Volterra 0.54, linear 0.75.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,8 +27,7 @@ from pilfr_casadi.diagnose import Diagnosis, diagnose
 from pilfr_casadi.models import Parameter
 from pilfr_casadi.simulators import Port, Simulator
 
-from .diagnosed import answer, rmse, started, table
-from .measured_data import measured
+from .diagnosed import given_folder, rmse, show, started, table
 
 EMPTY = 1e-3  # level below which powers of it are not followed to zero
 PUBLISHED = (
@@ -120,20 +118,15 @@ def run(folder: Path, root: bool, **options: Any) -> tuple[Diagnosis, dict[str, 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print what was found, and the errors beside the published ones."""
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args(
-        arguments
-    )
-    folder = measured("cascaded_tanks")
+    folder = given_folder(__doc__, "cascaded_tanks", arguments)
     if folder is None:
-        print("The tanks' recordings are not here; put them into DATA/cascaded_tanks and run with PILFR_DATA=DATA.")
         return 1
     kinds = ("train", "test")
     rows: list[tuple[str, Sequence[float | None]]] = []
     for root, name in ((False, "linear outflow"), (True, "square-root outflow")):
         diagnosis, errors = run(folder, root)
-        print(f"{name}\n{diagnosis}")
-        for port, law, form, sure in answer(diagnosis):
-            print(f"found: {law} ({form}) at {port}, confidence {sure:.2f}")
+        print(name)
+        show(diagnosis)
         rows.append((f"{name}, refitted", [errors["before"][k] for k in kinds]))
         rows.append((f"{name}, with what was found", [errors["after"][k] for k in kinds]))
     rows += [(name, [None, value]) for name, value in PUBLISHED]

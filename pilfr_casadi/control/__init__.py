@@ -7,6 +7,7 @@ from .._base.lazy import lazy_face
 if TYPE_CHECKING:
     from .bounds import response_bound as response_bound
     from .dompc import do_mpc_controller as do_mpc_controller, do_mpc_model as do_mpc_model
+    from .element_inverse import inverse_element as inverse_element
     from .estimation import (
         KalmanFilter as KalmanFilter,
         ekf_step as ekf_step,
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
         Feedforward as Feedforward,
         analyse_response as analyse_response,
         feedforward as feedforward,
-        inverse_element as inverse_element,
     )
     from .mpc import PredictiveController as PredictiveController
 else:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
+    from .build_step import FittedModel as FittedModel, exported as exported, to_casadi as to_casadi
     from .model_file import (
         FitContent as FitContent,
         model_text as model_text,
@@ -12,12 +13,6 @@ if TYPE_CHECKING:
         write_model_file as write_model_file,
     )
     from .smoothing import enclose as enclose, smooth_kinks as smooth_kinks
-    from .step import (
-        NAMES as NAMES,
-        Exported as Exported,
-        FittedModel as FittedModel,
-        exported as exported,
-        to_casadi as to_casadi,
-    )
+    from .step import NAMES as NAMES, Exported as Exported
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -229,8 +229,8 @@ def _score_from(recording: Recording, skip: int) -> Recording:
 class Watch:
     """Remember the point of a solve with the smallest error on the data held back."""
 
-    def __init__(self, problem: Problem, patience: int = PATIENCE) -> None:
-        self.problem, self.patience = problem, patience
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
         self.best, self.theta, self.failed = np.inf, np.zeros(0), 0
 
     def __call__(self, theta: np.ndarray) -> bool:
@@ -240,7 +240,7 @@ class Watch:
             self.best, self.theta, self.failed = cost, theta.copy(), 0
         else:
             self.failed += 1
-        return self.failed >= self.patience
+        return self.failed >= PATIENCE
 
 
 def solve_with_early_stopping(

@@ -72,6 +72,7 @@ Signals = list[np.ndarray]  # one array (M, channels) for each recording
 BLA_OPTION = "bla"  # value of `linear` that asks for the best linear approximation
 LINEAR = ("A", "B_u", "C_y", "D_yu", "y_0")
 COORDINATES = ("A", "B_u", "C_y")  # blocks that depend on the basis of the states
+PAPER_RANGE = 0.1  # R of Eq. 24
 START_BASES = 30  # start bases of the search for the nearest one
 # Deviation of the signals of neurons of slope one at the start. Among 1, 0.3, 0.1 and 0.03 this value gave the smallest
 # training error over two records of the two-mass rig and two sizes; no test recording was used.
@@ -211,7 +212,7 @@ def change_basis(blocks: Values, t: Array) -> Blocks:
     return {**blocks, "A": back @ blocks["A"] @ t, "B_u": back @ blocks["B_u"], "C_y": blocks["C_y"] @ t}
 
 
-def find_nearest_basis(blocks: Blocks, known: Values, seed: int = 0) -> Blocks:
+def find_nearest_basis(blocks: Blocks, known: Values) -> Blocks:
     """Return the blocks in the basis in which they come nearest to the `known` entries (nan: unknown)."""
     from scipy.optimize import least_squares
 
@@ -226,7 +227,7 @@ def find_nearest_basis(blocks: Blocks, known: Values, seed: int = 0) -> Blocks:
         found = change_basis(blocks, t)
         return np.concatenate([((found[k] - v) / size[k])[~np.isnan(v)] for k, v in want.items()])
 
-    rng, best, least = np.random.default_rng(seed), np.eye(n), np.inf
+    rng, best, least = np.random.default_rng(0), np.eye(n), np.inf
     for k in range(START_BASES):
         t = np.eye(n) if k == 0 else rng.standard_normal((n, n))
         for name, side in (("B_u", 1), ("C_y", -1)):  # known entries of `B_u` or `C_y` give the states' scale
@@ -262,19 +263,17 @@ def unit_states(blocks: Values, inputs: Signals, free: bool = True) -> tuple[Blo
     return {**blocks, **scaled, "C_y": blocks["C_y"] * spread}, [x / spread for x in states]
 
 
-def paper_start(
-    structure: PILFR, linear: Values, inputs: Signals, states: Signals, rng: np.random.Generator, spread: float = 0.1
-) -> Blocks:
+def paper_start(structure: PILFR, linear: Values, inputs: Signals, states: Signals, rng: np.random.Generator) -> Blocks:
     """Draw the start of Eq. 22-24: `C_z, D_zu ~ U(-1, 1)`, `w ~ U(0, 1/N)`, `r ~ U(0, R)`, `B_w = D_yw = 0`.
 
-    R is `spread`. Where the structure leaves no direction of z to draw, thresholds are in units of z's deviation: z
+    R is 0.1. Where the structure leaves no direction of z to draw, thresholds are in units of z's deviation: z
     then has the units of an input or output, in which all of them could lie beyond it. For a Wiener model z is the
     linear model's output: with any other z the non-negative weights fall to zero, where no other parameter has a slope.
     """
     element = _pi_element(structure)
     shape = (element.channels, element.n)
     blocks = _directions(element, linear, rng)
-    blocks["w"], blocks["r"] = rng.uniform(0, 1 / element.n, shape), rng.uniform(0, spread, shape)
+    blocks["w"], blocks["r"] = rng.uniform(0, 1 / element.n, shape), rng.uniform(0, PAPER_RANGE, shape)
     if direction_fixed(structure):
         blocks |= _fixed_blocks(structure, linear, blocks)
         blocks["r"] *= or_one(np.std(_signal(inputs, states, blocks), axis=0))[:, None]

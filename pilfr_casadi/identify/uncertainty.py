@@ -43,6 +43,8 @@ ENVELOPE = {"c": (0, 1), "a0": (-1, 1), "a": (0, 1), "b": (-1, 0), "d": (0, 0)}
 STATES = ("A", "B_u", "B_w", "C_y", "C_z")  # blocks that depend on the coordinates of the states
 FADED = 1e-30  # share of its matrix's largest sensitivity up to which an entry has no effect
 LAGS = 40  # largest lag of the noise model
+DEPENDENT = 1e-10  # part of a unit vector outside the span of others up to which it depends on them
+AT_BOUND = 1e-9  # change of the normalised outputs that rounding at a bound may cause
 
 
 def generators(structure: PILFR, values: Mapping[str, Array]) -> Iterator[Generator]:
@@ -153,25 +155,25 @@ def orbit_tangents(problem: Problem, theta: Array, structure: PILFR) -> tuple[Ar
     return everything[moving], everything[~moving]
 
 
-def null_space(rows: Array, tolerance: float = 1e-10) -> Array:
+def null_space(rows: Array) -> Array:
     """Find an orthonormal basis of the vectors that every row maps to zero, rows scaled to unit length."""
     length = np.linalg.norm(rows, axis=1)
     rows = rows[length > 0] / length[length > 0, None]
     if not len(rows):
         return np.eye(rows.shape[1])
-    return _complement(rows.T, tolerance)
+    return _complement(rows.T)
 
 
-def _complement(columns: Array, tolerance: float = 1e-10) -> Array:
+def _complement(columns: Array) -> Array:
     """Find an orthonormal basis of the orthogonal complement of columns, which may depend on each other."""
     from scipy.linalg import qr
 
     q, r = np.linalg.qr(columns, mode="complete")
     diagonal = np.abs(np.diag(r))
-    if np.any(diagonal <= tolerance * diagonal.max(initial=0.0)):  # pivoting counts the independent columns
+    if np.any(diagonal <= DEPENDENT * diagonal.max(initial=0.0)):  # pivoting counts the independent columns
         q, r, _ = qr(columns, pivoting=True)
         diagonal = np.abs(np.diag(r))
-    return np.asarray(q[:, int(np.sum(diagonal > tolerance * diagonal.max(initial=0.0))) :])
+    return np.asarray(q[:, int(np.sum(diagonal > DEPENDENT * diagonal.max(initial=0.0))) :])
 
 
 def covariance(problem: Problem, theta: Array, structure: PILFR | None = None) -> Array:
@@ -275,22 +277,22 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     return out, at_bound
 
 
-def snap_to_bounds(problem: Problem, theta: Array, sensitivity: Array, tolerance: float = 1e-9) -> Array:
+def snap_to_bounds(problem: Problem, theta: Array, sensitivity: Array) -> Array:
     """Move variables within rounding of a bound onto it, in place; return which are at a bound (size,), bool.
 
-    Within rounding means that the move changes the normalised outputs by less than `tolerance`, by the sensitivity at
+    Within rounding means that the move changes the normalised outputs by less than `AT_BOUND`, by the sensitivity at
     both ends: a variable without effect here, such as the slope of a saturated neuron, may have one at the bound.
     """
     given, at_bound = theta.copy(), np.zeros(problem.size, dtype=bool)
     for bound in (problem.lower, problem.upper):
         near = np.isfinite(bound) & (sensitivity > 0)
-        near[near] = np.abs(theta - bound)[near] * sensitivity[near] <= tolerance
+        near[near] = np.abs(theta - bound)[near] * sensitivity[near] <= AT_BOUND
         near |= theta == bound
         theta[near] = bound[near]
         at_bound |= near
     if np.any(theta != given):
         there = np.sqrt(np.diag(problem.normal(theta)[2]))
-        far = ~(np.abs(theta - given) * there <= tolerance)
+        far = ~(np.abs(theta - given) * there <= AT_BOUND)
         theta[far] = given[far]
         at_bound &= ~far
     return at_bound

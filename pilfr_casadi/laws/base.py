@@ -381,3 +381,8 @@ def readable_unit(unit: str, w: str, z: str) -> str:
 def contact_onset(z: Any, g: Any) -> Any:
     """Rise from 0 to 1 where |z| passes a gap g, over a share of the gap, because a jump would have no slope in g."""
     return (1 + ca.tanh((ca.fabs(z) - g) / (ONSET_WIDTH * g))) / 2
+
+
+def beyond_gap(z: Any, dz: Any, g: Any) -> tuple[Any, Any]:
+    """Travel beyond a gap g on both sides, and its rate."""
+    return z - ca.fmin(ca.fmax(z, -g), g), contact_onset(z, g) * dz

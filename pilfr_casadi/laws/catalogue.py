@@ -11,13 +11,12 @@ import inspect
 from collections.abc import Iterator
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from .._base import InputError
 from ..models import Named, Parameter
 from . import curves, dynamic, electrical, friction, hysteresis, in_line, stiffness, thermal
-from .base import Law, Local, contact_onset
+from .base import Law, Local, beyond_gap
 
 GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
 
@@ -179,8 +178,8 @@ def _behind_gap(base: Any) -> Any:
 
     def past(z: Any, dz: Any, p: Any) -> dict[str, Any]:
         """Arguments of the law's force or step beyond the gap."""
-        signals = {"z": z - ca.fmin(ca.fmax(z, -p["g"]), p["g"]), "dz": contact_onset(z, p["g"]) * dz}
-        return {"p": p, **{name: value for name, value in signals.items() if name in read}}
+        signals = zip(("z", "dz"), beyond_gap(z, dz, p["g"]), strict=True)
+        return {"p": p, **{name: value for name, value in signals if name in read}}
 
     class Behind(base):
         form = f"{base.form}, behind a gap".removeprefix(", ")

@@ -221,7 +221,19 @@ class Mode(Resonance):
         return bool(values["D"] > NO_PEAK or values["W"] >= self.parameters()["W"].bounds[1])
 
 
-class Attached(Resonance):
+class SprungMass:
+    """The common part of laws with a mass behind a spring and a damper; q are its travel, and its speed over W."""
+
+    def pull(self, z: Any, dz: Any, q: Any, p: Any) -> Any:
+        """Force of spring and damper over the spring's stiffness."""
+        return z - q[0] + 2 * p.D * (dz / p.W - q[1])
+
+    def far_side(self, q: Any, p: Any) -> tuple[Any, Any]:
+        """Travel and speed of the mass."""
+        return q[0], p.W * q[1]
+
+
+class Attached(SprungMass, Resonance):
     """A small mass on a spring and a damper, carried along (a tuned absorber, a loose part)."""
 
     form = "attached mass"
@@ -234,11 +246,11 @@ class Attached(Resonance):
     starts = {"W": lambda at: np.geomspace(0.015, 1.2, 32) / at.dt, "D": ("", 0.05)}
 
     def force(self, z: Any, dz: Any, q: Any, p: Any) -> Any:  # type: ignore[override]
-        return p.k_a * _pull(z, dz, q, p)
+        return p.k_a * self.pull(z, dz, q, p)
 
     def flow(self, z: Any, dz: Any, q: Any, p: Any) -> Any:  # type: ignore[override]
         """Rates of its travel and of its speed over W."""
-        return ca.vertcat(p.W * q[1], p.W * _pull(z, dz, q, p))
+        return ca.vertcat(p.W * q[1], p.W * self.pull(z, dz, q, p))
 
 
 class ElasticJoint(Attached):
@@ -250,15 +262,6 @@ class ElasticJoint(Attached):
     sentence = "an elastic joint: the sensor sees the far side of a spring that the simulator takes for rigid"
     sensed = True
     starts = {"W": lambda at: np.geomspace(0.03, 1.0, 8) / at.dt, "D": ("", 0.05)}
-
-    def far_side(self, q: Any, p: Any) -> tuple[Any, Any]:
-        """Travel and speed of the mass."""
-        return q[0], p.W * q[1]
-
-
-def _pull(z: Any, dz: Any, q: Any, p: Any) -> Any:
-    """Force of spring and damper over the spring's stiffness."""
-    return z - q[0] + 2 * p.D * (dz / p.W - q[1])
 
 
 class Drift(Law):

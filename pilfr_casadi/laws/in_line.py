@@ -16,7 +16,8 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from .base import Law, Local, contact_onset
+from .base import Law, Local, beyond_gap
+from .dynamic import SprungMass
 
 SAME = 1e-9  # relative difference that rounding may cause
 
@@ -63,13 +64,12 @@ class LineGap(_InLine):
     ranges = {"g": ("reach", 0.002, 0.95)}
 
     def force(self, z: Any, dz: Any, p: Any, term: Any) -> Any:
-        inner = z - ca.fmin(ca.fmax(z, -p.g), p.g)
-        return term(inner, contact_onset(z, p.g) * dz) - term(z, dz)
+        return term(*beyond_gap(z, dz, p.g)) - term(z, dz)
 
     def inner(self, local: Local, shape: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Travel beyond the gap, and its rate."""
-        g = shape["g"]
-        return local.z - np.clip(local.z, -g, g), np.where(np.abs(local.z) > g, local.dz, 0.0)
+        travel, rate = beyond_gap(ca.DM(local.z), ca.DM(local.dz), shape["g"])
+        return travel.full().ravel(), rate.full().ravel()
 
 
 class Compliance(_InLine):
@@ -110,7 +110,7 @@ class Compliance(_InLine):
         return inner, np.gradient(inner, local.dt)
 
 
-class ElasticDrive(_InLine):
+class ElasticDrive(SprungMass, _InLine):
     """A motor's rotor on a spring and a damper, between the torque that drives a joint and the joint."""
 
     id = "extra_mode"
@@ -136,19 +136,11 @@ class ElasticDrive(_InLine):
     order, follows = 2, 1
 
     def force(self, z: Any, dz: Any, q: Any, p: Any, term: Any) -> Any:
-        return p.k * self._pull(z, dz, q, p) - term(z, dz)
+        return p.k * self.pull(z, dz, q, p) - term(z, dz)
 
     def flow(self, z: Any, dz: Any, q: Any, p: Any, term: Any) -> Any:
         """Rates of the rotor's angle and of its speed over W."""
-        return ca.vertcat(p.W * q[1], p.W * (self._pull(z, dz, q, p) - term(q[0], p.W * q[1]) / p.k))
-
-    def far_side(self, q: Any, p: Any) -> tuple[Any, Any]:
-        """Angle and speed of the rotor."""
-        return q[0], p.W * q[1]
-
-    def _pull(self, z: Any, dz: Any, q: Any, p: Any) -> Any:
-        """Force of spring and damper over the spring's stiffness."""
-        return z - q[0] + 2 * p.D * (dz / p.W - q[1])
+        return ca.vertcat(p.W * q[1], p.W * (self.pull(z, dz, q, p) - term(q[0], p.W * q[1]) / p.k))
 
     def forces_along(self, local: Local, shapes: Sequence[Mapping[str, Any]]) -> np.ndarray:
         """Forces of inertia of the rotor, which lies ahead of the joint by the spring's deflection."""

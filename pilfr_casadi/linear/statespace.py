@@ -30,7 +30,6 @@ A fit that starts far from the truth anneals γ from 1 to 0. Anderson & Moore (1
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -38,7 +37,7 @@ import numpy as np
 
 from .._base import InputError, whole
 from ..data import Recording
-from ..models import Model, Parameter, or_one
+from ..models import Model, Parameter, inject_outputs, or_one
 
 Array = np.ndarray
 DEFECTIVE = 1e10  # condition number of the eigenvectors above which A counts as defective to rounding
@@ -207,25 +206,4 @@ def with_output_injection(model: Model, gain: Array) -> Model:
 
     `gain` (k, n_y) acts on the first k states, never on memory.
     """
-    parameters = model.parameters | {INJECTION: Parameter(0.0, bounds=(0.0, 1.0), fixed=True)}
-    sizes = (("x", model.n_x), ("u", model.n_u), ("w", model.n_w), ("p", parameters.size), ("y", model.n_y))
-    x, u, w, p, measured = (ca.SX.sym(name, n) for name, n in sizes)
-    z, s, read = ca.SX.sym("z", model.n_w), ca.SX.sym("s", model.n_s), ca.vertcat(u, measured)
-    following, y = model.step(x, u, w, p[:-1])
-    full = np.zeros((model.n_x, model.n_y))
-    full[: len(gain)] = gain[: model.n_x]
-    pushed = p[-1] * (ca.DM(full) @ (measured - y))
-    stages = model.stages
-    if stages is not None:
-        c = ca.SX.sym("c", stages.size1_in(4))
-        values, by_c, end = stages(x, u, w, p[:-1], c)
-        stages = ca.Function("stages", [x, read, w, p, c], [values, by_c, end + pushed])
-    return replace(
-        model,
-        step=ca.Function("step", [x, read, w, p], [following + pushed, y], ["x", "u", "w", "p"], ["x_next", "y"]),
-        port=ca.Function("port", [x, read, p], [model.port(x, u, p[:-1])], ["x", "u", "p"], ["z"]),
-        memory=ca.Function("memory", [z, s, p], list(model.memory(z, s, p[:-1])), ["z", "s", "p"], ["w", "s_next"]),
-        parameters=parameters,
-        reads=(*model.reads, "y"),
-        stages=stages,
-    )
+    return inject_outputs(model, gain, {INJECTION: Parameter(0.0, bounds=(0.0, 1.0), fixed=True)})

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         accumulate_steps as accumulate_steps,
         close_loop as close_loop,
         from_expressions as from_expressions,
+        inject_outputs as inject_outputs,
         map_points as map_points,
         open_model as open_model,
     )

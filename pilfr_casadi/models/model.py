@@ -10,7 +10,7 @@ CasADi matrix on the way in or out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -21,7 +21,7 @@ import numpy as np
 from .._base import InputError
 from ..data import Recording
 from .elements import Element
-from .parameters import ParameterSet
+from .parameters import Parameter, ParameterSet
 
 BLOCK = 100  # points or steps of one call, which bounds the memory of the mapped function
 StepExpression = Callable[[Any, Any, Any, dict[str, Any]], tuple[Any, Any]]
@@ -348,6 +348,45 @@ def close_loop(model: Any, element: Element, port: str | None = None) -> Any:
         element=element,
         stages=None,
         resting=None,
+    )
+
+
+def inject_outputs(model: Model, gain: np.ndarray, strength: Mapping[str, Parameter] | None = None) -> Model:
+    """Add `γ K (y_measured - y)` to the next state of a closed model, which then reads the measured outputs.
+
+    Parameters
+    ----------
+    gain : array, shape (k, n_y)
+        K; it acts on the first k states, never on memory.
+    strength : mapping of one Parameter, optional
+        γ and its name. Without it γ is 1 in the sub-steps at which a sample is taken and 0 in those after it.
+    """
+    x, s, u, p = model.symbols()
+    sizes = (("z", model.n_w), ("w", model.n_w), ("measured", model.n_y), ("gamma", 1))
+    z, w, measured, gamma = (ca.SX.sym(name, n) for name, n in sizes)
+    if strength:
+        parameters, vector = model.parameters | strength, ca.vertcat(p, gamma)
+        reads, read = (*model.reads, "y"), ca.vertcat(u, measured)
+    else:
+        parameters, vector = model.parameters, p
+        reads, read = (*model.reads, "y", "sampled"), ca.vertcat(u, measured, gamma)
+    full = np.zeros((model.n_x, model.n_y))
+    full[: len(gain)] = gain[: model.n_x]
+    following, y = model.step(x, u, w, p)
+    pushed = gamma * (ca.DM(full) @ (measured - y))
+    stages = model.stages
+    if stages is not None:
+        c = ca.SX.sym("c", stages.size1_in(4))
+        values, by_c, end = stages(x, u, w, p, c)
+        stages = ca.Function("stages", [x, read, w, vector, c], [values, by_c, end + pushed])
+    return replace(
+        model,
+        step=ca.Function("step", [x, read, w, vector], [following + pushed, y], ["x", "u", "w", "p"], ["x_next", "y"]),
+        port=ca.Function("port", [x, read, vector], [model.port(x, u, p)], ["x", "u", "p"], ["z"]),
+        memory=ca.Function("memory", [z, s, vector], list(model.memory(z, s, p)), ["z", "s", "p"], ["w", "s_next"]),
+        parameters=parameters,
+        reads=reads,
+        stages=stages,
     )
 
 

@@ -21,7 +21,7 @@ STILL_MEMORY = 1e-12  # distance of a memory's slope over a period from 1 up to 
 CHUNK_SAMPLES = 512  # samples of a period whose slopes are kept in memory at a time
 
 
-def steady_state(engine: Engine, period: Array, p: Array, state: Array, tolerance: float = STEADY) -> Array:
+def steady_state(engine: Engine, period: Array, p: Array, state: Array) -> Array:
     """Find the state at the beginning of a steady period; nan where no steady state is reached.
 
     Periods are run from the given state, with a Newton step on `x = Φ(x)` now and then to speed up slow poles. A period
@@ -32,7 +32,7 @@ def steady_state(engine: Engine, period: Array, p: Array, state: Array, toleranc
         for k in range(1, MOST_PERIODS + 1):
             before, state = state, engine.simulate(period, p, state)[1]
             change, size = np.max(np.abs(state - before), initial=0.0), np.max(np.abs(state), initial=1e-300)
-            if not np.isfinite(change) or change <= tolerance * size:
+            if not np.isfinite(change) or change <= STEADY * size:
                 return state
             if k % PERIODS_PER_NEWTON_STEP == 0:
                 state = _newton_step(engine, period, p, state)

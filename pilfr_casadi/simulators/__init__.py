@@ -2,10 +2,11 @@
 
 `equations` evaluates them with the laws in their ports, and `integration` discretises them to a `Model`. `simulator`
 holds the class `Simulator` and the state in which its laws begin at rest. `domains` infers a port's physical domain.
-`adapters` accept a Python file, a state space or a fitted model in its place. `fmu` wraps a functional mock-up unit as
-a simulator (`fmu_description`, `fmu_instance`), and `mujoco` writes the equations of a MuJoCo model. `numpy_function`
-makes a simulator from a NumPy function: `tracing` calls the function with `symbols` to obtain its equations. A function
-that cannot be traced is called with numbers (`black_box`). `external` lets equations call such a program.
+`adapters` accept a Python file (`user_file`), a state space or a fitted model in its place. `fmu` wraps a functional
+mock-up unit as a simulator (`fmu_description`, `fmu_instance`), and `mujoco` writes the equations of a MuJoCo model.
+`numpy_function` makes a simulator from a NumPy function: `tracing` calls the function with `symbols` to obtain its
+equations. A function that cannot be traced is called with numbers (`black_box`). `external` lets equations call such a
+program.
 """
 
 from typing import TYPE_CHECKING
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
         as_simulator as as_simulator,
         load_simulator as load_simulator,
         simulator_variable as simulator_variable,
-        user_variable as user_variable,
     )
     from .black_box import Numeric as Numeric
     from .domains import (
@@ -55,5 +55,6 @@ if TYPE_CHECKING:
     from .mujoco import from_mujoco as from_mujoco
     from .numpy_function import from_function as from_function
     from .simulator import Simulator as Simulator
+    from .user_file import user_variable as user_variable
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

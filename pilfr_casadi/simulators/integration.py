@@ -27,7 +27,7 @@ import numpy as np
 
 from .._base import InputError, one_at_a_time
 from ..data import Recording
-from ..models import Model, StepExpressions, accumulate_steps, from_expressions, map_points
+from ..models import Model, StepExpressions, accumulate_steps, from_expressions, inject_outputs, map_points
 from .equations import Equations, Named, Placed, Port, call, in_series
 
 LARGEST_STEP = 0.25  # largest |λ| h: a phase error of (λh)⁴/120 = 3e-5 of the angle of a cycle
@@ -175,13 +175,6 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
         reads, columns = [*reads, "next"], [*columns, u1]
     if ca.depends_on(ca.vertcat(x_next, y, begun), t):
         reads, columns = [*reads, "t"], [*columns, t]
-    if simulator.observer is not None:
-        measured, sampled = ca.SX.sym("measured", y.numel()), ca.SX.sym("sampled")
-        gain = np.zeros((x_next.numel(), y.numel()))
-        gain[: len(simulator.states)] = simulator.observer
-        pushed = sampled * (ca.DM(gain) @ (measured - y))
-        x_next, stages = x_next + pushed, stages and (*stages[:3], stages[3] + pushed)
-        reads, columns = [*reads, "y", "sampled"], [*columns, measured, sampled]
     x_next, y = ca.cse([x_next, y])
     port = None
     if s.numel() and not step.shifts.any() and not ca.depends_on(z, s):
@@ -194,7 +187,7 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
         x, s, x_next, s_next = ca.vertcat(x, s), ca.SX(0, 1), ca.vertcat(x_next, begun), ca.SX(0, 1)
         if stages is not None:
             stages = stages[0], staged[0], staged[1], ca.vertcat(staged[2], begun)
-    return from_expressions(
+    model = from_expressions(
         StepExpressions(x, s, ca.vertcat(*columns), step.vector, x_next, s_next, y, port, stages, step.resting()),
         simulator.parameter_set,
         states=simulator.states,
@@ -203,6 +196,7 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
         reads=tuple(reads),
         substeps=substeps,
     )
+    return model if simulator.observer is None else inject_outputs(model, simulator.observer)
 
 
 class _SubStep:

@@ -1,8 +1,8 @@
 """Many jobs, kept in a folder: runs and campaigns, which a file describes, and fleets of machines.
 
-`executor` runs jobs of any kind side by side, `folder` keeps their results. Of runs: `schema` (the file), `jobs`,
-`execution`, `summary`. Of fleets: `fleets` (the steps), `machines` (the work at one machine), `population` (statistics
-over machines), `fleet_result`.
+`executor` runs jobs of any kind side by side, `folder` keeps their results. Of runs: `schema` (the tables of the file),
+`run_file`, `jobs`, `execution`, `summary`. Of fleets: `fleets` (the steps), `machines` (the work at one machine),
+`population` (statistics over machines), `fleet_result`.
 """
 
 from typing import TYPE_CHECKING
@@ -43,16 +43,12 @@ if TYPE_CHECKING:
         estimate_population as estimate_population,
         slope as slope,
     )
+    from .run_file import ROLES as ROLES, Cell as Cell, Run as Run, grid_keys as grid_keys, read_run as read_run
     from .schema import (
         LARGEST_SIZE as LARGEST_SIZE,
-        ROLES as ROLES,
-        Cell as Cell,
         ModelTable as ModelTable,
-        Run as Run,
         RunTable as RunTable,
         SolverTable as SolverTable,
-        grid_keys as grid_keys,
-        read_run as read_run,
     )
     from .summary import reasons as reasons
 else:

@@ -28,7 +28,7 @@ from ..optimise import Status
 from .executor import AHEAD, Batch, Effort, run_side_by_side
 from .folder import PAGE, PICTURE, SUMMARY, TABLE, Store, check_own, lock_folder, read_times
 from .jobs import MODEL, RunJob, fold, input_digests, jobs_of, outcome
-from .schema import ROLES, Cell, Run, read_run
+from .run_file import ROLES, Cell, Run, read_run
 from .summary import (
     CellSummary,
     Score,
@@ -282,11 +282,11 @@ class _Execution:
         if given.folds:
             folds = jobs_of(given, store.inputs, store.recordings["train"])
             self._do_missing(folds)
-            selection = select(given, folds, store.scores(folds), store.entries, first)
+            selection = select(given, folds, store.scores(folds), store.manifest.entries, first)
             jobs = tuple(j for j in jobs if j.cell == selection.cell)
         self._do_missing(jobs, folds)
         if not given.folds and given.files["validation"] and len(given.cells) > 1:
-            selection = select(given, jobs, store.scores(jobs), store.entries, first)
+            selection = select(given, jobs, store.scores(jobs), store.manifest.entries, first)
         return (*folds, *jobs), selection
 
     def _do_missing(self, jobs: Sequence[RunJob], before: Sequence[RunJob] = ()) -> None:
@@ -309,7 +309,7 @@ class _Execution:
                     none = f"no model ({found.entry['status'].lower().replace('_', ' ')})"
                     self.print_line(f"{job.id}: {found.entry['sentence'] if store.ended_well(job) else none}")
                 store.write_table((*before, *ready))
-                best = min(store.entries[j.id].get("train", np.inf) for j in ready)
+                best = min(store.manifest.entries[j.id].get("train", np.inf) for j in ready)
                 self.progress("jobs", len(before) + len(ready), total, best)
         finally:
             with deferred_interrupt():  # however it ends, the table has all finished jobs
@@ -318,7 +318,7 @@ class _Execution:
     def _finish(self, jobs: Sequence[RunJob], selection: Selection | None) -> RunResult:
         """Write errors, tables, and the model and page of the chosen job."""
         store, given = self.store, self.store.run
-        manifest, entries = store.manifest, store.entries
+        manifest, entries = store.manifest, store.manifest.entries
         usable = self._usable([j for j in jobs if j.fold is None and (selection is None or j.cell == selection.cell)])
         scores = store.scores(jobs, last=True)
         best = choose_job(scores, [j.id for j in usable])
@@ -345,7 +345,7 @@ class _Execution:
 
     def _usable(self, jobs: Sequence[RunJob]) -> list[RunJob]:
         """Return the jobs with a model; refuse a run without any."""
-        file, entries = self.store.run.file, self.store.entries
+        file, entries = self.store.run.file, self.store.manifest.entries
         usable = [j for j in jobs if self.store.has_model(j)]
         if not usable:
             about = "; ".join(reasons(entries, [j.id for j in jobs]))

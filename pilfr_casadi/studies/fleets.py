@@ -293,19 +293,14 @@ class _Steps:
                 self.done += len(batch)
             for job, found in batch:
                 self.print_line(f"{job.id}: {found.entry['sentence']}")
-            self.progress(step, len(ready) + sum(j.id in self._entries for j in missing), len(jobs), np.nan)
-        text = json.dumps({job.machine: self._entries[job.id] for job in jobs}, sort_keys=True)
+            self.progress(step, len(ready) + sum(j.id in self.manifest.entries for j in missing), len(jobs), np.nan)
+        text = json.dumps({job.machine: self.manifest.entries[job.id] for job in jobs}, sort_keys=True)
         entries: dict[str, dict[str, Any]] = json.loads(text)  # in the order in which a resumed fleet reads them
-        return entries
-
-    @property
-    def _entries(self) -> dict[str, Any]:
-        entries: dict[str, Any] = self.manifest.content["jobs"]
         return entries
 
     def _complete(self, job: MachineJob) -> bool:
         """Tell whether a job ended with the same inputs, and its files are unchanged."""
-        entry = self._entries.get(job.id, {})
+        entry = self.manifest.entries.get(job.id, {})
         if entry.get("key") != job.key or entry["status"] == LOST or "time_limit" in entry:
             return False
         return all([self.manifest.holds(name) for name in self._names(job)])
@@ -349,7 +344,7 @@ class _Steps:
 
     def _finish(self, result: Fleet) -> None:
         """Write the files of the fleet as a whole, and forget jobs that are no longer part of it."""
-        self.manifest.content["jobs"] = {k: v for k, v in self._entries.items() if k in self.used}
+        self.manifest.content["jobs"] = {k: v for k, v in self.manifest.entries.items() if k in self.used}
         for name, text in result.documents().items():
             self.manifest.put(name, text)
         self.manifest.content.pop("writing", None)

@@ -24,7 +24,7 @@ from ..identify import load
 from ..models import Model
 from .executor import FAILED, LOST, TIMED_OUT, Batch, versions
 from .jobs import BAD_ENDS, MODEL, Recordings, RunJob, error_of, file_digest, scored_files
-from .schema import Run
+from .run_file import Run
 from .summary import Score, results_table
 
 VERSION, MANIFEST = 1, "manifest.json"
@@ -145,6 +145,12 @@ class Manifest:
             raise InputError(f"{path} was changed after the {kind} wrote it; {ADVICE}.")
         return cls(folder, content, layout)
 
+    @property
+    def entries(self) -> dict[str, Any]:
+        """The entries of finished jobs, by id."""
+        entries: dict[str, Any] = self.content["jobs"]
+        return entries
+
     def write(self) -> None:
         """Write it, with its digest."""
         content = {**self.content, "sha256": digest(self.content)}
@@ -210,15 +216,9 @@ class Store:
         self.manifest.write()
         self.written = -np.inf
 
-    @property
-    def entries(self) -> dict[str, Any]:
-        """The entries of the jobs in the manifest."""
-        entries: dict[str, Any] = self.manifest.content["jobs"]
-        return entries
-
     def complete(self, job: RunJob) -> bool:
         """Tell whether a job is finished with the same inputs, and its model is unchanged on disk."""
-        entry = self.entries.get(job.id, {})
+        entry = self.manifest.entries.get(job.id, {})
         if entry.get("key") != job.key or entry["status"] == LOST:
             return False
         if entry["status"] == TIMED_OUT:  # tried again with more time
@@ -229,7 +229,7 @@ class Store:
 
     def ended_well(self, job: RunJob) -> bool:
         """Tell whether a job gave a model that meets its constraints."""
-        return self.entries[job.id]["status"] not in BAD_ENDS
+        return self.manifest.entries[job.id]["status"] not in BAD_ENDS
 
     def has_model(self, job: RunJob) -> bool:
         """Tell whether the folder has a model of a job."""
@@ -248,7 +248,7 @@ class Store:
         out, used, known = [], set(), self.manifest.content["scores"]
         for job in (j for j in jobs if self.ended_well(j)):
             if job.fold is not None:
-                entry, name = self.entries[job.id], f"fold {job.fold}"
+                entry, name = self.manifest.entries[job.id], f"fold {job.fold}"
                 out += [Score(job.id, "train", name, entry["train"]), Score(job.id, "held", name, entry["held"])]
                 continue
             fit = None
@@ -276,7 +276,7 @@ class Store:
         """Write the errors so far while a campaign runs, at most once per `TABLE_PAUSE` unless it is the last table."""
         if not self.campaign or (not last and time.monotonic() < self.written + TABLE_PAUSE) or not jobs:
             return
-        self.manifest.put(TABLE, results_table(self.scores(jobs), jobs, self.entries, ""))
+        self.manifest.put(TABLE, results_table(self.scores(jobs), jobs, self.manifest.entries, ""))
         self.written = time.monotonic()
 
 
@@ -284,7 +284,7 @@ def refuse_other_versions(manifest: Manifest) -> None:
     """Refuse to mix results of different versions in one campaign, which compares its results."""
     before, now = manifest.content.get("versions", {}), versions()
     for name in now:
-        if manifest.content["jobs"] and before.get(name) != now[name]:
+        if manifest.entries and before.get(name) != now[name]:
             raise InputError(
                 f"{manifest.folder / MANIFEST} has results of {name} {before.get(name)}, and this is {now[name]}; give "
                 "another --out, or --overwrite to compute everything again."

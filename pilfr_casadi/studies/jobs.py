@@ -29,7 +29,7 @@ from ..identify import Fit, fit as identify, operators_used, prune, regularizati
 from ..models import Model
 from ..optimise import Solution, Status
 from .executor import FAILED, LOST, TIMED_OUT, Outcome, versions
-from .schema import ROLES, Run
+from .run_file import ROLES, Run
 
 Recordings = Mapping[str, tuple[Recording, ...]]
 BAD_ENDS = (FAILED, TIMED_OUT, LOST, Status.INFEASIBLE.name)  # without a model

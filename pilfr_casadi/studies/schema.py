@@ -11,13 +11,9 @@ Each table is a pydantic model. The `description` of a field ends the sentence a
 from __future__ import annotations
 
 import difflib
-import itertools
 import math
-import os
 import re
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
@@ -34,17 +30,14 @@ from pydantic import (
     model_validator,
 )
 
-from .._base import InputError, existing_file
+from .._base import InputError
 from ..identify import BLA_OPTION, DEFAULT_SOLVER, START_KINDS
-from ..models import ANY, HYSTERETIC, LAGGED, OPERATORS, PILFR, STRUCTURES, TAKES, Lagged, Model, named_structure
+from ..models import OPERATORS, PILFR, STRUCTURES, TAKES, Lagged, Model, named_structure
 from ..optimise import Constraint, GaussNewton, Ipopt, check_gain, dc_gain, ordered
-from ..simulators import user_variable
 
-ROLES = ("train", "validation", "test")
 # keys of the grid: those of [model] and [solver] that a study varies
 MODEL_KEYS = ("structure", "nx", "operator", "operators", "channels", "neurons", "hidden", "lags")
 SOLVER_KEYS = ("start", "starts", "linear")
-READING = ("period", "hold", "skip", "dt", "time_tolerance", "initial")  # fields of a Recording
 SIZE = {"nx": "states", "lags": "past outputs"}
 
 # The largest sizes that a run file or the command line may ask for, far above every sensible model: anything larger
@@ -66,64 +59,6 @@ LARGEST_SIZE = {
     "samples": 10**9,  # of a period, or left out: 8 GB per channel
     "jobs": 100_000,  # of a run: the manifest names each, about 300 bytes per job, and is written after every one
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Cell:
-    """One model of a study, with the options of its search: `starts`, `start` and, if given, `linear`, as for `fit`."""
-
-    values: Mapping[str, Any]  # key of the grid -> value, for the keys that matter to the cell
-    model: PILFR | Lagged | Model
-    search: dict[str, Any]
-    plain_tables: dict[str, Any] = field(default_factory=dict)  # `model` and `solver` as plain numbers and texts
-
-    @property
-    def name(self) -> str:
-        """The cell's values in a few words."""
-        return ", ".join(f"{key} {value}" for key, value in self.values.items())
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """A checked run; fields that are keys of the run file are described in `demo_data/every_key.toml`.
-
-    Attributes
-    ----------
-    file, out : Path
-        The run file, and the folder of the results.
-    plain_tables : dict
-        The tables `model`, `grid`, `solver`, `constraints` and `regularization` as plain numbers and texts. With data
-        and seed, a job depends on these alone, or on the Python file too if `own` is True (objects are among them).
-    files : dict
-        Names of the recordings in the file, by role (`train`, `validation`, `test`).
-    reading : dict
-        Options of reading them: `inputs`, `outputs`, `columns` and fields of `Recording`.
-    cells : tuple of Cell
-        The models of the grid with their searches; one cell without a grid.
-    """
-
-    file: Path
-    out: Path
-    plain_tables: dict[str, Any]
-    own: bool
-    files: dict[str, tuple[str, ...]]
-    reading: dict[str, Any]
-    cells: tuple[Cell, ...]
-    solver: Any
-    stable: bool | float
-    constraints: tuple[Constraint, ...]
-    regularization: RegularizationTable
-    seeds: tuple[int, ...] = (0,)
-    folds: int = 0
-    time_limit: float | None = None
-    retries: int = 2
-    workers: int = 1
-    engine: str = "auto"
-    report: bool = True
-
-    def path_of(self, name: str) -> Path:
-        """Return the path of a file of the run."""
-        return self.file.parent / name
 
 
 class Table(BaseModel):
@@ -428,172 +363,3 @@ def show_value(value: Any) -> str:
     except ValueError:  # of more digits than Python writes
         return "a number of thousands of digits"
     return text if len(text) <= 60 else text[:57] + "..."
-
-
-def as_plain(value: Any) -> tuple[Any, bool]:
-    """Convert a value for JSON, objects into a mark; return it and whether there are any objects."""
-    if isinstance(value, Mapping):
-        parts = {str(k): as_plain(v) for k, v in sorted(value.items(), key=lambda kv: str(kv[0]))}
-        return {k: v for k, (v, _) in parts.items()}, any(o for _, o in parts.values())
-    if isinstance(value, list | tuple | range):
-        items = [as_plain(v) for v in value]
-        return [v for v, _ in items], any(o for _, o in items)
-    if isinstance(value, float):
-        return repr(value), False  # inf and nan too
-    if value is None or isinstance(value, bool | int | str):
-        return value, False
-    return f"object {type(value).__name__}", True
-
-
-def read_run(path: Any, kind: str = "run") -> Run:
-    """Read a run file, `.toml` or `.py`; `kind` ends the default name of the folder of the results.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or asks for something impossible: one sentence with the file and the key.
-    """
-    if not isinstance(path, str | os.PathLike):
-        raise InputError(f"{path!r} was given for a run file; give its path, or the result of `read_run`.")
-    file = Path(path)
-    try:
-        existing_file(file)
-        if file.suffix.lower() == ".py":
-            content = user_variable(file, "run", "the run")
-        else:
-            content = tomllib.loads(file.read_bytes().decode())
-    except InputError as error:
-        raise InputError(f"The run file cannot be read: {error}") from None
-    except OSError as error:
-        raise InputError(f"The run file {file} cannot be read ({error.strerror}); check its permissions.") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{file} is not a TOML file ({error}); correct it.") from None
-    try:
-        return _check_content(file, content, kind)
-    except InputError as error:
-        raise InputError(f"{file}: {error}") from None
-
-
-def _check_content(file: Path, content: Any, kind: str) -> Run:
-    table = validate(RunTable, content)
-    plain, own = as_plain({k: content.get(k) for k in ("model", "grid", "solver", "constraints", "regularization")})
-    files = {role: getattr(table.data, role) for role in ROLES}
-    _check_files(file, files)
-    reading = {"inputs": table.data.inputs, "outputs": table.data.outputs, "columns": table.data.columns}
-    reading |= {key: content["data"][key] for key in READING if getattr(table.data, key) is not None}
-    cells, solver = _cells(table)
-    if "period" not in reading and any("linear" in cell.search for cell in cells):
-        raise InputError(
-            "linear = 'bla' is for periodic training recordings; give their 'period' in [data], in samples."
-        )
-    return Run(
-        file=file,
-        out=_folder(file, f"{file.stem}-{kind}" if table.out is None else table.out),
-        plain_tables=plain,
-        own=own,
-        files=files,
-        reading=reading,
-        cells=cells,
-        solver=solver,
-        stable=table.constraints.spectral_radius,
-        constraints=table.constraints.for_models([cell.model for cell in cells]),
-        **{key: getattr(table, key) for key in ("regularization", "seeds", "folds", "workers", "engine", "report")},
-        **dict(table.campaign),
-    )
-
-
-def _folder(file: Path, out: str) -> Path:
-    """Return the folder of the results; refuse one that is not below the folder of the run file."""
-    above = os.path.realpath(file.parent)
-    try:
-        inside = above in map(str, Path(os.path.realpath(os.path.join(above, out))).parents)
-    except (OSError, ValueError):
-        inside = False
-    if not inside:
-        raise InputError(
-            f"'out' is {out[:60]!r}, not below the folder of the run file; give a folder there, or any with --out."
-        )
-    return file.parent / out
-
-
-def _check_files(file: Path, files: Mapping[str, tuple[str, ...]]) -> None:
-    seen: dict[str, str] = {}
-    for role, names in files.items():
-        for name in names:
-            path = os.path.realpath(file.parent / name)
-            try:
-                existing_file(path)
-            except InputError as error:
-                raise InputError(f"{role!r} in [data]: {error}") from None
-            if path in seen:
-                raise InputError(f"{name} is given twice, as {seen[path]} and {role} recording; leave one out.")
-            seen[path] = role
-
-
-def _cells(table: RunTable) -> tuple[tuple[Cell, ...], Any]:
-    """Build the cells, in the order of the grid's keys with the last varying fastest, and the solver of all.
-
-    A cell keeps the keys that matter to its model (a NARX has lags and no operators); combinations that differ only
-    in other keys are one cell.
-    """
-    model, solver, axes = table.model, table.solver, table.axes
-    if isinstance(model, PILFR | Lagged | Model):
-        if axes:
-            raise InputError("[grid] varies a [model] table, and the model is an object; leave one of them out.")
-        return (_cell({}, model, {"model": model, "solver": solver}),), validate(SolverTable, solver, "solver").build()
-    for name, content in (("model", model), ("solver", solver)):
-        if not isinstance(content, Mapping):
-            raise InputError(f"{name} is {show_value(content)}; give a table.")
-    cells: dict[str, Cell] = {}
-    for combination in itertools.product(*axes.values()):
-        values = dict(zip(axes, combination, strict=True))
-        tables = {
-            "model": {**model, **{k: v for k, v in values.items() if k in MODEL_KEYS}},
-            "solver": {**solver, **{k: v for k, v in values.items() if k in SOLVER_KEYS}},
-        }
-        idle = _idle_keys(tables["model"], axes)
-        tables = {name: {k: v for k, v in content.items() if k not in idle} for name, content in tables.items()}
-        built = validate(ModelTable, tables["model"], "model").build()
-        cell = _cell({k: v for k, v in values.items() if k not in idle}, built, tables)
-        form = "linear" if _is_linear(tables["model"]) else tables["model"].get("structure", "lfr")
-        cells.setdefault(str({**cell.plain_tables, "model": {**cell.plain_tables["model"], "structure": form}}), cell)
-    return tuple(cells.values()), validate(SolverTable, solver, "solver").build()
-
-
-def _cell(values: Mapping[str, Any], model: PILFR | Lagged | Model, tables: dict[str, Any]) -> Cell:
-    """Build a cell; refuse a search that does not suit its model."""
-    search = validate(SolverTable, tables["solver"], "solver").search
-    if isinstance(model, Lagged) and search["start"] != "grid":
-        raise InputError(f"start = {search['start']!r} is not for a NARX or NOE, which has other starts; leave it out.")
-    if "linear" in search and not isinstance(model, PILFR):
-        of = "a NARX or NOE" if isinstance(model, Lagged) else "a Model, which has its own values"
-        raise InputError(f"linear = {search['linear']!r} is not for {of}; leave it out.")
-    return Cell(values, model, search, as_plain(tables)[0])
-
-
-def _is_linear(model: Mapping[str, Any]) -> bool:
-    """Tell whether a [model] table asks for a linear model: no operators."""
-    return TAKES.get(model.get("structure", "lfr")) == HYSTERETIC and model.get("operators") == 0
-
-
-def _idle_keys(model: Mapping[str, Any], axes: Mapping[str, Sequence[Any]]) -> set[str]:
-    """Return the keys that do not matter to a cell: keys of other structures, and keys without effect on its model."""
-    structure, out = model.get("structure", "lfr"), set[str]()
-    if "structure" in axes and structure in TAKES:
-        others = {name for s in axes["structure"] for name in TAKES.get(s, ())}
-        out = {k for k in ANY.difference(TAKES[structure]) if k not in axes or k in others}
-        if structure in LAGGED:
-            of_lfr = ("start", "linear")  # not of a NARX or NOE
-            out |= {k for k in of_lfr if k not in axes or not LAGGED.keys() >= set(axes["structure"])}
-    kinds = axes.get("operator", [])
-    if kinds and model.get("operator") != "generalized_play" and ("neurons" not in axes or "generalized_play" in kinds):
-        out.add("neurons")
-    if axes and _is_linear(model):
-        out |= {"operator", "neurons", "channels", *(k for k in SOLVER_KEYS if k in axes)}
-    return out
-
-
-def grid_keys(found: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return the keys of the grid that at least one cell has, in the order of the grid."""
-    given = {k for values in found for k in values}
-    return [k for k in (*MODEL_KEYS, *SOLVER_KEYS) if k in given]

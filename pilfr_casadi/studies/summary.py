@@ -22,7 +22,7 @@ from .._base import InputError
 from ..data import Recording
 from ..models import Model
 from .jobs import RunJob
-from .schema import Cell, Run, grid_keys
+from .run_file import Cell, Run, grid_keys
 
 QUARTILES = ("smallest", "lower_quartile", "median", "upper_quartile", "largest")
 FOLDS = "folds"

@@ -27,17 +27,6 @@ def rig():
     return pilfr.fit(structure, records["train"], starts=3), records
 
 
-@pytest.fixture(scope="module")
-def small():
-    fit, record = fitted(*plays([0.2, 1.0, 50.0], [0.5, 0.3, 0.2]))
-    return fit, record, kalman_filter(fit, record, share=1e-3)
-
-
-@pytest.fixture(scope="module")
-def square():
-    return fitted(pilfr.PILFR(2), {"A": A, "B_u": np.eye(2), "C_y": np.eye(2)}, n_u=2, n_y=2)
-
-
 def diagnosis(corrected, data, hold="zero"):
     empty = dict.fromkeys(("sentence", "effects", "candidates", "gates", "mismatch", "parameters", "errors", "floor"))
     return Diagnosis(

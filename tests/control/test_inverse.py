@@ -7,17 +7,11 @@ import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from small_fits import A, fitted, plays, refused
+from small_fits import A, fitted, refused
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.control import analyse_response, feedforward, inverse_element, kalman_filter, roll_out
 from pilfr_casadi.models import play
-
-
-@pytest.fixture(scope="module")
-def small():
-    fit, record = fitted(*plays([0.2, 1.0, 50.0], [0.5, 0.3, 0.2]))
-    return fit, record, kalman_filter(fit, record, share=1e-3)
 
 
 @settings(max_examples=40, deadline=None)

@@ -7,11 +7,11 @@ import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from small_fits import A, fitted, plays, refused
+from small_fits import A, refused
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import PredictiveController
-from pilfr_casadi.control import do_mpc_controller, do_mpc_model, kalman_filter
+from pilfr_casadi.control import do_mpc_controller, do_mpc_model
 from problems import mpc_masing, mpc_piezo
 from problems.closed_loop import LINEAR, table
 from problems.masing import simulate
@@ -51,17 +51,6 @@ def lags(*poles):
 def first_order(pole=0.9):
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
     return ca.Function("f", [x, u], [pole * x + u, x])
-
-
-@pytest.fixture(scope="module")
-def small():
-    fit, record = fitted(*plays([0.2, 1.0, 50.0], [0.5, 0.3, 0.2]))
-    return fit, record, kalman_filter(fit, record, share=1e-3)
-
-
-@pytest.fixture(scope="module")
-def square():
-    return fitted(pilfr.PILFR(2), {"A": A, "B_u": np.eye(2), "C_y": np.eye(2)}, n_u=2, n_y=2)
 
 
 def states_and_references(cases, seed=3):

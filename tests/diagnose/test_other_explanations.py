@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cart import cart
 from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
@@ -112,20 +113,14 @@ def test_a_law_that_no_declared_port_reaches_is_told_where_it_acts():
 DT, M = 0.05, 1200
 
 
-def cart():
-    """A mass on a spring and a damper."""
-    return Simulator(
-        lambda x, u, p: {"pos": x.vel, "vel": u.force - p.k * x.pos - p.d * x.vel},
-        lambda x: {"pos": x.pos},
-        states=("pos", "vel"),
-        inputs=("force",),
-        parameters={"k": Parameter(22.0, bounds=(5, 100)), "d": Parameter(0.9, bounds=(0, 5))},
-    )
+def machine():
+    """A cart without a port."""
+    return cart(k=22.0, d=0.9, k_bounds=(5, 100), ports=())
 
 
 def recorded(k, seed, state=(0.0, 0.0), initial="zero"):
     """A recording with a spring of stiffness k."""
-    rng, model = np.random.default_rng(seed), discretise(cart(), DT)
+    rng, model = np.random.default_rng(seed), discretise(machine(), DT)
     u = pilfr.multisine(M, f_max=2.0, fs=1 / DT, rng=rng)
     r = Recording(u, np.zeros(M), DT, ("force",), ("pos",), initial=initial, hold="zero", name=f"run{seed}")
     theta = model.parameters.pack({"k": k, "d": 0.8})
@@ -135,7 +130,7 @@ def recorded(k, seed, state=(0.0, 0.0), initial="zero"):
 
 def told(*recordings):
     """What is said of them where nothing else is found."""
-    bench = Workbench.of(cart(), recordings, "zero")
+    bench = Workbench.of(machine(), recordings, "zero")
     floor = Floor(np.full(1, 1e-3), "estimated")
     search = Search(bench, bench.fit(bench.simulator), floor, (), 1, Stages(lambda *_: None))
     return find_varying_values(search.run(0))

@@ -5,9 +5,10 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 import pytest
+from cart import cart
 
 import pilfr_casadi as pilfr
-from pilfr_casadi import Parameter, Port, Recording, Simulator
+from pilfr_casadi import Recording
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import Law
 from pilfr_casadi.simulators import discretise
@@ -27,27 +28,15 @@ class Sinh(Law):
         return p.c * ca.sinh(dz / p.v)
 
 
-def cart():
-    """A mass on a spring and a damper."""
-    return Simulator(
-        lambda x, u, p: {"pos": x.vel, "vel": u.force - p.k * x.pos - p.d * x.vel},
-        lambda x: {"pos": x.pos},
-        states=("pos", "vel"),
-        inputs=("force",),
-        parameters={"k": Parameter(40.0, bounds=(10, 200)), "d": Parameter(0.4, bounds=(0, 5))},
-        ports=(Port("ground", {"vel": -1.0}, lambda x: x.pos, lambda x: x.vel),),
-    )
-
-
 @pytest.mark.slow
 def test_what_a_law_of_another_shape_leaves_is_no_effect_elsewhere():
     """A damper whose force is a hyperbolic sine of speed."""
     rng = np.random.default_rng(2)
-    model = discretise(cart().with_element("ground", Sinh().at({"c": 1.0, "v": 0.6})), DT)
+    model = discretise(cart(d=0.4).with_element("ground", Sinh().at({"c": 1.0, "v": 0.6})), DT)
     u = 12 * pilfr.multisine(M, f_max=3.0, fs=1 / DT, rng=rng)
     r = Recording(u, np.zeros(M), DT, ("force",), ("pos",), initial="zero", hold="zero")
     y = make_engine(model).simulate(model.drive(r), model.parameters.start, np.zeros(model.n_state))[0]
     noisy = r.with_(y=y + 1e-3 * np.std(y) * rng.standard_normal(y.shape))
-    found = pilfr.diagnose(cart(), noisy)
+    found = pilfr.diagnose(cart(d=0.4), noisy)
     assert found.verdict in ("missing-physics", "unexplained")
     assert {e.port for e in found.effects} <= {"ground"} and "at ground" in found.sentence, str(found)

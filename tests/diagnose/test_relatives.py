@@ -5,9 +5,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from cart import cart
 
 import pilfr_casadi as pilfr
-from pilfr_casadi import Parameter, Port, Recording, Simulator
+from pilfr_casadi import Recording
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.relatives import _matching_forces, port_signals, relatives
 from pilfr_casadi.diagnose.screen import Scored
@@ -94,18 +95,6 @@ def test_a_refinement_that_came_near_asks_for_the_law_that_it_refines():
     (more,) = asked_for([best, near], scored)
     assert more.starts == ({k: own[k] for k in PreslidingFriction.units},)
     assert asked_for([best, near, fitted("guide", PreslidingFriction(), 0.1, k_t=1.0, r=1.0)], scored) == []
-
-
-def cart():
-    """A mass on a spring and a damper, driven by a force."""
-    return Simulator(
-        lambda x, u, p: {"pos": x.vel, "vel": u.force - p.k * x.pos - p.d * x.vel},
-        lambda x: {"pos": x.pos},
-        states=("pos", "vel"),
-        inputs=("force",),
-        parameters={"k": Parameter(40.0, bounds=(10, 200)), "d": Parameter(1.0, bounds=(0, 5))},
-        ports=(Port("ground", {"vel": -1.0}, lambda x: x.pos, lambda x: x.vel),),
-    )
 
 
 def bench(port, law):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cart import cart
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
@@ -63,13 +64,7 @@ def test_an_offset_that_was_the_mismatch_is_a_fault(moved, verdict):
 
 def beam(off=1.0):
     """One lightly damped mode."""
-    return Simulator(
-        lambda x, u, p: {"pos": x.vel, "vel": u.force - p.k * x.pos - p.d * x.vel},
-        lambda x: {"pos": x.pos},
-        states=("pos", "vel"),
-        inputs=("force",),
-        parameters={"k": Parameter(40.0 * off, bounds=(10, 200)), "d": Parameter(0.08 * off, bounds=(0, 5))},
-    )
+    return cart(k=40.0 * off, d=0.08 * off, ports=())
 
 
 @pytest.mark.slow

@@ -6,11 +6,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from cart import GROUND, cart
 from diagnosis_contract import SCHEMA, problems
 from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
-from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, laws
+from pilfr_casadi import InputError, Recording, laws
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.floor import noise_floor
@@ -26,15 +27,9 @@ DT, CUBIC = 0.02, 4000.0
 
 
 def spring(k=90.0, d=1.5, least=20.0, least_damping=0.1):
-    """A mass on a linear spring."""
-    return Simulator(
-        lambda x, u, p: {"pos": x.vel, "vel": u.force - p.k * x.pos - p.d * x.vel},
-        lambda x: {"position": x.pos},
-        states=("pos", "vel"),
-        inputs=("force",),
-        parameters={"k": Parameter(k, bounds=(least, 400)), "d": Parameter(d, bounds=(least_damping, 20))},
-        ports=(Port("ground", into={"vel": -1}, across=lambda x: x.pos, rate=lambda x: x.vel, unit="N"),),
-    )
+    """A mass on a linear spring, with a port whose unit is given."""
+    ground = replace(GROUND, unit="N")
+    return cart(k, d, (least, 400), (least_damping, 20), output="position", ports=(ground,))
 
 
 def shaken(samples, *bursts, seed=0, initial="zero"):

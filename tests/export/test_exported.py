@@ -319,7 +319,7 @@ def test_no_code_is_run_from_a_model_file(tmp_path, monkeypatch, text):
     assert not list(tmp_path.rglob("evil"))
 
 
-RUNS_PROGRAMS = ("adapters.py",)  # simulators/adapters runs the user's simulator file
+RUNS_PROGRAMS = ("user_file.py",)  # simulators/user_file runs the user's simulator file
 TALKS_TO_ITS_CHILD = ("workers.py",)
 
 

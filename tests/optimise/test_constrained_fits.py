@@ -31,11 +31,6 @@ PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)
 
 
 @pytest.fixture(scope="module")
-def record():
-    return three_plays(0, 1200)
-
-
-@pytest.fixture(scope="module")
 def full(record):
     return pilfr.fit(pilfr.hammerstein(1, pilfr.PrandtlIshlinskii(pilfr.Play, 6)), record, starts=2)
 

@@ -10,14 +10,8 @@ from pilfr_casadi._base import InputError
 from pilfr_casadi.identify import describe_reached_gain
 from pilfr_casadi.optimise import Gain, Problem, Solution, Status, dc_gain, limits_of
 from pilfr_casadi.optimise.gauss_newton import ExactPenalty
-from problems.constrained import three_plays
 
 PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)
-
-
-@pytest.fixture(scope="module")
-def record():
-    return three_plays(0, 1200)
 
 
 @pytest.mark.slow

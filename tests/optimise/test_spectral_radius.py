@@ -15,16 +15,11 @@ from pilfr_casadi._base import InputError
 from pilfr_casadi.optimise import Problem, Status, describe_unbounded, solve_within_radii, stable
 from pilfr_casadi.optimise.constraints import least_radius, stability
 from pilfr_casadi.optimise.exact_limits import SchurProblem, below_blocks, jury_rows, schur_basis
-from problems.constrained import radius, three_plays
+from problems.constrained import radius
 
 PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)
 FINE = pilfr.GaussNewton(tolerance=1e-9, max_iterations=500)
 DEMO = "pilfr_casadi/cli/demo_data/train.csv"
-
-
-@pytest.fixture(scope="module")
-def record():
-    return three_plays(0, 1200)
 
 
 @pytest.fixture(scope="module")
