@@ -46,7 +46,7 @@ from .linearise import linearised
 from .relatives import choose_pairs, complements, fit_pair, relatives
 from .screen import Remainder, Scored, flexible_shares, screen
 from .trials import Key, Trial, Trials
-from .workbench import FEW, THOROUGH, Fitted, Workbench
+from .workbench import DIVERGED, FEW, THOROUGH, Fitted, Workbench
 
 # Effort
 MOST_CONVERGED = 5  # trials of a step that are fitted to convergence at most
@@ -499,6 +499,8 @@ class Search:
             best = self.best
             for element in best.effects if len(best.effects) > 1 else ():
                 rest = self.beside([e for e in best.laws if e is not element], best)
+                if not rest.mean_square < DIVERGED:
+                    continue
                 if self._in_time() and not any(step.parent.key == rest.key for step in self.steps):
                     self.keep(rest)
                     self.add(rest, again=True)

@@ -3,6 +3,7 @@
 import json
 import sys
 import types
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -121,3 +122,13 @@ def test_held_out_blocks_tell_a_better_simulator():
     assert NOISE < after.error < 0.5 * before.error
     exact = Workbench.of(true, bench.recordings, "zero")
     assert held_out_errors(exact, exact.fit(true)).error == pytest.approx(NOISE, rel=0.1)
+
+
+def test_held_out_samples_have_no_say_in_what_predicts_them(nameless):
+    """The weights that a refit starts from do not matter, because what is held out has shaped them."""
+    bench, fitted = nameless.evidence["search"].bench, nameless.evidence["after"]
+    name = f"{fitted.simulator.elements[-1].prefix}c"
+    elsewhere = replace(fitted, values={**fitted.values, name: 2 * fitted.values[name]})
+    there, here = (held_out_errors(bench, f) for f in (elsewhere, fitted))
+    assert (there.blocks, there.ahead) == (here.blocks, here.ahead)
+    assert here.error > fitted.cost**0.5

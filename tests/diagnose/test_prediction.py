@@ -8,7 +8,7 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator
 from pilfr_casadi._base import InputError
-from pilfr_casadi.diagnose.prediction import can_be_led, observer
+from pilfr_casadi.diagnose.prediction import can_be_led, drifts, observer
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Saturation
 from pilfr_casadi.simulators import discretise
@@ -117,3 +117,20 @@ def test_a_wrong_gain_is_refused():
 def test_what_grows_within_a_sample_cannot_be_led(machine):
     assert can_be_led(levitation(), machine)
     assert not can_be_led(levitation(2e4), machine)
+
+
+def test_a_simulator_drifts_if_it_remembers_longer_than_its_recordings_last():
+    """An integrator does; a spring with damping forgets, unless the recording is short."""
+    r = Recording(np.ones(SAMPLES), np.ones(SAMPLES), DT, ("f",), ("gap",))
+
+    def body(k):
+        return Simulator(
+            lambda x, u: {"q": x.v, "v": u.f - 0.5 * x.v - k * x.q},
+            lambda x: {"gap": x.q},
+            states=("q", "v"),
+            inputs=("f",),
+        )
+
+    assert drifts(body(0.0), [r])
+    assert not drifts(body(25.0), [r])
+    assert drifts(body(25.0), [r.slice(0, 100)])
