@@ -351,7 +351,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
 
     The laws that are named there are refitted in free run. They have to predict held-out data better than the refit.
     """
-    if request.simulator.observer is not None or not drifts(request.simulator, request.recordings):
+    if request.simulator.observer is not None or not drifts(search.bench, search.root.fitted):
         return found
     say, hold = request.say.under("predictions: "), search.bench.hold
     try:

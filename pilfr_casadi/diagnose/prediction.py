@@ -22,15 +22,18 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
+import scipy.linalg
 
 from .._base import InputError
 from ..data import Recording
 from ..linear import steady_state_gain
 from ..simulators import Simulator, discretise, growth_rate
 from .gates import USELESS_FIT, Gate
-from .workbench import MOST_GROWTH, Workbench
+from .linearise import linearised
+from .workbench import MOST_GROWTH, Fitted, Workbench
 
 FOCUS = "simulation", "prediction"
+ROUNDING = 1e-9  # share of the largest entry that counts as zero
 # memories that are tried in turn, in half decades: times the time of e-fold growth (a longer one leaves the unstable
 # eigenvalue of the observer as it is); for a stable simulator times the longest recording's duration
 OF_GROWTH, OF_DURATION = (3.0, 1.0, 0.3, 0.1), (0.1, 0.03, 0.01, 0.003)
@@ -47,11 +50,22 @@ def can_be_led(simulator: Simulator, recordings: Sequence[Recording]) -> bool:
     return growth_rate(simulator, recordings[0]) * recordings[0].dt < 1
 
 
-def drifts(simulator: Simulator, recordings: Sequence[Recording]) -> bool:
-    """Tell whether a simulator remembers longer than its recordings last: small forces add up in a free run."""
-    if not simulator.states or simulator.discrete:
+def drifts(bench: Workbench, fitted: Fitted) -> bool:
+    """Tell whether small forces at ports add up in a free run, because it remembers longer than the recordings last.
+
+    A mode that slow has to feel a port's force, and an output has to show it.
+    """
+    probe, runs = linearised(bench, fitted)
+    a, b, c = max(runs, key=lambda r: len(r.z)).mean
+    inner = [i for i, name in enumerate(probe.ports) if not bench.simulator.port(name).series]
+    if not len(a) or not inner:
         return False
-    return growth_rate(simulator, recordings[0]) * max(len(r) * r.dt for r in recordings) > -1
+    forces = b[:, runs[0].n_free :][:, inner]
+    values, left, right = scipy.linalg.eig(a, left=True, right=True)
+    felt, seen = (np.max(np.abs(m), axis=1) for m in (left.conj().T @ forces, (c @ right).T))
+    felt, seen = (v > ROUNDING * np.max(np.abs(m), initial=0.0) for v, m in ((felt, forces), (seen, c)))
+    slow = np.abs(values) ** (max(map(len, bench.recordings)) * fitted.model.substeps) > np.exp(-1)
+    return bool(np.any(slow & felt & seen))
 
 
 def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str) -> tuple[Simulator, float]:

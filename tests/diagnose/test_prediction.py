@@ -8,6 +8,7 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator
 from pilfr_casadi._base import InputError
+from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.prediction import can_be_led, drifts, observer
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Saturation
@@ -119,18 +120,24 @@ def test_what_grows_within_a_sample_cannot_be_led(machine):
     assert not can_be_led(levitation(2e4), machine)
 
 
-def test_a_simulator_drifts_if_it_remembers_longer_than_its_recordings_last():
-    """An integrator does; a spring with damping forgets, unless the recording is short."""
-    r = Recording(np.ones(SAMPLES), np.ones(SAMPLES), DT, ("f",), ("gap",))
-
-    def body(k):
-        return Simulator(
-            lambda x, u: {"q": x.v, "v": u.f - 0.5 * x.v - k * x.q},
-            lambda x: {"gap": x.q},
-            states=("q", "v"),
-            inputs=("f",),
-        )
-
-    assert drifts(body(0.0), [r])
-    assert not drifts(body(25.0), [r])
-    assert drifts(body(25.0), [r.slice(0, 100)])
+@pytest.mark.parametrize(
+    ("stiffness", "duration", "port", "there"),
+    [
+        (0.0, SAMPLES, "v", True),  # an integrator
+        (25.0, SAMPLES, "v", False),  # a spring with a damper forgets
+        (25.0, 100, "v", True),  # but not within a short recording
+        (0.0, SAMPLES, "f", False),  # no force at the port gets into the integrator
+    ],
+)
+def test_a_free_run_drifts_if_it_remembers_what_forces_have_done(stiffness, duration, port, there):
+    simulator = Simulator(
+        lambda x, u, p: {"q": x.v, "v": u.f - 0.5 * x.v - stiffness * x.q, "f": p.rate * (x.v - x.f)},
+        lambda x: {"gap": x.q, "load": x.f},
+        states=("q", "v", "f"),
+        inputs=("f",),
+        parameters={"rate": Parameter(9.0, bounds=(1, 100))},
+        ports=Port("guide", into={port: -1.0}, across=lambda x: x.q, rate=lambda x: x.v, unit="N"),
+    )
+    r = Recording(np.ones(duration), np.ones((duration, 2)), DT, ("f",), ("gap", "load"), initial="zero")
+    bench = Workbench.of(simulator, [r.with_(y=np.random.default_rng(0).normal(size=(duration, 2)))], "zero")
+    assert drifts(bench, bench.fit(simulator)) is there
