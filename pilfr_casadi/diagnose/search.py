@@ -142,7 +142,7 @@ class Search:
     @cached_property
     def fits(self) -> Trials:
         """Fits of hypotheses, with the bench, workers and time limit of the search."""
-        return Trials(self.bench, self.workers, self.until)
+        return Trials(self.bench, self.workers, self.until, self.deadline)
 
     @property
     def samples(self) -> float:
