@@ -376,7 +376,7 @@ def _final_fits(
         whole, pair = everything.bench, (without, after)
         to_all = [everything.fitted(search, one) for one in pair]
         drawn = [back_on_stretches(bench, f, one.initial) for f, one in zip(to_all, pair, strict=True)]
-        nominal = errors_of(whole, whole.model(request.simulator))
+        nominal = errors_of(whole, whole.model(request.simulator), whole=True)
     return FinalFits(whole, to_all[0], to_all[1], nominal, (drawn[0], drawn[1]))
 
 
