@@ -285,8 +285,8 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     3. Compare named laws with a learned force on held-out data. If the force predicts better, the name is refuted.
     4. If there is no name, check undeclared ports and varying values, and return the best predictor.
 
-    At the time limit, the first half of step 4 is skipped. After Ctrl-C, step 2 is skipped as well, and a name that was
-    found stays; otherwise the refitted simulator is returned.
+    At the time limit, the first half of step 4 is skipped. After Ctrl-C nothing more is fitted: steps 2 to 4 are
+    skipped, and a name that was found stays; otherwise the refitted simulator is returned.
     """
     answer, interrupted = posterior(search), search.interrupted
     finished = not (interrupted or search.out_of_time)

@@ -33,8 +33,8 @@ def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
 def errors_of(bench: Workbench, model: Model, starts: Sequence[np.ndarray] = (), *, whole: bool = False) -> float:
     """Compute the NRMSE of a model at its start values, averaged over recordings; infinite if the simulation diverges.
 
-    Unknown initial states are sought from rest and from `starts`. With `whole` all samples are scored as in a fit, so
-    that errors on training recordings compare with those of fits; else those after the part that the state is fitted to.
+    Unknown initial states are sought from rest and from `starts`, on a first part that is not scored. With `whole` they
+    are fitted to all samples, which are all scored: so do errors on training recordings compare with those of fits.
     """
     engine = make_engine(model, bench.engine)
     errors = []
