@@ -73,12 +73,10 @@ def find_pinned_parameter(search: Search, answer: Posterior) -> PinnedParameter 
         free = replace(p, fixed=False, bounds=(0.0 if float(p.value) > 0 else -np.inf, np.inf))
         simulator = bench.simulator.with_parameters({**bench.simulator.parameters, name: free})
         starts = [without.values, *({**without.values, name: p.value * by} for by in far)]
-        try:
+        with search.until_interrupted():
             found = refit(bench, starts, simulator, states=without.initial)
             if found is not None and found.cost < NEAR_RATIO**2 * enough:
                 found = refit(bench, [found.values], simulator, states=found.initial, solver=THOROUGH, like=found)
-        except KeyboardInterrupt:
-            found, search.interrupted = None, True
         search.interrupted = search.interrupted or bool(bench.interrupted_fits)
         if search.interrupted:
             return None
@@ -112,14 +110,16 @@ def find_undeclared_port(search: Search) -> Sequence[Gate]:
     open_ = replace(search.bench.simulator, ports=())
     bench = replace(search.bench, simulator=open_)
     try:
-        without = bench.fit(open_, [search.root.fitted.values], states=search.root.fitted.begin)
-        other = Search(bench, without, search.floor, search.laws, search.workers, search.say, until=search.until).run(1)
+        with search.until_interrupted():
+            without = bench.fit(open_, [search.root.fitted.values], states=search.root.fitted.begin)
+            search_there = Search(bench, without, search.floor, search.laws, search.workers, search.say)
+            other = replace(search_there, until=search.until).run(1)
+            search.interrupted = other.interrupted
     except InputError:
         return ()
-    except KeyboardInterrupt:
-        search.interrupted = True
+    if search.interrupted:
         return ()
-    search.interrupted, found = other.interrupted, posterior(other)
+    found = posterior(other)
     if found.sure <= SURE or not found.effects[0].name[0].startswith("equation:"):
         return ()
     state, law = found.effects[0].name[0].removeprefix("equation:"), found.effects[0].name[1]
@@ -138,13 +138,11 @@ def find_varying_values(search: Search) -> tuple[Gate, ...]:
     bench, whole = search.bench, search.root.fitted
     if search.interrupted or not np.any(whole.model.parameters.free):
         return ()
-    try:
+    with search.until_interrupted():
         for groups, where in ((_by_recording(bench, whole), "the recordings"), (_by_half(bench, whole), "the halves")):
             found = _compare_groups(search, groups, where) if len(groups) > 1 else None
             if found is not None:
                 return (found,)
-    except KeyboardInterrupt:
-        search.interrupted = True
     return ()
 
 
