@@ -16,6 +16,7 @@ SOLVERS = {
     "ipopt": Ipopt(),
     "ipopt-bfgs": Ipopt(hessian="limited-memory", max_iterations=2000),
 }
+FIRST = ("gauss-newton", "ipopt")
 EVERY_CASE = pytest.mark.parametrize("name", CASES)
 EVERY_SOLVER = pytest.mark.parametrize("solver", SOLVERS)
 
@@ -189,7 +190,9 @@ def test_priors_pull():
     ],
     ids=["contradiction", "against a bound", "nowhere"],
 )
-@EVERY_SOLVER
+@pytest.mark.parametrize(
+    "solver", [*FIRST, *(pytest.param(s, marks=pytest.mark.slow) for s in SOLVERS if s not in FIRST)]
+)
 def test_infeasible_constraints(limits, solver):
     p = case("pi_wiener").problem(constraints=limits)
     s = SOLVERS[solver].solve(p)
