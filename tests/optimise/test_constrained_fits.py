@@ -122,6 +122,7 @@ def test_a_known_gain_and_its_multiplier(record):
     assert limit.multiplier == pytest.approx(slope, rel=0.1)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_at_a_kink_multipliers_are_not_known(record, tmp_path):
     """The last step's are those of its damping: they are told in no print, file or report."""
     fit = pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=1, constraints=dc_gain(1.1))
