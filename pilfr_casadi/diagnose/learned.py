@@ -356,8 +356,8 @@ def describe_learned(bench: Workbench, fitted: Fitted, share: float, laws: Colle
 def nearest_to_learned(bench: Workbench, fitted: Fitted, laws: Collection[type[Law]]) -> tuple[NearLaw, ...]:
     """Find the laws nearest to the last element of a fitted simulator, a learned one.
 
-    Their strengths may vary with the input that scales the learned force, or with the local coordinate; the input's gain
-    may vary with the local coordinate.
+    Their strengths may vary with the input that scales the learned force, or with the local coordinate. The gain of the
+    input may vary with the local coordinate.
     """
     element = fitted.simulator.elements[-1]
     z, dz, force = signals_along(bench, fitted)
