@@ -116,10 +116,10 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
 
     With `named`, the answer names its effects. If a learned element at another port predicts as well without them, the
     correction omits them. Learned elements at their own ports would only imitate them, and are not tried. After the
-    deadline nothing more is fitted.
+    deadline nothing more is fitted, and after an interrupt the named laws stay.
     """
     best_laws = answer.best
-    if named and answer.sure > SURE and explainable_remainder(search, best_laws) < FORMULA_ERROR:
+    if named and (search.interrupted or _settled(search, answer)):
         return named_correction(search, best_laws.fitted), best_laws.fitted
     refitted = _predict(search, [_make_candidate(search, search.root)], [])
     tried = [search.thorough(best_laws)] if named else _hypotheses_with_laws(search)
@@ -139,6 +139,11 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
         elements = (describe_learned(search.bench, fitted, shares["learned"], laws),)
     errors = refitted[0][1].error, held_out.error
     return Correction(_elements(search, fitted), shares, elements, *errors, base), fitted
+
+
+def _settled(search: Search, answer: Posterior) -> bool:
+    """Tell whether the names are sure and leave nothing that a force at a port could explain."""
+    return answer.sure > SURE and explainable_remainder(search, answer.best) < FORMULA_ERROR
 
 
 def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_Predicted]) -> list[_Predicted]:

@@ -292,8 +292,8 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     3. Compare named laws with a learned force on held-out data. If the force predicts better, the name is refuted.
     4. If there is no name, check undeclared ports and varying values, and return the best predictor.
 
-    At the time limit, the first half of step 4 is skipped. After Ctrl-C, step 2 is skipped as well, and a name that was
-    found stays; otherwise the refitted simulator is returned.
+    At the time limit, the first half of step 4 is skipped. After Ctrl-C nothing more is fitted: steps 2 to 4 are
+    skipped, and a name that was found stays; otherwise the refitted simulator is returned.
     """
     answer, interrupted = posterior(search), search.interrupted
     finished = not (interrupted or search.out_of_time)
@@ -427,7 +427,7 @@ def _final_fits(
         whole, pair = everything.bench, (without, after)
         to_all = [everything.fitted(search, one) for one in pair]
         drawn = [back_on_stretches(bench, f, one.initial) for f, one in zip(to_all, pair, strict=True)]
-        nominal = errors_of(whole, whole.model(request.simulator))
+        nominal = errors_of(whole, whole.model(request.simulator), whole=True)
     return FinalFits(whole, to_all[0], to_all[1], nominal, (drawn[0], drawn[1]))
 
 

@@ -87,7 +87,7 @@ def prepare(
     held: Sequence[Gate] = ()
     if not said:
         bench, held = _choose_hold(bench)
-    nominal = errors_of(bench, bench.model(simulator))
+    nominal = errors_of(bench, bench.model(simulator), whole=True)
     say(CHECKS, 1, CHECKED)
     checks = _Checks(gates, workers, starts, early, say)
     now = checks.run(bench, 1.0 if said else 0.5)

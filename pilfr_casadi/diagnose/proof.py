@@ -30,15 +30,16 @@ def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
     return float(np.mean([nrmse(r.y, r.y + e, skip=r.skip) for e, r in pairs]))
 
 
-def errors_of(bench: Workbench, model: Model, starts: Sequence[np.ndarray] = ()) -> float:
+def errors_of(bench: Workbench, model: Model, starts: Sequence[np.ndarray] = (), *, whole: bool = False) -> float:
     """Compute the NRMSE of a model at its start values, averaged over recordings; infinite if the simulation diverges.
 
-    Unknown initial states are sought from rest and from `starts`.
+    Unknown initial states are sought from rest and from `starts`, on a first part that is not scored. With `whole` they
+    are fitted to all samples, which are all scored: so do errors on training recordings compare with those of fits.
     """
     engine = make_engine(model, bench.engine)
     errors = []
     for r in bench.recordings:
-        y, skip = run_free(model, engine, r, starts)
+        y, skip = run_free(model, engine, r, starts, whole=whole)
         if not np.all(np.isfinite(y)):
             return np.inf
         errors.append(nrmse(r.y, y, skip=skip))

@@ -204,24 +204,27 @@ def _residual(model: Any, recording: Recording) -> tuple[np.ndarray, int]:
 
 
 def run_free(
-    model: Model, engine: Engine, recording: Recording, starts: Sequence[np.ndarray] = ()
+    model: Model, engine: Engine, recording: Recording, starts: Sequence[np.ndarray] = (), *, whole: bool = False
 ) -> tuple[np.ndarray, int]:
     """Simulate a model at its start values along a recording.
 
-    An unknown initial state is fitted to the first part of the recording, starting from rest and from `starts`.
+    An unknown initial state is fitted to the first part of the recording, starting from rest and from `starts`; with
+    `whole` to all of it, as in a fit.
 
     Returns
     -------
     array, shape (M, n_y)
         Simulated outputs; not finite where the simulation diverges.
     int
-        First scored sample: the part that the state is fitted to is left out.
+        First scored sample: the part that the state is fitted to is left out, unless that is the whole recording.
     """
     estimated = recording.begins == "estimate" and model.n_state > 0
     used = min(samples_for_state(model), len(recording) // 3) if estimated else 0
     with np.errstate(all="ignore"):
         try:
             state = estimate_initial_state(model, engine, recording, used or None, starts=starts)
+            if whole and estimated:
+                used, state = 0, estimate_initial_state(model, engine, recording, len(recording), starts=(state,))
             y = engine.simulate(model.drive(recording), model.parameters.start, state)[0]
         except (RuntimeError, FloatingPointError):  # a quadratic program of huge numbers
             y = np.full(recording.y.shape, np.nan)

@@ -85,7 +85,7 @@ def test_a_law_found_only_beside_another_one_may_do_without_it():
     assert found.best.key == single.key and found.best.mean_square < 0.1 * single.mean_square
 
 
-def test_after_the_deadline_the_correction_fits_nothing_more(monkeypatch):
+def test_after_the_deadline_and_ctrl_c_the_correction_fits_nothing_more(monkeypatch):
     found = searching(recordings(FRICTION, count=1)).run(1)
     found.memo = {key: replace(t, thorough=False) for key, t in found.memo.items()}
     fitted, polish = [], Trials.polish
@@ -101,7 +101,11 @@ def test_after_the_deadline_the_correction_fits_nothing_more(monkeypatch):
     unsure = replace(answer, effects=tuple(replace(e, confidence=0.4) for e in answer.effects))
     assert correction.find_correction(found, unsure, named=True)[0].elements  # no comparison has refuted the name
     assert not fitted
-    found.deadline = np.inf
+    found.deadline, found.interrupted = np.inf, True
+    with monkeypatch.context() as patch:  # after Ctrl-C not even the parts that a comparison needs
+        patch.setattr(type(found), "held_out_errors", lambda *_: pytest.fail("a comparison after Ctrl-C"))
+        assert correction.find_correction(found, unsure, named=True)[0].elements
+    found.interrupted = False
     correction.find_correction(found, posterior(found))
     assert fitted
 
