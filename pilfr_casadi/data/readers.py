@@ -1,8 +1,8 @@
 """Readers: CSV, ``.mat``, ``.npz``, Parquet and MDF files, and frames of pandas or polars, into recordings.
 
 A file holds one recording: a time column (``t``, ``t_s`` or ``time``, in seconds, uniform) and one column for each
-input and output by name; other columns are ignored. Any fault of a file is reported in one sentence that names the
-file, the column and the line.
+input and output by name, with or without its unit in brackets; other columns are ignored. Any fault of a file is
+reported in one sentence that names the file, the column and the line.
 """
 
 import re
@@ -25,6 +25,7 @@ TIME_NAMES = ("t", "t_s", "time")
 TOLERANCE = 1e-4  # steps that a sample may lie off the grid; the clocks of recorders do not drift by more in a record
 AGREEMENT = 1e-3  # relative difference between a stated step and the written times; another unit differs by far more
 _UNITS = r"ns|us|µs|μs|ms|min|h|d|nanoseconds?|microseconds?|milliseconds?|minutes?|hours?|days?"
+_WITH_UNIT = re.compile(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")  # such as "force [N]" or "speed (rad/s)"
 _OTHER_UNIT = re.compile(rf"(?:t|time)[\s_\-\[(]+({_UNITS})[\])]?", re.IGNORECASE)
 
 
@@ -50,8 +51,9 @@ def read_csv(
     path : str or Path, or several
         One file, or a list of files with the same columns.
     inputs, outputs : str or sequence of str
-        Names of the inputs and outputs, and of their columns unless `columns` maps them. Without outputs (`()`) the
-        recording can be simulated but not fitted.
+        Names of the inputs and outputs, and of their columns unless `columns` maps them. A column may say its unit
+        behind the name, as in ``force [N]`` or ``force (N)``; it becomes the unit of the recording. Without outputs
+        (`()`) the recording can be simulated but not fitted.
     columns : mapping, optional
         Column by name, e.g. ``{"force": "u_vir_V"}``; the key ``"t"`` chooses the time column.
     dt : float, optional
@@ -216,7 +218,7 @@ class _Request:
         """Return the time column, if any, and those of the inputs and outputs."""
         mapped = [column for name, column in self.columns.items() if name in TIME_NAMES]
         time = _time_column(names, mapped[0] if mapped else None, source)
-        wanted = self.wanted
+        wanted = [_with_unit(column, names) for column in self.wanted]
         both = sorted({*map(self.column, self.inputs)} & {*map(self.column, self.outputs)})
         if both:
             raise InputError(f"{source}: column {both[0]!r} is taken both for an input and for an output; correct one.")
@@ -227,8 +229,9 @@ class _Request:
             )
         for role, column in zip((*self.inputs, *self.outputs), wanted, strict=True):
             if column not in names:
+                like = next((name for name in names if name.lower().startswith(column.lower())), "COLUMN")
                 hint = (
-                    f"map it, as in columns={{'{role}': 'COLUMN'}}" if len(names) > 1 else "separate columns by commas"
+                    f"map it, as in columns={{'{role}': '{like}'}}" if len(names) > 1 else "separate columns by commas"
                 )
                 raise InputError(f"{source} has no column {column!r}; it has {listed(names) or 'none'}: {hint}.")
         for name in [*wanted, time] if time else wanted:
@@ -260,10 +263,25 @@ class _Request:
         n_u = len(self.inputs)
         u, y = np.hstack(parts[:n_u]), np.hstack([np.empty((len(parts[0]), 0)), *parts[n_u:]])
         names = _channel_names(self.inputs, parts[:n_u]), _channel_names(self.outputs, parts[n_u:])
+        written = zip((*self.inputs, *self.outputs), map(_unit_in, wanted), strict=True)
+        units = {name: unit for name, unit in written if unit and name in names[0] + names[1]}
+        units |= self.options.get("units") or {}
         try:
-            return Recording(u, y, dt, *names, **{"name": table.path.stem, **self.options})
+            return Recording(u, y, dt, *names, **{"name": table.path.stem, **self.options, "units": units})
         except InputError as error:
             raise InputError(f"{table.path}: {error}") from None
+
+
+def _with_unit(column: str, names: Sequence[str]) -> str:
+    """Find a column among a file's names, which may say its unit in brackets; the name as given if it is not there."""
+    found = [name for name in names if (parts := _WITH_UNIT.fullmatch(name)) and parts.group(1) == column]
+    return found[0] if column not in names and len(found) == 1 else column
+
+
+def _unit_in(column: str) -> str:
+    """Read the unit that a column's name says in brackets; empty if it says none."""
+    parts = _WITH_UNIT.fullmatch(column)
+    return (parts.group(2) or parts.group(3) or "").strip() if parts else ""
 
 
 def _names(given: Any, role: str) -> tuple[str, ...]:

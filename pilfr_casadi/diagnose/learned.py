@@ -26,7 +26,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, side_by_side
-from ..laws import SCALABLE, Law, Local, display_name, scheduled, unit_forces
+from ..laws import POSITION_GAINS, SCALABLE, Law, Local, display_name, scaled, scheduled, unit_forces
 from ..models import Parameter, play
 from .force_recovery import law_signals
 from .linearise import linearised, port_signals
@@ -356,7 +356,8 @@ def describe_learned(bench: Workbench, fitted: Fitted, share: float, laws: Colle
 def nearest_to_learned(bench: Workbench, fitted: Fitted, laws: Collection[type[Law]]) -> tuple[NearLaw, ...]:
     """Find the laws nearest to the last element of a fitted simulator, a learned one.
 
-    Their strengths may vary with the input that scales the learned force, or with the local coordinate.
+    Their strengths may vary with the input that scales the learned force, or with the local coordinate. The gain of the
+    input may vary with the local coordinate.
     """
     element = fitted.simulator.elements[-1]
     z, dz, force = signals_along(bench, fitted)
@@ -366,6 +367,8 @@ def nearest_to_learned(bench: Workbench, fitted: Fitted, laws: Collection[type[L
     for law in SCALABLE if "parallel" in port.kinds else ():
         signals = [element.law.factor] * bool(element.law.factor) + ["z"] * law.dissipative
         tried += [scheduled(law, by) for by in signals if law in laws and port.admits(law)]
+    gains = POSITION_GAINS if element.law.factor else ()
+    tried += [scaled(law, element.law.factor) for law in gains if law in laws and port.admits(law)]
     return nearest_laws(local, force, tried)
 
 

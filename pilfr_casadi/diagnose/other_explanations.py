@@ -1,7 +1,7 @@
 """Explanations other than a law at a declared port: a pinned parameter, an undeclared port, a machine that changed.
 
-- A missing law may be equivalent to another value of a parameter, as a spring beside a spring. It comes out as missing
-  only if that value is fixed, or if its bounds exclude the new one; then the pinned value is reported.
+- A missing law may be equivalent to other values of parameters, as a spring beside a spring. It comes out as missing
+  only if these values are fixed, or if their bounds exclude the new ones; then the pinned values are reported.
   If the bounds are in another unit, no law helps; values powers of ten away are tried.
 - A mismatch that no declared port explains may have a sure name in the equation of a state.
 - One set of values for all recordings is compared with one set for each, or with one for the first halves and one for
@@ -18,7 +18,7 @@ import numpy as np
 from .._base import InputError
 from ..data import Recording
 from ..laws import display_name
-from ..simulators import states_along
+from ..simulators import Placed, states_along
 from .evidence import AT_NOISE_RATIO, FAR_RATIO, NEAR_RATIO, SURE, deviations
 from .gates import (
     CERTAIN_ERRORS,
@@ -33,6 +33,7 @@ from .gates import (
     refit,
 )
 from .search import Search
+from .trials import Trial
 from .verdict import Posterior, posterior
 from .workbench import FEW, THOROUGH, Fitted, Workbench
 
@@ -41,19 +42,19 @@ DECADES = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3)
 
 
 @dataclass(frozen=True, eq=False)
-class PinnedParameter:
-    """A pinned parameter, its better value, the simulator fitted with it, and the sentence for the report."""
+class PinnedParameters:
+    """Pinned parameters, the simulator fitted with them freed, and the sentence for the report."""
 
-    name: str
-    value: float
+    names: tuple[str, ...]
     fitted: Fitted
     sentence: str
 
 
-def find_pinned_parameter(search: Search, answer: Posterior) -> PinnedParameter | None:
-    """Find the pinned parameter that explains as much, once freed, as the named laws; None if there is none.
+def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameters | None:
+    """Find the fewest pinned parameters that explain as much, once freed, as the named laws; None if there are none.
 
-    A law is often equivalent to another value: a spring beside a spring, a gain at the input of a known capacity.
+    A law is often equivalent to another value: a spring beside a spring, a gain at the input of a known capacity. Where
+    one value does not suffice, the next is freed beside the best, up to the number of the laws' own parameters.
     """
     named = [e.element for e in answer.effects]
     bench, without = search.bench, search.root.fitted
@@ -62,44 +63,81 @@ def find_pinned_parameter(search: Search, answer: Posterior) -> PinnedParameter 
     as_well = EQUAL_RATIO**2 * answer.best.mean_square if named else np.inf
     # a larger error means that something else is missing
     enough = min(as_well, (FAR_RATIO if named else AT_NOISE_RATIO) ** 2 * search.floor2)
-    far = DECADES if without.cost >= USELESS_FIT else ()
-    best: tuple[str, Fitted] | None = None
-    for name, p in bench.simulator.parameters.items():
-        stays = bool(np.all(p.fixed) or np.all(without.at_bound(name)))
-        if p.value.ndim or not stays or float(p.value) == 0:  # a matrix or a zero represents no physics
-            continue
-        if search.past_deadline:
-            break
-        free = replace(p, fixed=False, bounds=(0.0 if float(p.value) > 0 else -np.inf, np.inf))
-        simulator = bench.simulator.with_parameters({**bench.simulator.parameters, name: free})
-        starts = [without.values, *({**without.values, name: p.value * by} for by in far)]
-        with search.until_interrupted():
-            found = refit(bench, starts, simulator, states=without.initial)
-            if found is not None and found.cost < NEAR_RATIO**2 * enough:
-                found = refit(bench, [found.values], simulator, states=found.initial, solver=THOROUGH, like=found)
-        search.interrupted = search.interrupted or bool(bench.interrupted_fits)
-        if search.interrupted:
+    pinned = [
+        name
+        for name, p in bench.simulator.parameters.items()
+        if not p.value.ndim  # a matrix or a zero represents no physics
+        and float(p.value) != 0
+        and bool(np.all(p.fixed) or np.all(without.at_bound(name)))
+    ]
+    most = max(1, _count_free(answer.best))
+    freed: tuple[str, ...] = ()
+    best = without
+    while len(freed) < min(len(pinned), most):
+        if len(freed) == 1:
+            together = _free(search, pinned, best, enough)  # if all of them do not suffice, no few do
+            if together is None or together.cost > NEAR_RATIO**2 * enough:
+                return None
+        found = {name: _free(search, [*freed, name], best, enough) for name in pinned if name not in freed}
+        gained = {name: f for name, f in found.items() if f is not None and _went_beyond(search, (*freed, name), f)}
+        if search.interrupted or not gained:
             return None
-        if found is None:
-            continue
-        (low, high), value = p.bounds, float(found.values[name])
-        beyond = bool(np.all(p.fixed)) or not np.all((low <= value) & (value <= high))
-        if beyond and (best is None or found.cost < best[1].cost):
-            best = name, found
-    if best is None or best[1].cost > enough:
+        name = min(gained, key=lambda n: gained[n].cost)
+        freed, best = (*freed, name), gained[name]
+        if best.cost <= enough:
+            return PinnedParameters(freed, best, _describe_pinned(search, freed, best, named))
+    return None
+
+
+def _count_free(trial: Trial) -> int:
+    """Count the free entries of the parameters of a hypothesis's laws."""
+    return sum(p.size for e in trial.effects for p in e.law.parameters().values() if not np.all(p.fixed))
+
+
+def _free(search: Search, names: Sequence[str], start: Fitted, enough: float) -> Fitted | None:
+    """Refit with some pinned parameters freed; None if the fit fails or there is no time."""
+    if search.past_deadline or search.interrupted:
         return None
-    name, found = best
-    p, value = bench.simulator.parameters[name], float(found.values[name])
-    unit = f" {p.unit}" if p.unit else ""
-    kept = "held at" if np.all(p.fixed) else "kept by its bounds at"
-    words = " and ".join(f"the {display_name(c.law.id)} at {c.port}" for c in named)
+    bench, without = search.bench, search.root.fitted
+    own = bench.simulator.parameters
+    freed = {}
+    for name in names:
+        positive = float(own[name].value) > 0
+        freed[name] = replace(own[name], fixed=False, bounds=(0.0 if positive else -np.inf, np.inf))
+    simulator = bench.simulator.with_parameters({**own, **freed})
+    far = DECADES if without.cost >= USELESS_FIT and len(names) == 1 else ()
+    starts = [start.values, *({**start.values, n: own[n].value * by} for n in names for by in far)]
+    found = None
+    with search.until_interrupted():
+        found = refit(bench, starts, simulator, states=start.initial)
+        if found is not None and found.cost < NEAR_RATIO**2 * enough:
+            found = refit(bench, [found.values], simulator, states=found.initial, solver=THOROUGH, like=found)
+    search.interrupted = search.interrupted or bool(bench.interrupted_fits)
+    return None if search.interrupted else found
+
+
+def _went_beyond(search: Search, names: Sequence[str], found: Fitted) -> bool:
+    """Tell whether each freed value is one that it could not have while it was pinned."""
+    own = search.bench.simulator.parameters
+    ends = [(own[n], float(found.values[n])) for n in names]
+    return all(bool(np.all(p.fixed)) or not np.all((p.bounds[0] <= v) & (v <= p.bounds[1])) for p, v in ends)
+
+
+def _describe_pinned(search: Search, names: Sequence[str], found: Fitted, named: Sequence[Placed]) -> str:
+    without = search.root.fitted
+    parts = []
+    for name in names:
+        p, value = search.bench.simulator.parameters[name], float(found.values[name])
+        unit = f" {p.unit}" if p.unit else ""
+        kept = "held at" if np.all(p.fixed) else "kept by its bounds at"
+        parts.append(f"{name} = {value:.5g}{unit}, which is {kept} {float(without.values[name]):.4g}{unit}")
+    words = " and ".join(f"the {display_name(placed.law.id)} at {placed.port}" for placed in named)
     like = f", no further off than with {words}" if named else ""
-    sentence = (
-        f"Nothing is missing but a value: with {name} = {value:.5g}{unit}, which is {kept} "
-        f"{float(without.values[name]):.4g}{unit}, {describe_fall(without.cost, found.cost)}{like}; let it go there, "
-        "or say what takes its place."
+    what, it, its = ("a value", "it", "its") if len(names) == 1 else ("values", "them", "their")
+    return (
+        f"Nothing is missing but {what}: with {', and '.join(parts)}, {describe_fall(without.cost, found.cost)}{like}; "
+        f"let {it} go there, or say what takes {its} place."
     )
-    return PinnedParameter(name, value, found, sentence)
 
 
 def find_undeclared_port(search: Search) -> Sequence[Gate]:

@@ -54,7 +54,7 @@ from .floor import Floor, measured_floor
 from .gates import USELESS_FIT, Gate, Offset, final_gates, offset_gates, without_idle_offsets, without_zero_offsets
 from .identifiability import port_units
 from .mismatch_map import mismatch
-from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
+from .other_explanations import find_pinned_parameters, find_undeclared_port, find_varying_values
 from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
 from .preparation import (
     CHECKS,
@@ -118,7 +118,7 @@ class Conclusion:
     effects : tuple of NamedEffect
         The named effects.
     freed : str
-        The pinned parameter whose other value explains as much as the named law.
+        The pinned parameters whose other values explain as much as the named laws, joined by "and".
     decided : Search, optional
         The search that has named the effects, if it is another one.
     """
@@ -349,10 +349,12 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
 
 def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: Sequence[Gate]) -> Conclusion | None:
     """Conclude that a parameter has a wrong pinned value, or an input was clipped, if that explains as much as laws."""
-    held = find_pinned_parameter(search, answer)
+    held = find_pinned_parameters(search, answer)
     if held is not None:
         corrected = named_correction(search, held.fitted)
-        return Conclusion(Verdict("complete", held.sentence), tuple(gates), held.fitted, corrected, (), held.name)
+        return Conclusion(
+            Verdict("complete", held.sentence), tuple(gates), held.fitted, corrected, (), " and ".join(held.names)
+        )
     named = verdict.kind == "missing-physics"
     if named and answer.sure >= SURE:
         return None

@@ -121,7 +121,8 @@ class Diagnosis:
     substeps : int
         Integration steps per sample with which the corrected simulator was fitted.
     freed : str
-        Parameter that was fixed or at a bound and is free in the corrected simulator; see `other_explanations`.
+        Parameters that were fixed or at a bound and are free in the corrected simulator, joined by "and"; see
+        `other_explanations`.
     correction : Correction or None
         The elements of `corrected` beside the refit: laws, a learned element, and their shares. Elements that are not
         among `effects` predict unseen data better than the refit but have no sure name.

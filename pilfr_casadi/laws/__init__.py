@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         CATALOGUE as CATALOGUE,
         FINER as FINER,
         LINEAR as LINEAR,
+        POSITION_GAINS as POSITION_GAINS,
         SCALABLE as SCALABLE,
         behind_gap as behind_gap,
         scaled as scaled,

@@ -238,6 +238,9 @@ CATALOGUE: tuple[type[Law], ...] = (
 # ids of laws that are equivalent to other values of the simulator's own parameters, if it has a spring or damper there
 LINEAR = (stiffness.LinearStiffness.id, friction.ViscousDamping.id)
 
+# laws of the position that an input may scale: a force constant or a valve's gain that varies with the position
+POSITION_GAINS: tuple[type[Law], ...] = (stiffness.LinearStiffness, stiffness.QuadraticStiffness)
+
 # laws whose strength may vary with a signal
 SCALABLE: tuple[type[Law], ...] = (
     stiffness.LinearStiffness,

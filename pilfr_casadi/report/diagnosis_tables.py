@@ -76,8 +76,9 @@ def answer(diagnosis: Diagnosis, forces: Sequence[str]) -> str:
     places = ", ".join(dict.fromkeys(f.port for f in d.learned))
     nameless = f"A force without a name at {places}" if places else "Something is missing that has no name"
     at_fault = dict.fromkeys(f"{display_name(g.finding)} of {g.channel}" for g in d.gates if g.corrected)
+    are = "are" if " and " in d.freed else "is"
     other = {
-        "complete": f"{d.freed} is not as stated" if d.freed else "Nothing is missing",
+        "complete": f"{d.freed} {are} not as stated" if d.freed else "Nothing is missing",
         "recording-fault": f"The recordings are at fault: {', '.join(at_fault)}".removesuffix(": "),
     }
     words = "; ".join(named) or other.get(d.verdict, nameless)

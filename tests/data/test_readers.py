@@ -444,3 +444,12 @@ def test_numbers_too_large_to_square_are_refused(tmp_path, write, suffix):
     with pytest.raises(InputError, match=r"x2.*up to 1e\+100") as caught:
         read(path, "force", "x2")
     sentence(caught)
+
+
+def test_a_column_may_say_its_unit_in_brackets(tmp_path):
+    path = tmp_path / "rig.csv"
+    path.write_text("time,road [m],speed (m/s),speed_ref\n0,1,2,3\n0.1,4,5,6\n0.2,7,8,9\n")
+    r = read_csv(path, inputs="road", outputs="speed", units={"road": "mm"})
+    assert np.array_equal(r.y[:, 0], [2, 5, 8]) and dict(r.units) == {"road": "mm", "speed": "m/s"}
+    with pytest.raises(InputError, match=r"columns=\{'spee': 'speed"):
+        read_csv(path, inputs="road", outputs="spee")

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from cart import cart
@@ -51,6 +52,30 @@ def test_a_wrong_capacity_is_told_in_place_of_a_curve_of_the_inflow():
     found = pilfr.diagnose(tank, r, laws=(laws.PowerWithGain, laws.Cubic), effects=1, workers=1)
     assert (found.verdict, found.effects, found.freed) == ("complete", (), "area"), str(found)
     assert found.parameters["area"]["refit_with"] == pytest.approx(1.3, rel=0.02)
+
+
+def test_two_wrong_values_are_told_in_place_of_a_gain_of_the_torque_and_a_curve_of_the_angle():
+    arm = Simulator(
+        lambda x, u, p: {"angle": x.speed, "speed": (u.torque - p.d * x.speed - p.weight * ca.sin(x.angle)) / p.J},
+        lambda x: {"angle": x.angle},
+        states=("angle", "speed"),
+        inputs=("torque",),
+        parameters={
+            "J": Parameter(0.024, fixed=True),
+            "weight": Parameter(1.0, fixed=True),
+            "d": Parameter(0.03, bounds=(0, 1)),
+        },
+    )
+    rng = np.random.default_rng(5)
+    torque = 0.4 * np.repeat(rng.standard_normal(80), 10)
+    r = Recording(torque, np.zeros(800), 0.01, ("torque",), ("angle",), hold="zero", initial="zero")
+    true = {"J": Parameter(0.021), "weight": Parameter(0.9), "d": Parameter(0.035)}
+    y = arm.with_parameters(true).simulate(r)
+    r = r.with_(y=y + 0.003 * np.std(y) * rng.standard_normal(y.shape))
+    found = pilfr.diagnose(arm, r, laws=(laws.PowerWithGain, laws.CubicStiffness), effects=2, workers=1)
+    assert (found.verdict, found.effects, found.freed) == ("complete", (), "J and weight"), str(found)
+    assert found.parameters["J"]["refit_with"] == pytest.approx(0.021, rel=0.02)
+    assert "with J and weight let go" in headline(found).replace("\u00a0", " ")
 
 
 def test_friction_where_no_port_is_declared_is_told_where_it_acts():

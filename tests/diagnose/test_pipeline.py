@@ -122,7 +122,7 @@ def test_an_answer_that_is_there_outlives_an_interrupt_of_what_adds_to_it(monkey
     monkeypatch.setattr(pipeline, "named_correction", lambda *given: None)
     monkeypatch.setattr(pipeline, "tones", lambda *given: ())
     monkeypatch.setattr(pipeline, "judge", lambda *given: Verdict("unexplained", "Something is missing."))
-    monkeypatch.setattr(pipeline, "find_pinned_parameter", lambda *given: None)
+    monkeypatch.setattr(pipeline, "find_pinned_parameters", lambda *given: None)
     monkeypatch.setattr(pipeline, "clipped_input", lambda *given: None)
     monkeypatch.setattr(pipeline, "mean_nrmse", lambda *given: 0.5)
     monkeypatch.setattr(pipeline, "find_undeclared_port", interrupted)
