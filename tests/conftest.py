@@ -4,13 +4,17 @@ In the background of a script Ctrl-C is ignored, by its children too; tests of i
 """
 
 import base64
+import contextlib
 import signal
 import threading
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-settings.register_profile("steady", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+# thirty examples: they are the same in every run, so that more of them would find something once only
+settings.register_profile(
+    "steady", max_examples=30, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("steady")
 if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -18,11 +22,24 @@ if threading.current_thread() is threading.main_thread() and signal.getsignal(si
 PIXEL = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNgAAAAAgABSK+kcQAAAABJRU5ErkJggg=="
 
 
-@pytest.fixture
-def blank_figures(monkeypatch):
-    """Write every figure as one pixel, for tests that read only the words of a page: drawing takes most of its time."""
+@pytest.fixture(scope="session")
+def without_drawing():
+    """Make a context that writes every figure as one pixel: drawing takes most of a page's time."""
 
     def savefig(figure, file, **options):
         file.write(base64.b64decode(PIXEL))
 
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", savefig)
+    @contextlib.contextmanager
+    def context():
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("matplotlib.figure.Figure.savefig", savefig)
+            yield
+
+    return context
+
+
+@pytest.fixture
+def blank_figures(without_drawing):
+    """Write every figure as one pixel, for tests that read only the words of a page."""
+    with without_drawing():
+        yield

@@ -1,5 +1,6 @@
 """A small rig with one law hidden in a port, its recordings, and its diagnosis filled in by hand."""
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -53,6 +54,7 @@ def as_it_stands(bench, simulator):
     return bench.fit(simulator.with_parameters(fixed))
 
 
+@functools.cache  # nothing in it can be changed
 def example(verdict="missing-physics", port="ground", law="ground", test=True, outputs=("pos",), **more):
     """A diagnosis as `diagnose` returns it, with the truth filled in by hand."""
     clean = rig(name=port if ":" not in port else "ground", outputs=outputs)

@@ -30,7 +30,11 @@ def cases():
     return [case(seed) for seed in range(30)]
 
 
-@pytest.mark.parametrize("name", list(RIGS))
+# one of each kind: bodies, a nonlinear one, two inputs, a tank, no state
+FEW = ("chain2", "pendulum", "stage", "tanks", "static")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in FEW else [pytest.mark.slow]) for n in RIGS])
 def test_without_effects_the_package_reproduces_the_truth(name):
     rig = RIGS[name]
     draw = _Draw(np.random.default_rng([5, len(name)]), 5, "none", rig)

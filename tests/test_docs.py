@@ -1,18 +1,22 @@
 """Every example ends in an assertion, every snippet of the README and of docs/ runs as printed, and the site builds."""
 
 import ast
+import importlib
 import inspect
 import json
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
 
 import pilfr_casadi as pilfr
+from pilfr_casadi.cli import main
 
 ROOT = Path(__file__).parent.parent
 DEMO = ROOT / "pilfr_casadi" / "cli" / "demo_data"
@@ -68,12 +72,33 @@ def is_long(path):
     return path.stem in LONG or (path.parent.name == "gallery" and path.stem not in QUICK_PICTURES)
 
 
+@pytest.fixture
+def script(monkeypatch, capsys):
+    """Run a script in a folder as `python SCRIPT` does, but in this process, and return the words that it prints.
+
+    A process of its own takes seconds to import the package. Modules that lie in the folder are forgotten afterwards.
+    """
+
+    def run_script(path, folder):
+        before = set(sys.modules)
+        monkeypatch.chdir(folder)
+        monkeypatch.setattr(sys, "path", [str(path.parent), *sys.path])
+        with warnings.catch_warnings():
+            warnings.simplefilter("default")
+            runpy.run_path(str(path), run_name="__main__")
+        for name in set(sys.modules) - before:
+            if Path(getattr(sys.modules[name], "__file__", None) or ROOT).is_relative_to(folder):
+                del sys.modules[name]
+        return capsys.readouterr().out
+
+    return run_script
+
+
 @pytest.mark.parametrize(
     "path", [pytest.param(p, marks=[pytest.mark.slow] if is_long(p) else [], id=p.stem) for p in EXAMPLES]
 )
-def test_example(path, tmp_path):
-    done = subprocess.run([sys.executable, path], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+def test_example(path, tmp_path, script):
+    script(path, tmp_path)
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
@@ -177,32 +202,42 @@ def test_links_lead_somewhere(name):
             assert "://" in link or (ROOT / name).parent.joinpath(link).exists(), link
 
 
-def test_python_of_the_readme(folder):
+def test_python_of_the_readme(folder, script):
     (folder / "readme.py").write_text("\n".join(snippets("python", "README.md")), encoding="utf-8")
-    said = run(["readme.py"], folder)
+    said = script(folder / "readme.py", folder)
     assert "friction" in said and (folder / "report" / "report.html").exists()
     assert (folder / "rig.json").exists()
 
 
-def test_commands_of_the_readme(folder):
+@pytest.mark.usefixtures("blank_figures")
+def test_commands_of_the_readme(folder, monkeypatch):
+    """In this process and with a short catalogue: the snippet in Python searches the whole one on the same data."""
+    few = (pilfr.laws.CubicStiffness, pilfr.laws.PreslidingFriction)
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.preparation"), "CATALOGUE", few)
+    monkeypatch.chdir(folder)
     assert commands("README.md")
     for arguments in commands("README.md"):
-        run(["-c", COMMAND, *arguments], folder)
-    assert (folder / "diagnosis" / "diagnosis.json").exists()
+        assert main(arguments) == 0
+    found = json.loads((folder / "diagnosis" / "diagnosis.json").read_text(encoding="utf-8"))
+    assert [e["law"] for e in found["effects"]] == ["coulomb_friction"]
 
 
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in EXECUTED]
 )
-def test_snippets_of_a_page(folder, name):
+def test_snippets_of_a_page(folder, name, script, monkeypatch):
     """Every page stands alone: its Python runs as one script beside the demonstration's files, then its commands."""
-    blocks, lines = snippets("python", name), commands(name)
+    blocks, lines, alone = snippets("python", name), commands(name), name not in QUICK
     if blocks:
         (folder / "page.py").write_text("\n".join(blocks), encoding="utf-8")
-        said = run(["page.py"], folder)
+        said = run(["page.py"], folder) if alone else script(folder / "page.py", folder)
         assert SAID.get(name, "") in said
+    monkeypatch.chdir(folder)
     for arguments in lines:
-        run(["-c", COMMAND, *arguments], folder)
+        if alone:
+            run(["-c", COMMAND, *arguments], folder)
+        else:
+            assert main(arguments) == 0
     assert all((folder / file).exists() for file in WRITTEN.get(name, ()))
     if name == "docs/howto/constraints.md":  # the path shows what it is for
         table = said.partition("strength  operators")[2].partition("the strongest")[0]

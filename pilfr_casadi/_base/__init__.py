@@ -37,6 +37,7 @@ if TYPE_CHECKING:
         Clock as Clock,
         deferred_interrupt as deferred_interrupt,
         handled_interrupt as handled_interrupt,
+        is_interrupt as is_interrupt,
         terminable as terminable,
         time_limit as time_limit,
         unwrapped_interrupt as unwrapped_interrupt,

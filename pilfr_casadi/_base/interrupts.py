@@ -14,15 +14,18 @@ from typing import Any
 
 
 @contextlib.contextmanager
-def deferred_interrupt() -> Iterator[None]:
-    """Defer Ctrl-C to the end of the context: for imports and short writes."""
-    if not _in_main_thread() or not callable(signal.getsignal(signal.SIGINT)):
-        yield
-        return
+def deferred_interrupt(again: bool = True) -> Iterator[list[bool]]:
+    """Defer Ctrl-C to the end of the context: for imports and short writes.
+
+    Yields a list that has an entry for each Ctrl-C. Without `again` it is only noted there.
+    """
     pressed: list[bool] = []
+    if not _in_main_thread() or not callable(signal.getsignal(signal.SIGINT)):
+        yield pressed
+        return
     with _handler(signal.SIGINT, lambda *_: pressed.append(True)):
-        yield
-    if pressed:
+        yield pressed
+    if pressed and again:
         signal.raise_signal(signal.SIGINT)
 
 
@@ -36,12 +39,16 @@ def unwrapped_interrupt() -> Iterator[None]:
     try:
         yield
     except SystemError as error:
-        cause: BaseException | None = error
-        while cause is not None and not isinstance(cause, KeyboardInterrupt):
-            cause = cause.__cause__ or cause.__context__
-        if cause is None:
+        if not is_interrupt(error):
             raise
         raise KeyboardInterrupt from error
+
+
+def is_interrupt(error: BaseException | None) -> bool:
+    """Tell whether an exception is a KeyboardInterrupt, or a SystemError that it has caused in an extension module."""
+    while isinstance(error, SystemError):
+        error = error.__cause__ or error.__context__
+    return isinstance(error, KeyboardInterrupt)
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -45,6 +45,11 @@ class Stages:
         if math.isfinite(best):
             self.best[0] = min(self.best[0], best)
         self.report(f"{self.prefix}{stage}", done, total, self.best[0])
+
+    def interrupted(self) -> None:
+        """Report that an interrupt has been handled; a progress bar would raise it again."""
+        with suppress(KeyboardInterrupt):
+            self("interrupted", 0, 0)
 
     def under(self, prefix: str) -> Stages:
         """Make a reporter for a search inside the search; it shares the smallest error."""

@@ -108,12 +108,10 @@ def _free(search: Search, names: Sequence[str], start: Fitted, enough: float) ->
     far = DECADES if without.cost >= USELESS_FIT and len(names) == 1 else ()
     starts = [start.values, *({**start.values, n: own[n].value * by} for n in names for by in far)]
     found = None
-    try:
+    with search.until_interrupted():
         found = refit(bench, starts, simulator, states=start.initial)
         if found is not None and found.cost < NEAR_RATIO**2 * enough:
             found = refit(bench, [found.values], simulator, states=found.initial, solver=THOROUGH, like=found)
-    except KeyboardInterrupt:
-        search.interrupted = True
     search.interrupted = search.interrupted or bool(bench.interrupted_fits)
     return None if search.interrupted else found
 
@@ -150,14 +148,16 @@ def find_undeclared_port(search: Search) -> Sequence[Gate]:
     open_ = replace(search.bench.simulator, ports=())
     bench = replace(search.bench, simulator=open_)
     try:
-        without = bench.fit(open_, [search.root.fitted.values], states=search.root.fitted.begin)
-        other = Search(bench, without, search.floor, search.laws, search.workers, search.say, until=search.until).run(1)
+        with search.until_interrupted():
+            without = bench.fit(open_, [search.root.fitted.values], states=search.root.fitted.begin)
+            search_there = Search(bench, without, search.floor, search.laws, search.workers, search.say)
+            other = replace(search_there, until=search.until).run(1)
+            search.interrupted = other.interrupted
     except InputError:
         return ()
-    except KeyboardInterrupt:
-        search.interrupted = True
+    if search.interrupted:
         return ()
-    search.interrupted, found = other.interrupted, posterior(other)
+    found = posterior(other)
     if found.sure <= SURE or not found.effects[0].name[0].startswith("equation:"):
         return ()
     state, law = found.effects[0].name[0].removeprefix("equation:"), found.effects[0].name[1]
@@ -176,13 +176,11 @@ def find_varying_values(search: Search) -> tuple[Gate, ...]:
     bench, whole = search.bench, search.root.fitted
     if search.interrupted or not np.any(whole.model.parameters.free):
         return ()
-    try:
+    with search.until_interrupted():
         for groups, where in ((_by_recording(bench, whole), "the recordings"), (_by_half(bench, whole), "the halves")):
             found = _compare_groups(search, groups, where) if len(groups) > 1 else None
             if found is not None:
                 return (found,)
-    except KeyboardInterrupt:
-        search.interrupted = True
     return ()
 
 

@@ -42,7 +42,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, Stages, one_blas_thread, processors, whole
+from .._base import InputError, Progress, Stages, deferred_interrupt, one_blas_thread, processors, whole
 from ..data import Recording
 from ..identify import surrogate_warning
 from ..laws import Law, display_name, readable_unit
@@ -174,12 +174,14 @@ def diagnose_in_steps(
         with search.stage("fits to all recordings"):
             everything = Everything.of(search, request.stretches, ready.gates)
         request = replace(request, notes=(request.stretches.note(everything is not None), *request.notes))
-    with search.stage("conclusion"):
-        found = conclude(search, (*request.notes, *ready.gates))
+    found = _concluded(search, (*request.notes, *ready.gates))
     if found.verdict.kind == "unexplained" and request.focus is None and not (search.interrupted or search.out_of_time):
-        found = _name_in_predictions(request, search, found)
+        with search.until_interrupted():
+            found = _name_in_predictions(request, search, found)
     final = _final_fits(request, ready, search, found, everything)
-    return _build_diagnosis(request, ready, search, found, final, tests, limits, began)
+    with deferred_interrupt(again=False) as pressed:
+        built = _build_diagnosis(request, ready, search, found, final, tests, limits, began)
+    return replace(built, interrupted=built.interrupted or bool(pressed))
 
 
 def _on_stretches(request: Request, most: int) -> Request:
@@ -219,10 +221,15 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
     if search.interrupted or not search.other_hold_fits_better():
         return ready, search
     hold = search.bench.with_other_hold().hold
+    found: tuple[Prepared, Search] | None = None
     try:
-        other, again = _search(replace(request, hold=hold, say=request.say.under("other hold: ")))
+        with search.until_interrupted():
+            found = _search(replace(request, hold=hold, say=request.say.under("other hold: ")))
     except InputError:  # the simulator cannot be run with this hold
         return ready, search.resume(request.most_effects)
+    if found is None:  # interrupted before the other search began
+        return ready, search
+    other, again = found
     only_refitted = again.interrupted and len(again.memo) < 2
     if again.best.mean_square > search.best.mean_square or only_refitted:
         search.interrupted = again.interrupted
@@ -237,7 +244,12 @@ def _search(request: Request) -> tuple[Prepared, Search]:
     seemed_early = any(g.finding == "alignment" and g.value < 0 for g in ready.gates)
     if not seemed_early or search.interrupted or search.out_of_time or not search.can_improve(search.best):
         return ready, search
-    other, again = _search_once(request, shift_early=False)
+    found: tuple[Prepared, Search] | None = None
+    with search.until_interrupted():
+        found = _search_once(request, shift_early=False)
+    if found is None:
+        return ready, search
+    other, again = found
     if again.best.mean_square < AS_GIVEN_RATIO * search.best.mean_square:
         return other, again
     search.interrupted = again.interrupted
@@ -282,6 +294,13 @@ def _noise(request: Request, ready: Prepared) -> Floor:
     if not request.stand_in_error:
         return floor
     return floor.beside(request.stand_in_error * ready.bench.scale)
+
+
+def _concluded(search: Search, gates: Sequence[Gate]) -> Conclusion:
+    """Draw the conclusion; after an interrupt, draw it without further fits."""
+    with search.until_interrupted(), search.stage("conclusion"):
+        return conclude(search, gates)
+    return conclude(search, gates)
 
 
 def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
@@ -364,8 +383,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
     search.interrupted = leading.interrupted
     if leading.interrupted:
         return found
-    with leading.stage("conclusion"):
-        named = conclude(leading, ())
+    named = _concluded(leading, ())
     best = posterior(leading).best
     if named.verdict.kind != "missing-physics" or {e.name for e in named.effects} != names(best):
         return found
@@ -417,10 +435,11 @@ def _final_fits(
     """Return the fits that the answer states: those of the search, or fits to everything if it ran on stretches."""
     bench, without, after = search.bench, search.root.fitted, found.fitted
     if found.effects and not np.isfinite(found.correction.after):  # a held-out comparison chose what it compared
-        after = without_idle_offsets(bench, after)
+        with search.until_interrupted():
+            after = without_idle_offsets(bench, after)
     if everything is None:
         if not search.interrupted:
-            with search.stage("convergence"):
+            with search.until_interrupted(), search.stage("convergence"):
                 after = converge(bench, after, request.deadline - time.perf_counter())
         return FinalFits(bench, without, after, ready.nominal, (without, after))
     with search.stage("fits to all recordings"):

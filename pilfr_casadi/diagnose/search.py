@@ -19,7 +19,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from .._base import InputError, Stages, side_by_side
+from .._base import InputError, Stages, is_interrupt, side_by_side
 from ..laws import FINER, Law
 from ..simulators import Placed, Simulator
 from .evidence import (
@@ -286,15 +286,18 @@ class Search:
     def run(self, effects: float) -> Search:
         """Search for up to `effects` effects; an interrupt ends the search with the present results."""
         self.keep(Trial((), self.without, self.without.cost, self.without.cost, True))
-        try:
+        with self.until_interrupted():
             self._estimate_noise()
             if self._grow(effects) and self._name_rest(effects):
                 self._every_sensor()
                 self._judge_on_held_out_data()
-        except KeyboardInterrupt:
-            self.interrupted = True
+        if self.interrupted:
             self._forget_held_out()
         return self
+
+    def until_interrupted(self) -> UntilInterrupted:
+        """Make a context that an interrupt ends, so that the answer rests on what was found before it."""
+        return UntilInterrupted(self)
 
     def resume(self, effects: float) -> Search:
         """Continue with the present hold because the other is no better, unless the search was interrupted."""
@@ -570,6 +573,24 @@ class Search:
             named |= simulator.elements[-1].named(e.own(joint.fitted.values))
         fitted = self.bench.run(simulator, named, joint.fitted.begin)
         return Trial(fitted.last_elements(len(laws)), fitted, fitted.cost, fitted.cost)
+
+
+@dataclass(frozen=True)
+class UntilInterrupted:
+    """A context that an interrupt ends; the search is marked as interrupted then."""
+
+    search: Search
+
+    def __enter__(self) -> None:
+        """Do nothing."""
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
+        """Catch an interrupt, and nothing else."""
+        caught = is_interrupt(error)
+        if caught:
+            self.search.interrupted = True
+            self.search.say.interrupted()
+        return caught
 
 
 def likeliest(trials: Sequence[Trial], evidence: Callable[[Trial], float]) -> list[Trial]:

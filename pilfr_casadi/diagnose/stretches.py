@@ -318,11 +318,10 @@ class Everything:
         leading = [t for t in likeliest(list(search.memo.values()), search.evidence) if t.laws][:FEW]
         trials = [search.root, *leading]
         limit = _seconds_left(search) / 2  # the rest is for the simulators that the conclusion adds
-        try:
+        fits = list[Fitted]()
+        with search.until_interrupted():
             fits = side_by_side(lambda t: fit_to_all(whole, t.fitted, limit), trials, search.workers)
-        except KeyboardInterrupt:
-            search.interrupted = True
-            fits = [fit_to_all(whole, t.fitted, 0.0) for t in trials]
+        fits = fits or [fit_to_all(whole, t.fitted, 0.0) for t in trials]
         search.interrupted = search.interrupted or bool(whole.interrupted_fits)
         if not fits[0].cost < DIVERGED:
             return None

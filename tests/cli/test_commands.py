@@ -28,11 +28,11 @@ def train(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory):
+def fitted(tmp_path_factory, without_drawing):
     """A folder with recordings, the model of `pilfr fit` in out/, and its words in said.txt."""
     folder = tmp_path_factory.mktemp("fitted")
     train, test = write_csv(folder / "train.csv"), write_csv(folder / "test.csv", seed=1)
-    with (folder / "said.txt").open("w") as said, contextlib.redirect_stdout(said):
+    with (folder / "said.txt").open("w") as said, contextlib.redirect_stdout(said), without_drawing():
         assert main([str(a) for a in fit_arguments(train, folder, "--test", test)]) == 0
     return folder
 
@@ -232,7 +232,7 @@ def test_messages_name_options_of_the_command_line(capsys, tmp_path, train, monk
     t[300] += 3e-4
     write_csv(path, t=t)
     refused(capsys, *fit_arguments(path, tmp_path), says="--time-tolerance STEPS")
-    assert run(capsys, *fit_arguments(path, tmp_path, "--time-tolerance", 0.1))[0] == 0
+    assert run(capsys, *fit_arguments(path, tmp_path, "--operators", 0, "--time-tolerance", 0.1))[0] == 0
     periodic = [a if a != "zero" else "periodic" for a in fit_arguments(train, tmp_path, "--overwrite")]
     refused(capsys, *periodic, says="--period SAMPLES")
     monkeypatch.setattr("pilfr_casadi.engine.compiled.compiler", lambda: None)

@@ -16,7 +16,16 @@ from scipy.integrate import solve_ivp
 
 from pilfr_casadi import multisine
 from pilfr_casadi.cli.demo import diagnose_rig
-from pilfr_casadi.laws import CubicStiffness, Saturation, display_name
+from pilfr_casadi.laws import (
+    Backlash,
+    CoulombFriction,
+    CubicStiffness,
+    Delay,
+    Power,
+    PreslidingFriction,
+    Saturation,
+    display_name,
+)
 
 RIG = """
 from pilfr_casadi import Parameter, Port, Simulator
@@ -70,6 +79,16 @@ def truth():
 
 
 @pytest.fixture
+def catalogue(monkeypatch):
+    """Shorten the catalogue to some laws; the README's snippet and many slow tests search the whole one."""
+
+    def shorten(*laws):
+        monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.preparation"), "CATALOGUE", laws)
+
+    return shorten
+
+
+@pytest.fixture
 def files(tmp_path, truth):
     (tmp_path / "rig.py").write_text(RIG)
     for name, data in truth.items():
@@ -93,7 +112,9 @@ def arguments(folder, *more, simulator="rig.py", train="train.csv", test="test.c
     )
 
 
-def test_a_whole_diagnosis(capsys, files):
+@pytest.mark.usefixtures("blank_figures")
+def test_a_whole_diagnosis(capsys, files, catalogue):
+    catalogue(Backlash, CoulombFriction, CubicStiffness, Delay, Power, Saturation)
     given = arguments(files, "--hold", "zero", "--initial", "zero")
     status, out, err = run(capsys, *given)
     assert status == 0 and "pilfr: " not in err
@@ -206,7 +227,8 @@ def test_recordings_that_do_not_fit_each_other(capsys, files, truth):
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_what_a_simulation_answered_stands_in_for_it(capsys, files):
+def test_what_a_simulation_answered_stands_in_for_it(capsys, files, catalogue):
+    catalogue(CubicStiffness, Saturation)
     write_csv(files / "simulated.csv", *rig(5, m=1200, k=95.0, cubic=0.0))
     status, out, err = run(capsys, *arguments(files, "--hold", "zero", "--initial", "zero", simulator=None))
     assert status == 0 and "pilfr: " not in err
@@ -287,16 +309,14 @@ def test_a_column_that_the_recordings_have_not_is_told(capsys, files, truth, mon
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_a_saved_model_is_diagnosed_to_the_end(capsys, files, truth, monkeypatch):
+def test_a_saved_model_is_diagnosed_to_the_end(capsys, files, truth, catalogue):
     """A fitted PI-LFR in place of a simulator file: its matrices are parameters of the simulator."""
     names = ("--inputs", "force", "--outputs", "position", "--nx", 2, "--operators", 0)
     assert run(capsys, "fit", files / "train.csv", *names, "--out", files / "fit")[0] == 0
     for name in ("train", "test"):
         force, position = truth[name]
         write_csv(files / f"{name}.csv", force[:300], position[:300])
-    monkeypatch.setattr(
-        importlib.import_module("pilfr_casadi.diagnose.preparation"), "CATALOGUE", (CubicStiffness, Saturation)
-    )
+    catalogue(CubicStiffness, Saturation)
     given = arguments(files, "--hold", "zero", "--initial", "zero", simulator="fit/model.json")
     status, out, err = run(capsys, *given)
     assert status == 0 and "the simulator's own values, refitted" in out, out + err
@@ -329,7 +349,8 @@ def test_a_saved_model_is_diagnosed_like_a_simulator(capsys, files, monkeypatch)
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_the_demonstration_finds_what_its_rig_hides(capsys, tmp_path):
+def test_the_demonstration_finds_what_its_rig_hides(capsys, tmp_path, catalogue):
+    catalogue(CubicStiffness, PreslidingFriction)
     assert diagnose_rig(tmp_path / "diagnosis", 1) == 0
     assert "Coulomb friction at ground-m2" in capsys.readouterr().out
     found = json.loads((tmp_path / "diagnosis" / "diagnosis.json").read_text())

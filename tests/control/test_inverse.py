@@ -14,7 +14,7 @@ from pilfr_casadi.control import analyse_response, feedforward, inverse_element,
 from pilfr_casadi.models import play
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     st.lists(st.floats(0, 3), min_size=1, max_size=6),
     st.integers(0, 10**6),

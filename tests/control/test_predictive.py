@@ -264,7 +264,7 @@ def test_a_rate_of_one_input_holds_where_the_other_has_none(square, solver):
     assert plan.converged and moves[0] <= 0.2 + 1e-6 and moves[1] > 0.5
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.floats(-3, 3), st.lists(st.floats(-20, 20), min_size=2, max_size=4), st.floats(0.05, 1.0), st.floats(-20, 20))
 def test_rates_and_limits_hold_whatever_was_applied_before(x, befores, rate, level):
     """Also where the last plan was not followed, as under a manual mode."""

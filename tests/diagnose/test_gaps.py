@@ -39,6 +39,7 @@ def looked(*train):
     return [len(r) for r in found.bench.recordings], found.gates
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_gap_is_a_fault_of_the_recording(tmp_path):
     (r,) = recordings(count=1)
     found = pilfr.diagnose(rig(OFF), lost(r, 1100).with_(name="run"), test=recordings(seed=5, count=1))

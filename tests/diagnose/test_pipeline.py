@@ -12,6 +12,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, laws
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import pipeline
+from pilfr_casadi.diagnose.search import UntilInterrupted
 from pilfr_casadi.diagnose.verdict import Verdict
 
 
@@ -46,6 +47,9 @@ def test_what_seems_early_beside_something_unexplained_is_searched_as_it_is(monk
         def can_improve(self, trial):
             return True
 
+        def until_interrupted(self):
+            return UntilInterrupted(self)
+
     def prepare(*given, early, say):
         early_or_not.append(early)
         bench = SimpleNamespace(scale=np.ones(1))
@@ -68,6 +72,9 @@ class Searched:
 
     def other_hold_fits_better(self):
         return True
+
+    def until_interrupted(self):
+        return UntilInterrupted(self)
 
     def resume(self, effects):
         return self

@@ -87,6 +87,7 @@ def test_the_engines_agree_on_predictions_and_their_slopes(machine, substeps):
     assert np.allclose(*runs, rtol=0, atol=1e-10)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_friction_in_an_unstable_machine_is_named_and_a_complete_simulator_is_too(machine, tmp_path):
     laws = (CoulombFriction, CubicStiffness, Saturation)
     found = pilfr.diagnose(levitation(30.0, 1.0), machine[0], test=machine[1], laws=laws, workers=1)

@@ -281,7 +281,7 @@ JUNK = (None, True, -1, 0, 3, 1e308, 10**400, "", "x", "inf", [], {}, [[1.0]], [
 
 
 @given(st.data())
-@settings(max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_tampered_file_loads_or_is_one_sentence(tmp_path, data):
     case = data.draw(st.sampled_from(["generalized play", "stops, two channels", "linear"]))
     if not (tmp_path / case).exists():
@@ -366,7 +366,7 @@ def loads_the_same_or_refuses(written, text, name="tampered.json"):
 
 
 @given(st.data())
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_character_changed_is_refused_or_changes_nothing(written, data):
     text = bytearray(written.read_bytes())
     for _ in range(data.draw(st.integers(1, 3))):
@@ -394,7 +394,7 @@ def test_every_digit_of_the_numbers_counts(written):
 
 
 @given(st.data())
-@settings(max_examples=75, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_key_out_and_any_value_changed_is_refused(written, data):
     content = json.loads(written.read_text())
     path = data.draw(st.sampled_from([p for p in leaves(content) if p]))

@@ -51,7 +51,7 @@ def search():
     return StartSearch(FitContext(train, DEFAULT_SOLVER, stability(model)), model, blocks, start="paper")
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (1, 2))])
 def test_the_papers_start_is_polished(search, seed):
     sequence = np.random.SeedSequence(seed)
     inputs = [r.u for r in search.context.recordings]
@@ -124,9 +124,13 @@ def test_the_first_starts_place_the_element(search, monkeypatch):
     assert places == ["output", "input", "random", "random"]
 
 
+@pytest.fixture(scope="module")
+def candidate(search):
+    return explore(replace(search, start="grid"), 0, np.random.SeedSequence(0))
+
+
 @pytest.mark.parametrize("last", [1, 2, 3])
-def test_an_interrupted_polish_ends_with_the_best(search, monkeypatch, last):
-    candidate = explore(replace(search, start="grid"), 0, np.random.SeedSequence(0))
+def test_an_interrupted_polish_ends_with_the_best(search, candidate, monkeypatch, last):
     errors = []
 
     class Struck:

@@ -35,7 +35,7 @@ def full(record):
     return pilfr.fit(pilfr.hammerstein(1, pilfr.PrandtlIshlinskii(pilfr.Play, 6)), record, starts=2)
 
 
-@pytest.mark.parametrize("bound", [0.9, 0.8, 0.79, 0.6, 0.3])
+@pytest.mark.parametrize("bound", [0.9, 0.6, *(pytest.param(b, marks=pytest.mark.slow) for b in (0.8, 0.79, 0.3))])
 def test_a_bound_on_the_radius_holds_to_the_last_digit(record, bound):
     fit = pilfr.fit(pilfr.PILFR(2, PLAYS), record, starts=1, stable=bound)
     assert radius(fit) <= bound
@@ -122,6 +122,7 @@ def test_a_known_gain_and_its_multiplier(record):
     assert limit.multiplier == pytest.approx(slope, rel=0.1)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_at_a_kink_multipliers_are_not_known(record, tmp_path):
     """The last step's are those of its damping: they are told in no print, file or report."""
     fit = pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=1, constraints=dc_gain(1.1))

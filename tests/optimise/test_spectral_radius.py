@@ -77,7 +77,7 @@ def test_derivatives_of_the_rows(record):
     assert schur.cost(x) == problem.cost(x[: problem.size])
 
 
-@pytest.mark.parametrize("bound", [0.79, 0.6, 0.3])
+@pytest.mark.parametrize("bound", [0.6, *(pytest.param(b, marks=pytest.mark.slow) for b in (0.79, 0.3))])
 def test_no_feasible_point_nearby_is_better(record, bound):
     """SLSQP, which knows the bound by trace and determinant alone, finds nothing better from there, nor by chance."""
     fit = pilfr.fit(pilfr.PILFR(2), record, stable=bound, solver=FINE)
@@ -108,7 +108,10 @@ def test_no_feasible_point_nearby_is_better(record, bound):
     assert len(near) > 100 and min(problem.cost(x * size) for x in near) >= best * (1 - 1e-6)
 
 
-@pytest.mark.parametrize("bound, reached", [(0.95, 0.2950), (0.8, 0.3955), (0.5, 0.5338)])
+@pytest.mark.parametrize(
+    "bound, reached",
+    [(0.95, 0.2950), *(pytest.param(*v, marks=pytest.mark.slow) for v in ((0.8, 0.3955), (0.5, 0.5338)))],
+)
 def test_poles_that_meet_on_the_bound(demo, bound, reached):
     """Two pairs and a real pole, or five equal ones, at the bound; the figures come from Schur coordinates alone.
 
@@ -175,7 +178,8 @@ def test_a_bound_where_a_is_known(record):
 
 
 def test_the_seed_of_starts_that_are_not_drawn(record):
-    few, more = (pilfr.fit(pilfr.PILFR(1, PLAYS), record, starts=n) for n in (2, 3))
+    quick = pilfr.GaussNewton(max_iterations=2)
+    few, more = (pilfr.fit(pilfr.PILFR(1, PLAYS), record, starts=n, solver=quick) for n in (2, 3))
     assert "the seed has no effect" in str(few) and "the seed has no effect" not in str(more)
 
 

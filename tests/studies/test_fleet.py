@@ -40,10 +40,10 @@ def days():
 
 
 @pytest.fixture(scope="module")
-def found(days, tmp_path_factory):
+def found(days, tmp_path_factory, without_drawing):
     """The fleet and its folder; the pages of single diagnoses take long and are tested elsewhere."""
     folder = tmp_path_factory.mktemp("fleet") / "out"
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, without_drawing():
         patch.setattr(report, "diagnosis_page", lambda diagnosis: Page(diagnosis.verdict, ()))
         return pilfr.fleet(rig(), days, **OPTIONS, workers=1, out=folder), folder
 
@@ -107,6 +107,7 @@ def test_the_folder_holds_table_content_and_page(found):
     assert str(read_fleet(folder, rig(), laws=LAWS)) == str(fleet)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_report_elsewhere_is_complete(found, tmp_path):
     fleet, folder = found
     fleet.report(tmp_path / "copy")
@@ -114,6 +115,7 @@ def test_a_report_elsewhere_is_complete(found, tmp_path):
     assert contents(tmp_path / "copy") == {k: v for k, v in whole.items() if k != "manifest.json"}
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_what_is_missing_is_done_again_and_nothing_else(found, days, tmp_path, monkeypatch):
     _, folder = found
     copy = tmp_path / "copy"
