@@ -81,6 +81,9 @@ EXPLAINED_NOISE = 0.01  # largest share of noise that a force may explain
 EXPLAINED_QUIET_NOISE = 0.05  # the same of noise that does not matter
 LEAST_EXPLAINED = 0.1  # least share of a residual that a flexible force has to explain to count
 
+LEAST_KNOWN = 1e-12  # eigenvalue of the scaled information, over the largest, below which a combination is unknown
+UNKNOWN_SHARE = 1e-6  # squared share of a parameter in an unknown combination; rounding gives far less
+
 # Held-out data
 FOLDS, ROUNDS = 4, 2  # folds, and blocks of a recording in each fold: eight blocks, spread over the recording
 LEAD_SHARE = 0.5  # share of a block that is never held out at the start of a recording: it determines the initial state
@@ -184,7 +187,8 @@ def _hessian(bench: Workbench, fitted: Fitted) -> tuple[Problem, np.ndarray, np.
 def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
     """Compute standard errors from the residual and its correlation time; nan for fixed parameters and at bounds.
 
-    Initial states are estimated together with the parameters.
+    Initial states are estimated together with the parameters. Parameters that can be identified only together, such as
+    the damping of a law beside the simulator's own, have none either.
     """
     full = np.full(fitted.model.parameters.size, np.nan)
     if not np.any(fitted.model.parameters.free):
@@ -193,10 +197,12 @@ def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
     inside, diagonal = (theta > problem.lower) & (theta < problem.upper), np.diag(hessian)
     kept = np.flatnonzero(inside & np.isfinite(diagonal) & (diagonal > 0))
     size = np.sqrt(np.maximum(diagonal[kept], 1e-300))
-    scaled = hessian[np.ix_(kept, kept)] / np.outer(size, size)
-    matrix = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) / np.outer(size, size)
+    values, vectors = np.linalg.eigh(hessian[np.ix_(kept, kept)] / np.outer(size, size))
+    known = values > LEAST_KNOWN * values[-1:]
+    variance = np.sum(vectors[:, known] ** 2 / values[known], axis=1)
+    variance[np.sum(vectors[:, ~known] ** 2, axis=1) > UNKNOWN_SHARE] = np.nan
     own, n = kept < problem.n_free, max(effective_size(fitted.residual), 10.0)
-    full[np.flatnonzero(problem.free)[kept[own]]] = np.sqrt(np.maximum(np.diag(matrix)[own] * fitted.cost / n, 0))
+    full[np.flatnonzero(problem.free)[kept[own]]] = np.sqrt(variance[own] * fitted.cost / n) / size[own]
     return fitted.model.parameters.unpack(full)
 
 

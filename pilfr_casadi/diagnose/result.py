@@ -489,7 +489,9 @@ def _effect_lines(e: Effect) -> list[str]:
         symbols = "where u or z is the signal, and w is added to it"
     else:
         local = "v the speed" if re.search(r"\bv\b", e.equation) else "z the local coordinate"
-        symbols = f"where w is the force and {local} at the port"
+        kind, _, state = e.port.partition(":")
+        what = f"subtracted from the derivative of {state}" if kind == "equation" and state else "the force"
+        symbols = f"where w is {what} and {local} at the port"
     lines = [
         f"{display_name(e.law)}{form} at {e.port}, confidence {e.confidence:.2f}",
         f"  {e.sentence}: {e.equation}",

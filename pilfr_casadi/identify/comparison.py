@@ -22,7 +22,7 @@ from .._base import InputError, later
 from ..data import Recording, as_recordings, rmse_per_output
 from ..engine import Engine, make_engine
 from ..models import Model
-from ..optimise import estimate_initial_state, samples_for_state
+from ..optimise import estimate_initial_state, samples_to_start
 from ..simulators import Simulator, as_simulator, choose_substeps, discretise
 from .result import Fit, match_channels
 
@@ -219,7 +219,7 @@ def run_free(
         First scored sample: the part that the state is fitted to is left out, unless that is the whole recording.
     """
     estimated = recording.begins == "estimate" and model.n_state > 0
-    used = min(samples_for_state(model), len(recording) // 3) if estimated else 0
+    used = samples_to_start(model, engine, recording) if estimated else 0
     with np.errstate(all="ignore"):
         try:
             state = estimate_initial_state(model, engine, recording, used or None, starts=starts)

@@ -105,7 +105,7 @@ def _scaled(base: Any, by: str) -> Any:
 
     class Scaled(base):
         form = f"{base.form}, scaled by {by}".removeprefix(", ")
-        equation = f"w = {by} v,  {base.equation.replace('w =', 'v =', 1)}"
+        equation = f"w = {by} f,  {base.equation.replace('w =', 'f =', 1)}"
         sentence = f"{base.sentence}; {by} scales its strength"
         units, strength = strengths, base.strength
         places = ("parallel",)

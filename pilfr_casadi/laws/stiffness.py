@@ -55,6 +55,7 @@ class PowerStiffness(CubicStiffness):
 
     form = "power"
     equation = "w = k_n sign(z) |z|^n"
+    sentence = "a force that grows with a power of the deflection, the same in both directions"
     units = {"k_n": "w/z^n", "n": ""}
     domains = ("mechanical", "fluid")
     starts = {"n": ("", 2.0, 2.5, 4.0)}

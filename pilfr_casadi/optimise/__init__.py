@@ -36,7 +36,11 @@ if TYPE_CHECKING:
         GaussNewton as GaussNewton,
         unconstrained_step as unconstrained_step,
     )
-    from .initial_state import estimate_initial_state as estimate_initial_state, samples_for_state as samples_for_state
+    from .initial_state import (
+        estimate_initial_state as estimate_initial_state,
+        samples_for_state as samples_for_state,
+        samples_to_start as samples_to_start,
+    )
     from .ipopt import Ipopt as Ipopt
     from .problem import Problem as Problem, check_weights as check_weights
     from .solution import (

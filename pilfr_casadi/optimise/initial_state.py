@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from .._base import InputError
 from ..data import Recording
 from ..engine import Engine
 from ..models import Model
@@ -18,12 +19,58 @@ from .problem import STATE_NOISE, Penalties, Problem, state_precision
 from .steady_state import steady_state
 
 STATE_ROUNDS = 20  # solves for a first state, at most, each with a wider prior
+SAMPLES_PER_STATE = 10  # an estimate from so many adds a tenth of the noise's mean square to the run
+LEAST_INFORMATION = 1e-9  # singular value, over the largest, below which a direction of the state moves no output
 LARGEST_STATE = 1.1  # mean square of a first state, in units of its prior, above which the prior is widened
 
 
 def samples_for_state(model: Model) -> int:
-    """Return the number of samples that an unknown initial state is fitted to: ten per state, at least 50."""
-    return max(10 * model.n_state, 50)
+    """Return the least number of samples that an unknown initial state is fitted to: ten per state, at least 50."""
+    return max(SAMPLES_PER_STATE * model.n_state, 50)
+
+
+def samples_to_start(model: Model, engine: Engine, recording: Recording) -> int:
+    """Choose how many leading samples an unknown initial state is fitted to, up to a third of the recording.
+
+    Ten samples per state are enough where all inform alike: the estimate's error then adds a tenth of the noise's mean
+    square to the rest of the run. A slow or lightly damped mode is hardly seen in few samples, and its error rings on.
+    With `H` and `H'` the information of the head and of the rest (n' residuals) on the state, the error adds
+    `tr(H^-1 H') / n'` of the noise; the head is doubled until that is at most a tenth.
+    """
+    least, most = samples_for_state(model), len(recording) // 3
+    if least >= most or not model.n_state:
+        return min(least, most)
+    jacobian = _slope_by_state(model, engine, recording)
+    if not np.all(np.isfinite(jacobian)):  # the run diverges
+        return least
+    used, rows = least, jacobian.shape[0] // len(recording)
+    while used < most:
+        head, rest = jacobian[: used * rows], jacobian[used * rows :]
+        size = np.maximum(np.linalg.norm(head, axis=0), 1e-300)
+        inverse = np.linalg.pinv(head / size, rcond=LEAST_INFORMATION)
+        added = float(np.sum((rest / size @ inverse) ** 2)) / len(rest)
+        if added <= 1 / SAMPLES_PER_STATE:
+            break
+        used = min(2 * used, most)
+    return used
+
+
+def _deviations(recording: Recording) -> np.ndarray:
+    """Compute the outputs' standard deviations; that of another output where one is constant."""
+    spread = np.std(recording.y, axis=0)
+    return np.where(spread > 0, spread, np.max(spread) or 1.0)
+
+
+def _slope_by_state(model: Model, engine: Engine, recording: Recording) -> np.ndarray:
+    """Compute the slope of the outputs, over their deviations, by the initial state in a run from rest, (M n_y, n)."""
+    fixed = model.parameters.change(**{k: {"fixed": True, "prior": None} for k in model.parameters})
+    whole = recording.with_(skip=0, initial="estimate", period=None)
+    problem = Problem(model.with_parameters(fixed), whole, engine=engine, scale=_deviations(recording))
+    try:
+        with np.errstate(all="ignore"):
+            return np.asarray(problem.jacobian(problem.start))
+    except (InputError, RuntimeError, FloatingPointError):
+        return np.full((1, 1), np.nan)
 
 
 def estimate_initial_state(
@@ -48,8 +95,7 @@ def estimate_initial_state(
     if recording.begins != "estimate" or not n:
         return state
     head = recording.slice(0, max(min(len(recording), samples or samples_for_state(model)), 2)).with_(skip=0)
-    spread = np.std(head.y, axis=0)
-    spread = np.where(spread > 0, spread, np.max(spread) or 1.0)
+    spread = _deviations(head)
     fixed = model.parameters.change(**{k: {"fixed": True, "prior": None} for k in model.parameters})
     problem, solver = (
         Problem(model.with_parameters(fixed), head, engine=engine, scale=spread),
