@@ -251,7 +251,8 @@ def refit_learned(bench: Workbench, found: Fitted) -> Fitted:
     fitted = bench.fit(placed, [found.values], states=found.initial, model=model, engine=engine)
     z, dz, _ = signals_along(bench, fitted)
     seen = {f"{placed.elements[-1].prefix}{k}": np.array(v) for k, v in _ranges(EXTENSION, z=z, v=dz).items()}
-    return bench.result(placed, {**fitted.values, **seen}, fitted.initial, engine, model)
+    whole = bench.result(placed, {**fitted.values, **seen}, fitted.initial, engine, model)
+    return replace(whole, status=fitted.status)
 
 
 def signals_along(bench: Workbench, fitted: Fitted, number: int = -1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -150,8 +150,8 @@ def find_undeclared_port(search: Search) -> Sequence[Gate]:
     try:
         with search.until_interrupted():
             without = bench.fit(open_, [search.root.fitted.values], states=search.root.fitted.begin)
-            search_there = Search(bench, without, search.floor, search.laws, search.workers, search.say)
-            other = replace(search_there, until=search.until).run(1)
+            there = Search(bench, without, search.floor, search.laws, search.workers, search.say, until=search.until)
+            other = there.run(1)
             search.interrupted = other.interrupted
     except InputError:
         return ()

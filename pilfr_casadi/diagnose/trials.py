@@ -178,6 +178,7 @@ class Trials:
         whole = found
         if self.part is not self.bench:
             whole = self.bench.result(found.simulator, found.values, found.initial, found.engine, found.model)
+            whole = replace(whole, status=found.status)
         return Trial(found.last_elements(count), whole, found.cost, whole.cost if np.isfinite(whole.cost) else np.inf)
 
     def polish(self, trial: Trial) -> Trial:

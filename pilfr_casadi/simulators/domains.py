@@ -55,7 +55,7 @@ _UNITS: dict[str, tuple[int, int, int, int, int]] = {
     "%": (0, 0, 0, 0, 0),
     "rpm": (0, 0, -1, 0, 0),
 }
-_ANGLES = {"rad", "mrad", "deg", "rpm"}  # units that occur in mechanics alone
+_ANGLES = {"rad", "deg", "rpm"}  # units that occur in mechanics alone
 _PREFIXES = "pnuµμmcdhkMG"
 
 # domains of the dimensions that are neither thermal nor electrical; others may be anything
@@ -118,7 +118,8 @@ def _allowed_domains(unit: str) -> tuple[str, ...]:
     size = _dimension(unit)
     if size is None:
         return DOMAINS
-    if _ANGLES & set(re.findall(r"[^\s*/·^()\d-]+", unit)):
+    symbols = re.findall(r"[^\s*/·^()\d-]+", unit)
+    if any(s in _ANGLES or (s[0] in _PREFIXES and s[1:] in _ANGLES) for s in symbols):
         return ("mechanical",)
     if size[4]:
         return ("thermal",)
