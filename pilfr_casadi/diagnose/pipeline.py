@@ -59,7 +59,7 @@ from .correction import find_correction, named_correction
 from .evidence import AS_GIVEN_RATIO, SURE
 from .floor import Floor, measured_floor
 from .gates import USELESS_FIT, Gate, Offset, offset_gates, without_idle_offsets
-from .other_explanations import find_pinned_parameters, find_undeclared_port, find_varying_values
+from .other_explanations import find_pinned_parameters, find_undeclared_port, find_untried_laws, find_varying_values
 from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
 from .preparation import CHECKS, Prepared, hold_note, prepare
 from .proof import errors_of, mean_nrmse
@@ -273,7 +273,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
             zeros = offset_gates(answer.best.laws, answer.best.fitted.values)
             return Conclusion(Verdict(verdict.kind, said), (*gates, *zeros), fitted, correction, answer.effects)
     if verdict.kind == "unexplained" and finished:
-        gates = (*gates, *find_undeclared_port(search), *find_varying_values(search))
+        gates = (*gates, *find_undeclared_port(search), *find_untried_laws(search), *find_varying_values(search))
     refitted = search.root.fitted
     if interrupted and verdict.kind != "recording-fault":
         sentence = (
