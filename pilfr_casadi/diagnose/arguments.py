@@ -11,7 +11,7 @@ import numpy as np
 from .._base import InputError, Stages, listed
 from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
 from ..identify import match_channels
-from ..laws import CATALOGUE, SCALABLE, Law, scaled, scheduled
+from ..laws import CATALOGUE, SCALABLE, Law, LinearStiffness, ViscousDamping, scaled, scheduled
 from ..simulators import Simulator, as_simulator
 from .gates import Gate
 from .stretches import Stretches
@@ -92,11 +92,14 @@ def check_laws(laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
 def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[type[Law], ...]:
     """Return the laws, and versions of some of them whose strength varies with a signal.
 
-    An input that the equations do not read may scale a law; with a port's own signals its strength may vary.
+    An input that the equations do not read may scale a law. A spring or damper of the simulator's own may vary with the
+    time, an input, or a port's own signal. Other laws are found first, and then let vary (`Search`).
     """
-    some, own = [law for law in SCALABLE if law in laws], {name for port in simulator.ports for name in port.signals}
-    by_input = (scaled(law, by) for law in some for by in simulator.idle_inputs)
-    return (*laws, *by_input, *(scheduled(law, by) for law in some for by in sorted(own)))
+    by_input = [scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs]
+    read = [name for name in simulator.inputs if name not in simulator.idle_inputs]
+    signals = ["t", *read, *sorted({name for port in simulator.ports for name in port.signals})]
+    varying = [scheduled(law, by) for law in (LinearStiffness, ViscousDamping) if law in laws for by in signals]
+    return (*laws, *by_input, *varying, *([scheduled(ViscousDamping, "z")] if ViscousDamping in laws else []))
 
 
 def check_limits(simulator: Simulator, limits: Mapping[str, float] | None) -> None:

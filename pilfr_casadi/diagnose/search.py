@@ -16,11 +16,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
 from .._base import InputError, Stages, is_interrupt, side_by_side
-from ..laws import FINER, Law
+from ..laws import FINER, SCALABLE, Law, Local, scheduled, unscheduled
 from ..simulators import Placed, Simulator
 from .evidence import (
     BETTER_RATIO,
@@ -44,7 +45,7 @@ from .gates import CLEARLY_BETTER
 from .learned import learn_forces, nearest_to_learned
 from .linearise import linearised
 from .relatives import choose_pairs, complements, fit_pair, relatives
-from .screen import Remainder, Scored, flexible_shares, screen
+from .screen import Remainder, Scored, flexible_shares, screen, usable
 from .trials import Key, Trial, Trials
 from .workbench import DIVERGED, FEW, THOROUGH, Fitted, Workbench
 
@@ -387,8 +388,11 @@ class Search:
             trials = sorted([*trials, *self._fitted(parent, more, gain, enough, again)], key=lambda t: t.error)
         with self.stage("choice"):
             self._record(parent, scored, trials)
-            self._finer(parent)
             self._estimate_noise()
+            best = self.best
+            self._finer(parent)
+            if self.best is not best:
+                self._estimate_noise()
 
     def _record(self, parent: Trial, scored: Sequence[Scored], trials: Sequence[Trial]) -> None:
         """Keep the trials of a move, and note the move."""
@@ -453,21 +457,34 @@ class Search:
         self.floor = Floor(np.hypot(np.maximum(white, rest), known), "estimated")
 
     def _finer(self, parent: Trial) -> None:
-        """Fit the best law of a step in its finer forms."""
+        """Fit the best law of a step in its finer forms; then let the strength of the best that may vary do so."""
         best = self.best
-        if len(best.laws) != len(parent.laws) + 1:
-            return
-        element, base = best.element, best.fitted
+        if len(best.laws) == len(parent.laws) + 1:
+            self._refine(best, FINER.get(type(best.element.law), ()))
+        step = [self.memo[t.key] for t in self.steps[-1].trials if unscheduled(type(t.law)) in SCALABLE]
+        if step and self.can_improve(self.best) and self._in_time():
+            varied = max(step, key=self.optimistic_evidence)
+            kind = unscheduled(type(varied.law))
+            signals = ("z", *self._local(varied.port).inputs)
+            self._refine(varied, [scheduled(kind, by) for by in signals if by != varied.law.scheduled_by])
+
+    def _local(self, port: str) -> Local:
+        """Return the signals at a port as it was first screened."""
+        return next(s.local for step in self.steps for s in step.scored if s.port == port)
+
+    def _refine(self, trial: Trial, kinds: Sequence[Any]) -> None:
+        """Fit a hypothesis with its last law in other forms, which start from its values."""
+        element, base, local = trial.element, trial.fitted, self._local(trial.port)
         bare = base.simulator.without_element()
-        local = next((s.local for step in self.steps for s in step.scored if s.port == best.port), None)
-        for kind in FINER.get(type(element.law), ()) if local is not None else ():
-            shapes = list(kind.finer_starts(best.own, local))
-            law = kind().at(shapes[0], kind().bounds(local))
-            placed = bare.with_element(element.port, law)
+
+        def fit(kind: Any) -> Trial | None:
+            shapes = list(kind.finer_starts(trial.own, local))
+            placed = bare.with_element(element.port, kind().at(shapes[0], kind().bounds(local)))
             starts = [{**base.values, **element.named(shape)} for shape in shapes]
-            found = self.fits.fitted(placed, starts, len(best.laws), states=base.begin)
-            if found is not None:
-                self._keep_all([found])
+            return self.fits.fitted(placed, starts, len(trial.laws), states=base.begin)
+
+        found = side_by_side(fit, [kind for kind in kinds if usable(kind(), local)], self.workers)
+        self._keep_all([t for t in found if t is not None])
 
     def learned(self, base: Trial) -> list[Fitted]:
         """Fit learned forces beside a hypothesis, at the most promising ports, to a part of the recordings."""
