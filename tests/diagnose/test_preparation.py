@@ -74,7 +74,7 @@ def test_offsets_that_differ_between_recordings_are_subtracted(side, channel):
 
 
 def test_a_mean_force_of_missing_physics_is_no_offset():
-    both = recordings(QuadraticStiffness({"k_2": 4e3}), count=2)
+    both = recordings(QuadraticStiffness({"k_2": 500.0}), count=2)
     bench = Workbench.of(rig(OFF), both, "zero")
     found = find_offsets(Checked(bench, refitted(bench)))
     assert not any(isinstance(gate.value, list) for gate in found.gates)
