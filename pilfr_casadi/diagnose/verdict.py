@@ -266,7 +266,7 @@ def judge(search: Search, found: Posterior, gates: Sequence[Gate], closest: Tria
     steady = [g for g in gates if g.finding == "tone" and not found.effects]
     mode = ringing(search.bench, search.root.fitted)
     noise = not found.effects and _is_noise(search, steady, share, mode)
-    if faults and (noise or cured or (share < LEAST_EXPLAINED and not found.effects)):
+    if faults and (noise or cured):
         return Verdict("recording-fault", faults[0].sentence)
     if noise and share < LEAST_EXPLAINED:
         beside = f" but a steady tone in {' and '.join(g.channel for g in steady)}" if steady else ""
