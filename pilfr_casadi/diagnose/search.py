@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, side_by_side
-from ..laws import FINER, SCALABLE, Law, Local, scheduled, unscheduled
+from ..laws import FINER, SCALABLE, Law, scheduled, unscheduled
 from ..simulators import Placed
 from .evidence import (
     BETTER_RATIO,
@@ -30,7 +30,7 @@ from .learned import learn_forces, nearest_to_learned
 from .linearise import linearised
 from .relatives import choose_pairs, complements, fit_pair, relatives
 from .screen import Remainder, Scored, usable
-from .trials import Trial
+from .trials import Trial, place_law
 from .workbench import DIVERGED, FEW, THOROUGH, Fitted
 
 # Effort
@@ -176,25 +176,26 @@ class Search(Hypotheses):
         if step and self.can_improve(self.best) and self.in_time():
             varied = max(step, key=self.optimistic_evidence)
             kind = unscheduled(type(varied.law))
-            signals = ("z", *self._local(varied.port).inputs)
+            signals = ("z", *self._entry(varied).local.inputs)
             self._refine(varied, [scheduled(kind, by) for by in signals if by != varied.law.scheduled_by])
 
-    def _local(self, port: str) -> Local:
-        """Return the signals at a port as it was first screened."""
-        return next(s.local for step in self.steps for s in step.scored if s.port == port)
+    def _entry(self, trial: Trial) -> Scored:
+        """Return how the last law of a trial, or another with the same sense, was first screened at its port."""
+        there = [s for step in self.steps for s in step.scored if s.port == trial.port]
+        return next((s for s in there if s.law.dissipative == trial.law.dissipative), there[0])
 
     def _refine(self, trial: Trial, kinds: Sequence[Any]) -> None:
         """Fit a hypothesis with its last law in other forms, which start from its values."""
-        element, base, local = trial.element, trial.fitted, self._local(trial.port)
+        entry, base = self._entry(trial), trial.fitted
         bare = base.simulator.without_element()
 
         def fit(kind: Any) -> Trial | None:
-            shapes = list(kind.finer_starts(trial.own, local))
-            placed = bare.with_element(element.port, kind().at(shapes[0], kind().bounds(local)))
-            starts = [{**base.values, **element.named(shape)} for shape in shapes]
-            return self.fits.fitted(placed, starts, len(trial.laws), states=base.begin)
+            starts = list(kind.finer_starts(trial.own, entry.local))
+            placed = [place_law(bare, replace(entry, law=kind()), own) for own in starts]
+            values = [{**base.values, **named} for _, named in placed]
+            return self.fits.fitted(placed[0][0], values, len(trial.laws), states=base.begin)
 
-        found = side_by_side(fit, [kind for kind in kinds if usable(kind(), local)], self.workers)
+        found = side_by_side(fit, [kind for kind in kinds if usable(kind(), entry.local)], self.workers)
         self._keep_all([t for t in found if t is not None])
 
     def learned(self, base: Trial) -> list[Fitted]:
