@@ -185,8 +185,11 @@ class Search(Hypotheses):
         return next((s for s in there if s.law.dissipative == trial.law.dissipative), there[0])
 
     def _refine(self, trial: Trial, kinds: Sequence[Any]) -> None:
-        """Fit a hypothesis with its last law in other forms, which start from its values."""
-        entry, base = self._entry(trial), trial.fitted
+        """Fit a hypothesis with its last law in other forms, which start from its values and oppose motion alike."""
+        entry, base, law = self._entry(trial), trial.fitted, trial.law
+        if law.dissipative and not entry.sense:
+            total = sum(np.sum(trial.own[name]) for name in law.strength if name not in law.signed)
+            entry = replace(entry, sense=int(np.sign(total)))
         bare = base.simulator.without_element()
 
         def fit(kind: Any) -> Trial | None:

@@ -149,6 +149,9 @@ def _scheduled(base: Any, by: str) -> Any:
 
         def why_not(self, local: Local) -> str:
             """Say why the data carries no information on this law; empty if it does."""
+            unknown = not (local.shown or (local.from_zero and all(local.from_zero)))
+            if by == "z" and unknown:  # a level of each recording's own would pass for a variation with z
+                return "no output reads the coordinate, and its start is unknown"
             return super().why_not(local) or ("" if by == "z" else _not_there(by, local))
 
         def parameters(self) -> dict[str, Parameter]:
