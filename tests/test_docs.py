@@ -213,7 +213,7 @@ def test_python_of_the_readme(folder, script):
 def test_commands_of_the_readme(folder, monkeypatch):
     """In this process and with a short catalogue: the snippet in Python searches the whole one on the same data."""
     few = (pilfr.laws.CubicStiffness, pilfr.laws.PreslidingFriction)
-    monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.preparation"), "CATALOGUE", few)
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.arguments"), "CATALOGUE", few)
     monkeypatch.chdir(folder)
     assert commands("README.md")
     for arguments in commands("README.md"):

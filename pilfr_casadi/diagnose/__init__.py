@@ -5,19 +5,22 @@ one log evidence; verdict, effects and confidence are sums over their posterior.
 about. The files by stage:
 
 - The whole: `pipeline` (the steps in their order), `workbench` (what all steps share).
-- Preparation: `prediction` stabilises an unstable simulator with an observer. `preparation` checks the arguments, then
-  the recordings. A check of recordings corrects a fault where it finds one: `gates` (what a finding is and when it is
-  accepted; sign, unit or gain, exchange, offset), `recording_faults` (glitches, stale and clipped samples, unsettled
-  periods, tones) and `timing` (shift, clock, gap). `floor` estimates the noise.
+- Preparation: `arguments` checks the arguments. `prediction` stabilises an unstable simulator with an observer.
+  `preparation` checks the recordings. A check corrects a fault where it finds one; `gates` is what a finding is and
+  when it is accepted. The faults: `channel_faults` (sign, unit or gain, exchange), `offsets`, `recording_faults`
+  (glitches, stale and clipped samples, unsettled periods, tones) and `timing` (shift, clock, gap). `floor` estimates
+  the noise.
 - Long recordings: `stretches` chooses what the search sees of them, and fits the leading hypotheses to everything.
-- Search: `search` moves from hypothesis to hypothesis. `linearise`, `screen` and `relatives` select the hypotheses that
-  are worth a fit, `trials` fits them. `learned` fits forces that have no name yet.
+- Search: `hypotheses` keeps what was fitted, with its evidence. `search` moves from one hypothesis to others.
+  `linearise`, `screen` and `relatives` select those that are worth a fit, `trials` fits them. `learned` fits forces
+  that have no name yet.
 - Evidence: `evidence` is the one scale: log evidence, prior of laws, errors on held-out data, and a table of the
   numbers on which answers rest. `verdict` turns the evidences into a posterior and a verdict.
 - Correction: `correction` chooses the corrected simulator, with a learned force where named laws do not suffice.
 - Other explanations: `other_explanations` (a pinned value, an undeclared port, a machine that changed).
 - Proof: `proof` (errors before and after, placebo, next experiment), `force_recovery`, `mismatch_map`.
-- Result: `result`, and `refinement`: a Prandtl-Ishlinskii layer in place of the hysteresis that was found.
+- Result: `answer` puts it together, `result` is what users hold, and `refinement` puts a Prandtl-Ishlinskii layer in
+  place of the hysteresis that was found.
 - After a diagnosis: `replication` fits laws that were found to the recordings of further machines.
 - Before a diagnosis: `blind_spots` (`check`: what the recordings cannot reveal), based on `identifiability` (which
   parameters are identifiable, and which laws detectable).
@@ -35,6 +38,11 @@ if TYPE_CHECKING:
     from ..data import Recording
     from ..identify import surrogate as surrogate
     from ..laws import Law
+    from .arguments import (
+        add_scaled_laws as add_scaled_laws,
+        check_laws as check_laws,
+        match_recordings as match_recordings,
+    )
     from .blind_spots import BlindSpot as BlindSpot, Check as Check, check as check
     from .evidence import SURE as SURE
     from .force_recovery import (
@@ -45,11 +53,6 @@ if TYPE_CHECKING:
     from .gates import Gate as Gate
     from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
     from .mismatch_map import mismatch as mismatch
-    from .preparation import (
-        add_scaled_laws as add_scaled_laws,
-        check_laws as check_laws,
-        match_recordings as match_recordings,
-    )
     from .refinement import Refinement as Refinement
     from .replication import (
         Replication as Replication,

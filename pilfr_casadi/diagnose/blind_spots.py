@@ -19,6 +19,7 @@ from .._base import in_words, one_blas_thread, to_json
 from ..data import Recording
 from ..laws import LINEAR, Law, display_name
 from ..simulators import in_series
+from .arguments import check_laws, match_recordings, stated_hold
 from .floor import ABOVE_NOISE, Floor, noise_floor
 from .identifiability import (
     SMALL_SHARE,
@@ -34,7 +35,6 @@ from .identifiability import (
     port_units,
 )
 from .linearise import Probe, Run, linearised
-from .preparation import check_laws, match_recordings, stated_hold
 from .workbench import Fitted, Workbench
 
 LEAST_NOISE = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor

@@ -61,6 +61,7 @@ LEAST_MODEL_ERROR = 0.05  # least share of the error that counts as model error
 LARGE_MODEL_ERROR = 0.2  # share of model error in the error above which models are judged on held-out blocks
 DISTURBANCE_WEIGHT = 0.2  # of a law's remainder that no force at a port explains: a disturbance may act beside the law
 INPUT_FACTOR = 0.7  # factor on the inputs' deviation for which the spread is computed: well inside their range
+DISTURBANCE = 1e-5  # of the inputs, over their deviation, by which a motion is tried: linear, and above rounding
 
 # Comparison of hypotheses
 SURE = 0.5  # probability above which an answer is stated: it is more likely than not
@@ -135,6 +136,10 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     tr(H' (n H / v + P)^-1). Initial states are among the parameters, because the two may make up for each other. The
     spread reveals parameters that the recordings hardly determine, such as a curve of a pressure that had two levels; a
     cross-validation on the same recordings cannot.
+
+    A motion near an unstable one, such as a pendulum's near its upper rest, enlarges any small change. If the motion
+    for the other inputs enlarges more than the recorded one, that is a matter of those inputs, and the spread is
+    divided by it.
     """
     if not np.any(fitted.model.parameters.free):
         return 0.0
@@ -158,7 +163,23 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
         return np.inf
     covariance = np.linalg.pinv(precision, rcond=1e-14, hermitian=True)
     found = float(np.sum(covariance * other * np.outer(width, width)))
-    return found if np.isfinite(found) else np.inf
+    if not np.isfinite(found):
+        return np.inf
+    as_recorded, now = _enlargement(bench, fitted), _enlargement(bench.on(smaller), fitted)
+    return found / max(now / as_recorded, 1.0) if 0 < as_recorded < np.inf and now < np.inf else found
+
+
+def _enlargement(bench: Workbench, fitted: Fitted) -> float:
+    """Compute the mean square change of the outputs by a small disturbance, over that of the inputs."""
+    rng, size = np.random.default_rng(0), DISTURBANCE * np.std(np.concatenate([r.u for r in bench.recordings]), axis=0)
+    disturbed = bench.on([r.with_(u=r.u + size * rng.standard_normal(r.u.shape)) for r in bench.recordings])
+    try:
+        with np.errstate(all="ignore"):
+            runs = [problem.simulate(theta) for problem, theta in (b.problem_at(fitted) for b in (bench, disturbed))]
+            moved = np.concatenate([(y - x) / bench.scale for x, y in zip(*runs, strict=True)])
+    except (InputError, RuntimeError):  # a run diverges
+        return np.inf
+    return float(np.mean(moved**2) / max(np.sum(size**2), 1e-300))
 
 
 def _of_laws(fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:

@@ -172,9 +172,9 @@ def linear_starts(bench: Workbench, base: Fitted, port_names: Sequence[str]) -> 
 
 
 def _may_scale(task: Task, name: str) -> bool:
-    """Tell whether an input may scale the force at a port: it varies, and is not one of the port's own signals."""
+    """Tell whether a signal may scale the force at a port: it varies, and is neither the time nor z or its rate."""
     u, local = task.local.inputs[name], task.local
-    if task.port.series or not np.ptp(u) > 0:
+    if task.port.series or name == "t" or not np.ptp(u) > 0:
         return False
     own = [v for v in (local.z, local.dz) if np.ptp(v) > 0]
     return not any(abs(np.corrcoef(u, v)[0, 1]) > SAME_SIGNAL for v in own)

@@ -4,6 +4,7 @@
   only if these values are fixed, or if their bounds exclude the new ones; then the pinned values are reported.
   If the bounds are in another unit, no law helps; values powers of ten away are tried.
 - A mismatch that no declared port explains may have a sure name in the equation of a state.
+- Laws that occur in one physical domain alone are not tried at a port whose domain is unknown; that is noted.
 - One set of values for all recordings is compared with one set for each, or with one for the first halves and one for
   the second. If separate sets follow far better, the differing values are reported; the cause is left to the engineer.
 """
@@ -15,10 +16,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, listed
 from ..data import Recording
 from ..laws import display_name
-from ..simulators import Placed, states_along
+from ..simulators import UNKNOWN, Placed, states_along
 from .evidence import AT_NOISE_RATIO, FAR_RATIO, NEAR_RATIO, SURE, deviations
 from .gates import (
     CERTAIN_ERRORS,
@@ -166,6 +167,20 @@ def find_undeclared_port(search: Search) -> Sequence[Gate]:
         f"the error is {found.best.error:.3g} of the outputs' deviation). Declare the port that it acts through."
     )
     return (Gate(state, "undeclared", law.replace("_", " "), sentence, corrected=False),)
+
+
+def find_untried_laws(search: Search) -> tuple[Gate, ...]:
+    """Note the ports of unknown domain, where laws of a single domain were not tried."""
+    special = [law for law in search.laws if law.special]
+    ports = [p.name for p in search.bench.simulator.all_ports() if p.domain == UNKNOWN and not p.series]
+    if not (special and ports):
+        return ()
+    domains = sorted({domain for law in special for domain in law.domains})
+    sentence = (
+        f"The physical domain of {listed(ports)} is unknown, so laws that are {' or '.join(domains)} alone "
+        "were not tried there; state the units of the port's force and coordinate, or its domain."
+    )
+    return (Gate(", ".join(ports), "domain", UNKNOWN, sentence, corrected=False),)
 
 
 Group = tuple[str, Sequence[Recording], Sequence[np.ndarray]]  # name, recordings, and initial states

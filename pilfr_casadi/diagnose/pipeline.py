@@ -36,100 +36,42 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from .._base import InputError, Progress, Stages, deferred_interrupt, one_blas_thread, processors, whole
 from ..data import Recording
-from ..identify import surrogate_warning
-from ..laws import Law, display_name, readable_unit
-from ..simulators import Simulator
-from .blind_spots import BlindSpot, assess_recordings
-from .correction import Correction, find_correction, named_correction
-from .evidence import AS_GIVEN_RATIO, SURE, deviations
-from .floor import Floor, measured_floor
-from .gates import USELESS_FIT, Gate, Offset, final_gates, offset_gates, without_idle_offsets, without_zero_offsets
-from .identifiability import port_units
-from .mismatch_map import mismatch
-from .other_explanations import find_pinned_parameters, find_undeclared_port, find_varying_values
-from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
-from .preparation import (
-    CHECKS,
+from ..laws import Law, display_name
+from .answer import Conclusion, FinalFits, build_diagnosis
+from .arguments import (
     FEWEST_SAMPLES,
-    Prepared,
+    Request,
     add_scaled_laws,
     check_laws,
     check_limits,
-    hold_note,
     match_recordings,
     match_tests,
-    prepare,
     stated_hold,
 )
-from .proof import errors_of, free_run_errors, mean_nrmse, next_experiment, parameter_table, placebo, test_errors
+from .correction import find_correction, named_correction
+from .evidence import AS_GIVEN_RATIO, SURE
+from .floor import Floor, measured_floor
+from .gates import USELESS_FIT, Gate
+from .offsets import Offset, offset_gates, without_idle_offsets
+from .other_explanations import find_pinned_parameters, find_undeclared_port, find_untried_laws, find_varying_values
+from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
+from .preparation import CHECKS, Prepared, hold_note, prepare
+from .proof import errors_of, mean_nrmse
 from .recording_faults import clipped_input, open_unsettled, remove_glitches, tones
-from .result import Diagnosis, Effect
+from .result import Diagnosis
 from .search import Search
 from .stretches import MOST_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
-from .trials import Trial
-from .verdict import NamedEffect, Posterior, Verdict, judge, names, posterior
-from .workbench import Fitted, RunsAway, Workbench, converge
+from .verdict import Posterior, Verdict, judge, names, posterior
+from .workbench import RunsAway, converge
 
 SEARCH_SHARE = 0.7  # share of the remaining time for preparation and search; the rest is for the correction
-
-
-@dataclass(frozen=True, eq=False)
-class Request:
-    """Arguments of `diagnose`, checked; see there."""
-
-    simulator: Simulator
-    recordings: Sequence[Recording]
-    laws: Sequence[type[Law]]
-    hold: str | None
-    engine: str
-    workers: int
-    most_effects: float
-    stand_in_error: float
-    deadline: float
-    say: Stages
-    focus: str | None = None
-    notes: tuple[Gate, ...] = ()
-    stretches: Stretches | None = None  # where `recordings` are stretches of long ones
-
-    @property
-    def hold_said(self) -> bool:
-        """Whether somebody said what inputs do between samples."""
-        return stated_hold(self.simulator, self.recordings, self.hold) is not None
-
-
-@dataclass(frozen=True, eq=False)
-class Conclusion:
-    """Answer of a search.
-
-    Attributes
-    ----------
-    fitted : Fitted
-        The corrected simulator, or the refitted one if there is nothing to correct.
-    correction : Correction
-        The elements that `fitted` has beside the refitted simulator.
-    effects : tuple of NamedEffect
-        The named effects.
-    freed : str
-        The pinned parameters whose other values explain as much as the named laws, joined by "and".
-    decided : Search, optional
-        The search that has named the effects, if it is another one.
-    """
-
-    verdict: Verdict
-    gates: tuple[Gate, ...]
-    fitted: Fitted
-    correction: Correction
-    effects: tuple[NamedEffect, ...] = ()
-    freed: str = ""
-    decided: Search | None = None
 
 
 @one_blas_thread
@@ -180,7 +122,7 @@ def diagnose_in_steps(
             found = _name_in_predictions(request, search, found)
     final = _final_fits(request, ready, search, found, everything)
     with deferred_interrupt(again=False) as pressed:
-        built = _build_diagnosis(request, ready, search, found, final, tests, limits, began)
+        built = build_diagnosis(request, ready, search, found, final, tests, limits, began)
     return replace(built, interrupted=built.interrupted or bool(pressed))
 
 
@@ -270,10 +212,11 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
     )
     if request.focus is None:  # an unstable simulator may stay within bounds and still not follow
         ready.bench.check_followed(ready.without, USELESS_FIT)
+    ready = replace(ready, floor=_noise(request, ready))
     search = Search(
         ready.bench,
         ready.without,
-        _noise(request, ready),
+        ready.floor,
         (*request.laws, Offset),
         request.workers,
         request.say,
@@ -331,7 +274,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
             zeros = offset_gates(answer.best.laws, answer.best.fitted.values)
             return Conclusion(Verdict(verdict.kind, said), (*gates, *zeros), fitted, correction, answer.effects)
     if verdict.kind == "unexplained" and finished:
-        gates = (*gates, *find_undeclared_port(search), *find_varying_values(search))
+        gates = (*gates, *find_undeclared_port(search), *find_untried_laws(search), *find_varying_values(search))
     refitted = search.root.fitted
     if interrupted and verdict.kind != "recording-fault":
         sentence = (
@@ -406,29 +349,6 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
     )
 
 
-@dataclass(frozen=True, eq=False)
-class FinalFits:
-    """The fits whose values and errors an answer states.
-
-    Attributes
-    ----------
-    bench : Workbench
-        All training recordings as corrected.
-    without, after : Fitted
-        The refitted and the corrected simulator, fitted to them.
-    nominal : float
-        NRMSE at the user's values.
-    drawn : tuple of Fitted
-        Both along the recordings of the search's bench.
-    """
-
-    bench: Workbench
-    without: Fitted
-    after: Fitted
-    nominal: float
-    drawn: tuple[Fitted, Fitted]
-
-
 def _final_fits(
     request: Request, ready: Prepared, search: Search, found: Conclusion, everything: Everything | None
 ) -> FinalFits:
@@ -448,161 +368,3 @@ def _final_fits(
         drawn = [back_on_stretches(bench, f, one.initial) for f, one in zip(to_all, pair, strict=True)]
         nominal = errors_of(whole, whole.model(request.simulator), whole=True)
     return FinalFits(whole, to_all[0], to_all[1], nominal, (drawn[0], drawn[1]))
-
-
-def _build_diagnosis(
-    request: Request,
-    ready: Prepared,
-    search: Search,
-    found: Conclusion,
-    final: FinalFits,
-    tests: tuple[Recording, ...],
-    limits: Mapping[str, float] | None,
-    began: float,
-) -> Diagnosis:
-    """Put the search's conclusion and its proof into a Diagnosis."""
-    proving = time.perf_counter()
-    request.say("proof", 0, 1)
-    bench, without, after = final.bench, final.without, final.after
-    std = deviations(bench, after)
-    errors: dict[str, dict[str, float] | None] = {
-        "train": {"nominal": final.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
-        "test": test_errors(bench, tests, found.gates, request.simulator, without, after) if tests else None,
-    }
-    if bench.simulator.observer is not None:
-        errors["free_run"] = free_run_errors(bench, tests or bench.recordings, request.simulator, without, after)
-    effects = tuple(_effect(search, e, after, std) for e in found.effects)
-    settled = found.verdict.kind in ("complete", "recording-fault") or (
-        min((e.confidence for e in effects), default=0) > SURE
-    )
-    decided = found.decided or search
-    experiment = _next(decided, found.effects, limits)
-    request.say("proof", 1, 1)
-    now = time.perf_counter()
-    return Diagnosis(
-        verdict=found.verdict.kind,
-        sentence=found.verdict.sentence,
-        effects=effects,
-        candidates=tuple(
-            _row(decided, decided.memo.get(t.key, t), step.parent) for step in decided.steps for t in step.trials
-        ),
-        gates=(
-            *_surrogate_note(request.stand_in_error),
-            *_convergence_note(after),
-            *final_gates(found.gates, after, std, bool(effects), settled),
-        ),
-        mismatch=mismatch(
-            bench.recordings,
-            without.residual,
-            [e + r.y for e, r in zip(without.residual, bench.recordings, strict=True)],
-            search.floor.deviation,
-            bench.scale,
-        ),
-        parameters=parameter_table(request.simulator, without, after, std),
-        errors=errors,
-        floor={"nrmse": search.floor.nrmse(bench.scale), "source": search.floor.source},
-        corrected=without_zero_offsets(after.corrected()),
-        refitted=without.corrected(),
-        hold=bench.hold,
-        train=bench.recordings,
-        test=tests,
-        next_experiment=experiment,
-        seconds=now - began,
-        times={**search.times, "proof": now - proving},
-        interrupted=search.interrupted,
-        out_of_time=search.out_of_time,
-        evidence={"search": search, "without": final.drawn[0], "after": final.drawn[1]},
-        substeps=after.model.substeps,
-        freed=found.freed,
-        correction=found.correction,
-        blind_spots=_blind_spots(request, ready, search),
-    )
-
-
-def _surrogate_note(error: float) -> tuple[Gate, ...]:
-    """Note that a surrogate stands for the simulation and misses it by an NRMSE of `error`; no note if that is zero."""
-    if not error:
-        return ()
-    words = f"A linear model stands for the simulation, which it follows to NRMSE {error:.4f}; that counts as noise."
-    return (Gate("simulation", "surrogate", error, f"{words} {surrogate_warning(error)}".rstrip(), False),)
-
-
-def _convergence_note(after: Fitted) -> tuple[Gate, ...]:
-    """Note that the fit whose values are stated has not converged; no note if it has."""
-    if after.status.converged:
-        return ()
-    words = (
-        f"The fit of the corrected simulator ended early. {after.status.value} Its parameters may still change by more "
-        "than their standard errors; bound those that are known, or add a recording that tells them apart."
-    )
-    return (Gate("simulation", "convergence", after.status.name.lower(), words, False),)
-
-
-def _blind_spots(request: Request, ready: Prepared, search: Search) -> tuple[BlindSpot, ...]:
-    """Find what the recordings cannot reveal of the refitted simulator; empty if that cannot be computed."""
-    stated = search.bench.hold if request.hold_said else ""
-    with suppress(InputError, np.linalg.LinAlgError):
-        return assess_recordings(search.bench, search.root.fitted, _noise(request, ready), stated).blind_spots
-    return ()
-
-
-def _effect(search: Search, named: NamedEffect, fitted: Fitted, std: dict[str, np.ndarray]) -> Effect:
-    bench = search.bench
-    element = next(e for e in fitted.simulator.elements if (e.port, e.law.id) == named.name)  # its form may differ
-    law = element.law
-    own, unrelated = placebo(bench, search.root.fitted, element.port, law)
-    port = bench.simulator.port(element.port)
-    w_unit, z_unit = port_units(port, bench.recordings[0])
-    if port.series and not w_unit:  # in the unit of its signal, such as [force]
-        w_unit = z_unit = f"[{port.name.partition(':')[2]}]"
-    values = {k: v for k, v in fitted.values.items() if k.startswith(element.prefix)}
-    shown: dict[str, dict[str, Any]] = {}
-    for name, value in values.items():
-        unit = readable_unit(element.law.units[name.removeprefix(element.prefix)], w_unit, z_unit)
-        flat = np.ravel(value)
-        for i, v in enumerate(flat):
-            label = name.removeprefix(element.prefix) + (f"[{i}]" if len(flat) > 1 else "")
-            error = float(np.ravel(std[name])[i])
-            shown[label] = {"value": float(v), "std": error if np.isfinite(error) else None, "unit": unit}
-    return Effect(
-        port=element.port,
-        law=law.id,
-        confidence=named.confidence,
-        sentence=law.sentence,
-        equation=law.equation.replace("dz/dt", "v") if port.is_speed else law.equation,
-        parameters=shown,
-        indistinguishable=tuple(named.alike),
-        form=law.form,
-        placebo={"own": own, "unrelated": unrelated},
-    )
-
-
-def _next(search: Search, effects: Sequence[NamedEffect], limits: Mapping[str, float] | None) -> dict[str, Any] | None:
-    """Design the experiment that would separate the first tie, if there is one."""
-    if search.bench.simulator.observer is not None:  # a proposed input has no outputs to be led by
-        return None
-    for effect in effects:
-        if effect.alike:
-            name, other = next(iter(effect.alike.items()))
-            one = max((t for t in search.memo.values() if effect.name in names(t)), key=search.evidence)
-            best = next_experiment(search.bench, one.fitted, other.fitted, search.floor.deviation, limits)
-            tied = [list(effect.name), list(name)]
-            if best is not None:
-                return {"between": tied, **best}
-            sentence = "No sine or triangle within the allowed amplitude separates them beyond the noise."
-            return {"between": tied, "sentence": sentence}
-    return None
-
-
-def _row(search: Search, t: Trial, parent: Trial) -> dict[str, Any]:
-    """Return a candidate's row for diagnosis.json."""
-    held_out = search.findings[t.key].held_out
-    gain = search.evidence(t) - search.evidence(parent)
-    return {
-        "port": t.port,
-        "law": t.law.id,
-        "form": t.law.form,
-        "nrmse_train": t.error,
-        "nrmse_validation": held_out.error if held_out and np.isfinite(held_out.error) else None,
-        "delta_bic": -2 * gain,
-    }

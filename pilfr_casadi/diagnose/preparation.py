@@ -1,4 +1,4 @@
-"""From the user's arguments to a refitted simulator: checks of arguments, and checks of recordings in their order.
+"""From recordings to a refitted simulator: the checks of recordings in their order.
 
 If nobody stated what the inputs do between samples, the hold with the smaller error is used. Faulty data say nothing
 about the hold: if a fault was found, the other hold goes through all checks as well.
@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Stages, listed
-from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
-from ..identify import match_channels
-from ..laws import CATALOGUE, SCALABLE, Law, scaled, scheduled
-from ..simulators import Simulator, as_simulator
+from .._base import InputError, Stages
+from ..data import Recording
+from ..simulators import Simulator
+from .arguments import stated_hold
+from .channel_faults import find_slips, open_bench
 from .floor import Floor, white_part
 from .gates import (
     CURED_SHARE,
@@ -25,15 +25,12 @@ from .gates import (
     POOR_FIT,
     Checked,
     Gate,
-    find_offsets,
-    find_slips,
-    find_wrong_start,
-    open_bench,
     refit,
 )
 from .linearise import along, linearised, observer_gain
+from .offsets import find_offsets, find_wrong_start
 from .proof import errors_of
-from .recording_faults import find_stale_samples, open_unsettled, remove_glitches, unclip
+from .recording_faults import mend_stale_samples, open_unsettled, remove_glitches, unclip
 from .timing import AVERAGED_NOISE, find_gaps, find_time_shift, in_steps, run_as_given
 from .workbench import THOROUGH, Fitted, Workbench, refine_steps
 
@@ -83,7 +80,7 @@ def prepare(
     recordings, transients = open_unsettled(recordings)
     said = stated_hold(simulator, recordings, hold)
     bench, times = open_bench(simulator, recordings, said or "zero", engine)
-    gates = (*spikes, *transients, *find_stale_samples(recordings), *times)
+    gates = (*spikes, *transients, *times)
     held: Sequence[Gate] = ()
     if not said:
         bench, held = _choose_hold(bench)
@@ -124,7 +121,7 @@ class _Checks:
                 starts = [found.fitted.values, {}, *self.starts]
                 found = found.then(bench, bench.fit(bench.simulator, starts, solver=THOROUGH))
             now = found
-        now = find_gaps(unclip(self._report(3, now)))
+        now = find_gaps(mend_stale_samples(unclip(self._report(3, now))))
         now = now.then(*refine_steps(now.bench, self._report(4, now).fitted))
         return find_offsets(self._report(5, find_time_shift(now, part, self.early)))
 
@@ -191,11 +188,6 @@ def refitted(bench: Workbench, starts: Sequence[Mapping[str, Any]] = ()) -> Fitt
 # hold of the inputs between samples
 
 
-def stated_hold(simulator: Any, recordings: Sequence[Recording], said: str | None) -> str | None:
-    """Return the hold that the user, the simulator or a recording states; None if none of them does."""
-    return next((h for h in (said, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
-
-
 def _choose_hold(bench: Workbench) -> tuple[Workbench, Sequence[Gate]]:
     """Choose the hold whose refit has the smaller error, and note it; keep the bench's own if the errors are equal."""
     both = bench, bench.with_other_hold()
@@ -215,68 +207,3 @@ def hold_note(simulator: Simulator, hold: str, ratio: float) -> Gate:
         "smaller) and is used."
     )
     return Gate(", ".join(simulator.inputs), "hold", hold, sentence)
-
-
-FEWEST_SAMPLES = 20  # samples in all training recordings together; fewer cannot determine a model
-
-
-def match_recordings(
-    simulator: Any, train: Recording | Sequence[Recording], hold: str | None, excited: bool = True
-) -> tuple[Simulator, tuple[Recording, ...]]:
-    """Return the simulator, and the recordings with its channels in its order.
-
-    With `excited`, recordings in which no input ever changes are refused.
-
-    Raises
-    ------
-    InputError
-        If the hold is unknown, or simulator and recordings do not fit each other.
-    """
-    if hold not in HOLDS:
-        raise InputError(f"hold={hold!r} was given; use 'zero', 'linear' or None.")
-    given = as_recordings(train)
-    simulator = as_simulator(simulator, given)
-    recordings = [match_channels(simulator, r) for r in given]
-    return simulator, check_for_identification(recordings, FEWEST_SAMPLES, excited)
-
-
-def match_tests(
-    simulator: Simulator, test: Recording | Sequence[Recording] | None, train: Sequence[Recording]
-) -> tuple[Recording, ...]:
-    """Return the test recordings with the simulator's channels; refuse training data and other steps."""
-    tests = tuple(match_channels(simulator, r) for r in as_recordings(test)) if test is not None else ()
-    for t in tests:
-        if any(len(r) == len(t) and np.array_equal(r.u, t.u) and np.array_equal(r.y, t.y) for r in train):
-            raise InputError("A test recording equals a training recording; give data the fit has not seen.")
-        if abs(t.dt / train[0].dt - 1) > SAME_STEP:
-            raise InputError(f"The test recording's step is {t.dt:g} s, the training's {train[0].dt:g} s; resample it.")
-    return tests
-
-
-def check_laws(laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
-    """Return the laws as a tuple, by default the catalogue; refuse anything that is not a class of laws."""
-    for law in laws or ():
-        if not (isinstance(law, type) and issubclass(law, Law)):
-            raise InputError(f"laws holds {law!r}; give classes of laws, such as pilfr.laws.CoulombFriction.")
-    return CATALOGUE if laws is None else tuple(laws)
-
-
-def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[type[Law], ...]:
-    """Return the laws, and versions of some of them whose strength varies with a signal.
-
-    An input that the equations do not read may scale a law; with a port's own signals its strength may vary.
-    """
-    some, own = [law for law in SCALABLE if law in laws], {name for port in simulator.ports for name in port.signals}
-    by_input = (scaled(law, by) for law in some for by in simulator.idle_inputs)
-    return (*laws, *by_input, *(scheduled(law, by) for law in some for by in sorted(own)))
-
-
-def check_limits(simulator: Simulator, limits: Mapping[str, float] | None) -> None:
-    """Refuse a limit on a name that is not an input, and a limit that is not positive."""
-    for name, most in (limits or {}).items():
-        if name not in simulator.inputs:
-            raise InputError(
-                f"A limit was given for {name!r}, which is no input; there are {listed(simulator.inputs)}."
-            )
-        if not most > 0:
-            raise InputError(f"The limit of {name} is {most!r}; give the largest amplitude allowed, a positive number.")

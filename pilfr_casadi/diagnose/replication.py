@@ -24,10 +24,10 @@ from .._base import InputError, one_blas_thread
 from ..data import Recording
 from ..laws import Law
 from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
+from .arguments import match_recordings, stated_hold
 from .evidence import FORMULA_ERROR, Sample, deviations, information, log_evidence, log_prior, prior_width
 from .floor import effective_size, measured_floor, third_differences
 from .linearise import along
-from .preparation import match_recordings, stated_hold
 from .proof import mean_nrmse
 from .trials import Trials
 from .workbench import FINER_STEPS, THOROUGH, Fitted, Workbench

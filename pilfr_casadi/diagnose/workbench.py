@@ -365,8 +365,9 @@ class Workbench:
         return sorted(starts, key=cost)
 
     def local(self, z: np.ndarray, dz: np.ndarray) -> Local:
-        """Return the local signals of a port along all recordings, with the inputs."""
+        """Return the local signals of a port along all recordings, with the time and the inputs."""
         inputs = dict(zip(self.simulator.inputs, np.concatenate([r.u for r in self.recordings]).T, strict=True))
+        inputs = {"t": np.concatenate([self.dt * np.arange(len(r)) for r in self.recordings]), **inputs}
         lengths, rest = tuple(map(len, self.recordings)), tuple(r.begins == "zero" for r in self.recordings)
         return Local(z, dz, self.dt, lengths, inputs=inputs, from_zero=rest)
 

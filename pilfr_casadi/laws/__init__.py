@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         behind_gap as behind_gap,
         scaled as scaled,
         scheduled as scheduled,
+        unscheduled as unscheduled,
     )
     from .curves import (
         AsymmetricDeadZone as AsymmetricDeadZone,

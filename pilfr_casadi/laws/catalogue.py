@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -50,7 +50,7 @@ def scheduled(law: type[Law], by: str) -> type[Law]:
     law : class of Law
         Any law that may act in parallel, as a force.
     by : str
-        An input of the simulator, one of the port's own `signals`, or "z", the local coordinate.
+        An input of the simulator, one of the port's own `signals`, "z", the local coordinate, or "t", the time.
 
     Raises
     ------
@@ -58,6 +58,11 @@ def scheduled(law: type[Law], by: str) -> type[Law]:
         If it is not a law, or acts in series with a signal.
     """
     return _scheduled(_parallel(law), by)
+
+
+def unscheduled(law: type[Law]) -> type[Law]:
+    """Return the law whose strength does not vary, if it does; see `scheduled`."""
+    return law.__base__ if law.scheduled_by else law  # type: ignore[return-value]
 
 
 def behind_gap(law: type[Law]) -> type[Law]:
@@ -122,7 +127,8 @@ def _scaled(base: Any, by: str) -> Any:
 @functools.cache
 def _scheduled(base: Any, by: str) -> Any:
     high = {name: f"{name}_high" for name in base.strength}
-    unit = "z" if by == "z" else f"[{by}]"
+    unit = {"z": "z", "t": "s"}.get(by, f"[{by}]")
+    words = {"z": "the local coordinate", "t": "time"}.get(by, by)
     read = [*inspect.signature(base.step if base.memory else base.force).parameters]
 
     def strengths(p: Any, u: Any, z: Any) -> dict[str, Any]:
@@ -135,7 +141,7 @@ def _scheduled(base: Any, by: str) -> Any:
     class Scheduled(base):
         form = f"{base.form}, scheduled by {by}".removeprefix(", ")
         equation = f"{base.equation}  with {', '.join(base.strength)} linear in {by}"
-        sentence = f"{base.sentence}; its strength varies with {by}"
+        sentence = f"{base.sentence}; its strength varies with {words}"
         units = {**base.units, **{end: base.units[name] for name, end in high.items()}, "low": unit, "high": unit}
         strength = (*base.strength, *high.values())
         places = ("parallel",)
@@ -156,6 +162,14 @@ def _scheduled(base: Any, by: str) -> Any:
             for own in super().shapes(local):
                 yield {**own, "low": float(signal.min()), "high": float(signal.max())}
 
+        @classmethod
+        def finer_starts(cls, values: Mapping[str, Any], local: Local) -> Iterator[dict[str, Any]]:
+            """Start as the law of these values, equally strong in the whole range of the signal."""
+            signal = cls().schedule(local)
+            mean = {name: (values[name] + values.get(end, values[name])) / 2 for name, end in high.items()}
+            ends = {"low": float(signal.min()), "high": float(signal.max())}
+            yield {**values, **mean, **{end: mean[name] for name, end in high.items()}, **ends}
+
         if base.memory:
 
             def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0, u: Any = None) -> Any:
@@ -169,7 +183,9 @@ def _scheduled(base: Any, by: str) -> Any:
                 have = {"z": z, "dz": dz, "p": Named("parameter", strengths(p, u, z))}
                 return super().force(**{k: have[k] for k in read if k in have})
 
-    return _name(Scheduled, f"{base.__name__}ScheduledBy_{by}", f"{base.__doc__}\n\n    Its strength varies with {by}.")
+    return _name(
+        Scheduled, f"{base.__name__}ScheduledBy_{by}", f"{base.__doc__}\n\n    Its strength varies with {words}."
+    )
 
 
 @functools.cache

@@ -90,6 +90,10 @@ class Relaxation(Law):
     def flow(self, z: Any, q: Any, p: Any) -> Any:
         return (z - q) / p.T
 
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """Tell whether a time constant is at its longest: it hardly creeps, so it is a spring or a gain."""
+        return any(values[name] >= p.bounds[1] for name, p in self.parameters().items() if p.unit == "s")
+
 
 class _TwoStages(Law):
     """The common part of creep with a fast and a slow part."""

@@ -93,7 +93,7 @@ class ClosedEquations:
         def apply(
             i: int, z: Any, dz: Any, beside: Mapping[str, Any] | None = None, term: Callable[..., Any] | None = None
         ) -> Any:
-            e, now = simulator.elements[i], Named("input", {**u, **(beside or {})})
+            e, now = simulator.elements[i], Named("input", {"t": t, **u, **(beside or {})})
             have = {"z": z, "dz": dz, "q": q[i], "p": self._own(e), "t": t, "x": x, "u": now, "term": term}
             if hasattr(e.law, "step"):
                 read = {k: have[k] for k in ("dz", "u") if k in inspect.signature(e.law.step).parameters}

@@ -83,7 +83,7 @@ def catalogue(monkeypatch):
     """Shorten the catalogue to some laws; the README's snippet and many slow tests search the whole one."""
 
     def shorten(*laws):
-        monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.preparation"), "CATALOGUE", laws)
+        monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.arguments"), "CATALOGUE", laws)
 
     return shorten
 

@@ -101,6 +101,24 @@ def test_values_that_two_levels_of_an_input_hardly_determine_spread_predictions_
     assert of_parabola > 100 * v
 
 
+def test_other_inputs_that_lead_past_an_unstable_rest_do_not_count_as_ignorance_of_the_parameters():
+    """Between two wells, inputs 0.7 times as large come to rest on the ridge, where any small change grows."""
+    wells = pilfr.Simulator(
+        lambda x, u, p: {"x": p.a * (x.x - x.x**3) + u.push},
+        lambda x: {"x": x.x},
+        states=("x",),
+        inputs=("push",),
+        parameters={"a": pilfr.Parameter(1.0, bounds=(0.2, 5))},
+        hold="zero",
+    )
+    t = 0.1 * np.arange(600)
+    push = pilfr.Recording(0.66 * np.sin(0.2 * t), np.zeros(600), 0.1, ("push",), ("x",), initial="zero")
+    y = wells.simulate(push) + 0.01 * np.random.default_rng(0).standard_normal((600, 1))
+    bench = Workbench.of(wells, [push.with_(y=y)], "zero")
+    fitted = bench.fit(wells)
+    assert spread(bench, fitted, (), fitted.cost, 600.0) < 0.01 * fitted.cost  # one value from 600 samples
+
+
 def test_the_more_a_force_would_follow_of_the_rest_the_less_the_name_is_believed():
     shares = [share_named(s) for s in (0.0, 0.003, 0.03, 0.3, 1.0)]
     assert shares == sorted(shares, reverse=True)

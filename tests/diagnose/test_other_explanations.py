@@ -13,7 +13,7 @@ from pilfr_casadi import Parameter, Recording, Simulator, laws
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.floor import Floor
-from pilfr_casadi.diagnose.other_explanations import find_varying_values
+from pilfr_casadi.diagnose.other_explanations import find_untried_laws, find_varying_values
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.report.diagnosis_tables import headline
@@ -153,12 +153,16 @@ def recorded(k, seed, state=(0.0, 0.0), initial="zero"):
     return r.with_(y=y + 1e-3 * rng.standard_normal(y.shape)), after
 
 
+def searched(simulator, *recordings, tried=()):
+    """A search for no effect."""
+    bench = Workbench.of(simulator, recordings, "zero")
+    floor = Floor(np.full(1, 1e-3), "estimated")
+    return Search(bench, bench.fit(bench.simulator), floor, tried, 1, Stages(lambda *_: None)).run(0)
+
+
 def told(*recordings):
     """What is said of them where nothing else is found."""
-    bench = Workbench.of(machine(), recordings, "zero")
-    floor = Floor(np.full(1, 1e-3), "estimated")
-    search = Search(bench, bench.fit(bench.simulator), floor, (), 1, Stages(lambda *_: None))
-    return find_varying_values(search.run(0))
+    return find_varying_values(searched(machine(), *recordings))
 
 
 def test_recordings_that_disagree_are_told_with_the_value_that_differs():
@@ -178,3 +182,10 @@ def test_a_value_that_changes_within_a_recording_is_told_by_its_halves():
 
 def test_recordings_that_agree_are_not():
     assert told(recorded(20.0, 0)[0], recorded(20.0, 1)[0]) == ()
+
+
+@pytest.mark.parametrize(("tried", "names"), [(laws.Radiation, ["equation:pos, equation:vel"]), (laws.Cubic, [])])
+def test_laws_that_need_a_known_domain_are_told_where_it_is_unknown(tried, names):
+    found = find_untried_laws(searched(machine(), recorded(20.0, 0)[0], tried=(tried,)))
+    assert [gate.channel for gate in found] == names
+    assert all("thermal alone were not tried" in gate.sentence for gate in found)

@@ -12,7 +12,9 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, laws
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import pipeline
-from pilfr_casadi.diagnose.search import UntilInterrupted
+from pilfr_casadi.diagnose.floor import Floor
+from pilfr_casadi.diagnose.hypotheses import UntilInterrupted
+from pilfr_casadi.diagnose.preparation import Prepared
 from pilfr_casadi.diagnose.verdict import Verdict
 
 
@@ -53,7 +55,8 @@ def test_what_seems_early_beside_something_unexplained_is_searched_as_it_is(monk
     def prepare(*given, early, say):
         early_or_not.append(early)
         bench = SimpleNamespace(scale=np.ones(1))
-        return SimpleNamespace(bench=bench, without=None, floor=None, gates=gates if early else ())
+        floor = Floor(np.zeros(1), "periods")
+        return Prepared(bench, None, 0.0, gates if early else (), floor)
 
     monkeypatch.setattr(pipeline, "prepare", prepare)
     monkeypatch.setattr(pipeline, "Search", Unsure)
@@ -126,6 +129,7 @@ def test_an_answer_that_is_there_outlives_an_interrupt_of_what_adds_to_it(monkey
     monkeypatch.setattr(pipeline, "clipped_input", lambda *given: None)
     monkeypatch.setattr(pipeline, "mean_nrmse", lambda *given: 0.5)
     monkeypatch.setattr(pipeline, "find_undeclared_port", interrupted)
+    monkeypatch.setattr(pipeline, "find_untried_laws", lambda search: ())
     monkeypatch.setattr(pipeline, "find_varying_values", lambda search: ())
     found = pipeline.conclude(search, ())
     assert search.interrupted and found.verdict.kind == "unexplained"

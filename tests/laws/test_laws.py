@@ -25,6 +25,7 @@ from pilfr_casadi.laws import (
     Local,
     Mode,
     PreslidingStribeckFriction,
+    Relaxation,
     StopHysteresis,
     StribeckFriction,
     behind_gap,
@@ -208,6 +209,12 @@ def test_the_catalogue_has_no_law_twice():
 )
 def test_a_power_of_one_is_no_curve_and_a_damper_without_a_spring_no_clearance(kind, values, doubtful):
     assert kind().doubtful(values) is doubtful
+
+
+@pytest.mark.parametrize(("T", "doubtful"), [(5.0, False), (20.0, True)])
+def test_creep_at_its_longest_time_constant_is_doubtful(T, doubtful):
+    law = Relaxation().at({}, {"T": (0.05, 20.0)})
+    assert law.doubtful({"k_v": 3.0, "T": T}) is doubtful
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,113 @@
+"""The arguments of `diagnose`: their checks, and the request that they make."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .._base import InputError, Stages, listed
+from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
+from ..identify import match_channels
+from ..laws import CATALOGUE, SCALABLE, Law, LinearStiffness, ViscousDamping, scaled, scheduled
+from ..simulators import Simulator, as_simulator
+from .gates import Gate
+from .stretches import Stretches
+
+FEWEST_SAMPLES = 20  # samples in all training recordings together; fewer cannot determine a model
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """Arguments of `diagnose`, checked; see there."""
+
+    simulator: Simulator
+    recordings: Sequence[Recording]
+    laws: Sequence[type[Law]]
+    hold: str | None
+    engine: str
+    workers: int
+    most_effects: float
+    stand_in_error: float
+    deadline: float
+    say: Stages
+    focus: str | None = None
+    notes: tuple[Gate, ...] = ()
+    stretches: Stretches | None = None  # where `recordings` are stretches of long ones
+
+    @property
+    def hold_said(self) -> bool:
+        """Whether somebody said what inputs do between samples."""
+        return stated_hold(self.simulator, self.recordings, self.hold) is not None
+
+
+def stated_hold(simulator: Any, recordings: Sequence[Recording], said: str | None) -> str | None:
+    """Return the hold that the user, the simulator or a recording states; None if none of them does."""
+    return next((h for h in (said, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
+
+
+def match_recordings(
+    simulator: Any, train: Recording | Sequence[Recording], hold: str | None, excited: bool = True
+) -> tuple[Simulator, tuple[Recording, ...]]:
+    """Return the simulator, and the recordings with its channels in its order.
+
+    With `excited`, recordings in which no input ever changes are refused.
+
+    Raises
+    ------
+    InputError
+        If the hold is unknown, or simulator and recordings do not fit each other.
+    """
+    if hold not in HOLDS:
+        raise InputError(f"hold={hold!r} was given; use 'zero', 'linear' or None.")
+    given = as_recordings(train)
+    simulator = as_simulator(simulator, given)
+    recordings = [match_channels(simulator, r) for r in given]
+    return simulator, check_for_identification(recordings, FEWEST_SAMPLES, excited)
+
+
+def match_tests(
+    simulator: Simulator, test: Recording | Sequence[Recording] | None, train: Sequence[Recording]
+) -> tuple[Recording, ...]:
+    """Return the test recordings with the simulator's channels; refuse training data and other steps."""
+    tests = tuple(match_channels(simulator, r) for r in as_recordings(test)) if test is not None else ()
+    for t in tests:
+        if any(len(r) == len(t) and np.array_equal(r.u, t.u) and np.array_equal(r.y, t.y) for r in train):
+            raise InputError("A test recording equals a training recording; give data the fit has not seen.")
+        if abs(t.dt / train[0].dt - 1) > SAME_STEP:
+            raise InputError(f"The test recording's step is {t.dt:g} s, the training's {train[0].dt:g} s; resample it.")
+    return tests
+
+
+def check_laws(laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
+    """Return the laws as a tuple, by default the catalogue; refuse anything that is not a class of laws."""
+    for law in laws or ():
+        if not (isinstance(law, type) and issubclass(law, Law)):
+            raise InputError(f"laws holds {law!r}; give classes of laws, such as pilfr.laws.CoulombFriction.")
+    return CATALOGUE if laws is None else tuple(laws)
+
+
+def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[type[Law], ...]:
+    """Return the laws, and versions of some of them whose strength varies with a signal.
+
+    An input that the equations do not read may scale a law. A spring or damper of the simulator's own may vary with the
+    time, an input, or a port's own signal. Other laws are found first, and then let vary (`Search`).
+    """
+    by_input = [scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs]
+    read = [name for name in simulator.inputs if name not in simulator.idle_inputs]
+    signals = ["t", *read, *sorted({name for port in simulator.ports for name in port.signals})]
+    varying = [scheduled(law, by) for law in (LinearStiffness, ViscousDamping) if law in laws for by in signals]
+    return (*laws, *by_input, *varying, *([scheduled(ViscousDamping, "z")] if ViscousDamping in laws else []))
+
+
+def check_limits(simulator: Simulator, limits: Mapping[str, float] | None) -> None:
+    """Refuse a limit on a name that is not an input, and a limit that is not positive."""
+    for name, most in (limits or {}).items():
+        if name not in simulator.inputs:
+            raise InputError(
+                f"A limit was given for {name!r}, which is no input; there are {listed(simulator.inputs)}."
+            )
+        if not most > 0:
+            raise InputError(f"The limit of {name} is {most!r}; give the largest amplitude allowed, a positive number.")
