@@ -167,11 +167,13 @@ def _scheduled(base: Any, by: str) -> Any:
 
         @classmethod
         def finer_starts(cls, values: Mapping[str, Any], local: Local) -> Iterator[dict[str, Any]]:
-            """Start as the law of these values, equally strong in the whole range of the signal."""
+            """Start as the law of these values, stronger at one end of the range of the signal than at the other."""
             signal = cls().schedule(local)
             mean = {name: (values[name] + values.get(end, values[name])) / 2 for name, end in high.items()}
             ends = {"low": float(signal.min()), "high": float(signal.max())}
-            yield {**values, **mean, **{end: mean[name] for name, end in high.items()}, **ends}
+            for low, top in ((0.5, 1.5), (1.5, 0.5)):
+                own = {name: low * v for name, v in mean.items()}
+                yield {**values, **own, **{end: top * mean[name] for name, end in high.items()}, **ends}
 
         if base.memory:
 
