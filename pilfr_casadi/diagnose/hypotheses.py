@@ -249,9 +249,18 @@ class Hypotheses:
                         self.alternatives[s.port] = (*there, s.law)
         return known.screened
 
-    def can_improve(self, trial: Trial) -> bool:
+    @property
+    def least_noise2(self) -> float:
+        """Mean square of the noise at least: what was measured, or the white part of the best residual."""
+        if self.floor.source != "estimated":
+            return self.floor2
+        white = np.hypot(white_part(self.best.fitted.residual), self.stand_in_error * self.bench.scale)
+        return float(np.mean((white / self.bench.scale) ** 2))
+
+    def can_improve(self, trial: Trial, noise2: float | None = None) -> bool:
         """Tell whether a law that removes all but the noise would be worth its prior beside a hypothesis."""
-        left, noise = (v + self.tolerance for v in (trial.mean_square, self.floor2))
+        noise2 = self.floor2 if noise2 is None else noise2
+        left, noise = (v + self.tolerance for v in (trial.mean_square, noise2))
         most = 0.5 * self.sample.effective(0.0) * np.log(max(left / noise, 1.0))
         return bool(most > np.log(max(len(self.alternatives), 1)) - EFFECT_PRIOR)
 

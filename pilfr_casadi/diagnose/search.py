@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, side_by_side
-from ..laws import FINER, SCALABLE, Law, scheduled, unscheduled
+from ..laws import FINER, LINEAR, SCALABLE, Law, scheduled, unscheduled
 from ..simulators import Placed
 from .evidence import (
     BETTER_RATIO,
@@ -172,8 +172,10 @@ class Search(Hypotheses):
         best = self.best
         if len(best.laws) == len(parent.laws) + 1:
             self._refine(best, FINER.get(type(best.element.law), ()))
-        step = [self.memo[t.key] for t in self.steps[-1].trials if unscheduled(type(t.law)) in SCALABLE]
-        if step and self.can_improve(self.best) and self.in_time():
+        may_vary = [kind for kind in SCALABLE if kind.id not in LINEAR]  # a linear law was screened with every signal
+        step = [self.memo[t.key] for t in self.steps[-1].trials if unscheduled(type(t.law)) in may_vary]
+        # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
+        if step and self.can_improve(self.best, self.least_noise2) and self.in_time():
             varied = max(step, key=self.optimistic_evidence)
             kind = unscheduled(type(varied.law))
             signals = ("z", *self._entry(varied).local.inputs)

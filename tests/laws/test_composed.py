@@ -16,6 +16,7 @@ from pilfr_casadi.laws import (
     Relaxation,
     Saturation,
     SoftClearance,
+    ViscousDamping,
     behind_gap,
     scaled,
     scheduled,
@@ -104,6 +105,34 @@ def test_friction_that_varies_with_a_signal_is_found(law, values):
     assert [(e.port, e.law) for e in found.effects] == [("damper", "coulomb_friction")], str(found)
     assert law.scheduled_by in found.effects[0].form.partition("scheduled by ")[2]
     assert found.errors["test"]["after"] < 0.05 * found.errors["test"]["before"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "by", "values", "ends"),
+    [
+        (CoulombFriction, "voltage", {"F_c": 1.0, "F_c_high": 5.0, "v_0": 5e-3}, (0.5, 4.0)),
+        (CoulombFriction, "z", {"F_c": 0.5, "F_c_high": 5.0, "v_0": 5e-3}, (-0.15, 0.15)),
+        (CoulombFriction, "t", {"F_c": 1.0, "F_c_high": 5.0, "v_0": 5e-3}, (0.0, 5.998)),
+        (ViscousDamping, "t", {"c_1": 2.0, "c_1_high": 12.0}, (0.0, 5.998)),
+    ],
+    ids=("friction with an input", "friction with the position", "friction with the time", "damping with the time"),
+)
+def test_a_strength_that_varies_is_found_with_its_signal(kind, by, values, ends):
+    law = scheduled(kind, by)().at({**values, "low": ends[0], "high": ends[1]})
+    train = recorded(rig(push=4.0).with_element("damper", law), 0)
+    found = pilfr.diagnose(rig(1000.0, 7.5, push=4.0), train, laws=(kind,), effects=1)
+    assert [(e.port, e.law) for e in found.effects] == [("damper", kind.id)], str(found)
+    assert found.effects[0].form.endswith(f"scheduled by {by}")
+    assert found.errors["train"]["after"] < 1.1e-3
+
+
+@pytest.mark.parametrize(
+    ("shown", "from_zero", "usable"), [(True, False, True), (False, True, True), (False, False, False)]
+)
+def test_a_strength_varies_with_the_position_where_that_is_known(shown, from_zero, usable):
+    z = np.linspace(-1.0, 2.0, 50)
+    local = Local(z, np.ones(50), 0.1, (50,), shown=shown, from_zero=(from_zero,))
+    assert (not scheduled(CoulombFriction, "z")().why_not(local)) is usable
 
 
 def test_a_scheduled_law_is_the_law_where_the_signal_stands_still():
