@@ -45,13 +45,21 @@ COMPARED_SAMPLES = 4000  # approximate number of samples on which forces are com
 def complements(one: Law, other: Law) -> bool:
     """Tell whether two laws of a port are different physics: one opposes motion, the other is a curve of position.
 
-    A constant offset may stand beside any other law.
+    So are two curves of position if a signal, such as a pressure, varies the strength of one alone. A constant offset
+    may stand beside any other law.
     """
     if "offset" in (one.id, other.id):
         return one.id != other.id
     rubs, springs = sorted((one, other), key=lambda law: not law.dissipative)
-    apart = rubs.dissipative and not springs.dissipative and springs.reads() == {"z"} and not hasattr(springs, "step")
-    return apart and springs.order == 0 and rubs.id not in ("creep", "extra_mode")
+    if _is_curve(rubs):
+        varied = [bool(law.scaled_by or law.scheduled_by not in ("", "z")) for law in (one, other)]
+        return _is_curve(springs) and varied[0] != varied[1]
+    return rubs.dissipative and _is_curve(springs) and rubs.id not in ("creep", "extra_mode")
+
+
+def _is_curve(law: Law) -> bool:
+    """Tell whether a law is a curve of position, without memory."""
+    return not law.dissipative and law.reads() == {"z"} and not hasattr(law, "step") and law.order == 0
 
 
 def relatives(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:

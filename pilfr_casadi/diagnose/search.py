@@ -99,9 +99,15 @@ class Search(Hypotheses):
         return True
 
     def _name_rest(self, effects: float) -> bool:
-        """Name the forces learned beside the simulator and the best hypothesis; go on if one of the laws leads."""
+        """Name the forces learned beside the simulator, the best hypothesis, and that without its weakest effect.
+
+        The weakest of several effects may imitate a law that only a learned force shows, such as a gain that varies
+        with the position. Go on if one of the laws leads.
+        """
         best = self.best
-        for base in {t.key: t for t in (self.root, best)}.values():
+        fewer = [t for t in self.memo.values() if t.effects and t.key < best.key]
+        without_weakest = sorted(fewer, key=lambda t: (-len(t.effects), t.mean_square))[:1]
+        for base in {t.key: t for t in (self.root, best, *without_weakest)}.values():
             if len(base.effects) < effects and self.can_improve(best) and self.in_time():
                 self.name_learned(base)
         return self.best is best or self._grow(effects)

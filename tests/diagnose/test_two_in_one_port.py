@@ -31,6 +31,8 @@ def test_friction_and_ripple_at_one_port_are_both_named():
         (laws.CubicStiffness, laws.PiecewiseStiffness, False),  # both of position
         (laws.Relaxation, laws.CubicStiffness, False),  # it is a spring itself
         (laws.CoulombFriction, laws.Drift, False),  # neither of position
+        (laws.CubicStiffness, laws.scaled(laws.LinearStiffness, "pressure"), True),  # a signal varies one of them
+        (laws.CubicStiffness, laws.scheduled(laws.LinearStiffness, "z"), False),
     ],
 )
 def test_only_different_physics_stands_beside_a_law(one, other, apart):
