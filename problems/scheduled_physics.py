@@ -72,10 +72,10 @@ def run(
         value, first, last = {
             "temperature": (u[1], 20.0, 45.0),
             "pressure": (u[0], 0.6e5, 5.4e5),
-            "z": (s, 0.6 * at_rest, 1.4 * at_rest),
+            "z": (s, 0.3 * at_rest, 1.8 * at_rest),
             "t": (u[2], 0.0, t[-1]),
         }[signal]
-        share = np.clip((value - first) / (last - first), -0.2, 1.2)
+        share = max((value - first) / (last - first), -0.2)
         size = ends[0] + share * (ends[1] - ends[0])
         w = size * (np.tanh(v / KNEE) if law == "coulomb_friction" else v)
         return np.array([v, (p["A"] * u[0] - p["k"] * s - p["d"] * v - w) / p["m"]])
