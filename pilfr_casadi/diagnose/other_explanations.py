@@ -85,7 +85,8 @@ def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameter
             return None
         name = min(gained, key=lambda n: gained[n].cost)
         freed, best = (*freed, name), gained[name]
-        if best.cost <= enough:
+        # a law that hardly explains anything is equalled by any value
+        if best.cost <= enough and gain(without.cost, best.cost, best.residual, len(freed)) > LEAST_GAIN:
             return PinnedParameters(freed, best, _describe_pinned(search, freed, best, named))
     return None
 

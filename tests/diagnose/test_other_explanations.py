@@ -13,11 +13,12 @@ from pilfr_casadi import Parameter, Recording, Simulator, laws
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.floor import Floor
-from pilfr_casadi.diagnose.other_explanations import find_untried_laws, find_varying_values
+from pilfr_casadi.diagnose.other_explanations import find_pinned_parameters, find_untried_laws, find_varying_values
 from pilfr_casadi.diagnose.search import Search
+from pilfr_casadi.diagnose.verdict import NamedEffect, Posterior
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.report.diagnosis_tables import headline
-from pilfr_casadi.simulators import discretise
+from pilfr_casadi.simulators import Placed, discretise
 
 # on the smallest rigs that have them
 
@@ -76,6 +77,14 @@ def test_two_wrong_values_are_told_in_place_of_a_gain_of_the_torque_and_a_curve_
     assert (found.verdict, found.effects, found.freed) == ("complete", (), "J and weight"), str(found)
     assert found.parameters["J"]["refit_with"] == pytest.approx(0.021, rel=0.02)
     assert "with J and weight let go" in headline(found).replace("\u00a0", " ")
+
+
+def test_no_value_is_told_in_place_of_a_law_that_explains_nothing():
+    right = machine()
+    held = right.with_parameters({**right.parameters, "k": Parameter(20.0, fixed=True)})
+    search = searched(held, recorded(20.0, 0)[0])
+    named = NamedEffect(Placed("equation:vel", laws.CubicStiffness(), "equation:vel."), 0.9, {})
+    assert find_pinned_parameters(search, Posterior(search.root, 1.0, (named,), 0.0)) is None
 
 
 def test_friction_where_no_port_is_declared_is_told_where_it_acts():
