@@ -5,6 +5,8 @@ STAMP := .venv/.installed
 DOCS_STAMP := .venv/.installed-docs
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 WORKERS ?= auto
+# some environments forbid compiled modules; the workers and commands of a test run would compile all sources again
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test lint slow docs clean
 .DELETE_ON_ERROR:

@@ -6,12 +6,14 @@ about. The files by stage:
 
 - The whole: `pipeline` (the steps in their order), `workbench` (what all steps share).
 - Preparation: `arguments` checks the arguments. `prediction` stabilises an unstable simulator with an observer.
-  `preparation` checks the recordings. A check of recordings corrects a fault where it finds one: `gates` (what a
-  finding is and when it is accepted; sign, unit or gain, exchange, offset), `recording_faults` (glitches, stale and
-  clipped samples, unsettled periods, tones) and `timing` (shift, clock, gap). `floor` estimates the noise.
+  `preparation` checks the recordings. A check corrects a fault where it finds one; `gates` is what a finding is and
+  when it is accepted. The faults: `channel_faults` (sign, unit or gain, exchange), `offsets`, `recording_faults`
+  (glitches, stale and clipped samples, unsettled periods, tones) and `timing` (shift, clock, gap). `floor` estimates
+  the noise.
 - Long recordings: `stretches` chooses what the search sees of them, and fits the leading hypotheses to everything.
-- Search: `search` moves from hypothesis to hypothesis. `linearise`, `screen` and `relatives` select the hypotheses that
-  are worth a fit, `trials` fits them. `learned` fits forces that have no name yet.
+- Search: `hypotheses` keeps what was fitted, with its evidence. `search` moves from one hypothesis to others.
+  `linearise`, `screen` and `relatives` select those that are worth a fit, `trials` fits them. `learned` fits forces
+  that have no name yet.
 - Evidence: `evidence` is the one scale: log evidence, prior of laws, errors on held-out data, and a table of the
   numbers on which answers rest. `verdict` turns the evidences into a posterior and a verdict.
 - Correction: `correction` chooses the corrected simulator, with a learned force where named laws do not suffice.

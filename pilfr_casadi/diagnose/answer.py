@@ -18,9 +18,10 @@ from .arguments import Request
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction
 from .evidence import SURE, deviations
-from .gates import Gate, final_gates, without_zero_offsets
+from .gates import Gate
 from .identifiability import port_units
 from .mismatch_map import mismatch
+from .offsets import final_gates, without_zero_offsets
 from .preparation import Prepared
 from .proof import free_run_errors, mean_nrmse, next_experiment, parameter_table, placebo, test_errors
 from .result import Diagnosis, Effect

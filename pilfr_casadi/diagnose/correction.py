@@ -21,8 +21,9 @@ from .._base import InputError
 from ..laws import CATALOGUE, display_name
 from ..simulators import Placed
 from .evidence import FORMULA_ERROR, SURE, HeldOut
+from .hypotheses import likeliest
 from .learned import Learned, LearnedForce, describe_learned, refit_learned
-from .search import Search, likeliest
+from .search import Search
 from .trials import Trial
 from .verdict import Posterior, explainable_remainder, share_left
 from .workbench import FEW, Fitted

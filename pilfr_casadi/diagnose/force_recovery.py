@@ -97,34 +97,42 @@ class _Smoother:
         """Find the likeliest random step of the force and factor on the noise; None if the force is not observable."""
         if not self.unit[-1] > 0:
             return None
-        length = min(len(self.e), 1200)
-        found = [(self._filter(q, r, length)[0], (float(q), r)) for q in TRIED for r in LOUDER]
-        usable = [v for v in found if np.isfinite(v[0])]
-        return min(usable)[1] if usable else None
+        q, r = (v.ravel() for v in np.meshgrid(TRIED, LOUDER, indexing="ij"))
+        costs, _ = self._filter(q, r, min(len(self.e), 1200))
+        if not np.any(np.isfinite(costs)):
+            return None
+        best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+        return float(q[best]), float(r[best])
 
-    def _filter(self, q: float, r: float, length: int) -> tuple[float, list[tuple[Any, ...]]]:
-        """Compute minus twice the log likelihood, and the predicted and filtered means and covariances."""
-        n = len(self.unit)
-        s, p = np.zeros(n), np.diag(np.append(np.full(n - 1, 0.01), 25.0))
-        cost = 0.0
-        kept: list[tuple[Any, ...]] = []
-        for k in range(length):
-            h = self.h[k]
-            v, gain, p_at = measurement_update(p, h, r**2 * np.eye(len(h)))
-            innovation = self.e[k] - h @ s
-            cost += float(innovation @ np.linalg.solve(v, innovation)) + float(np.linalg.slogdet(v)[1])
-            s_at = s + gain @ innovation
-            p_at = (p_at + p_at.T) / 2
-            kept.append((s, p, s_at, p_at))
-            f = self.f[k]
-            s, p = f @ s_at, f @ p_at @ f.T
-            s[-1] += self.steps[k]
-            p[-1, -1] += q**2
-        return cost, kept
+    def _filter(
+        self, q: np.ndarray, r: np.ndarray, length: int, keep: bool = False
+    ) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
+        """Run K filters side by side, because a step of many costs hardly more than a step of one.
+
+        q and r are (K,). Returns minus twice the log likelihoods, (K,), and, if they are to be kept, the predicted and
+        filtered means (K, n) and covariances (K, n, n) of each sample.
+        """
+        n, n_y = len(self.unit), self.e.shape[1]
+        s, p = np.zeros((len(q), n)), np.tile(np.diag(np.append(np.full(n - 1, 0.01), 25.0)), (len(q), 1, 1))
+        noise = r[:, None, None] ** 2 * np.eye(n_y)
+        costs = np.zeros(len(q))
+        kept: list[tuple[np.ndarray, ...]] = []
+        for h, f, e, step in zip(self.h[:length], self.f, self.e, self.steps, strict=False):
+            v, gain, p_at = measurement_update(p, h, noise)
+            innovation = (e - s @ h.T)[:, :, None]
+            costs += (innovation.mT @ np.linalg.solve(v, innovation))[:, 0, 0] + np.linalg.slogdet(v)[1]
+            s_at = s + (gain @ innovation)[:, :, 0]
+            p_at = (p_at + p_at.mT) / 2
+            if keep:
+                kept.append((s, p, s_at, p_at))
+            s, p = s_at @ f.T, f @ p_at @ f.T
+            s[:, -1] += step
+            p[:, -1, -1] += q**2
+        return costs, kept
 
     def smooth(self, q: float, r: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute the changes of states (M, n_x) and force (M,), and the force's standard deviation (M,)."""
-        kept = self._filter(q, r, len(self.e))[1]
+        kept = [tuple(v[0] for v in each) for each in self._filter(np.array([q]), np.array([r]), len(self.e), True)[1]]
         m, n = len(kept), len(self.unit)
         mean, variance = np.empty((m, n)), np.empty(m)
         s, p = kept[-1][2], kept[-1][3]

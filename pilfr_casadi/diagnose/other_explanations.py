@@ -173,9 +173,7 @@ def find_untried_laws(search: Search) -> tuple[Gate, ...]:
     """Note the ports of unknown domain, where laws of a single domain were not tried."""
     special = [law for law in search.laws if law.special]
     ports = [p.name for p in search.bench.simulator.all_ports() if p.domain == UNKNOWN and not p.series]
-    if not special:
-        return ()
-    if not ports:
+    if not (special and ports):
         return ()
     domains = sorted({domain for law in special for domain in law.domains})
     sentence = (

@@ -58,7 +58,8 @@ from .arguments import (
 from .correction import find_correction, named_correction
 from .evidence import AS_GIVEN_RATIO, SURE
 from .floor import Floor, measured_floor
-from .gates import USELESS_FIT, Gate, Offset, offset_gates, without_idle_offsets
+from .gates import USELESS_FIT, Gate
+from .offsets import Offset, offset_gates, without_idle_offsets
 from .other_explanations import find_pinned_parameters, find_undeclared_port, find_untried_laws, find_varying_values
 from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
 from .preparation import CHECKS, Prepared, hold_note, prepare

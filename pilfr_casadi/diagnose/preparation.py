@@ -16,6 +16,7 @@ from .._base import InputError, Stages
 from ..data import Recording
 from ..simulators import Simulator
 from .arguments import stated_hold
+from .channel_faults import find_slips, open_bench
 from .floor import Floor, white_part
 from .gates import (
     CURED_SHARE,
@@ -24,15 +25,12 @@ from .gates import (
     POOR_FIT,
     Checked,
     Gate,
-    find_offsets,
-    find_slips,
-    find_wrong_start,
-    open_bench,
     refit,
 )
 from .linearise import along, linearised, observer_gain
+from .offsets import find_offsets, find_wrong_start
 from .proof import errors_of
-from .recording_faults import find_stale_samples, open_unsettled, remove_glitches, unclip
+from .recording_faults import mend_stale_samples, open_unsettled, remove_glitches, unclip
 from .timing import AVERAGED_NOISE, find_gaps, find_time_shift, in_steps, run_as_given
 from .workbench import THOROUGH, Fitted, Workbench, refine_steps
 
@@ -82,7 +80,7 @@ def prepare(
     recordings, transients = open_unsettled(recordings)
     said = stated_hold(simulator, recordings, hold)
     bench, times = open_bench(simulator, recordings, said or "zero", engine)
-    gates = (*spikes, *transients, *find_stale_samples(recordings), *times)
+    gates = (*spikes, *transients, *times)
     held: Sequence[Gate] = ()
     if not said:
         bench, held = _choose_hold(bench)
@@ -123,7 +121,7 @@ class _Checks:
                 starts = [found.fitted.values, {}, *self.starts]
                 found = found.then(bench, bench.fit(bench.simulator, starts, solver=THOROUGH))
             now = found
-        now = find_gaps(unclip(self._report(3, now)))
+        now = find_gaps(mend_stale_samples(unclip(self._report(3, now))))
         now = now.then(*refine_steps(now.bench, self._report(4, now).fitted))
         return find_offsets(self._report(5, find_time_shift(now, part, self.early)))
 

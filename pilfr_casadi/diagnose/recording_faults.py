@@ -3,9 +3,9 @@
 - Glitches, for example from a lost bit or a loose contact: a sample far off the cubic through its four neighbours,
   relative to the distances nearby. Replacing it by that cubic makes its neighbours inconspicuous; this does not hold at
   a step or a shock.
-- Stale samples: a channel sometimes repeats its last value, which it otherwise never does. Three other causes are told
-  apart: a coarse converter, or an encoder that moves by no more than its step, has few values; a machine at rest
-  repeats one value for long; a clipped channel repeats its limit.
+- Stale samples: a channel sometimes repeats its last value, which it otherwise never does. Interpolation replaces them.
+  Three other causes are told apart: a coarse converter, or an encoder that moves by no more than its step, has few
+  values; a machine at rest repeats one value for long; a clipped channel repeats its limit.
 - Clipped channels: exactly repeated extremes. A clipped output can be compared with an equally clipped simulation; the
   part of a clipped input beyond its limit is lost.
 - Unsettled periods: the rms differences of neighbouring periods are equal if only noise differs, and larger at first if
@@ -21,6 +21,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -140,24 +141,54 @@ def _stands_alone(y: np.ndarray, d: np.ndarray, k: int) -> bool:
 # stale samples
 
 
-def find_stale_samples(recordings: Sequence[Recording]) -> list[Gate]:
-    """Note each output that repeats samples."""
-    found = []
-    for i, name in enumerate(recordings[0].outputs):
-        columns = [r.y[r.skip :, i] for r in recordings]
-        levels = np.unique(np.concatenate(columns))
-        step = np.min(np.diff(levels), initial=np.inf)
-        repeated = float(np.mean(np.concatenate([_find_repeats(y, step) for y in columns])))
-        up = float(np.mean(np.abs(np.concatenate(list(map(np.diff, columns))) - step) < 0.5 * step))
-        if repeated > max(EXCEPTION_SHARE, CHANCE_FACTOR * up) and len(levels) > DISTINCT_SHARE * sum(
-            map(len, columns)
-        ):
-            sentence = (
-                f"{repeated:.0%} of the samples of {name} repeat the one before, as from lost or stale samples; the "
-                "error that this makes is taken for noise: record again, or leave them out."
-            )
-            found.append(Gate(name, "stale", repeated, sentence, False))
-    return found
+@dataclass(frozen=True)
+class Stale(Gate):
+    """A channel that repeats samples: interpolation between the others replaces them."""
+
+    remedy: ClassVar[str] = "with these samples interpolated"
+
+
+def mend_stale_samples(now: Checked) -> Checked:
+    """Interpolate stale samples if the rule accepts it; else note those of outputs."""
+    first = now.bench.recordings[0]
+    for side, names in (("u", first.inputs), ("y", first.outputs)):
+        for i, name in enumerate(names):
+            repeated = share_of_repeats([getattr(r, side)[r.skip :, i] for r in now.bench.recordings])
+            if not repeated:
+                continue
+            words = f"{repeated:.0%} of the samples of {name} repeat the one before, as from lost or stale samples"
+            fault = Stale(name, "stale", repeated, words, change=partial(_interpolate_repeats, side=side, column=i))
+            found = accept(now, correct(now, fault, [{}, now.fitted.values], now.fitted.begin), fault)
+            if found is now and side == "y":
+                words = f"{words}; the error that this makes is taken for noise: record again, or leave them out."
+                found = now.then(now.bench, now.fitted, Gate(name, "stale", repeated, words, False))
+            now = found
+    return now
+
+
+def _interpolate_repeats(r: Recording, side: str, column: int) -> Recording:
+    """Replace repeated samples of a channel by a cubic spline through the others."""
+    from scipy.interpolate import CubicSpline
+
+    v, k = np.array(getattr(r, side)), np.arange(len(r))
+    fresh = ~_find_repeats(v[:, column], _smallest_step(v[:, column]))
+    v[~fresh, column] = CubicSpline(k[fresh], v[fresh, column])(k[~fresh])
+    return r.with_(**{side: v})
+
+
+def share_of_repeats(columns: Sequence[np.ndarray]) -> float:
+    """Compute the share of the samples of a channel that repeat the one before; zero if chance or rest explains it."""
+    together = np.concatenate(columns)
+    step = _smallest_step(together)
+    repeated = float(np.mean(np.concatenate([_find_repeats(v, step) for v in columns])))
+    by_chance = float(np.mean(np.abs(np.concatenate(list(map(np.diff, columns))) - step) < 0.5 * step))
+    many = len(np.unique(together)) > DISTINCT_SHARE * len(together)
+    return repeated if many and repeated > max(EXCEPTION_SHARE, CHANCE_FACTOR * by_chance) else 0.0
+
+
+def _smallest_step(v: np.ndarray) -> float:
+    """Return the smallest distance between two values of a signal."""
+    return float(np.min(np.diff(np.unique(v)), initial=np.inf))
 
 
 def find_stretches(mask: np.ndarray) -> np.ndarray:

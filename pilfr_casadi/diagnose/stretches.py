@@ -37,9 +37,10 @@ from ..optimise import GaussNewton, estimate_initial_state, samples_for_state
 from ..simulators import Simulator
 from .floor import FEWEST, effective_size
 from .gates import Gate
+from .hypotheses import Findings, likeliest
 from .linearise import Probe, loudest_stretch, run
 from .screen import Remainder, Surface, Task, orthonormal
-from .search import Findings, Search, likeliest
+from .search import Search
 from .timing import Jump
 from .trials import Trial
 from .workbench import DIVERGED, FEW, Fitted, Workbench

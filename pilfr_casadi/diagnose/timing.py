@@ -60,6 +60,8 @@ RIVAL_DISTANCE = 5  # samples around a jump at which rivals are tried, and at wh
 SHOCK_DELAYS = (-0.5, 0.0, 0.5)  # delays of a shock that are tried, in samples
 RIDGE = 1e-6  # on the normal equations, against jumps that initial states can follow
 
+_Curve = Callable[[np.ndarray], np.ndarray]  # a signal over time
+
 
 @dataclass(frozen=True)
 class TimeShift(Gate):
@@ -78,18 +80,18 @@ class TimeShift(Gate):
         moved = replace(self, value=value, sentence=words)
         return replace(moved, change=moved.read)
 
-    def read(self, r: Recording, cut: bool = True) -> Recording:
+    def read(self, r: Recording, cut: bool = True, curves: Sequence[_Curve] = ()) -> Recording:
         """Read the channels at the times of the others, interpolated: outputs by cubic splines, inputs by chords.
 
         Samples from before the recording are skipped, samples from behind it are cut off. Without `cut`, the end values
-        are held. A periodic recording wraps around.
+        are held. A periodic recording wraps around. `curves` are those of the recording where they are known.
         """
         change = self.value if self.kind == "y" else -self.value
         at = r.t + change if self.finding == "alignment" else r.t * (1 + change)
-        wraps = bool(r.period) and len(r) % (r.period or 1) == 0 and self.finding == "alignment"
+        wraps = self._wraps(r)
         values = np.array(getattr(r, self.kind))
-        for i in self.columns:
-            values[:, i] = _interpolate(r, values[:, i], at, wraps, smooth=self.kind == "y")
+        for i, curve in zip(self.columns, curves or self.curves(r), strict=True):
+            values[:, i] = curve(at)
         other = r.with_(**{self.kind: values})
         if self.kind == "y" and r.begins == "zero":  # the recording was at rest at its stated start
             other = other.with_(initial="estimate")
@@ -100,6 +102,14 @@ class TimeShift(Gate):
             other = other.with_(skip=min(max(r.skip, early), len(r) - 2))
         return other.slice(0, max(len(r) - late, other.skip + 2)) if late else other
 
+    def _wraps(self, r: Recording) -> bool:
+        return bool(r.period) and len(r) % (r.period or 1) == 0 and self.finding == "alignment"
+
+    def curves(self, r: Recording) -> list[_Curve]:
+        """Interpolate the channels, whatever the value."""
+        values = getattr(r, self.kind)
+        return [_interpolant(r, values[:, i], self._wraps(r), smooth=self.kind == "y") for i in self.columns]
+
     def remainder(self, first: FirstOrder, fitted: Fitted) -> Callable[[float], float]:
         """Return the mean square that parameters and initial states leave, as a function of the value."""
         bench = first.bench
@@ -109,13 +119,15 @@ class TimeShift(Gate):
 
         @np.errstate(over="ignore", invalid="ignore")  # a diverging run leaves everything
         def left(value: float) -> float:
-            others = [self.at(value, bench.dt).read(r, cut=False) for r in bench.recordings]
+            moved = self.at(value, bench.dt)
+            others = [moved.read(r, False, own) for r, own in zip(bench.recordings, curves, strict=True)]
             runs = as_recorded or list(map(simulate, others, fitted.initial))
             pairs = zip(runs, others, strict=True)
             error = np.concatenate([((y - other.y) / bench.scale)[other.skip :].ravel() for y, other in pairs])
             mean = float(np.mean(first.left(error) ** 2))
             return mean if np.isfinite(mean) else np.inf
 
+        curves = list(map(self.curves, bench.recordings))
         as_recorded = [] if self.kind == "u" else list(map(simulate, bench.recordings, fitted.initial))
         return left
 
@@ -132,16 +144,17 @@ class TimeShift(Gate):
         return late and not (in_steps(self.value, dt, part) and self.value > LONG_SHIFT * dt)
 
 
-def _interpolate(r: Recording, v: np.ndarray, at: np.ndarray, wraps: bool, smooth: bool) -> np.ndarray:
-    """Interpolate a signal along a cubic spline or along its chords; ends are held."""
+def _interpolant(r: Recording, v: np.ndarray, wraps: bool, smooth: bool) -> _Curve:
+    """Interpolate a signal along a cubic spline or along its chords, as a function of time; ends are held."""
     end = len(r) * r.dt
     if not smooth:
-        return np.interp(at, r.t, v, period=end if wraps else None)
+        return lambda at: np.interp(at, r.t, v, period=end if wraps else None)
     from scipy.interpolate import CubicSpline
 
-    if not wraps:
-        return np.asarray(CubicSpline(r.t, v)(np.clip(at, r.t[0], r.t[-1])))
-    return np.asarray(CubicSpline(np.append(r.t, end), np.append(v, v[0]), bc_type="periodic")(at))
+    if wraps:
+        return CubicSpline(np.append(r.t, end), np.append(v, v[0]), bc_type="periodic")
+    spline = CubicSpline(r.t, v)
+    return lambda at: np.asarray(spline(np.clip(at, r.t[0], r.t[-1])))
 
 
 def _minimise(left: Callable[[float], float], low: float, high: float) -> tuple[float, float]:

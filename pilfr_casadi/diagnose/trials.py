@@ -22,7 +22,8 @@ from ..laws import Law
 from ..optimise import GaussNewton
 from ..simulators import Placed, Simulator
 from .evidence import FAR_RATIO, FORMULA_ERROR
-from .gates import Offset, open_start
+from .gates import open_start
+from .offsets import Offset
 from .screen import Pair, Scored
 from .workbench import (
     BRIEF,

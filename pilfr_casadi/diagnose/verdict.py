@@ -1,7 +1,7 @@
 """The posterior of all answers, from the log evidences of all fitted hypotheses, and the verdict that follows.
 
 A hypothesis with laws has a probability in proportion to its evidence. The simulator alone claims that its whole error
-is noise; so it is weighed with samples that count in full (`search.Search.optimistic_evidence`).
+is noise; so it is weighed with samples that count in full (`hypotheses.Hypotheses.optimistic_evidence`).
 
 The right law leaves little of the mismatch for a flexible force to explain. Let s be the share of the mismatch that the
 law leaves and that a flexible force at some port would explain. The density of s is
@@ -47,9 +47,9 @@ from .evidence import (
 )
 from .floor import ABOVE_NOISE, swells_with, white_part
 from .gates import Gate
+from .hypotheses import Hypotheses
 from .proof import mean_nrmse
 from .recording_faults import ringing
-from .search import Search
 from .trials import Trial
 
 Name = tuple[str, str]  # port and law id
@@ -119,7 +119,7 @@ def names(trial: Trial) -> frozenset[Name]:
     return frozenset((e.port, e.law.id) for e in trial.effects)
 
 
-def explainable_remainder(search: Search, trial: Trial) -> float:
+def explainable_remainder(search: Hypotheses, trial: Trial) -> float:
     """Compute the share s of the mismatch that a hypothesis leaves and that a flexible force would explain.
 
     A remainder that no force at a port explains counts little: it may be a disturbance that acts beside the law.
@@ -128,7 +128,7 @@ def explainable_remainder(search: Search, trial: Trial) -> float:
     return share_left(search, trial.mean_square) * (share + DISTURBANCE_WEIGHT * (1 - share))
 
 
-def share_left(search: Search, mean_square: float) -> float:
+def share_left(search: Hypotheses, mean_square: float) -> float:
     """Compute the share of the refit's mismatch above the noise that a mean square error is."""
     excess = max(search.root.mean_square - search.floor2, 1e-300)
     return float(np.clip((mean_square - search.floor2) / excess, 0.0, 1.0))
@@ -141,7 +141,7 @@ def share_named(s: float) -> float:
     return float(law / (law + other))
 
 
-def posterior(search: Search) -> Posterior:
+def posterior(search: Hypotheses) -> Posterior:
     """Weigh all hypotheses of a search."""
     trials = list(search.memo.values())
     weights = _weights(search, trials)
@@ -164,7 +164,7 @@ def posterior(search: Search) -> Posterior:
     return Posterior(best, named, effects, by_names.get(frozenset(), 0.0))
 
 
-def _plainest(search: Search, trials: Sequence[Trial]) -> Trial:
+def _plainest(search: Hypotheses, trials: Sequence[Trial]) -> Trial:
     """Choose the likeliest hypothesis, or one with fewer parameters that is about as likely and follows as well."""
     best = max(trials, key=search.evidence)
     least, most = search.evidence(best) - INDISTINGUISHABLE_NATS, BETTER_RATIO**2 * best.mean_square
@@ -177,7 +177,7 @@ def _count_parameters(placed: Placed) -> int:
 
 
 def _make_effect(
-    search: Search, best: Trial, element: Placed, by_names: Mapping[frozenset[Name], float]
+    search: Hypotheses, best: Trial, element: Placed, by_names: Mapping[frozenset[Name], float]
 ) -> NamedEffect:
     """Make an effect, with its inclusion probability given that the physics is in the catalogue."""
     twins = _indistinguishable(search, best, element)
@@ -188,7 +188,7 @@ def _make_effect(
     return NamedEffect(element, sum(w for n, w in by_names.items() if n & same), twins)
 
 
-def _weights(search: Search, trials: Sequence[Trial]) -> np.ndarray:
+def _weights(search: Hypotheses, trials: Sequence[Trial]) -> np.ndarray:
     """Compute the probability of each hypothesis.
 
     The simulator alone claims that its whole error is noise, so samples count in full against it. Laws claim only to be
@@ -209,7 +209,7 @@ def _shares(logs: np.ndarray) -> np.ndarray:
     return np.asarray(found / max(found.sum(), 1e-300))
 
 
-def _indistinguishable(search: Search, best: Trial, element: Placed) -> dict[Name, Trial]:
+def _indistinguishable(search: Hypotheses, best: Trial, element: Placed) -> dict[Name, Trial]:
     """Find hypotheses, about as likely as the best, that have another effect in place of one of its effects.
 
     The same law in every sensor is one effect, at "sensor:a + sensor:b".
@@ -242,7 +242,7 @@ class Verdict:
     sentence: str
 
 
-def judge(search: Search, found: Posterior, gates: Sequence[Gate], closest: Trial | None = None) -> Verdict:
+def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: Trial | None = None) -> Verdict:
     """Choose the verdict: a fault if it was the mismatch, else the likeliest answer of the posterior.
 
     `closest` is the hypothesis that an unexplained mismatch is compared with, by default the most promising with a law.
@@ -266,7 +266,7 @@ def judge(search: Search, found: Posterior, gates: Sequence[Gate], closest: Tria
     steady = [g for g in gates if g.finding == "tone" and not found.effects]
     mode = ringing(search.bench, search.root.fitted)
     noise = not found.effects and _is_noise(search, steady, share, mode)
-    if faults and (noise or cured or (share < LEAST_EXPLAINED and not found.effects)):
+    if faults and (noise or cured):
         return Verdict("recording-fault", faults[0].sentence)
     if noise and share < LEAST_EXPLAINED:
         beside = f" but a steady tone in {' and '.join(g.channel for g in steady)}" if steady else ""
@@ -280,7 +280,7 @@ def judge(search: Search, found: Posterior, gates: Sequence[Gate], closest: Tria
     return Verdict("unexplained", _describe_unexplained(search, closest, shares, mode))
 
 
-def closest_law(search: Search, likeliest: Trial) -> Trial:
+def closest_law(search: Hypotheses, likeliest: Trial) -> Trial:
     """Return the most promising hypothesis with a law.
 
     The likeliest one may explain nothing: where all are wrong, few samples count, and the
@@ -289,7 +289,7 @@ def closest_law(search: Search, likeliest: Trial) -> Trial:
     return max((t for t in search.memo.values() if t.laws), key=search.optimistic_evidence, default=likeliest)
 
 
-def _is_noise(search: Search, steady: Sequence[Gate], share: float, mode: float | None) -> bool:
+def _is_noise(search: Hypotheses, steady: Sequence[Gate], share: float, mode: float | None) -> bool:
     """Tell whether the refit's residual can be noise: no force explains it, no mode rings, and its power is steady."""
     root = search.root
     quiet = root.error * max(1 - sum(1 - g.left for g in steady), 0.0) ** 0.5
@@ -306,7 +306,7 @@ def _is_noise(search: Search, steady: Sequence[Gate], share: float, mode: float 
     return like and mode is None and not _swells(search)
 
 
-def _swells(search: Search) -> bool:
+def _swells(search: Hypotheses) -> bool:
     """Tell whether the residual's power follows the inputs, the outputs or their rates."""
     records = search.bench.recordings
     signals = [np.column_stack([r.u, r.y, np.gradient(r.y, axis=0)])[r.skip :] for r in records]
@@ -314,7 +314,7 @@ def _swells(search: Search) -> bool:
     return swells_with(rest, signals)
 
 
-def _describe_effects(search: Search, found: Posterior) -> str:
+def _describe_effects(search: Hypotheses, found: Posterior) -> str:
     words = " and ".join(f"{display_name(e.name[1])} at {e.name[0]}" for e in found.effects)
     if found.sure > SURE:
         said = f"The simulator leaves out {words}."
@@ -323,7 +323,7 @@ def _describe_effects(search: Search, found: Posterior) -> str:
     return said + _describe_vanished(search, found)
 
 
-def _describe_vanished(search: Search, found: Posterior) -> str:
+def _describe_vanished(search: Hypotheses, found: Posterior) -> str:
     """Describe the simulator's own parameters that vanish beside the effects, which may replace them."""
     simulator = search.bench.simulator
     offsets = tuple(e.prefix for e in simulator.elements if e.law.id == "offset")
@@ -334,7 +334,7 @@ def _describe_vanished(search: Search, found: Posterior) -> str:
     return f" Beside {beside}, {' and '.join(gone)} {'come' if gone[1:] else 'comes'} out as zero." if gone else ""
 
 
-def _describe_unexplained(search: Search, closest: Trial, shares: dict[str, float], mode: float | None) -> str:
+def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, float], mode: float | None) -> str:
     root, share = search.root, max(shares.values(), default=0.0)
     where = max(shares, key=lambda k: shares[k], default="")
     laws = closest.effects

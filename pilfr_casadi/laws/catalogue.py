@@ -149,6 +149,9 @@ def _scheduled(base: Any, by: str) -> Any:
 
         def why_not(self, local: Local) -> str:
             """Say why the data carries no information on this law; empty if it does."""
+            unknown = not (local.shown or (local.from_zero and all(local.from_zero)))
+            if by == "z" and unknown:  # a level of each recording's own would pass for a variation with z
+                return "no output reads the coordinate, and its start is unknown"
             return super().why_not(local) or ("" if by == "z" else _not_there(by, local))
 
         def parameters(self) -> dict[str, Parameter]:
@@ -164,11 +167,13 @@ def _scheduled(base: Any, by: str) -> Any:
 
         @classmethod
         def finer_starts(cls, values: Mapping[str, Any], local: Local) -> Iterator[dict[str, Any]]:
-            """Start as the law of these values, equally strong in the whole range of the signal."""
+            """Start as the law of these values, stronger at one end of the range of the signal than at the other."""
             signal = cls().schedule(local)
             mean = {name: (values[name] + values.get(end, values[name])) / 2 for name, end in high.items()}
             ends = {"low": float(signal.min()), "high": float(signal.max())}
-            yield {**values, **mean, **{end: mean[name] for name, end in high.items()}, **ends}
+            for low, top in ((0.5, 1.5), (1.5, 0.5)):
+                own = {name: low * v for name, v in mean.items()}
+                yield {**values, **own, **{end: top * mean[name] for name, end in high.items()}, **ends}
 
         if base.memory:
 

@@ -164,18 +164,23 @@ def in_modal_coordinates(blocks: Mapping[str, Array], recordings: tuple[Recordin
 def innovation_gain(S: Any, P: Any, C: Any, A: Any = None) -> Any:
     """Compute the gain `A P C' S⁻¹`, (n, n_y), for arrays or CasADi matrices; A is the identity by default."""
     solve = ca.solve if isinstance(P, ca.MX) else np.linalg.solve
-    return solve(S, C @ P if A is None else C @ P @ A.T).T
+    return _transpose(solve(S, C @ P if A is None else C @ P @ A.T))
+
+
+def _transpose(matrix: Any) -> Any:
+    """Transpose a matrix, or each of a stack."""
+    return matrix.mT if isinstance(matrix, np.ndarray) else matrix.T
 
 
 def measurement_update(P: Any, C: Any, R: Any) -> tuple[Any, Any, Any]:
     """Compute the innovation covariance S, the filter gain, and the covariance after a measurement.
 
-    Takes arrays or CasADi matrices.
+    Takes arrays or CasADi matrices; P and R may be stacks of arrays.
     """
     S = C @ P @ C.T + R
     gain = innovation_gain(S, P, C)
-    left = np.eye(P.shape[0]) - gain @ C
-    return S, gain, left @ P @ left.T + gain @ R @ gain.T
+    left = np.eye(P.shape[-1]) - gain @ C
+    return S, gain, left @ P @ _transpose(left) + gain @ R @ _transpose(gain)
 
 
 def steady_state_gain(a: Array, c: Array, q: Array, r: Array) -> Array:

@@ -12,7 +12,6 @@ import time
 import numpy as np
 import pytest
 from command_line import refused, run
-from scipy.integrate import solve_ivp
 
 from pilfr_casadi import multisine
 from pilfr_casadi.cli.demo import diagnose_rig
@@ -20,7 +19,6 @@ from pilfr_casadi.laws import (
     Backlash,
     CoulombFriction,
     CubicStiffness,
-    Delay,
     Power,
     PreslidingFriction,
     Saturation,
@@ -56,14 +54,17 @@ def rig(seed, m=800, k=100.0, cubic=4000.0):
     rng = np.random.default_rng(seed)
     force = 12 * multisine(m, f_max=4.0, fs=1 / DT, rng=rng)
 
-    def f(t, x):
-        return [x[1], force[min(int(t / DT + 1e-9), m - 1)] - k * x[0] - cubic * x[0] ** 3 - 2.0 * x[1]]
+    def speed_change(pos, vel, push):
+        return push - k * pos - cubic * pos**3 - 2.0 * vel
 
-    x, out = np.zeros(2), np.zeros(m)
-    for i in range(m):
-        out[i] = x[0]
-        x = solve_ivp(f, (i * DT, (i + 1) * DT - 1e-9), x, rtol=1e-8, atol=1e-10).y[:, -1]
-    return force, out + 1e-4 * rng.standard_normal(m)
+    pos, vel, out, h = 0.0, 0.0, [], DT / 200
+    for push in force.tolist():
+        out.append(pos)
+        for _ in range(200):  # Heun's rule
+            a = speed_change(pos, vel, push)
+            ahead = speed_change(pos + h * vel, vel + h * a, push)
+            pos, vel = pos + h * (vel + h / 2 * a), vel + h / 2 * (a + ahead)
+    return force, np.array(out) + 1e-4 * rng.standard_normal(m)
 
 
 def write_csv(path, force, position, names=("t", "force", "position"), t=None):
@@ -114,7 +115,7 @@ def arguments(folder, *more, simulator="rig.py", train="train.csv", test="test.c
 
 @pytest.mark.usefixtures("blank_figures")
 def test_a_whole_diagnosis(capsys, files, catalogue):
-    catalogue(Backlash, CoulombFriction, CubicStiffness, Delay, Power, Saturation)
+    catalogue(Backlash, CoulombFriction, CubicStiffness, Power)
     given = arguments(files, "--hold", "zero", "--initial", "zero")
     status, out, err = run(capsys, *given)
     assert status == 0 and "pilfr: " not in err

@@ -70,8 +70,8 @@ def test_a_hidden_law_is_named_at_its_port(port, law):
 
 @pytest.fixture(scope="module")
 def plain():
-    """Recordings that the simulator can follow."""
-    return recordings()
+    """A recording that the simulator can follow."""
+    return recordings(count=1)
 
 
 def test_nothing_missing_is_said(plain):

@@ -6,7 +6,7 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.gates import Offset
+from pilfr_casadi.diagnose.offsets import Offset
 from pilfr_casadi.diagnose.preparation import prepare
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
@@ -142,7 +142,8 @@ def test_degrees_fahrenheit_are_a_fault_of_the_recording():
 
 
 def test_an_offset_alone_is_a_fault_but_no_wrong_unit():
-    found = pilfr.diagnose(tank(1.15), recorded(30.0, change=lambda y: y + np.array([0.0, 12.0])))
+    some = (Backlash, Creep, Delay, Lag, Quadratic)
+    found = pilfr.diagnose(tank(1.15), recorded(30.0, change=lambda y: y + np.array([0.0, 12.0])), laws=some)
     assert [(g.channel, g.finding) for g in found.gates] == [("lower", "offset")]
     assert found.verdict == "recording-fault"
     assert "constant offset" in found.sentence and not found.effects

@@ -17,6 +17,8 @@ from pilfr_casadi.diagnose.timing import find_gaps, find_jump, settle_jump
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import discretise
 
+SOME = (laws.CoulombFriction, laws.CubicStiffness, laws.QuadraticDrag)
+
 
 def lost(r, *places, count=25):
     """The recording without `count` samples from some places on, as they are numbered afterwards."""
@@ -42,7 +44,7 @@ def looked(*train):
 @pytest.mark.usefixtures("blank_figures")
 def test_a_gap_is_a_fault_of_the_recording(tmp_path):
     (r,) = recordings(count=1)
-    found = pilfr.diagnose(rig(OFF), lost(r, 1100).with_(name="run"), test=recordings(seed=5, count=1))
+    found = pilfr.diagnose(rig(OFF), lost(r, 1100).with_(name="run"), test=recordings(seed=5, count=1), laws=SOME)
     (gate,) = [g for g in found.gates if g.finding == "gap"]
     assert found.verdict == "recording-fault"
     assert (gate.corrected, gate.fault, gate.value) == (True, True, [pytest.approx(2.2)])
@@ -67,8 +69,7 @@ def test_several_gaps_are_found_and_the_recordings_told_apart():
 @pytest.mark.slow
 def test_friction_is_named_beside_a_gap():
     train = recordings(laws.CoulombFriction(values={"F_c": 3.0, "v_0": 0.01}))
-    some = (laws.CoulombFriction, laws.CubicStiffness, laws.QuadraticDrag)
-    found = pilfr.diagnose(rig(OFF), [lost(train[0], 1200), train[1]], laws=some, effects=1)
+    found = pilfr.diagnose(rig(OFF), [lost(train[0], 1200), train[1]], laws=SOME, effects=1)
     assert "gap" in [g.finding for g in found.gates]
     assert [(e.port, e.law) for e in found.effects] == [("ground-m1", "coulomb_friction")]
 

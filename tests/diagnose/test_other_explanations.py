@@ -32,7 +32,7 @@ def test_a_value_that_cannot_go_where_it_should_is_told(known):
     simulator = rig(OFF)
     p = simulator.parameters
     held = simulator.with_parameters({**p, "k1": replace(p["k1"], **known)})
-    found = pilfr.diagnose(held, short(), laws=(laws.LinearStiffness,), effects=1, workers=1)
+    found = pilfr.diagnose(held, short().slice(0, 800), laws=(laws.LinearStiffness,), effects=1, workers=1)
     assert (found.verdict, found.effects, found.freed) == ("complete", (), "k1"), str(found)
     assert found.parameters["k1"]["refit_with"] == pytest.approx(1100, rel=0.03)
 

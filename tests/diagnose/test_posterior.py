@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pilfr_casadi.diagnose.gates import Offset
+from pilfr_casadi.diagnose.offsets import Offset
 from pilfr_casadi.diagnose.trials import Trial
 from pilfr_casadi.diagnose.verdict import explainable_remainder, posterior, share_named
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, DirectionalFriction, QuadraticDrag

@@ -11,7 +11,7 @@ from pilfr_casadi._base import InputError
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.prediction import can_be_led, drifts, observer
 from pilfr_casadi.engine import make_engine
-from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Saturation
+from pilfr_casadi.laws import CoulombFriction, CubicStiffness
 from pilfr_casadi.simulators import discretise
 
 DT, SAMPLES = 0.01, 1500
@@ -89,7 +89,7 @@ def test_the_engines_agree_on_predictions_and_their_slopes(machine, substeps):
 
 @pytest.mark.usefixtures("blank_figures")
 def test_friction_in_an_unstable_machine_is_named_and_a_complete_simulator_is_too(machine, tmp_path):
-    laws = (CoulombFriction, CubicStiffness, Saturation)
+    laws = (CoulombFriction, CubicStiffness)
     found = pilfr.diagnose(levitation(30.0, 1.0), machine[0], test=machine[1], laws=laws, workers=1)
     assert [(e.port, e.law) for e in found.effects] == [("guide", "coulomb_friction")]
     assert found.effects[0].parameters["F_c"]["value"] == pytest.approx(1.5, rel=0.05)

@@ -7,9 +7,11 @@ from test_slips import DT, recorded, tanks
 
 from pilfr_casadi import Recording
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.gates import Checked, final_gates, find_offsets, offset_gates
+from pilfr_casadi.diagnose.gates import Checked
+from pilfr_casadi.diagnose.offsets import final_gates, find_offsets, offset_gates
 from pilfr_casadi.diagnose.preparation import prepare, refitted
 from pilfr_casadi.diagnose.proof import mean_nrmse
+from pilfr_casadi.laws import QuadraticStiffness
 
 
 def unsaid(r, u, y, initial="zero"):
@@ -58,6 +60,24 @@ def test_a_constant_of_a_sensor_is_found_and_kept():
     (told,) = final_gates([gate], fitted, {gate.parameter: np.array(0.03)}, False, False)
     assert "may be a part of that" in told.sentence
     assert not final_gates([gate], fitted, {gate.parameter: np.array(0.3)}, False, False)  # it may be none
+
+
+@pytest.mark.parametrize(("side", "channel"), [("u", "force"), ("y", "x2")])
+def test_offsets_that_differ_between_recordings_are_subtracted(side, channel):
+    size = {"u": 20.0, "y": 0.02}[side]
+    both = zip(recordings(count=2), (size, -size / 2), strict=True)
+    bench = Workbench.of(rig(OFF), [r.with_(**{side: getattr(r, side) + v}) for r, v in both], "zero")
+    found = find_offsets(Checked(bench, refitted(bench)))
+    (gate,) = found.gates
+    assert gate.finding == "offset" and gate.fault and found.cost < 0.01**2
+    assert gate.channel == channel and gate.value == pytest.approx([size, -size / 2], rel=0.02)
+
+
+def test_a_mean_force_of_missing_physics_is_no_offset():
+    both = recordings(QuadraticStiffness({"k_2": 500.0}), count=2)
+    bench = Workbench.of(rig(OFF), both, "zero")
+    found = find_offsets(Checked(bench, refitted(bench)))
+    assert not any(isinstance(gate.value, list) for gate in found.gates)
 
 
 def test_the_error_as_given_compares_with_that_of_the_refit():

@@ -6,13 +6,17 @@ from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
+from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.floor import measured_floor
+from pilfr_casadi.diagnose.gates import Checked
+from pilfr_casadi.diagnose.preparation import refitted
 from pilfr_casadi.diagnose.recording_faults import (
     find_glitches,
-    find_stale_samples,
     mend,
+    mend_stale_samples,
     open_unsettled,
     remove_glitches,
+    share_of_repeats,
 )
 
 # single samples far off their neighbours
@@ -69,22 +73,30 @@ def test_friction_is_named_beside_glitches():
 # samples that repeat the one before, among those that never do
 
 
-def lost(r, share, seed=0):
+def lost(r, share, side="y", seed=0):
     """The recording with some samples that repeat the one before."""
-    y = np.array(r.y)
-    for k in np.flatnonzero(np.random.default_rng(seed).random(len(y)) < share):
-        y[k] = y[max(k - 1, 0)]
-    return r.with_(y=y)
+    v = np.array(getattr(r, side))
+    for k in np.flatnonzero(np.random.default_rng(seed).random(len(v)) < share):
+        v[k] = v[max(k - 1, 0)]
+    return r.with_(**{side: v})
 
 
-@pytest.mark.slow
-def test_stale_samples_are_told_and_where():
+@pytest.mark.parametrize(("side", "channel"), [("u", "force"), ("y", "x2")])
+def test_stale_samples_are_interpolated(side, channel):
     (r,) = recordings(count=1)
-    (gate,) = find_stale_samples([lost(r, 0.1)])
-    assert (gate.channel, gate.finding, gate.corrected, gate.fault) == ("x2", "stale", False, False)
+    bench = Workbench.of(rig(OFF), [lost(r, 0.1, side)], "zero")
+    found = mend_stale_samples(Checked(bench, refitted(bench)))
+    (gate,) = found.gates
+    assert (gate.channel, gate.finding, gate.corrected, gate.fault) == (channel, "stale", True, True)
     assert gate.value == pytest.approx(0.1, abs=0.02)
-    found = pilfr.diagnose(rig(OFF), lost(r, 0.1))
-    assert found.verdict == "complete" and "stale" in [g.finding for g in found.gates]
+    assert found.cost < 0.01**2
+
+
+def test_stale_samples_beside_missing_physics_are_noted():
+    (r,) = recordings(laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01}), count=1)
+    bench = Workbench.of(rig(OFF), [lost(r, 0.1)], "zero")
+    (gate,) = mend_stale_samples(Checked(bench, refitted(bench))).gates
+    assert (gate.channel, gate.finding, gate.corrected, gate.fault) == ("x2", "stale", False, False)
 
 
 @pytest.mark.parametrize("kind", ["clean", "coarse", "resting", "clipped", "encoder"])
@@ -99,7 +111,7 @@ def test_a_converter_and_a_rest_are_not_stale(kind):
         y = np.clip(y, *np.quantile(y, [0.05, 0.95]))
     if kind == "encoder":  # more levels than half of the samples, and slow ways between them
         y = np.round(np.linspace(0, 1, len(y))[:, None] ** 4 + 0.01 * y / np.std(y), 3)
-    assert not find_stale_samples([r.with_(y=y)])
+    assert not share_of_repeats([y[:, 0]])
 
 
 # periodic recordings whose periods still differ by what dies away

@@ -14,8 +14,8 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Recording, laws
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose.channel_faults import scale_channels
 from pilfr_casadi.diagnose.floor import noise_floor
-from pilfr_casadi.diagnose.gates import scale_channels
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.stretches import Everything, Stretch, Stretches, choose_stretches, divide, spread_out
 from pilfr_casadi.diagnose.timing import Jump

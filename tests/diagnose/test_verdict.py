@@ -8,7 +8,7 @@ from diagnosis_rig import recordings, rig
 
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.correction import Correction
-from pilfr_casadi.diagnose.gates import Offset, without_idle_offsets
+from pilfr_casadi.diagnose.offsets import Offset, without_idle_offsets
 from pilfr_casadi.diagnose.verdict import _describe_vanished, closest_law
 from pilfr_casadi.laws import CoulombFriction
 

@@ -223,9 +223,9 @@ def well_spread(pivots):
 
 @pytest.mark.parametrize("colour", [pytest.param(0.0, marks=pytest.mark.slow), 0.8])
 def test_monte_carlo_of_a_grey_box(colour):
-    """100 noise seeds; with coloured noise the classical formula would be off by a factor of up to three."""
+    """60 noise seeds; with coloured noise the classical formula would be off by a factor of up to three."""
     pivots, classical = [], []
-    for seed in range(100):
+    for seed in range(60):
         problem = oscillator(2e-3, seed, colour=colour, initial="estimate")
         solution = GaussNewton().solve(problem)
         truth = problem.start  # the parameters that made the data, from rest
@@ -239,12 +239,12 @@ def test_monte_carlo_of_a_grey_box(colour):
 
 @pytest.mark.parametrize("colour", [0.0, 0.7])
 def test_monte_carlo_of_a_pi_lfr(colour):
-    """Gauge-invariant functions by the delta method, 50 noise seeds."""
+    """Gauge-invariant functions by the delta method, 30 noise seeds."""
     structure, values = random_lfr(21, nx=2, n=2, gain=0.5)
     u = random_input(21, 1000)
     values["r"][0] = np.std(signals(Play, values, u)[1]) * np.array([0.3, 1.0])
     pivots = []
-    for seed in range(50):
+    for seed in range(30):
         model, recording = recorded(structure, values, u, noise=0.01, seed=seed, colour=colour, initial="zero")
         problem = Problem(model, recording)
         truth = invariant(structure, problem, problem.start)

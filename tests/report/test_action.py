@@ -4,7 +4,7 @@ import numpy as np
 from diagnosis_rig import recordings, rig
 
 from pilfr_casadi.diagnose import Effect, Workbench
-from pilfr_casadi.diagnose.gates import Offset
+from pilfr_casadi.diagnose.offsets import Offset
 from pilfr_casadi.laws import CoulombFriction
 from pilfr_casadi.report.action import element_of
 

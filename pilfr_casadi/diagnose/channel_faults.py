@@ -1,0 +1,169 @@
+"""Faults of whole channels: a wrong sign, unit or gain, exchanged channels, and a wrong unit of time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from .._base import InputError, side_by_side
+from ..data import Recording
+from ..engine import make_engine
+from ..optimise import GaussNewton
+from .gates import CLEARLY_BETTER, CURED_SHARE, POOR_FIT, USELESS_FIT, Checked, Gate, accept, correct
+from .offsets import constant_at
+from .workbench import Workbench
+
+# metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
+UNITS = (1e3, 1e6, 1e2, 180 / np.pi, 9.80665, 30 / np.pi, 3.6, 1e5, 60.0, 4.4482216, 25.4, 1 / 0.0254, 6894.757)
+FACTORS = tuple(f for unit in UNITS for f in (unit, 1 / unit))  # each unit by mistake in either direction
+FAHRENHEIT = (1.8, 1 / 1.8)  # Fahrenheit's zero differs as well: this unit comes with an offset
+# factors on the time: ms, minutes, µs, hours, and the reverse of the first two
+TIME_UNITS = (1e-3, 1 / 60, 1e-6, 1 / 3600, 60.0, 1e3)
+SIZE_RATIO = 6.0  # a factor is tried if it brings the simulated size within this ratio of the measured one
+MOST_AT_BOUNDS = 0.3  # share of the parameters at their bounds above which a refit does not confirm a unit of time
+# first refit of each trial, only to discard hopeless ones
+FIRST_REFIT = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
+
+
+def map_channels(kind: str, matrix: np.ndarray, channel: str, finding: str, value: Any, words: str) -> Gate:
+    """Return the fault that inputs ("u") or outputs ("y") times a matrix (n, n) correct."""
+    sentence = f"In the recordings {channel if finding != 'exchange' else ' and '.join(value)} {words}"
+    return Gate(channel, finding, value, sentence, change=lambda r: r.with_(**{kind: getattr(r, kind) @ matrix}))
+
+
+def scale_channels(kind: str, names: Sequence[str], columns: Sequence[int], factor: float, more: str = "") -> Gate:
+    """Return the fault that a factor on some channels corrects: a wrong sign or unit."""
+    matrix, channel = np.eye(len(names)), ", ".join(names[i] for i in columns)
+    matrix[columns, columns] = factor
+    if factor < 0:
+        return map_channels(kind, matrix, channel, "sign", factor, f"has the wrong sign{more}")
+    words = f"{'are' if len(columns) > 1 else 'is'} {_describe_factor(factor, more)}"
+    return map_channels(kind, matrix, channel, "unit", factor, words)
+
+
+def exchange_channels(kind: str, names: Sequence[str], one: int, other: int) -> Gate:
+    """Return the fault that two channels are exchanged."""
+    matrix, both = np.eye(len(names)), [names[one], names[other]]
+    matrix[[one, other]] = matrix[[other, one]]
+    return map_channels(kind, matrix, ", ".join(both), "exchange", both, "are exchanged")
+
+
+def scale_time(factor: float) -> Gate:
+    """Return the fault that a factor on the time corrects."""
+    words = f"In the recordings the time is {_describe_factor(factor)}"
+    return Gate("time", "time-unit", factor, words, change=lambda r: r.with_(dt=r.dt * factor))
+
+
+def _describe_factor(correction: float, more: str = "") -> str:
+    return f"off by a factor of {1 / correction:.4g}{more}, as from a wrong unit"
+
+
+def open_bench(simulator: Any, recordings: Sequence[Recording], hold: str, engine: str) -> tuple[Workbench, list[Gate]]:
+    """Make the bench; if the simulator is too fast for the recordings' step, try other units of time.
+
+    Raises
+    ------
+    InputError
+        If no unit of time makes simulator and recordings fit each other.
+    """
+    try:
+        return Workbench.of(simulator, recordings, hold, engine), []
+    except InputError as error:
+        for factor in TIME_UNITS:
+            with suppress(InputError):
+                bench = Workbench.of(simulator, [r.with_(dt=r.dt * factor) for r in recordings], hold, engine)
+                cost, fault = bench.fit(simulator).cost, scale_time(factor)
+                if cost < USELESS_FIT:
+                    words = f"as given, the simulator cannot follow; corrected, its error is {cost**0.5:.3g}"
+                    words = f"{fault.sentence}; {words} of the outputs' deviation."
+                    return bench, [replace(fault, sentence=words, fault=True)]
+        raise error
+
+
+def find_slips(now: Checked, workers: int) -> Checked:
+    """Find wrong signs and units, exchanged channels and a wrong unit of time, with `workers` trials at a time.
+
+    If the error stays large, try each output with an offset as well; `find_offsets` reports the offset and keeps it.
+    """
+    bench = now.bench
+    # with an offset there is a working point, which a run from rest would have to reach first
+    found = _accept_best(now, _possible_slips(now, _from_rest(bench)), workers)
+    for i, name in enumerate(bench.simulator.output_names if found.cost > POOR_FIT else ()):
+        offset = constant_at(f"sensor:{name}")
+        level = correct(now, offset, [{}, now.fitted.values], now.fitted.begin)
+        if level is None:
+            continue
+        near = _near(level, level.fitted.residual)
+        factors = [f for f in (-1.0, *FACTORS, *FAHRENHEIT) if f < 0 or near("y", [i], f)]
+        faults = [scale_channels("y", bench.simulator.output_names, [i], f, " and an offset") for f in factors]
+        beside = _accept_best(level, faults, workers)
+        if len(beside.gates) > len(now.gates) and beside.cost < CURED_SHARE * found.cost:
+            found = replace(beside, bench=replace(beside.bench, simulator=bench.simulator))
+    return found
+
+
+def _possible_slips(now: Checked, errors: Sequence[np.ndarray]) -> list[Gate]:
+    """List the faults of sign, unit, exchange and unit of time that the outputs' sizes allow."""
+    near, faults = _near(now, errors), list[Gate]()
+    channels = {"y": now.bench.simulator.output_names, "u": now.bench.simulator.inputs}
+    for kind, names in channels.items():
+        for i in range(len(names)):
+            factors = [f for f in FACTORS if near(kind, [i], f)]
+            faults += [scale_channels(kind, names, [i], f) for f in (-1.0, *factors)]
+    every = range(len(channels["y"]))
+    joint = [f for f in FACTORS if len(every) > 1 and near("y", every, f)]
+    faults += [scale_channels("y", channels["y"], every, f) for f in joint]
+    for kind, names in channels.items():
+        faults += [exchange_channels(kind, names, i, j) for i, j in combinations(range(len(names)), 2)]
+    return [*faults, *(map(scale_time, TIME_UNITS) if now.cost > POOR_FIT else ())]
+
+
+def _near(now: Checked, errors: Sequence[np.ndarray]) -> Callable[[str, Sequence[int], float], bool]:
+    """Return a test whether a factor on channels lets the outputs of a run have about the measured size."""
+    with np.errstate(all="ignore"):
+        y = np.concatenate([e + r.y for e, r in zip(errors, now.bench.recordings, strict=True)])
+        sizes = now.bench.scale / np.std(y, axis=0)
+
+    def near(kind: str, columns: Sequence[int], factor: float) -> bool:
+        ratios = factor * sizes[columns] if kind == "y" else sizes / factor
+        unknown = ~np.isfinite(ratios) | (ratios == 0) | (now.cost > 1)  # the size of a diverging run says nothing
+        close = unknown | ((ratios > 1 / SIZE_RATIO) & (ratios < SIZE_RATIO))
+        return bool(np.all(close) if kind == "y" else np.any(close))
+
+    return near
+
+
+def _accept_best(now: Checked, faults: Sequence[Gate], workers: int) -> Checked:
+    """Accept the fault whose correction leaves the smallest error, if the rule accepts it."""
+    best: tuple[Gate, Checked] | None = None
+    for fault, after in zip(faults, side_by_side(partial(_try, now), faults, workers), strict=True):
+        # for a linear simulator, a unit of all outputs is equivalent to a unit of its input, or of its only output
+        joint = fault.finding == "unit" and "," in fault.channel
+        if after is not None and (best is None or after.cost < (CLEARLY_BETTER if joint else 1 - 1e-6) * best[1].cost):
+            best = fault, after
+    return now if best is None else accept(now, best[1], best[0])
+
+
+def _try(now: Checked, fault: Gate) -> Checked | None:
+    """Correct a fault and refit from the user's values; None if it is hopeless."""
+    glanced = correct(now, fault, solver=FIRST_REFIT)
+    if glanced is None or not glanced.cost < now.cost:
+        return None
+    after = correct(now, fault, [{}, glanced.fitted.values], glanced.fitted.begin)
+    bent = fault.finding == "time-unit" and after is not None and after.fitted.at_bounds > MOST_AT_BOUNDS
+    return None if bent else after
+
+
+def _from_rest(bench: Workbench) -> list[np.ndarray]:
+    """Compute the errors of the simulator at the user's values, run from rest."""
+    model = bench.model(bench.simulator)
+    engine = make_engine(model, bench.engine)
+    start, n = model.parameters.start, model.n_state
+    with np.errstate(all="ignore"):
+        return [engine.simulate(model.drive(r), start, np.zeros(n))[0] - r.y for r in bench.recordings]

@@ -1,0 +1,361 @@
+"""The hypotheses of a search: sets of laws in ports, each fitted once and kept, all compared by one log evidence."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from .._base import Stages, is_interrupt
+from ..laws import Law
+from ..simulators import Placed, Simulator
+from .evidence import (
+    CONTENDING_NATS,
+    EFFECT_PRIOR,
+    FORMULA_ERROR,
+    LARGE_MODEL_ERROR,
+    LOUDEST_NOISE,
+    WRONG_MODEL_SAMPLES,
+    HeldOut,
+    Sample,
+    held_out_errors,
+    information,
+    log_evidence,
+    log_prior,
+    spread,
+)
+from .floor import FEWEST, Floor, effective_size, white_part
+from .screen import Scored, flexible_shares, screen
+from .trials import Key, Trial, Trials
+from .workbench import Fitted, Workbench
+
+MOST_PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
+
+
+@dataclass(eq=False)
+class Findings:
+    """Results about one hypothesis that are computed when they are first needed.
+
+    Attributes
+    ----------
+    screened : tuple, optional
+        The scores of all further laws, and the observer's gain; see `screen`.
+    flexible : dict, optional
+        The share of the residual that a flexible force at each port explains.
+    learned : list of Fitted, optional
+        The learned forces beside it, best first.
+    held_out : HeldOut, optional
+        Its errors on held-out data.
+    """
+
+    screened: tuple[list[Scored], np.ndarray | None] | None = None
+    flexible: dict[str, float] | None = None
+    learned: list[Fitted] | None = None
+    held_out: HeldOut | None = None
+
+
+@dataclass(eq=False)
+class Hypotheses:
+    """The hypotheses that were fitted to some recordings, by key, with all that is known of each.
+
+    Attributes
+    ----------
+    bench : Workbench
+        Recordings, and the settings for runs and fits.
+    without : Fitted
+        The refitted simulator, with no law.
+    floor : Floor
+        The noise; if it is only estimated, the search improves the estimate.
+    laws : sequence of type of Law
+        The laws that are tried.
+    memo : dict
+        The best trial of every fitted hypothesis, by key.
+    findings : dict
+        Further results about each fitted hypothesis, by key.
+    hold_said : bool
+        Whether somebody stated the hold of the inputs between samples.
+    stand_in_error : float
+        NRMSE between a surrogate and its simulation; the floor contains it.
+    count : float
+        Samples of the best residual over its correlation time.
+    until : float
+        Time (of `time.perf_counter`) at which the search ends.
+    deadline : float
+        Time at which the diagnosis has to end.
+    out_of_time : bool
+        Whether the time limit ended the search.
+    """
+
+    bench: Workbench
+    without: Fitted
+    floor: Floor
+    laws: Sequence[type[Law]]
+    workers: int
+    say: Stages
+    hold_said: bool = True
+    stand_in_error: float = 0.0
+    until: float = np.inf
+    deadline: float = np.inf
+    memo: dict[Key, Trial] = field(default_factory=dict)
+    alternatives: dict[str, tuple[Law, ...]] = field(default_factory=dict)
+    findings: defaultdict[Key, Findings] = field(default_factory=lambda: defaultdict(Findings))
+    times: dict[str, float] = field(default_factory=dict)
+    interrupted: bool = False
+    out_of_time: bool = False
+    count: float = FEWEST
+
+    @cached_property
+    def fits(self) -> Trials:
+        """Fits of hypotheses, with the bench, workers and time limit of the search."""
+        return Trials(self.bench, self.workers, self.until, self.deadline)
+
+    @property
+    def samples(self) -> float:
+        """Effective samples, shared by all hypotheses."""
+        return self.sample.effective(min(t.mean_square for t in self.memo.values()) + self.tolerance)
+
+    @property
+    def floor2(self) -> float:
+        """Mean square of the noise in units of the outputs' variance."""
+        return float(np.mean((self.floor.deviation / self.bench.scale) ** 2))
+
+    @property
+    def tolerance(self) -> float:
+        """Mean square error that the formulas of laws leave of any mismatch, because no machine follows one exactly."""
+        return FORMULA_ERROR * max(self.root.mean_square - self.floor2, 0.0)
+
+    @property
+    def sample(self) -> Sample:
+        """Noise and number of samples of the recordings."""
+        return Sample(self.floor2 + self.tolerance, self.count)
+
+    @property
+    def root(self) -> Trial:
+        """The hypothesis without laws."""
+        return self.memo[frozenset()]
+
+    @property
+    def best(self) -> Trial:
+        """The most promising hypothesis, from which the search goes on."""
+        return max(self.memo.values(), key=self.optimistic_evidence)
+
+    def optimistic_evidence(self, trial: Trial) -> float:
+        """Compute the log evidence of a hypothesis as if the missing rest were found: samples count as at the noise."""
+        return self._log_evidence(trial, trial.mean_square, self.sample.effective(0.0))
+
+    def evidence(self, trial: Trial) -> float:
+        """Compute the log evidence of a hypothesis, from its error on held-out blocks if that is known.
+
+        Where all models are wrong, the spread of predictions for other inputs counts as an error.
+        """
+        known = self.findings[trial.key].held_out
+        v = known.error**2 if known else trial.mean_square * self._held_out_ratio()
+        v += known.spread if known and self._all_wrong else 0.0
+        return self._log_evidence(trial, v, self.samples)
+
+    def _held_out_ratio(self) -> float:
+        """Compute the usual ratio of held-out to fit error (mean squares), for hypotheses that were not predicted."""
+        known = [(self.findings[key].held_out, trial.mean_square) for key, trial in self.memo.items()]
+        ratios = [h.error**2 / fit for h, fit in known if h and np.isfinite(h.error) and fit > 0]
+        return float(np.median(ratios)) if ratios else 1.0
+
+    def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
+        known = trial.information if trial.information is not None else np.zeros(0)
+        return log_evidence(v + self.tolerance, known, self.log_prior(trial), n)
+
+    def log_prior(self, trial: Trial) -> float:
+        """Compute the log prior probability of a hypothesis."""
+        return log_prior(trial.laws, self.alternatives, trial.doubtful, self.domains)
+
+    @cached_property
+    def domains(self) -> dict[str, str]:
+        """The physical domain of each port, by name."""
+        return {port.name: port.domain for port in self.bench.simulator.all_ports()}
+
+    def held_out(self, trial: Trial) -> HeldOut:
+        """Compute the held-out errors of a hypothesis, once."""
+        known = self.findings[trial.key]
+        if known.held_out is None:
+            known.held_out = self.held_out_errors(trial.fitted, self.spread(trial.fitted, trial.laws))
+        return known.held_out
+
+    def held_out_errors(self, fitted: Fitted, spread: float) -> HeldOut:
+        """Compute the held-out errors of a fitted simulator with a known spread for other inputs."""
+        return replace(held_out_errors(self.bench, fitted, self.workers), spread=spread)
+
+    def spread(self, fitted: Fitted, laws: Sequence[Placed]) -> float:
+        """Compute the mean square uncertainty of a fitted simulator's predictions for other inputs."""
+        own = Sample(self.floor2, _count_samples(fitted, self.bench))
+        return spread(self.bench, fitted, laws, fitted.cost + self.tolerance, own.effective(0.0))
+
+    @property
+    def _all_wrong(self) -> bool:
+        """Whether even the best model's error is mostly model error."""
+        return self.samples < WRONG_MODEL_SAMPLES / LARGE_MODEL_ERROR
+
+    def judge_on_held_out_data(self) -> None:
+        """Compute the held-out errors of the likeliest hypotheses.
+
+        If only one is likely and its error is noise, the fit error is enough. A wrong model may overfit; and of several
+        that follow the recordings equally well, the right one predicts best.
+        """
+        if not self._all_wrong and len({frozenset((e.port, e.law.id) for e in t.laws) for t in self._likeliest()}) < 2:
+            return
+        with self.stage("held-out blocks"):
+            if self._all_wrong:
+                self.held_out(self.root)
+            for done in itertools.count():
+                likely = self._likeliest()
+                left = [t for t in likely if self.findings[t.key].held_out is None]
+                if not left or (done >= MOST_PREDICTED and left[0] is not likely[0]):
+                    break
+                if not self.in_time():  # a comparison that was not finished favours what was not judged
+                    self.forget_held_out()
+                    break
+                self.held_out(left[0])
+
+    def forget_held_out(self) -> None:
+        """Forget the held-out errors, so that all hypotheses are compared by their fit errors."""
+        for known in self.findings.values():
+            known.held_out = None
+
+    def _likeliest(self) -> list[Trial]:
+        """List the hypotheses that may be the likeliest."""
+        return likeliest(list(self.memo.values()), self.evidence)
+
+    def flexible(self, trial: Trial) -> dict[str, float]:
+        """Compute the share of a trial's residual that a flexible force explains, by port."""
+        known = self.findings[trial.key]
+        if known.flexible is None:
+            with self.stage("flexible"):
+                known.flexible = flexible_shares(self.bench, trial.fitted)
+        return known.flexible
+
+    def screened(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
+        """Score every port and law beside a hypothesis; see `screen`."""
+        known = self.findings[parent.key]
+        if known.screened is None:
+            with self.stage("screen"):
+                known.screened = screen(self.bench, parent.fitted, self.laws, self.floor.deviation, self.workers)
+                for s in known.screened[0]:
+                    there = self.alternatives.setdefault(s.port, ())
+                    if not any(type(law) is type(s.law) for law in there):
+                        self.alternatives[s.port] = (*there, s.law)
+        return known.screened
+
+    def can_improve(self, trial: Trial) -> bool:
+        """Tell whether a law that removes all but the noise would be worth its prior beside a hypothesis."""
+        left, noise = (v + self.tolerance for v in (trial.mean_square, self.floor2))
+        most = 0.5 * self.sample.effective(0.0) * np.log(max(left / noise, 1.0))
+        return bool(most > np.log(max(len(self.alternatives), 1)) - EFFECT_PRIOR)
+
+    @property
+    def past_deadline(self) -> bool:
+        """Whether the time for the whole diagnosis is over."""
+        return time.perf_counter() > self.deadline
+
+    def in_time(self) -> bool:
+        """Tell whether there is time for more; if not, note that in the result."""
+        self.out_of_time = self.out_of_time or time.perf_counter() > self.until
+        return not self.out_of_time
+
+    def keep(self, trial: Trial) -> None:
+        """Put a trial into the memo, unless the same hypothesis fits better there."""
+        if trial.information is None:
+            trial = replace(trial, information=information(self.bench, trial.fitted, trial.laws))
+        known = self.memo.get(trial.key)
+        if known is None or trial.supersedes(known):
+            self.memo[trial.key] = trial
+            self.findings.pop(trial.key, None)
+
+    def thorough(self, trial: Trial) -> Trial:
+        """Return the same hypothesis fitted to convergence and to all samples, or as it is after the deadline."""
+        if not self.memo[trial.key].thorough and not self.past_deadline:
+            self.keep(self.fits.polish(trial))
+        return self.memo[trial.key]
+
+    def estimate_noise(self) -> None:
+        """Estimate the noise: the part of the best hypothesis' residual that no force and no law at any port explains.
+
+        A measured noise is kept. Third differences give a lower limit: the white noise inside the residual. The
+        effective samples follow from the residual's correlation.
+        """
+        self.count = _count_samples(self.best.fitted, self.bench)
+        if self.floor.source != "estimated":
+            return
+        best = self.best
+        pairs = zip(best.fitted.residual, self.bench.recordings, strict=True)
+        error = np.concatenate([e[r.skip :] for e, r in pairs])
+        followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
+        share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
+        rest = np.minimum(np.sqrt(share * np.mean(error**2, axis=0)), LOUDEST_NOISE * self.bench.scale)
+        known, white = self.stand_in_error * self.bench.scale, white_part(best.fitted.residual)
+        self.floor = Floor(np.hypot(np.maximum(white, rest), known), "estimated")
+
+    def beside(self, laws: Sequence[Placed], joint: Trial) -> Trial:
+        """Make a trial of some laws of a hypothesis, perhaps of another search, at the values that they have there."""
+        simulator: Simulator = self.bench.simulator
+        named: dict[str, object] = {k: joint.fitted.values.get(k, v) for k, v in self.root.fitted.values.items()}
+        for e in laws:
+            simulator = simulator.with_element(e.port, e.law)
+            named |= simulator.elements[-1].named(e.own(joint.fitted.values))
+        bench = replace(self.bench, at_least=max(self.bench.at_least, joint.fitted.model.substeps))
+        fitted = bench.run(simulator, named, joint.fitted.begin)
+        return Trial(fitted.last_elements(len(laws)), fitted, fitted.cost, fitted.cost)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Report that a stage begins and ends, add its seconds, and end the search if one of its fits was interrupted.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            If a fit was interrupted. Such a fit has returned its best result so far.
+        """
+        self.say(name, 0, 1, self.without.cost**0.5)
+        began = time.perf_counter()
+        yield
+        self.times[name] = self.times.get(name, 0.0) + time.perf_counter() - began
+        self.say(name, 1, 1, self.best.error)
+        if self.bench.interrupted_fits and not self.interrupted:
+            raise KeyboardInterrupt
+
+    def until_interrupted(self) -> UntilInterrupted:
+        """Make a context that an interrupt ends, so that the answer rests on what was found before it."""
+        return UntilInterrupted(self)
+
+
+@dataclass(frozen=True)
+class UntilInterrupted:
+    """A context that an interrupt ends; the search is marked as interrupted then."""
+
+    hypotheses: Hypotheses
+
+    def __enter__(self) -> None:
+        """Do nothing."""
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
+        """Catch an interrupt, and nothing else."""
+        caught = is_interrupt(error)
+        if caught:
+            self.hypotheses.interrupted = True
+            self.hypotheses.say.interrupted()
+        return caught
+
+
+def likeliest(trials: Sequence[Trial], evidence: Callable[[Trial], float]) -> list[Trial]:
+    """List the hypotheses that may be the likeliest by an evidence, the likeliest first."""
+    ranked = sorted(trials, key=evidence, reverse=True)
+    return [t for t in ranked if evidence(t) > evidence(ranked[0]) - CONTENDING_NATS]
+
+
+def _count_samples(fitted: Fitted, bench: Workbench) -> float:
+    """Compute the number of samples over the correlation time of a fit's residual."""
+    residual = [e[r.skip :] for e, r in zip(fitted.residual, bench.recordings, strict=True)]
+    return max(effective_size(residual), FEWEST)

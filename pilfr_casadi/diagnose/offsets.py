@@ -1,0 +1,270 @@
+"""Constants that the recordings have beside the simulation: offsets of channels, and initial states not as stated.
+
+An offset of a channel that all recordings share stays a parameter of the simulator, because a constant load acts alike.
+If offsets differ between the recordings, they are subtracted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ..data import Recording
+from ..laws import Law
+from ..simulators import Simulator
+from .floor import ABOVE_NOISE
+from .gates import (
+    CERTAIN_ERRORS,
+    CURED_SHARE,
+    EQUAL_RATIO,
+    EXCEPTION_SHARE,
+    LEAST_GAIN,
+    NEAR_NOISE_RATIO,
+    Checked,
+    FirstOrder,
+    Gate,
+    accept,
+    correct,
+    gain,
+    refit,
+    settle,
+)
+from .screen import lengths
+from .workbench import FEW, THOROUGH, Fitted, Workbench
+
+KEPT_OFFSET = 0.1  # share of its first value that an offset must keep beside effects to be reported
+
+
+@dataclass(frozen=True)
+class WrongStart(Gate):
+    """Initial states that are not as stated."""
+
+    remedy: ClassVar[str] = "with them estimated"
+
+
+def find_wrong_start(now: Checked) -> Checked:
+    """Estimate the initial states if the stated ones contradict the first samples and no constant explains it as well.
+
+    A first sample depends on no dynamics: missing physics cannot contradict it.
+    """
+    both = zip(now.bench.recordings, now.fitted.residual, strict=True)
+    stated = [(r, e[0]) for r, e in both if r.begins in ("zero", "given")]
+    unknown = len(stated) * len(now.bench.simulator.states)
+    if not any(np.any(np.abs(first) > CERTAIN_ERRORS * now.floor.deviation) for _, first in stated) or not unknown:
+        return now
+    words = "The initial states are not as stated"
+    fault = WrongStart("initial state", "start", stated[0][0].begins, words, change=_with_unknown_start)
+    after = correct(now, fault, [now.fitted.values, {}])
+    if after is None or gain(now.cost, after.cost, after.fitted.residual, unknown) < LEAST_GAIN:
+        return now
+    found = accept(now, after, fault)
+    return found if found.cost * EQUAL_RATIO < find_offsets(now).cost else now
+
+
+def _with_unknown_start(r: Recording) -> Recording:
+    return r.with_(initial="estimate") if r.begins in ("zero", "given") else r
+
+
+class Offset(Law):
+    """A constant added to a signal; it stays a parameter of the simulator and is fitted together with the laws."""
+
+    id = "offset"
+    equation = "w = w_0"
+    source = "Ljung (1999), System Identification, sec. 14.1"
+    sentence = "a constant offset of the signal"
+    units: ClassVar[Mapping[str, str]] = {"w_0": "w"}
+    strength: ClassVar[tuple[str, ...]] = ("w_0",)
+    places: ClassVar[tuple[str, ...]] = ("series",)
+
+    def force(self, p: Any) -> Any:
+        """Return the constant."""
+        return p.w_0
+
+
+@dataclass(frozen=True)
+class Constant(Gate):
+    """A constant at an input or an output; as a parameter of the simulator, it may leave any error to other physics."""
+
+    port: str = ""
+    parameters: ClassVar[int] = 1
+    most_left: ClassVar[float] = 1.0
+    remedy: ClassVar[str] = "with it as a parameter"
+
+    def apply(self, bench: Workbench) -> Workbench:
+        """Return the bench with the constant in its simulator."""
+        return replace(bench, simulator=bench.simulator.with_element(self.port, Offset()))
+
+
+def constant_at(port: str, value: float = 0.0, parameter: str = "") -> Constant:
+    """Return the fault that a channel has a constant offset."""
+    kind, name = port.split(":", 1)
+    where, load = ("input", ", or a constant load acts like one") if kind == "actuator" else ("output", "")
+    words = f"The {where} {name} has a constant offset of about {value:.3g}{load}"
+    return Constant(name, "offset", value, words, parameter=parameter, port=port)
+
+
+def find_offsets(now: Checked) -> Checked:
+    """Find constants at inputs and outputs, the most useful first, and keep them as parameters of the simulator.
+
+    They count as a fault if they explain most of the mismatch.
+    """
+    begin, ports = now, _channels(now.bench.simulator)
+    while ports:
+        share = share_of_constants(now.bench, now.fitted, ports)
+        port = max(share, key=lambda name: share[name])
+        if share[port] < EXCEPTION_SHARE:
+            break
+        after = correct(now, constant_at(port), [now.fitted.values], now.fitted.initial, THOROUGH)
+        if after is None:
+            break
+        name = f"{after.bench.simulator.elements[-1].prefix}w_0"
+        before, now = now, accept(now, after, constant_at(port, float(after.fitted.values[name]), name))
+        if now.bench is before.bench:
+            break
+        ports.remove(port)
+    fault = now.cost < CURED_SHARE * begin.cost
+    # a constant load acts alike, so that the share that is left does not prove a fault
+    found = (replace(g, fault=fault, left=1.0) for g in now.gates[len(begin.gates) :])
+    shared = begin.then(now.bench, now.fitted, *found)
+    if shared.cost < NEAR_NOISE_RATIO**2 * shared.noise2:
+        return shared
+    each = find_varying_offset(begin)
+    more = len(begin.bench.recordings) - len(shared.gates) + len(begin.gates)
+    return each if gain(shared.cost, each.cost, each.fitted.residual, more) > LEAST_GAIN else shared
+
+
+@dataclass(frozen=True)
+class VaryingOffset(Gate):
+    """Constants of a channel that differ between the recordings, as of a sensor that is zeroed before each.
+
+    `value` has one constant for each recording; `port` is that of the channel.
+    """
+
+    port: str = ""
+
+    @property
+    def parameters(self) -> int:  # type: ignore[override]
+        """Number of the constants."""
+        return len(self.value)
+
+    def apply(self, bench: Workbench) -> Workbench:
+        """Return the bench with the constants subtracted from its recordings."""
+        kind, name = self.port.split(":", 1)
+        side, names = ("u", bench.simulator.inputs) if kind == "actuator" else ("y", bench.simulator.output_names)
+        at = np.array([one == name for one in names], dtype=float)
+        pairs = zip(bench.recordings, self.value, strict=True)
+        return replace(bench, recordings=tuple(r.with_(**{side: getattr(r, side) - v * at}) for r, v in pairs))
+
+    def relocate(self, now: Checked, after: Checked) -> VaryingOffset:
+        """Return the constants that follow best to first order at the corrected refit."""
+        first = FirstOrder.of(after.bench, after.fitted)
+        return self.at(np.add(self.value, _constants_of_each(first, self.port)[1]))
+
+    def at(self, values: np.ndarray) -> VaryingOffset:
+        """Return it with other constants."""
+        value = [float(f"{v:.6g}") for v in values]
+        listed_values = ", ".join(f"{v:.3g}" for v in value)
+        words = f"{self.channel} has an offset that differs between the recordings: {listed_values}"
+        return replace(self, value=value, sentence=words)
+
+
+def _constants_of_each(first: FirstOrder, port: str) -> tuple[float, np.ndarray]:
+    """Compute the share of the mean square that a constant of each recording's own removes, and the constants."""
+    n = len(first.runs)
+    forces = [np.tile(one, (len(r), 1)) for one, r in zip(np.eye(n), first.bench.recordings, strict=True)]
+    columns = first.response([port], forces)
+    rest = first.left(columns)
+    seen = lengths(rest) > 1e-6 * lengths(columns)  # exclude constants that the initial state can follow
+    found = np.zeros(n)
+    found[seen] = np.linalg.lstsq(rest[:, seen], first.error, rcond=1e-8)[0]
+    left = first.left(first.error)
+    share = 1 - np.sum((left - rest @ found) ** 2) / max(left @ left, 1e-300)
+    return float(share), found if port.startswith("actuator") else -found
+
+
+def find_varying_offset(now: Checked) -> Checked:
+    """Subtract constants of a channel that differ between the recordings if the rule accepts them and noise is left.
+
+    If more is missing, its mean may differ between the recordings as well.
+    """
+    if len(now.bench.recordings) < 2:
+        return now
+    first = FirstOrder.of(now.bench, now.fitted)
+    found = {port: _constants_of_each(first, port) for port in _channels(now.bench.simulator)}
+    likely = sorted(found, key=lambda port: -found[port][0])[:FEW]
+    faults = (VaryingOffset(p.split(":", 1)[1], "offset", (), port=p).at(found[p][1]) for p in likely)
+    settled = [pair for fault in faults if (pair := settle(now, fault)) is not None]
+    if not settled:
+        return now
+    fault, after = min(settled, key=lambda pair: pair[1].cost)
+    return accept(now, after, fault) if after.cost < ABOVE_NOISE**2 * after.noise2 else now
+
+
+def _channels(simulator: Simulator) -> list[str]:
+    """List the ports of the inputs and outputs that have no element yet."""
+    ports = [f"actuator:{n}" for n in simulator.inputs] + [f"sensor:{n}" for n in simulator.output_names]
+    return [port for port in ports if port not in {e.port for e in simulator.elements}]
+
+
+def share_of_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[str, float]:
+    """Compute the share of the mean square that a constant at each port removes, to first order."""
+    first = FirstOrder.of(bench, fitted)
+    columns = first.response(ports, [np.ones((len(r), 1)) for r in bench.recordings])
+    rest = first.left(columns)
+    seen = lengths(rest) > 1e-6 * lengths(columns)  # exclude constants that the initial state can follow
+    along = np.where(seen, rest.T @ first.error / np.maximum(lengths(rest), 1e-150), 0.0)
+    return dict(zip(ports, (along**2 / max(first.error @ first.error, 1e-300)).tolist(), strict=True))
+
+
+def offset_gates(elements: Sequence[Any], values: Mapping[str, Any]) -> list[Gate]:
+    """List the offsets among fitted laws as findings."""
+    placed = [(e.port, f"{e.prefix}w_0") for e in elements if isinstance(e.law, Offset)]
+    found = [constant_at(port, float(values[name]), name) for port, name in placed]
+    return [replace(c, sentence=f"{c.sentence}; it is a parameter of the corrected simulator.") for c in found]
+
+
+def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
+    """Fix offsets at zero that gain nothing beside effects: an effect may have looked like an offset."""
+    before = len(bench.simulator.elements)
+    placed = fitted.simulator.elements
+    for offset in offset_gates(placed[:before], fitted.values) if len(placed) > before else ():
+        name = offset.parameter
+        held = replace(fitted.simulator.parameters[name], value=0.0, fixed=True)
+        simulator = fitted.simulator.with_parameters({**fitted.simulator.parameters, name: held})
+        start = {k: v for k, v in fitted.values.items() if k != name}
+        found = refit(bench, [start], simulator, states=fitted.initial, solver=THOROUGH)
+        if found is not None and gain(found.cost, fitted.cost, fitted.residual) <= LEAST_GAIN:
+            fitted = found
+    return fitted
+
+
+def without_zero_offsets(simulator: Simulator) -> Simulator:
+    """Return a simulator without the offsets that are fixed at zero."""
+    for i, e in reversed(list(enumerate(simulator.elements))):
+        if isinstance(e.law, Offset) and np.all(simulator.parameters[f"{e.prefix}w_0"].fixed):
+            simulator = simulator.without_element(i)
+    return simulator
+
+
+def final_gates(
+    gates: Sequence[Gate], after: Fitted, std: Mapping[str, np.ndarray], effects: bool, sure: bool
+) -> tuple[Gate, ...]:
+    """Return the findings with the offsets that remain, at their fitted values beside the effects, if any."""
+    fitted = {g.parameter: g for g in offset_gates(after.simulator.elements, after.values)}
+    out = []
+    for gate in gates:
+        if not gate.parameter:
+            out.append(gate)
+            continue
+        remaining = fitted[gate.parameter]
+        certain = abs(remaining.value) > CERTAIN_ERRORS * float(std[gate.parameter])
+        if not (certain and abs(remaining.value) > KEPT_OFFSET * abs(gate.value)):
+            continue
+        sentence = remaining.sentence if effects else gate.sentence  # fitted without the effects, it says little
+        if not sure:
+            sentence += " As long as the mismatch has no sure name, it may be a part of that."
+        out.append(replace(gate, value=remaining.value, sentence=sentence))
+    return tuple(out)
