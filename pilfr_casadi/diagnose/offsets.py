@@ -152,11 +152,14 @@ class VaryingOffset(Gate):
 
     def apply(self, bench: Workbench) -> Workbench:
         """Return the bench with the constants subtracted from its recordings."""
+        return replace(bench, recordings=tuple(map(self.subtract, bench.recordings, self.value)))
+
+    def subtract(self, r: Recording, value: float) -> Recording:
+        """Subtract a constant from the channel of a recording."""
         kind, name = self.port.split(":", 1)
-        side, names = ("u", bench.simulator.inputs) if kind == "actuator" else ("y", bench.simulator.output_names)
+        side, names = ("u", r.inputs) if kind == "actuator" else ("y", r.outputs)
         at = np.array([one == name for one in names], dtype=float)
-        pairs = zip(bench.recordings, self.value, strict=True)
-        return replace(bench, recordings=tuple(r.with_(**{side: getattr(r, side) - v * at}) for r, v in pairs))
+        return r.with_(**{side: getattr(r, side) - value * at})
 
     def relocate(self, now: Checked, after: Checked) -> VaryingOffset:
         """Return the constants that follow best to first order at the corrected refit."""
@@ -167,7 +170,7 @@ class VaryingOffset(Gate):
         """Return it with other constants."""
         value = [float(f"{v:.6g}") for v in values]
         listed_values = ", ".join(f"{v:.3g}" for v in value)
-        words = f"{self.channel} has an offset that differs between the recordings: {listed_values}"
+        words = f"{self.channel} has an offset that differs between the recordings, {listed_values}, and may in others"
         return replace(self, value=value, sentence=words)
 
 

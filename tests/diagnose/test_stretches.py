@@ -16,6 +16,7 @@ from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.channel_faults import scale_channels
 from pilfr_casadi.diagnose.floor import noise_floor
+from pilfr_casadi.diagnose.offsets import VaryingOffset
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.stretches import Everything, Stretch, Stretches, choose_stretches, divide, spread_out
 from pilfr_casadi.diagnose.timing import Jump
@@ -133,6 +134,16 @@ def test_a_fault_of_the_stretches_is_corrected_in_everything():
     whole = stretches.everything(bench, [scale_channels("y", a.outputs, [0], -1.0)])
     assert [np.array_equal(r.y, -given.y) for r, given in zip(whole.recordings, (a, b), strict=True)] == [True, True]
     assert whole.substeps == bench.substeps and whole.simulator is bench.simulator
+
+
+def test_offsets_of_the_stretches_are_subtracted_from_their_recordings():
+    a, b = recordings(count=2)
+    stretches = Stretches((a, b), (Stretch(1, 0, 500), Stretch(1, 500, 1500)))
+    bench = Workbench.of(rig(OFF), stretches.cut(), "zero")
+    offset = VaryingOffset("x2", "offset", (), port="sensor:x2").at(np.array([1.0, 3.0]))
+    first, second = stretches.everything(bench, [offset]).recordings
+    assert first is a
+    np.testing.assert_allclose(second.y, b.y - 2.0)
 
 
 def test_whole_short_recordings_are_stretches():
