@@ -182,10 +182,10 @@ class Search(Hypotheses):
         step = [self.memo[t.key] for t in self.steps[-1].trials if unscheduled(type(t.law)) in may_vary]
         # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
         if step and self.can_improve(self.best, self.least_noise2) and self.in_time():
-            varied = max(step, key=self.optimistic_evidence)
-            kind = unscheduled(type(varied.law))
-            signals = ("z", *self._entry(varied).local.inputs)
-            self._refine(varied, [scheduled(kind, by) for by in signals if by != varied.law.scheduled_by])
+            likeliest = max(step, key=self.optimistic_evidence)
+            for varied in (t for t in step if t.law.id == likeliest.law.id):  # all its forms
+                kind, signals = unscheduled(type(varied.law)), ("z", *self._entry(varied).local.inputs)
+                self._refine(varied, [scheduled(kind, by) for by in signals if by != varied.law.scheduled_by])
 
     def _entry(self, trial: Trial) -> Scored:
         """Return how the last law of a trial, or another with the same sense, was first screened at its port."""
