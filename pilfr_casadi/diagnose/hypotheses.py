@@ -314,8 +314,7 @@ class Hypotheses:
         for e in laws:
             simulator = simulator.with_element(e.port, e.law)
             named |= simulator.elements[-1].named(e.own(joint.fitted.values))
-        bench = replace(self.bench, at_least=max(self.bench.at_least, joint.fitted.model.substeps))
-        fitted = bench.run(simulator, named, joint.fitted.begin)
+        fitted = self.bench.run(simulator, named, joint.fitted.begin)
         return Trial(fitted.last_elements(len(laws)), fitted, fitted.cost, fitted.cost)
 
     @contextmanager
