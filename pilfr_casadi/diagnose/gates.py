@@ -93,6 +93,10 @@ class Gate:
         scale = np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
         return replace(bench, recordings=recordings, scale=scale)
 
+    def apply_to_whole(self, whole: list[Recording], places: Sequence[tuple[int, int]]) -> list[Recording]:
+        """Return the recordings corrected of which stretches were checked, each from (recording, sample) on."""
+        return list(map(self.change, whole)) if self.change is not None and self.corrected else whole
+
     def begin(self, previous: Fitted) -> Sequence[np.ndarray]:
         """Return guesses of the initial states of the corrected recordings."""
         return previous.begin

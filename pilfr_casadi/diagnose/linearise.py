@@ -321,8 +321,7 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
     lift, push = (np.max([getattr(r, name) for r in runs], axis=0) for name in ("lift", "push"))
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # a force that does not move it has no limit
         max_stiffness, max_damping = np.where(lift > 0, rate / lift, rate**2 / push), rate / push
-    inputs = {"t": np.concatenate([bench.dt * np.arange(n) for n in lengths])}
-    inputs |= zip(bench.simulator.inputs, np.concatenate([r.u for r in runs]).T, strict=True)
+    inputs = bench.signals_of([r.u for r in runs])
     own = own_signals(bench.simulator, np.concatenate([r.own for r in runs]))
     rest = tuple(r.from_zero for r in runs)
     pairs = enumerate(zip(max_stiffness.tolist(), max_damping.tolist(), strict=True))

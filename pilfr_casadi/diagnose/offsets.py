@@ -154,6 +154,13 @@ class VaryingOffset(Gate):
         """Return the bench with the constants subtracted from its recordings."""
         return replace(bench, recordings=tuple(map(self.subtract, bench.recordings, self.value)))
 
+    def apply_to_whole(self, whole: list[Recording], places: Sequence[tuple[int, int]]) -> list[Recording]:
+        """Subtract from each recording the mean of the constants of its stretches; none if gaps have cut stretches."""
+        if len(self.value) != len(places):
+            return whole
+        each = [[v for v, (k, _) in zip(self.value, places, strict=True) if k == i] for i in range(len(whole))]
+        return [self.subtract(r, float(np.mean(v))) if v else r for r, v in zip(whole, each, strict=True)]
+
     def subtract(self, r: Recording, value: float) -> Recording:
         """Subtract a constant from the channel of a recording."""
         kind, name = self.port.split(":", 1)

@@ -39,10 +39,8 @@ from .floor import FEWEST, effective_size
 from .gates import Gate
 from .hypotheses import Findings, likeliest
 from .linearise import Probe, loudest_stretch, run
-from .offsets import VaryingOffset
 from .screen import Remainder, Surface, Task, orthonormal
 from .search import Search
-from .timing import Jump
 from .trials import Trial
 from .workbench import DIVERGED, FEW, Fitted, Workbench
 
@@ -107,35 +105,11 @@ class Stretches:
 
     def everything(self, bench: Workbench, gates: Sequence[Gate]) -> Workbench:
         """Return a bench of the stretches with all recordings in their place, corrected by the gates."""
-        recordings = list(self.recordings)
+        recordings, places = list(self.recordings), [(s.recording, s.begin) for s in self.chosen]
         for gate in gates:
-            if isinstance(gate, Jump):
-                recordings = self._cut_at_gaps(recordings, gate)
-            elif isinstance(gate, VaryingOffset):
-                recordings = self._without_offsets(recordings, gate)
-            elif gate.change is not None and gate.corrected:
-                recordings = list(map(gate.change, recordings))
+            recordings = gate.apply_to_whole(recordings, places)
         scale = np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
         return replace(bench.on(recordings), scale=scale)
-
-    def _without_offsets(self, recordings: list[Recording], offset: VaryingOffset) -> list[Recording]:
-        """Subtract from each recording the mean of the offsets of its stretches; none if gaps have cut stretches."""
-        if len(offset.value) != len(self.chosen) or len(recordings) != len(self.recordings):
-            return recordings
-        each = [
-            [v for v, s in zip(offset.value, self.chosen, strict=True) if s.recording == i]
-            for i in range(len(recordings))
-        ]
-        return [offset.subtract(r, float(np.mean(v))) if v else r for r, v in zip(recordings, each, strict=True)]
-
-    def _cut_at_gaps(self, recordings: list[Recording], gap: Jump) -> list[Recording]:
-        """Cut the recordings where samples are missing in a stretch."""
-        places = [(self.chosen[i].recording, self.chosen[i].begin + k) for i, k in gap.places]
-        for i, k in sorted(places, reverse=True):
-            r = recordings[i]
-            later = r.slice(k).with_(initial="estimate", period=None, name=f"{r.name} from {k * r.dt:.6g} s".strip())
-            recordings[i : i + 1] = [r.slice(0, k), later]
-        return recordings
 
 
 def choose_stretches(

@@ -292,6 +292,15 @@ class Jump(Gate):
         pieces = r.slice(0, k), r.slice(k).with_(initial="estimate", period=None)
         return replace(bench, recordings=(*bench.recordings[:i], *pieces, *bench.recordings[i + 1 :]))
 
+    def apply_to_whole(self, whole: list[Recording], places: Sequence[tuple[int, int]]) -> list[Recording]:
+        """Cut the recordings where samples are missing in a stretch."""
+        out = list(whole)
+        for i, k in sorted(((places[i][0], places[i][1] + k) for i, k in self.places), reverse=True):
+            r = out[i]
+            later = r.slice(k).with_(initial="estimate", period=None, name=f"{r.name} from {k * r.dt:.6g} s".strip())
+            out[i : i + 1] = [r.slice(0, k), later]
+        return out
+
     def begin(self, previous: Fitted) -> Sequence[np.ndarray]:
         """Return the states after the jump for the later piece."""
         return self.states

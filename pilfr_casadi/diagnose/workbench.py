@@ -366,10 +366,14 @@ class Workbench:
 
     def local(self, z: np.ndarray, dz: np.ndarray) -> Local:
         """Return the local signals of a port along all recordings, with the time and the inputs."""
-        inputs = dict(zip(self.simulator.inputs, np.concatenate([r.u for r in self.recordings]).T, strict=True))
-        inputs = {"t": np.concatenate([self.dt * np.arange(len(r)) for r in self.recordings]), **inputs}
+        inputs = self.signals_of([r.u for r in self.recordings])
         lengths, rest = tuple(map(len, self.recordings)), tuple(r.begins == "zero" for r in self.recordings)
         return Local(z, dz, self.dt, lengths, inputs=inputs, from_zero=rest)
+
+    def signals_of(self, inputs: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the time `t` and the inputs by name along all recordings, from the inputs (M, n_u) of each."""
+        time = np.concatenate([self.dt * np.arange(len(u)) for u in inputs])
+        return {"t": time, **dict(zip(self.simulator.inputs, np.concatenate(inputs).T, strict=True))}
 
     def run(self, simulator: Simulator, values: Mapping[str, Any], states: Sequence[np.ndarray]) -> Fitted:
         """Run a simulator at values by name, from the simulator's own initial states."""

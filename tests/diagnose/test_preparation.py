@@ -5,13 +5,13 @@ import pytest
 from diagnosis_rig import OFF, recordings, rig
 from test_slips import DT, recorded, tanks
 
-from pilfr_casadi import Recording
+from pilfr_casadi import Parameter, Recording, Simulator, multisine
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.gates import Checked
 from pilfr_casadi.diagnose.offsets import final_gates, find_offsets, offset_gates
 from pilfr_casadi.diagnose.preparation import prepare, refitted
 from pilfr_casadi.diagnose.proof import mean_nrmse
-from pilfr_casadi.laws import QuadraticStiffness
+from pilfr_casadi.laws import AsymmetricSaturation
 
 
 def unsaid(r, u, y, initial="zero"):
@@ -74,8 +74,21 @@ def test_offsets_that_differ_between_recordings_are_subtracted(side, channel):
 
 
 def test_a_mean_force_of_missing_physics_is_no_offset():
-    both = recordings(QuadraticStiffness({"k_2": 500.0}), count=2)
-    bench = Workbench.of(rig(OFF), both, "zero")
+    """A skew saturation pushes an axis to one side, in each recording by a mean of its own."""
+    axis = Simulator(
+        lambda x, u, p: {"position": x.speed, "speed": u.force - p.d * x.speed},
+        lambda x: {"position": x.position},
+        states=("position", "speed"),
+        inputs=("force",),
+        parameters={"d": Parameter(2.0, bounds=(0.1, 20))},
+    )
+    rng, train = np.random.default_rng(0), []
+    for amplitude in (1.0, 2.0):
+        force = amplitude * multisine(1500, f_max=2.0, fs=50.0, rng=rng)
+        blank = Recording(force, np.zeros(1500), 0.02, ("force",), ("position",), initial="zero", hold="zero")
+        y = axis.with_element("actuator:force", AsymmetricSaturation().at({"low": -2.0, "high": 1.2})).simulate(blank)
+        train.append(blank.with_(y=y + 1e-3 * np.std(y) * rng.standard_normal(y.shape)))
+    bench = Workbench.of(axis, train, "zero")
     found = find_offsets(Checked(bench, refitted(bench)))
     assert not any(isinstance(gate.value, list) for gate in found.gates)
 
