@@ -93,13 +93,13 @@ def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[ty
     """Return the laws, and versions of some of them whose strength varies with a signal.
 
     An input that the equations do not read may scale a law. A spring or damper of the simulator's own may vary with the
-    time, an input, or a port's own signal. Other laws are found first, and then let vary (`Search`).
+    time, an input, or a port's own signal, and a damper with the position. Other laws are found first, and then let
+    vary (`Search`).
     """
     by_input = [scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs]
-    read = [name for name in simulator.inputs if name not in simulator.idle_inputs]
-    signals = ["t", *read, *sorted({name for port in simulator.ports for name in port.signals})]
-    varying = [scheduled(law, by) for law in (LinearStiffness, ViscousDamping) if law in laws for by in signals]
-    return (*laws, *by_input, *varying, *([scheduled(ViscousDamping, "z")] if ViscousDamping in laws else []))
+    signals = ["t", *simulator.inputs, *sorted({name for port in simulator.ports for name in port.signals})]
+    pairs = [(law, by) for law in (LinearStiffness, ViscousDamping) for by in signals] + [(ViscousDamping, "z")]
+    return (*laws, *by_input, *(scheduled(law, by, "quadratic") for law, by in pairs if law in laws))
 
 
 def check_limits(simulator: Simulator, limits: Mapping[str, float] | None) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, side_by_side
-from ..laws import FINER, LINEAR, SCALABLE, Law, scheduled, unscheduled
+from ..laws import FINER, LINEAR, PROFILES, SCALABLE, Law, constant, scheduled
 from ..simulators import Placed
 from .evidence import (
     BETTER_RATIO,
@@ -179,13 +179,18 @@ class Search(Hypotheses):
         if len(best.laws) == len(parent.laws) + 1:
             self._refine(best, FINER.get(type(best.element.law), ()))
         may_vary = [kind for kind in SCALABLE if kind.id not in LINEAR]  # a linear law was screened with every signal
-        step = [self.memo[t.key] for t in self.steps[-1].trials if unscheduled(type(t.law)) in may_vary]
+        step = [self.memo[t.key] for t in self.steps[-1].trials if constant(type(t.law)) in may_vary]
         # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
         if step and self.can_improve(self.best, self.least_noise2) and self.in_time():
             likeliest = max(step, key=self.optimistic_evidence)
             for varied in (t for t in step if t.law.id == likeliest.law.id):  # all its forms
-                kind, signals = unscheduled(type(varied.law)), ("z", *self._entry(varied).local.inputs)
-                self._refine(varied, [scheduled(kind, by) for by in signals if by != varied.law.scheduled_by])
+                kind, signals = constant(type(varied.law)), ("z", *self._entry(varied).local.inputs)
+                self._refine(varied, [scheduled(kind, by, "quadratic") for by in signals])
+        best = self.best
+        by = (best.law.scheduled_by or best.law.scaled_by) if best.laws else ""
+        if by and self.in_time():
+            kind, tried = constant(type(best.law)), [p for p in PROFILES if p != best.law.profile]
+            self._refine(best, [scheduled(kind, by, profile) for profile in tried])
 
     def _entry(self, trial: Trial) -> Scored:
         """Return how the last law of a trial, or another with the same sense, was first screened at its port."""
@@ -201,7 +206,7 @@ class Search(Hypotheses):
         bare = base.simulator.without_element()
 
         def fit(kind: Any) -> Trial | None:
-            starts = list(kind.finer_starts(trial.own, entry.local))
+            starts = list(kind.finer_starts(trial.law.at(trial.own), entry.local))
             placed = [place_law(bare, replace(entry, law=kind()), own) for own in starts]
             values = [{**base.values, **named} for _, named in placed]
             return self.fits.fitted(placed[0][0], values, len(trial.laws), states=base.begin)

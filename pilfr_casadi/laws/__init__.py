@@ -4,8 +4,8 @@
 contacts, gaps, periodic forces), `friction` (forces of speed), `hysteresis` (loops), `curves` (saturation and other
 curves of actuators and sensors), `dynamic` (delays, creep, modes, trends), `in_line` (in line with a term of the
 equations), and those of one domain, `thermal` and
-`electrical`. `catalogue` lists the laws that a diagnosis tries and composes laws (scaled, scheduled, behind a gap).
-`forces` evaluates laws along given signals.
+`electrical`. `composed` makes laws of laws (scaled, scheduled, behind a gap). `catalogue` lists the laws that a
+diagnosis tries. `forces` evaluates laws along given signals.
 """
 
 from typing import TYPE_CHECKING
@@ -20,10 +20,13 @@ if TYPE_CHECKING:
         LINEAR as LINEAR,
         POSITION_GAINS as POSITION_GAINS,
         SCALABLE as SCALABLE,
+    )
+    from .composed import (
+        PROFILES as PROFILES,
         behind_gap as behind_gap,
+        constant as constant,
         scaled as scaled,
         scheduled as scheduled,
-        unscheduled as unscheduled,
     )
     from .curves import (
         AsymmetricDeadZone as AsymmetricDeadZone,

@@ -187,6 +187,8 @@ class Law:
         Name of the speed within which the force changes its sign; integration steps have to be fine there.
     scaled_by, scheduled_by : str
         Input that multiplies the force, or signal with which the strengths vary, if any; see `scaled`, `scheduled`.
+    profile : str
+        How they vary.
 
     Parameters
     ----------
@@ -231,6 +233,7 @@ class Law:
     knee: ClassVar[str] = ""
     scaled_by: ClassVar[str] = ""
     scheduled_by: ClassVar[str] = ""
+    profile: ClassVar[str] = ""
 
     values: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)

@@ -35,9 +35,8 @@ def unit_forces(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.
         bare = unit_forces(kind.__base__(), local, [{k: s[k] for k in kind.__base__.units if k in s} for s in shapes])
         if law.scaled_by:
             return np.asarray(bare * local.inputs[law.scaled_by][:, None, None])
-        signal = law.schedule(local)
-        share = ((signal - np.min(signal)) / np.ptp(signal))[:, None, None]
-        return np.concatenate([bare * (1 - share), bare * share], axis=2)
+        weights = np.array([kind().weights(local, shape) for shape in shapes])
+        return np.concatenate([bare * of_value.T[:, :, None] for of_value in np.swapaxes(weights, 0, 1)], axis=2)
     step = _all_lanes(kind, len(shapes), local.dt if law.shifts else 0.0)
     p = law.at(shapes[0]).parameters()
     names = [name for name in p if name not in law.strength]

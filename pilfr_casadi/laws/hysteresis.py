@@ -106,11 +106,11 @@ class PlayHysteresis(StopHysteresis):
         return bool(w @ np.abs(r - mean) < EQUAL_THRESHOLDS * mean * total)
 
     @classmethod
-    def finer_starts(cls, values: Mapping[str, Any], local: Local) -> Iterator[dict[str, Any]]:
+    def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:
         """Split each play but the first into two, a little apart."""
-        w, r = np.asarray(values["w"]), np.asarray(values["r"])
+        w, r = np.asarray(found.values["w"]), np.asarray(found.values["r"])
         apart = np.concatenate([r[:1], 0.8 * r[1:], 1.2 * r[1:]])
-        yield {**values, "w": np.concatenate([w[:1], w[1:] / 2, w[1:] / 2]), "r": apart}
+        yield {**found.values, "w": np.concatenate([w[:1], w[1:] / 2, w[1:] / 2]), "r": apart}
 
 
 class FinePlays(PlayHysteresis):
@@ -178,10 +178,10 @@ class SmoothHysteresis(Law):
         return p["k_h"] * force / total, ca.vertcat(*following)
 
     @classmethod
-    def finer_starts(cls, values: Mapping[str, Any], local: Local) -> Iterator[dict[str, Any]]:
+    def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:
         """Start as stiff as the stops of given weights, with their thresholds spread in several ways."""
         for shape in cls().shapes(local):
-            yield {**shape, "k_h": float(np.sum(values["w"]))}
+            yield {**shape, "k_h": float(np.sum(found.values["w"]))}
 
 
 class BoucWen(Law):

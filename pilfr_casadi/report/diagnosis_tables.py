@@ -330,7 +330,8 @@ def _parts(law: Any) -> tuple[tuple[Any, ...], str]:
         return (learned_force,), f"learned_force({law.factor!r})"
     if by := law.scaled_by or law.scheduled_by:
         compose, base = (scaled if law.scaled_by else scheduled), law.__base__
-        return (compose, base), f"{compose.__name__}({base.__name__}, {by!r})"
+        how = f", {law.profile!r}" if law.profile not in ("", "linear") else ""
+        return (compose, base), f"{compose.__name__}({base.__name__}, {by!r}{how})"
     return (law,), law.__name__
 
 

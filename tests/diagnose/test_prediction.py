@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -41,14 +42,14 @@ def controlled(seed, friction=1.5):
         own = {k: replace(p, value=known.get(k, p.value), bounds=(0, np.inf)) for k, p in plant.parameters.items()}
         plant = plant.with_parameters(own)
     model = discretise(plant, DT, "zero", 10)
-    p = model.parameters.start
+    x, u = ca.SX.sym("x", model.n_state), ca.SX.sym("u")
+    sample = ca.Function("sample", [x, u], [model.closed(x, u, model.parameters.start)[0]]).fold(model.substeps)
     reference = 4 * np.cumsum(rng.standard_normal(SAMPLES)) * DT
     x, y, u = np.zeros(2), np.zeros((SAMPLES, 1)), np.zeros((SAMPLES, 1))
     for k in range(SAMPLES):
         y[k] = x[0] + 1e-3 * rng.standard_normal()
         u[k] = -GAINS[0] * (y[k, 0] - reference[k]) - GAINS[1] * x[1] + rng.normal(0, 3)
-        for _ in range(model.substeps):
-            x = np.asarray(model.closed(x, u[k], p)[0]).ravel()
+        x = np.asarray(sample(x, np.full((1, model.substeps), u[k, 0]))).ravel()
     return Recording(u, y, DT, ("f",), ("gap",), hold="zero")
 
 

@@ -256,7 +256,7 @@ def test_more_plays_begin_near_those_that_they_refine(plain):
     (finer,) = FINER[plain]
     few = plain().at({"w": np.array([-0.4, 0.3, 0.2, 0.1, 0.1, 0.05]), "r": np.linspace(0.0, 0.5, 6)})
     few = few.at({k: p.value for k, p in few.parameters().items()})
-    (start,) = finer.finer_starts(few.values, LOCAL)
+    (start,) = finer.finer_starts(few, LOCAL)
     more = finer().at(start, finer().bounds(LOCAL))
     one, other = (unit_forces(law, LOCAL, [{}])[:, 0, : law.n] @ law.parameters()["w"].value for law in (few, more))
     assert all(np.shape(more.parameters()[k].value) == (11,) for k in ("w", "r"))

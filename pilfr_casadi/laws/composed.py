@@ -1,0 +1,305 @@
+"""Laws made of laws: scaled by a signal, varying with one, or acting behind a gap.
+
+Two laws in parallel in one port need no class of their own: call `Simulator.with_element` twice.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .._base import InputError
+from ..models import Named, Parameter
+from .base import Law, Local, beyond_gap
+
+GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
+PROFILES = {"linear": ("", "_high"), "quadratic": ("", "_mid", "_high"), "exponential": ("",)}  # names of the values
+RATIOS, MOST_RATIO = (0.3, 3.0), 100.0  # tried ratios of an exponential profile, and the largest
+PATTERNS = (
+    (0.5, 1.0, 1.5),
+    (1.5, 1.0, 0.5),
+    (0.5, 1.5, 0.5),
+    (1.5, 0.5, 1.5),
+)  # variations, over the mean
+SPARE = 0.25  # of the variation, the least strength from which a profile starts
+
+
+def scaled(law: type[Law], by: str) -> type[Law]:
+    """Make a law whose strength a signal scales: `w = by law(z, dz/dt)`, such as a yield force set by a voltage.
+
+    Parameters
+    ----------
+    law : class of Law
+        Any law that may act in parallel, as a force.
+    by : str
+        An input of the simulator, which multiplies the strength.
+
+    Raises
+    ------
+    InputError
+        If it is not a law, or acts in series with a signal.
+    """
+    return _scaled(_parallel(law), by)
+
+
+def scheduled(law: type[Law], by: str, profile: str = "linear") -> type[Law]:
+    """Make a law whose strength varies with a signal, such as friction that grows with a pressure.
+
+    A strength, such as `F_c`, has its value where the signal is lowest in the recordings (`low`), and another where it
+    is highest (`high`). A force that opposes motion does so at both.
+
+    Parameters
+    ----------
+    law : class of Law
+        Any law that may act in parallel, as a force.
+    by : str
+        An input of the simulator, one of the port's own `signals`, "z", the local coordinate, or "t", the time.
+    profile : {"linear", "quadratic", "exponential"}
+        How the strength varies: in a line, to `F_c_high`; in a parabola over `F_c_mid` in the middle to `F_c_high`,
+        constant outside the range; or in proportion to exp, to `ratio` times `F_c`, as viscosity does with temperature.
+
+    Raises
+    ------
+    InputError
+        If it is not a law, or acts in series with a signal, or there is no such profile.
+    """
+    if profile not in PROFILES:
+        raise InputError(f"profile = {profile!r} was given; give {', '.join(map(repr, PROFILES))}.")
+    return _scheduled(_parallel(law), by, profile)
+
+
+def constant(law: type[Law]) -> type[Law]:
+    """Return the law whose strength is constant, if a signal varies or scales it; see `scheduled` and `scaled`."""
+    return law.__base__ if law.scheduled_by or law.scaled_by else law  # type: ignore[return-value]
+
+
+def profile_weights(profile: str, share: Any, ratio: Any) -> list[Any]:
+    """Compute the weights of a strength's values, such as `F_c` and `F_c_high`, at a share of the signal's range."""
+    if profile == "linear":
+        return [1 - share, share]
+    if profile == "quadratic":
+        return [(1 - share) * (1 - 2 * share), 4 * share * (1 - share), share * (2 * share - 1)]
+    return [ratio**share]
+
+
+def behind_gap(law: type[Law]) -> type[Law]:
+    """Make a law that acts beyond a gap only: on `z' = z - clip(z, -g, g)` and its rate, such as a stop that rubs.
+
+    A force of the rate sets in over a twentieth of the gap, as a contact does.
+
+    Parameters
+    ----------
+    law : class of Law
+        Any law that may act in parallel, as a force of `z` and `dz` alone.
+
+    Raises
+    ------
+    InputError
+        If it is not a law, acts in series with a signal, has states or a gap of its own, or reads other signals.
+    """
+    base = _parallel(law)
+    if base.order or "g" in base.units:
+        raise InputError(f"The law {base.id!r} has {'states' if base.order else 'a gap'} of its own; take another.")
+    if base.reads() - {"z", "dz"}:
+        raise InputError(f"The law {base.id!r} reads more than z and dz; take another.")
+    return _behind_gap(base)
+
+
+def _parallel(law: Any) -> Any:
+    """Check that a law is a force."""
+    if not (isinstance(law, type) and issubclass(law, Law)):
+        raise InputError(f"A composed law is made of a class of laws, such as CoulombFriction; got {law!r}.")
+    if "parallel" not in law.places:
+        raise InputError(f"The law {law.id!r} stands in series with a signal; only a force can be composed.")
+    return law
+
+
+def _not_there(by: str, local: Local) -> str:
+    """Say why a signal cannot vary a strength at a port; empty if it can."""
+    if by not in local.inputs:
+        return f"the port has no signal {by}"
+    return "" if np.ptp(local.inputs[by]) > 0 else f"{by} is constant"
+
+
+@functools.cache  # the same class for the same arguments
+def _scaled(base: Any, by: str) -> Any:
+    strengths = {name: f"{unit}/[{by}]" if name in base.strength else unit for name, unit in base.units.items()}
+
+    class Scaled(base):
+        form = f"{base.form}, scaled by {by}".removeprefix(", ")
+        equation = f"w = {by} f,  {base.equation.replace('w =', 'f =', 1)}"
+        sentence = f"{base.sentence}; {by} scales its strength"
+        units, strength = strengths, base.strength
+        places = ("parallel",)
+        dissipative = restoring = False  # the signal may have either sign
+        scaled_by = by
+
+        def why_not(self, local: Local) -> str:
+            """Say why the data carries no information on this law; empty if it does."""
+            return super().why_not(local) or _not_there(by, local)
+
+    return _name(Scaled, f"{base.__name__}ScaledBy_{by}", f"{base.__doc__}\n\n    Its strength is scaled by {by}.")
+
+
+def _levels(found: Law, own: str, by: str, limits: Mapping[str, float]) -> np.ndarray:
+    """Compute a strength at the low end, the middle and the high end of a signal that varies it, (3,) or (3, n).
+
+    A law that another signal varies has its mean strength. What a signal only scales may be negative; the simulator's
+    own spring or damper makes up for that, and here all is positive.
+    """
+    value = np.asarray(found.values[own], dtype=float)
+    if found.scaled_by == by:
+        levels = np.array([share * value for share in (limits["low"], sum(limits.values()) / 2, limits["high"])])
+        return np.asarray(levels - levels.min(axis=0) + SPARE * np.ptp(levels, axis=0))
+    if not found.scheduled_by:
+        return np.array([value] * 3)
+    values = [np.asarray(found.values[f"{own}{end}"], dtype=float) for end in PROFILES[found.profile]]
+    rows = [profile_weights(found.profile, share, found.values.get("ratio", 1.0)) for share in (0.0, 0.5, 1.0)]
+    levels = np.array([sum(float(w) * v for w, v in zip(row, values, strict=True)) for row in rows])
+    return levels if found.scheduled_by == by else np.array([levels.mean(axis=0)] * 3)
+
+
+@functools.cache
+def _scheduled(base: Any, by: str, profile: str) -> Any:
+    ends = {own: [f"{own}{end}" for end in PROFILES[profile]] for own in base.strength}
+    further = {ends[own][k]: base.units[own] for k in range(1, len(PROFILES[profile])) for own in base.strength}
+    shape = {"ratio": ""} if profile == "exponential" else {}
+    unit = {"z": "z", "t": "s"}.get(by, f"[{by}]")
+    words = {"z": "the local coordinate", "t": "time"}.get(by, by)
+    how = {"linear": "", "quadratic": " in a parabola", "exponential": " exponentially"}[profile]
+    read = [*inspect.signature(base.step if base.memory else base.force).parameters]
+
+    def strengths(p: Any, u: Any, z: Any) -> dict[str, Any]:
+        """Parameters of the law at a value of the signal."""
+        signal = z if by == "z" else u[by]
+        share = (signal - p["low"]) / (p["high"] - p["low"])
+        if profile == "quadratic":
+            share = ca.fmin(ca.fmax(share, 0), 1)
+        weights = profile_weights(profile, share, p["ratio"] if shape else 1.0)
+        own = {name: p[name] for name in base.units}
+        return own | {k: sum(w * p[name] for w, name in zip(weights, names, strict=True)) for k, names in ends.items()}
+
+    class Scheduled(base):
+        form = f"{base.form}, scheduled{how} by {by}".removeprefix(", ")
+        equation = f"{base.equation}  with {', '.join(base.strength)} {profile} in {by}"
+        sentence = f"{base.sentence}; its strength varies{how} with {words}"
+        units = {**base.units, **further, **shape, "low": unit, "high": unit}
+        strength = (*base.strength, *further)
+        places = ("parallel",)
+        scheduled_by = by
+
+        def why_not(self, local: Local) -> str:
+            """Say why the data carries no information on this law; empty if it does."""
+            unknown = not (local.shown or (local.from_zero and all(local.from_zero)))
+            if by == "z" and unknown:  # a level of each recording's own would pass for a variation with z
+                return "no output reads the coordinate, and its start is unknown"
+            return super().why_not(local) or ("" if by == "z" else _not_there(by, local))
+
+        def parameters(self) -> dict[str, Parameter]:
+            """Parameters, of which the ends of the signal's range are fixed."""
+            fixed = {k: Parameter(float(self.values.get(k, k == "high")), unit, fixed=True) for k in ("low", "high")}
+            return {**super().parameters(), **fixed}
+
+        def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+            """Bounds of the law, and of the ratio of its strengths."""
+            return {**super().bounds(local), **{name: (1 / MOST_RATIO, MOST_RATIO) for name in shape}}
+
+        def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+            """Shapes of the law, with the range of the signal."""
+            signal = self.schedule(local)
+            for own in super().shapes(local):
+                for more in ({name: value for name in shape} for value in (RATIOS if shape else (1.0,))):
+                    yield {**own, **more, "low": float(signal.min()), "high": float(signal.max())}
+
+        def weights(self, local: Local, given: Mapping[str, Any]) -> list[np.ndarray]:
+            """Weights (M,) of a strength's values along signals, for a shape of the law."""
+            signal = self.schedule(local)
+            share = (signal - signal.min()) / np.ptp(signal)
+            return [np.ravel(w) for w in profile_weights(profile, share, given.get("ratio", 1.0))]
+
+        @classmethod
+        def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:
+            """Start as a law varies that varies already, or else as it does with every sense of variation."""
+            signal = cls().schedule(local)
+            limits = {"low": float(signal.min()), "high": float(signal.max())}
+            known = by in (found.scheduled_by, found.scaled_by)
+            for pattern in ((1.0, 1.0, 1.0),) if known else PATTERNS[: None if profile == "quadratic" else 2]:
+                values: dict[str, Any] = {k: v for k, v in found.values.items() if k in base.units} | limits
+                for own, names in ends.items():
+                    low, middle, high = np.multiply(pattern, _levels(found, own, by, limits).T).T
+                    levels = {1: (low,), 2: (low, high), 3: (low, middle, high)}[len(names)]
+                    values |= dict(zip(names, levels, strict=True))
+                    if shape:
+                        ratio = np.abs(np.sum(high)) / max(np.abs(np.sum(low)), 1e-300)
+                        values["ratio"] = float(np.clip(ratio, 1 / MOST_RATIO, MOST_RATIO))
+                yield values
+
+        if base.memory:
+
+            def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0, u: Any = None) -> Any:
+                at = p if u is None and by != "z" else strengths(p, u, z)
+                have = {"z": z, "s": s, "p": at, "dz": dz}
+                return super().step(**{k: have[k] for k in read if k in have})
+
+        else:
+
+            def force(self, z: Any, dz: Any, u: Any, p: Any) -> Any:
+                have = {"z": z, "dz": dz, "p": Named("parameter", strengths(p, u, z))}
+                return super().force(**{k: have[k] for k in read if k in have})
+
+    Scheduled.profile = profile
+    return _name(
+        Scheduled,
+        f"{base.__name__}ScheduledBy_{by}{profile.capitalize() if how else ''}",
+        f"{base.__doc__}\n\n    Its strength varies{how} with {words}.",
+    )
+
+
+@functools.cache
+def _behind_gap(base: Any) -> Any:
+    read = inspect.signature(base.step if base.memory else base.force).parameters
+
+    def past(z: Any, dz: Any, p: Any) -> dict[str, Any]:
+        """Arguments of the law's force or step beyond the gap."""
+        signals = zip(("z", "dz"), beyond_gap(z, dz, p["g"]), strict=True)
+        return {"p": p, **{name: value for name, value in signals if name in read}}
+
+    class Behind(base):
+        form = f"{base.form}, behind a gap".removeprefix(", ")
+        equation = f"{base.equation}  with z - clip(z, -g, g) in place of z"
+        sentence = f"{base.sentence}, beyond a gap"
+        units, strength = {**base.units, "g": "z"}, base.strength
+        places = ("parallel",)
+
+        def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+            """Shapes of the law, each with every gap."""
+            for own in super().shapes(local):
+                for share in GAPS:
+                    yield {**own, "g": share * local.reach}
+
+        def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+            """Bounds of the law, and a gap that the signal passes."""
+            return {**super().bounds(local), "g": (0.01 * local.reach, 0.95 * local.reach)}
+
+        if base.memory:
+
+            def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0) -> Any:
+                return super().step(s=s, **past(z, dz, p))
+
+        else:
+
+            def force(self, z: Any, dz: Any, p: Any) -> Any:
+                return super().force(**past(z, dz, p))
+
+    return _name(Behind, f"{base.__name__}BehindGap", f"{base.__doc__}\n\n    It acts beyond a gap.")
+
+
+def _name(law: Any, name: str, doc: str) -> Any:
+    law.__name__ = law.__qualname__ = name
+    law.__doc__ = doc
+    return law
