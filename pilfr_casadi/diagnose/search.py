@@ -179,7 +179,9 @@ class Search(Hypotheses):
         if len(best.laws) == len(parent.laws) + 1:
             self._refine(best, FINER.get(type(best.element.law), ()))
         may_vary = [kind for kind in SCALABLE if kind.id not in LINEAR]  # a linear law was screened with every signal
-        step = [self.memo[t.key] for t in self.steps[-1].trials if constant(type(t.law)) in may_vary]
+        added = [t for t in self.steps[-1].trials if constant(type(t.law)) in may_vary]
+        kept = [self.memo[t.key] for t in added]  # perhaps found before, with these laws added in another order
+        step = [new if known.pair != new.pair else known for new, known in zip(added, kept, strict=True)]
         # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
         if step and self.can_improve(self.best, self.least_noise2) and self.in_time():
             likeliest = max(step, key=self.optimistic_evidence)
