@@ -2,8 +2,9 @@
 
 A pneumatic piston drives a carriage against a spring. The simulator has inertia, spring, damper and piston. What it
 lacks varies with one signal by a factor of two to five: a recorded temperature, which its equations do not read; the
-pressure, which they do; the position along the guide; or the time, as bearings wear. Values are drawn anew for every
-seed. The truth is integrated apart from the package.
+pressure, which they do; the position along the guide; or the time, as bearings wear. It does so in a line,
+exponentially, or in a parabola with its vertex in the middle. Values are drawn anew for every seed. The truth is
+integrated apart from the package.
 
     python -m problems.scheduled_physics                  60 rigs
     python -m problems.scheduled_physics --cases 8
@@ -24,6 +25,7 @@ KNEE = 2e-3  # m/s, within which the friction reverses
 NOISE = 2e-3  # of the output's deviation
 SIGNALS = ("temperature", "pressure", "z", "t")
 LAWS = ("coulomb_friction", "viscous_damping")
+PROFILES = ("line", "exponential", "parabola")
 
 
 def simulator(values: Mapping[str, float], thermometer: bool) -> Simulator:
@@ -46,7 +48,7 @@ def simulator(values: Mapping[str, float], thermometer: bool) -> Simulator:
     )
 
 
-def recorded(seed: int, law: str, signal: str) -> tuple[Simulator, Recording, Recording]:
+def recorded(seed: int, law: str, signal: str, profile: str) -> tuple[Simulator, Recording, Recording]:
     """Draw a rig; return its simulator, with values off by up to a quarter, a training and a test recording."""
     rng = np.random.default_rng([seed, LAWS.index(law), SIGNALS.index(signal)])
     true = {"m": rng.uniform(3, 8), "A": 3e-4, "k": rng.uniform(1000, 3000), "d": rng.uniform(10, 30)}
@@ -54,14 +56,22 @@ def recorded(seed: int, law: str, signal: str) -> tuple[Simulator, Recording, Re
     ends = (low, low * rng.uniform(2.0, 5.0))
     given = {n: v * (rng.uniform(0.8, 1.25) if n in "kd" else 1.0) for n, v in true.items()}
     ends = ends if rng.random() < 0.5 else ends[::-1]
-    train, test = (run(true, law, signal, ends, rng) for _ in range(2))
+    train, test = (run(true, law, signal, profile, ends, rng) for _ in range(2))
     return simulator(given, signal == "temperature"), train, test
 
 
+def strength(share: float, profile: str, ends: tuple[float, float]) -> float:
+    """Compute what is missing at a share of the signal's range; a parabola has the second value at both ends."""
+    share = max(share, -0.2)
+    if profile == "exponential":
+        return ends[0] * (ends[1] / ends[0]) ** share
+    return ends[0] + ((2 * share - 1) ** 2 if profile == "parabola" else share) * (ends[1] - ends[0])
+
+
 def run(
-    p: Mapping[str, float], law: str, signal: str, ends: tuple[float, float], rng: np.random.Generator
+    p: Mapping[str, float], law: str, signal: str, profile: str, ends: tuple[float, float], rng: np.random.Generator
 ) -> Recording:
-    """Drive a rig with a random pressure; `ends` is what is missing at both ends of the signal's range."""
+    """Drive a rig with a random pressure; `ends` are the values of what is missing."""
     t = DT * np.arange(SAMPLES)
     pressure = 3e5 + random_sines(rng, t, (0.1, 8.0), 25, 2.4e5, roll_off=0.3)
     temperature = 40 - 20 * np.exp(-t / rng.uniform(3, 8)) + random_sines(rng, t, (0.03, 0.1), 3, 3.0)
@@ -75,8 +85,7 @@ def run(
             "z": (s, 0.3 * at_rest, 1.8 * at_rest),
             "t": (u[2], 0.0, t[-1]),
         }[signal]
-        share = max((value - first) / (last - first), -0.2)
-        size = ends[0] + share * (ends[1] - ends[0])
+        size = strength((value - first) / (last - first), profile, ends)
         w = size * (np.tanh(v / KNEE) if law == "coulomb_friction" else v)
         return np.array([v, (p["A"] * u[0] - p["k"] * s - p["d"] * v - w) / p["m"]])
 
@@ -94,12 +103,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for case in numbered(options):
         signal, rest = SIGNALS[case % len(SIGNALS)], case // len(SIGNALS)
         law, seed = LAWS[rest % len(LAWS)], rest // len(LAWS)
-        answer = diagnose_case(recorded(seed, law, signal), options.workers)
+        profile = PROFILES[seed % len(PROFILES)]
+        answer = diagnose_case(recorded(seed, law, signal, profile), options.workers)
         right = answer.named == [("guide", law)]
         told = right and answer.found.effects[0].form.endswith(f"by {signal}")
         judged = "law and signal" if told else "law" if right else "wrong" if answer.found.sure else "unsure"
         counts[judged] += 1
-        answer.show(f"{case:3} {law:16} by {signal:12} {judged:14}")
+        answer.show(f"{case:3} {law:16} by {signal:12} {profile:12} {judged:14}")
     print(", ".join(f"{name} {count}" for name, count in counts.items()))
     return 0
 

@@ -61,7 +61,7 @@ def scheduled(law: type[Law], by: str, profile: str = "linear") -> type[Law]:
         An input of the simulator, one of the port's own `signals`, "z", the local coordinate, or "t", the time.
     profile : {"linear", "quadratic", "exponential"}
         How the strength varies: in a line, to `F_c_high`; in a parabola over `F_c_mid` in the middle to `F_c_high`,
-        constant outside the range; or in proportion to exp, to `ratio` times `F_c`, as viscosity does with temperature.
+        along its tangents outside the range; or exponentially, to `ratio` times `F_c`, as viscosity with temperature.
 
     Raises
     ------
@@ -83,7 +83,14 @@ def profile_weights(profile: str, share: Any, ratio: Any) -> list[Any]:
     if profile == "linear":
         return [1 - share, share]
     if profile == "quadratic":
-        return [(1 - share) * (1 - 2 * share), 4 * share * (1 - share), share * (2 * share - 1)]
+        number = isinstance(share, (float, np.ndarray))
+        inside = np.clip(share, 0, 1) if number else ca.fmin(ca.fmax(share, 0), 1)
+        beyond = share - inside
+        return [
+            (1 - inside) * (1 - 2 * inside) + beyond * (4 * inside - 3),
+            4 * inside * (1 - inside) + beyond * (4 - 8 * inside),
+            inside * (2 * inside - 1) + beyond * (4 * inside - 1),
+        ]
     return [ratio**share]
 
 
@@ -177,10 +184,7 @@ def _scheduled(base: Any, by: str, profile: str) -> Any:
     def strengths(p: Any, u: Any, z: Any) -> dict[str, Any]:
         """Parameters of the law at a value of the signal."""
         signal = z if by == "z" else u[by]
-        share = (signal - p["low"]) / (p["high"] - p["low"])
-        if profile == "quadratic":
-            share = ca.fmin(ca.fmax(share, 0), 1)
-        weights = profile_weights(profile, share, p["ratio"] if shape else 1.0)
+        weights = profile_weights(profile, (signal - p["low"]) / (p["high"] - p["low"]), p["ratio"] if shape else 1.0)
         own = {name: p[name] for name in base.units}
         return own | {k: sum(w * p[name] for w, name in zip(weights, names, strict=True)) for k, names in ends.items()}
 

@@ -8,6 +8,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
+    PROFILES,
     CoulombFriction,
     CubicStiffness,
     Drift,
@@ -22,6 +23,7 @@ from pilfr_casadi.laws import (
     scheduled,
     unit_forces,
 )
+from pilfr_casadi.models import Named
 from pilfr_casadi.simulators import discretise
 
 DT, SAMPLES = 2e-3, 3000
@@ -159,6 +161,46 @@ def test_forces_of_a_scheduled_law_at_unit_strength_add_up():
         bare = unit_forces(CoulombFriction(), local, [{"v_0": shape["v_0"]}])[:, 0, 0]
         share = (signal - signal.min()) / np.ptp(signal)
         np.testing.assert_allclose(columns, bare[:, None] * np.column_stack([1 - share, share]), atol=1e-12)
+
+
+def test_the_profile_of_a_strength_passes_its_values():
+    """At both ends and in the middle it has the values; outside a parabola goes on in a line."""
+    values = {"c_1": 2.0, "low": 10.0, "high": 30.0}
+    dz, p = (
+        3.0,
+        {"linear": {"c_1_high": 8.0}, "quadratic": {"c_1_mid": 3.0, "c_1_high": 8.0}, "exponential": {"ratio": 4.0}},
+    )
+    expected = {
+        "linear": (2.0, 5.0, 8.0, 11.0),
+        "quadratic": (2.0, 3.0, 8.0, 15.0),
+        "exponential": (2.0, 4.0, 8.0, 16.0),
+    }
+    for profile, own in p.items():
+        law = scheduled(ViscousDamping, "heat", profile)()
+        given = Named("parameter", values | own)
+        found = [law.force(z=0.0, dz=dz, u=Named("input", {"heat": ca.DM(heat)}), p=given) for heat in (10, 20, 30, 40)]
+        np.testing.assert_allclose(np.ravel(found), dz * np.array(expected[profile]), rtol=1e-12)
+
+
+def test_there_is_no_other_profile():
+    with pytest.raises(InputError, match="'cubic' was given; give 'linear', 'quadratic', 'exponential'"):
+        scheduled(ViscousDamping, "heat", "cubic")
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_one_profile_starts_as_another(profile):
+    """A strength that varies in a line starts in every profile with the same values at the ends of the range."""
+    rng = np.random.default_rng(1)
+    z, heat = np.cumsum(rng.standard_normal(300)) / 10, rng.uniform(10, 30, 300)
+    local = Local(z, np.gradient(z, 0.1), 0.1, (300,), inputs={"heat": heat})
+    ends = {"low": heat.min(), "high": heat.max()}
+    line = scheduled(ViscousDamping, "heat")().at({"c_1": 2.0, "c_1_high": 8.0, **ends})
+    kind = scheduled(ViscousDamping, "heat", profile)
+    (start,) = kind.finer_starts(line, local)
+    strength = [k for k in kind.strength if k in start]
+    force = unit_forces(kind(), local, [start])[:, 0] @ [float(start[k]) for k in strength]
+    for end in (heat.argmin(), heat.argmax()):
+        assert force[end] == pytest.approx((2.0 if end == heat.argmin() else 8.0) * local.dz[end], rel=1e-9)
 
 
 def test_a_scaled_law_is_the_law_times_the_signal():
