@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     )
     from .gates import Gate as Gate
     from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
+    from .linearise import port_signals as port_signals
     from .mismatch_map import mismatch as mismatch
     from .refinement import Refinement as Refinement
     from .replication import (

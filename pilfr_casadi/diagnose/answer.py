@@ -187,9 +187,10 @@ def _effect(search: Search, named: NamedEffect, fitted: Fitted, std: dict[str, n
     if port.series and not w_unit:  # in the unit of its signal, such as [force]
         w_unit = z_unit = f"[{port.name.partition(':')[2]}]"
     values = {k: v for k, v in fitted.values.items() if k.startswith(element.prefix)}
+    signals = {**bench.simulator.units, **bench.recordings[0].units}
     shown: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
-        unit = readable_unit(element.law.units[name.removeprefix(element.prefix)], w_unit, z_unit)
+        unit = readable_unit(element.law.units[name.removeprefix(element.prefix)], w_unit, z_unit, signals)
         flat = np.ravel(value)
         for i, v in enumerate(flat):
             label = name.removeprefix(element.prefix) + (f"[{i}]" if len(flat) > 1 else "")

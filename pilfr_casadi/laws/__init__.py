@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         constant as constant,
         scaled as scaled,
         scheduled as scheduled,
+        strengths_over as strengths_over,
     )
     from .curves import (
         AsymmetricDeadZone as AsymmetricDeadZone,

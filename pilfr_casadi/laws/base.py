@@ -369,14 +369,18 @@ def display_name(law: str, form: str = "") -> str:
     return f"{text} ({', '.join(map(display_name, form.split(', ')))})" if form else text
 
 
-def readable_unit(unit: str, w: str, z: str) -> str:
-    """Put the port's own units into a unit in w, z and s: ("w/z^3", "N", "m") -> "N/m^3"."""
+def readable_unit(unit: str, w: str, z: str, signals: Mapping[str, str] | None = None) -> str:
+    """Put the port's own units into a unit in w, z and s: ("w/z^3", "N", "m") -> "N/m^3".
+
+    `signals` has the units of signals by name, such as that of "[temperature]".
+    """
     if unit == "w/z" and w == z:
         return ""
+    units = {"w": w or "[w]", "z": z or "[z]", **{f"[{name}]": own for name, own in (signals or {}).items() if own}}
     parts = []
     for token in unit.replace("*", " * ").replace("/", " / ").split():
         base, _, power = token.partition("^")
-        known = {"w": w or "[w]", "z": z or "[z]"}.get(base, base)
+        known = units.get(base, base)
         parts.append(f"({known})^{power}" if power and " " in known else known + (f"^{power}" if power else ""))
     return "".join(f" {p} " if p == "*" else p for p in parts).strip()
 

@@ -133,6 +133,18 @@ def _not_there(by: str, local: Local) -> str:
     return "" if np.ptp(local.inputs[by]) > 0 else f"{by} is constant"
 
 
+def strengths_over(law: Law, values: Mapping[str, Any], signal: np.ndarray) -> dict[str, np.ndarray]:
+    """Compute each strength (G,), or (G, n) of n operators, of a law that a signal (G,) varies; see `scheduled`."""
+    share = (signal - values["low"]) / (values["high"] - values["low"])
+    weights = profile_weights(law.profile, share, values.get("ratio", 1.0))
+    return {
+        own: sum(
+            np.multiply.outer(w, values[f"{own}{end}"]) for w, end in zip(weights, PROFILES[law.profile], strict=True)
+        )
+        for own in constant(type(law)).strength
+    }
+
+
 @functools.cache  # the same class for the same arguments
 def _scaled(base: Any, by: str) -> Any:
     strengths = {name: f"{unit}/[{by}]" if name in base.strength else unit for name, unit in base.units.items()}
@@ -165,9 +177,8 @@ def _levels(found: Law, own: str, by: str, limits: Mapping[str, float]) -> np.nd
         return np.asarray(levels - levels.min(axis=0) + SPARE * np.ptp(levels, axis=0))
     if not found.scheduled_by:
         return np.array([value] * 3)
-    values = [np.asarray(found.values[f"{own}{end}"], dtype=float) for end in PROFILES[found.profile]]
-    rows = [profile_weights(found.profile, share, found.values.get("ratio", 1.0)) for share in (0.0, 0.5, 1.0)]
-    levels = np.array([sum(float(w) * v for w, v in zip(row, values, strict=True)) for row in rows])
+    signal = np.array([found.values["low"], (found.values["low"] + found.values["high"]) / 2, found.values["high"]])
+    levels = strengths_over(found, found.values, signal)[own]
     return levels if found.scheduled_by == by else np.array([levels.mean(axis=0)] * 3)
 
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         mismatch_map as mismatch_map,
         mismatch_time as mismatch_time,
         refined_hysteresis as refined_hysteresis,
+        strength_over_signal as strength_over_signal,
     )
     from .fits import (
         convergence as convergence,

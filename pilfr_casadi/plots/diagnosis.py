@@ -36,6 +36,7 @@ from .canvas import (
 from .fits import density_beside
 
 CLOUD_POINTS = 2500  # more cannot be told apart in a figure
+STRENGTH_BINS = 30  # of the signal that varies a strength
 LINE_POINTS = 400  # samples along which laws are drawn over a learned force: a few swings
 
 
@@ -218,6 +219,20 @@ def learned_force(x: Signal, force: Signal, laws: Sequence[tuple[str, np.ndarray
         for (name, values), colour, style in zip(laws, (VERMILLION, GREEN, INK), ("-", "--", ":"), strict=False):
             ax.plot(x.values[part] / sx, values[part] / sy, style, color=colour, linewidth=1.2, label=plain(name))
     ax.set_ylim(*_robust_limits(force.values / sy, np.concatenate([f[known] for _, f in laws]) / sy if laws else None))
+    return finish(ax, across, up, title)
+
+
+def strength_over_signal(signal: Signal, strength: Signal, seen: np.ndarray, *, title: str = "") -> Axes:
+    """Draw the strength (G,) of a law over the signal (G,) that varies it, and mark where recordings (M,) have been."""
+    ax = axes_or_new(None)
+    (sx, across), (sy, up) = (scale_axis(v.name, v.values, v.unit) for v in (signal, strength))
+    ax.plot(signal.values / sx, strength.values / sy, color=VERMILLION, linewidth=1.6, label="fitted strength")
+    share, edges = np.histogram(seen, STRENGTH_BINS, (float(signal.values[0]), float(signal.values[-1])))
+    top = float(np.max(strength.values)) / sy
+    height = 0.3 * top * share / max(int(share.max()), 1)
+    label = "how often the recordings have the value"
+    ax.bar(edges[:-1] / sx, height, np.diff(edges) / sx, align="edge", color=BLUE, alpha=0.25, label=label)
+    ax.set_ylim(min(0.0, 1.1 * float(np.min(strength.values)) / sy), 1.15 * top)
     return finish(ax, across, up, title)
 
 

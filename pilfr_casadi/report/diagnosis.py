@@ -22,8 +22,9 @@ from ..diagnose import (
     Learned,
     Workbench,
     hidden_force,
+    port_signals,
 )
-from ..laws import display_name
+from ..laws import display_name, readable_unit, strengths_over
 from ..plots import Signal
 from ..simulators import MECHANICAL, Port
 from . import diagnosis_tables as tables
@@ -191,6 +192,7 @@ def _hidden_forces(case: _Case) -> list[Block]:
     for e in d.effects:
         if (number := element_of(case.after, e)) is not None:
             out += _force_blocks(case, case.after, e.port, number, display_name(e.law))
+            out += _strength_pictures(case, number)
     if d.verdict != "unexplained":
         return out
     search, rows = d.evidence.get("search"), tables.candidates_by_pass(d)
@@ -283,6 +285,27 @@ def _force_pictures(h: HiddenForce, port: Port, name: str) -> list[Block]:
         caption = "The recovered force minus the law. Where the mean bends away from zero, the law's form is wrong."
         drawn.append((left, caption, f"{alt} without the law."))
     return [Picture(*picture) for picture in drawn]
+
+
+def _strength_pictures(case: _Case, number: int) -> list[Block]:
+    """Draw the strength of an element over the signal that varies it; nothing if none does."""
+    element = case.after.simulator.elements[number]
+    law, by = element.law, element.law.scheduled_by
+    if not by:
+        return []
+    port, values = case.bench.simulator.port(element.port), element.own(case.after.values)
+    across = {"z": port.across_unit, "t": "s"}.get(by) or case.unit(by)
+    grid = np.linspace(values["low"], values["high"], 200)
+    signal = Signal({"z": "local coordinate z", "t": "time"}.get(by, by), grid, across)
+    seen = law.schedule(port_signals(case.bench, case.after, element.port))
+    out: list[Block] = []
+    for name, found in strengths_over(law, values, grid).items():
+        unit = readable_unit(law.units[name], port.unit, port.across_unit)
+        strength = Signal(name, found if found.ndim == 1 else found.sum(axis=1), unit)
+        drawn = plots.strength_over_signal(signal, strength, seen, title=element.port)
+        caption = f"How {name} of the {display_name(law.id)} at {element.port} varies with {signal.name}."
+        out.append(Picture(drawn, caption, f"Strength {name} at {element.port} over {signal.name}."))
+    return out
 
 
 def _candidates(d: Diagnosis) -> list[Block]:

@@ -152,7 +152,7 @@ class Simulator(Equations):
         for e in self.elements:
             if name.startswith(e.prefix):
                 port = self.port(e.port)
-                return readable_unit(unit, port.unit, port.position_unit)
+                return readable_unit(unit, port.unit, port.position_unit, self.units)
         return unit
 
     def _measured(self, recording: Recording) -> np.ndarray:
