@@ -63,7 +63,8 @@ class Port:
         Name in results.
     into : callable or mapping
         Where an internal force w enters: `{state: factor}` (added to the state's derivative) or `{output: factor}`; a
-        callable takes any of x, u, p by name.
+        callable takes any of x, u, p by name. An output that is a state's derivative, such as that of an accelerometer,
+        or that reads one by `dx`, feels the force as well, without an entry of its own.
     across : callable
         Local coordinate z, from any of x, u, p.
     rate : callable, optional
@@ -280,9 +281,13 @@ class Equations:
             raise InputError(f"The simulator's dynamics returned {type(found).__name__}; return {{state: derivative}}.")
         return ca.vertcat(*_row(found, self.states, "dynamics", "derivative"))
 
-    def measured(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
-        """Evaluate the outputs by name, without laws."""
-        found = call(self.outputs, "simulator's outputs", x=x, u=u, p=p, t=t)
+    def measured(self, x: Named, u: Named, p: Named, t: Any, dx: Any = None) -> dict[str, Any]:
+        """Evaluate the outputs by name, without laws; `dx` are the states' derivatives, by default without laws."""
+        more = {}
+        if self._reads_rates:
+            dx = self.derivatives(x, u, p, t) if dx is None else dx
+            more["dx"] = Named("derivative", dict(zip(self.states, ca.vertsplit(dx), strict=True)))
+        found = call(self.outputs, "simulator's outputs", x=x, u=u, p=p, t=t, **more)
         if not isinstance(found, Mapping) or not found:
             raise InputError("The simulator's outputs must be a dict {output: expression} with at least one entry.")
         return dict(zip(found, _row(found, tuple(found), "outputs", "expression"), strict=True))
@@ -291,6 +296,55 @@ class Equations:
     def output_names(self) -> tuple[str, ...]:
         """Names of the outputs."""
         return tuple(self.measured(*self.symbols()))
+
+    @cached_property
+    def _reads_rates(self) -> bool:
+        """Whether the outputs ask for the states' derivatives."""
+        if self.discrete or not self.states:
+            return False
+        try:
+            return "dx" in inspect.signature(self.outputs).parameters
+        except (TypeError, ValueError):
+            return False
+
+    def _rates_in_outputs(self, x: Named, u: Named, p: Named, t: Any) -> Any:
+        """Evaluate what each output reads of each state's derivative, (n_y, n_x)."""
+        if not self._reads_rates:
+            return ca.sparsify(ca.SX(self._derivatives_measured))
+        dx = ca.SX.sym("dx", len(self.states))
+        outputs = ca.vertcat(*self.measured(x, u, p, t, dx).values())
+        factors = ca.jacobian(outputs, dx)
+        if ca.depends_on(factors, dx):
+            raise InputError("An output is not linear in dx; a force at a port would not add to it.")
+        return factors
+
+    @cached_property
+    def _derivatives_measured(self) -> np.ndarray:
+        """Find outputs that are a positive multiple of a state's derivative, as accelerometers measure; (n_y, n_x).
+
+        They are compared at random points. A derivative that depends on a single state or input is left out: its
+        multiple may be that state itself.
+        """
+        n_x, n_y = len(self.states), len(self.output_names)
+        out = np.zeros((n_y, n_x))
+        if self.discrete or not n_x:
+            return out
+        x, u, p, t = self.symbols()
+        moving = ca.vertcat(*x._values.values(), *u._values.values())
+        known = ca.vertcat(*(ca.vec(v) for v in (moving, *p._values.values())), t)
+        f, y = self.derivatives(x, u, p, t), ca.vertcat(*self.measured(x, u, p, t).values())
+        both = ca.Function("both", [known], [f, y])
+        if any(both.instruction_id(k) == ca.OP_CALL for k in range(both.n_instructions())):
+            return out  # the user's program, which may fail at random points
+        points = np.random.default_rng(0).uniform(0.5, 1.5, (SIGN_POINTS, known.numel()))
+        with np.errstate(all="ignore"):
+            rates, shown = (np.array([both(v)[i].full().ravel() for v in points]) for i in range(2))
+            ratios = shown[:, :, None] / rates[:, None, :]
+        same = np.all(np.isclose(ratios, ratios[0], rtol=1e-9, atol=0.0), axis=0) & (ratios[0] > 0)
+        rich = np.array([ca.jacobian(f[i], moving).nnz() > 1 for i in range(n_x)])
+        for i, j in zip(*np.nonzero(same & rich), strict=True):
+            out[i, j] = ratios[0, i, j] if not out[i].any() else 0.0
+        return out
 
     def port_signals(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
         """Evaluate a port's own signals by name."""
@@ -312,7 +366,11 @@ class Equations:
         for target in found:
             if target not in known:
                 raise InputError(f"Port {port.name!r} goes into {target!r}; there are {', '.join(known)}.")
-        return dict(zip(found, _row(found, tuple(found), f"port {port.name!r}", "factor"), strict=True))
+        given = dict(zip(found, _row(found, tuple(found), f"port {port.name!r}", "factor"), strict=True))
+        moved = ca.vertcat(*(given.get(state, 0.0) for state in self.states))
+        shown = ca.vertsplit(ca.mtimes(self._rates_in_outputs(x, u, p, t), moved)) if self.states else []
+        rates = dict(zip(self.output_names, shown, strict=bool(shown)))
+        return {k: v for k, v in rates.items() if not ca.SX(v).is_zero()} | given
 
     def across(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Any:
         """Evaluate the local coordinate z."""

@@ -114,7 +114,7 @@ class ClosedEquations:
                 at = simulator.inputs.index(name)
                 u[name] = u[name] + apply(i, u[name], v.slope[at])
         inputs = Named("input", u)
-        f = simulator.derivatives(x, inputs, p, t)
+        f = bare = simulator.derivatives(x, inputs, p, t)
         seen, more = dict(x._values), list[tuple[str, Any]]()
         rates = self.local(x_only, ca.vertcat(*u.values()), v.slope, t, self.vector)[1]
         for i, e in placed:
@@ -134,7 +134,7 @@ class ClosedEquations:
             if getattr(e.law, "sensed", False):
                 shown = simulator.shown_states(port) or ()
                 seen |= zip(shown, e.law.far_side(q[i], self._own(e)), strict=False)
-        y = simulator.measured(Named("state", seen), inputs, p, t)
+        y = simulator.measured(Named("state", seen), inputs, p, t, bare)
         for name, part in more:
             y[name] = y[name] + part
         for i, e in placed:

@@ -31,7 +31,8 @@ class Simulator(Equations):
         From any of x, u, p (and t, time in s) by name to `{state: derivative}`; x.<state>, u.<input>, p.<parameter> are
         CasADi symbols.
     outputs : callable
-        From the same to `{output: expression}`.
+        From the same to `{output: expression}`; it may also ask for `dx`, the states' derivatives, for sensors of
+        acceleration or force: `lambda x, dx: {"acceleration": dx.vel}`. Outputs are linear in `dx`.
     states, inputs : tuple of str
         Names; `states=()` is a static device.
     parameters : mapping
