@@ -1,11 +1,11 @@
 """The corrected simulator: the candidate that best predicts data it was not fitted to, with or without a named law.
 
 If the named answer is not sure, or leaves error above the noise, several candidates compete on held-out parts of the
-training recordings (`evidence`): the refitted simulator, the named laws or else all likely hypotheses, and a learned
-force alone or beside them. The score is the held-out error plus the spread of predictions for other inputs
-(`evidence.spread`), which is large if many parameters are hardly determined. The smallest score wins. Candidates are
-predicted in the order of their fit error plus spread, until that exceeds the smallest score. Test recordings are never
-used.
+training recordings (`evidence`): the refitted simulator, the named laws (with and without those that are not sure) or
+else all likely hypotheses, and a learned force alone or beside them. The score is the held-out error plus the spread of
+predictions for other inputs (`evidence.spread`), which is large if many parameters are hardly determined. The smallest
+score wins. Candidates are predicted in the order of their fit error plus spread, until that exceeds the smallest score.
+Test recordings are never used.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .hypotheses import likeliest
 from .learned import Learned, LearnedForce, describe_learned, refit_learned
 from .search import Search
 from .trials import Trial
-from .verdict import Posterior, explainable_remainder, share_left
+from .verdict import Posterior, explainable_remainder, names, share_left
 from .workbench import FEW, Fitted
 
 
@@ -123,12 +123,13 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     if named and (search.interrupted or _settled(search, answer)):
         return named_correction(search, best_laws.fitted), best_laws.fitted
     refitted = _predict(search, [_make_candidate(search, search.root)], [])
-    tried = [search.thorough(best_laws)] if named else _hypotheses_with_laws(search)
+    tried = _named_hypotheses(search, answer) if named else _hypotheses_with_laws(search)
     predicted = _predict(search, [_make_candidate(search, t) for t in tried], refitted)
     if len(predicted) == 1 and search.past_deadline:  # without a comparison the named laws, or the refit, stay
         stays = tried[0] if named else search.root
         return named_correction(search, stays.fitted), stays.fitted
-    beside = best_laws if named else _choose(predicted)[0].base
+    chosen = _choose(predicted)[0].base
+    beside = best_laws if named and not chosen.laws else chosen
     learned = _learned_candidates(search, search.memo[beside.key]) if beside.laws else []
     learned += _learned_candidates(search, search.root, {e.port for e in best_laws.laws} if named else ())
     candidate, held_out = _choose(_predict(search, learned, predicted))
@@ -162,6 +163,14 @@ def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_
 def _choose(predicted: Sequence[_Predicted]) -> _Predicted:
     """Choose the candidate with the smallest expected error on other recordings."""
     return min(predicted, key=lambda p: p[1].mean_square)
+
+
+def _named_hypotheses(search: Search, answer: Posterior) -> list[Trial]:
+    """List the likeliest hypothesis, and the one without the effects whose names are not certain."""
+    sure = frozenset(e.name for e in answer.effects if e.confidence > SURE)
+    fewer = [t for t in search.memo.values() if names(t) == sure] if sure else []
+    tried = {t.key: t for t in (answer.best, *sorted(fewer, key=lambda t: t.mean_square)[:1])}
+    return [search.thorough(t) for t in tried.values()]
 
 
 def _hypotheses_with_laws(search: Search) -> list[Trial]:

@@ -119,18 +119,19 @@ def names(trial: Trial) -> frozenset[Name]:
     return frozenset((e.port, e.law.id) for e in trial.effects)
 
 
-def explainable_remainder(search: Hypotheses, trial: Trial) -> float:
+def explainable_remainder(search: Hypotheses, trial: Trial, before: Trial | None = None) -> float:
     """Compute the share s of the mismatch that a hypothesis leaves and that a flexible force would explain.
 
-    A remainder that no force at a port explains counts little: it may be a disturbance that acts beside the law.
+    The mismatch is that of the refit, or of another hypothesis `before`. A remainder that no force at a port explains
+    counts little: it may be a disturbance that acts beside the law.
     """
     share = float(np.clip(max(search.flexible(trial).values(), default=0.0), 0.0, 1.0))
-    return share_left(search, trial.mean_square) * (share + DISTURBANCE_WEIGHT * (1 - share))
+    return share_left(search, trial.mean_square, before) * (share + DISTURBANCE_WEIGHT * (1 - share))
 
 
-def share_left(search: Hypotheses, mean_square: float) -> float:
-    """Compute the share of the refit's mismatch above the noise that a mean square error is."""
-    excess = max(search.root.mean_square - search.floor2, 1e-300)
+def share_left(search: Hypotheses, mean_square: float, before: Trial | None = None) -> float:
+    """Compute the share that a mean square error is of a hypothesis' error above the noise, by default the refit's."""
+    excess = max((before or search.root).mean_square - search.floor2, 1e-300)
     return float(np.clip((mean_square - search.floor2) / excess, 0.0, 1.0))
 
 
@@ -160,8 +161,20 @@ def posterior(search: Hypotheses) -> Posterior:
             break
         said = fewer
     named = share_named(explainable_remainder(search, best))
-    effects = tuple(replace(e, confidence=named * e.confidence) for e in found)
+    effects = tuple(replace(e, confidence=_named_beside(search, best, e) * e.confidence) for e in found)
     return Posterior(best, named, effects, by_names.get(frozenset(), 0.0))
+
+
+def _named_beside(search: Hypotheses, best: Trial, effect: NamedEffect) -> float:
+    """Compute the probability that one law of a hypothesis is the physics, from what is left of its own mismatch.
+
+    Its own mismatch is what the others leave without it. A small effect may only make up for the formula of a large
+    one, and so it has to explain its part as well as that one does.
+    """
+    others = names(best) - {effect.name}
+    without = [t for t in search.memo.values() if names(t) == others] if others else []
+    before = min(without, key=lambda t: t.mean_square, default=None)
+    return share_named(explainable_remainder(search, best, before))
 
 
 def _plainest(search: Hypotheses, trials: Sequence[Trial]) -> Trial:
@@ -315,11 +328,20 @@ def _swells(search: Hypotheses) -> bool:
 
 
 def _describe_effects(search: Hypotheses, found: Posterior) -> str:
-    words = " and ".join(f"{display_name(e.name[1])} at {e.name[0]}" for e in found.effects)
-    if found.sure > SURE:
-        said = f"The simulator leaves out {words}."
+    sure, unsure = (
+        " and ".join(
+            f"{display_name(e.name[1])} at {e.name[0]}" for e in found.effects if (e.confidence > SURE) is known
+        )
+        for known in (True, False)
+    )
+    if not unsure:
+        said = f"The simulator leaves out {sure}."
+    elif not sure:
+        said = f"The simulator most likely leaves out {unsure}; the name is not certain."
     else:
-        said = f"The simulator most likely leaves out {words}; the name is not certain."
+        said = (
+            f"The simulator leaves out {sure}. More acts beside that, most likely {unsure}; this name is not certain."
+        )
     return said + _describe_vanished(search, found)
 
 

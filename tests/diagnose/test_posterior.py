@@ -126,6 +126,17 @@ def test_what_a_flexible_force_would_still_follow_speaks_against_the_name():
     assert explainable_remainder(search, trial(DRY)) == 0.0
 
 
+def test_a_small_effect_is_named_by_what_is_left_of_its_own_mismatch():
+    small = ("b", CubicStiffness())
+    for left, sure in ((1e-6, True), (2e-3, False)):  # after the large effect 1 % is left
+        both = trial(DRY, small, left=left)
+        told = [(trial(left=1.0), 0.0), (trial(DRY, left=0.01), 40.0), (trial(small, left=0.9), 5.0), (both, 80.0)]
+        found = posterior(searched(told, flexible=0.5))
+        named = {e.name: e.confidence for e in found.effects}
+        assert named["a", "coulomb_friction"] > 0.9
+        assert (named["b", "cubic_stiffness"] > 0.9) == sure and (named["b", "cubic_stiffness"] > 0.5) == sure
+
+
 def test_a_law_that_leaves_nothing_is_the_physics_and_one_that_leaves_all_is_none():
     shares = [share_named(s) for s in np.linspace(0, 1, 200)]
     assert all(0 <= s <= 1 for s in shares) and np.all(np.diff(shares) <= 1e-12)
