@@ -359,15 +359,19 @@ def _describe_vanished(search: Hypotheses, found: Posterior) -> str:
 def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, float], mode: float | None) -> str:
     root, share = search.root, max(shares.values(), default=0.0)
     where = max(shares, key=lambda k: shares[k], default="")
-    laws = closest.effects
-    if not laws:
+    laws, left = closest.effects, share_left(search, closest.mean_square)
+    if not laws or 1 - left < LEAST_EXPLAINED:
         rings = (
             f" The rest swings at the simulator's own {mode:.3g} Hz, as from a force that was not recorded or a value "
             "that varies in time."
             if mode
             else ""
         )
-        at = f" A force at {where} could explain {share:.0%} of the rest." if share > LEAST_EXPLAINED else ""
+        at = (
+            f" A force at {where} could explain {share:.0%} of the rest; it may also be one that was not recorded."
+            if share > LEAST_EXPLAINED
+            else ""
+        )
         noise = search.floor.nrmse(search.bench.scale)
         return (
             "Physics is missing, and no law of the catalogue explains it. The refitted simulator is off by "
@@ -375,7 +379,6 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
             f"{100 * noise:.3g} %.{at}{rings}"
         )
     port = where if shares.get(laws[0].port, 0.0) < 0.5 * share else laws[0].port
-    left = share_left(search, closest.mean_square)
     rest = max(search.flexible(closest).values(), default=0.0)
     words = " and ".join(f"{display_name(e.law.id, e.law.form)} at {e.port}" for e in laws)
     named = f"laws, {words}, remove" if laws[1:] else f"law, {words}, removes"
