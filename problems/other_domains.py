@@ -5,7 +5,7 @@
 | battery | linear open-circuit voltage, a resistor, a pair of R and C | a curved open-circuit voltage; hysteresis |
 | oven | heater and block, losses in proportion to the temperature | radiation; free convection; a slow thermistor |
 | tank | outflow in proportion to the level, linear pump valve | an orifice; an equal-percentage valve |
-| coil | constant inductance, over the current | a core that saturates |
+| coil | constant inductance, over the current | a core that saturates; the dead time of a bridge |
 | core | constant inductance, over the flux | hysteresis of the iron |
 | clamp | resistors and a capacitor | a diode; a clamp of two diodes |
 
@@ -201,14 +201,15 @@ def tank(rng: np.random.Generator, kind: str) -> Rig:
 
 
 def coil(rng: np.random.Generator, kind: str) -> Rig:
-    """A coil at a voltage; its core may saturate."""
+    """A coil at a voltage; its core may saturate, or the bridge that feeds it drop a voltage against the current."""
     p = {"R": rng.uniform(0.5, 2.0), "L": rng.uniform(0.02, 0.08)}
     most, air = rng.uniform(8, 14) * p["R"], rng.uniform(0.1, 0.3) * p["L"]
     knee = rng.uniform(3.0, 5.0)  # A
+    drop, sharp = (rng.uniform(0.05, 0.15) * most, rng.uniform(0.05, 0.3)) if kind == "dead-time" else (0.0, 1.0)
 
     def flow(x: Array, u: Array) -> Array:
         inductance = air + (p["L"] - air) / (1 + (x[0] / knee) ** 2) if kind == "saturating-core" else p["L"]
-        return np.array([(u[0] - p["R"] * x[0]) / inductance])
+        return np.array([(u[0] - p["R"] * x[0] - drop * np.tanh(x[0] / sharp)) / inductance])
 
     simulator = Simulator(
         lambda x, u, p: {"current": (u.voltage - p.R * x.current) / p.L},
@@ -291,6 +292,7 @@ KINDS: dict[str, tuple[Callable[[np.random.Generator, str], Rig], str, str]] = {
     "orifice": (tank, "outlet", "static_curve"),
     "valve": (tank, "actuator:opening", "static_curve"),
     "saturating-core": (coil, "core", "saturating_inductance"),
+    "dead-time": (coil, "core", "static_curve"),
     "iron-loops": (core, "core", "hysteresis"),
     "diode": (clamp, "load", "static_curve"),
     "diode-pair": (clamp, "load", "static_curve"),

@@ -21,7 +21,7 @@ KINDS = {
     "hysteresis": "Loops",
     "curves": "Curves of actuators and sensors",
     "dynamic": "Delays, creep, modes and trends",
-    "catalogue": "Forces of speed",
+    "composed": "Forces of speed",
     "in_line": "In line with a force of the equations",
     "thermal": "Heat flows",
     "electrical": "Currents and voltages",
@@ -29,6 +29,7 @@ KINDS = {
 # units of w and z, by the name of a law or by its first domain
 UNITS = {
     "Overpotential": ("V", "A"),
+    "VoltageDrop": ("V", "A"),
     "SaturatingInductance": ("V", "A"),
     "FreeCurve": ("V", "1"),
     "thermal": ("W", "K"),

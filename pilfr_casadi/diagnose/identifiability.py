@@ -79,7 +79,8 @@ class Tie:
         if not self.only_as:
             return f"{names} can be identified only together, not separately."
         if len(self.only_as) == 1 and len(self.names) == 2:
-            word = "product" if "*" in self.only_as[0] else "sum" if "+" in self.only_as[0] else ""
+            text = self.only_as[0]
+            word = "sum" if " + " in text else "product" if "*" in text and " - " not in text else ""
             if word and "^" not in self.only_as[0]:
                 return f"{names} can be identified only as their {word} ({self.only_as[0]})."
         return f"{names} can be identified only as {in_words(self.only_as)}."

@@ -77,6 +77,7 @@ class TimeShift(Gate):
         if self.finding == "alignment":
             late = "late" if value > 0 else "early"
             words = f"{self.channel} is recorded {abs(value / dt):.3g} samples ({abs(value):.3g} s) too {late}"
+            words += ", or the machine delays it by as much" if self.kind == "y" and value > 0 else ""
         moved = replace(self, value=value, sentence=words)
         return replace(moved, change=moved.read)
 

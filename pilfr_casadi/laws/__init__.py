@@ -70,6 +70,7 @@ if TYPE_CHECKING:
         Overpotential as Overpotential,
         ReversedDiode as ReversedDiode,
         SaturatingInductance as SaturatingInductance,
+        VoltageDrop as VoltageDrop,
     )
     from .forces import count_columns as count_columns, unit_forces as unit_forces
     from .friction import (

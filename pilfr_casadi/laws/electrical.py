@@ -87,6 +87,27 @@ class Overpotential(Law):
         return p.V_a * ca.asinh(z / p.I_0)
 
 
+class VoltageDrop(Law):
+    """Voltage that a contact or a switch takes at any current: of brushes, or by the dead time of a bridge."""
+
+    id = "static_curve"
+    form = "voltage drop"
+    equation = "w = V_d tanh(z / I_0)"
+    source = "Choi & Sul (1996), IEEE Trans. Power Electron. 11(2)"
+    sentence = "a voltage drop that opposes the current and hardly grows with it, as of brushes or a bridge's dead time"
+    units = {"V_d": "w", "I_0": "z"}
+    domains = ("electrical",)
+    special = True
+    across = "A"
+    restoring = True
+    two_sided = True
+    starts = {"I_0": ("reach", 0.01, 0.05, 0.2)}
+    ranges = {"I_0": ("reach", 1e-4, 0.5)}
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.V_d * ca.tanh(z / p.I_0)
+
+
 class SaturatingInductance(Law):
     """A coil whose core saturates: its inductance falls with the current."""
 
