@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..laws import display_name
+from ..laws import display_name, short_name
 from ..simulators import Placed
 from .evidence import (
     AT_NOISE_RATIO,
@@ -330,7 +330,9 @@ def _swells(search: Hypotheses) -> bool:
 def _describe_effects(search: Hypotheses, found: Posterior) -> str:
     sure, unsure = (
         " and ".join(
-            f"{display_name(e.name[1])} at {e.name[0]}" for e in found.effects if (e.confidence > SURE) is known
+            f"{short_name(e.name[1], e.element.law.form)} at {e.name[0]}"
+            for e in found.effects
+            if (e.confidence > SURE) is known
         )
         for known in (True, False)
     )

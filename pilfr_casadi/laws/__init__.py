@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .base import Law as Law, Local as Local, display_name as display_name, readable_unit as readable_unit
+    from .base import (
+        Law as Law,
+        Local as Local,
+        display_name as display_name,
+        readable_unit as readable_unit,
+        short_name as short_name,
+    )
     from .catalogue import (
         CATALOGUE as CATALOGUE,
         FINER as FINER,

@@ -362,11 +362,20 @@ def _tried(entry: Tried, local: Local) -> Any:
     return [getattr(local, attribute) * multiple if attribute else multiple for multiple in multiples]
 
 
+GENERAL = ("static_curve", "extra_mode")  # ids of laws that are named by their form
+
+
 def display_name(law: str, form: str = "") -> str:
     """Write the id of a law, and its form, as words: "coulomb_friction" -> "Coulomb friction"."""
     text = PROPER_NAMES.get(law, law.replace("_", " "))
     text = text.capitalize() if text.split(" ")[0] in PEOPLE else text
     return f"{text} ({', '.join(map(display_name, form.split(', ')))})" if form else text
+
+
+def short_name(law: str, form: str = "") -> str:
+    """Write the id of a law as words, with its form if the id says little, or what varies the strength."""
+    told = [part for part in form.split(", ") if law in GENERAL or part.startswith(("scheduled", "scaled"))]
+    return display_name(law, ", ".join(told))
 
 
 def readable_unit(unit: str, w: str, z: str, signals: Mapping[str, str] | None = None) -> str:

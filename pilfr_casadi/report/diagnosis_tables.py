@@ -11,7 +11,7 @@ import numpy as np
 from .._base import to_json
 from ..diagnose import ERROR_NAMES, Diagnosis, Effect, learned_force
 from ..identify import RUN_AWAY
-from ..laws import display_name, scaled, scheduled
+from ..laws import display_name, scaled, scheduled, short_name
 from ..models import Parameter, ParameterSet
 from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
 
@@ -36,7 +36,10 @@ def correction_words(diagnosis: Diagnosis) -> str:
     """
     if diagnosis.effects:
         unsure = [g.finding == "unsure" for g in diagnosis.gates]
-        names = [*(display_name(e.law) for e in diagnosis.effects), *(["what is not sure"] if any(unsure) else [])]
+        names = [
+            *(short_name(e.law, e.form) for e in diagnosis.effects),
+            *(["what is not sure"] if any(unsure) else []),
+        ]
         names += ["a learned force"] if diagnosis.learned else []
         stated = diagnosis.sure and diagnosis.outcome in ("better", "")
         return f"with {' and '.join(names)} {'put back' if stated else 'added'}"
@@ -70,7 +73,7 @@ def answer(diagnosis: Diagnosis, forces: Sequence[str]) -> str:
     d = diagnosis
     role, errors = errors_that_count(d)
     named = [
-        f"{display_name(e.law)} at {e.port}{strong and ', ' + strong}, {100 * e.confidence:.0f}\u00a0% sure"
+        f"{short_name(e.law, e.form)} at {e.port}{strong and ', ' + strong}, {100 * e.confidence:.0f}\u00a0% sure"
         for e, strong in zip(d.effects, forces, strict=True)
     ]
     places = ", ".join(dict.fromkeys(f.port for f in d.learned))
