@@ -26,6 +26,7 @@ PATTERNS = (
     (0.5, 1.5, 0.5),
     (1.5, 0.5, 1.5),
 )  # variations, over the mean
+LEVEL = 0.1  # smallest variation of a strength, over the largest strength; below it the strength is constant
 SPARE = 0.25  # of the variation, the least strength from which a profile starts
 
 
@@ -236,6 +237,13 @@ def _scheduled(base: Any, by: str, profile: str) -> Any:
             signal = self.schedule(local)
             share = (signal - signal.min()) / np.ptp(signal)
             return [np.ravel(w) for w in profile_weights(profile, share, given.get("ratio", 1.0))]
+
+        def doubtful(self, values: Mapping[str, Any]) -> bool:
+            """Tell whether the law hardly acts, or its strength hardly varies."""
+            middle = (values["low"] + values["high"]) / 2
+            found = strengths_over(self, values, np.array([values["low"], middle, values["high"]]))
+            varies = any(np.any(np.ptp(v, axis=0) > LEVEL * np.max(np.abs(v), axis=0)) for v in found.values())
+            return not varies or super().doubtful(values)
 
         @classmethod
         def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:

@@ -182,6 +182,17 @@ def test_the_profile_of_a_strength_passes_its_values():
         np.testing.assert_allclose(np.ravel(found), dz * np.array(expected[profile]), rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("profile", "more"), [("linear", ["c_1_high"]), ("quadratic", ["c_1_mid", "c_1_high"]), ("exponential", ["ratio"])]
+)
+def test_a_strength_that_hardly_varies_is_doubtful(profile, more):
+    law, own = scheduled(ViscousDamping, "heat", profile)(), {"c_1": 2.0, "low": 10.0, "high": 30.0}
+    base = {name: 1.0 if name == "ratio" else 2.0 for name in more}
+    for factor, doubtful in ((1.05, True), (1.2, False)):
+        values = {**own, **base, more[-1]: base[more[-1]] * factor}
+        assert law.doubtful(values) is doubtful
+
+
 def test_there_is_no_other_profile():
     with pytest.raises(InputError, match="'cubic' was given; give 'linear', 'quadratic', 'exponential'"):
         scheduled(ViscousDamping, "heat", "cubic")
