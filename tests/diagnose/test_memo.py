@@ -12,7 +12,7 @@ from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.trials import Trials
 
-TRIED = (laws.CoulombFriction, laws.CubicStiffness, laws.QuadraticDrag)
+TRIED = (laws.CoulombFriction, laws.CubicStiffness)
 CUBIC, DRY = laws.CubicStiffness(values={"k_3": 4e5}), laws.CoulombFriction(values={"F_c": 4.0, "v_0": 0.01})
 
 
@@ -42,7 +42,7 @@ def searched(train, effects):
 
 def test_one_effect_needs_each_hypothesis_once(fits):
     begun, polished = fits
-    found = searched(recordings(CUBIC, count=1), 1)
+    found = searched([r.slice(0, 800) for r in recordings(CUBIC, count=1)], 1)
     assert [(e.port, e.law.id) for e in found.best.laws] == [("ground-m1", "cubic_stiffness")]
     assert set(begun.values()) == {1} and set(polished.values()) == {1}
     assert set(polished) <= set(found.memo)
@@ -51,7 +51,7 @@ def test_one_effect_needs_each_hypothesis_once(fits):
 def test_what_two_effects_are_exchanged_for_is_not_fitted_twice(fits):
     begun, polished = fits
     true = rig().with_element("ground-m1", CUBIC)
-    train = [r.slice(0, 1200) for r in recordings(DRY, port="m1-m2", count=1, of=true)]
+    train = [r.slice(0, 700) for r in recordings(DRY, port="m1-m2", count=1, of=true)]
     found = searched(train, 2)
     assert {(e.port, e.law.id) for e in found.best.laws} == {
         ("ground-m1", "cubic_stiffness"),

@@ -22,7 +22,7 @@ def unsaid(r, u, y, initial="zero"):
 def test_a_shift_and_the_hold_are_told_apart():
     """Half a sample more or less, and inputs held or interpolated: the one may look like the other."""
     (r,) = recordings(count=1, hold="linear")
-    found = prepare(rig(OFF), [unsaid(r, r.u[:1500], r.y[9:1509], "estimate")], None, "auto")
+    found = prepare(rig(OFF), [unsaid(r, r.u[:900], r.y[9:909], "estimate")], None, "auto")
     (shift,) = [g for g in found.gates if g.finding == "alignment"]
     assert shift.value == pytest.approx(-9 * r.dt, abs=1e-9)
     assert found.bench.hold == "linear" and found.without.cost < 0.003**2
@@ -30,10 +30,10 @@ def test_a_shift_and_the_hold_are_told_apart():
 
 def test_across_a_gap_the_hold_is_chosen_again():
     (r,) = recordings(count=1, hold="linear")
-    keep = np.r_[0:700, 725:1600]
+    keep = np.r_[0:500, 525:1000]
     found = prepare(rig(OFF), [unsaid(r, r.u[keep], r.y[keep])], None, "auto")
     (gap,) = [g for g in found.gates if g.finding == "gap"]
-    assert gap.value == [pytest.approx(700 * r.dt)] and [len(p) for p in found.bench.recordings] == [700, 875]
+    assert gap.value == [pytest.approx(500 * r.dt)] and [len(p) for p in found.bench.recordings] == [500, 475]
     assert found.bench.hold == "linear" and found.without.cost < 0.003**2
 
 

@@ -86,7 +86,7 @@ def test_it_is_exported_and_drawn(many, refined):
 def test_where_three_operators_suffice_the_diagnosed_law_stays():
     three = StopHysteresis().at({"w": [150.0, 100.0, 60.0, 0, 0, 0], "r": [0.006, 0.02, 0.05, 1, 1, 1]})
     diagnosis = diagnosed(three, seeds=(0,))
-    refined = diagnosis.refine(operators=12, kind="stop")
+    refined = diagnosis.refine(operators=6, kind="stop")
     assert not refined.improves
     assert "which stays" in refined.sentence
     assert refined.simulator is diagnosis.corrected and refined.layer is not diagnosis.corrected
@@ -108,7 +108,7 @@ def test_hysteresis_of_an_actuator():
     gain = {"g": pilfr.Parameter(1.5, bounds=(0.1, 10), unit="mm/V")}
     device = pilfr.Simulator(lambda: {}, lambda u, p: {"pos": p.g * u.volt}, inputs=("volt",), parameters=gain)
     diagnosis = pilfr.diagnose(device, measured(0), test=measured(1), laws=(PlayHysteresis,), **OPTIONS)
-    refined = diagnosis.refine(10)
+    refined = diagnosis.refine(6)
     assert refined.port in ("actuator:volt", "sensor:pos")
     assert refined.errors["test"]["refined"] <= 1.05 * refined.errors["test"]["diagnosed"]
     assert "generalized_play" in refined.held_out

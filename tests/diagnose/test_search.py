@@ -1,5 +1,6 @@
 """The search over hypotheses: when it stops, what it keeps, and what an interrupt and a time limit leave."""
 
+import functools
 import sys
 from dataclasses import replace
 
@@ -21,6 +22,12 @@ FRICTION = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
 TRIED = (laws.CoulombFriction, laws.CubicStiffness, laws.ViscousDamping)
 
 
+@functools.cache
+def rubbing():
+    """A recording of the rig with friction; half as long, it says as much."""
+    return [r.slice(0, 1200) for r in recordings(FRICTION, count=1)]
+
+
 def searching(train, simulator=None, until=np.inf):
     """A search on recordings, not yet begun."""
     bench = Workbench.of(simulator or rig(OFF), train, "zero")
@@ -34,7 +41,7 @@ def test_where_nothing_is_missing_nothing_is_fitted():
 
 
 def test_a_law_is_found_and_no_hypothesis_is_kept_twice():
-    found = searching(recordings(FRICTION, count=1)).run(2)
+    found = searching(rubbing()).run(2)
     assert [(e.port, e.law.id) for e in found.best.laws] == [("ground-m1", "coulomb_friction")]
     assert len(found.memo) == len({t.key for t in found.memo.values()}) > 1
     assert found.best.thorough and not found.interrupted
@@ -46,14 +53,14 @@ def test_an_interrupt_leaves_what_there_is(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Trials, "polish", interrupted)
-    found = searching(recordings(FRICTION, count=1)).run(2)
+    found = searching(rubbing()).run(2)
     assert found.interrupted and len(found.memo) > 1
 
 
 def test_at_the_time_limit_the_search_answers_from_what_it_has():
-    found = searching(recordings(FRICTION, count=1), until=0.0).run(2)
+    found = searching(rubbing(), until=0.0).run(2)
     assert found.out_of_time and list(found.memo) == [frozenset()]
-    (r,) = recordings(FRICTION, count=1)
+    (r,) = rubbing()
     diagnosis = pilfr.diagnose(rig(OFF), r.slice(0, 800), laws=TRIED, time_limit=1e-3)
     assert "The time limit ended the search" in str(diagnosis)
     with pytest.raises(pilfr.InputError, match="time_limit=0 was given"):
@@ -62,7 +69,7 @@ def test_at_the_time_limit_the_search_answers_from_what_it_has():
 
 def test_hypotheses_are_not_compared_by_different_errors_where_time_ran_out(monkeypatch):
     """Held-out errors are larger than fit errors: a law that was judged on them lost to one that was not."""
-    found = searching(recordings(FRICTION, count=1)).run(1)
+    found = searching(rubbing()).run(1)
     found.held_out(found.best)
     found.until = 0.0
     monkeypatch.setattr(Search, "_likeliest", lambda self: [self.root, self.best])
@@ -72,7 +79,7 @@ def test_hypotheses_are_not_compared_by_different_errors_where_time_ran_out(monk
 
 def test_a_law_found_only_beside_another_one_may_do_without_it():
     """Its own first fit was in a wrong minimum, and after the time limit the useless other law was sure."""
-    found = searching(recordings(FRICTION, count=1), until=0.0).run(0)
+    found = searching(rubbing(), until=0.0).run(0)
     for kinds in ((FRICTION.at({"F_c": 0.1}),), (FRICTION, laws.CubicStiffness().at({"k_3": 1.0}))):
         placed = rig(OFF)
         for law in kinds:
@@ -87,7 +94,7 @@ def test_a_law_found_only_beside_another_one_may_do_without_it():
 
 
 def test_after_the_deadline_and_ctrl_c_the_correction_fits_nothing_more(monkeypatch):
-    found = searching(recordings(FRICTION, count=1)).run(1)
+    found = searching(rubbing()).run(1)
     found.memo = {key: replace(t, thorough=False) for key, t in found.memo.items()}
     fitted, polish = [], Trials.polish
 
@@ -112,7 +119,7 @@ def test_after_the_deadline_and_ctrl_c_the_correction_fits_nothing_more(monkeypa
 
 
 def test_an_answer_that_rests_on_an_interrupted_fit_is_concluded():
-    search = searching(recordings(FRICTION, count=1)).run(1)
+    search = searching(rubbing()).run(1)
     search.bench.interrupted_fits.append(Status.INTERRUPTED)
     with pytest.raises(KeyboardInterrupt), search.stage("fits"):
         pass
@@ -123,7 +130,7 @@ def test_an_answer_that_rests_on_an_interrupted_fit_is_concluded():
 
 def test_a_hypothesis_fitted_to_a_part_is_judged_on_everything(monkeypatch):
     monkeypatch.setitem(vars(sys.modules[Trials.__module__]), "COMPARED_SAMPLES", 300)
-    search = searching(recordings(FRICTION, count=1))
+    search = searching(rubbing())
     placed = rig(OFF).with_element("ground-m1", FRICTION)
     trial = search.fits.fitted(placed, [{}], 1)
     (whole,) = search.bench.recordings
@@ -132,7 +139,7 @@ def test_a_hypothesis_fitted_to_a_part_is_judged_on_everything(monkeypatch):
 
 
 def test_a_law_that_only_led_the_simulator_out_of_a_dead_end_is_no_physics():
-    train = recordings(None, count=1)
+    train = [r.slice(0, 1200) for r in recordings(None, count=1)]
     search = searching(train, rig((3.0, 1.0, 1.0, 1.0)))
     stuck = search.bench.fit(search.bench.simulator, solver=GaussNewton(max_iterations=1))
     search.without = stuck

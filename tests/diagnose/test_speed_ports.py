@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from pilfr_casadi import Parameter, Port, Recording, Simulator, diagnose
-from pilfr_casadi.laws import CATALOGUE, Clearance, CoulombFriction
+from pilfr_casadi.laws import CATALOGUE, Clearance, CoulombFriction, CubicDamping, PowerWithGain, StribeckFriction
 
 DT, J, B, K, F_C = 0.01, 2e-3, 1e-3, 0.08, 0.03  # s, kg m², N m s, N m/A, N m
+TRIED = (CoulombFriction, StribeckFriction, CubicDamping, PowerWithGain)
 
 
 def drive(*ports: Port, units: dict[str, str] | None = None) -> Simulator:
@@ -97,7 +98,7 @@ def test_where_there_is_a_position_the_coordinate_is_none() -> None:
 )
 def test_friction_of_a_drive_without_an_angle_is_named(ports: tuple[Port, ...]) -> None:
     """With a port and without, friction is named, and its torque is right."""
-    d = diagnose(drive(*ports), measured(1), test=measured(2), workers=1)
+    d = diagnose(drive(*ports), measured(1), test=measured(2), laws=TRIED, effects=1, workers=1)
     effect, test = d.effects[0], d.errors["test"]
     assert (d.verdict, effect.law) == ("missing-physics", "coulomb_friction")
     assert effect.confidence > 0.8

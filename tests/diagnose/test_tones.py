@@ -103,7 +103,7 @@ def disturbed(size, seed=5):
 
 
 def test_a_force_that_is_not_recorded_is_not_called_noise():
-    found = pilfr.diagnose(rig(OFF), disturbed(0.02), laws=[laws.CubicStiffness])
+    found = pilfr.diagnose(rig(OFF), disturbed(0.02), laws=[laws.CubicStiffness], effects=1)
     assert found.verdict == "unexplained"
     assert "swings at the simulator's own" in found.sentence
 

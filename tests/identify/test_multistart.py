@@ -43,7 +43,7 @@ class Counting:
 
 @pytest.fixture(scope="module")
 def search():
-    train = (demo_recordings()["train"],)
+    train = (demo_recordings()["train"].slice(0, 1000),)
     model = structure(5)
     linear, problem, solution = linear_model(train, model)
     parameters = linear.parameters.at(problem.parameters(solution.theta))

@@ -243,10 +243,11 @@ def test_monte_carlo_of_a_pi_lfr(colour):
     structure, values = random_lfr(21, nx=2, n=2, gain=0.5)
     u = random_input(21, 1000)
     values["r"][0] = np.std(signals(Play, values, u)[1]) * np.array([0.3, 1.0])
-    pivots = []
+    pivots, engine = [], "auto"
     for seed in range(30):
         model, recording = recorded(structure, values, u, noise=0.01, seed=seed, colour=colour, initial="zero")
-        problem = Problem(model, recording)
+        problem = Problem(model, recording, engine=engine)
+        engine = problem.engine  # of the same model for every seed
         truth = invariant(structure, problem, problem.start)
         theta = GaussNewton(tolerance=1e-9).solve(problem).theta
         matrix = variance(covariance(problem, theta, structure), slopes(structure, problem, theta))
