@@ -20,12 +20,7 @@ from .base import Law, Local, beyond_gap
 GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
 PROFILES = {"linear": ("", "_high"), "quadratic": ("", "_mid", "_high"), "exponential": ("",)}  # names of the values
 RATIOS, MOST_RATIO = (0.3, 3.0), 100.0  # tried ratios of an exponential profile, and the largest
-PATTERNS = (
-    (0.5, 1.0, 1.5),
-    (1.5, 1.0, 0.5),
-    (0.5, 1.5, 0.5),
-    (1.5, 0.5, 1.5),
-)  # variations, over the mean
+PATTERNS = ((0.5, 1.0, 1.5), (1.5, 1.0, 0.5), (0.5, 1.5, 0.5), (1.5, 0.5, 1.5))  # variations, over the mean
 LEVEL = 0.1  # smallest variation of a strength, over the largest strength; below it the strength is constant
 SPARE = 0.25  # of the variation, the least strength from which a profile starts
 
@@ -191,6 +186,11 @@ def _scheduled(base: Any, by: str, profile: str) -> Any:
     unit = {"z": "z", "t": "s"}.get(by, f"[{by}]")
     words = {"z": "the local coordinate", "t": "time"}.get(by, by)
     how = {"linear": "", "quadratic": " in a parabola", "exponential": " exponentially"}[profile]
+    course = {
+        "linear": f"linear in {by}",
+        "quadratic": f"a parabola in {by} through three values",
+        "exponential": f"times ratio^(({by} - low)/(high - low))",
+    }[profile]
     read = [*inspect.signature(base.step if base.memory else base.force).parameters]
 
     def strengths(p: Any, u: Any, z: Any) -> dict[str, Any]:
@@ -202,7 +202,7 @@ def _scheduled(base: Any, by: str, profile: str) -> Any:
 
     class Scheduled(base):
         form = f"{base.form}, scheduled{how} by {by}".removeprefix(", ")
-        equation = f"{base.equation}  with {', '.join(base.strength)} {profile} in {by}"
+        equation = f"{base.equation}  with {', '.join(base.strength)} {course}"
         sentence = f"{base.sentence}; its strength varies{how} with {words}"
         units = {**base.units, **further, **shape, "low": unit, "high": unit}
         strength = (*base.strength, *further)
