@@ -185,14 +185,22 @@ class Search(Hypotheses):
         # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
         if step and self.can_improve(self.best, self.least_noise2) and self.in_time():
             likeliest = max(step, key=self.optimistic_evidence)
-            for varied in (t for t in step if t.law.id == likeliest.law.id):  # all its forms
-                kind, signals = constant(type(varied.law)), ("z", *self._entry(varied).local.inputs)
-                self._refine(varied, [scheduled(kind, by, "quadratic") for by in signals])
+            forms = [t for t in step if t.law.id == likeliest.law.id]
+            self._vary([likeliest], ("z", *self._entry(likeliest).local.inputs))
+            if self.best.laws and self.best.law.scheduled_by:  # with the signal found, other forms may be the physics
+                self._vary([t for t in forms if t is not likeliest], (self.best.law.scheduled_by,))
         best = self.best
-        by = (best.law.scheduled_by or best.law.scaled_by) if best.laws else ""
+        added_now = len(best.laws) == len(parent.laws) + 1
+        by = (best.law.scheduled_by or best.law.scaled_by) if added_now else ""
         if by and self.in_time():
             kind, tried = constant(type(best.law)), [p for p in PROFILES if p != best.law.profile]
             self._refine(best, [scheduled(kind, by, profile) for profile in tried])
+
+    def _vary(self, trials: Sequence[Trial], signals: Sequence[str]) -> None:
+        """Fit hypotheses with the strength of their last law varying with each signal."""
+        for trial in trials:
+            kind = constant(type(trial.law))
+            self._refine(trial, [scheduled(kind, by, "quadratic") for by in signals])
 
     def _entry(self, trial: Trial) -> Scored:
         """Return how the last law of a trial, or another with the same sense, was first screened at its port."""
