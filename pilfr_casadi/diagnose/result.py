@@ -434,7 +434,7 @@ class Diagnosis:
         lines = [self.summary, *self.gravest_blind_spots()]
         for e in self.effects:
             lines += _effect_lines(e)
-        lines += [*self._own(), *self._error_lines(), *self._blind_lines()]
+        lines += [*self._nameless_lines(), *self._own(), *self._error_lines(), *self._blind_lines()]
         lines += [f"note: {text}" for text in (*(g.sentence for g in self.gates), *self.warnings())]
         if self.next_experiment:
             lines.append(f"next experiment: {self.next_experiment['sentence']}")
@@ -466,6 +466,21 @@ class Diagnosis:
         left = len(self.blind_spots) - MOST_PRINTED
         more = [f"  and {left} more, see pilfr check"] if left > 0 else []
         return ["further blind spots of these recordings:", *told, *more] if told else []
+
+    def _nameless_lines(self) -> list[str]:
+        """List the laws of a correction without a sure name, with their values."""
+        if self.nameless is None:
+            return []
+        lines, parameters = list[str](), self.corrected.readable_parameters()
+        for e in self.corrected.elements[len(self.refitted.elements) :]:
+            own = {name: parameters[f"{e.prefix}{name}"] for name in e.law.parameters()}
+            numbers = {name: p for name, p in own.items() if p.value.ndim == 0 and not np.all(p.fixed)}
+            if numbers:
+                lines.append(
+                    f"in the correction, without a sure name: {display_name(e.law.id, e.law.form)} at {e.port}"
+                )
+                lines += [f"  {name} = {float(p.value):.5g} {p.unit}".rstrip() for name, p in numbers.items()]
+        return lines
 
     def _own(self) -> list[str]:
         """List the simulator's own estimated values, largest changes first."""

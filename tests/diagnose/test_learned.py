@@ -52,6 +52,12 @@ def test_the_correction_halves_the_error_without_a_name(nameless):
     assert nameless.nrmse(nameless.test[0]) == pytest.approx(nameless.errors["test"]["after"], rel=1e-6)
 
 
+def test_laws_without_a_sure_name_are_printed_with_their_values(nameless):
+    law = CubicStiffness().at({"k_3": 5.0})
+    shown = str(replace(nameless, corrected=nameless.corrected.with_element("ground", law)))
+    assert "in the correction, without a sure name: cubic stiffness at ground\n  k_3 = 5 N/m^3\n" in shown
+
+
 def test_an_export_gives_the_numbers_of_the_simulation(nameless, tmp_path):
     r, step = nameless.test[0], nameless.to_casadi()
     state, y = np.zeros(step.size1_in(0)), []
