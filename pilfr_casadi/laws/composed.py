@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -217,9 +218,15 @@ def _scheduled(base: Any, by: str, profile: str) -> Any:
             return super().why_not(local) or ("" if by == "z" else _not_there(by, local))
 
         def parameters(self) -> dict[str, Parameter]:
-            """Parameters, of which the ends of the signal's range are fixed."""
+            """Parameters: the ends of the signal's range are fixed, and all values of a strength have one shape."""
+            found = super().parameters()
+            for own, names in ends.items():
+                shape_of = found[own].value.shape
+                for name in names[1:]:
+                    if found[name].value.shape != shape_of:
+                        found[name] = replace(found[name], value=np.broadcast_to(found[name].value, shape_of))
             fixed = {k: Parameter(float(self.values.get(k, k == "high")), unit, fixed=True) for k in ("low", "high")}
-            return {**super().parameters(), **fixed}
+            return {**found, **fixed}
 
         def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
             """Bounds of the law, and of the ratio of its strengths."""

@@ -6,6 +6,7 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
+from pilfr_casadi.diagnose.screen import start_values
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
     PROFILES,
@@ -17,6 +18,7 @@ from pilfr_casadi.laws import (
     Relaxation,
     Saturation,
     SoftClearance,
+    StopHysteresis,
     ViscousDamping,
     behind_gap,
     scaled,
@@ -191,6 +193,23 @@ def test_a_strength_that_hardly_varies_is_doubtful(profile, more):
     for factor, doubtful in ((1.05, True), (1.2, False)):
         values = {**own, **base, more[-1]: base[more[-1]] * factor}
         assert law.doubtful(values) is doubtful
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_operators_vary_each_by_itself(profile):
+    """A layer of stops has a weight of each operator at each value of the signal."""
+    kind = scheduled(StopHysteresis, "z", profile)
+    z = np.linspace(-1.0, 1.0, 50)
+    local = Local(z, np.ones(50), 0.1, (50,), shown=True)
+    shape = next(iter(kind().shapes(local)))
+    columns = unit_forces(kind(), local, [shape])[:, 0]
+    values = start_values(kind(), shape, np.arange(1.0, 1 + columns.shape[1]))
+    law = kind().at(values)
+    assert all(law.parameters()[name].value.shape == (6,) for name in kind.strength)
+    assert law.doubtful(values) in (True, False) and columns.shape == (50, 6 * len(kind.strength))
+    line = {k: shape[k] for k in ("r", "low", "high")} | {"w": np.ones(6), "w_high": 2 * np.ones(6)}
+    (start,) = kind.finer_starts(scheduled(StopHysteresis, "z")().at(line), local)
+    assert all(np.shape(start[name]) == (6,) for name in kind.strength)
 
 
 def test_there_is_no_other_profile():
