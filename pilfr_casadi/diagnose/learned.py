@@ -26,7 +26,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, side_by_side
-from ..laws import POSITION_GAINS, SCALABLE, Law, Local, display_name, scaled, scheduled, unit_forces
+from ..laws import POSITION_GAINS, SCALABLE, Law, Local, display_name, likely_profiles, scaled, scheduled, unit_forces
 from ..models import Parameter, play
 from .force_recovery import law_signals
 from .linearise import linearised, port_signals
@@ -367,7 +367,8 @@ def nearest_to_learned(bench: Workbench, fitted: Fitted, laws: Collection[type[L
     tried = [law for law in laws if port.admits(law)]
     for law in SCALABLE if "parallel" in port.kinds else ():
         signals = [element.law.factor] * bool(element.law.factor) + ["z"] * law.dissipative
-        tried += [scheduled(law, by) for by in signals if law in laws and port.admits(law)]
+        profile = "linear" if "linear" in likely_profiles(law) else "exponential"
+        tried += [scheduled(law, by, profile) for by in signals if law in laws and port.admits(law)]
     gains = POSITION_GAINS if element.law.factor else ()
     tried += [scaled(law, element.law.factor) for law in gains if law in laws and port.admits(law)]
     return nearest_laws(local, force, tried)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, side_by_side
-from ..laws import FINER, LINEAR, PROFILES, SCALABLE, Law, constant, scheduled
+from ..laws import FINER, LINEAR, SCALABLE, Law, constant, likely_profiles, scheduled
 from ..simulators import Placed
 from .evidence import (
     BETTER_RATIO,
@@ -193,14 +193,14 @@ class Search(Hypotheses):
         added_now = len(best.laws) == len(parent.laws) + 1
         by = (best.law.scheduled_by or best.law.scaled_by) if added_now else ""
         if by and self.in_time():
-            kind, tried = constant(type(best.law)), [p for p in PROFILES if p != best.law.profile]
-            self._refine(best, [scheduled(kind, by, profile) for profile in tried])
+            kind = constant(type(best.law))
+            self._refine(best, [scheduled(kind, by, p) for p in likely_profiles(kind) if p != best.law.profile])
 
     def _vary(self, trials: Sequence[Trial], signals: Sequence[str]) -> None:
         """Fit hypotheses with the strength of their last law varying with each signal."""
         for trial in trials:
             kind = constant(type(trial.law))
-            self._refine(trial, [scheduled(kind, by, "quadratic") for by in signals])
+            self._refine(trial, [scheduled(kind, by, likely_profiles(kind)[0]) for by in signals])
 
     def _entry(self, trial: Trial) -> Scored:
         """Return how the last law of a trial, or another with the same sense, was first screened at its port."""

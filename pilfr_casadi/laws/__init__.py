@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         PROFILES as PROFILES,
         behind_gap as behind_gap,
         constant as constant,
+        likely_profiles as likely_profiles,
         scaled as scaled,
         scheduled as scheduled,
         strengths_over as strengths_over,

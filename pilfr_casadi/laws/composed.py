@@ -75,6 +75,15 @@ def constant(law: type[Law]) -> type[Law]:
     return law.__base__ if law.scheduled_by or law.scaled_by else law  # type: ignore[return-value]
 
 
+def likely_profiles(law: type[Law]) -> tuple[str, ...]:
+    """Return the profiles in which a strength may vary in a machine, the most general one first.
+
+    The operators of a layer vary together, by one ratio: each by itself, they could imitate any curve of position.
+    """
+    layer = any(law().parameters()[name].value.ndim for name in law.strength)
+    return ("exponential",) if layer else ("quadratic", "linear", "exponential")
+
+
 def profile_weights(profile: str, share: Any, ratio: Any) -> list[Any]:
     """Compute the weights of a strength's values, such as `F_c` and `F_c_high`, at a share of the signal's range."""
     if profile == "linear":

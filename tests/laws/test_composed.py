@@ -21,6 +21,7 @@ from pilfr_casadi.laws import (
     StopHysteresis,
     ViscousDamping,
     behind_gap,
+    likely_profiles,
     scaled,
     scheduled,
     unit_forces,
@@ -210,6 +211,13 @@ def test_operators_vary_each_by_itself(profile):
     line = {k: shape[k] for k in ("r", "low", "high")} | {"w": np.ones(6), "w_high": 2 * np.ones(6)}
     (start,) = kind.finer_starts(scheduled(StopHysteresis, "z")().at(line), local)
     assert all(np.shape(start[name]) == (6,) for name in kind.strength)
+
+
+def test_the_operators_of_a_layer_vary_together():
+    """Each by itself, their strengths over the position could imitate any curve and friction."""
+    assert likely_profiles(StopHysteresis) == ("exponential",)
+    assert set(likely_profiles(CoulombFriction)) == set(PROFILES)
+    assert scheduled(StopHysteresis, "z", "exponential").strength == StopHysteresis.strength
 
 
 def test_there_is_no_other_profile():
