@@ -81,8 +81,8 @@ class Tie:
         if len(self.only_as) == 1 and len(self.names) == 2:
             text = self.only_as[0]
             word = "sum" if " + " in text else "product" if "*" in text and " - " not in text else ""
-            if word and "^" not in self.only_as[0]:
-                return f"{names} can be identified only as their {word} ({self.only_as[0]})."
+            if word and "^" not in text:
+                return f"{names} can be identified only as their {word} ({text})."
         return f"{names} can be identified only as {in_words(self.only_as)}."
 
 

@@ -370,7 +370,7 @@ class Equations:
         moved = ca.vertcat(*(given.get(state, 0.0) for state in self.states))
         shown = ca.vertsplit(ca.mtimes(self._rates_in_outputs(x, u, p, t), moved)) if self.states else []
         rates = dict(zip(self.output_names, shown, strict=bool(shown)))
-        return {k: v for k, v in rates.items() if not ca.SX(v).is_zero()} | given
+        return given | {k: v for k, v in rates.items() if k not in given and not ca.SX(v).is_zero()}
 
     def across(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Any:
         """Evaluate the local coordinate z."""

@@ -9,6 +9,7 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, check, multisine
+from pilfr_casadi.diagnose.identifiability import Tie
 from pilfr_casadi.laws import CATALOGUE, CoulombFriction, CubicStiffness
 from pilfr_casadi.models import close_loop
 from problems.blind_spots import DT, NOISE, SAMPLES, controls, noise_like, plain, record, rigs
@@ -332,3 +333,11 @@ def test_every_law_of_the_catalogue_is_in_the_table(mass):
 def test_its_name_stays_a_function():
     importlib.import_module("pilfr_casadi.diagnose.blind_spots")
     assert pilfr.check is check and "without fitting a law" in check.__doc__
+
+
+@pytest.mark.parametrize(
+    ("only_as", "said"),
+    [("3*Cm + 2*Cw", "their sum (3*Cm + 2*Cw)"), ("Cm*Cw", "their product (Cm*Cw)"), ("Cm - 2*Cw", "Cm - 2*Cw")],
+)
+def test_a_tie_is_called_by_its_kind(only_as, said):
+    assert Tie(("Cm", "Cw"), (only_as,)).sentence == f"Cm and Cw can be identified only as {said}."
