@@ -109,9 +109,7 @@ def build_diagnosis(
     if bench.simulator.observer is not None:
         errors["free_run"] = free_run_errors(bench, tests or bench.recordings, request.simulator, without, after)
     fewer = test_errors(bench, tests, found.gates, _without_each_effect(search, found)) if tests else {}
-    effects = tuple(
-        _effect(search, e, after, std, fewer.get(e, np.nan)) for e in found.effects
-    )
+    effects = tuple(_effect(search, e, after, std, fewer.get(e, np.nan)) for e in found.effects)
     settled = found.verdict.kind in ("complete", "recording-fault") or (
         min((e.confidence for e in effects), default=0) > SURE
     )
