@@ -215,16 +215,12 @@ class Equations:
             if not callable(getattr(self, kind)):
                 raise InputError(f"The simulator's {kind} are {getattr(self, kind)!r}; give a function of x, u and p.")
         for kind in ("states", "inputs"):
-            object.__setattr__(self, kind, _distinct_names(getattr(self, kind), kind))
+            object.__setattr__(self, kind, distinct_names(getattr(self, kind), kind))
         if self.hold not in (None, "zero", "linear"):
             raise InputError(f"hold = {self.hold!r} was given; use 'zero', 'linear' or None.")
-        for kind, wanted in (("parameters", "{name: Parameter(value, ...)}"), ("units", "{name: unit}")):
-            if not isinstance(getattr(self, kind), Mapping):
-                raise InputError(f"The simulator's {kind} are {getattr(self, kind)!r}; give {wanted}.")
-        for name, given in self.parameters.items():
-            if not isinstance(given, Parameter):
-                raise InputError(f"The simulator's parameter {name!r} is {given!r}; give Parameter(value, ...).")
-        object.__setattr__(self, "parameters", ParameterSet(dict(self.parameters)))
+        if not isinstance(self.units, Mapping):
+            raise InputError(f"The simulator's units are {self.units!r}; give {{name: unit}}.")
+        object.__setattr__(self, "parameters", parameter_set(self.parameters))
         object.__setattr__(self, "ports", _checked_ports(self.ports))
         x, u, p, t = self.symbols()
         derivatives = ca.vertsplit(self.derivatives(x, u, p, t)) if self.states else ()
@@ -546,7 +542,18 @@ def _row(found: Mapping[str, Any], names: tuple[str, ...], where: str, kind: str
     return [_scalar(found[name], f"{kind} of {name!r} in the {where}") for name in names]
 
 
-def _distinct_names(given: Any, kind: str) -> tuple[str, ...]:
+def parameter_set(given: Any) -> ParameterSet:
+    """Check that parameters by name are given, and lay them out."""
+    if not isinstance(given, Mapping):
+        raise InputError(f"The simulator's parameters are {given!r}; give {{name: Parameter(value, ...)}}.")
+    for name, value in given.items():
+        if not isinstance(value, Parameter):
+            raise InputError(f"The simulator's parameter {name!r} is {value!r}; give Parameter(value, ...).")
+    return ParameterSet(dict(given))
+
+
+def distinct_names(given: Any, kind: str) -> tuple[str, ...]:
+    """Return one name or several as a tuple; refuse what are no names, and a name given twice."""
     try:
         names = (given,) if isinstance(given, str) else tuple(given)
     except TypeError:

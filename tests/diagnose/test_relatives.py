@@ -30,6 +30,7 @@ from pilfr_casadi.laws import (
     Resonance,
     Saturation,
     Settling,
+    SoftSaturation,
     StopHysteresis,
 )
 from pilfr_casadi.simulators import discretise
@@ -88,6 +89,7 @@ def test_a_law_with_one_more_term_than_one_that_came_near_is_no_worse_and_so_is_
     (more,) = [s for s in asked_for([best, near, lost], scored) if isinstance(s.law, HarmonicForce)]
     assert more.port == "a" and more.starts == ({"a": 3.0, "b": -2.0, "a_2": 0.0, "b_2": 0.0, "L": 0.7},)
     assert asked_for([("c", CubicStiffness, 0.05, {}), near, lost], scored) == []
+    assert asked_for([best, near, ("a", HarmonicForce, 0.1, start)], scored) == []
     # of the same names, but no line is an exponential
     trend, settling = ("a", Drift, 0.1, {"a": 3.0, "b": -2.0}), ("a", Settling, 0.5, {"a": 1.0, "b": 0.0, "T": 2.0})
     assert asked_for([best, trend, settling], [entry("a", Settling, settling[-1])]) == []
@@ -147,7 +149,7 @@ def test_a_simple_law_stands_for_itself():
     best = Trials(on, 1).fitted(cart().with_element("actuator:force", Saturation().at({"L": 8.0})), [{}], 1)
     local = port_signals(on, best.fitted, "actuator:force")
     np.testing.assert_allclose(local.z, on.recordings[0].u[:, 0])
-    assert relatives(on, [best], [Scored("actuator:force", DeadZone(), 0.1, ({},), local)]) == []
+    assert relatives(on, [best], [Scored("actuator:force", SoftSaturation(), 0.1, ({},), local)]) == []
 
 
 @pytest.mark.parametrize(("level", "compared"), [(0.5, True), (0.0, False)])

@@ -338,22 +338,22 @@ def test_bounds_and_fixed_entries_have_no_error():
 
 
 def test_what_hardly_counts_is_not_moved_to_a_bound_where_it_counts():
-    """The slope of a saturated neuron is blind where it is, and not so at its bound."""
+    """The slope of a saturated neuron is nearly blind where it is, and not so at its bound."""
     parameters = ParameterSet(
-        {"gain": Parameter(1e-12, bounds=(0, 9)), "slope": Parameter(70.0, bounds=(0, 99)), "offset": Parameter(3.0)}
+        {"gain": Parameter(1e-12, bounds=(0, 9)), "slope": Parameter(16.0, bounds=(0, np.inf)), "offset": Parameter(3.0)}
     )
 
     def step(x, u, w, p):
         return x, p["gain"] * u + ca.tanh(p["slope"] * u) + p["offset"]
 
     model = open_model(step, lambda x, u, p: x, parameters, n_x=0, n_u=1, n_w=0)
-    u = np.random.default_rng(0).uniform(0.7, 2.0, (100, 1))
+    u = np.random.default_rng(0).uniform(1.0, 1.2, (100, 1))
     y = 4 + 0.01 * np.random.default_rng(1).standard_normal(u.shape)
     problem = Problem(model, Recording(u=u, y=y, dt=1.0, initial="zero"), engine="vm")
     errors = standard_errors(problem, problem.start)
     assert np.isnan(errors["gain"])  # within rounding of its bound
-    assert np.isinf(errors["slope"])
-    assert 0 < errors["offset"] < 0.01
+    assert errors["slope"] > 1e6
+    assert 0 < errors["offset"] < 0.1
 
 
 def test_an_active_constraint_is_projected_out():
