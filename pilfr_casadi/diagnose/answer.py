@@ -23,7 +23,7 @@ from .identifiability import port_units
 from .mismatch_map import mismatch
 from .offsets import final_gates, without_zero_offsets
 from .preparation import Prepared
-from .proof import free_run_errors, mean_nrmse, next_experiment, parameter_table, placebo, test_errors
+from .proof import errors_of, free_run_errors, mean_nrmse, next_experiment, parameter_table, placebo, test_errors
 from .result import Diagnosis, Effect
 from .search import Search
 from .trials import Trial
@@ -98,11 +98,18 @@ def build_diagnosis(
     std = deviations(bench, after)
     errors: dict[str, dict[str, float] | None] = {
         "train": {"nominal": final.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
-        "test": test_errors(bench, tests, found.gates, request.simulator, without, after) if tests else None,
+        "test": None,
     }
+    if tests:
+        judged, fits = bench.on(tests), {"before": without, "after": after}
+        errors["test"] = {
+            "nominal": errors_of(judged, judged.model(request.simulator)),  # on the recordings as they are
+            **test_errors(bench, tests, found.gates, fits),
+        }
     if bench.simulator.observer is not None:
         errors["free_run"] = free_run_errors(bench, tests or bench.recordings, request.simulator, without, after)
-    effects = tuple(_effect(search, e, after, std) for e in found.effects)
+    fewer = test_errors(bench, tests, found.gates, _without_each_effect(search, found)) if tests else {}
+    effects = tuple(_effect(search, e, after, std, fewer.get(e, np.nan)) for e in found.effects)
     settled = found.verdict.kind in ("complete", "recording-fault") or (
         min((e.confidence for e in effects), default=0) > SURE
     )
@@ -177,7 +184,22 @@ def _blind_spots(request: Request, ready: Prepared, search: Search) -> tuple[Bli
     return ()
 
 
-def _effect(search: Search, named: NamedEffect, fitted: Fitted, std: dict[str, np.ndarray]) -> Effect:
+def _without_each_effect(search: Search, found: Conclusion) -> dict[NamedEffect, Fitted]:
+    """Fit the corrected simulator without each of several named effects; empty beside a learned force."""
+    laws = found.fitted.last_elements(len(found.correction.elements))
+    if len(found.effects) < 2 or found.correction.learned or search.interrupted:
+        return {}
+    joint, out = Trial(laws, found.fitted, found.fitted.cost, found.fitted.cost), dict[NamedEffect, Fitted]()
+    for effect in found.effects:
+        rest = search.beside([e for e in laws if (e.port, e.law.id) != effect.name], joint)
+        search.keep(rest)
+        out[effect] = search.thorough(rest).fitted
+    return out
+
+
+def _effect(
+    search: Search, named: NamedEffect, fitted: Fitted, std: dict[str, np.ndarray], test_without: float
+) -> Effect:
     bench = search.bench
     element = next(e for e in fitted.simulator.elements if (e.port, e.law.id) == named.name)  # its form may differ
     law = element.law
@@ -206,6 +228,7 @@ def _effect(search: Search, named: NamedEffect, fitted: Fitted, std: dict[str, n
         indistinguishable=tuple(named.alike),
         form=law.form,
         placebo={"own": own, "unrelated": unrelated},
+        test_without=test_without,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from .gates import Gate
 from .linearise import linearised
 from .screen import RIDGES, Remainder, held_out
 from .workbench import Fitted, Workbench
+
+K = TypeVar("K")
 
 AMPLITUDES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
 SINES = 12  # frequencies of sines that are tried
@@ -53,24 +55,13 @@ def starts_of(fitted: Fitted) -> list[np.ndarray]:
 
 
 def test_errors(
-    bench: Workbench,
-    tests: Sequence[Recording],
-    gates: Sequence[Gate],
-    simulator: Simulator,
-    without: Fitted,
-    after: Fitted,
-) -> dict[str, float]:
-    """Compute the NRMSE on test recordings: unedited for the nominal simulator, with the gates' edits for the others.
-
-    Fits are judged on the sub-steps that they were fitted on.
-    """
-    out = {"nominal": errors_of(bench.on(tests), bench.on(tests).model(simulator))}
+    bench: Workbench, tests: Sequence[Recording], gates: Sequence[Gate], fits: Mapping[K, Fitted]
+) -> dict[K, float]:
+    """Compute the NRMSE of fits on test recordings with the gates' edits, on the sub-steps that they were fitted on."""
     for g in gates:
         if g.change is not None:
             tests = [g.change(r) for r in tests]
-    for name, one in (("before", without), ("after", after)):
-        out[name] = errors_of(bench.on(tests), one.fitted_model, starts_of(one))
-    return out
+    return {name: errors_of(bench.on(tests), one.fitted_model, starts_of(one)) for name, one in fits.items()}
 
 
 def free_run_errors(

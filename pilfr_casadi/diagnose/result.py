@@ -41,7 +41,14 @@ OUT_OF_TIME = "The time limit ended the search: the answer rests on the fits mad
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """A piece of physics that the simulator leaves out."""
+    """A piece of physics that the simulator leaves out.
+
+    Attributes
+    ----------
+    test_without : float, optional
+        NRMSE on the test recordings of the corrected simulator without this effect, the others refitted; nan if there
+        is no other.
+    """
 
     port: str
     law: str
@@ -52,6 +59,7 @@ class Effect:
     indistinguishable: tuple[tuple[str, str], ...] = ()
     form: str = ""
     placebo: Mapping[str, float] = field(default_factory=dict)
+    test_without: float = np.nan
 
     @property
     def defined(self) -> dict[str, dict[str, Any]]:
@@ -78,6 +86,8 @@ class Effect:
             out["form"] = self.form
         if self.placebo:
             out["placebo"] = dict(self.placebo)
+        if not np.isnan(self.test_without):
+            out["test_without"] = self.test_without
         return out
 
 
@@ -185,8 +195,25 @@ class Diagnosis:
             return f"{self.sentence} On the test recordings it makes no difference: {before} before, {after} after."
         return (
             f"{self.sentence} But this correction makes the test recordings worse: their error is {before} refitted "
-            f"and {after} with it. Do not use it as a correction."
+            f"and {after} with it. Do not use it as a correction.{self._better_without()}"
         )
+
+    def worth(self, effect: Effect) -> str:
+        """Say what one of several effects does to the error on the test recordings; empty if that is unknown."""
+        errors = self.errors.get("test")
+        if not errors or np.isnan(effect.test_without):
+            return ""
+        with_it, without = _percent(errors["after"]), _percent(effect.test_without)
+        return f"error on the test recordings: {with_it} with it, {without} without it (the rest refitted)"
+
+    def _better_without(self) -> str:
+        """Name the effect without which a correction that harms would help most, if there is one."""
+        errors = self.errors.get("test") or {}
+        known = [e for e in self.effects if not np.isnan(e.test_without)]
+        least = min(known, key=lambda e: e.test_without, default=None)
+        if least is None or not least.test_without < errors["before"]:
+            return ""
+        return f" Without {display_name(least.law, least.form)} at {least.port} it is {_percent(least.test_without)}."
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of diagnosis.json; numbers that are not finite are None."""
@@ -434,6 +461,7 @@ class Diagnosis:
         lines = [self.summary, *self.gravest_blind_spots()]
         for e in self.effects:
             lines += _effect_lines(e)
+            lines += [f"  {self.worth(e)}"] if self.worth(e) else []
         lines += [*self._nameless_lines(), *self._own(), *self._error_lines(), *self._blind_lines()]
         lines += [f"note: {text}" for text in (*(g.sentence for g in self.gates), *self.warnings())]
         if self.next_experiment:

@@ -20,10 +20,7 @@ import numpy as np
 from .._base import InputError, side_by_side
 from ..laws import FINER, LINEAR, SCALABLE, Law, constant, likely_profiles, scheduled
 from ..simulators import Placed
-from .evidence import (
-    BETTER_RATIO,
-    NEAR_RATIO,
-)
+from .evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO
 from .gates import CLEARLY_BETTER
 from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
@@ -259,15 +256,22 @@ class Search(Hypotheses):
                 rest = self.beside([e for e in best.laws if e is not element], best)
                 if not rest.mean_square < DIVERGED:
                     continue
-                if self.in_time() and not any(step.parent.key == rest.key for step in self.steps):
+                if self.in_time() and not self._expanded(rest):
                     self.keep(rest)
                     self.add(rest, again=True)
                 known = self.memo.get(rest.key)  # a law that was found only beside another one may do without it
                 converged = known is not None and known.thorough and known.mean_square <= rest.mean_square
                 if not converged and not self.past_deadline:
                     self.keep(self.fits.polish(rest))
+                    found = self.memo[rest.key]
+                    if self.in_time() and not self._expanded(found, FAR_RATIO):  # it had been in a wrong minimum
+                        self.add(found, again=True)
             if self.best.key == best.key:
                 return
+
+    def _expanded(self, trial: Trial, ratio: float = np.inf) -> bool:
+        """Tell whether laws were added to a hypothesis, at an error of at most `ratio` times the present one."""
+        return any(s.parent.key == trial.key and s.parent.error <= ratio * trial.error for s in self.steps)
 
     def add_two(self) -> None:
         """Fit two laws at once beside the simulator alone, because one after the other may hide each other."""

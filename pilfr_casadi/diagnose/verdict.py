@@ -38,6 +38,7 @@ from .evidence import (
     FORMULA_ERROR,
     INDISTINGUISHABLE_NATS,
     LEAST_EXPLAINED,
+    LEAST_MODEL_ERROR,
     LOUDEST_NOISE,
     NEAR_RATIO,
     NEGLIGIBLE_ERROR,
@@ -123,10 +124,13 @@ def explainable_remainder(search: Hypotheses, trial: Trial, before: Trial | None
     """Compute the share s of the mismatch that a hypothesis leaves and that a flexible force would explain.
 
     The mismatch is that of the refit, or of another hypothesis `before`. A remainder that no force at a port explains
-    counts little: it may be a disturbance that acts beside the law.
+    counts little: it may be a disturbance that acts beside the law. The noise is known only so well
+    (LEAST_MODEL_ERROR), so that a mismatch below the noise hardly shows what explains it.
     """
     share = float(np.clip(max(search.flexible(trial).values(), default=0.0), 0.0, 1.0))
-    return share_left(search, trial.mean_square, before) * (share + DISTURBANCE_WEIGHT * (1 - share))
+    least = (1 + LEAST_MODEL_ERROR) * search.floor2
+    left = share_left(search, max(trial.mean_square, least), before)
+    return left * (share + DISTURBANCE_WEIGHT * (1 - share))
 
 
 def share_left(search: Hypotheses, mean_square: float, before: Trial | None = None) -> float:

@@ -10,6 +10,7 @@ CasADi matrix on the way in or out.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -420,16 +421,22 @@ def accumulate_steps(function: ca.Function, state: np.ndarray, *arguments: np.nd
         Arguments after the state, one row for each step.
     """
     count, state = len(arguments[0]), np.array(state, dtype=float)
-    arrays = [np.ascontiguousarray(a, dtype=float) for a in arguments]
-    results = [np.zeros((count, function.size1_out(i))) for i in range(function.n_out())]
-    begin = 0
-    for length, run in ((BLOCK, function.mapaccum("accumulated", BLOCK)), (1, function)):
-        while begin + length <= count:
-            block = slice(begin, begin + length)
-            _call(run, [state, *(a[block] for a in arrays)], [out[block] for out in results])
-            state = results[0][begin + length - 1]
-            begin += length
-    return results
+    blocks = -(-count // BLOCK)  # the last one is filled up: single steps cost far more each
+    more = blocks * BLOCK - count
+    arrays = [np.concatenate([a, np.repeat(a[-1:], more, axis=0)], dtype=float) for a in arguments]
+    results = [np.zeros((blocks * BLOCK, function.size1_out(i))) for i in range(function.n_out())]
+    run = _accumulated(function)
+    for begin in range(0, blocks * BLOCK, BLOCK):
+        block = slice(begin, begin + BLOCK)
+        _call(run, [state, *(a[block] for a in arrays)], [out[block] for out in results])
+        state = results[0][begin + BLOCK - 1]
+    return [out[:count] for out in results]
+
+
+@functools.lru_cache(maxsize=256)
+def _accumulated(function: ca.Function) -> ca.Function:
+    """Chain the steps of a block."""
+    return function.mapaccum("accumulated", BLOCK)
 
 
 def _call(function: ca.Function, arrays: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:

@@ -143,6 +143,8 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
         Text(f"At {e.port}: {display_name(e.law)}{form}. In words: {e.sentence}. Confidence {e.confidence:.2f} of 1."),
     ]
     out += [Code(e.equation), *([action] if action else [])]
+    worth = diagnosis.worth(e)
+    out += [Text(f"{worth[0].upper()}{worth[1:]}.")] if worth else []
     rows = [
         [name, uncertain_text(p["value"], float(_array(p["std"]))), p["unit"] or "–"]
         for name, p in (e.defined | e.parameters).items()

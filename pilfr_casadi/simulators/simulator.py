@@ -162,10 +162,22 @@ class Simulator(Equations):
                 raise InputError(f"{recording.label} has no output {name!r}; it has {', '.join(recording.outputs)}.")
         return recording.y[:, [recording.outputs.index(name) for name in self.output_names]]
 
-    def with_parameters(self, parameters: Mapping[str, Parameter]) -> Simulator:
-        """Copy with other parameters of the same names."""
-        given, own = ParameterSet(dict(parameters)), self.parameter_set
-        alike = tuple(given) == tuple(own) and all(given[name].shape == own[name].shape for name in own)
+    def with_parameters(self, parameters: Mapping[str, Any]) -> Simulator:
+        """Copy with some parameters replaced; a number, or an array, replaces the value alone.
+
+        Raises
+        ------
+        InputError
+            If a name is unknown.
+        """
+        own = self.parameter_set
+        for name in parameters:
+            if name not in own:
+                raise InputError(f"There is no parameter {name!r}; the simulator has {', '.join(own) or 'none'}.")
+        given = ParameterSet(
+            {k: p if isinstance(p := parameters.get(k, q), Parameter) else replace(q, value=p) for k, q in own.items()}
+        )
+        alike = all(given[name].shape == own[name].shape for name in own)
         return self._with(parameters=given) if alike else replace(self, parameters=given)
 
     def with_element(self, port: str, law: Any) -> Simulator:

@@ -111,12 +111,14 @@ def test_an_answer_that_is_there_outlives_an_interrupt_of_what_adds_to_it(leakin
 def test_two_effects_at_two_ports_are_both_named():
     one = laws.CubicStiffness(values={"k_3": 4e5})
     true = [("ground-m1", one), ("m1-m2", laws.CoulombFriction(values={"F_c": 4.0, "v_0": 0.01}))]
-    train = [r.slice(0, 700) for r in recordings_of(true)]
+    whole = recordings_of(true)[0]
     tried = (laws.CubicStiffness, laws.CoulombFriction)
-    found = pilfr.diagnose(rig(OFF), train, laws=tried, workers=1)
+    found = pilfr.diagnose(rig(OFF), whole.slice(0, 700), test=whole.slice(700, 1100), laws=tried, workers=1)
     assert {(e.port, e.law) for e in found.effects} == {(port, law.id) for port, law in true}, str(found)
     assert min(e.confidence for e in found.effects) > 0.8
     assert found.errors["train"]["after"] < 1.2 * found.floor["nrmse"]
+    # each by itself leaves most of the error on the test recording
+    assert min(e.test_without for e in found.effects) > 3 * found.errors["test"]["after"]
 
 
 def recordings_of(placed):

@@ -125,6 +125,19 @@ def test_a_correction_that_diverges_on_the_test_recording_is_worse():
 
 
 @pytest.mark.usefixtures("blank_figures")
+@pytest.mark.parametrize(("without", "advised"), [(0.2, True), (0.6, False)])
+def test_the_effect_that_harms_the_test_recording_is_told(without, advised, tmp_path):
+    d = with_test_errors(0.5, 1.24, 0.9)
+    drag = replace(d.effects[0], law="quadratic_drag", form="", test_without=without)
+    d = replace(d, effects=(replace(d.effects[0], test_without=0.7), drag))
+    page = diagnosis_report(d, tmp_path).read_text()
+    assert ("Without quadratic drag at ground it is 20 %" in d.summary) == advised
+    worth = f"rror on the test recordings: 124 % with it, {100 * without:.0f} % without it (the rest refitted)"
+    assert worth in str(d) and worth in page
+    assert json.loads((tmp_path / "diagnosis.json").read_text())["effects"][1]["test_without"] == without
+
+
+@pytest.mark.usefixtures("blank_figures")
 def test_the_gravest_blind_spots_stand_right_after_the_verdict(tmp_path):
     spots = tuple(BlindSpot("flat", (name,), f"These recordings say nothing about {name}.") for name in "abc")
     d = replace(example(), blind_spots=spots)
