@@ -9,7 +9,7 @@ from pilfr_casadi.diagnose.offsets import Offset
 from pilfr_casadi.diagnose.verdict import closest_law, explainable_remainder, posterior, share_named
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Delay, DirectionalFriction, QuadraticDrag
 
-SURE = share_named(0.0)  # of a law that leaves nothing
+SURE = share_named(0.0)  # of a law that leaves nothing: 0.98
 DRY, CUBIC = ("a", CoulombFriction), ("a", CubicStiffness)
 DRY_NAME, CUBIC_NAME = ("a", "coulomb_friction"), ("a", "cubic_stiffness")
 
@@ -45,13 +45,13 @@ def sure_of(found):
 @pytest.mark.parametrize(("behind", "share"), [(0.0, 0.5), (2.0, 0.881), (12.0, 1.0)])
 def test_two_laws_that_tie_share_the_confidence(search, trial, behind, share):
     found = posterior(search((trial(DRY), 0.0), (trial(CUBIC), behind)))
-    assert found.named == SURE > 0.95 and found.nothing < 1e-6
+    assert found.named == pytest.approx(SURE) and found.nothing < 1e-6
     assert sure_of(found) == {DRY_NAME: pytest.approx(SURE * share, rel=1e-3)}
     assert list(found.effects[0].alike) == ([CUBIC_NAME] if behind < 3 else [])
 
 
 def test_an_effect_keeps_its_name_only_in_the_corrected_simulator(search, trial):
-    found = posterior(search((trial(DRY, ("b", CubicStiffness)), 0.0), (trial(DRY), 20.0)))
+    found = posterior(search(trial(DRY, ("b", CubicStiffness)), trial(DRY, left=0.1)))
     assert len(found.effects) == 2
     one = found.within({DRY_NAME, ("b", "backlash")}, learned=0.0)
     assert sure_of(one) == {DRY_NAME: pytest.approx(found.sure)}
@@ -119,7 +119,7 @@ def test_what_a_flexible_force_would_still_follow_speaks_against_the_name(search
         named.append(posterior(found).named)
     assert share == sorted(share) and share[-1] == pytest.approx(0.3 * (0.9 + 0.2 * 0.1), rel=1e-5)
     assert named == sorted(named, reverse=True) and named[-1] < 0.5
-    assert explainable_remainder(found, trial(DRY)) == 0.0
+    assert explainable_remainder(found, trial(DRY)) < 1e-6
 
 
 @pytest.mark.parametrize(("left", "sure"), [(1e-6, True), (2e-3, False)])

@@ -340,7 +340,11 @@ def test_bounds_and_fixed_entries_have_no_error():
 def test_what_hardly_counts_is_not_moved_to_a_bound_where_it_counts():
     """The slope of a saturated neuron is nearly blind where it is, and not so at its bound."""
     parameters = ParameterSet(
-        {"gain": Parameter(1e-12, bounds=(0, 9)), "slope": Parameter(16.0, bounds=(0, np.inf)), "offset": Parameter(3.0)}
+        {
+            "gain": Parameter(1e-12, bounds=(0, 9)),
+            "slope": Parameter(16.0, bounds=(0, np.inf)),
+            "offset": Parameter(3.0),
+        }
     )
 
     def step(x, u, w, p):
