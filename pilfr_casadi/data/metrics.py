@@ -50,25 +50,27 @@ def rmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> float:
     return float(np.mean(rmse_per_output(y, y_hat, skip)))
 
 
-def nrmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> float:
+def nrmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0, resting: np.ndarray | None = None) -> float:
     """Return the error relative to the standard deviation of the output, averaged over outputs.
 
     Krikelis et al. (2024), Eq. 27; 0 is perfect, 1 is as good as the mean of the output. Parameters are those of
-    :func:`rmse_per_output`.
+    :func:`rmse_per_output`; an output that never changes here is scaled by its entry of `resting`, (n_y,), if given.
 
     Raises
     ------
     InputError
-        As :func:`rmse_per_output`, and if an output is constant.
+        As :func:`rmse_per_output`, and if an output is constant and there is no scale for it.
     """
     errors = rmse_per_output(y, y_hat, skip)
     measured, _ = _scored(y, y_hat, skip)
     sigma = measured.std(axis=0)
-    still = np.flatnonzero(sigma <= 1e-14 * np.abs(measured).max(axis=0))
-    if still.size:
+    still = sigma <= 1e-14 * np.abs(measured).max(axis=0)
+    if resting is not None:
+        sigma = np.where(still, resting, sigma)
+    elif np.any(still):
         raise InputError(
-            f"output {still[0] + 1} of {len(sigma)} never changes, so an error relative to its standard deviation does "
-            "not exist; leave it out or use rmse."
+            f"output {int(np.argmax(still)) + 1} of {len(sigma)} never changes, so an error relative to its standard "
+            "deviation does not exist; leave it out or use rmse."
         )
     return float(np.mean(errors / sigma))
 

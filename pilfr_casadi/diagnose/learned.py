@@ -367,8 +367,7 @@ def nearest_to_learned(bench: Workbench, fitted: Fitted, laws: Collection[type[L
     tried = [law for law in laws if port.admits(law)]
     for law in SCALABLE if "parallel" in port.kinds else ():
         signals = [element.law.factor] * bool(element.law.factor) + ["z"] * law.dissipative
-        profile = "linear" if "linear" in likely_profiles(law) else "exponential"
-        tried += [scheduled(law, by, profile) for by in signals if law in laws and port.admits(law)]
+        tried += [scheduled(law, by, likely_profiles(law)[0]) for by in signals if law in laws and port.admits(law)]
     gains = POSITION_GAINS if element.law.factor else ()
     tried += [scaled(law, element.law.factor) for law in gains if law in laws and port.admits(law)]
     return nearest_laws(local, force, tried)

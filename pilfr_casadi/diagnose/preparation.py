@@ -6,9 +6,8 @@ about the hold: if a fault was found, the other hold goes through all checks as 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -67,11 +66,10 @@ def prepare(
     hold: str | None,
     engine: str,
     workers: int = 1,
-    starts: Sequence[Mapping[str, Any]] = (),
     early: bool = True,
     say: Stages | None = None,
 ) -> Prepared:
-    """Correct faults of the recordings, refit from the user's values and from `starts`, and measure the noise.
+    """Correct faults of the recordings, refit from the user's values, and measure the noise.
 
     Without `early`, an early channel counts as a fault only where nothing else is wrong.
     """
@@ -87,7 +85,7 @@ def prepare(
         bench, held = _choose_hold(bench)
     nominal = errors_of(bench, bench.model(simulator), whole=True)
     say(CHECKS, 1, CHECKED)
-    checks = _Checks(gates, workers, starts, early, say)
+    checks = _Checks(gates, workers, early, say)
     now = checks.run(bench, 1.0 if said else 0.5)
     if not said and any(g.fault for g in now.gates[len(gates) :]):  # on faulty data the better hold says nothing
         now, held = _with_better_hold(checks, now, bench, held)
@@ -107,19 +105,18 @@ class _Checks:
 
     gates: tuple[Gate, ...]
     workers: int
-    starts: Sequence[Mapping[str, Any]]
     early: bool
     say: Stages
 
     def run(self, bench: Workbench, part: float) -> Checked:
         """Refit, and correct one fault after the other; `part` is the unit of shifts in samples, see `timing`."""
-        now = self._report(2, find_wrong_start(Checked(bench, refitted(bench, self.starts), self.gates)))
+        now = self._report(2, find_wrong_start(Checked(bench, refitted(bench), self.gates)))
         bench = now.bench
         if now.cost > max(NEAR_NOISE_RATIO**2 * now.noise2, CHECKED_ABOVE):
             found = self._slips(now, part)
             if len(found.gates) > len(now.gates):
                 bench = Workbench.of(bench.simulator, found.bench.recordings, bench.hold, bench.engine)
-                starts = [found.fitted.values, {}, *self.starts]
+                starts = [found.fitted.values, {}]
                 found = found.then(bench, bench.fit(bench.simulator, starts, solver=THOROUGH))
             now = found
         now = find_output_gaps(find_gaps(mend_stale_samples(unclip(self._report(3, now)))))
@@ -169,9 +166,9 @@ def _comparable_cost(found: Checked) -> float:
     return found.cost / (AVERAGED_NOISE if between else 1)
 
 
-def refitted(bench: Workbench, starts: Sequence[Mapping[str, Any]] = ()) -> Fitted:
-    """Fit the simulator from the user's values and from others; if the error stays large, use an observer as well."""
-    plain = bench.fit(bench.simulator, [{}, *starts], solver=THOROUGH)
+def refitted(bench: Workbench) -> Fitted:
+    """Fit the simulator from the user's values; if the error stays large, use an observer as well."""
+    plain = bench.fit(bench.simulator, solver=THOROUGH)
     if plain.cost < POOR_FIT:
         return plain
     probe, runs = linearised(bench, run_as_given(bench, plain))

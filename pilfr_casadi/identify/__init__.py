@@ -85,7 +85,6 @@ if TYPE_CHECKING:
         gauge_tangents as gauge_tangents,
         generators as generators,
         gradient_covariance as gradient_covariance,
-        snap_to_bounds as snap_to_bounds,
         standard_errors as standard_errors,
         variance as variance,
     )

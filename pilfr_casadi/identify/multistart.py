@@ -159,7 +159,7 @@ def polish(search: StartSearch, candidate: Candidate) -> Candidate:
         values, states = problem.parameters(best.theta), problem.first_states(best.theta)
         runs = [engine.simulate(r.u, values, s, True) for r, s in zip(recordings, states, strict=True)]
         z = np.concatenate([run[2] for run in runs])
-        moved = regrid_channels(search.structure, parameters.unpack(values), z, extent)
+        moved = regrid_channels(search.structure, parameters.unpack(values), z, extent=extent)
         model = candidate.model.with_parameters(parameters.at(parameters.pack(moved)))
         if spread:
             model = hold_near_density(model, moved, spread)
@@ -254,13 +254,11 @@ def regrid(
 
 
 def regrid_channels(
-    structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, extent: float = 1.3
+    structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, **options: Any
 ) -> dict[str, Any]:
-    """Spread every channel's thresholds and weights anew; z (M, n_w) is the fitted model's signal."""
+    """Spread every channel's thresholds and weights anew by `regrid`; z (M, n_w) is the fitted model's signal."""
     reaches = [threshold_range(structure, values, z_i, i) for i, z_i in enumerate(z.T)]
-    channels = [
-        regrid(r, w, reach, extent=extent) for r, w, reach in zip(values["r"], values["w"], reaches, strict=True)
-    ]
+    channels = [regrid(r, w, reach, **options) for r, w, reach in zip(values["r"], values["w"], reaches, strict=True)]
     return {**values, "r": np.array([r for r, _ in channels]), "w": np.array([w for _, w in channels])}
 
 

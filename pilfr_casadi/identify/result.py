@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, is_number, later, listed
-from ..data import NOTHING_SENTENCE, Recording, as_recordings, explains_nothing, fingerprint, nrmse, rmse_per_output
+from ..data import NOTHING_SENTENCE, Recording, as_recordings, explains_nothing, fingerprint, nrmse
 from ..engine import Engine, make_engine
 from ..export import FitContent, exported, read_model_file, write_model_file
 from ..linear import LinearPart, any_bla, linear_parts
@@ -263,11 +263,8 @@ class Fit:
         first = [self.scored_from(r) for r in given]
         pooled = np.concatenate([r.y[k:] for r, k in zip(given, first, strict=True)])
         nrmse(pooled, pooled)  # refuses an output that never changes
-        errors = []
-        for r, k in zip(given, first, strict=True):
-            spread, size = np.std(r.y[k:], axis=0), np.max(np.abs(r.y[k:]), axis=0)
-            spread = np.where(spread <= 1e-14 * size, np.std(pooled, axis=0), spread)
-            errors.append(np.mean(rmse_per_output(r.y, self.simulate(r), k) / spread))
+        spread = np.std(pooled, axis=0)
+        errors = [nrmse(r.y, self.simulate(r), k, spread) for r, k in zip(given, first, strict=True)]
         return float(np.mean(errors))
 
     def matched(self, recording: Recording) -> Recording:

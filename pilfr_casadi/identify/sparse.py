@@ -26,7 +26,7 @@ from ..models import LAYER, PILFR, PrandtlIshlinskii
 from ..optimise import Candidate, Status
 from .context import context_of_fit, rms_error
 from .fitting import fit as identify
-from .multistart import DEFAULT_SOLVER, StartSearch, hold_near_density, polish, regrid
+from .multistart import DEFAULT_SOLVER, StartSearch, hold_near_density, polish, regrid_channels
 from .result import DENSITY_PRIOR, Fit
 
 FACTORS = (0.01, 0.1, 1.0, 10.0, 100.0)  # on the strength of priors
@@ -296,7 +296,6 @@ def thin_operators(
         return ()
     smaller, old = replace(structure, element=replace(structure.element, n=n)), fit.model
     z = np.concatenate([fit.signals(r)["z"] for r in recordings])
-    reach = np.max(np.abs(z), axis=0)
     states = [fit.initial_state(r) for r in recordings if r.begins == "estimate"]
     states = [np.concatenate([s[: old.n_x], np.zeros(n * structure.element.channels)]) for s in states]
     fits: list[Fit] = []
@@ -304,11 +303,7 @@ def thin_operators(
         context = context_of_fit(
             replace(fit, structure=smaller), recordings, solver=solver or DEFAULT_SOLVER, **options
         )
-        rows = [
-            regrid(r, w, float(top), extent=extent, spacing=spacing, count=n)
-            for r, w, top in zip(fit.parameters["r"], fit.parameters["w"], reach, strict=True)
-        ]
-        values = {**fit.parameters, "r": np.array([r for r, _ in rows]), "w": np.array([w for _, w in rows])}
+        values = regrid_channels(structure, fit.parameters, z, extent=extent, spacing=spacing, count=n)
         model = smaller.model(old.n_u, old.n_y, values, inputs=old.inputs, outputs=old.outputs)
         model = hold_near_density(model, values, SPREAD)
         problem = context.problem(model, float(np.mean(fit.train_nrmse)))

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -19,11 +19,58 @@ from ..models import Named, Parameter
 from .base import Law, Local, beyond_gap
 
 GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
-PROFILES = {"linear": ("", "_high"), "quadratic": ("", "_mid", "_high"), "exponential": ("",)}  # names of the values
 RATIOS, MOST_RATIO = (0.3, 3.0), 100.0  # tried ratios of an exponential profile, and the largest
 PATTERNS = ((0.5, 1.0, 1.5), (1.5, 1.0, 0.5), (0.5, 1.5, 0.5), (1.5, 0.5, 1.5))  # variations, over the mean
 LEVEL = 0.1  # smallest variation of a strength, over the largest strength; below it the strength is constant
 SPARE = 0.25  # of the variation, the least strength from which a profile starts
+
+
+@dataclass(frozen=True)
+class Profile:
+    """How a strength varies over the range of a signal, from `low` to `high`.
+
+    Attributes
+    ----------
+    ends : tuple of str
+        The names of a strength's values are its own name with these ends.
+    how, course : str
+        The variation in words, and in an equation that names the signal.
+    weights_at : callable
+        Weight of each value at a share of the range, from the values of the law's parameters.
+    """
+
+    ends: tuple[str, ...]
+    how: str
+    course: str
+    weights_at: Callable[[Any, Mapping[str, Any]], list[Any]]
+
+    def weights(self, signal: Any, values: Any) -> list[Any]:
+        """Compute the weights of a strength's values, such as `F_c` and `F_c_high`, at a signal."""
+        return self.weights_at((signal - values["low"]) / (values["high"] - values["low"]), values)
+
+
+def _parabola(share: Any, values: Mapping[str, Any]) -> list[Any]:
+    """Weigh the values at both ends and in the middle; outside the range along the tangents there."""
+    number = isinstance(share, (float, np.ndarray))
+    inside = np.clip(share, 0, 1) if number else ca.fmin(ca.fmax(share, 0), 1)
+    beyond = share - inside
+    return [
+        (1 - inside) * (1 - 2 * inside) + beyond * (4 * inside - 3),
+        4 * inside * (1 - inside) + beyond * (4 - 8 * inside),
+        inside * (2 * inside - 1) + beyond * (4 * inside - 1),
+    ]
+
+
+PROFILES = {
+    "linear": Profile(("", "_high"), "", "linear in {by}", lambda share, values: [1 - share, share]),
+    "quadratic": Profile(("", "_mid", "_high"), " in a parabola", "a parabola in {by} through three values", _parabola),
+    "exponential": Profile(
+        ("",),
+        " exponentially",
+        "times ratio^(({by} - low)/(high - low))",
+        lambda share, values: [values["ratio"] ** share],
+    ),
+}
 
 
 def scaled(law: type[Law], by: str) -> type[Law]:
@@ -84,22 +131,6 @@ def likely_profiles(law: type[Law]) -> tuple[str, ...]:
     return ("exponential",) if layer else ("quadratic", "linear", "exponential")
 
 
-def profile_weights(profile: str, share: Any, ratio: Any) -> list[Any]:
-    """Compute the weights of a strength's values, such as `F_c` and `F_c_high`, at a share of the signal's range."""
-    if profile == "linear":
-        return [1 - share, share]
-    if profile == "quadratic":
-        number = isinstance(share, (float, np.ndarray))
-        inside = np.clip(share, 0, 1) if number else ca.fmin(ca.fmax(share, 0), 1)
-        beyond = share - inside
-        return [
-            (1 - inside) * (1 - 2 * inside) + beyond * (4 * inside - 3),
-            4 * inside * (1 - inside) + beyond * (4 - 8 * inside),
-            inside * (2 * inside - 1) + beyond * (4 * inside - 1),
-        ]
-    return [ratio**share]
-
-
 def behind_gap(law: type[Law]) -> type[Law]:
     """Make a law that acts beyond a gap only: on `z' = z - clip(z, -g, g)` and its rate, such as a stop that rubs.
 
@@ -141,12 +172,10 @@ def _not_there(by: str, local: Local) -> str:
 
 def strengths_over(law: Law, values: Mapping[str, Any], signal: np.ndarray) -> dict[str, np.ndarray]:
     """Compute each strength (G,), or (G, n) of n operators, of a law that a signal (G,) varies; see `scheduled`."""
-    share = (signal - values["low"]) / (values["high"] - values["low"])
-    weights = profile_weights(law.profile, share, values.get("ratio", 1.0))
+    profile = PROFILES[law.profile]
+    weights = profile.weights(signal, values)
     return {
-        own: sum(
-            np.multiply.outer(w, values[f"{own}{end}"]) for w, end in zip(weights, PROFILES[law.profile], strict=True)
-        )
+        own: sum(np.multiply.outer(w, values[f"{own}{end}"]) for w, end in zip(weights, profile.ends, strict=True))
         for own in constant(type(law)).strength
     }
 
@@ -189,35 +218,30 @@ def _levels(found: Law, own: str, by: str, limits: Mapping[str, float]) -> np.nd
 
 
 @functools.cache
-def _scheduled(base: Any, by: str, profile: str) -> Any:
-    ends = {own: [f"{own}{end}" for end in PROFILES[profile]] for own in base.strength}
-    further = {ends[own][k]: base.units[own] for k in range(1, len(PROFILES[profile])) for own in base.strength}
-    shape = {"ratio": ""} if profile == "exponential" else {}
+def _scheduled(base: Any, by: str, name: str) -> Any:
+    varies = PROFILES[name]
+    ends = {own: [f"{own}{end}" for end in varies.ends] for own in base.strength}
+    further = {ends[own][k]: base.units[own] for k in range(1, len(varies.ends)) for own in base.strength}
+    shape = {"ratio": ""} if name == "exponential" else {}
     unit = {"z": "z", "t": "s"}.get(by, f"[{by}]")
     words = {"z": "the local coordinate", "t": "time"}.get(by, by)
-    how = {"linear": "", "quadratic": " in a parabola", "exponential": " exponentially"}[profile]
-    course = {
-        "linear": f"linear in {by}",
-        "quadratic": f"a parabola in {by} through three values",
-        "exponential": f"times ratio^(({by} - low)/(high - low))",
-    }[profile]
     read = [*inspect.signature(base.step if base.memory else base.force).parameters]
 
     def strengths(p: Any, u: Any, z: Any) -> dict[str, Any]:
         """Parameters of the law at a value of the signal."""
         signal = z if by == "z" else u[by]
-        weights = profile_weights(profile, (signal - p["low"]) / (p["high"] - p["low"]), p["ratio"] if shape else 1.0)
+        weights = varies.weights(signal, p)
         own = {name: p[name] for name in base.units}
-        return own | {k: sum(w * p[name] for w, name in zip(weights, names, strict=True)) for k, names in ends.items()}
+        return own | {k: sum(w * p[v] for w, v in zip(weights, names, strict=True)) for k, names in ends.items()}
 
     class Scheduled(base):
-        form = f"{base.form}, scheduled{how} by {by}".removeprefix(", ")
-        equation = f"{base.equation}  with {', '.join(base.strength)} {course}"
-        sentence = f"{base.sentence}; its strength varies{how} with {words}"
+        form = f"{base.form}, scheduled{varies.how} by {by}".removeprefix(", ")
+        equation = f"{base.equation}  with {', '.join(base.strength)} {varies.course.format(by=by)}"
+        sentence = f"{base.sentence}; its strength varies{varies.how} with {words}"
         units = {**base.units, **further, **shape, "low": unit, "high": unit}
         strength = (*base.strength, *further)
         places = ("parallel",)
-        scheduled_by = by
+        scheduled_by, profile = by, name
 
         def why_not(self, local: Local) -> str:
             """Say why the data carries no information on this law; empty if it does."""
@@ -248,12 +272,6 @@ def _scheduled(base: Any, by: str, profile: str) -> Any:
                 for more in ({name: value for name in shape} for value in (RATIOS if shape else (1.0,))):
                     yield {**own, **more, "low": float(signal.min()), "high": float(signal.max())}
 
-        def weights(self, local: Local, given: Mapping[str, Any]) -> list[np.ndarray]:
-            """Weights (M,) of a strength's values along signals, for a shape of the law."""
-            signal = self.schedule(local)
-            share = (signal - signal.min()) / np.ptp(signal)
-            return [np.ravel(w) for w in profile_weights(profile, share, given.get("ratio", 1.0))]
-
         def doubtful(self, values: Mapping[str, Any]) -> bool:
             """Tell whether the law hardly acts, or its strength hardly varies."""
             middle = (values["low"] + values["high"]) / 2
@@ -267,7 +285,7 @@ def _scheduled(base: Any, by: str, profile: str) -> Any:
             signal = cls().schedule(local)
             limits = {"low": float(signal.min()), "high": float(signal.max())}
             known = by in (found.scheduled_by, found.scaled_by)
-            for pattern in ((1.0, 1.0, 1.0),) if known else PATTERNS[: None if profile == "quadratic" else 2]:
+            for pattern in ((1.0, 1.0, 1.0),) if known else PATTERNS[: None if name == "quadratic" else 2]:
                 values: dict[str, Any] = {k: v for k, v in found.values.items() if k in base.units} | limits
                 for own, names in ends.items():
                     low, middle, high = np.multiply(pattern, _levels(found, own, by, limits).T).T
@@ -291,11 +309,10 @@ def _scheduled(base: Any, by: str, profile: str) -> Any:
                 have = {"z": z, "dz": dz, "p": Named("parameter", strengths(p, u, z))}
                 return super().force(**{k: have[k] for k in read if k in have})
 
-    Scheduled.profile = profile
     return _name(
         Scheduled,
-        f"{base.__name__}ScheduledBy_{by}{profile.capitalize() if how else ''}",
-        f"{base.__doc__}\n\n    Its strength varies{how} with {words}.",
+        f"{base.__name__}ScheduledBy_{by}{name.capitalize() if varies.how else ''}",
+        f"{base.__doc__}\n\n    Its strength varies{varies.how} with {words}.",
     )
 
 

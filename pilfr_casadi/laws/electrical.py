@@ -11,7 +11,15 @@ from .base import Law, Local
 SHARPEST_KNEE = 0.005  # smallest width of a knee that is tried, over the largest |z|
 
 
-class Diode(Law):
+class _Electrical(Law):
+    """A law that is tried at electrical ports alone; its local coordinate is a current."""
+
+    domains = ("electrical",)
+    special = True
+    across = "A"
+
+
+class Diode(_Electrical):
     """A junction that conducts in one direction, with its series resistance 1 / G (Shockley 1949)."""
 
     id = "static_curve"
@@ -20,8 +28,6 @@ class Diode(Law):
     source = "Sze & Ng (2007), Physics of Semiconductor Devices, sec. 2.3; Enz et al. (1995)"
     sentence = "a diode: a current that grows exponentially with the voltage, from about V_0 on in proportion to it"
     units = {"G": "w/z", "V_0": "z", "V_T": "z"}
-    domains = ("electrical",)
-    special = True
     across = "V"
     restoring = True  # it takes power
     starts = {"V_0": ("reach", 0.1, 0.2, 0.35, 0.6, 0.9), "V_T": ("reach", 0.02, 0.08)}
@@ -67,7 +73,7 @@ def _rise(x: Any) -> Any:
     return ca.fmax(x, 0) + ca.log1p(ca.exp(-ca.fabs(x)))
 
 
-class Overpotential(Law):
+class Overpotential(_Electrical):
     """Voltage that a reaction at an electrode takes, or a junction: its inverse is the exponential (Butler-Volmer)."""
 
     id = "static_curve"
@@ -76,9 +82,6 @@ class Overpotential(Law):
     source = "Newman & Thomas-Alyea (2004), Electrochemical Systems, ch. 8"
     sentence = "an overpotential: a voltage that grows with the logarithm of a large current"
     units = {"V_a": "w", "I_0": "z"}
-    domains = ("electrical",)
-    special = True
-    across = "A"
     restoring = True
     starts = {"I_0": ("reach", 0.003, 0.02, 0.1, 0.4)}
     ranges = {"I_0": ("reach", 1e-4, 2.0)}
@@ -87,7 +90,7 @@ class Overpotential(Law):
         return p.V_a * ca.asinh(z / p.I_0)
 
 
-class VoltageDrop(Law):
+class VoltageDrop(_Electrical):
     """Voltage that a contact or a switch takes at any current: of brushes, or by the dead time of a bridge."""
 
     id = "static_curve"
@@ -96,9 +99,6 @@ class VoltageDrop(Law):
     source = "Choi & Sul (1996), IEEE Trans. Power Electron. 11(2)"
     sentence = "a voltage drop that opposes the current and hardly grows with it, as of brushes or a bridge's dead time"
     units = {"V_d": "w", "I_0": "z"}
-    domains = ("electrical",)
-    special = True
-    across = "A"
     restoring = True
     two_sided = True
     starts = {"I_0": ("reach", 0.01, 0.05, 0.2)}
@@ -108,7 +108,7 @@ class VoltageDrop(Law):
         return p.V_d * ca.tanh(z / p.I_0)
 
 
-class SaturatingInductance(Law):
+class SaturatingInductance(_Electrical):
     """A coil whose core saturates: its inductance falls with the current."""
 
     id = "saturating_inductance"
@@ -116,9 +116,6 @@ class SaturatingInductance(Law):
     source = "Chua & Stromsmoe (1970), IEEE Trans. Circuit Theory 17(4); Boldea & Nasar (2010)"
     sentence = "a saturating inductance: the current changes faster as it grows, because the core carries no more flux"
     units = {"L_s": "w*s/z", "I_s": "z"}
-    domains = ("electrical",)
-    special = True
-    across = "A"
     starts = {"I_s": ("reach", 0.2, 0.5, 1.0, 2.0)}
     ranges = {"I_s": ("reach", 0.05, 5.0), "L_s": ("", 0.0, float("inf"))}
 

@@ -13,6 +13,7 @@ import numpy as np
 from .._base import one_at_a_time
 from ..models import Named, accumulate_steps, map_points
 from .base import Law, Local
+from .composed import PROFILES
 
 
 def count_columns(law: Law) -> int:
@@ -35,7 +36,8 @@ def unit_forces(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.
         bare = unit_forces(kind.__base__(), local, [{k: s[k] for k in kind.__base__.units if k in s} for s in shapes])
         if law.scaled_by:
             return np.asarray(bare * local.inputs[law.scaled_by][:, None, None])
-        weights = np.array([kind().weights(local, shape) for shape in shapes])
+        signal = law.schedule(local)
+        weights = np.array([PROFILES[kind.profile].weights(signal, shape) for shape in shapes])
         return np.concatenate([bare * of_value.T[:, :, None] for of_value in np.swapaxes(weights, 0, 1)], axis=2)
     step = _all_lanes(kind, len(shapes), local.dt if law.shifts else 0.0)
     p = law.at(shapes[0]).parameters()

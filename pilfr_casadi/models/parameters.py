@@ -38,9 +38,9 @@ def check_size(owner: str, count: int) -> None:
         )
 
 
-def within_a_factor(value: float, factor: float = 10.0) -> tuple[float, float]:
+def within_a_factor(value: float) -> tuple[float, float]:
     """Return usual bounds of a value of which nothing is known but its size: a factor of ten either way."""
-    low, high = sorted((value / factor, value * factor))
+    low, high = sorted((value / 10, value * 10))
     return low, high
 
 

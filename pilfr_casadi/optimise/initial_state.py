@@ -61,11 +61,15 @@ def _deviations(recording: Recording) -> np.ndarray:
     return np.where(spread > 0, spread, np.max(spread) or 1.0)
 
 
+def _state_problem(model: Model, engine: Engine, recording: Recording) -> Problem:
+    """Make the problem whose only variables are the initial state; the outputs are over their deviations."""
+    fixed = model.parameters.change(**{k: {"fixed": True, "prior": None} for k in model.parameters})
+    return Problem(model.with_parameters(fixed), recording, engine=engine, scale=_deviations(recording))
+
+
 def _slope_by_state(model: Model, engine: Engine, recording: Recording) -> np.ndarray:
     """Compute the slope of the outputs, over their deviations, by the initial state in a run from rest, (M n_y, n)."""
-    fixed = model.parameters.change(**{k: {"fixed": True, "prior": None} for k in model.parameters})
-    whole = recording.with_(skip=0, initial="estimate", period=None)
-    problem = Problem(model.with_parameters(fixed), whole, engine=engine, scale=_deviations(recording))
+    problem = _state_problem(model, engine, recording.with_(skip=0, initial="estimate", period=None))
     try:
         with np.errstate(all="ignore"):
             return np.asarray(problem.jacobian(problem.start))
@@ -95,19 +99,15 @@ def estimate_initial_state(
     if recording.begins != "estimate" or not n:
         return state
     head = recording.slice(0, max(min(len(recording), samples or samples_for_state(model)), 2)).with_(skip=0)
-    spread = _deviations(head)
-    fixed = model.parameters.change(**{k: {"fixed": True, "prior": None} for k in model.parameters})
-    problem, solver = (
-        Problem(model.with_parameters(fixed), head, engine=engine, scale=spread),
-        GaussNewton(max_iterations=50),
-    )
+    problem, solver = _state_problem(model, engine, head), GaussNewton(max_iterations=50)
     square = state_precision(engine, model.drive(recording), values, model.n_x, model.n_s) if state_prior else None
     if square is None:
         found = [solver.solve(problem, start) for start in (problem.start, *starts)]
         return min(found, key=lambda solution: solution.cost).theta
     state, wider = problem.start, 1.0
     for _ in range(STATE_ROUNDS):  # free decay from a large state exceeds the states of forced motion
-        problem.penalties = Penalties(fixed, {}, 1.0, problem.residuals, problem.size, [(0, square / wider)])
+        prior = [(0, square / wider)]
+        problem.penalties = Penalties(problem.model.parameters, {}, 1.0, problem.residuals, problem.size, prior)
         state = solver.solve(problem, state).theta
         size = float(state @ square @ state) / STATE_NOISE**2 / n
         if size <= LARGEST_STATE * wider:

@@ -21,7 +21,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, numbers
-from ..data import Recording, as_recordings
+from ..data import Recording, as_recordings, nrmse
 from ..engine import Engine, VirtualMachine, make_engine
 from ..models import Model, Neighbours, ParameterSet, check_size
 from .constraints import Constraint, Rows, check_gain
@@ -36,6 +36,7 @@ STATE_SAMPLES = 256  # states of a run from which second moments are computed
 STILL_STATE = 1e-3  # least deviation of a state, relative to the largest of its kind
 LEAST_CORRELATION_VARIANCE = 1e-6  # added to the diagonal of the correlation matrix
 MOST_WRITTEN_PERIODS = 50  # most periods that `to_nlp` writes out before a recording in steady state
+AT_LIMIT = 1e-7  # distance from a limit, in units of a constraint, up to which the constraint is active
 STRETCH_ENTRIES = 2_000_000  # entries of the Jacobian kept in memory at a time (16 MB)
 
 
@@ -430,10 +431,10 @@ class Problem:
         change = np.abs(self.constraint_jacobian(theta)) * np.where(size > 0, size, still)
         return self.rows.units_from(np.max(change, axis=1, initial=0.0))
 
-    def active_constraints(self, theta: Array, tolerance: float = 1e-7) -> Array:
-        """Tell which general constraints are at or beyond a limit, within `tolerance` of their unit: (n_g,), bool."""
+    def active_constraints(self, theta: Array) -> Array:
+        """Tell which general constraints are at or beyond a limit, within `AT_LIMIT` of their unit: (n_g,), bool."""
         g, unit = self.constraint(theta), self.constraint_units(theta)
-        slack = tolerance * np.where(unit > 0, unit, 1.0)
+        slack = AT_LIMIT * np.where(unit > 0, unit, 1.0)
         return (g >= self.g_upper - slack) | (g <= self.g_lower + slack)
 
     def nrmse(self, theta: Array) -> list[float]:
@@ -441,14 +442,8 @@ class Problem:
 
         An output that rests in a recording is scaled by its deviation over all recordings.
         """
-        out = []
-        for r, y in zip(self.recordings, self.simulate(theta), strict=True):
-            measured = r.y[r.skip :]
-            error, spread = y[r.skip :] - measured, np.std(measured, axis=0)
-            rests = spread <= 1e-14 * np.max(np.abs(measured), axis=0)
-            size = np.where(rests, self.scale, spread)
-            out.append(float(np.mean(np.sqrt(np.mean(error**2, axis=0)) / size)))
-        return out
+        pairs = zip(self.recordings, self.simulate(theta), strict=True)
+        return [nrmse(r.y, y, r.skip, self.scale) for r, y in pairs]
 
     def to_nlp(self, periods: int | None = None) -> Horizon:
         """Write the problem as CasADi expressions over the whole horizon, to which you can add costs and constraints.

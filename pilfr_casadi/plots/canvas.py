@@ -187,7 +187,7 @@ def noise_band(ax: Axes, deviation: float, label: str) -> None:
         ax.axhline(side, color=GREEN, linestyle="--", linewidth=1.3, label=label if side > 0 else None)
 
 
-def noise_line(ax: Axes, level: float, label: str = "noise floor") -> None:
+def noise_line(ax: Axes, level: float) -> None:
     """Draw the noise level, if it is known, as a dashed line."""
     if level > 0:
-        ax.axhline(level, color=GREEN, linestyle="--", linewidth=1.4, label=label)
+        ax.axhline(level, color=GREEN, linestyle="--", linewidth=1.4, label="noise floor")

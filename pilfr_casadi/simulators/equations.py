@@ -24,7 +24,7 @@ from .domains import DOMAINS, MECHANICAL, UNKNOWN, common_domain, infer_domain, 
 
 Expression = Callable[..., Any]
 EQUAL_DEPTH = 5  # to which two expressions are compared
-SIGN_POINTS = 3  # at which the sign of a term is looked at
+COMPARED_POINTS = 3  # random points at which expressions are compared
 BUILT_IN = ("actuator:", "sensor:", "equation:")  # prefixes of the ports that need no declaration
 
 
@@ -215,16 +215,12 @@ class Equations:
             if not callable(getattr(self, kind)):
                 raise InputError(f"The simulator's {kind} are {getattr(self, kind)!r}; give a function of x, u and p.")
         for kind in ("states", "inputs"):
-            object.__setattr__(self, kind, _distinct_names(getattr(self, kind), kind))
+            object.__setattr__(self, kind, distinct_names(getattr(self, kind), kind))
         if self.hold not in (None, "zero", "linear"):
             raise InputError(f"hold = {self.hold!r} was given; use 'zero', 'linear' or None.")
-        for kind, wanted in (("parameters", "{name: Parameter(value, ...)}"), ("units", "{name: unit}")):
-            if not isinstance(getattr(self, kind), Mapping):
-                raise InputError(f"The simulator's {kind} are {getattr(self, kind)!r}; give {wanted}.")
-        for name, given in self.parameters.items():
-            if not isinstance(given, Parameter):
-                raise InputError(f"The simulator's parameter {name!r} is {given!r}; give Parameter(value, ...).")
-        object.__setattr__(self, "parameters", ParameterSet(dict(self.parameters)))
+        if not isinstance(self.units, Mapping):
+            raise InputError(f"The simulator's units are {self.units!r}; give {{name: unit}}.")
+        object.__setattr__(self, "parameters", parameter_set(self.parameters))
         object.__setattr__(self, "ports", _checked_ports(self.ports))
         x, u, p, t = self.symbols()
         derivatives = ca.vertsplit(self.derivatives(x, u, p, t)) if self.states else ()
@@ -336,9 +332,8 @@ class Equations:
         both = ca.Function("both", [known], [f, y])
         if any(both.instruction_id(k) == ca.OP_CALL for k in range(both.n_instructions())):
             return out  # the user's program, which may fail at random points
-        points = np.random.default_rng(0).uniform(0.5, 1.5, (SIGN_POINTS, known.numel()))
+        rates, shown = _at_random_points(both)
         with np.errstate(all="ignore"):
-            rates, shown = (np.array([both(v)[i].full().ravel() for v in points]) for i in range(2))
             ratios = shown[:, :, None] / rates[:, None, :]
         same = np.all(np.isclose(ratios, ratios[0], rtol=1e-9, atol=0.0), axis=0) & (ratios[0] > 0)
         rich = np.array([ca.jacobian(f[i], moving).nnz() > 1 for i in range(n_x)])
@@ -400,10 +395,7 @@ class Equations:
         held = dict(zip(self.states, ca.vertsplit(self.derivatives(x, u, p, t)), strict=True)) if self.states else {}
         whole = held[name] if name in held else self.measured(x, u, p, t)[name]
         slopes = ca.Function("slopes", [known], [ca.jacobian(v, known) for v in (whole, factor * term, factor)])
-        values = np.random.default_rng(0).uniform(0.5, 1.5, (SIGN_POINTS, known.numel()))
-        all_of, own, scale = (
-            np.array([s.full().ravel() for s in column]) for column in zip(*(slopes(v) for v in values), strict=True)
-        )
+        all_of, own, scale = _at_random_points(slopes)
         moving = np.any(own != 0, axis=0) & ~np.any(scale != 0, axis=0)
         same, opposite = (np.any(np.all(np.isclose(all_of, sign * own, atol=0.0), axis=0) & moving) for sign in (1, -1))
         if opposite and not same:
@@ -504,6 +496,14 @@ def _series(kind: str, name: str, across: Expression, units: Mapping[str, str], 
     return Port(f"{kind}:{name}", {}, across, None, unit, unit, series=True, domain=domain)
 
 
+def _at_random_points(function: ca.Function) -> list[np.ndarray]:
+    """Evaluate a function of one vector at random points; an array (points, entries) for each of its results."""
+    points = np.random.default_rng(0).uniform(0.5, 1.5, (COMPARED_POINTS, function.numel_in(0)))
+    with np.errstate(all="ignore"):
+        results = zip(*(function.call([point]) for point in points), strict=True)
+        return [np.array([value.full().ravel() for value in column]) for column in results]
+
+
 def _check_expressions(found: Mapping[str, Any], known: list[Any]) -> None:
     """Refuse foreign symbols, and the NaN that `math.sin(symbol)` gives without an error."""
     names, expressions = list(found), list(found.values())
@@ -542,7 +542,18 @@ def _row(found: Mapping[str, Any], names: tuple[str, ...], where: str, kind: str
     return [_scalar(found[name], f"{kind} of {name!r} in the {where}") for name in names]
 
 
-def _distinct_names(given: Any, kind: str) -> tuple[str, ...]:
+def parameter_set(given: Any) -> ParameterSet:
+    """Check that parameters by name are given, and lay them out."""
+    if not isinstance(given, Mapping):
+        raise InputError(f"The simulator's parameters are {given!r}; give {{name: Parameter(value, ...)}}.")
+    for name, value in given.items():
+        if not isinstance(value, Parameter):
+            raise InputError(f"The simulator's parameter {name!r} is {value!r}; give Parameter(value, ...).")
+    return ParameterSet(dict(given))
+
+
+def distinct_names(given: Any, kind: str) -> tuple[str, ...]:
+    """Return one name or several as a tuple; refuse what are no names, and a name given twice."""
     try:
         names = (given,) if isinstance(given, str) else tuple(given)
     except TypeError:

@@ -25,6 +25,7 @@ import numpy as np
 from .._base import InputError, in_words, listed
 from ..models import Named, Parameter, ParameterSet
 from .black_box import BlackBox, Numeric, nominal_sizes
+from .equations import distinct_names, parameter_set
 from .simulator import Simulator
 from .symbols import NotFollowed, expression, symbols
 from .tracing import Trace, accept_symbols, follow
@@ -95,7 +96,10 @@ def from_function(
     >>> simulator.output_names
     ('pos',)
     """
-    names = _Names(_tuple(states, "states"), _tuple(inputs, "inputs"), _parameter_set(parameters))
+    own = distinct_names(states, "states"), distinct_names(inputs, "inputs"), parameter_set(parameters or {})
+    if not own[0]:
+        raise InputError("No states were given; give their names, such as ('pos', 'vel').")
+    names = _Names(*own)
     dynamics = _made(function, "derivatives", names, names.states, numeric)
     if not callable(outputs):
         measured: Any = _MeasuredStates(_measured(outputs, names.states))
@@ -104,7 +108,6 @@ def from_function(
     for made in (dynamics, measured):
         if isinstance(made, BlackBox) and not (discrete and made is dynamics):
             made.find_equal_states()
-    own = (names.states, names.inputs, names.parameters)
     return Simulator(dynamics, measured, *own, ports, hold, discrete, units=units or {})
 
 
@@ -344,27 +347,6 @@ def _check_arguments(function: Any, called: str, kind: str) -> None:
         inspect.signature(getattr(function, "py_func", function)).bind(*ARGUMENTS)
     except (TypeError, ValueError):
         raise InputError(f"{called} cannot be called as {called}(t, x, u, p); give a function of these four.") from None
-
-
-def _tuple(given: Any, kind: str) -> tuple[str, ...]:
-    try:
-        names = (given,) if isinstance(given, str) else tuple(given)
-    except TypeError:
-        names = (None,)
-    if not all(isinstance(n, str) and n for n in names) or (kind == "states" and not names):
-        raise InputError(f"The {kind} are {given!r}; give their names, such as ('pos', 'vel').")
-    if len(set(names)) != len(names):
-        raise InputError(f"The {kind} {', '.join(names)} are not unique; name each once.")
-    return names
-
-
-def _parameter_set(given: Mapping[str, Parameter] | None) -> ParameterSet:
-    if not isinstance(given, Mapping | None):
-        raise InputError(f"The parameters are {given!r}; give {{name: Parameter(value, ...)}}.")
-    for name, value in (given or {}).items():
-        if not isinstance(value, Parameter):
-            raise InputError(f"The parameter {name!r} is {value!r}; give Parameter(value, ...).")
-    return ParameterSet(dict(given or {}))
 
 
 def _measured(given: Any, states: tuple[str, ...]) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """How a search is begun anew, with the other hold or without a shift, and what an interrupt on the way leaves."""
 
+import signal
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,131 +9,103 @@ from diagnosis_rig import OFF, recordings, rig
 from test_timing import shaken, spring
 
 import pilfr_casadi as pilfr
-from pilfr_casadi import InputError, laws
-from pilfr_casadi._base import Stages
-from pilfr_casadi.diagnose import pipeline
-from pilfr_casadi.diagnose.floor import Floor
-from pilfr_casadi.diagnose.hypotheses import UntilInterrupted
-from pilfr_casadi.diagnose.preparation import Prepared
-from pilfr_casadi.diagnose.verdict import Verdict
+from pilfr_casadi import Parameter, Port, Recording, Simulator, laws
 
 
-def a_request(hold=None):
-    """A diagnosis of two effects, of nothing in particular."""
-    return pipeline.Request(
-        SimpleNamespace(hold=None), (), (), hold, "auto", 1, 2, 0.0, np.inf, Stages(lambda *_: None), "simulation"
-    )
+def diagnosed(simulator, r, tried=(), press="", after="", **options):
+    """Diagnose; press Ctrl-C when the stage `press` begins, of several the first one after `after`.
+
+    Also returns the stages in their order.
+    """
+    stages, pressed = [], []
+
+    def note(stage, done, total, best):
+        if done == 0:
+            stages.append(stage)
+            if stage == press and after in ("", *stages[:-1]) and not pressed:
+                pressed.append(stage)
+                signal.raise_signal(signal.SIGINT)
+
+    found = pilfr.diagnose(simulator, r, laws=tried, workers=1, progress=note, **options)
+    assert found.interrupted is bool(press)
+    return found, stages
 
 
 @pytest.mark.parametrize("said", [None, "zero"])
 def test_how_inputs_are_held_is_asked_of_the_data_unless_it_is_said(said):
-    found = pilfr.diagnose(spring(), shaken("linear", m=1200), hold=said, laws=())
+    found = pilfr.diagnose(spring(), shaken("linear", m=500), hold=said, laws=())
     assert found.hold == (said or "linear")
     assert (found.errors["train"]["after"] < 1e-3) is (said is None)
 
 
-@pytest.mark.parametrize(("nearer", "interrupted"), [(True, False), (False, False), (True, True)])
-def test_what_seems_early_beside_something_unexplained_is_searched_as_it_is(monkeypatch, nearer, interrupted):
-    early_or_not = []
-    gates = (SimpleNamespace(finding="alignment", value=-0.1),)
-
-    class Unsure:
-        def __init__(self, *given, **more):
-            self.interrupted, self.out_of_time = interrupted, False
-            whole = 1.0 if early_or_not[-1] else 0.1 if nearer else 0.9
-            self.best = SimpleNamespace(mean_square=whole)
-
-        def run(self, effects):
-            return self
-
-        def can_improve(self, trial):
-            return True
-
-        def until_interrupted(self):
-            return UntilInterrupted(self)
-
-    def prepare(*given, early, say):
-        early_or_not.append(early)
-        bench = SimpleNamespace(scale=np.ones(1))
-        floor = Floor(np.zeros(1), "periods")
-        return Prepared(bench, None, 0.0, gates if early else (), floor)
-
-    monkeypatch.setattr(pipeline, "prepare", prepare)
-    monkeypatch.setattr(pipeline, "Search", Unsure)
-    ready, _ = pipeline._search(a_request())
-    assert early_or_not == ([True] if interrupted else [True, False])
-    assert ready.gates == (() if nearer and not interrupted else gates)
+def stiffened(k_3, m, **options):
+    """A recording of the spring, which stiffens, with interpolated inputs unless another hold is given."""
+    return shaken(options.pop("hold", "linear"), m=m, law=laws.CubicStiffness(values={"k_3": k_3}), **options)
 
 
-class Searched:
-    """A finished search, as far as the choice of a hold reads it."""
-
-    def __init__(self, whole, interrupted=False, fits=3):
-        self.best, self.interrupted, self.out_of_time = SimpleNamespace(mean_square=whole), interrupted, False
-        self.bench = SimpleNamespace(with_other_hold=lambda: SimpleNamespace(hold="linear"))
-        self.memo = dict.fromkeys(range(fits))
-
-    def other_hold_fits_better(self):
-        return True
-
-    def until_interrupted(self):
-        return UntilInterrupted(self)
-
-    def resume(self, effects):
-        return self
+@pytest.mark.slow
+@pytest.mark.parametrize("press", ["", "other hold: checks and refit"], ids=["taken", "interrupted"])
+def test_a_law_shows_that_the_other_hold_is_nearer(press):
+    """Beside the error of the refit, that of the hold hardly counts."""
+    found, stages = diagnosed(spring(), stiffened(1e6, 400), (laws.CubicStiffness,), press, effects=1)
+    assert stages[0] == "checks and refit" and "other hold: checks and refit" in stages
+    assert found.hold == ("zero" if press else "linear")
+    assert [g.finding for g in found.gates] == ([] if press else ["hold"])
+    assert [e.law for e in found.effects] == ["cubic_stiffness"]
+    assert (found.errors["train"]["after"] < 0.01) is not bool(press)
 
 
-@pytest.mark.parametrize(
-    ("again", "taken"),
-    [
-        (Searched(0.5), True),
-        (Searched(1.5), False),
-        (Searched(0.5, interrupted=True, fits=1), False),
-        (InputError("it cannot be run so"), False),
-    ],
-)
-def test_the_search_with_the_other_hold_is_taken_where_it_comes_nearer(monkeypatch, again, taken):
-    first, ready = Searched(1.0), SimpleNamespace(gates=())
-
-    def searched(one):
-        if one.hold is None:
-            return ready, first
-        if isinstance(again, InputError):
-            raise again
-        return SimpleNamespace(gates=()), again
-
-    monkeypatch.setattr(pipeline, "stated_hold", lambda *given: given[2])
-    monkeypatch.setattr(pipeline, "_search", searched)
-    monkeypatch.setattr(pipeline, "hold_note", lambda *given: given[1])
-    monkeypatch.setattr(pipeline, "replace", lambda of, **more: SimpleNamespace(**{**vars(of), **more}))
-    prepared, search = pipeline._search_both_holds(a_request())
-    assert search is (again if taken else first)
-    assert prepared.gates == (("linear",) if taken else ())
-    assert search.interrupted is getattr(again, "interrupted", False)
+def leak(a=1.0):
+    """A tank with a pinned outlet, whose smaller time constant looks like an early output."""
+    return Simulator(
+        lambda x, u, p: {"h": p.gain * u.q - p.a * x.h},
+        lambda x: {"level": x.h},
+        ("h",),
+        ("q",),
+        {"a": Parameter(a, fixed=True), "gain": Parameter(1.0, bounds=(0.1, 10))},
+        Port("outlet", {"h": -1.0}, lambda x: x.h),
+    )
 
 
-@pytest.mark.parametrize("unfinished", [False, True])
-def test_an_answer_that_is_there_outlives_an_interrupt_of_what_adds_to_it(monkeypatch, unfinished):
-    def interrupted(search):
-        search.interrupted = True
-        return ()
+@pytest.fixture(scope="module")
+def leaking():
+    """A recording of the tank with a larger outlet, at frequencies near to each other."""
+    rng, t = np.random.default_rng(0), 0.05 * np.arange(160)
+    u = sum(np.cos(2 * np.pi * f * t + rng.uniform(0, 6.28)) for f in np.linspace(0.2, 0.5, 7))
+    blank = Recording(u, u, 0.05, ("q",), ("level",), initial="zero", hold="zero")
+    y = leak(3.0).simulate(blank)
+    return blank.with_(y=y + 1e-3 * np.std(y) * rng.standard_normal(y.shape), initial="estimate")
 
-    best = SimpleNamespace(fitted=None, mean_square=1.0)
-    search = SimpleNamespace(interrupted=unfinished, out_of_time=False, past_deadline=False, bench=None, root=best)
-    answer = SimpleNamespace(best=best, sure=0.0, effects=())
-    monkeypatch.setattr(pipeline, "posterior", lambda search: answer)
-    monkeypatch.setattr(pipeline, "named_correction", lambda *given: None)
-    monkeypatch.setattr(pipeline, "tones", lambda *given: ())
-    monkeypatch.setattr(pipeline, "judge", lambda *given: Verdict("unexplained", "Something is missing."))
-    monkeypatch.setattr(pipeline, "find_pinned_parameters", lambda *given: None)
-    monkeypatch.setattr(pipeline, "clipped_input", lambda *given: None)
-    monkeypatch.setattr(pipeline, "mean_nrmse", lambda *given: 0.5)
-    monkeypatch.setattr(pipeline, "find_undeclared_port", interrupted)
-    monkeypatch.setattr(pipeline, "find_untried_laws", lambda search: ())
-    monkeypatch.setattr(pipeline, "find_varying_values", lambda search: ())
-    found = pipeline.conclude(search, ())
-    assert search.interrupted and found.verdict.kind == "unexplained"
-    assert ("interrupted before" in found.verdict.sentence) == unfinished
+
+@pytest.mark.slow
+def test_what_seems_early_and_is_a_law_is_searched_as_it_is(leaking):
+    found, stages = diagnosed(leak(), leaking, (laws.LinearStiffness,), effects=1, engine="vm")
+    assert stages.count("checks and refit") == 2 and found.gates == ()
+    assert (found.verdict, found.freed) == ("complete", "a")
+    assert found.errors["train"]["after"] < 1.2e-3
+
+
+def test_an_interrupt_of_the_second_search_leaves_the_shift(leaking):
+    found, stages = diagnosed(leak(), leaking, (), "checks and refit", "flexible", effects=0, engine="vm")
+    assert stages.count("checks and refit") == 2
+    assert [(g.channel, g.finding) for g in found.gates] == [("level", "alignment")]
+
+
+@pytest.mark.slow
+def test_a_channel_that_is_early_beside_something_unexplained_stays_shifted():
+    r = stiffened(5e3, 600, hold="zero", early=6)
+    found, stages = diagnosed(spring(), r, (), effects=0, hold="zero")
+    assert stages.count("checks and refit") == 2
+    assert [(g.channel, g.finding, g.value) for g in found.gates] == [("pos, vel", "alignment", -0.12)]
+
+
+@pytest.mark.parametrize(("after", "answered"), [("conclusion", True), ("checks and refit", False)])
+def test_an_answer_that_is_there_outlives_an_interrupt_of_what_adds_to_it(leaking, after, answered):
+    """In the conclusion, other ports are searched where no law at a declared one explains the mismatch."""
+    r = leaking.with_(u=leaking.u[::-1])  # no shift explains it
+    found, _ = diagnosed(leak(), r, (), "screen", after, effects=0, engine="vm")
+    assert found.verdict == "unexplained"
+    assert ("interrupted before" in found.sentence) is not answered
 
 
 def test_two_effects_at_two_ports_are_both_named():

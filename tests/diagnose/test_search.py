@@ -151,11 +151,8 @@ def test_a_law_that_only_led_the_simulator_out_of_a_dead_end_is_no_physics():
 @pytest.fixture
 def stuck_refit(monkeypatch):
     """Recordings that lack nothing, of a simulator whose refit stays in a local minimum."""
-    refit = preparation.refitted
 
-    def stuck(bench, starts=()):
-        if starts:
-            return refit(bench, starts)
+    def stuck(bench):
         return bench.fit(bench.simulator, solver=GaussNewton(max_iterations=1))
 
     monkeypatch.setattr(preparation, "refitted", stuck)

@@ -1,27 +1,28 @@
 """The verdict in words, and offsets beside it."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
+from cart import cart
 from diagnosis_rig import recordings, rig
 
+import pilfr_casadi as pilfr
+from pilfr_casadi import Recording, multisine
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.correction import Correction
 from pilfr_casadi.diagnose.offsets import Offset, without_idle_offsets
-from pilfr_casadi.diagnose.verdict import _describe_vanished, closest_law
-from pilfr_casadi.laws import CoulombFriction
+from pilfr_casadi.laws import CoulombFriction, CubicDamping
 
 
-def test_only_what_is_the_users_own_is_told_to_come_out_as_zero():
-    """An offset that was looked for is none of it."""
-    offset = SimpleNamespace(prefix="actuator:u.", law=SimpleNamespace(id="offset"))
-    drag = SimpleNamespace(prefix="guide.", law=SimpleNamespace(id="coulomb_friction"))
-    own = SimpleNamespace(parameters=dict.fromkeys(("d", "actuator:u.w_0", "guide.F_c")), elements=(offset, drag))
-    before, after = (SimpleNamespace(fitted=SimpleNamespace(values=dict.fromkeys(own.parameters, v))) for v in (1, 0))
-    search = SimpleNamespace(bench=SimpleNamespace(simulator=own), root=before)
-    found = SimpleNamespace(effects=("a law",), best=after)
-    assert _describe_vanished(search, found) == " Beside it, d and guide.F_c come out as zero."
+def test_a_value_of_the_simulator_that_a_law_replaces_is_told_to_come_out_as_zero():
+    """Without the law, the damping has to stand for it."""
+    u = 10 * multisine(200, f_max=3.0, fs=20.0, rng=np.random.default_rng(1))
+    blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
+    true = cart(d=-0.01, d_bounds=(-1, 5)).with_element("ground", CubicDamping().at({"c_3": 0.3}))
+    y = true.simulate(blank)
+    r = blank.with_(y=y + 1e-3 * np.std(y) * np.random.default_rng(2).standard_normal(y.shape))
+    found = pilfr.diagnose(cart(), r, laws=(CubicDamping,), effects=1, workers=1)
+    assert found.parameters["d"]["refit_without"] > 1
+    assert found.sentence == "The simulator leaves out cubic damping at ground. Beside it, d comes out as zero."
 
 
 @pytest.mark.parametrize("offset", [0.0, 3.0])
@@ -41,11 +42,3 @@ def test_a_refit_that_was_compared_with_nothing_is_not_said_to_predict_best():
     shares = {"named": 0.0, "learned": 0.0, "left": 1.0}
     assert "no time left to compare" in Correction((), shares).sentence
     assert "nothing that was tried" in Correction((), shares, before=0.1, after=0.1).sentence
-
-
-def test_the_closest_law_is_the_one_that_promises_most():
-    """A delay that explains nothing may be the likeliest where hardly any sample counts."""
-    cube, delay = (SimpleNamespace(laws=("law",), ms=ms) for ms in (0.5, 1.0))
-    search = SimpleNamespace(memo={0: SimpleNamespace(laws=(), ms=1.1), 1: delay, 2: cube})
-    search.optimistic_evidence = lambda t: -t.ms
-    assert closest_law(search, delay) is cube

@@ -1,7 +1,5 @@
 """Gauge freedoms: tangents, and standard errors checked by Monte Carlo."""
 
-from types import SimpleNamespace
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ from pilfr_casadi.identify import (
     gauge_tangents,
     generators,
     gradient_covariance,
-    snap_to_bounds,
     standard_errors,
     variance,
 )
@@ -341,16 +338,26 @@ def test_bounds_and_fixed_entries_have_no_error():
 
 
 def test_what_hardly_counts_is_not_moved_to_a_bound_where_it_counts():
-    """The slope of a neuron that bends where only a faded transient was: blind where it is, not so at zero."""
+    """The slope of a saturated neuron is nearly blind where it is, and not so at its bound."""
+    parameters = ParameterSet(
+        {
+            "gain": Parameter(1e-12, bounds=(0, 9)),
+            "slope": Parameter(16.0, bounds=(0, np.inf)),
+            "offset": Parameter(3.0),
+        }
+    )
 
-    def normal(theta):
-        return 0.0, np.zeros(3), np.diag([1.0, 1e-40, 1.0]) if theta[1] else np.diag([1.0, 1e-14, 1.0])
+    def step(x, u, w, p):
+        return x, p["gain"] * u + ca.tanh(p["slope"] * u) + p["offset"]
 
-    problem = SimpleNamespace(size=3, lower=np.zeros(3), upper=np.full(3, np.inf), normal=normal)
-    theta = np.array([1e-12, 70.0, 3.0])
-    held = snap_to_bounds(problem, theta, np.array([1.0, 1e-20, 1.0]))
-    np.testing.assert_array_equal(held, [True, False, False])
-    np.testing.assert_array_equal(theta, [0.0, 70.0, 3.0])
+    model = open_model(step, lambda x, u, p: x, parameters, n_x=0, n_u=1, n_w=0)
+    u = np.random.default_rng(0).uniform(1.0, 1.2, (100, 1))
+    y = 4 + 0.01 * np.random.default_rng(1).standard_normal(u.shape)
+    problem = Problem(model, Recording(u=u, y=y, dt=1.0, initial="zero"), engine="vm")
+    errors = standard_errors(problem, problem.start)
+    assert np.isnan(errors["gain"])  # within rounding of its bound
+    assert errors["slope"] > 1e6
+    assert 0 < errors["offset"] < 0.1
 
 
 def test_an_active_constraint_is_projected_out():
