@@ -19,8 +19,8 @@ import numpy as np
 from .._base import InputError, listed
 from ..data import Recording
 from ..laws import display_name
-from ..simulators import UNKNOWN, Placed, states_along
-from .evidence import AT_NOISE_RATIO, FAR_RATIO, NEAR_RATIO, SURE, deviations
+from ..simulators import UNKNOWN, Placed, in_series, states_along
+from .evidence import AT_NOISE_RATIO, BETTER_RATIO, CONTENDING_NATS, FAR_RATIO, NEAR_RATIO, SURE, deviations
 from .gates import (
     CERTAIN_ERRORS,
     CURED_SHARE,
@@ -35,7 +35,7 @@ from .gates import (
 )
 from .search import Search
 from .trials import Trial
-from .verdict import Posterior, posterior
+from .verdict import Posterior, posterior, strained
 from .workbench import FEW, THOROUGH, Fitted, Workbench
 
 # factors on a parameter's start value that are tried if the refit says nothing
@@ -135,18 +135,35 @@ def _describe_pinned(search: Search, names: Sequence[str], found: Fitted, named:
         parts.append(f"{name} = {value:.5g}{unit}, which is {kept} {float(without.values[name]):.4g}{unit}")
     words = " and ".join(f"the {display_name(placed.law.id)} at {placed.port}" for placed in named)
     like = f", no further off than with {words}" if named else ""
-    what, it, its = ("a value", "it", "its") if len(names) == 1 else ("values", "them", "their")
+    what, it, its, given = (
+        ("a value", "it", "its", "value is") if len(names) == 1 else ("values", "them", "their", "values are")
+    )
     return (
         f"Nothing is missing but {what}: with {', and '.join(parts)}, {describe_fall(without.cost, found.cost)}{like}; "
-        f"let {it} go there, or say what takes {its} place."
+        f"free {it}, or widen {its} bounds. If the given {given} right, physics that acts like another is missing."
     )
 
 
-def find_undeclared_port(search: Search) -> Sequence[Gate]:
-    """Note a mismatch that no declared port explains but that has a sure name in the equation of a state."""
+def may_act_elsewhere(search: Search, trial: Trial) -> bool:
+    """Tell whether the laws of a hypothesis may stand for others in an equation where no port is declared.
+
+    Then they drive a parameter to a bound, or they are at an actuator or sensor and leave more than white noise.
+    """
+    if not search.bench.simulator.unreached:
+        return False
+    at_ends = any(in_series(e.port) for e in trial.effects)
+    return strained(search, trial) or (at_ends and trial.mean_square > AT_NOISE_RATIO**2 * search.least_noise2)
+
+
+def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[Sequence[Gate], float]:
+    """Note a mismatch that has a sure name in the equation of a state, and return its odds against `named`.
+
+    `named` is the hypothesis that has a name at declared ports, if there is one.
+    """
+    nothing = (), 0.0
     ports = search.bench.simulator.ports
     if not ports or search.interrupted:
-        return ()
+        return nothing
     open_ = replace(search.bench.simulator, ports=())
     bench = replace(search.bench, simulator=open_)
     try:
@@ -156,18 +173,23 @@ def find_undeclared_port(search: Search) -> Sequence[Gate]:
             other = there.run(1)
             search.interrupted = other.interrupted
     except InputError:
-        return ()
+        return nothing
     if search.interrupted:
-        return ()
+        return nothing
     found = posterior(other)
     if found.sure <= SURE or not found.effects[0].name[0].startswith("equation:"):
-        return ()
+        return nothing
+    if named is not None and not found.best.error < BETTER_RATIO * named.error:
+        return nothing
     state, law = found.effects[0].name[0].removeprefix("equation:"), found.effects[0].name[1]
     sentence = (
-        f"No declared port reaches it: in the equation of {state}, {display_name(law)} explains it (refitted with it, "
-        f"the error is {found.best.error:.3g} of the outputs' deviation). Declare the port that it acts through."
+        f"No declared port {'may ' * bool(named)}reach{'' if named else 'es'} it: in the equation of {state}, "
+        f"{display_name(law)} explains it{' as well' * bool(named)} (refitted with it, the error is "
+        f"{found.best.error:.3g} of the outputs' deviation). Declare the port that it acts through."
     )
-    return (Gate(state, "undeclared", law.replace("_", " "), sentence, corrected=False),)
+    gate = Gate(state, "undeclared", law.replace("_", " "), sentence, corrected=False)
+    ahead = other.evidence(found.best) - search.evidence(named) if named is not None else 0.0
+    return (gate,), float(np.exp(np.clip(ahead, -CONTENDING_NATS, CONTENDING_NATS)))
 
 
 def find_untried_laws(search: Search) -> tuple[Gate, ...]:

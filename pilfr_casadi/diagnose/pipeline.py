@@ -60,7 +60,13 @@ from .evidence import AS_GIVEN_RATIO, SURE
 from .floor import Floor, measured_floor
 from .gates import USELESS_FIT, Gate
 from .offsets import Offset, offset_gates, without_idle_offsets
-from .other_explanations import find_pinned_parameters, find_undeclared_port, find_untried_laws, find_varying_values
+from .other_explanations import (
+    find_pinned_parameters,
+    find_undeclared_port,
+    find_untried_laws,
+    find_varying_values,
+    may_act_elsewhere,
+)
 from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
 from .preparation import CHECKS, Prepared, hold_note, prepare
 from .proof import errors_of, mean_nrmse
@@ -252,6 +258,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     1. Compute the posterior, which gives a verdict.
     2. Check whether a wrong fixed parameter, or a clipped input, explains as much as a law.
     3. Compare named laws with a learned force on held-out data. If the force predicts better, the name is refuted.
+       If it may stand for a law where no port is declared, weigh it against that.
     4. If there is no name, check undeclared ports and varying values, and return the best predictor.
 
     At the time limit, the first half of step 4 is skipped. After Ctrl-C nothing more is fitted: steps 2 to 4 are
@@ -270,11 +277,15 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
         answer = answer.within({(port, law) for port, law, _ in correction.elements}, correction.shares["learned"])
         verdict = judge(search, answer, gates)
         if verdict.kind == "missing-physics":
+            if finished and may_act_elsewhere(search, answer.best):
+                more, odds = find_undeclared_port(search, answer.best)
+                gates, answer = (*gates, *more), answer.against(odds)
+                verdict = judge(search, answer, gates)
             said = f"{verdict.sentence} {correction.sentence}" if correction.learned else verdict.sentence
             zeros = offset_gates(answer.best.laws, answer.best.fitted.values)
             return Conclusion(Verdict(verdict.kind, said), (*gates, *zeros), fitted, correction, answer.effects)
     if verdict.kind == "unexplained" and finished:
-        gates = (*gates, *find_undeclared_port(search), *find_untried_laws(search), *find_varying_values(search))
+        gates = (*gates, *find_undeclared_port(search)[0], *find_untried_laws(search), *find_varying_values(search))
     refitted = search.root.fitted
     if interrupted and verdict.kind != "recording-fault":
         sentence = (

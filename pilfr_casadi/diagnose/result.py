@@ -186,15 +186,20 @@ class Diagnosis:
 
     @property
     def summary(self) -> str:
-        """The verdict's sentence, and a second one if the correction does not help on the test recordings."""
-        errors = self.errors.get("test")
+        """The verdict's sentence, and what else has to be said first.
+
+        That is whether the search was cut short, and whether the correction does not help on the test recordings.
+        """
+        errors, said = self.errors.get("test"), self.sentence
+        if self.effects and (self.interrupted or self.out_of_time):
+            said += " The search was cut short, so that a further effect may not have been tried."
         if not errors or self.outcome not in ("worse", "same"):
-            return self.sentence
+            return said
         before, after = (_percent(errors[k]) for k in ("before", "after"))
         if self.outcome == "same":
-            return f"{self.sentence} On the test recordings it makes no difference: {before} before, {after} after."
+            return f"{said} On the test recordings it makes no difference: {before} before, {after} after."
         return (
-            f"{self.sentence} But this correction makes the test recordings worse: their error is {before} refitted "
+            f"{said} But this correction makes the test recordings worse: their error is {before} refitted "
             f"and {after} with it. Do not use it as a correction.{self._better_without()}"
         )
 

@@ -115,6 +115,10 @@ class Posterior:
         ratio = named / max(self.named, 1e-300)
         return replace(self, named=named, effects=tuple(replace(e, confidence=ratio * e.confidence) for e in effects))
 
+    def against(self, odds: float) -> Posterior:
+        """Weigh the effects against another explanation of given odds."""
+        return replace(self, effects=tuple(replace(e, confidence=e.confidence / (1 + odds)) for e in self.effects))
+
 
 def names(trial: Trial) -> frozenset[Name]:
     """Return ports and law ids of the effects of a hypothesis."""
@@ -168,7 +172,7 @@ def posterior(search: Hypotheses) -> Posterior:
         if least.confidence > SURE or fewer not in by_names or not fewer:
             break
         said = fewer
-    named = share_named(explainable_remainder(search, best), _strained(search, best))
+    named = share_named(explainable_remainder(search, best), strained(search, best))
     effects = tuple(replace(e, confidence=_named_beside(search, best, e) * e.confidence) for e in found)
     return Posterior(best, named, effects, by_names.get(frozenset(), 0.0))
 
@@ -182,10 +186,10 @@ def _named_beside(search: Hypotheses, best: Trial, effect: NamedEffect) -> float
     others = names(best) - {effect.name}
     without = [t for t in search.memo.values() if names(t) == others] if others else []
     before = min(without, key=lambda t: t.mean_square, default=None)
-    return share_named(explainable_remainder(search, best, before), _strained(search, best))
+    return share_named(explainable_remainder(search, best, before), strained(search, best))
 
 
-def _strained(search: Hypotheses, trial: Trial) -> bool:
+def strained(search: Hypotheses, trial: Trial) -> bool:
     """Tell whether a hypothesis needs a value of the simulator that the user has excluded."""
     return trial.fitted.strained(search.bench.simulator.parameters)
 

@@ -484,6 +484,13 @@ class Equations:
         return frozenset(n for n, rate in own.items() if rate in self.states and rate != n)
 
     @cached_property
+    def unreached(self) -> frozenset[str]:
+        """States whose equations lack a declared port, though they are no definitions."""
+        at = self.symbols()
+        reached = {target for port in self.ports for target in self.into(port, *at)}
+        return frozenset(self.states) - self.kinematic - reached
+
+    @cached_property
     def idle_inputs(self) -> tuple[str, ...]:
         """Inputs that no equation reads: they may scale the missing physics."""
         x, u, p, t = self.symbols()
