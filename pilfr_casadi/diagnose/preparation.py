@@ -27,10 +27,11 @@ from .gates import (
     refit,
 )
 from .linearise import along, linearised, observer_gain
+from .lost_samples import find_gaps, find_output_gaps
 from .offsets import find_offsets, find_wrong_start
 from .proof import errors_of
 from .recording_faults import mend_stale_samples, open_unsettled, remove_glitches, unclip
-from .timing import AVERAGED_NOISE, find_gaps, find_time_shift, in_steps, run_as_given
+from .timing import AVERAGED_NOISE, find_time_shift, in_steps, run_as_given
 from .workbench import THOROUGH, Fitted, Workbench, refine_steps
 
 CHECKED_ABOVE = 4e-4  # mean square error up to which signs and units are not checked
@@ -118,7 +119,7 @@ class _Checks:
                 starts = [found.fitted.values, {}]
                 found = found.then(bench, bench.fit(bench.simulator, starts, solver=THOROUGH))
             now = found
-        now = find_gaps(mend_stale_samples(unclip(self._report(3, now))))
+        now = find_output_gaps(find_gaps(mend_stale_samples(unclip(self._report(3, now)))))
         now = now.then(*refine_steps(now.bench, self._report(4, now).fitted))
         return find_offsets(self._report(5, find_time_shift(now, part, self.early)))
 

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from diagnosis_contract import SCHEMA, problems
 from diagnosis_rig import OFF, recordings, rig
+from test_timing import shaken, spring
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.gates import CURED_SHARE, Checked
+from pilfr_casadi.diagnose.lost_samples import OutputGap, find_gaps, find_jump, find_output_gaps, settle_jump
 from pilfr_casadi.diagnose.preparation import prepare, refitted
-from pilfr_casadi.diagnose.timing import find_gaps, find_jump, settle_jump
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import discretise
 
@@ -137,3 +138,51 @@ def test_where_states_cannot_tell_and_in_periodic_recordings_nothing_is_looked_f
 def _hidden(dynamics):
     """The same equations, no state of which is plainly the integral of another."""
     return lambda x, u, p: {name: 1.0000001 * d for name, d in dynamics(x, u, p).items()}
+
+
+def behind(r, columns, k, count):
+    """A recording of which some outputs (the others, if `count` is negative) have lost samples from k on."""
+    mine, others = (count, 0) if count > 0 else (0, -count)
+    rest = len(r) - k - abs(count)
+    u, y = (np.concatenate([v[:k], v[k + others : k + others + rest]]) for v in (r.u, r.y))
+    y[k:, columns] = r.y[k + mine : k + mine + rest, columns]
+    return r.with_(u=u, y=y)
+
+
+def looked_at_outputs(r):
+    made = Workbench.of(spring(), [r], "zero")
+    return find_output_gaps(Checked(made, refitted(made)))
+
+
+@pytest.mark.parametrize(
+    ("columns", "count", "name", "word"),
+    [([1], 12, "vel", "early"), ([0], -7, "pos", "late"), ([0, 1], -9, "pos, vel", "late")],
+)
+def test_samples_that_some_outputs_lost_are_found(columns, count, name, word):
+    found = looked_at_outputs(behind(shaken("zero"), columns, 1300, count))
+    (gate,) = found.gates
+    assert (gate.finding, gate.channel, gate.fault) == ("gap", name, True)
+    value = gate.to_dict()["value"]
+    assert value == {"recording": 0, "sample": pytest.approx(1300, abs=1), "lost": count}
+    assert f"recorded {abs(count)} samples" in gate.sentence
+    assert f"too {word}" in gate.sentence
+    assert found.cost**0.5 < 2e-4  # the noise is 1e-4
+    (first, second) = map(len, found.bench.recordings)
+    assert first == value["sample"] and first + second == 3000 - 2 * abs(count)
+
+
+def test_a_shift_of_the_whole_recording_and_missing_physics_are_no_gap_of_an_output():
+    whole = shaken("zero")
+    late = whole.with_(u=whole.u[:-9], y=np.column_stack([whole.y[9:, 0], whole.y[:-9, 1]]))
+    stiff = shaken("zero", law=laws.CubicStiffness().at({"k_3": 2e4}))
+    play = shaken("zero", law=laws.Clearance().at({"k_g": 300.0, "g": 0.02}))
+    for r in (whole, late, stiff, play):
+        assert not looked_at_outputs(r).gates
+
+
+def test_in_a_stretch_the_whole_recording_is_cut():
+    given = behind(shaken("zero"), [1], 1300, 12)
+    gap = OutputGap("vel", "gap", (0, 300, 12), columns=(1,))
+    before, after = gap.apply_to_whole([given], [(0, 1000)])
+    assert len(before) == 1300 and len(after) == len(given) - 1312
+    assert np.array_equal(after.y, shaken("zero").y[1312 : 1312 + len(after)])

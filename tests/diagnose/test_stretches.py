@@ -16,10 +16,10 @@ from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.channel_faults import scale_channels
 from pilfr_casadi.diagnose.floor import noise_floor
+from pilfr_casadi.diagnose.lost_samples import Jump
 from pilfr_casadi.diagnose.offsets import VaryingOffset
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.stretches import Everything, Stretch, Stretches, choose_stretches, divide, spread_out
-from pilfr_casadi.diagnose.timing import Jump
 from pilfr_casadi.diagnose.trials import Trial
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import discretise

@@ -1,0 +1,415 @@
+"""Lost samples: in all channels, after which every state jumps, or in some outputs, which are too early from there on.
+
+If all channels have lost samples and the time was renumbered, every state jumps at once. Along the refitted run, a jump
+δ of the state at sample k changes the later outputs by `Φ_k δ`. With e the error that parameters and initial states
+leave, and base the directions that these can follow, the best jump removes
+
+    s' (S - G G')⁻¹ s,    S = Φ_k'Φ_k,  G = Φ_k' base,  s = Φ_k' e
+
+of e'e. S, G and s follow from those of the next sample by recursion, so that every sample is tried. A shock or a stop
+moves no state that is the integral of another, and a step of a force or of a sensor moves none. If one of these
+explains about as much, or if no state is such an integral, no gap is reported. A jump is confirmed by a refit to the
+two pieces.
+
+If only some outputs have lost samples, as by one of two loggers, their later samples come too early against the others.
+Every sample is tried with every number of lost samples, by sums of the error that parameters and initial states leave
+with these outputs as recorded before it, and moved after it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from ..data import Recording
+from ..simulators import states_along
+from .floor import ABOVE_NOISE, third_differences
+from .gates import (
+    CLEARLY_BETTER,
+    CURED_SHARE,
+    EQUAL_RATIO,
+    NEAR_NOISE_RATIO,
+    Checked,
+    FirstOrder,
+    Gate,
+    accept,
+    correct,
+    robust_deviation,
+    settle,
+)
+from .linearise import Run
+from .workbench import THOROUGH, Fitted, Workbench
+
+MOST_LOST = 64  # lost samples of some outputs that are tried at most
+MOST_GAPS = 3  # gaps that are sought at most
+SHORTEST_PIECE = 40  # samples of a piece at least
+RIVAL_DISTANCE = 5  # samples around a jump at which rivals are tried, and at which a drift would explain as much
+SHOCK_DELAYS = (-0.5, 0.0, 0.5)  # delays of a shock that are tried, in samples
+RIDGE = 1e-6  # on the normal equations, against jumps that initial states can follow
+
+
+@dataclass(frozen=True, eq=False)
+class Jump(Gate):
+    """A jump of the state, as where samples were lost; until it is reported, its value is (recording, sample).
+
+    Attributes
+    ----------
+    share : float
+        Share of the mean square that the jump removes.
+    rival : float
+        Share that a shock nearby, or a step of one force or sensor there, removes.
+    beside : float
+        Share that a jump some samples away removes.
+    states : list of array
+        Initial states of the recordings when this one is cut there.
+    places : tuple of (int, int)
+        Once reported: each recording that is cut, and the sample at which its later piece begins.
+    """
+
+    share: float = 0.0
+    rival: float = 0.0
+    beside: float = 0.0
+    states: Sequence[np.ndarray] = ()
+    places: tuple[tuple[int, int], ...] = ()
+    remedy: ClassVar[str] = "with the recording cut there"
+
+    def beats(self, other: float, share: float) -> bool:
+        """Tell whether this jump leaves at most a share of the error that a rival leaves, which removes `other`."""
+        return 1 - self.share < share * (1 - other)
+
+    def apply(self, bench: Workbench) -> Workbench:
+        """Cut the recording; the state at the first sample of the later piece is estimated."""
+        i, k = self.value
+        r = bench.recordings[i]
+        pieces = r.slice(0, k), r.slice(k).with_(initial="estimate", period=None)
+        return replace(bench, recordings=(*bench.recordings[:i], *pieces, *bench.recordings[i + 1 :]))
+
+    def apply_to_whole(self, whole: list[Recording], places: Sequence[tuple[int, int]]) -> list[Recording]:
+        """Cut the recordings where samples are missing in a stretch."""
+        out = list(whole)
+        for i, k in sorted(((places[i][0], places[i][1] + k) for i, k in self.places), reverse=True):
+            r = out[i]
+            later = r.slice(k).with_(initial="estimate", period=None, name=f"{r.name} from {k * r.dt:.6g} s".strip())
+            out[i : i + 1] = [r.slice(0, k), later]
+        return out
+
+    def begin(self, previous: Fitted) -> Sequence[np.ndarray]:
+        """Return the states after the jump for the later piece."""
+        return self.states
+
+    def relocate(self, now: Checked, after: Checked) -> Jump | None:
+        """Find the jump along the run that a fit to the two pieces makes of the whole recording."""
+        fitted, bench = after.fitted, now.bench
+        initial = [x for i, x in enumerate(fitted.initial) if i != self.value[0] + 1]
+        return find_jump(bench, bench.result(bench.simulator, fitted.values, initial, fitted.engine, fitted.model))
+
+
+def settle_jump(now: Checked) -> tuple[Jump, Checked] | None:
+    """Find a jump, and fit the two pieces; the jump is repeated until it stays."""
+    jump = find_jump(now.bench, now.fitted)
+    return None if jump is None else settle(now, jump, THOROUGH)
+
+
+def find_gaps(now: Checked) -> Checked:
+    """Find lost samples; cut the recordings there if the rule accepts it.
+
+    The state at the first sample of a later piece is estimated. Recordings in periodic steady state are not checked.
+    """
+    noise2 = min(now.noise2, _quiet_noise2(now) or np.inf)
+    origins = [(r, 0) for r in now.bench.recordings]  # recording as given, and the sample at which a piece begins
+    last, found = now, now
+    while len(origins) - len(now.bench.recordings) < MOST_GAPS and last.cost > ABOVE_NOISE**2 * noise2:
+        settled = settle_jump(last)
+        if settled is None or not settled[0].beats(settled[0].rival, 1 / EQUAL_RATIO**2):
+            break
+        jump, last = settled
+        i, k = jump.value
+        r, begin = origins[i]
+        origins.insert(i + 1, (r, begin + k))
+        # jumps around a drift also imitate it
+        sharp = jump.beats(jump.beside, CLEARLY_BETTER) or last.cost < NEAR_NOISE_RATIO**2 * noise2
+        if sharp and jump.beats(jump.rival, CURED_SHARE):
+            accepted = accept(now, _name_pieces(last, origins), _describe_gaps(jump, origins))
+            found = accepted if len(accepted.gates) > len(now.gates) else found
+    return found
+
+
+def _name_pieces(now: Checked, origins: Sequence[tuple[Recording, int]]) -> Checked:
+    """Name each piece by the time at which it begins."""
+    named = [
+        piece.with_(name=f"{r.name} from {k * r.dt:.6g} s".strip()) if k else piece
+        for piece, (r, k) in zip(now.bench.recordings, origins, strict=True)
+    ]
+    return now.then(replace(now.bench, recordings=tuple(named)), now.fitted)
+
+
+def _describe_gaps(jump: Jump, origins: Sequence[tuple[Recording, int]]) -> Gate:
+    """Describe the gaps before some samples."""
+    gaps = sorted([(r.label, k, k * r.dt) for r, k in origins if k])
+    several = len({id(r) for r, _ in origins}) > 1
+    at = " and ".join(f"t = {t:.6g} s (sample {k}{f' of {label}' if several else ''})" for label, k, t in gaps)
+    words = (
+        f"Samples are missing just before {at}: the state jumps there as no force and no shock could make it, as where "
+        "a logger lost some and counted on"
+    )
+    given = list(dict.fromkeys(id(r) for r, _ in origins))  # the recordings in their order
+    places = tuple((given.index(id(r)), k) for r, k in origins if k)
+    return replace(jump, value=[t for _, _, t in gaps], sentence=words, places=places)
+
+
+def _quiet_noise2(now: Checked) -> float:
+    """Estimate the mean square of white noise from third differences, not disturbed by a few jumps."""
+    thirds = np.concatenate([third_differences(e) for e in now.fitted.residual])
+    return float(np.mean((robust_deviation(thirds) / now.bench.scale) ** 2))
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
+    """Find the jump of the states that removes most error, to first order; None if gaps cannot be detected."""
+    simulator = bench.simulator
+    if not simulator.kinematic:
+        return None
+    first = FirstOrder.of(bench, fitted)
+    error = first.left(first.error)
+    total, at = max(float(error @ error), 1e-300), 0
+    moved = [i for i, name in enumerate(simulator.states) if name not in simulator.kinematic]
+    best, best_size = Jump(", ".join([*simulator.inputs, *simulator.output_names]), "gap", None), np.zeros(0)
+    for i, (r, one) in enumerate(zip(bench.recordings, first.runs, strict=True)):
+        rows = slice(at, at + (len(r) - r.skip) * r.n_y)
+        at = rows.stop
+        if r.begins == "periodic" or len(r) - r.skip < 2 * SHORTEST_PIECE:
+            continue
+        read = np.column_stack([first.base, error])[rows].reshape(-1, r.n_y, first.base.shape[1] + 1)
+        shares, rivals, sizes = _jump_shares(one, bench.scale, read, r.skip, len(simulator.states), moved)
+        shares, rivals = shares / total, rivals / total
+        shares[: r.skip + SHORTEST_PIECE] = shares[len(r) - SHORTEST_PIECE :] = 0.0
+        k = int(np.argmax(shares))
+        if shares[k] > best.share:
+            around = slice(max(k - RIVAL_DISTANCE, 0), k + RIVAL_DISTANCE + 1)
+            rival, beside = float(np.max(rivals[around])), float(max(shares[around.start], shares[k + RIVAL_DISTANCE]))
+            best = replace(best, value=(i, k), share=float(shares[k]), rival=rival, beside=beside)
+            best_size = sizes[k]
+    if best.share < 1 - CLEARLY_BETTER:
+        return None
+    (i, k), model = best.value, fitted.model
+    run = states_along(model, model.drive(bench.recordings[i]), fitted.vector, fitted.initial[i])
+    state = run[k * model.substeps, : len(best_size)] - best_size
+    return replace(best, states=[*fitted.begin[: i + 1], np.asarray(state), *fitted.begin[i + 1 :]])
+
+
+def _jump_shares(
+    run: Run, scale: np.ndarray, read: np.ndarray, skip: int, n_x: int, moved: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute, at each sample, what the best jump of the state removes, what its best rival removes, and the jump.
+
+    `read` are the base and the error from `skip` on, `moved` the states that a shock moves. Shapes of the results are
+    (M,), (M,) and (M, n_x). Forces that stay constant from a sample on are further states.
+    """
+    m, _, n = run.c.shape
+    forces = run.b[:, :, run.n_free :]
+    full, n_b = n + forces.shape[2], read.shape[2] - 1
+    a = np.tile(np.eye(full), (m, 1, 1))
+    a[:, :n, :n], a[:, :n, n:] = run.a, forces
+    c = np.concatenate([run.c, run.d[:, :, run.n_free :]], axis=2) / scale[:, None]
+    s, g = np.zeros((full, full)), np.zeros((full, n_b + 1))
+    size2, left, along = np.zeros((m, full, full)), np.zeros((m, full, full)), np.zeros((m, full))
+    for k in range(m - 1, skip - 1, -1):
+        s = c[k].T @ c[k] + a[k].T @ s @ a[k]
+        g = c[k].T @ read[k - skip] + a[k].T @ g
+        size2[k], left[k], along[k] = s, s - g[:, :n_b] @ g[:, :n_b].T, g[:, n_b]
+    unit, shock = np.eye(full), np.eye(full)[:, list(moved)]
+    removed, size = _solve_jumps(left, size2, along, unit[:, :n_x])
+    later = a - np.eye(full)
+    later[:, :, n:] = 0.0
+    rivals = [shock + part * later @ shock for part in SHOCK_DELAYS] + [unit[:, [j]] for j in range(n, full)]
+    return removed, np.max([_solve_jumps(left, size2, along, way)[0] for way in rivals], axis=0), size
+
+
+def _solve_jumps(left: np.ndarray, s: np.ndarray, e: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute what jumps along some directions, (n, k) or (M, n, k), remove, and their lengths."""
+    across = np.swapaxes(ways, -1, -2)
+    size = np.sqrt(np.maximum(np.einsum("...ii->...i", across @ s @ ways), 0.0))
+    size = np.where(size > 0, size, 1.0)
+    matrix = across @ left @ ways / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(ways.shape[-1])
+    wanted = (across @ e[:, :, None])[:, :, 0] / size
+    lost = ~(np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(wanted).all(axis=1))  # the run diverges
+    matrix[lost], wanted[lost] = np.eye(ways.shape[-1]), 0.0
+    found = np.linalg.solve(matrix, wanted[:, :, None])[:, :, 0]
+    return np.sum(found * wanted, axis=1), found / size
+
+
+@dataclass(frozen=True, eq=False)
+class OutputGap(Gate):
+    """Lost samples of some outputs; until it is reported, its value is (recording, sample, number of lost samples).
+
+    A negative number says that all other channels have lost samples, so that these outputs come too late.
+
+    Attributes
+    ----------
+    columns : tuple of int
+        The outputs.
+    share : float
+        Share of the mean square that is left.
+    states : list of array
+        Initial states of the recordings when this one is cut there.
+    """
+
+    columns: tuple[int, ...] = (0,)
+    share: float = 1.0
+    states: Sequence[np.ndarray] = ()
+    parameters: ClassVar[int] = 2
+    remedy: ClassVar[str] = "with the recording cut there and what follows moved back"
+
+    def apply(self, bench: Workbench) -> Workbench:
+        """Cut the recording, and move the outputs of the later piece; the state at its first sample is estimated."""
+        i, k, lost = self.value
+        pieces = self.pieces(bench.recordings[i], k, lost)
+        return replace(bench, recordings=(*bench.recordings[:i], *pieces, *bench.recordings[i + 1 :]))
+
+    def pieces(self, r: Recording, k: int, lost: int) -> tuple[Recording, Recording]:
+        """Return what was recorded before sample k, and the corrected rest."""
+        y, begin, end = np.array(r.y), k + max(lost, 0), len(r) + min(lost, 0)
+        y[begin:end, self.columns] = r.y[begin - lost : end - lost, self.columns]
+        name = f"{r.name} from {begin * r.dt:.6g} s".strip()
+        return r.slice(0, k), r.with_(y=y).slice(begin, end).with_(initial="estimate", period=None, name=name)
+
+    def apply_to_whole(self, whole: list[Recording], places: Sequence[tuple[int, int]]) -> list[Recording]:
+        """Cut and correct the recording of which a stretch was checked."""
+        i, k, lost = self.value
+        j, begin = places[i]
+        return [*whole[:j], *self.pieces(whole[j], begin + k, lost), *whole[j + 1 :]]
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the finding as in diagnosis.json."""
+        i, k, lost = self.value
+        return {**super().to_dict(), "value": {"recording": i, "sample": k, "lost": lost}}
+
+    def begin(self, previous: Fitted) -> Sequence[np.ndarray]:
+        """Return the states along the run for the later piece."""
+        return self.states
+
+    def relocate(self, now: Checked, after: Checked) -> OutputGap | None:
+        """Find the gap along the run that a fit to the two pieces makes of the whole recording."""
+        fitted, bench = after.fitted, now.bench
+        initial = [x for i, x in enumerate(fitted.initial) if i != self.value[0] + 1]
+        return find_output_gap(
+            bench, bench.result(bench.simulator, fitted.values, initial, fitted.engine, fitted.model)
+        )
+
+
+def find_output_gaps(now: Checked) -> Checked:
+    """Find samples that some outputs have lost; cut the recordings there if the rule accepts it."""
+    for _ in range(MOST_GAPS):
+        found = find_output_gap(now.bench, now.fitted) if now.cost > ABOVE_NOISE**2 * now.noise2 else None
+        settled = None if found is None else settle(now, found, THOROUGH)
+        if settled is None:
+            break
+        gap, after = _place(now, *settled)
+        i, k, lost = gap.value
+        r = now.bench.recordings[i]
+        verb = "are" if len(gap.columns) > 1 else "is"
+        off = f"{abs(lost)} samples ({abs(lost) * r.dt:.3g} s) too {'early' if lost > 0 else 'late'}"
+        whose = "a logger of its own" if lost > 0 else "the logger of the other channels"
+        words = (
+            f"From t = {k * r.dt:.6g} s (sample {k} of {r.label}) on, {gap.channel} {verb} recorded {off}, as where "
+            f"{whose} lost samples and counted on"
+        )
+        accepted = accept(now, after, replace(gap, sentence=words))
+        if len(accepted.gates) == len(now.gates):
+            break
+        now = accepted
+    return now
+
+
+def _place(now: Checked, gap: OutputGap, after: Checked) -> tuple[OutputGap, Checked]:
+    """Move a gap by smaller and smaller steps to where the refit is best: lost inputs also leave a wrong state."""
+    step = MOST_LOST if after.cost > NEAR_NOISE_RATIO**2 * now.noise2 else 0
+    while step:
+        i, k, lost = gap.value
+        last = len(now.bench.recordings[i]) - MOST_LOST - SHORTEST_PIECE
+        for other in (k - step, k + step):
+            moved = replace(gap, value=(i, other, lost))
+            if SHORTEST_PIECE <= other <= last:
+                found = correct(now, moved, [after.fitted.values], after.fitted.begin)
+                if found is not None and found.cost < after.cost:
+                    gap, after = moved, found
+        step //= 2
+    return gap, after
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def find_output_gap(bench: Workbench, fitted: Fitted) -> OutputGap | None:
+    """Find the gap of some outputs that leaves least, to first order; None if none is clearly better than a shift."""
+    first, names = FirstOrder.of(bench, fitted), bench.simulator.output_names
+    groups = [(i,) for i in range(len(names))] + ([tuple(range(len(names)))] if len(names) > 1 else [])
+    whole = float(np.mean(first.left(first.error) ** 2))
+    best: OutputGap | None = None
+    at = 0
+    for i, r in enumerate(bench.recordings):
+        rows = slice(at, at + (len(r) - r.skip) * r.n_y)
+        at = rows.stop
+        if r.begins == "periodic" or len(r) - r.skip < 2 * SHORTEST_PIECE + MOST_LOST:
+            continue
+        sums = _Sums.of(first, rows, r.y[r.skip :] / bench.scale)
+        for columns in groups:
+            for lost, left in sums.left(columns):
+                k = SHORTEST_PIECE + int(np.argmin(left[SHORTEST_PIECE:]))
+                rival = min(whole, left[0])  # none, or the whole recording shifted
+                if left[k] < CLEARLY_BETTER * rival and (best is None or left[k] < best.share * whole):
+                    channel = ", ".join(names[c] for c in columns)
+                    value = (i, r.skip + k, lost)
+                    best = OutputGap(channel, "gap", value, columns=columns, share=left[k] / whole)
+    if best is None:
+        return None
+    (i, k, lost), model = best.value, fitted.model
+    run = states_along(model, model.drive(bench.recordings[i]), fitted.vector, fitted.initial[i])
+    state = run[(k + max(lost, 0)) * model.substeps]
+    return replace(best, states=[*fitted.initial[: i + 1], state, *fitted.initial[i + 1 :]])
+
+
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """A recording's part of the error, and what the other recordings add to its sums.
+
+    error, y (M, n_y) in units of the outputs' deviation; base (M, n_y, n); square and along (n,) of the others.
+    """
+
+    error: np.ndarray
+    y: np.ndarray
+    base: np.ndarray
+    square: float
+    along: np.ndarray
+    count: int
+
+    @classmethod
+    def of(cls, first: FirstOrder, rows: slice, y: np.ndarray) -> _Sums:
+        """Take the rows of one recording apart from the others."""
+        rest = np.delete(first.error, rows)
+        along = np.delete(first.base, rows, axis=0).T @ rest
+        base = first.base[rows].reshape(*y.shape, -1)
+        return cls(first.error[rows].reshape(y.shape), y, base, float(rest @ rest), along, len(rest))
+
+    def left(self, columns: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        """Generate each number of lost samples with the mean square that is left for a gap at each sample."""
+        m = len(self.y)
+        before, along_before = self._sums(self.error)
+        for lost in (n for n in range(-MOST_LOST, MOST_LOST + 1) if n):
+            begin, end = max(lost, 0), m + min(lost, 0)
+            moved = np.array(self.error[begin:end])
+            moved[:, columns] += self.y[begin:end, columns] - self.y[begin - lost : end - lost, columns]
+            after, along_after = self._sums(moved, begin)
+            n = len(moved) - SHORTEST_PIECE  # gaps at the first n samples
+            square = self.square + before[:n] + after[-1] - after[:n]
+            along = self.along + along_before[:n] + along_after[-1] - along_after[:n]
+            used = self.count + self.y.shape[1] * (m - abs(lost))
+            yield lost, (square - np.sum(along**2, axis=1)) / used
+
+    def _sums(self, error: np.ndarray, begin: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Sum squares, and products with the base, up to each sample."""
+        base = self.base[begin : begin + len(error)]
+        square = np.append(0.0, np.cumsum(np.sum(error**2, axis=1)))
+        along = np.cumsum(np.einsum("tyn,ty->tn", base, error), axis=0)
+        return square, np.vstack([np.zeros((1, along.shape[1])), along])
