@@ -52,6 +52,7 @@ FLEXIBLE_PRIOR = np.log(0.2)  # the same of a law that can imitate others, relat
 DOUBTFUL_PRIOR = np.log(0.01)  # the same of parameter values at which a law degenerates into another
 DOMAIN_PRIOR = np.log(4.0)  # the same of a law that belongs to the domain of its port, relative to a general one
 OUTSIDE_CATALOGUE = 0.1  # probability that missing physics is in no law of the catalogue
+STRAINED_ODDS = 10.0  # how much likelier a wrong law drives a parameter of the simulator to a bound than the right one
 STATE_PRIOR = 1e-9  # precision of initial states relative to the information of a sample: hardly any prior
 
 # Model error: no machine follows a formula exactly

@@ -282,6 +282,8 @@ class Hypotheses:
         if known is None or trial.supersedes(known):
             self.memo[trial.key] = trial
             self.findings.pop(trial.key, None)
+        if self.floor.source == "estimated" and trial.mean_square < self.floor2:  # noise is no larger than what is left
+            self.floor = Floor(np.minimum(self.floor.deviation, self._rms(trial)), "estimated")
 
     def thorough(self, trial: Trial) -> Trial:
         """Return the same hypothesis fitted to convergence and to all samples, or as it is after the deadline."""
@@ -299,13 +301,16 @@ class Hypotheses:
         if self.floor.source != "estimated":
             return
         best = self.best
-        pairs = zip(best.fitted.residual, self.bench.recordings, strict=True)
-        error = np.concatenate([e[r.skip :] for e, r in pairs])
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
         share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
-        rest = np.minimum(np.sqrt(share * np.mean(error**2, axis=0)), LOUDEST_NOISE * self.bench.scale)
+        rest = np.minimum(np.sqrt(share) * self._rms(best), LOUDEST_NOISE * self.bench.scale)
         known, white = self.stand_in_error * self.bench.scale, white_part(best.fitted.residual)
         self.floor = Floor(np.hypot(np.maximum(white, rest), known), "estimated")
+
+    def _rms(self, trial: Trial) -> np.ndarray:
+        """Compute the rms error of each output, (n_y,)."""
+        pairs = zip(trial.fitted.residual, self.bench.recordings, strict=True)
+        return np.asarray(np.sqrt(np.mean(np.concatenate([e[r.skip :] for e, r in pairs]) ** 2, axis=0)))
 
     def beside(self, laws: Sequence[Placed], joint: Trial) -> Trial:
         """Make a trial of some laws of a hypothesis, perhaps of another search, at the values that they have there."""

@@ -10,9 +10,9 @@ law leaves and that a flexible force at some port would explain. The density of 
     2 / (π s_0 (1 + (s / s_0)²)), if the law is the physics: half-Cauchy,
 
 and the probability of a hypothesis is divided between a named and an unnamed answer in this ratio. s_0 is the share
-that the formula of the right law may leave. The verdict is the likeliest of complete, missing physics and unexplained.
-The confidence of an effect is the probability that it is included. An effect beside others is named if that exceeds one
-half (Barbieri & Berger 2004).
+that the formula of the right law may leave. A wrong law often drives a parameter of the simulator to a bound. The
+verdict is the likeliest of complete, missing physics and unexplained. The confidence of an effect is the probability
+that it is included. An effect beside others is named if that exceeds one half (Barbieri & Berger 2004).
 
 `judge` puts the verdict into words. It also takes into account what the checks of the recordings have found, and
 whether the refit's residual can be noise.
@@ -43,6 +43,7 @@ from .evidence import (
     NEAR_RATIO,
     NEGLIGIBLE_ERROR,
     OUTSIDE_CATALOGUE,
+    STRAINED_ODDS,
     SURE,
     WHITE_NOISE_RATIO,
 )
@@ -139,11 +140,14 @@ def share_left(search: Hypotheses, mean_square: float, before: Trial | None = No
     return float(np.clip((mean_square - search.floor2) / excess, 0.0, 1.0))
 
 
-def share_named(s: float) -> float:
-    """Compute the probability that a law which leaves the share s is the physics."""
+def share_named(s: float, strained: bool = False) -> float:
+    """Compute the probability that a law which leaves the share s is the physics.
+
+    `strained` tells that a parameter of the simulator is at a bound then (`Fitted.strained`).
+    """
     law = (1 - OUTSIDE_CATALOGUE) * 2 / (np.pi * FORMULA_ERROR * (1 + (s / FORMULA_ERROR) ** 2))
     other = OUTSIDE_CATALOGUE / (max(s, FORMULA_ERROR) * (1 - np.log(FORMULA_ERROR)))
-    return float(law / (law + other))
+    return float(law / (law + other * (STRAINED_ODDS if strained else 1.0)))
 
 
 def posterior(search: Hypotheses) -> Posterior:
@@ -164,7 +168,7 @@ def posterior(search: Hypotheses) -> Posterior:
         if least.confidence > SURE or fewer not in by_names or not fewer:
             break
         said = fewer
-    named = share_named(explainable_remainder(search, best))
+    named = share_named(explainable_remainder(search, best), _strained(search, best))
     effects = tuple(replace(e, confidence=_named_beside(search, best, e) * e.confidence) for e in found)
     return Posterior(best, named, effects, by_names.get(frozenset(), 0.0))
 
@@ -178,7 +182,12 @@ def _named_beside(search: Hypotheses, best: Trial, effect: NamedEffect) -> float
     others = names(best) - {effect.name}
     without = [t for t in search.memo.values() if names(t) == others] if others else []
     before = min(without, key=lambda t: t.mean_square, default=None)
-    return share_named(explainable_remainder(search, best, before))
+    return share_named(explainable_remainder(search, best, before), _strained(search, best))
+
+
+def _strained(search: Hypotheses, trial: Trial) -> bool:
+    """Tell whether a hypothesis needs a value of the simulator that the user has excluded."""
+    return trial.fitted.strained(search.bench.simulator.parameters)
 
 
 def _plainest(search: Hypotheses, trials: Sequence[Trial]) -> Trial:

@@ -9,7 +9,7 @@ steps. The cost then has spurious minima, and no other term of a law should make
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -111,6 +111,13 @@ class Fitted:
         """Mark the entries of a parameter that are at one of its bounds."""
         (low, high), value = self.model.parameters[name].bounds, self.values[name]
         return np.asarray((value <= low) | (value >= high))
+
+    def strained(self, names: Iterable[str]) -> bool:
+        """Tell whether a free parameter of some is at a bound other than zero, so that the fit wants it beyond."""
+        own = self.model.parameters
+        limits = [np.asarray(b) for name in names if not np.all(own[name].fixed) for b in own[name].bounds]
+        values = [self.values[name] for name in names if not np.all(own[name].fixed) for _ in range(2)]
+        return any(bool(np.any((v == b) & (b != 0))) for v, b in zip(values, limits, strict=True))
 
     @property
     def begin(self) -> list[np.ndarray]:

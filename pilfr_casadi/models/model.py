@@ -423,7 +423,8 @@ def accumulate_steps(function: ca.Function, state: np.ndarray, *arguments: np.nd
     count, state = len(arguments[0]), np.array(state, dtype=float)
     blocks = -(-count // BLOCK)  # the last one is filled up: single steps cost far more each
     more = blocks * BLOCK - count
-    arrays = [np.concatenate([a, np.repeat(a[-1:], more, axis=0)], dtype=float) for a in arguments]
+    filled = (np.concatenate([a, np.repeat(a[-1:], more, axis=0)], dtype=float) for a in arguments)
+    arrays = list(map(np.ascontiguousarray, filled))
     results = [np.zeros((blocks * BLOCK, function.size1_out(i))) for i in range(function.n_out())]
     run = _accumulated(function)
     for begin in range(0, blocks * BLOCK, BLOCK):

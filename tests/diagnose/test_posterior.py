@@ -148,3 +148,26 @@ def test_the_closest_law_is_the_one_that_promises_most(search, trial):
     found = search((cube, 4.0), delay)
     assert found.evidence(delay) > found.evidence(found.memo[cube.key])
     assert closest_law(found, delay).key == cube.key
+
+
+def test_a_mismatch_below_the_noise_hardly_shows_what_explains_it(search, trial):
+    noise2 = search(trial(DRY)).floor2
+    second = DRY, ("b", CubicStiffness)
+    for before, least, most in ((1e3, 0.95, 1.0), (1.1, 0.1, 0.5)):  # what the second law is left with, in noises
+        found = posterior(search(trial(*second, left=noise2), trial(DRY, left=before * noise2)))
+        assert sure_of(found)[DRY_NAME] > 0.95
+        if len(found.effects) > 1:
+            assert least < sure_of(found)["b", "cubic_stiffness"] <= most
+        else:
+            assert before < 2
+
+
+def test_a_value_that_the_user_has_excluded_makes_a_law_less_sure(search, trial, tiny):
+    bench, _ = tiny
+    name, p = next((k, p) for k, p in bench.simulator.parameters.items() if not np.all(p.fixed))
+    at_bound = trial(DRY)
+    values = {**at_bound.fitted.values, name: np.array(p.bounds[1])}
+    strained = replace(at_bound, fitted=replace(at_bound.fitted, values=values))
+    assert strained.fitted.strained([name]) and not at_bound.fitted.strained([name])
+    assert sure_of(posterior(search(strained)))[DRY_NAME] == pytest.approx(share_named(0.0, strained=True))
+    assert 0.75 < share_named(0.0, strained=True) < 0.9

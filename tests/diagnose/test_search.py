@@ -14,7 +14,7 @@ from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench, correction, preparation
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.search import Search
-from pilfr_casadi.diagnose.trials import Trials
+from pilfr_casadi.diagnose.trials import Trial, Trials
 from pilfr_casadi.diagnose.verdict import posterior
 from pilfr_casadi.optimise import GaussNewton, Status
 
@@ -46,6 +46,18 @@ def test_a_law_is_found_and_no_hypothesis_is_kept_twice():
     assert len(found.memo) == len({t.key for t in found.memo.values()}) > 1
     assert found.best.thorough and not found.interrupted
     assert found.evidence(found.best) > found.evidence(found.root) + 10
+
+
+@pytest.mark.parametrize("source", ["estimated", "repeats"])
+def test_an_estimated_noise_is_no_larger_than_what_a_fit_leaves(source):
+    found = searching(rubbing())
+    refit = found.without
+    given = found.floor = Floor(0.9 * refit.cost**0.5 * found.bench.scale, source)
+    better = found.bench.fit(found.bench.simulator.with_element("ground-m1", laws.CoulombFriction()))
+    assert better.cost < 0.1 * refit.cost
+    for fitted, count in ((refit, 0), (better, 1)):
+        found.keep(Trial(fitted.last_elements(count), fitted, fitted.cost, fitted.cost, True))
+    assert found.floor is given if source == "repeats" else found.floor2 <= 1.0001 * better.cost
 
 
 def test_an_interrupt_leaves_what_there_is(monkeypatch):
