@@ -190,15 +190,13 @@ def robust_bla(
     return BLA(spectra.frequency, G.mean(axis=0), var_noise, var_total, spectra.dt, n, spectra.U.shape[2])
 
 
-def output_spectra(
-    recordings: Recording | Iterable[Recording], period: int | None = None, lines: Sequence[int] | Array | None = None
-) -> OutputSpectra:
+def output_spectra(recordings: Recording | Iterable[Recording]) -> OutputSpectra:
     """Estimate the spectra of the outputs, of their noise, and of noise and nonlinear distortion together.
 
-    Takes the arguments of :func:`robust_bla`. The distortion is the scatter of ``Y - G U`` over the realizations, `G`
-    being the BLA.
+    Takes periodic recordings, as :func:`robust_bla`. The distortion is the scatter of ``Y - G U`` over the
+    realizations, `G` being the BLA.
     """
-    spectra = _periodic_spectra(recordings, period, lines)
+    spectra = _periodic_spectra(recordings, None, None)
     G, _ = spectra.frf()
     n, n_u = spectra.U.shape[:2]
     U, Y = spectra.U.mean(axis=2), spectra.Y.mean(axis=2)

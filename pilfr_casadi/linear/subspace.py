@@ -138,7 +138,6 @@ def subspace_matrices(
     recordings: Recording | Iterable[Recording],
     nx: int,
     offset: bool = False,
-    block_rows: int | None = None,
     progress: Progress | None = None,
 ) -> tuple[Array, Array, Array, Array]:
     """Return the matrices A, B, C, D of :func:`time_subspace`, without importing the control package.
@@ -147,7 +146,7 @@ def subspace_matrices(
     """
     if nx == 0:
         return _static_gain(as_recordings(recordings), offset)
-    model = TimeProblem(recordings, offset).solve([whole(nx, "the order nx", 1)], block_rows, progress)[0]
+    model = TimeProblem(recordings, offset).solve([whole(nx, "the order nx", 1)], None, progress)[0]
     return model.A, model.B, model.C, model.D
 
 

@@ -80,11 +80,8 @@ def from_mujoco(
         (outputs or (), tuple(tree.sensors), "joints, and sensors of joints"),
     ):
         check_known(names, there, kind, path)
-    given = {n: (bounds or {}).get(n) or _usual_bounds(n, tree.numbers[n]) for n in own}
-    if isinstance(own, Mapping):
-        made = dict(own)
-    else:
-        made = {n: parameter_within(n, tree.numbers[n], ends) for n, ends in given.items()}
+    ends = {n: (bounds or {}).get(n) or _usual_bounds(n, tree.numbers[n]) for n in own}
+    made = own if isinstance(own, Mapping) else {n: parameter_within(n, tree.numbers[n], ends[n]) for n in own}
     drives = tuple(tree.actuators if inputs is None else inputs)
     measured = tuple(tree.usual_outputs if outputs is None else outputs)
     equations = _Equations(tree, tuple(made), drives, measured)

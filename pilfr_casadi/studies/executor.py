@@ -24,7 +24,7 @@ from concurrent.futures import (
     wait,
 )
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -34,22 +34,6 @@ AHEAD = 64  # jobs submitted to an executor at a time
 SCHEDULER_TIMEOUT = 10.0  # seconds to wait for a Dask scheduler
 RETRIES = 2  # trials of a job whose worker was lost, after the first
 FAILED, TIMED_OUT, LOST = "FAILED", "TIMED_OUT", "LOST"  # endings of a job without a result
-
-
-class Job(Protocol):
-    """An independent piece of work."""
-
-    @property
-    def id(self) -> str:
-        """Name of the job, the same in every execution."""
-
-    @property
-    def key(self) -> str:
-        """Digest of everything that its result depends on."""
-
-    @property
-    def parameters(self) -> Mapping[str, Any]:
-        """Facts about the job for its entry in the manifest."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,6 @@ than the common physics, if that is more likely than not.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,6 +21,7 @@ from ..laws import Law, display_name
 from ..simulators import as_simulator
 from .machines import DONE, PAGE, RESIDUAL, LawAt, MachineWork, measured_entry
 from .population import Population, combine, estimate_population, slope
+from .summary import csv_text
 
 CONTENT, TABLE = "fleet.json", "fleet.csv"
 SCHEMA = 1
@@ -319,11 +318,8 @@ class Fleet:
         """Make the files of the fleet as a whole: fleet.json, fleet.csv and report.html."""
         from ..report import fleet_page
 
-        content, rows, text = self.to_dict(), self.table(), io.StringIO()
+        content, rows = self.to_dict(), self.table()
         names = list(dict.fromkeys(key for row in rows for key in row))
-        writer = csv.DictWriter(text, names, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
         residuals = {
             m.name: json.loads(self.files[path])
             for m in self.machines
@@ -331,7 +327,7 @@ class Fleet:
         }
         return {
             CONTENT: json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n",
-            TABLE: text.getvalue(),
+            TABLE: csv_text([names, *([row.get(name, "") for name in names] for row in rows)]),
             PAGE: fleet_page(content, residuals).html(),
         }
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,23 +49,27 @@ def choose_job(scores: Sequence[Score], jobs: Sequence[str]) -> str:
     return min(errors, key=lambda job: (float(np.mean(errors[job])), list(errors).index(job)))
 
 
+def csv_text(rows: Iterable[Sequence[Any]]) -> str:
+    """Write rows as the text of a CSV file."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
 def results_table(scores: Sequence[Score], jobs: Sequence[RunJob], entries: Mapping[str, Any], best: str) -> str:
     """Write results.csv: one row per job and recording, one row for a job without a model; all digits."""
     keys = grid_keys(job.parameters for job in jobs) + ["fold"] * any(job.fold is not None for job in jobs)
     by_job: dict[str, list[Score]] = {}
     for s in scores:
         by_job.setdefault(s.job, []).append(s)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["job", "seed", "chosen", *keys, "status", "operators_used", "role", "recording", "nrmse"])
+    heads = ["job", "seed", "chosen", *keys, "status", "operators_used", "role", "recording", "nrmse"]
+    rows: list[list[Any]] = [heads]
     for job in jobs:
         entry = entries[job.id]
         about = [job.id, job.parameters["seed"], int(job.id == best), *(job.parameters.get(k, "") for k in keys)]
         for s in by_job.get(job.id, [Score(job.id, "", "", np.nan)]):
-            writer.writerow(
-                [*about, entry["status"], entry.get("operators_used", ""), s.role, s.recording, repr(s.nrmse)]
-            )
-    return text.getvalue()
+            rows.append([*about, entry["status"], entry.get("operators_used", ""), s.role, s.recording, repr(s.nrmse)])
+    return csv_text(rows)
 
 
 def reasons(entries: Mapping[str, Mapping[str, Any]], ids: Sequence[str]) -> list[str]:
@@ -139,13 +143,11 @@ def summarise(
 def summary_table(run: Run, summary: Sequence[CellSummary]) -> str:
     """Write summary.csv: one row per recording and cell, numbers to the last digit."""
     keys = grid_keys(cell.values for cell in run.cells)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["role", "recording", *keys, "jobs", "failed", "failure_rate", *QUARTILES])
+    rows: list[list[Any]] = [["role", "recording", *keys, "jobs", "failed", "failure_rate", *QUARTILES]]
     for s in summary:
         about = [s.role, s.recording, *(s.cell.get(k, "") for k in keys), s.jobs, s.failed, repr(s.failure_rate)]
-        writer.writerow([*about, *map(repr, s.quartiles)])
-    return text.getvalue()
+        rows.append([*about, *map(repr, s.quartiles)])
+    return csv_text(rows)
 
 
 def box_plots(run: Run, jobs: Sequence[RunJob], scores: Sequence[Score]) -> bytes:

@@ -33,7 +33,7 @@ def diagnosed(simulator, r, tried=(), press="", after="", **options):
 
 @pytest.mark.parametrize("said", [None, "zero"])
 def test_how_inputs_are_held_is_asked_of_the_data_unless_it_is_said(said):
-    found = pilfr.diagnose(spring(), shaken("linear", m=500), hold=said, laws=())
+    found = pilfr.diagnose(spring(), shaken("linear", m=1200), hold=said, laws=())
     assert found.hold == (said or "linear")
     assert (found.errors["train"]["after"] < 1e-3) is (said is None)
 
