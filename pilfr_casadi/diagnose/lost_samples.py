@@ -301,13 +301,18 @@ class OutputGap(Gate):
 
 
 def find_output_gaps(now: Checked) -> Checked:
-    """Find samples that some outputs have lost; cut the recordings there if the rule accepts it."""
+    """Find samples that some outputs have lost; cut the recordings there if the rule accepts it and that is all.
+
+    Where more is wrong, a gap may imitate a slow clock or a delay that varies.
+    """
     for _ in range(MOST_GAPS):
         found = find_output_gap(now.bench, now.fitted) if now.cost > ABOVE_NOISE**2 * now.noise2 else None
         settled = None if found is None else settle(now, found, THOROUGH)
         if settled is None:
             break
         gap, after = _place(now, *settled)
+        if after.cost > NEAR_NOISE_RATIO**2 * now.noise2:
+            break
         i, k, lost = gap.value
         r = now.bench.recordings[i]
         verb = "are" if len(gap.columns) > 1 else "is"

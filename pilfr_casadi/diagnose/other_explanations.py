@@ -155,12 +155,12 @@ def may_act_elsewhere(search: Search, trial: Trial) -> bool:
     return strained(search, trial) or (at_ends and trial.mean_square > AT_NOISE_RATIO**2 * search.least_noise2)
 
 
-def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[Sequence[Gate], float]:
+def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[tuple[Gate, ...], float]:
     """Note a mismatch that has a sure name in the equation of a state, and return its odds against `named`.
 
     `named` is the hypothesis that has a name at declared ports, if there is one.
     """
-    nothing = (), 0.0
+    nothing = tuple[Gate, ...](), 0.0
     ports = search.bench.simulator.ports
     if not ports or search.interrupted:
         return nothing
@@ -188,7 +188,8 @@ def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[Se
         f"{found.best.error:.3g} of the outputs' deviation). Declare the port that it acts through."
     )
     gate = Gate(state, "undeclared", law.replace("_", " "), sentence, corrected=False)
-    ahead = other.evidence(found.best) - search.evidence(named) if named is not None else 0.0
+    ahead = other.log_prior(found.best) - search.log_prior(found.best)  # as many samples count in both
+    ahead += search.optimistic_evidence(found.best) - search.optimistic_evidence(named or search.root)
     return (gate,), float(np.exp(np.clip(ahead, -CONTENDING_NATS, CONTENDING_NATS)))
 
 

@@ -265,7 +265,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     skipped, and a name that was found stays; otherwise the refitted simulator is returned.
     """
     answer, interrupted = posterior(search), search.interrupted
-    finished = not (interrupted or search.out_of_time)
+    finished, elsewhere = not (interrupted or search.out_of_time), tuple[Gate, ...]()
     gates = (*gates, *tones(search.bench, answer.best.fitted))
     verdict = judge(search, answer, gates)
     if verdict.kind in ("missing-physics", "unexplained") and not (interrupted or search.past_deadline):
@@ -276,16 +276,18 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
         correction, fitted = find_correction(search, answer, named=True)
         answer = answer.within({(port, law) for port, law, _ in correction.elements}, correction.shares["learned"])
         verdict = judge(search, answer, gates)
+        if verdict.kind == "missing-physics" and finished and may_act_elsewhere(search, answer.best):
+            elsewhere, odds = find_undeclared_port(search, answer.best)
+            answer = answer.against(odds)
+            verdict = judge(search, answer, gates)
         if verdict.kind == "missing-physics":
-            if finished and may_act_elsewhere(search, answer.best):
-                more, odds = find_undeclared_port(search, answer.best)
-                gates, answer = (*gates, *more), answer.against(odds)
-                verdict = judge(search, answer, gates)
             said = f"{verdict.sentence} {correction.sentence}" if correction.learned else verdict.sentence
             zeros = offset_gates(answer.best.laws, answer.best.fitted.values)
-            return Conclusion(Verdict(verdict.kind, said), (*gates, *zeros), fitted, correction, answer.effects)
+            notes = (*gates, *elsewhere, *zeros)
+            return Conclusion(Verdict(verdict.kind, said), notes, fitted, correction, answer.effects)
     if verdict.kind == "unexplained" and finished:
-        gates = (*gates, *find_undeclared_port(search)[0], *find_untried_laws(search), *find_varying_values(search))
+        elsewhere = elsewhere or find_undeclared_port(search)[0]
+        gates = (*gates, *elsewhere, *find_untried_laws(search), *find_varying_values(search))
     refitted = search.root.fitted
     if interrupted and verdict.kind != "recording-fault":
         sentence = (
@@ -296,7 +298,9 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     elif verdict.kind == "unexplained" and not search.interrupted:
         correction, fitted = find_correction(search, answer)
         verdict = judge(search, answer, gates, correction.closest)
-        verdict = Verdict(verdict.kind, f"{verdict.sentence} {correction.sentence}")
+        where = [f"{g.value} in the equation of {g.channel} explains it" for g in elsewhere]
+        said = f"Physics is missing, but hardly at a declared port: {where[0]}." if where else verdict.sentence
+        verdict = Verdict(verdict.kind, f"{said} {correction.sentence}")
         return Conclusion(verdict, gates, fitted, correction)
     return Conclusion(verdict, gates, refitted, named_correction(search, refitted))
 

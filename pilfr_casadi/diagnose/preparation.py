@@ -119,9 +119,10 @@ class _Checks:
                 starts = [found.fitted.values, {}]
                 found = found.then(bench, bench.fit(bench.simulator, starts, solver=THOROUGH))
             now = found
-        now = find_output_gaps(find_gaps(mend_stale_samples(unclip(self._report(3, now)))))
+        now = find_gaps(mend_stale_samples(unclip(self._report(3, now))))
         now = now.then(*refine_steps(now.bench, self._report(4, now).fitted))
-        return find_offsets(self._report(5, find_time_shift(now, part, self.early)))
+        now = find_output_gaps(find_time_shift(now, part, self.early))
+        return find_offsets(self._report(5, now))
 
     def _report(self, done: int, now: Checked) -> Checked:
         self.say(CHECKS, done, CHECKED, now.cost**0.5)

@@ -117,7 +117,8 @@ class Posterior:
 
     def against(self, odds: float) -> Posterior:
         """Weigh the effects against another explanation of given odds."""
-        return replace(self, effects=tuple(replace(e, confidence=e.confidence / (1 + odds)) for e in self.effects))
+        effects = tuple(replace(e, confidence=e.confidence / (1 + odds)) for e in self.effects)
+        return replace(self, named=self.named / (1 + odds), effects=effects)
 
 
 def names(trial: Trial) -> frozenset[Name]:

@@ -176,7 +176,9 @@ def test_a_shift_of_the_whole_recording_and_missing_physics_are_no_gap_of_an_out
     late = whole.with_(u=whole.u[:-9], y=np.column_stack([whole.y[9:, 0], whole.y[:-9, 1]]))
     stiff = shaken("zero", law=laws.CubicStiffness().at({"k_3": 2e4}))
     play = shaken("zero", law=laws.Clearance().at({"k_g": 300.0, "g": 0.02}))
-    for r in (whole, late, stiff, play):
+    slow = shaken("zero", clock=2e-3)
+    slow = slow.with_(y=np.column_stack([slow.y[:, 0], shaken("zero").y[: len(slow), 1]]))
+    for r in (whole, late, stiff, play, slow):
         assert not looked_at_outputs(r).gates
 
 

@@ -94,7 +94,8 @@ def test_friction_where_no_port_is_declared_is_told_where_it_acts():
     found = pilfr.diagnose(
         replace(full, ports=full.ports[1:]), hidden, laws=(laws.CoulombFriction,), effects=1, workers=1
     )
-    assert found.verdict == "unexplained" and "no law of the catalogue explains" in found.sentence
+    assert found.verdict == "unexplained"
+    assert "hardly at a declared port: coulomb friction in the equation of v1 explains it" in found.sentence
     (note,) = [g for g in found.gates if g.finding == "undeclared"]
     assert (note.channel, note.value, note.corrected) == ("v1", "coulomb friction", False)
 
@@ -198,3 +199,40 @@ def test_laws_that_need_a_known_domain_are_told_where_it_is_unknown(tried, names
     found = find_untried_laws(searched(machine(), recorded(20.0, 0)[0], tried=(tried,)))
     assert [gate.channel for gate in found] == names
     assert all("thermal alone were not tried" in gate.sentence for gate in found)
+
+
+def positioner():
+    """A valve's stem on a spring behind a pneumatic chamber, which has the only declared port."""
+    return Simulator(
+        lambda x, u, p: {
+            "pressure": (u.command - x.pressure) / p.tau,
+            "stem": x.speed,
+            "speed": (2000 * x.pressure - p.k * x.stem - p.d * x.speed) / 20,
+        },
+        lambda x: {"stem": x.stem},
+        states=("pressure", "stem", "speed"),
+        inputs=("command",),
+        parameters={
+            "tau": Parameter(0.3, bounds=(0.02, 2)),
+            "k": Parameter(1.1e4, bounds=(3e3, 3e4)),
+            "d": Parameter(600.0, bounds=(0, 5e3)),
+        },
+        ports=(pilfr.Port("chamber", lambda p: {"pressure": -1 / p.tau}, lambda x: x.pressure),),
+        hold="zero",
+    )
+
+
+def test_a_law_at_the_sensor_is_weighed_against_friction_where_no_port_is_declared():
+    assert positioner().unreached == {"speed"}
+    rubbing = replace(positioner(), ports=()).with_parameters({"tau": 0.25, "k": 1e4})
+    rubbing = rubbing.with_element("equation:speed", laws.PreslidingFriction().at({"k_t": 2e4, "r": 3.75e-4}))
+    rng = np.random.default_rng(2)
+    command = np.repeat(rng.uniform(0, 1, 16), 50)
+    r = Recording(command, np.zeros(800), 0.02, ("command",), ("stem",), initial="zero", hold="zero")
+    y = rubbing.simulate(r)
+    r = r.with_(y=y + 0.005 * np.std(y) * rng.standard_normal(y.shape))
+    found = pilfr.diagnose(positioner(), r, laws=(laws.PlayHysteresis, laws.PreslidingFriction), effects=1, workers=1)
+    (note,) = [g for g in found.gates if g.finding == "undeclared"]
+    assert note.channel == "speed" and note.value == "coulomb friction", str(found)
+    assert found.verdict == "unexplained" and "hardly at a declared port" in found.sentence
+    assert found.errors["train"]["after"] < found.errors["train"]["before"]
