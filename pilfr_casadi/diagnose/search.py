@@ -264,7 +264,8 @@ class Search(Hypotheses):
                 if not converged and not self.past_deadline:
                     self.keep(self.fits.polish(rest))
                     found = self.memo[rest.key]
-                    if self.in_time() and not self._expanded(found, FAR_RATIO):  # it had been in a wrong minimum
+                    wrong = not self._expanded(found, FAR_RATIO)  # it had been in a wrong minimum
+                    if wrong and self.can_improve(self.best) and self.in_time():
                         self.add(found, again=True)
             if self.best.key == best.key:
                 return
