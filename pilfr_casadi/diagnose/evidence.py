@@ -42,9 +42,9 @@ from .floor import effective_size
 from .workbench import DIVERGED, Fitted, Workbench
 
 # The priors and thresholds on which every answer of a search rests. Elsewhere are those of the noise (`floor`), of
-# faults (`gates`, `channel_faults`, `offsets`, `timing`, `recording_faults`), the memories of an observer
-# (`prediction`), the bases of flexible forces (`screen`, `learned`) and the accuracy of integration (`workbench`). All
-# other numbers limit the effort or keep numbers finite.
+# faults (`gates`, `channel_faults`, `offsets`, `timing`, `lost_samples`, `recording_faults`), the memories of an
+# observer (`prediction`), the bases of flexible forces (`screen`, `learned`) and the accuracy of integration
+# (`workbench`). All other numbers limit the effort or keep numbers finite.
 
 # Prior probabilities
 EFFECT_PRIOR = np.log(0.5)  # log probability of each further effect: one more effect is as likely as not
