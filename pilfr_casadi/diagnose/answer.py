@@ -28,7 +28,7 @@ from .result import Diagnosis, Effect
 from .search import Search
 from .trials import Trial
 from .verdict import NamedEffect, Verdict, names
-from .workbench import Fitted, Workbench
+from .workbench import DIVERGED, Fitted, Workbench
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,8 +192,10 @@ def _without_each_effect(search: Search, found: Conclusion) -> dict[NamedEffect,
     joint, out = Trial(laws, found.fitted, found.fitted.cost, found.fitted.cost), dict[NamedEffect, Fitted]()
     for effect in found.effects:
         rest = search.beside([e for e in laws if (e.port, e.law.id) != effect.name], joint)
-        search.keep(rest)
-        out[effect] = search.thorough(rest).fitted
+        if rest.mean_square < DIVERGED:
+            search.keep(rest)
+            with suppress(InputError):  # it diverges without the effect
+                out[effect] = search.thorough(rest).fitted
     return out
 
 

@@ -301,32 +301,29 @@ class OutputGap(Gate):
 
 
 def find_output_gaps(now: Checked) -> Checked:
-    """Find samples that some outputs have lost; cut the recordings there if the rule accepts it and that is all.
+    """Find samples that some outputs have lost; cut the recording there if the rule accepts it and that is all.
 
     Where more is wrong, a gap may imitate a slow clock or a delay that varies.
     """
-    for _ in range(MOST_GAPS):
-        found = find_output_gap(now.bench, now.fitted) if now.cost > ABOVE_NOISE**2 * now.noise2 else None
-        settled = None if found is None else settle(now, found, THOROUGH)
-        if settled is None:
-            break
-        gap, after = _place(now, *settled)
-        if after.cost > NEAR_NOISE_RATIO**2 * now.noise2:
-            break
-        i, k, lost = gap.value
-        r = now.bench.recordings[i]
-        verb = "are" if len(gap.columns) > 1 else "is"
-        off = f"{abs(lost)} samples ({abs(lost) * r.dt:.3g} s) too {'early' if lost > 0 else 'late'}"
-        whose = "a logger of its own" if lost > 0 else "the logger of the other channels"
-        words = (
-            f"From t = {k * r.dt:.6g} s (sample {k} of {r.label}) on, {gap.channel} {verb} recorded {off}, as where "
-            f"{whose} lost samples and counted on"
-        )
-        accepted = accept(now, after, replace(gap, sentence=words))
-        if len(accepted.gates) == len(now.gates):
-            break
-        now = accepted
-    return now
+    if any(g.finding == "gap" for g in now.gates) or now.cost < ABOVE_NOISE**2 * now.noise2:
+        return now
+    found = find_output_gap(now.bench, now.fitted)
+    settled = None if found is None else settle(now, found, THOROUGH)
+    if settled is None:
+        return now
+    gap, after = _place(now, *settled)
+    if after.cost > NEAR_NOISE_RATIO**2 * now.noise2:
+        return now
+    i, k, lost = gap.value
+    r = now.bench.recordings[i]
+    verb = "are" if len(gap.columns) > 1 else "is"
+    off = f"{abs(lost)} samples ({abs(lost) * r.dt:.3g} s) too {'early' if lost > 0 else 'late'}"
+    whose = "a logger of its own" if lost > 0 else "the logger of the other channels"
+    words = (
+        f"From t = {k * r.dt:.6g} s (sample {k} of {r.label}) on, {gap.channel} {verb} recorded {off}, as where "
+        f"{whose} lost samples and counted on"
+    )
+    return accept(now, after, replace(gap, sentence=words))
 
 
 def _place(now: Checked, gap: OutputGap, after: Checked) -> tuple[OutputGap, Checked]:

@@ -114,10 +114,8 @@ class Fitted:
 
     def strained(self, names: Iterable[str]) -> bool:
         """Tell whether a free parameter of some is at a bound other than zero, so that the fit wants it beyond."""
-        own = self.model.parameters
-        limits = [np.asarray(b) for name in names if not np.all(own[name].fixed) for b in own[name].bounds]
-        values = [self.values[name] for name in names if not np.all(own[name].fixed) for _ in range(2)]
-        return any(bool(np.any((v == b) & (b != 0))) for v, b in zip(values, limits, strict=True))
+        free = (name for name in names if not np.all(self.model.parameters[name].fixed))
+        return any(bool(np.any(self.at_bound(name) & (self.values[name] != 0))) for name in free)
 
     @property
     def begin(self) -> list[np.ndarray]:

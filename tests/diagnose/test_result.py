@@ -124,6 +124,14 @@ def test_a_correction_that_diverges_on_the_test_recording_is_worse():
     assert d.outcome == "worse" and "the simulation diverges" in d.summary
 
 
+def test_a_search_that_was_cut_short_says_so_first():
+    d = with_test_errors(0.5, 0.1, 0.9)
+    for how in ("interrupted", "out_of_time"):
+        first = str(replace(d, **{how: True})).splitlines()[0]
+        assert "was cut short, so that a further effect may not have been tried" in first
+    assert "cut short" not in str(d).splitlines()[0]
+
+
 @pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize(("without", "advised"), [(0.2, True), (0.6, False)])
 def test_the_effect_that_harms_the_test_recording_is_told(without, advised, tmp_path):
