@@ -22,6 +22,7 @@ from ..data import Recording
 from ..linear import measurement_update
 from ..models import Model, ParameterSet, map_points
 from ..simulators import (
+    PARAMETER,
     ClosedEquations,
     Instant,
     Simulator,
@@ -176,6 +177,8 @@ def hidden_force(
     The force is that of element `number` of the corrected simulator; with None it is one at `port` beside all elements.
     `noise` (n_y,) is the standard deviation of the outputs' noise.
     """
+    if port.startswith(PARAMETER):  # no force acts there
+        return None
     r, n = bench.recordings[i], fitted.model.substeps
     drive, start = fitted.model.drive(r), np.asarray(fitted.initial[i], dtype=float)
     with np.errstate(all="ignore"):

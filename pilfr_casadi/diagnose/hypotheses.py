@@ -243,11 +243,15 @@ class Hypotheses:
         if known.screened is None:
             with self.stage("screen"):
                 known.screened = screen(self.bench, parent.fitted, self.laws, self.floor.deviation, self.workers)
-                for s in known.screened[0]:
-                    there = self.alternatives.setdefault(s.port, ())
-                    if not any(type(law) is type(s.law) for law in there):
-                        self.alternatives[s.port] = (*there, s.law)
+                self.note_alternatives(known.screened[0])
         return known.screened
+
+    def note_alternatives(self, scored: Sequence[Scored]) -> None:
+        """Note the laws that are possible at each port."""
+        for s in scored:
+            there = self.alternatives.setdefault(s.port, ())
+            if not any(type(law) is type(s.law) for law in there):
+                self.alternatives[s.port] = (*there, s.law)
 
     @property
     def least_noise2(self) -> float:

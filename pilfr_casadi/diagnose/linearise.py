@@ -23,7 +23,7 @@ from ..data import Recording
 from ..laws import Law, Local
 from ..linear import steady_state_gain, with_output_injection
 from ..models import Model, map_points
-from ..simulators import Port, Simulator, discretise, signals, states_along, term_function
+from ..simulators import PARAMETER, Port, Simulator, discretise, signals, states_along, term_function
 from .workbench import FINER_STEPS, Fitted, Workbench
 
 WALL = 1.0  # largest |λ| h of a contact on the finest steps
@@ -351,16 +351,28 @@ def own_signals(simulator: Simulator, values: np.ndarray) -> list[dict[str, np.n
     return [{name: next(columns) for name in port.signals} for port in simulator.all_ports()]
 
 
+def parameter_signals(bench: Workbench, value: float, x: Sequence[np.ndarray], u: Sequence[np.ndarray]) -> Local:
+    """Return what a parameter may vary with: states (M, n_x) and inputs (M, n_u) of each run, by name, and the time."""
+    states = zip(bench.simulator.states, np.concatenate(x).T, strict=True)
+    signals = {**bench.signals_of(u), **dict(states)}
+    z = np.full(len(signals["t"]), value)
+    return Local(z, np.zeros_like(z), bench.dt, tuple(map(len, u)), inputs=signals)
+
+
 def port_signals(bench: Workbench, fitted: Fitted, port: str) -> Local:
-    """Compute the local signals of a port along the fitted runs of all recordings."""
+    """Compute the local signals of a port, or of a parameter, along the fitted runs of all recordings."""
     simulator, model = fitted.simulator, fitted.model
-    index = [p.name for p in simulator.all_ports()].index(port)
+    of_parameter = port.startswith(PARAMETER)
+    index = 0 if of_parameter else [p.name for p in simulator.all_ports()].index(port)
     function, parts = signals(simulator), []
     for r, state in zip(bench.recordings, fitted.initial, strict=True):
         with np.errstate(over="ignore", invalid="ignore"):
             x = states_along(model, model.drive(r), fitted.vector, state)[:: model.substeps, : len(simulator.states)]
             z, dz, *_, own = local_signals(bench, function, x, r, fitted.vector)
         parts.append((z[:, index], dz[:, index], own, x, r.u))
+    if of_parameter:
+        value = float(fitted.values[port.removeprefix(PARAMETER)])
+        return parameter_signals(bench, value, *zip(*(part[3:] for part in parts), strict=True))
     z, dz, own, x, u = (np.concatenate([part[k] for part in parts]) for k in range(5))
     local = bench.local(z, dz)
     local = replace(local, inputs={**local.inputs, **own_signals(simulator, own)[index]})

@@ -165,14 +165,16 @@ def next_experiment(
 def placebo(bench: Workbench, fitted: Fitted, port: str, law: Law) -> tuple[float, float]:
     """Compute the held-out share of the residual that a law explains with its own signal, and with an unrelated one.
 
-    The unrelated signal is the port's own, shifted by half a recording: it has the same statistics but no relation to
-    the residual.
+    The unrelated signals are its own, shifted by half a recording: they have the same statistics but no relation to the
+    residual.
     """
     probe, runs = linearised(bench, fitted)
     shares = []
     for moved in (False, True):
         shifted = [
-            replace(r, z=np.roll(r.z, len(r.z) // 2, axis=0), dz=np.roll(r.dz, len(r.dz) // 2, axis=0)) if moved else r
+            replace(
+                r, **{k: np.roll(getattr(r, k), len(r.z) // 2, axis=0) for k in ("z", "dz", "x", "u")} if moved else {}
+            )
             for r in runs
         ]
         rest = Remainder.of(bench, probe, shifted, [type(law)], at=port)

@@ -27,8 +27,18 @@ import numpy as np
 from .._base import side_by_side
 from ..laws import Creep, Law, Local, PlayHysteresis, Relaxation, StopHysteresis, count_columns, unit_forces
 from ..models import Parameter
-from ..simulators import Port
-from .linearise import Probe, Run, linearised, locals_of, loudest_stretch, observer_gain, propagate, run
+from ..simulators import PARAMETER, Port
+from .linearise import (
+    Probe,
+    Run,
+    linearised,
+    locals_of,
+    loudest_stretch,
+    observer_gain,
+    parameter_signals,
+    propagate,
+    run,
+)
 from .workbench import FEW, Fitted, Workbench
 
 Pair = tuple[str, type[Law]]  # a port and the class of a law
@@ -45,7 +55,10 @@ MOST_WORK, LEAST_SAMPLES = 600_000, 2500
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A port, its local signals over the whole recordings, and each law allowed there with its shapes."""
+    """A port, its local signals over the whole recordings, and each law allowed there with its shapes.
+
+    `index` is its place among all ports; that of a parameter counts back from the first port.
+    """
 
     index: int
     port: Port
@@ -99,7 +112,8 @@ class Remainder:
         error = np.concatenate([(r.error / bench.scale).ravel() for r in short])
         base = followed(bench, short)
         left = project_off(error, base)
-        tasks = [t for t in _tasks(bench, probe, laws, runs, short) if at in ("", t.port.name)]
+        every = (*_tasks(bench, probe, laws, runs, short), *_parameter_tasks(bench, probe, laws, runs, short))
+        tasks = [t for t in every if at in ("", t.port.name)]
         return cls(bench, short, base, left, tuple(tasks), folds(len(left), len(runs)))
 
     def columns(self, task: Task) -> tuple[np.ndarray, np.ndarray]:
@@ -193,6 +207,24 @@ def _tasks(bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list
         if pairs:
             out.append(Task(j, port, local, part, pairs))
     return sorted(out, key=lambda t: t.port.name.startswith("sensor:"))
+
+
+def _parameter_tasks(
+    bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list[Run], short: list[Run]
+) -> Iterator[Task]:
+    """Generate a task for each free scalar parameter of the simulator; a change of it has a column of its own."""
+    own = [law() for law in laws if "parameter" in law.places]
+    elements = tuple(e.prefix for e in bench.simulator.elements)
+    for name, p in bench.simulator.parameters.items() if own else ():
+        if p.value.ndim or np.all(p.fixed) or name.startswith(elements or ("\0",)):
+            continue
+        at = probe.model.parameters.position(name).start
+        index = int(np.searchsorted(probe.free, at)) - runs[0].n_free
+        value = float(probe.values[at])
+        local, part = (parameter_signals(bench, value, [r.x for r in rs], [r.u for r in rs]) for rs in (runs, short))
+        pairs = [(law, list(law.shapes(local))) for law in own if usable(law, local)]
+        if pairs:
+            yield Task(index, bench.simulator.port(f"{PARAMETER}{name}"), local, part, pairs)
 
 
 def usable(law: Law, local: Local) -> bool:

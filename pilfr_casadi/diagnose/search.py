@@ -2,9 +2,10 @@
 
 Moves lead from one hypothesis to others: *add* a law to the present ones; *exchange* one of several laws for another,
 the others fixed in place; *add two* at once, if neither helps alone; *refine* a law: fit it in a finer form, or with a
-strength that varies with a signal; *name a learned force*: fit the laws nearest to a force that was learned beside a
-hypothesis. A move starts from the most promising hypothesis. The search ends if a move brings no better one, if the
-error is at the noise, or at the time limit. All fits are kept and count in the posterior (`hypotheses`).
+strength that varies with a signal; *vary a parameter* of the simulator with a signal; *name a learned force*: fit the
+laws nearest to a force that was learned beside a hypothesis. A move starts from the most promising hypothesis. The
+search ends if a move brings no better one, if the error is at the noise, or at the time limit. All fits are kept and
+count in the posterior (`hypotheses`).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, side_by_side
-from ..laws import FINER, LINEAR, SCALABLE, Law, constant, likely_profiles, scheduled
+from ..laws import FINER, LINEAR, SCALABLE, Law, constant, likely_profiles, scheduled, varying
 from ..simulators import Placed
 from .evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO
 from .gates import CLEARLY_BETTER
@@ -26,7 +27,7 @@ from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
 from .linearise import linearised
 from .relatives import choose_pairs, complements, fit_pair, relatives
-from .screen import Remainder, Scored, usable
+from .screen import Remainder, Scored, screen, usable
 from .trials import Trial, place_law
 from .workbench import DIVERGED, FEW, THOROUGH, Fitted
 
@@ -96,7 +97,9 @@ class Search(Hypotheses):
         return True
 
     def _name_rest(self, effects: float) -> bool:
-        """Name the forces learned beside the simulator, the best hypothesis, and that without its weakest effect.
+        """Name what is left beside the simulator, the best hypothesis, and that without its weakest effect.
+
+        A parameter may vary with a signal; or a force that is learned there is nearly a law.
 
         The weakest of several effects may imitate a law that only a learned force shows, such as a gain that varies
         with the position. Go on if one of the laws leads.
@@ -104,9 +107,10 @@ class Search(Hypotheses):
         best = self.best
         fewer = [t for t in self.memo.values() if t.effects and t.key < best.key]
         without_weakest = sorted(fewer, key=lambda t: (-len(t.effects), t.mean_square))[:1]
-        for base in {t.key: t for t in (self.root, best, *without_weakest)}.values():
-            if len(base.effects) < effects and self.can_improve(best) and self.in_time():
-                self.name_learned(base)
+        for name_rest in (self.vary_parameters, self.name_learned):
+            for base in {t.key: t for t in (self.root, best, *without_weakest)}.values():
+                if len(base.effects) < effects and self.can_improve(self.best) and self.in_time():
+                    name_rest(base)
         return self.best is best or self._grow(effects)
 
     def _pays(self, trial: Trial) -> bool:
@@ -247,6 +251,19 @@ class Search(Hypotheses):
         if not entries:
             return
         self._record(base, entries, self._fitted(base, entries, None, float(np.sqrt(self.floor2)), True))
+
+    def vary_parameters(self, base: Trial) -> None:
+        """Let parameters of the simulator vary with a signal beside a hypothesis: fit those that explain most."""
+        signals = ("t", *self.bench.simulator.inputs, *self.bench.simulator.states)
+        laws = [law for by in dict.fromkeys(signals) for law in varying(by)]
+        with self.stage("varying parameters"):
+            scored, gain = screen(self.bench, base.fitted, laws, self.floor.deviation, self.workers)
+            self.note_alternatives(scored)
+        best = list(dict.fromkeys((s.port, s.law.scheduled_by) for s in scored))[:FEW]
+        entries = [s for s in scored if (s.port, s.law.scheduled_by) in best]
+        if entries:
+            enough = float(np.sqrt(self.floor2))
+            self._record(base, entries, self._fitted(base, entries, gain, enough, True))
 
     def exchange(self) -> None:
         """Try all other laws, and none, in place of each of several laws, the rest in place, until none changes."""

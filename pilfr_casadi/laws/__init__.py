@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         scaled as scaled,
         scheduled as scheduled,
         strengths_over as strengths_over,
+        varying as varying,
     )
     from .curves import (
         AsymmetricDeadZone as AsymmetricDeadZone,

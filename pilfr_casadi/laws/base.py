@@ -151,8 +151,8 @@ class Law:
         `Local`. Every combination of start values is tried.
     defaults : mapping
         Values of parameters before any are given; otherwise strengths are zero and shapes one.
-    places : tuple of {"parallel", "series", "sensor"}
-        Allowed places: inside the dynamics, at an actuator or a sensor, or at a sensor alone.
+    places : tuple of {"parallel", "series", "sensor", "parameter"}
+        Allowed places: inside the dynamics, at an actuator or a sensor, at a sensor alone, or at a parameter.
     domains : tuple of {"mechanical", "thermal", "electrical", "fluid"}
         Physical domains in which it occurs; left out, all of them.
     special : bool
@@ -314,10 +314,6 @@ class Law:
         out = np.zeros(self.memory or self.order)
         out[: len(out) if self.shifts else self.follows] = z
         return out
-
-    def schedule(self, local: Local) -> np.ndarray:
-        """Signal (M,) with which the strengths vary."""
-        return local.z if self.scheduled_by == "z" else local.inputs[self.scheduled_by]
 
     def on_grid(self, h: float) -> Law:
         """Copy for steps of length h, s; only a delay depends on them."""

@@ -1,4 +1,4 @@
-"""Laws made of laws: scaled by a signal, varying with one, or acting behind a gap.
+"""Laws made of laws: scaled by a signal, varying with one, or acting behind a gap; and parameters that vary.
 
 Two laws in parallel in one port need no class of their own: call `Simulator.with_element` twice.
 """
@@ -70,7 +70,17 @@ PROFILES = {
         "times ratio^(({by} - low)/(high - low))",
         lambda share, values: [values["ratio"] ** share],
     ),
+    # of what is added to a parameter, which has its own value in the middle of the signal's range
+    "tilt": Profile(("",), "", "in a line from -c over 0 to c with {by}", lambda share, values: [2 * share - 1]),
+    "bend": Profile(
+        ("", "_high"),
+        "",
+        "a parabola in {by} from c over 0 to c_high",
+        lambda share, values: _parabola(share, values)[::2],
+    ),
 }
+SCHEDULES = ("linear", "quadratic", "exponential")  # profiles of a law's strength
+VARIATIONS = ("tilt", "bend")  # profiles of a parameter
 
 
 def scaled(law: type[Law], by: str) -> type[Law]:
@@ -112,9 +122,39 @@ def scheduled(law: type[Law], by: str, profile: str = "linear") -> type[Law]:
     InputError
         If it is not a law, or acts in series with a signal, or there is no such profile.
     """
-    if profile not in PROFILES:
-        raise InputError(f"profile = {profile!r} was given; give {', '.join(map(repr, PROFILES))}.")
+    if profile not in SCHEDULES:
+        raise InputError(f"profile = {profile!r} was given; give {', '.join(map(repr, SCHEDULES))}.")
     return _scheduled(_parallel(law), by, profile)
+
+
+class VaryingParameter(Law):
+    """What is added to a parameter of the equations, at the port `parameter:<name>`; see `varying`."""
+
+    id = "varying_parameter"
+    flexible = True
+    equation = "w = c"
+    source = "Toth (2010), Modeling and Identification of Linear Parameter-Varying Systems, sec. 2.1"
+    sentence = "a change of a parameter"
+    units = {"c": "w"}
+    places = ("parameter",)
+
+    def force(self, p: Any) -> Any:
+        return p.c
+
+
+def varying(by: str) -> tuple[type[Law], ...]:
+    """Make the laws by which a parameter may vary with a signal, such as a force constant with the position.
+
+    The parameter has its own value in the middle of the signal's range in the recordings. Its change is in a line
+    (`c` at the upper end, minus that at the lower one), or in a parabola (`c` at the lower end, `c_high` at the upper
+    one) that goes on along its tangents outside the range.
+
+    Parameters
+    ----------
+    by : str
+        A state or an input of the simulator, or "t", the time.
+    """
+    return tuple(_scheduled(VaryingParameter, by, profile) for profile in VARIATIONS)
 
 
 def constant(law: type[Law]) -> type[Law]:
@@ -127,6 +167,8 @@ def likely_profiles(law: type[Law]) -> tuple[str, ...]:
 
     The operators of a layer vary together, by one ratio: each by itself, they could imitate any curve of position.
     """
+    if "parallel" not in law.places:
+        return VARIATIONS[::-1]
     layer = any(law().parameters()[name].value.ndim for name in law.strength)
     return ("exponential",) if layer else ("quadratic", "linear", "exponential")
 
@@ -223,13 +265,14 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
     ends = {own: [f"{own}{end}" for end in varies.ends] for own in base.strength}
     further = {ends[own][k]: base.units[own] for k in range(1, len(varies.ends)) for own in base.strength}
     shape = {"ratio": ""} if name == "exponential" else {}
-    unit = {"z": "z", "t": "s"}.get(by, f"[{by}]")
-    words = {"z": "the local coordinate", "t": "time"}.get(by, by)
+    with_z = by == "z" and base.places == ("parallel",)
+    unit = "z" if with_z else "s" if by == "t" else f"[{by}]"
+    words = "the local coordinate" if with_z else "time" if by == "t" else by
     read = [*inspect.signature(base.step if base.memory else base.force).parameters]
 
     def strengths(p: Any, u: Any, z: Any) -> dict[str, Any]:
         """Parameters of the law at a value of the signal."""
-        signal = z if by == "z" else u[by]
+        signal = z if with_z else u[by]
         weights = varies.weights(signal, p)
         own = {name: p[name] for name in base.units}
         return own | {k: sum(w * p[v] for w, v in zip(weights, names, strict=True)) for k, names in ends.items()}
@@ -240,15 +283,24 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
         sentence = f"{base.sentence}; its strength varies{varies.how} with {words}"
         units = {**base.units, **further, **shape, "low": unit, "high": unit}
         strength = (*base.strength, *further)
-        places = ("parallel",)
+        places = base.places
         scheduled_by, profile = by, name
+
+        @classmethod
+        def reads(cls) -> set[str]:
+            """Signals of the law, and the one that varies its strength."""
+            return base.reads() | {"z" if with_z else "t" if by == "t" else "u"}
+
+        def schedule(self, local: Local) -> np.ndarray:
+            """Signal (M,) with which the strengths vary."""
+            return local.z if with_z else local.inputs[by]
 
         def why_not(self, local: Local) -> str:
             """Say why the data carries no information on this law; empty if it does."""
             unknown = not (local.shown or (local.from_zero and all(local.from_zero)))
-            if by == "z" and unknown:  # a level of each recording's own would pass for a variation with z
+            if with_z and unknown:  # a level of each recording's own would pass for a variation with z
                 return "no output reads the coordinate, and its start is unknown"
-            return super().why_not(local) or ("" if by == "z" else _not_there(by, local))
+            return super().why_not(local) or ("" if with_z else _not_there(by, local))
 
         def parameters(self) -> dict[str, Parameter]:
             """Parameters: the ends of the signal's range are fixed, and all values of a strength have one shape."""
@@ -299,7 +351,7 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
         if base.memory:
 
             def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0, u: Any = None) -> Any:
-                at = p if u is None and by != "z" else strengths(p, u, z)
+                at = p if u is None and not with_z else strengths(p, u, z)
                 have = {"z": z, "s": s, "p": at, "dz": dz}
                 return super().step(**{k: have[k] for k in read if k in have})
 

@@ -26,7 +26,13 @@ if TYPE_CHECKING:
         UNKNOWN as UNKNOWN,
         infer_domain as infer_domain,
     )
-    from .equations import Named as Named, Placed as Placed, Port as Port, in_series as in_series
+    from .equations import (
+        PARAMETER as PARAMETER,
+        Named as Named,
+        Placed as Placed,
+        Port as Port,
+        in_series as in_series,
+    )
     from .external import (
         PythonFunction as PythonFunction,
         leaves as leaves,

@@ -25,7 +25,8 @@ from .domains import DOMAINS, MECHANICAL, UNKNOWN, common_domain, infer_domain, 
 Expression = Callable[..., Any]
 EQUAL_DEPTH = 5  # to which two expressions are compared
 COMPARED_POINTS = 3  # random points at which expressions are compared
-BUILT_IN = ("actuator:", "sensor:", "equation:")  # prefixes of the ports that need no declaration
+PARAMETER = "parameter:"  # prefix of the port of a parameter, to whose value a law there adds
+BUILT_IN = ("actuator:", "sensor:", "equation:", PARAMETER)  # prefixes of the ports that need no declaration
 
 
 def call(function: Expression, name: str, **available: Any) -> Any:
@@ -135,7 +136,9 @@ class Port:
 
     @property
     def kinds(self) -> set[str]:
-        """Kinds of places of a law that it offers: "parallel", or "series" and at a sensor "sensor"."""
+        """Kinds of places of a law that it offers: "parallel", "parameter", or "series" and at a sensor "sensor"."""
+        if self.name.startswith(PARAMETER):
+            return {"parameter"}
         if not self.series:
             return {"parallel"}
         return {"series", "sensor"} if self.name.startswith("sensor:") else {"series"}
@@ -418,10 +421,16 @@ class Equations:
         return (name, rate) if ca.depends_on(read, ca.vertcat(x[name], x[rate])) else None
 
     def port(self, name: str) -> Port:
-        """Find a port by name: declared, `actuator:<input>`, `sensor:<output>` or `equation:<state>`."""
+        """Find a port by name: declared, `actuator:<input>`, `sensor:<output>`, `equation:<state>`, `parameter:<name>`.
+
+        Parameters are not among `all_ports`: a law there adds to a number of the equations, and no signal passes it.
+        """
         for port in self.all_ports():
             if port.name == name:
                 return port
+        own = name.removeprefix(PARAMETER)
+        if name.startswith(PARAMETER) and own in self.parameters and not self.parameters[own].value.ndim:
+            return Port(name, {}, lambda p: p[own], None, self.parameters[own].unit, series=True)
         known = ", ".join(port.name for port in self.all_ports())
         raise InputError(f"There is no port {name!r}; there are {known}.")
 

@@ -28,7 +28,7 @@ import numpy as np
 from .._base import InputError, one_at_a_time
 from ..data import Recording
 from ..models import Model, StepExpressions, accumulate_steps, from_expressions, inject_outputs, map_points
-from .equations import Equations, Named, Placed, Port, call, in_series
+from .equations import PARAMETER, Equations, Named, Placed, Port, call, in_series
 
 LARGEST_STEP = 0.25  # largest |λ| h: a phase error of (λh)⁴/120 = 3e-5 of the angle of a cycle
 MOST_SUBSTEPS = 200  # per sample
@@ -114,11 +114,20 @@ class ClosedEquations:
                 at = simulator.inputs.index(name)
                 u[name] = u[name] + apply(i, u[name], v.slope[at])
         inputs = Named("input", u)
+        vector = self.vector
+        for i, e in placed:
+            if e.port.startswith(PARAMETER):
+                at = simulator.parameter_set.position(e.port.removeprefix(PARAMETER))
+                added = ca.SX.zeros(vector.shape)
+                added[at] = apply(i, vector[at], 0.0, x._values)
+                vector = vector + added
+        if vector is not self.vector:
+            p = Named("parameter", simulator.parameter_set.symbols(vector))
         f = bare = simulator.derivatives(x, inputs, p, t)
         seen, more = dict(x._values), list[tuple[str, Any]]()
-        rates = self.local(x_only, ca.vertcat(*u.values()), v.slope, t, self.vector)[1]
+        rates = self.local(x_only, ca.vertcat(*u.values()), v.slope, t, vector)[1]
         for i, e in placed:
-            if in_series(e.port):
+            if in_series(e.port) or e.port.startswith(PARAMETER):
                 continue
             port = simulator.port(e.port)
             z = simulator.across(port, x, inputs, p, t)

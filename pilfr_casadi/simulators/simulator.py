@@ -185,7 +185,7 @@ class Simulator(Equations):
         place = self.port(port)
         allowed = getattr(law, "places", ("series", "parallel"))
         if not place.kinds & set(allowed):
-            kind = "series" if place.series else "parallel"
+            kind = "a parameter" if place.kinds == {"parameter"} else "series" if place.series else "parallel"
             raise InputError(f"The law {law.id!r} cannot stand in {kind} at {port!r}; choose another port or law.")
         if getattr(law, "in_line", False) and place.term is None:
             raise InputError(
