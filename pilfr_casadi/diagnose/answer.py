@@ -211,7 +211,7 @@ def _effect(
     if port.series and not w_unit:  # in the unit of its signal, such as [force]
         w_unit = z_unit = f"[{port.name.partition(':')[2]}]"
     values = {k: v for k, v in fitted.values.items() if k.startswith(element.prefix)}
-    signals = {**bench.simulator.units, **bench.recordings[0].units}
+    signals = {**bench.simulator.state_units, **bench.simulator.units, **bench.recordings[0].units}
     shown: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
         unit = readable_unit(element.law.units[name.removeprefix(element.prefix)], w_unit, z_unit, signals)

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError
-from ..laws import CATALOGUE, display_name
-from ..simulators import Placed
+from ..laws import CATALOGUE
+from ..simulators import Placed, name_at
 from .evidence import FORMULA_ERROR, SURE, HeldOut
 from .hypotheses import likeliest
 from .learned import Learned, LearnedForce, describe_learned, refit_learned
@@ -61,8 +61,8 @@ class Correction:
         """The elements in words, such as "Coulomb friction at seal and a learned force at seal"."""
         names = []
         for port, law, form in self.elements:
-            learned = "a learned force" + (f" ({form})" if form else "")
-            names.append(f"{learned if law == LearnedForce.id else display_name(law, form)} at {port}")
+            learned = "a learned force" + (f" ({form})" if form else "") + f" at {port}"
+            names.append(learned if law == LearnedForce.id else name_at(port, law, form))
         return " and ".join(names)
 
     @property

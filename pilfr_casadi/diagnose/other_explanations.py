@@ -19,7 +19,7 @@ import numpy as np
 from .._base import InputError, listed
 from ..data import Recording
 from ..laws import display_name
-from ..simulators import UNKNOWN, Placed, in_series, states_along
+from ..simulators import UNKNOWN, Placed, in_series, name_at, states_along
 from .evidence import AT_NOISE_RATIO, BETTER_RATIO, CONTENDING_NATS, FAR_RATIO, NEAR_RATIO, SURE, deviations
 from .gates import (
     CERTAIN_ERRORS,
@@ -133,7 +133,7 @@ def _describe_pinned(search: Search, names: Sequence[str], found: Fitted, named:
         unit = f" {p.unit}" if p.unit else ""
         kept = "held at" if np.all(p.fixed) else "kept by its bounds at"
         parts.append(f"{name} = {value:.5g}{unit}, which is {kept} {float(without.values[name]):.4g}{unit}")
-    words = " and ".join(f"the {display_name(placed.law.id)} at {placed.port}" for placed in named)
+    words = " and ".join(f"the {name_at(placed.port, placed.law.id)}" for placed in named)
     like = f", no further off than with {words}" if named else ""
     what, it, its, given = (
         ("a value", "it", "its", "value is") if len(names) == 1 else ("values", "them", "their", "values are")

@@ -16,9 +16,8 @@ from .._base import InputError, later, to_json, write_atomically
 from ..data import SAME_STEP, Recording, as_recordings, nrmse
 from ..engine import make_engine
 from ..identify import RUN_AWAY, match_channels, run_free
-from ..laws import display_name
 from ..models import ParameterSet
-from ..simulators import Simulator, discretise, in_series
+from ..simulators import PARAMETER, Simulator, discretise, in_series, name_at
 from .blind_spots import BlindSpot
 from .correction import Correction
 from .evidence import BETTER_RATIO, FAR_RATIO, SURE
@@ -218,7 +217,7 @@ class Diagnosis:
         least = min(known, key=lambda e: e.test_without, default=None)
         if least is None or not least.test_without < errors["before"]:
             return ""
-        return f" Without {display_name(least.law, least.form)} at {least.port} it is {_percent(least.test_without)}."
+        return f" Without {name_at(least.port, least.law, least.form)} it is {_percent(least.test_without)}."
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of diagnosis.json; numbers that are not finite are None."""
@@ -509,9 +508,7 @@ class Diagnosis:
             own = {name: parameters[f"{e.prefix}{name}"] for name in e.law.parameters()}
             numbers = {name: p for name, p in own.items() if p.value.ndim == 0 and not np.all(p.fixed)}
             if numbers:
-                lines.append(
-                    f"in the correction, without a sure name: {display_name(e.law.id, e.law.form)} at {e.port}"
-                )
+                lines.append(f"in the correction, without a sure name: {name_at(e.port, e.law.id, e.law.form)}")
                 lines += [f"  {name} = {float(p.value):.5g} {p.unit}".rstrip() for name, p in numbers.items()]
         return lines
 
@@ -532,8 +529,9 @@ class Diagnosis:
 
 def _effect_lines(e: Effect) -> list[str]:
     """Describe an effect with its equation, its numbers, and the laws indistinguishable from it."""
-    form = f" ({display_name(e.form)})" if e.form else ""
-    if in_series(e.port):
+    if e.port.startswith(PARAMETER):
+        symbols = f"where w is added to {e.port.removeprefix(PARAMETER)}"
+    elif in_series(e.port):
         symbols = "where u or z is the signal, and w is added to it"
     else:
         local = "v the speed" if re.search(r"\bv\b", e.equation) else "z the local coordinate"
@@ -541,7 +539,7 @@ def _effect_lines(e: Effect) -> list[str]:
         what = f"subtracted from the derivative of {state}" if kind == "equation" and state else "the force"
         symbols = f"where w is {what} and {local} at the port"
     lines = [
-        f"{display_name(e.law)}{form} at {e.port}, confidence {e.confidence:.2f}",
+        f"{name_at(e.port, e.law, e.form)}, confidence {e.confidence:.2f}",
         f"  {e.sentence}: {e.equation}",
         f"  {symbols}",
     ]
@@ -549,7 +547,7 @@ def _effect_lines(e: Effect) -> list[str]:
         std = "" if p["std"] is None else f" ± {p['std']:.2g}"
         lines.append(f"  {name} = {p['value']:.5g}{std} {p['unit']}".rstrip())
     if e.indistinguishable:
-        others = ", ".join(f"{display_name(law)} at {port}" for port, law in e.indistinguishable)
+        others = ", ".join(name_at(port, law) for port, law in e.indistinguishable)
         lines.append(f"  cannot be told apart from {others}")
     return lines
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, side_by_side
-from ..laws import FINER, LINEAR, SCALABLE, Law, constant, likely_profiles, scheduled, varying
+from ..laws import FINER, LINEAR, SCALABLE, VARIATIONS, Law, constant, likely_profiles, scheduled, varying
 from ..simulators import Placed
 from .evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO
 from .gates import CLEARLY_BETTER
@@ -193,7 +193,7 @@ class Search(Hypotheses):
         best = self.best
         added_now = len(best.laws) == len(parent.laws) + 1
         by = (best.law.scheduled_by or best.law.scaled_by) if added_now else ""
-        if by and self.in_time():
+        if by and "parallel" in best.law.places and self.in_time():
             kind = constant(type(best.law))
             self._refine(best, [scheduled(kind, by, p) for p in likely_profiles(kind) if p != best.law.profile])
 
@@ -255,7 +255,7 @@ class Search(Hypotheses):
     def vary_parameters(self, base: Trial) -> None:
         """Let parameters of the simulator vary with a signal beside a hypothesis: fit those that explain most."""
         signals = ("t", *self.bench.simulator.inputs, *self.bench.simulator.states)
-        laws = [law for by in dict.fromkeys(signals) for law in varying(by)]
+        laws = [varying(by, profile) for by in dict.fromkeys(signals) for profile in VARIATIONS]
         with self.stage("varying parameters"):
             scored, gain = screen(self.bench, base.fitted, laws, self.floor.deviation, self.workers)
             self.note_alternatives(scored)

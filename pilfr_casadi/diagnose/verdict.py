@@ -25,8 +25,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..laws import display_name, short_name
-from ..simulators import Placed
+from ..simulators import Placed, name_at
 from .evidence import (
     AT_NOISE_RATIO,
     BETTER_RATIO,
@@ -348,9 +347,7 @@ def _swells(search: Hypotheses) -> bool:
 def _describe_effects(search: Hypotheses, found: Posterior) -> str:
     sure, unsure = (
         " and ".join(
-            f"{short_name(e.name[1], e.element.law.form)} at {e.name[0]}"
-            for e in found.effects
-            if (e.confidence > SURE) is known
+            name_at(*e.name, e.element.law.form, brief=True) for e in found.effects if (e.confidence > SURE) is known
         )
         for known in (True, False)
     )
@@ -400,7 +397,7 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
         )
     port = where if shares.get(laws[0].port, 0.0) < 0.5 * share else laws[0].port
     rest = max(search.flexible(closest).values(), default=0.0)
-    words = " and ".join(f"{display_name(e.law.id, e.law.form)} at {e.port}" for e in laws)
+    words = " and ".join(name_at(e.port, e.law.id, e.law.form) for e in laws)
     named = f"laws, {words}, remove" if laws[1:] else f"law, {words}, removes"
     return (
         f"Physics is missing, most likely at {port}, and no law of the catalogue explains all of it. The closest "

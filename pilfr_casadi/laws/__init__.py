@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     )
     from .composed import (
         PROFILES as PROFILES,
+        VARIATIONS as VARIATIONS,
+        VaryingParameter as VaryingParameter,
         behind_gap as behind_gap,
         constant as constant,
         likely_profiles as likely_profiles,

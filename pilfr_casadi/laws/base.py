@@ -315,6 +315,10 @@ class Law:
         out[: len(out) if self.shifts else self.follows] = z
         return out
 
+    def schedule(self, local: Local) -> np.ndarray:
+        """Signal (M,) with which the strengths vary."""
+        return local.inputs[self.scheduled_by]
+
     def on_grid(self, h: float) -> Law:
         """Copy for steps of length h, s; only a delay depends on them."""
         return self

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -71,11 +71,13 @@ PROFILES = {
         lambda share, values: [values["ratio"] ** share],
     ),
     # of what is added to a parameter, which has its own value in the middle of the signal's range
-    "tilt": Profile(("",), "", "in a line from -c over 0 to c with {by}", lambda share, values: [2 * share - 1]),
+    "tilt": Profile(
+        ("",), "", "w = c (2 s - 1),  s = ({by} - low)/(high - low)", lambda share, values: [2 * share - 1]
+    ),
     "bend": Profile(
         ("", "_high"),
         "",
-        "a parabola in {by} from c over 0 to c_high",
+        "w = (c (1 - s) - c_high s) (1 - 2 s),  s = ({by} - low)/(high - low)",
         lambda share, values: _parabola(share, values)[::2],
     ),
 }
@@ -122,9 +124,7 @@ def scheduled(law: type[Law], by: str, profile: str = "linear") -> type[Law]:
     InputError
         If it is not a law, or acts in series with a signal, or there is no such profile.
     """
-    if profile not in SCHEDULES:
-        raise InputError(f"profile = {profile!r} was given; give {', '.join(map(repr, SCHEDULES))}.")
-    return _scheduled(_parallel(law), by, profile)
+    return _scheduled(_parallel(law), by, _checked(profile, SCHEDULES))
 
 
 class VaryingParameter(Law):
@@ -134,7 +134,7 @@ class VaryingParameter(Law):
     flexible = True
     equation = "w = c"
     source = "Toth (2010), Modeling and Identification of Linear Parameter-Varying Systems, sec. 2.1"
-    sentence = "a change of a parameter"
+    sentence = "a parameter that varies with {by}: w is added to its value"
     units = {"c": "w"}
     places = ("parameter",)
 
@@ -142,19 +142,33 @@ class VaryingParameter(Law):
         return p.c
 
 
-def varying(by: str) -> tuple[type[Law], ...]:
-    """Make the laws by which a parameter may vary with a signal, such as a force constant with the position.
+def varying(by: str, profile: str = "tilt") -> type[Law]:
+    """Make the law by which a parameter varies with a signal, such as a force constant with the position.
 
-    The parameter has its own value in the middle of the signal's range in the recordings. Its change is in a line
-    (`c` at the upper end, minus that at the lower one), or in a parabola (`c` at the lower end, `c_high` at the upper
-    one) that goes on along its tangents outside the range.
+    It stands in the port `parameter:<name>`. The parameter has its own value in the middle of the signal's range in the
+    recordings.
 
     Parameters
     ----------
     by : str
         A state or an input of the simulator, or "t", the time.
+    profile : {"tilt", "bend"}
+        How it varies: in a line that adds `c` at the upper end and takes it away at the lower one; or in a parabola
+        that adds `c` at the lower end and `c_high` at the upper one, along its tangents outside the range.
+
+    Raises
+    ------
+    InputError
+        If there is no such profile.
     """
-    return tuple(_scheduled(VaryingParameter, by, profile) for profile in VARIATIONS)
+    return _scheduled(VaryingParameter, by, _checked(profile, VARIATIONS))
+
+
+def _checked(profile: str, known: Sequence[str]) -> str:
+    """Check the name of a profile."""
+    if profile not in known:
+        raise InputError(f"profile = {profile!r} was given; give {', '.join(map(repr, known))}.")
+    return profile
 
 
 def constant(law: type[Law]) -> type[Law]:
@@ -167,8 +181,6 @@ def likely_profiles(law: type[Law]) -> tuple[str, ...]:
 
     The operators of a layer vary together, by one ratio: each by itself, they could imitate any curve of position.
     """
-    if "parallel" not in law.places:
-        return VARIATIONS[::-1]
     layer = any(law().parameters()[name].value.ndim for name in law.strength)
     return ("exponential",) if layer else ("quadratic", "linear", "exponential")
 
@@ -259,6 +271,15 @@ def _levels(found: Law, own: str, by: str, limits: Mapping[str, float]) -> np.nd
     return levels if found.scheduled_by == by else np.array([levels.mean(axis=0)] * 3)
 
 
+def _in_words(base: Any, varies: Profile, by: str, words: str) -> tuple[str, str]:
+    """Return equation and sentence of a law whose strength varies."""
+    course = varies.course.format(by=by)
+    if "parameter" in base.places:
+        return course, base.sentence.format(by=words)
+    equation = f"{base.equation}  with {', '.join(base.strength)} {course}"
+    return equation, f"{base.sentence}; its strength varies{varies.how} with {words}"
+
+
 @functools.cache
 def _scheduled(base: Any, by: str, name: str) -> Any:
     varies = PROFILES[name]
@@ -279,8 +300,7 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
 
     class Scheduled(base):
         form = f"{base.form}, scheduled{varies.how} by {by}".removeprefix(", ")
-        equation = f"{base.equation}  with {', '.join(base.strength)} {varies.course.format(by=by)}"
-        sentence = f"{base.sentence}; its strength varies{varies.how} with {words}"
+        equation, sentence = _in_words(base, varies, by, words)
         units = {**base.units, **further, **shape, "low": unit, "high": unit}
         strength = (*base.strength, *further)
         places = base.places
@@ -293,7 +313,7 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
 
         def schedule(self, local: Local) -> np.ndarray:
             """Signal (M,) with which the strengths vary."""
-            return local.z if with_z else local.inputs[by]
+            return local.z if with_z else super().schedule(local)
 
         def why_not(self, local: Local) -> str:
             """Say why the data carries no information on this law; empty if it does."""

@@ -16,7 +16,7 @@ from ..diagnose import Diagnosis
 from ..identify import Comparison, Fit
 from ..laws import display_name
 from ..models import ParameterSet
-from ..simulators import Simulator
+from ..simulators import Simulator, name_at
 from .diagnosis_tables import facts, headline, tone
 from .page import Table, number_text, render, status_tone, uncertain_text
 
@@ -92,7 +92,7 @@ def simulator_card(simulator: Simulator) -> str:
         "ports": ", ".join(ports) or "one for each state equation",
     }
     if s.elements:
-        shown["laws closed in"] = ", ".join(f"{display_name(e.law.id)} at {e.port}" for e in s.elements)
+        shown["laws closed in"] = ", ".join(name_at(e.port, e.law.id, e.law.form) for e in s.elements)
     title = "Simulator in discrete time" if s.discrete else "Simulator"
     return Card(title, facts=shown, tables=_parameter_tables(s.readable_parameters(), {})).html()
 

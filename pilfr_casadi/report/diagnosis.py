@@ -26,7 +26,7 @@ from ..diagnose import (
 )
 from ..laws import display_name, readable_unit, strengths_over
 from ..plots import Signal
-from ..simulators import MECHANICAL, Port
+from ..simulators import MECHANICAL, PARAMETER, Port, name_at
 from . import diagnosis_tables as tables
 from .action import Action, element_of, measure_action
 from .page import Block, Code, Page, Picture, Section, Table, Text, numbered
@@ -301,10 +301,12 @@ def _strength_pictures(case: _Case, number: int) -> list[Block]:
     out: list[Block] = []
     for name, found in strengths_over(law, values, grid).items():
         unit = readable_unit(law.units[name], port.unit, port.across_unit)
-        strength = Signal(name, found if found.ndim == 1 else found.sum(axis=1), unit)
-        drawn = plots.strength_over_signal(signal, strength, seen, title=element.port)
-        caption = f"How {name} of the {display_name(law.id)} at {element.port} varies with {signal.name}."
-        out.append(Picture(drawn, caption, f"Strength {name} at {element.port} over {signal.name}."))
+        total, what = found if found.ndim == 1 else found.sum(axis=1), f"{name} of the {name_at(element.port, law.id)}"
+        if element.port.startswith(PARAMETER):
+            name = what = element.port.removeprefix(PARAMETER)
+            total = total + float(case.after.values[name])
+        drawn = plots.strength_over_signal(signal, Signal(name, total, unit), seen, title=element.port)
+        out.append(Picture(drawn, f"How {what} varies with {signal.name}.", f"{what} over {signal.name}."))
     return out
 
 

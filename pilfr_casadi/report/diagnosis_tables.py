@@ -11,8 +11,9 @@ import numpy as np
 from .._base import to_json
 from ..diagnose import ERROR_NAMES, Diagnosis, Effect, learned_force
 from ..identify import RUN_AWAY
-from ..laws import display_name, scaled, scheduled, short_name
+from ..laws import VaryingParameter, display_name, scaled, scheduled, short_name, varying
 from ..models import Parameter, ParameterSet
+from ..simulators import name_at
 from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
@@ -73,7 +74,7 @@ def answer(diagnosis: Diagnosis, forces: Sequence[str]) -> str:
     d = diagnosis
     role, errors = errors_that_count(d)
     named = [
-        f"{short_name(e.law, e.form)} at {e.port}{strong and ', ' + strong}, {100 * e.confidence:.0f}\u00a0% sure"
+        f"{name_at(e.port, e.law, e.form, brief=True)}{strong and ', ' + strong}, {100 * e.confidence:.0f}\u00a0% sure"
         for e, strong in zip(d.effects, forces, strict=True)
     ]
     places = ", ".join(dict.fromkeys(f.port for f in d.learned))
@@ -138,9 +139,9 @@ def error_table(diagnosis: Diagnosis) -> Table:
 def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> list[Block]:
     """Describe an effect: its law, how it acts, its parameters, and the laws that cannot be told apart from it."""
     e = diagnosis.effects[number]
-    form = f" ({display_name(e.form)})" if e.form else ""
+    name = name_at(e.port, e.law, e.form)
     out: list[Block] = [
-        Text(f"At {e.port}: {display_name(e.law)}{form}. In words: {e.sentence}. Confidence {e.confidence:.2f} of 1."),
+        Text(f"{name[0].upper()}{name[1:]}. In words: {e.sentence}. Confidence {e.confidence:.2f} of 1."),
     ]
     out += [Code(e.equation), *([action] if action else [])]
     worth = diagnosis.worth(e)
@@ -154,13 +155,13 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
         note = "± one standard deviation." if given else ""
         out.append(Table(["parameter", "value", "unit"], rows, note=note))
     if e.indistinguishable:
-        others = "; ".join(f"{display_name(law)} at {port}" for port, law in e.indistinguishable)
+        others = "; ".join(name_at(port, law) for port, law in e.indistinguishable)
         out.append(Text(f"These recordings cannot tell it apart from: {others}."))
     best = [r for rows in candidates_by_pass(diagnosis)[number : number + 1] for r in rows]
     mine = min((score(r) for r in best if (r["port"], r["law"]) == (e.port, e.law)), default=np.nan)
     known = {(e.port, e.law), *e.indistinguishable}
     close = list(dict.fromkeys((r["port"], r["law"]) for r in best if score(r) < ALIKE * mine))
-    wider = "; ".join(f"{display_name(law)} at {port}" for port, law in close if (port, law) not in known)
+    wider = "; ".join(name_at(port, law) for port, law in close if (port, law) not in known)
     if wider:
         out.append(Text(f"Equally good, but more flexible than needed: {wider}."))
     elif not e.indistinguishable:
@@ -200,7 +201,7 @@ def in_place(diagnosis: Diagnosis, number: int) -> str:
     """Name the laws that were in place in a pass; empty for the simulator alone."""
     parent = _parent(diagnosis, number)
     laws = () if parent is None else parent.laws
-    return " and ".join(f"{display_name(e.law.id)} at {e.port}" for e in laws)
+    return " and ".join(name_at(e.port, e.law.id) for e in laws)
 
 
 def _parent(diagnosis: Diagnosis, number: int) -> Any:
@@ -333,6 +334,8 @@ def _parts(law: Any) -> tuple[tuple[Any, ...], str]:
     """List what has to be imported to make the class of a law, and write the expression that makes it."""
     if getattr(law, "factor", ""):
         return (learned_force,), f"learned_force({law.factor!r})"
+    if issubclass(law, VaryingParameter):
+        return (varying,), f"varying({law.scheduled_by!r}, {law.profile!r})"
     if by := law.scaled_by or law.scheduled_by:
         compose, base = (scaled if law.scaled_by else scheduled), law.__base__
         how = f", {law.profile!r}" if law.profile not in ("", "linear") else ""

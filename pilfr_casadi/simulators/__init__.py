@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         Placed as Placed,
         Port as Port,
         in_series as in_series,
+        name_at as name_at,
     )
     from .external import (
         PythonFunction as PythonFunction,

@@ -19,6 +19,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, listed
+from ..laws import display_name, short_name
 from ..models import Named, Parameter, ParameterSet
 from .domains import DOMAINS, MECHANICAL, UNKNOWN, common_domain, infer_domain, may_be_speed, may_convert
 
@@ -190,6 +191,18 @@ class Placed:
     def named(self, own: Mapping[str, Any]) -> dict[str, Any]:
         """Give values of the law their full names."""
         return {f"{self.prefix}{name}": value for name, value in own.items()}
+
+
+def name_at(port: str, law: str, form: str = "", brief: bool = False) -> str:
+    """Name a law in a port by its id and form: "backlash at gear", or "variation of R with temperature".
+
+    A `brief` name has the form only where it says what the law is.
+    """
+    if port.startswith(PARAMETER):
+        _, _, by = form.rpartition("scheduled by ")
+        own = port.removeprefix(PARAMETER)
+        return f"variation of {own}" + (f" with {'time' if by == 't' else by}" if by else "")
+    return f"{(short_name if brief else display_name)(law, form)} at {port}"
 
 
 def in_series(port: str) -> bool:
@@ -457,9 +470,7 @@ class Equations:
         port has units if an output is the coordinate itself.
         """
         integral = next((n for n, rate in self._integrals.items() if rate == state), state)
-        x, u, p, t = self.symbols()
-        same = (n for n, y in self.measured(x, u, p, t).items() if y.is_symbolic() and y.name() == integral)
-        unit = next((self.units[n] for n in same if n in self.units), "")
+        unit = self.state_units.get(integral, "")
         own = f"{unit}/s" if integral == state else f"{unit}/s^2"
         rate = None if integral == state else lambda x: x[state]
         return Port(f"equation:{state}", {state: -1.0}, lambda x: x[integral], rate, own if unit else "", unit)
@@ -479,6 +490,14 @@ class Equations:
             speed = not at_once.is_zero() and port.domain in (MECHANICAL, UNKNOWN) and may_be_speed(port.across_unit)
             speed = speed and not (z.is_symbolic() and z.name() in self.kinematic)  # which are positions
         return replace(port, rate=port.across) if speed else port
+
+    @cached_property
+    def state_units(self) -> dict[str, str]:
+        """Units of the states that are an output, or else the coordinate of a declared port."""
+        at = self.symbols()
+        shown = [(self.across(port, *at), port.across_unit) for port in self.ports]
+        shown += [(y, self.units.get(name, "")) for name, y in self.measured(*at).items()]
+        return {z.name(): unit for z, unit in shown if unit and z.is_symbolic() and z.name() in self.states}
 
     @cached_property
     def _integrals(self) -> dict[str, str]:

@@ -117,9 +117,9 @@ class ClosedEquations:
         vector = self.vector
         for i, e in placed:
             if e.port.startswith(PARAMETER):
-                at = simulator.parameter_set.position(e.port.removeprefix(PARAMETER))
+                own = simulator.parameter_set.position(e.port.removeprefix(PARAMETER))
                 added = ca.SX.zeros(vector.shape)
-                added[at] = apply(i, vector[at], 0.0, x._values)
+                added[own] = apply(i, vector[own], 0.0, x._values)
                 vector = vector + added
         if vector is not self.vector:
             p = Named("parameter", simulator.parameter_set.symbols(vector))

@@ -17,8 +17,8 @@ import numpy as np
 from .._base import InputError, existing_file, make_folder, to_json, write_atomically
 from ..data import Recording
 from ..diagnose import SURE, add_scaled_laws, check_laws, replicate
-from ..laws import Law, display_name
-from ..simulators import as_simulator
+from ..laws import Law
+from ..simulators import as_simulator, name_at
 from .machines import DONE, PAGE, RESIDUAL, LawAt, MachineWork, measured_entry
 from .population import Population, combine, estimate_population, slope
 from .summary import csv_text
@@ -105,7 +105,7 @@ class Machine:
 
     def _rest(self) -> str:
         said = f"lacks more: its error is {self.ratio:.3g} times the noise"
-        named = ", ".join(f"{display_name(e['law'])} at {e['port']}" for e in self.rest.get("effects", ()))
+        named = ", ".join(name_at(e["port"], e["law"], e.get("form", "")) for e in self.rest.get("effects", ()))
         return f"{said}; {named}" if named else said
 
     def to_dict(self) -> dict[str, Any]:
@@ -176,7 +176,7 @@ class Common:
     @property
     def words(self) -> str:
         """The laws in words."""
-        return " and ".join(f"{display_name(law.id, law.form)} at {law.port}" for law in self.laws)
+        return " and ".join(name_at(law.port, law.id, law.form) for law in self.laws)
 
 
 @dataclass(frozen=True, eq=False)
