@@ -19,7 +19,18 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, side_by_side
-from ..laws import FINER, LINEAR, SCALABLE, VARIATIONS, Law, constant, likely_profiles, scheduled, varying
+from ..laws import (
+    FINER,
+    LINEAR,
+    SCALABLE,
+    VARIATIONS,
+    Law,
+    VaryingParameter,
+    constant,
+    likely_profiles,
+    scheduled,
+    varying,
+)
 from ..simulators import Placed
 from .evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO
 from .gates import CLEARLY_BETTER
@@ -255,15 +266,26 @@ class Search(Hypotheses):
     def vary_parameters(self, base: Trial) -> None:
         """Let parameters of the simulator vary with a signal beside a hypothesis: fit those that explain most."""
         signals = ("t", *self.bench.simulator.inputs, *self.bench.simulator.states)
-        laws = [varying(by, profile) for by in dict.fromkeys(signals) for profile in VARIATIONS]
+        laws = [varying(by, profile) for by in dict.fromkeys(signals) for profile in VARIATIONS[:2]]
         with self.stage("varying parameters"):
             scored, gain = screen(self.bench, base.fitted, laws, self.floor.deviation, self.workers)
             self.note_alternatives(scored)
         best = list(dict.fromkeys((s.port, s.law.scheduled_by) for s in scored))[:FEW]
         entries = [s for s in scored if (s.port, s.law.scheduled_by) in best]
-        if entries:
-            enough = float(np.sqrt(self.floor2))
-            self._record(base, entries, self._fitted(base, entries, gain, enough, True))
+        if not entries:
+            return
+        enough = float(np.sqrt(self.floor2))
+        self._record(base, entries, self._fitted(base, entries, gain, enough, True))
+        last = self.best.laws[-1] if self.best.laws else None
+        if last and isinstance(last.law, VaryingParameter) and self.can_improve(self.best) and self.in_time():
+            law = varying(last.law.scheduled_by, VARIATIONS[-1])()
+            finer = [
+                replace(s, law=law, starts=(law.starts_as(last.law, self.best.own),))
+                for s in entries
+                if s.pair == (last.port, type(last.law))
+            ]
+            self.note_alternatives(finer)
+            self._record(base, finer, self._fitted(base, finer, gain, enough, True))
 
     def exchange(self) -> None:
         """Try all other laws, and none, in place of each of several laws, the rest in place, until none changes."""

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     )
     from .composed import (
         PROFILES as PROFILES,
+        SCHEDULES as SCHEDULES,
         VARIATIONS as VARIATIONS,
         VaryingParameter as VaryingParameter,
         behind_gap as behind_gap,

@@ -49,21 +49,34 @@ class Profile:
         return self.weights_at((signal - values["low"]) / (values["high"] - values["low"]), values)
 
 
-def _parabola(share: Any, values: Mapping[str, Any]) -> list[Any]:
-    """Weigh the values at both ends and in the middle; outside the range along the tangents there."""
+@functools.cache
+def _lagrange(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the polynomials that are one at one of `count` equidistant nodes and zero at the others, with slopes."""
+    nodes = np.linspace(0, 1, count)
+    others = (np.poly(np.delete(nodes, i)) for i in range(count))
+    basis = [c / np.polyval(c, at) for c, at in zip(others, nodes, strict=True)]
+    return [(c, np.polyder(c)) for c in basis]
+
+
+def _through(share: Any, count: int) -> list[Any]:
+    """Weigh values at `count` equidistant nodes by the polynomial through them; outside along its tangents."""
     number = isinstance(share, (float, np.ndarray))
     inside = np.clip(share, 0, 1) if number else ca.fmin(ca.fmax(share, 0), 1)
-    beyond = share - inside
-    return [
-        (1 - inside) * (1 - 2 * inside) + beyond * (4 * inside - 3),
-        4 * inside * (1 - inside) + beyond * (4 - 8 * inside),
-        inside * (2 * inside - 1) + beyond * (4 * inside - 1),
-    ]
+
+    def at(coefficients: np.ndarray) -> Any:
+        return functools.reduce(lambda total, c: total * inside + c, coefficients.tolist())
+
+    return [at(value) + (share - inside) * at(slope) for value, slope in _lagrange(count)]
 
 
 PROFILES = {
     "linear": Profile(("", "_high"), "", "linear in {by}", lambda share, values: [1 - share, share]),
-    "quadratic": Profile(("", "_mid", "_high"), " in a parabola", "a parabola in {by} through three values", _parabola),
+    "quadratic": Profile(
+        ("", "_mid", "_high"),
+        " in a parabola",
+        "a parabola in {by} through three values",
+        lambda share, values: _through(share, 3),
+    ),
     "exponential": Profile(
         ("",),
         " exponentially",
@@ -78,11 +91,18 @@ PROFILES = {
         ("", "_high"),
         "",
         "w = (c (1 - s) - c_high s) (1 - 2 s),  s = ({by} - low)/(high - low)",
-        lambda share, values: _parabola(share, values)[::2],
+        lambda share, values: _through(share, 3)[::2],
+    ),
+    "curve": Profile(
+        ("", "_25", "_75", "_high"),
+        "",
+        "w in a curve of fourth degree in {by}: c, c_25, 0, c_75, c_high at even steps from low to high",
+        lambda share, values: [weight for i, weight in enumerate(_through(share, 5)) if i != 2],
     ),
 }
 SCHEDULES = ("linear", "quadratic", "exponential")  # profiles of a law's strength
-VARIATIONS = ("tilt", "bend")  # profiles of a parameter
+NODES = {"": 0.0, "_25": 0.25, "_75": 0.75, "_high": 1.0}  # shares of the range at which a curve has its values
+VARIATIONS = ("tilt", "bend", "curve")  # profiles of a parameter
 
 
 def scaled(law: type[Law], by: str) -> type[Law]:
@@ -141,6 +161,13 @@ class VaryingParameter(Law):
     def force(self, p: Any) -> Any:
         return p.c
 
+    def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
+        """Start values at which a curve equals another variation with the same signal, fitted to `own`."""
+        ends = {name: own[name] for name in ("low", "high")}
+        shares = np.array([NODES[name.removeprefix("c")] for name in self.strength])
+        levels = strengths_over(plain, own, ends["low"] + shares * (ends["high"] - ends["low"]))["c"]
+        return ends | dict(zip(self.strength, levels.tolist(), strict=True))
+
 
 def varying(by: str, profile: str = "tilt") -> type[Law]:
     """Make the law by which a parameter varies with a signal, such as a force constant with the position.
@@ -152,9 +179,10 @@ def varying(by: str, profile: str = "tilt") -> type[Law]:
     ----------
     by : str
         A state or an input of the simulator, or "t", the time.
-    profile : {"tilt", "bend"}
-        How it varies: in a line that adds `c` at the upper end and takes it away at the lower one; or in a parabola
-        that adds `c` at the lower end and `c_high` at the upper one, along its tangents outside the range.
+    profile : {"tilt", "bend", "curve"}
+        How it varies: in a line that adds `c` at the upper end and takes it away at the lower one; in a parabola that
+        adds `c` at the lower end and `c_high` at the upper one; or in a curve of fourth degree through four such
+        values. Outside the range it goes on along its tangents.
 
     Raises
     ------

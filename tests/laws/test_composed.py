@@ -9,7 +9,7 @@ from pilfr_casadi import InputError
 from pilfr_casadi.diagnose.screen import start_values
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
-    PROFILES,
+    SCHEDULES,
     CoulombFriction,
     CubicStiffness,
     Drift,
@@ -196,7 +196,7 @@ def test_a_strength_that_hardly_varies_is_doubtful(profile, more):
         assert law.doubtful(values) is doubtful
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("profile", SCHEDULES)
 def test_operators_vary_each_by_itself(profile):
     """A layer of stops has a weight of each operator at each value of the signal."""
     kind = scheduled(StopHysteresis, "z", profile)
@@ -216,7 +216,7 @@ def test_operators_vary_each_by_itself(profile):
 def test_the_operators_of_a_layer_vary_together():
     """Each by itself, their strengths over the position could imitate any curve and friction."""
     assert likely_profiles(StopHysteresis) == ("exponential",)
-    assert set(likely_profiles(CoulombFriction)) == set(PROFILES)
+    assert set(likely_profiles(CoulombFriction)) == set(SCHEDULES)
     assert scheduled(StopHysteresis, "z", "exponential").strength == StopHysteresis.strength
 
 
@@ -225,7 +225,7 @@ def test_there_is_no_other_profile():
         scheduled(ViscousDamping, "heat", "cubic")
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("profile", SCHEDULES)
 def test_one_profile_starts_as_another(profile):
     """A strength that varies in a line starts in every profile with the same values at the ends of the range."""
     rng = np.random.default_rng(1)

@@ -1,0 +1,139 @@
+"""A parameter of the simulator that varies with a signal: closed in, found, named, drawn."""
+
+import numpy as np
+import pytest
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import InputError
+from pilfr_casadi.laws import VARIATIONS, CubicStiffness, strengths_over, varying
+
+DT, SAMPLES = 5e-3, 1500
+R, L, K, J, C = 1.3, 0.04, 0.08, 2e-3, 6e-3
+
+
+def motor(resistance=lambda x, u, p: p.R, **free):
+    """A motor whose winding has a constant resistance, unless another one is given."""
+    return pilfr.Simulator(
+        lambda x, u, p: {
+            "i": (u.voltage - resistance(x, u, p) * x.i - p.K * x.w) / L,
+            "w": (p.K * x.i - p.c * x.w) / J,
+        },
+        lambda x: {"current": x.i, "speed": x.w},
+        states=("i", "w"),
+        inputs=("voltage", "temperature"),
+        parameters={
+            "R": pilfr.Parameter(1.0, bounds=(0.2, 5.0), unit="Ohm"),
+            "K": pilfr.Parameter(0.07, bounds=(0.02, 0.3), unit="N m/A"),
+            "c": pilfr.Parameter(4e-3, bounds=(0.0, 0.1), unit="N m s"),
+            **free,
+        },
+        ports=(pilfr.Port("bearing", {"w": -1 / J}, lambda x: x.w, lambda x: x.w, "N m", "rad/s"),),
+        units={"temperature": "degC"},
+    )
+
+
+def warm(x, u, p):
+    """A resistance that grows by 40 % from 20 to 80 degC."""
+    return R * (1 + 0.4 * (u.temperature - 20) / 60)
+
+
+def blank(seed, temperature):
+    """A recording without outputs: a multisine of the voltage, and a temperature at both ends."""
+    rng = np.random.default_rng(seed)
+    voltage = 6.0 * pilfr.multisine(SAMPLES, f_max=8.0, fs=1 / DT, rng=rng)
+    course = np.linspace(*temperature, SAMPLES) + 3 * np.sin(np.arange(SAMPLES) / 200)
+    return pilfr.Recording(
+        np.column_stack([voltage, course]), np.zeros((SAMPLES, 2)), DT, ("voltage", "temperature"),
+        ("current", "speed"), initial="zero", hold="zero",
+    )  # fmt: skip
+
+
+def recorded(seed, temperature):
+    """A recording of the machine that grows warm, with noise of 1 %."""
+    true = motor(warm).with_parameters({"K": K, "c": C})
+    r = blank(seed, temperature)
+    y = true.simulate(r)
+    return r.with_(y=y + 0.01 * y.std(axis=0) * np.random.default_rng(seed + 1).standard_normal(y.shape))
+
+
+@pytest.mark.parametrize("profile", VARIATIONS[:2])
+def test_a_varying_parameter_equals_equations_that_write_it_out(profile):
+    """In the middle of the range the parameter has its own value; at the ends it is changed by c and c_high."""
+    law = varying("temperature", profile)().at({"c": 0.3, "c_high": 0.3, "low": 20, "high": 80}
+                                               if profile == "bend" else {"c": 0.3, "low": 20, "high": 80})  # fmt: skip
+    closed = motor().with_element("parameter:R", law)
+
+    def resistance(x, u, p):
+        share = (u.temperature - 50) / 30
+        return p.R + 0.3 * (share**2 if profile == "bend" else share)
+
+    r = blank(1, (25, 75))
+    np.testing.assert_allclose(closed.simulate(r), motor(resistance).simulate(r), rtol=1e-9)
+
+
+def test_a_parameter_may_vary_with_a_state():
+    """The signal is a state of the run, not of the recording."""
+    law = varying("w")().at({"c": 0.2, "low": -10.0, "high": 10.0})
+    closed, r = motor().with_element("parameter:R", law), blank(2, (20, 30))
+    written = motor(lambda x, u, p: p.R + 0.2 * x.w / 10)
+    np.testing.assert_allclose(closed.simulate(r), written.simulate(r), rtol=1e-9)
+
+
+def test_only_a_variation_stands_at_a_parameter():
+    """A force has no place there, a variation has none elsewhere, and a matrix has no port."""
+    with pytest.raises(InputError, match="cannot stand in a parameter at 'parameter:R'"):
+        motor().with_element("parameter:R", CubicStiffness())
+    with pytest.raises(InputError, match="cannot stand in parallel at 'bearing'"):
+        motor().with_element("bearing", varying("w")())
+    with pytest.raises(InputError, match="no port 'parameter:gone'"):
+        motor().with_element("parameter:gone", varying("w")())
+    with pytest.raises(InputError, match="no port 'parameter:G'"):
+        motor(G=pilfr.Parameter(np.eye(2))).with_element("parameter:G", varying("w")())
+    with pytest.raises(InputError, match="profile = 'cubic' was given; give 'tilt', 'bend'"):
+        varying("w", "cubic")
+
+
+@pytest.fixture(scope="module")
+def diagnosis():
+    """Diagnosis of a motor whose resistance grows with a recorded temperature."""
+    return pilfr.diagnose(motor(), recorded(3, (20, 80)), test=recorded(5, (75, 25)), workers=1)
+
+
+def test_the_parameter_and_its_signal_are_named(diagnosis):
+    """The answer says what varies with what, by how much, and predicts the test to the noise."""
+    (effect,) = diagnosis.effects
+    assert (effect.port, effect.law, effect.form) == ("parameter:R", "varying_parameter", "scheduled by temperature")
+    assert diagnosis.sentence == "The simulator leaves out variation of R with temperature."
+    assert effect.confidence > 0.9
+    low, high = (effect.parameters[k]["value"] for k in ("low", "high"))
+    rise = (high - low) / 60 * 0.4 * R
+    assert effect.parameters["c"]["value"] == pytest.approx(rise / 2, rel=0.02)
+    assert effect.parameters["low"]["unit"] == "degC"
+    assert diagnosis.errors["test"]["after"] < 0.011 < 0.03 < diagnosis.errors["test"]["before"]
+    assert "where w is added to R" in str(diagnosis)
+    assert effect.placebo["own"] > 0.5 > effect.placebo["unrelated"]
+
+
+def test_the_corrected_simulator_is_exported_and_reported(diagnosis, tmp_path):
+    """It is an exported step like any other, and the report draws the parameter over its signal."""
+    r, step, x = recorded(7, (30, 70)), diagnosis.to_casadi(), None
+    y, x = [], np.zeros(step.size1_in(0))
+    for u in r.u[:50]:
+        x, now = step(x, u)
+        y.append(now.full().ravel())
+    np.testing.assert_allclose(y, diagnosis.simulate(r)[:50], atol=1e-9)
+    page = diagnosis.report(tmp_path).read_text()
+    assert "How R varies with temperature." in page
+    assert "variation of R with temperature" in page
+    assert "varying(&#39;temperature&#39;, &#39;tilt&#39;)" in page or "varying('temperature', 'tilt')" in page
+
+
+def test_a_curve_starts_as_the_variation_that_it_refines():
+    """A curve through the values of a parabola is that parabola, inside the range and along its tangents outside."""
+    bend, curve = (varying("w", profile)() for profile in ("bend", "curve"))
+    own = {"c": -0.3, "c_high": 0.7, "low": -2.0, "high": 6.0}
+    signal = np.linspace(-3.0, 8.0, 40)
+    parabola = strengths_over(bend.at(own), own, signal)["c"]
+    values = curve.starts_as(bend, own)
+    np.testing.assert_allclose(strengths_over(curve, values, signal)["c"], parabola, atol=1e-12)
+    assert parabola[-1] > own["c_high"] + 0.2  # it goes on outside
