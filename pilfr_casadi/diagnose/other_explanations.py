@@ -161,15 +161,21 @@ def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[tu
     `named` is the hypothesis that has a name at declared ports, if there is one.
     """
     nothing = tuple[Gate, ...](), 0.0
-    ports = search.bench.simulator.ports
+    ports = search.bench.simulator.undeclared
     if not ports or search.interrupted:
         return nothing
-    open_ = replace(search.bench.simulator, ports=())
+    open_ = search.bench.simulator.with_ports(ports)
     bench = replace(search.bench, simulator=open_)
+    forces = [law for law in search.laws if "parallel" in law.places]  # at actuators and sensors all was tried
     try:
         with search.until_interrupted():
             without = bench.fit(open_, [search.root.fitted.values], states=search.root.fitted.begin)
-            there = Search(bench, without, search.floor, search.laws, search.workers, search.say, until=search.until)
+            there = Search(bench, without, search.floor, forces, search.workers, search.say, until=search.until)
+            there.alternatives |= {port: laws for port, laws in search.alternatives.items() if in_series(port)}
+            for trial in search.memo.values():
+                if trial.laws and all(in_series(e.port) for e in trial.laws):
+                    known = replace(trial.fitted, simulator=trial.fitted.simulator.with_ports(ports))
+                    there.memo[trial.key] = replace(trial, fitted=known)
             other = there.run(1)
             search.interrupted = other.interrupted
     except InputError:

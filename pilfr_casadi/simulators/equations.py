@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Self, cast
 
@@ -272,6 +272,12 @@ class Equations:
         """Copy with other laws in place of its own; they have the same parameters."""
         return self._with(elements=elements)
 
+    def with_ports(self, ports: tuple[Port, ...]) -> Self:
+        """Copy with other inner ports, such as those of `undeclared`."""
+        copy = object.__new__(type(self))
+        copy.__dict__.update({f.name: getattr(self, f.name) for f in fields(self)}, ports=ports)
+        return copy
+
     @property
     def parameter_set(self) -> ParameterSet:
         """The parameters with the layout of their vector."""
@@ -517,6 +523,26 @@ class Equations:
         at = self.symbols()
         reached = {target for port in self.ports for target in self.into(port, *at)}
         return frozenset(self.states) - self.kinematic - reached
+
+    @cached_property
+    def undeclared(self) -> tuple[Port, ...]:
+        """Ports of states' equations that differ from all declared ports; empty if none is declared.
+
+        A declared port that enters one equation, at the same coordinate, is that of the equation.
+        """
+        at = self.symbols()
+        declared = [
+            ([target for target in self.into(port, *at) if target in self.states], self.across(port, *at))
+            for port in self.ports
+        ]
+        found = []
+        for state in self.states if self.ports and not self.discrete else ():
+            port = self._equation(state)
+            z = self.across(port, *at)
+            same = any(reached == [state] and ca.is_equal(z, other, EQUAL_DEPTH) for reached, other in declared)
+            if state not in self.kinematic and not same:
+                found.append(self._with_speed(port))
+        return tuple(found)
 
     @cached_property
     def idle_inputs(self) -> tuple[str, ...]:
