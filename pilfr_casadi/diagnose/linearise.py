@@ -29,7 +29,7 @@ from .workbench import FINER_STEPS, Fitted, Workbench
 WALL = 1.0  # largest |λ| h of a contact on the finest steps
 
 BLOCK = 256  # samples propagated at a time
-CHUNK = 300  # samples linearised at a time
+CHUNK, ENTRIES = 300, 2e7  # samples linearised at a time, and entries of their matrices, at most
 POINTS = 60  # samples of a run at which the user's equations are evaluated
 
 
@@ -171,8 +171,10 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
         states = states_along(seen, seen.drive(r), np.append(p, 1.0), x)
     kept: list[np.ndarray] = []
     means = []
-    for begin in range(0, len(states), CHUNK * n):  # matrices of all sub-steps would be large
-        now = slice(begin, begin + CHUNK * n)
+    size = n * model.n_state * (model.n_state + probe.step.size2_out(2))
+    chunk = int(np.clip(ENTRIES / max(size, 1), 1, CHUNK)) * n
+    for begin in range(0, len(states), chunk):  # matrices of all sub-steps would be large
+        now = slice(begin, begin + chunk)
         y, a, b, c, d = map_points(probe.step, states[now], drive[now])
         means.append([len(y) * v.mean(axis=0) for v in (a, b, c)])
         if gain is not None:

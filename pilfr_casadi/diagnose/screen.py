@@ -49,8 +49,8 @@ RIDGES = (1e-6, 1e-3)  # strengths of the ridge regression of flexible forces, r
 DEGREE = 4  # of the flexible surface
 # degrees in z and dz/dt of the surface's terms
 TERMS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j)
-# largest product of samples and squared number of states for a flexible force; least number of samples
-MOST_WORK, LEAST_SAMPLES = 600_000, 2500
+# product of samples and squared number of states for a flexible force: that of more than LEAST_SAMPLES, and of any
+MOST_WORK, LEAST_SAMPLES, MOST_MEMORY = 600_000, 2500, 100_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -457,7 +457,8 @@ FLEXIBLE = (Surface, StopHysteresis, PlayHysteresis, Relaxation, Creep)
 
 def flexible_shares(bench: Workbench, fitted: Fitted) -> dict[str, float]:
     """Compute the held-out share of the residual's power that any force at a port explains, by port."""
-    most = max(MOST_WORK // max(fitted.model.n_state, 1) ** 2, LEAST_SAMPLES) // len(bench.recordings)
+    size = max(fitted.model.n_state, 1) ** 2  # hundreds of states if a law holds a long delay
+    most = max(MOST_WORK // size, min(LEAST_SAMPLES, MOST_MEMORY // size)) // len(bench.recordings)
     if any(len(r) > most for r in bench.recordings):
         bench = bench.on([r.slice(0, max(most, r.skip + LEAST_SAMPLES // 10)) for r in bench.recordings])
     probe, runs = linearised(bench, fitted)
