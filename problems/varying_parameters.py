@@ -2,7 +2,7 @@
 
 - `winding`: the resistance of a motor's winding grows by 20 to 50 % with a recorded temperature.
 - `magnet`: the torque constant of the same motor falls by 10 to 25 % with it, in both equations that it stands in.
-- `coil`: the force constant of a loudspeaker falls with the deflection, in both equations, and so does no force.
+- `coil`: the force constant of a loudspeaker falls with the deflection, in both equations.
 - `tank`: the mass of a carriage with a tank falls by 20 to 50 % in the time of a recording.
 
 Values are drawn anew for every seed. The truth is integrated apart from the package.
@@ -66,7 +66,7 @@ def motor(kind: str, rng: np.random.Generator) -> Drawn:
         states=("i", "w"),
         inputs=("voltage", "temperature"),
         parameters=free(p, rng),
-        ports=Port("bearing", {"w": -1 / inertia}, lambda x: x.w, lambda x: x.w, "N m", "rad/s"),
+        ports=(Port("bearing", {"w": -1 / inertia}, lambda x: x.w, lambda x: x.w, "N m", "rad/s"),),
     )
     return simulator, recorded(20, 80), recorded(75, 30)
 
@@ -126,7 +126,7 @@ def carriage(_: str, rng: np.random.Generator) -> Drawn:
         states=("s", "v"),
         inputs=("force",),
         parameters=free(p, rng),
-        ports=Port("guide", lambda p: {"v": -1 / p.m}, lambda x: x.s, lambda x: x.v, "N", "m"),
+        ports=(Port("guide", lambda p: {"v": -1 / p.m}, lambda x: x.s, lambda x: x.v, "N", "m"),),
     )
     return simulator, recorded(), recorded()
 
