@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, in_words
 from ..data import Recording
 from ..identify import surrogate_warning
 from ..laws import readable_unit
@@ -127,6 +127,7 @@ def build_diagnosis(
         gates=(
             *_surrogate_note(request.stand_in_error),
             *_convergence_note(after),
+            *_combination_note(after, std),
             *final_gates(found.gates, after, std, bool(effects), settled),
         ),
         mismatch=mismatch(
@@ -174,6 +175,20 @@ def _convergence_note(after: Fitted) -> tuple[Gate, ...]:
         "than their standard errors; bound those that are known, or add a recording that tells them apart."
     )
     return (Gate("simulation", "convergence", after.status.name.lower(), words, False),)
+
+
+def _combination_note(after: Fitted, std: Mapping[str, np.ndarray]) -> tuple[Gate, ...]:
+    """Note the numbers that the recordings determine only in combination, so that they have no standard error."""
+    own = after.model.parameters
+    tied = [
+        name
+        for name, p in own.items()
+        if not p.value.ndim and not np.all(p.fixed) and not np.isfinite(std[name]) and not after.at_bound(name)
+    ]
+    if len(tied) < 2:
+        return ()
+    words = f"These recordings determine {in_words(tied)} only in combination, so they have no standard errors."
+    return (Gate("simulation", "combination", ", ".join(tied), words, False),)
 
 
 def _blind_spots(request: Request, ready: Prepared, search: Search) -> tuple[BlindSpot, ...]:

@@ -345,7 +345,8 @@ def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) 
         if names:
             yield BlindSpot(kind, tuple(names), sentence.format(in_words(names)))
 
-    if found.error**2 > ROUGH:
+    rough = found.error**2 > ROUGH  # then the simulated motion is not the machine's
+    if rough:
         left = f"{100 * found.error:.3g} % of the outputs' deviation"
         yield BlindSpot("rough", (), f"The refitted simulator leaves {left}, so all of this is rough.")
     yield from spot("constant-input", still, "Constant in all recordings: {}.")
@@ -359,7 +360,8 @@ def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) 
         yield from spot(status, names, sentence + more)
     for tie in found.ties:
         yield BlindSpot("tied", tie.names, tie.sentence)
-    moving = [e for e in found.excitation if e.port.removeprefix("actuator:") not in still]
+    known = [e for e in found.excitation if not rough or e.port.startswith("actuator:")]
+    moving = [e for e in known if e.port.removeprefix("actuator:") not in still]
     yield from spot("no-motion", [e.port for e in moving if e.travel == 0], "Nothing moves at {}.")
     text = "No reversal at {}: hysteresis and friction look like stiffness and damping there."
     yield from spot("no-reversal", [e.port for e in moving if e.travel > 0 and e.reversals == 0], text)

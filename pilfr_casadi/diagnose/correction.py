@@ -73,9 +73,9 @@ class Correction:
             f"Of the mismatch above the noise, named laws explain {named}, a learned force {learned}; {left} is left."
         )
         if not self.elements:
-            why = "nothing that was tried is expected to predict other recordings better"
+            why = "nothing that was tried is expected to predict recordings better that it was not fitted to"
             late = "there was no time left to compare it with others"
-            return f"The corrected simulator is the refitted one: {why if np.isfinite(self.after) else late}."
+            return f"The corrected simulator is still the refitted one: {why if np.isfinite(self.after) else late}."
         if not np.isfinite(self.after):
             return shares
         return (

@@ -228,7 +228,7 @@ class CubicDamping(Law):
     id = "cubic_damping"
     equation = "w = c_3 (dz/dt)^3"
     source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 3.3"
-    sentence = "a damping force that grows with the cube of speed"
+    sentence = "a damping force in proportion to the cube of speed"
     units = {"c_3": "w*s^3/z^3"}
 
     def force(self, dz: Any, p: Any) -> Any:

@@ -130,7 +130,7 @@ class PiecewiseStiffness(Law):
     form = "above"
     equation = "w = k_c max(z - g, 0)"
     source = "Shaw & Holmes (1983), J. Sound Vib. 90(1)"
-    sentence = "a contact: beyond a point of the travel another stiffness sets in"
+    sentence = "another stiffness sets in beyond a point, as of a contact"
     units = {"k_c": "w/z", "g": "z"}
     starts = {"g": lambda at: at.low + 2 * at.half * np.array([0.15, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])}
     ranges = {

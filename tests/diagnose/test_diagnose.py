@@ -181,3 +181,24 @@ def test_a_spring_or_damper_that_was_left_out_is_named(left_out, hidden, port, n
     assert found.effects[0].confidence > 0.8
     for symbol, truth in strength.items():
         assert found.effects[0].parameters[symbol]["value"] == pytest.approx(truth, rel=0.05)
+
+
+def test_values_that_are_known_only_together_say_so():
+    """Of a product, the factors have no standard errors; a note names them."""
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal(400)
+    r = pilfr.Recording(u, 6 * u + 0.01 * rng.standard_normal(400), 0.01, ("volt",), ("gauge",), initial="zero")
+    amplifier = pilfr.Simulator(
+        lambda: {},
+        lambda u, p: {"gauge": p.gain * p.sensitivity * u.volt + p.zero},
+        inputs=("volt",),
+        parameters={name: pilfr.Parameter(2.0) for name in ("gain", "sensitivity")} | {"zero": pilfr.Parameter(0.0)},
+    )
+    found = pilfr.diagnose(amplifier, r, laws=[Delay], workers=1)
+    assert found.verdict == "complete"
+    (note,) = [g for g in found.gates if g.finding == "combination"]
+    assert note.sentence == (
+        "These recordings determine gain and sensitivity only in combination, so they have no standard errors."
+    )
+    assert found.parameters["gain"]["std"] is None
+    assert found.parameters["zero"]["std"] is not None
