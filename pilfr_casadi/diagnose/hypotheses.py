@@ -317,13 +317,17 @@ class Hypotheses:
         return np.asarray(np.sqrt(np.mean(np.concatenate([e[r.skip :] for e, r in pairs]) ** 2, axis=0)))
 
     def beside(self, laws: Sequence[Placed], joint: Trial) -> Trial:
-        """Make a trial of some laws of a hypothesis, perhaps of another search, at the values that they have there."""
+        """Make a trial of some laws of a hypothesis, perhaps of another search, at the values that they have there.
+
+        It runs on steps as fine as the hypothesis: a law that only asks for finer steps would seem to explain something.
+        """
         simulator: Simulator = self.bench.simulator
         named: dict[str, object] = {k: joint.fitted.values.get(k, v) for k, v in self.root.fitted.values.items()}
         for e in laws:
             simulator = simulator.with_element(e.port, e.law)
             named |= simulator.elements[-1].named(e.own(joint.fitted.values))
-        fitted = self.bench.run(simulator, named, joint.fitted.begin)
+        bench = replace(self.bench, at_least=max(self.bench.at_least, joint.fitted.model.substeps))
+        fitted = bench.run(simulator, named, joint.fitted.begin)
         return Trial(fitted.last_elements(len(laws)), fitted, fitted.cost, fitted.cost)
 
     @contextmanager
