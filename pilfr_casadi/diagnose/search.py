@@ -299,7 +299,8 @@ class Search(Hypotheses):
                     self.keep(rest)
                     self.add(rest, again=True)
                 known = self.memo.get(rest.key)  # a law that was found only beside another one may do without it
-                converged = known is not None and known.thorough and known.mean_square <= rest.mean_square
+                as_fine = known is not None and known.fitted.model.substeps >= rest.fitted.model.substeps
+                converged = known is not None and known.thorough and as_fine and known.mean_square <= rest.mean_square
                 if not converged and not self.past_deadline:
                     self.keep(self.fits.polish(rest))
                     found = self.memo[rest.key]
