@@ -173,7 +173,7 @@ def varying(by: str, profile: str = "tilt") -> type[Law]:
     """Make the law by which a parameter varies with a signal, such as a force constant with the position.
 
     It stands in the port `parameter:<name>`. The parameter has its own value in the middle of the signal's range in the
-    recordings.
+    recordings, and stays within its bounds.
 
     Parameters
     ----------

@@ -118,9 +118,12 @@ class ClosedEquations:
         for i, e in placed:
             if e.port.startswith(PARAMETER):
                 own = simulator.parameter_set.position(e.port.removeprefix(PARAMETER))
-                added = ca.SX.zeros(vector.shape)
-                added[own] = apply(i, vector[own], 0.0, x._values)
-                vector = vector + added
+                low, high = (
+                    ends[own].item() for ends in (simulator.parameter_set.lower, simulator.parameter_set.upper)
+                )
+                varied = ca.SX(vector)
+                varied[own] = ca.fmin(ca.fmax(vector[own] + apply(i, vector[own], 0.0, x._values), low), high)
+                vector = varied
         if vector is not self.vector:
             p = Named("parameter", simulator.parameter_set.symbols(vector))
         f = bare = simulator.derivatives(x, inputs, p, t)

@@ -1,5 +1,6 @@
 """A parameter of the simulator that varies with a signal: closed in, found, named, drawn."""
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -76,6 +77,14 @@ def test_a_parameter_may_vary_with_a_state():
     law = varying("w")().at({"c": 0.2, "low": -10.0, "high": 10.0})
     closed, r = motor().with_element("parameter:R", law), blank(2, (20, 30))
     written = motor(lambda x, u, p: p.R + 0.2 * x.w / 10)
+    np.testing.assert_allclose(closed.simulate(r), written.simulate(r), rtol=1e-9)
+
+
+def test_a_varying_parameter_stays_within_its_bounds():
+    """A line that would lead below zero ends at the lower bound."""
+    law = varying("temperature")().at({"c": -5.0, "low": 20.0, "high": 80.0})
+    closed, r = motor().with_element("parameter:R", law), blank(2, (30, 75))
+    written = motor(lambda x, u, p: ca.fmin(ca.fmax(p.R - 5.0 * (u.temperature - 50) / 30, 0.2), 5.0))
     np.testing.assert_allclose(closed.simulate(r), written.simulate(r), rtol=1e-9)
 
 
