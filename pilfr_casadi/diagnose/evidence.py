@@ -37,7 +37,7 @@ from .._base import InputError, side_by_side
 from ..identify import solve_within_bounds
 from ..laws import Law
 from ..optimise import GaussNewton, Problem
-from ..simulators import MECHANICAL, UNKNOWN, Placed
+from ..simulators import MECHANICAL, PARAMETER, UNKNOWN, Placed
 from .floor import effective_size
 from .workbench import DIVERGED, Fitted, Workbench
 
@@ -266,12 +266,15 @@ def log_prior(
 ) -> float:
     """Compute the log prior probability of laws: all ports are alike, in a port all laws, and in a law all its forms.
 
-    At a port of a known domain (`domains`) the laws of that domain are likelier than general ones. One law in several
-    sensors, such as a logger's filters, counts once. `alternatives` are the laws allowed in each port; `doubtful` tells
-    that a law degenerates at its fitted values.
+    The parameters, which nobody declared as ports, count as one port together. At a port of a known domain (`domains`)
+    the laws of that domain are likelier than general ones. One law in several sensors, such as a logger's filters,
+    counts once. `alternatives` are the laws allowed in each port; `doubtful` tells that a law degenerates at its fitted
+    values.
     """
     total = DOUBTFUL_PRIOR if doubtful else 0.0
     in_sensors = set[type[Law]]()
+    parameters = sum(port.startswith(PARAMETER) for port in alternatives)
+    ports = max(len(alternatives) - parameters + min(parameters, 1), 1)
     for e in laws:
         if e.port.startswith("sensor:"):
             if type(e.law) in in_sensors:
@@ -279,7 +282,8 @@ def log_prior(
             in_sensors.add(type(e.law))
         there = alternatives.get(e.port, ())
         forms = sum(law.id == e.law.id for law in there)
-        total += EFFECT_PRIOR - np.log(max(len(alternatives), 1)) - np.log(max(forms, 1))
+        total += EFFECT_PRIOR - np.log(ports) - np.log(max(forms, 1))
+        total -= np.log(parameters) if e.port.startswith(PARAMETER) else 0.0
         total += _log_share(e.law.id, there, (domains or {}).get(e.port, UNKNOWN))
         total += FLEXIBLE_PRIOR if e.law.flexible else 0.0
     return float(total)

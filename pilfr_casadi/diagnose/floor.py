@@ -1,5 +1,7 @@
 """The noise floor: from repeated periods, from repeated recordings, or estimated from a residual.
 
+What repeats is rounded alike, so that a measured floor is at least the error of rounding to the sensor's steps.
+
 The estimate takes third differences of the residual (normalised by √20): they remove slow model error and keep white
 noise. They underestimate coloured noise. If a fit's residual cannot be told from noise (no local signal explains any of
 it on held-out data), the residual itself is the floor.
@@ -18,6 +20,8 @@ CORRELATED, P_VALUE = 0.5, 1e-4  # rank correlation, and its p-value, from which
 ABOVE_NOISE = 2.0  # ratio of the error to the noise from which results say that more is missing
 FEWEST = 30.0  # effective samples that a residual has at least
 LONGEST = 400  # longest correlation of a residual, in samples
+DISTINCT_SHARE = 0.5  # share of the samples with distinct values above which a signal is not quantised
+SAME_LEVEL = 1e-9  # distance of two values, over the range, below which they are one level
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,15 +48,29 @@ def noise_floor(recordings: Sequence[Recording], residuals: Sequence[np.ndarray]
 def measured_floor(recordings: Sequence[Recording]) -> Floor | None:
     """Measure the floor on periods, else on recordings with the same input; None if there are neither."""
     found = [d for d in map(_from_periods, recordings) if d is not None]
+    rounding = _sensor_steps(recordings) / np.sqrt(12)
     if found:
-        return Floor(np.sqrt(np.mean(np.square(found), axis=0)), "periods")
+        return Floor(np.maximum(np.sqrt(np.mean(np.square(found), axis=0)), rounding), "periods")
     groups: dict[bytes, list[Recording]] = {}
     for r in recordings:
         groups.setdefault(r.u.tobytes(), []).append(r)
     repeats = [np.std([r.y[_settled(g) :] for r in g], axis=0, ddof=1) for g in groups.values() if len(g) > 1]
     if repeats:
-        return Floor(np.sqrt(np.mean(np.concatenate(repeats) ** 2, axis=0)), "repeats")
+        return Floor(np.maximum(np.sqrt(np.mean(np.concatenate(repeats) ** 2, axis=0)), rounding), "repeats")
     return None
+
+
+def _sensor_steps(recordings: Sequence[Recording]) -> np.ndarray:
+    """Find the step of each output's values, (n_y,); zero if most samples have a value of their own."""
+    y = np.concatenate([r.y for r in recordings])
+    out = np.zeros(y.shape[1])
+    for i, column in enumerate(y.T):
+        levels = np.unique(column)
+        gaps = np.diff(levels)
+        gaps = gaps[gaps > SAME_LEVEL * np.ptp(column)]
+        if len(levels) < DISTINCT_SHARE * len(column) and len(gaps):
+            out[i] = gaps.min()
+    return out
 
 
 def _settled(group: Sequence[Recording]) -> int:

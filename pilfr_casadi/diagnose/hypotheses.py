@@ -319,7 +319,7 @@ class Hypotheses:
     def beside(self, laws: Sequence[Placed], joint: Trial) -> Trial:
         """Make a trial of some laws of a hypothesis, perhaps of another search, at the values that they have there.
 
-        It runs on steps as fine as the hypothesis: a law that only asks for finer steps would seem to explain something.
+        It runs on steps as fine as the hypothesis, because a law that only asks for finer steps explains nothing.
         """
         simulator: Simulator = self.bench.simulator
         named: dict[str, object] = {k: joint.fitted.values.get(k, v) for k, v in self.root.fitted.values.items()}

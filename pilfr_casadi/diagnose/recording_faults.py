@@ -28,6 +28,7 @@ import numpy as np
 
 from ..data import Recording
 from ..laws import AsymmetricSaturation
+from .floor import DISTINCT_SHARE
 from .gates import (
     CURED_SHARE,
     EXCEPTION_SHARE,
@@ -52,7 +53,6 @@ ISOLATED_SHARE = 0.12  # distance of neighbours, and deviation nearby, over a gl
 
 ROUNDING = 1e-6  # relative rounding of distances, far above what occurs
 
-DISTINCT_SHARE = 0.5  # share of the samples with distinct values above which a signal is not quantised
 LONGEST_REST = 5  # longest rest of an encoder or a machine, in samples
 LARGEST_MOTION = 5  # largest motion of an encoder in a sample, in steps
 MOST_LEFT = 0.5  # largest share of the mismatch left by what an input may have been beyond its limit, a guess

@@ -212,11 +212,10 @@ def _tasks(bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list
 def _parameter_tasks(
     bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list[Run], short: list[Run]
 ) -> Iterator[Task]:
-    """Generate a task for each free scalar parameter of the simulator; a change of it has a column of its own."""
+    """Generate a task for each free coefficient of the equations; a change of it has a column of its own."""
     own = [law() for law in laws if "parameter" in law.places]
-    elements = tuple(e.prefix for e in bench.simulator.elements)
-    for name, p in bench.simulator.parameters.items() if own else ():
-        if p.value.ndim or np.all(p.fixed) or name.startswith(elements or ("\0",)):
+    for name in bench.simulator.coefficients if own else ():
+        if np.all(bench.simulator.parameters[name].fixed):
             continue
         at = probe.model.parameters.position(name).start
         index = int(np.searchsorted(probe.free, at)) - runs[0].n_free

@@ -351,14 +351,16 @@ def _describe_effects(search: Hypotheses, found: Posterior) -> str:
         )
         for known in (True, False)
     )
+    names_are = "names are" if " and " in unsure else "name is"
     if not unsure:
         said = f"The simulator leaves out {sure}."
     elif not sure:
-        said = f"The simulator most likely leaves out {unsure}; the name is not certain."
+        the = "these" if " and " in unsure else "the"
+        said = f"The simulator most likely leaves out {unsure}; {the} {names_are} not certain."
     else:
-        said = (
-            f"The simulator leaves out {sure}. More acts beside that, most likely {unsure}; this name is not certain."
-        )
+        these = "these" if " and " in unsure else "this"
+        more = f"More acts beside that, most likely {unsure}; {these} {names_are} not certain."
+        said = f"The simulator leaves out {sure}. {more}"
     return said + _describe_vanished(search, found)
 
 

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     )
     from .catalogue import (
         CATALOGUE as CATALOGUE,
+        DRAGS as DRAGS,
+        DRY as DRY,
         FINER as FINER,
         LINEAR as LINEAR,
         POSITION_GAINS as POSITION_GAINS,

@@ -29,6 +29,10 @@ CATALOGUE: tuple[type[Law], ...] = (
 # ids of laws that are equivalent to other values of the simulator's own parameters, if it has a spring or damper there
 LINEAR = (stiffness.LinearStiffness.id, friction.ViscousDamping.id)
 
+# ids of dry friction, and of drags that grow with speed; a bearing or a seal may have one of each
+DRY = (friction.CoulombFriction.id, friction.StribeckFriction.id)
+DRAGS = (friction.ViscousDamping.id, friction.QuadraticDrag.id, friction.CubicDamping.id)
+
 # laws of the position that an input may scale: a force constant or a valve's gain that varies with the position
 POSITION_GAINS: tuple[type[Law], ...] = (stiffness.LinearStiffness, stiffness.QuadraticStiffness)
 

@@ -545,6 +545,18 @@ class Equations:
         return tuple(found)
 
     @cached_property
+    def coefficients(self) -> tuple[str, ...]:
+        """Scalar parameters whose effect on the equations depends on states or inputs.
+
+        What varies in any other one, such as an offset, is a force or a curve at a port.
+        """
+        x, u, p, t = self.symbols()
+        equations = ca.vertcat(self.derivatives(x, u, p, t), *self.measured(x, u, p, t).values())
+        moving = ca.vertcat(*x._values.values(), *u._values.values())
+        scalars = [name for name, own in self.parameters.items() if not own.value.ndim]
+        return tuple(name for name in scalars if ca.depends_on(ca.jacobian(equations, p[name]), moving))
+
+    @cached_property
     def idle_inputs(self) -> tuple[str, ...]:
         """Inputs that no equation reads: they may scale the missing physics."""
         x, u, p, t = self.symbols()

@@ -27,7 +27,10 @@ def test_friction_and_ripple_at_one_port_are_both_named():
     [
         (laws.CoulombFriction, laws.CubicStiffness, True),
         (laws.PiecewiseStiffness, laws.PreslidingFriction, True),
-        (laws.CoulombFriction, laws.ViscousDamping, False),  # both of motion
+        (laws.CoulombFriction, laws.ViscousDamping, True),  # dry, and growing with speed
+        (laws.StribeckFriction, laws.QuadraticDrag, True),
+        (laws.CoulombFriction, laws.StribeckFriction, False),  # both dry
+        (laws.ViscousDamping, laws.QuadraticDrag, False),  # both grow with speed
         (laws.CubicStiffness, laws.PiecewiseStiffness, False),  # both of position
         (laws.Relaxation, laws.CubicStiffness, False),  # it is a spring itself
         (laws.CoulombFriction, laws.Drift, False),  # neither of position

@@ -74,9 +74,9 @@ def test_a_varying_parameter_equals_equations_that_write_it_out(profile):
 
 def test_a_parameter_may_vary_with_a_state():
     """The signal is a state of the run, not of the recording."""
-    law = varying("w")().at({"c": 0.2, "low": -10.0, "high": 10.0})
+    law = varying("w")().at({"c": 0.02, "low": -10.0, "high": 10.0})
     closed, r = motor().with_element("parameter:R", law), blank(2, (20, 30))
-    written = motor(lambda x, u, p: p.R + 0.2 * x.w / 10)
+    written = motor(lambda x, u, p: p.R + 0.02 * x.w / 10)
     np.testing.assert_allclose(closed.simulate(r), written.simulate(r), rtol=1e-9)
 
 
