@@ -524,7 +524,10 @@ class Diagnosis:
             value, nominal = float(p["refit_with"]), float(p["nominal"])
             lines.append(f"  {name} = {value:.5g}{std} {p['unit']}".rstrip() + f", given as {nominal:.5g}")
         more = [f"  and {len(moved) - MOST_PRINTED} more"] if len(moved) > MOST_PRINTED else []
-        return ["the simulator's own values, refitted:", *lines, *more] if lines else []
+        for e in (e for e in self.corrected.elements if e.law.id == "offset"):
+            value, unit = float(own[f"{e.prefix}w_0"].value), self.corrected.port(e.port).unit
+            more.append(f"  offset of {e.port.rpartition(':')[2]} = {value:.4g} {unit}".rstrip())
+        return ["the simulator's own values, refitted:", *lines, *more] if lines or more else []
 
 
 def _effect_lines(e: Effect) -> list[str]:

@@ -401,8 +401,10 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
     rest = max(search.flexible(closest).values(), default=0.0)
     words = " and ".join(name_at(e.port, e.law.id, e.law.form) for e in laws)
     named = f"laws, {words}, remove" if laws[1:] else f"law, {words}, removes"
+    explained = (
+        f"a force at a port explains {rest:.0%} of it" if rest > LEAST_EXPLAINED else "nothing tried explains it"
+    )
     return (
         f"Physics is missing, most likely at {port}, and no law of the catalogue explains all of it. The closest "
-        f"{named} {1 - left:.0%} of the mismatch on the training recordings. The rest is not noise: a force at a port "
-        f"explains {rest:.0%} of it."
+        f"{named} {1 - left:.0%} of the mismatch on the training recordings. The rest is not noise: {explained}."
     )
