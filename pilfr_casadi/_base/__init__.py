@@ -42,7 +42,12 @@ if TYPE_CHECKING:
         time_limit as time_limit,
         unwrapped_interrupt as unwrapped_interrupt,
     )
-    from .progress import Progress as Progress, Stages as Stages, progress_bar as progress_bar
+    from .progress import (
+        Progress as Progress,
+        Stages as Stages,
+        progress_bar as progress_bar,
+        shown_progress as shown_progress,
+    )
     from .workers import (
         Reply as Reply,
         check_executor as check_executor,

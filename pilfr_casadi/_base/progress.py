@@ -10,10 +10,11 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
+from .errors import InputError
 from .interrupts import repeated_interrupt
 
 Progress = Callable[[str, int, int, float], None]
@@ -72,6 +73,19 @@ def progress_bar() -> Iterator[Progress]:
             repeat()
 
         yield report
+
+
+def shown_progress(progress: Progress | bool | None) -> AbstractContextManager[Progress | None]:
+    """Make a context whose value work reports to: a progress bar for True, the callable, or None.
+
+    Raises
+    ------
+    InputError
+        If it is none of these.
+    """
+    if progress is not None and not isinstance(progress, bool) and not callable(progress):
+        raise InputError(f"progress = {progress!r} was given; give True, or a function of (stage, done, total, error).")
+    return progress_bar() if progress is True else nullcontext(progress or None)
 
 
 @dataclass

@@ -88,7 +88,7 @@ def diagnose(
     time_limit: float | None = None,
     focus: str | None = None,
     search_samples: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Diagnosis:
     """Find what a simulator leaves out, from recordings of the machine.
 
@@ -123,8 +123,8 @@ def diagnose(
     search_samples : int, optional
         Samples of the training recordings up to which the search uses everything, by default 60 000. If there are more,
         it uses the stretches that tell most of missing forces, and only the final fits use everything.
-    progress : callable
-        Called with (stage, done, total, smallest error so far).
+    progress : bool or callable, optional
+        True shows a bar on the terminal; a callable gets (stage, done, total, smallest error so far).
 
     Returns
     -------
@@ -135,21 +135,23 @@ def diagnose(
     InputError
         If simulator and recordings do not fit each other.
     """
+    from .._base import shown_progress
     from .pipeline import diagnose_in_steps
 
-    return diagnose_in_steps(
-        simulator,
-        train,
-        test=test,
-        hold=hold,
-        laws=laws,
-        effects=effects,
-        limits=limits,
-        workers=workers,
-        engine=engine,
-        stand_in_error=stand_in_error,
-        time_limit=time_limit,
-        focus=focus,
-        search_samples=search_samples,
-        progress=progress,
-    )
+    with shown_progress(progress) as report:
+        return diagnose_in_steps(
+            simulator,
+            train,
+            test=test,
+            hold=hold,
+            laws=laws,
+            effects=effects,
+            limits=limits,
+            workers=workers,
+            engine=engine,
+            stand_in_error=stand_in_error,
+            time_limit=time_limit,
+            focus=focus,
+            search_samples=search_samples,
+            progress=report,
+        )

@@ -117,6 +117,18 @@ class Diagnosis:
     ----------
     verdict : str
         One of `VERDICTS`.
+    sentence : str
+        The verdict in words; `summary` adds what has to be said first.
+    effects : tuple of Effect
+        The missing physics that has a name: port, law, confidence, equation, values with standard errors.
+    candidates : tuple of dict
+        All laws that were fitted, in the order of the search.
+    gates : tuple of Gate
+        Findings about recordings and simulator, with what was corrected.
+    mismatch : dict
+        Where the refitted simulator misses: by output, band, amplitude, rate and time.
+    parameters : dict
+        The simulator's own parameters: given, refitted without and with the effects.
     corrected : Simulator
         The simulator with the effects added, at the fitted values (without effects: refitted).
     errors : dict

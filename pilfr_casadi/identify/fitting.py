@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, check_executor, filled, one_blas_thread, progress_bar, whole, worker_pool
+from .._base import InputError, Progress, check_executor, filled, one_blas_thread, shown_progress, whole, worker_pool
 from ..data import Recording, as_recordings
 from ..models import PILFR, Lagged, Model, PrandtlIshlinskii, StaticNetwork
 from ..optimise import (
@@ -154,7 +154,8 @@ def fit(
         If recordings and model do not match, hold too little, the start is not usable, or an option is invalid.
     """
     solver = solver or DEFAULT_SOLVER
-    _check_arguments(model, solver, starts, seed, workers, progress)
+    _check_arguments(model, solver, starts, seed, workers)
+    showing = shown_progress(progress)
     check_executor(executor)
     if not isinstance(start, Mapping) and start not in START_KINDS:
         raise InputError(f"The start {start!r} is unknown; use 'grid', 'paper' or 'plain', or values by name.")
@@ -169,7 +170,7 @@ def fit(
     options = model.options if isinstance(model, Fit) else FitOptions()
     options = options.updated(stable, constraints, noise, weights, train)
     with ExitStack() as stack:
-        report = stack.enter_context(progress_bar()) if progress is True else progress or None
+        report = stack.enter_context(showing)
         context = FitContext((), solver, (), dict(l1 or {}), engine, report, 1 if searches else workers, options)
         try:
             pool = stack.enter_context(worker_pool(workers)) if own_pool and searches else executor
@@ -179,7 +180,7 @@ def fit(
             raise InputError(NO_GUARD if spawned else DEAD_WORKER) from None
 
 
-def _check_arguments(model: Any, solver: Any, starts: Any, seed: Any, workers: Any, progress: Any) -> None:
+def _check_arguments(model: Any, solver: Any, starts: Any, seed: Any, workers: Any) -> None:
     """Refuse invalid arguments before any long work."""
     if not isinstance(model, PILFR | Lagged | Model | Simulator | Fit):
         raise InputError(
@@ -189,8 +190,6 @@ def _check_arguments(model: Any, solver: Any, starts: Any, seed: Any, workers: A
         raise InputError(f"The solver is {solver!r}; give an object such as GaussNewton() or Ipopt().")
     for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("workers", workers, 1)):
         whole(value, name, least)
-    if progress is not None and not isinstance(progress, bool) and not callable(progress):
-        raise InputError(f"progress = {progress!r} was given; give True, or a function of (stage, done, total, error).")
 
 
 @one_blas_thread

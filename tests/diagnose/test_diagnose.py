@@ -149,6 +149,7 @@ def test_test_data_that_was_trained_on_is_refused(plain):
     [
         ({"workers": 0}, "workers is 0; give a whole number, 1 or more"),
         ({"effects": -1}, "effects is -1"),
+        ({"progress": "yes"}, "progress = 'yes' was given; give True"),
         ({"hold": "cubic"}, "hold='cubic' was given"),
         ({"laws": ["friction"]}, "laws holds 'friction'; give classes of laws"),
     ],

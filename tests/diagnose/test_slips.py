@@ -60,6 +60,7 @@ def test_an_offset_that_was_the_mismatch_is_a_fault(moved, verdict):
         (gate,) = found.gates
         assert (gate.channel, gate.finding) == ("lower", "offset") and gate.value == pytest.approx(moved, rel=0.02)
         assert "lower has a constant offset" in found.sentence
+        assert f"offset of lower = {gate.value:.4g}" in str(found)
 
 
 def beam(off=1.0):
