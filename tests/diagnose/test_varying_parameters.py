@@ -6,7 +6,16 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
-from pilfr_casadi.laws import VARIATIONS, CubicStiffness, strengths_over, varying
+from pilfr_casadi.laws import (
+    VARIATIONS,
+    CoulombFriction,
+    CubicStiffness,
+    Delay,
+    QuadraticDrag,
+    Saturation,
+    strengths_over,
+    varying,
+)
 
 DT, SAMPLES = 5e-3, 1500
 R, L, K, J, C = 1.3, 0.04, 0.08, 2e-3, 6e-3
@@ -104,8 +113,9 @@ def test_only_a_variation_stands_at_a_parameter():
 
 @pytest.fixture(scope="module")
 def diagnosis():
-    """Diagnosis of a motor whose resistance grows with a recorded temperature."""
-    return pilfr.diagnose(motor(), recorded(3, (20, 80)), test=recorded(5, (75, 25)), workers=1)
+    """Diagnosis of a motor whose resistance grows with a recorded temperature, by some of the laws."""
+    tried = [CoulombFriction, QuadraticDrag, Saturation, Delay]
+    return pilfr.diagnose(motor(), recorded(3, (20, 80)), test=recorded(5, (75, 25)), laws=tried, workers=1)
 
 
 def test_the_parameter_and_its_signal_are_named(diagnosis):
