@@ -3,6 +3,8 @@
 - `winding`: the resistance of a motor's winding grows by 20 to 50 % with a recorded temperature.
 - `magnet`: the torque constant of the same motor falls by 10 to 25 % with it, in both equations that it stands in.
 - `coil`: the force constant of a loudspeaker falls with the deflection, in both equations.
+- `heat`: the resistance of such a motor grows by 30 to 80 % with a temperature that nobody records, which the square of
+  its own current drives.
 - `tank`: the mass of a carriage with a tank falls by 20 to 50 % in the time of a recording.
 
 Values are drawn anew for every seed. The truth is integrated apart from the package.
@@ -23,7 +25,13 @@ from .simulated_cases import Drawn, case_parser, diagnose_case, numbered, random
 
 NOISE = 5e-3  # of each output's deviation
 SAMPLES, FINE = 1500, 10  # samples, and steps of the truth in a sample
-VARIES = {"winding": ("R", "temperature"), "magnet": ("K", "temperature"), "coil": ("K", "x"), "tank": ("m", "t")}
+VARIES = {
+    "winding": ("R", "temperature"),
+    "magnet": ("K", "temperature"),
+    "coil": ("K", "x"),
+    "heat": ("R", "the heat of i"),
+    "tank": ("m", "t"),
+}
 
 
 def free(values: Mapping[str, float], rng: np.random.Generator) -> dict[str, Parameter]:
@@ -69,6 +77,45 @@ def motor(kind: str, rng: np.random.Generator) -> Drawn:
         ports=(Port("bearing", {"w": -1 / inertia}, lambda x: x.w, lambda x: x.w, "N m", "rad/s"),),
     )
     return simulator, recorded(20, 80), recorded(75, 30)
+
+
+def warming(_: str, rng: np.random.Generator) -> Drawn:
+    """Draw a motor that its own current heats, in bursts; nobody records its temperature."""
+    dt, inertia = 5e-3, 2e-3
+    p = {"R": rng.uniform(0.8, 2.0), "K": rng.uniform(0.06, 0.1), "c": rng.uniform(3e-3, 8e-3)}
+    inductance, slow = p["R"] * rng.uniform(0.02, 0.05), rng.uniform(0.6, 2.0)
+    heat = rng.uniform(0.3, 0.8) / (4.0 / p["R"]) ** 2
+
+    def flow(x: np.ndarray, u: float) -> np.ndarray:
+        i, w, warm = x
+        resistance = p["R"] * (1 + warm)
+        return np.array(
+            [
+                (u - resistance * i - p["K"] * w) / inductance,
+                (p["K"] * i - p["c"] * w) / inertia,
+                (heat * i**2 - warm) / slow,
+            ]
+        )
+
+    def recorded() -> Recording:
+        t = dt * np.arange(SAMPLES)
+        bursts = np.repeat(rng.uniform(0.2, 1.0, SAMPLES // 150), 150)
+        u = bursts * random_sines(rng, t, (0.1, 8.0), 25, 14.0)
+        y = measured(rng, trajectory(flow, np.zeros(3), u, dt, FINE)[:, :2])
+        return Recording(u, y, dt, ("voltage",), ("current", "speed"), initial="zero", hold="zero")
+
+    simulator = Simulator(
+        lambda x, u, p: {
+            "i": (u.voltage - p.R * x.i - p.K * x.w) / inductance,
+            "w": (p.K * x.i - p.c * x.w) / inertia,
+        },
+        lambda x: {"current": x.i, "speed": x.w},
+        states=("i", "w"),
+        inputs=("voltage",),
+        parameters=free(p, rng),
+        ports=(Port("bearing", {"w": -1 / inertia}, lambda x: x.w, lambda x: x.w, "N m", "rad/s"),),
+    )
+    return simulator, recorded(), recorded()
 
 
 def loudspeaker(_: str, rng: np.random.Generator) -> Drawn:
@@ -131,7 +178,7 @@ def carriage(_: str, rng: np.random.Generator) -> Drawn:
     return simulator, recorded(), recorded()
 
 
-MACHINES = {"winding": motor, "magnet": motor, "coil": loudspeaker, "tank": carriage}
+MACHINES = {"winding": motor, "magnet": motor, "coil": loudspeaker, "heat": warming, "tank": carriage}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

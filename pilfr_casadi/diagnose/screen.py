@@ -220,10 +220,13 @@ def _parameter_tasks(
         at = probe.model.parameters.position(name).start
         index = int(np.searchsorted(probe.free, at)) - runs[0].n_free
         value = float(probe.values[at])
-        local, part = (parameter_signals(bench, value, [r.x for r in rs], [r.u for r in rs]) for rs in (runs, short))
-        pairs = [(law, list(law.shapes(local))) for law in own if usable(law, local)]
-        if pairs:
-            yield Task(index, bench.simulator.port(f"{PARAMETER}{name}"), local, part, pairs)
+        port = bench.simulator.port(f"{PARAMETER}{name}")
+        both = [parameter_signals(bench, value, [r.x for r in rs], [r.u for r in rs]) for rs in (runs, short)]
+        for signal in dict.fromkeys(law.signal for law in own):
+            local, part = (replace(v, z=v.inputs[signal]) if signal else v for v in both)
+            laws_of = [law for law in own if law.signal == signal and usable(law, local)]
+            if laws_of:
+                yield Task(index, port, local, part, [(law, list(law.shapes(local))) for law in laws_of])
 
 
 def usable(law: Law, local: Local) -> bool:

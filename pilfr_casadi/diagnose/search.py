@@ -27,6 +27,7 @@ from ..laws import (
     Law,
     VaryingParameter,
     constant,
+    heated,
     likely_profiles,
     scheduled,
     varying,
@@ -267,17 +268,24 @@ class Search(Hypotheses):
         """Let parameters of the simulator vary with a signal beside a hypothesis: fit those that explain most."""
         signals = ("t", *self.bench.simulator.inputs, *self.bench.simulator.states)
         laws = [varying(by, profile) for by in dict.fromkeys(signals) for profile in VARIATIONS[:2]]
+        laws += [heated(by) for by in dict.fromkeys(signals[1:])]
         with self.stage("varying parameters"):
             scored, gain = screen(self.bench, base.fitted, laws, self.floor.deviation, self.workers)
             self.note_alternatives(scored)
-        best = list(dict.fromkeys((s.port, s.law.scheduled_by) for s in scored))[:FEW]
-        entries = [s for s in scored if (s.port, s.law.scheduled_by) in best]
+        best = list(dict.fromkeys((s.port, s.law.form) for s in scored))[:FEW]
+        entries = [s for s in scored if (s.port, s.law.form) in best]
         if not entries:
             return
         enough = float(np.sqrt(self.floor2))
         self._record(base, entries, self._fitted(base, entries, gain, enough, True))
         last = self.best.laws[-1] if self.best.laws else None
-        if last and isinstance(last.law, VaryingParameter) and self.can_improve(self.best) and self.in_time():
+        if (
+            last
+            and isinstance(last.law, VaryingParameter)
+            and last.law.scheduled_by
+            and self.can_improve(self.best)
+            and self.in_time()
+        ):
             law = varying(last.law.scheduled_by, VARIATIONS[-1])()
             finer = [
                 replace(s, law=law, starts=(law.starts_as(last.law, self.best.own),))

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
         VaryingParameter as VaryingParameter,
         behind_gap as behind_gap,
         constant as constant,
+        heated as heated,
         likely_profiles as likely_profiles,
         scaled as scaled,
         scheduled as scheduled,

@@ -189,6 +189,8 @@ class Law:
         Input that multiplies the force, or signal with which the strengths vary, if any; see `scaled`, `scheduled`.
     profile : str
         How they vary.
+    signal : str
+        State or input that is the local coordinate of a law at a parameter, if any.
 
     Parameters
     ----------
@@ -234,6 +236,7 @@ class Law:
     scaled_by: ClassVar[str] = ""
     scheduled_by: ClassVar[str] = ""
     profile: ClassVar[str] = ""
+    signal: ClassVar[str] = ""
 
     values: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)

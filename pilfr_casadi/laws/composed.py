@@ -9,7 +9,7 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -190,6 +190,20 @@ def varying(by: str, profile: str = "tilt") -> type[Law]:
         If there is no such profile.
     """
     return _scheduled(VaryingParameter, by, _checked(profile, VARIATIONS))
+
+
+def heated(by: str) -> type[Law]:
+    """Make the law by which a parameter varies with a slow state that the square of a signal drives.
+
+    So a winding's resistance follows the heat of its current: `w = c q`, `dq/dt = (s^2 / s_2 - q) / T`, with the mean
+    square s_2 of the signal s in the recordings. It stands in the port `parameter:<name>`.
+
+    Parameters
+    ----------
+    by : str
+        A state or an input of the simulator.
+    """
+    return _heated(by)
 
 
 def _checked(profile: str, known: Sequence[str]) -> str:
@@ -414,6 +428,41 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
         f"{base.__name__}ScheduledBy_{by}{name.capitalize() if varies.how else ''}",
         f"{base.__doc__}\n\n    Its strength varies{varies.how} with {words}.",
     )
+
+
+@functools.cache
+def _heated(by: str) -> Any:
+    class Heated(VaryingParameter):
+        form = f"scheduled by the heat of {by}"
+        equation = f"w = c q,  dq/dt = ({by}^2 / s_2 - q) / T"
+        source = "Incropera et al. (2007), Fundamentals of Heat and Mass Transfer, sec. 5.1 (lumped capacitance)"
+        sentence = f"a parameter that varies with a slow state which the square of {by} drives, as by self-heating"
+        units: ClassVar[Mapping[str, str]] = {"c": "w", "T": "s", "s_2": f"[{by}]^2"}
+        order, signal = 1, by
+        starts = {"T": ("duration", 0.03, 0.1, 0.3)}
+        ranges = {"T": ("duration", 0.01, 2.0)}
+
+        def force(self, q: Any, p: Any) -> Any:
+            return p.c * q[0]
+
+        def flow(self, z: Any, q: Any, p: Any) -> Any:
+            return (z**2 / p.s_2 - q[0]) / p.T
+
+        def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+            """Time constants, with the mean square of the signal."""
+            for own in super().shapes(local):
+                yield {**own, "s_2": float(np.mean(local.z**2))}
+
+        def parameters(self) -> dict[str, Parameter]:
+            """Parameters: the mean square of the signal is fixed."""
+            found = super().parameters()
+            return {**found, "s_2": replace(found["s_2"], fixed=True)}
+
+        def why_not(self, local: Local) -> str:
+            """Say why the data carries no information on this law; empty if it does."""
+            return "" if np.ptp(local.z) > 0 else f"{by} is constant"
+
+    return _name(Heated, f"Heated_{by}", VaryingParameter.__doc__)
 
 
 @functools.cache

@@ -11,7 +11,7 @@ import numpy as np
 from .._base import to_json
 from ..diagnose import ERROR_NAMES, Diagnosis, Effect, learned_force
 from ..identify import RUN_AWAY
-from ..laws import VaryingParameter, display_name, scaled, scheduled, short_name, varying
+from ..laws import VaryingParameter, display_name, heated, scaled, scheduled, short_name, varying
 from ..models import Parameter, ParameterSet
 from ..simulators import name_at
 from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
@@ -334,6 +334,8 @@ def _parts(law: Any) -> tuple[tuple[Any, ...], str]:
     """List what has to be imported to make the class of a law, and write the expression that makes it."""
     if getattr(law, "factor", ""):
         return (learned_force,), f"learned_force({law.factor!r})"
+    if issubclass(law, VaryingParameter) and law.signal:
+        return (heated,), f"heated({law.signal!r})"
     if issubclass(law, VaryingParameter):
         return (varying,), f"varying({law.scheduled_by!r}, {law.profile!r})"
     if by := law.scaled_by or law.scheduled_by:

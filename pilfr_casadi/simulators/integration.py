@@ -122,7 +122,8 @@ class ClosedEquations:
                     ends[own].item() for ends in (simulator.parameter_set.lower, simulator.parameter_set.upper)
                 )
                 varied = ca.SX(vector)
-                varied[own] = ca.fmin(ca.fmax(vector[own] + apply(i, vector[own], 0.0, x._values), low), high)
+                z = {**u, **x._values}[e.law.signal] if getattr(e.law, "signal", "") else vector[own]
+                varied[own] = ca.fmin(ca.fmax(vector[own] + apply(i, z, 0.0, x._values), low), high)
                 vector = varied
         if vector is not self.vector:
             p = Named("parameter", simulator.parameter_set.symbols(vector))
