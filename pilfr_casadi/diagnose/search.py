@@ -25,14 +25,13 @@ from ..laws import (
     SCALABLE,
     VARIATIONS,
     Law,
-    VaryingParameter,
     constant,
     heated,
     likely_profiles,
     scheduled,
     varying,
 )
-from ..simulators import Placed
+from ..simulators import PARAMETER, Placed
 from .evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO
 from .gates import CLEARLY_BETTER
 from .hypotheses import Hypotheses
@@ -276,24 +275,20 @@ class Search(Hypotheses):
         entries = [s for s in scored if (s.port, s.law.form) in best]
         if not entries:
             return
-        enough = float(np.sqrt(self.floor2))
-        self._record(base, entries, self._fitted(base, entries, gain, enough, True))
+        self._record(base, entries, self._fitted(base, entries, gain, float(np.sqrt(self.floor2)), True))
         last = self.best.laws[-1] if self.best.laws else None
-        if (
-            last
-            and isinstance(last.law, VaryingParameter)
-            and last.law.scheduled_by
-            and self.can_improve(self.best)
-            and self.in_time()
-        ):
-            law = varying(last.law.scheduled_by, VARIATIONS[-1])()
-            finer = [
-                replace(s, law=law, starts=(law.starts_as(last.law, self.best.own),))
-                for s in entries
-                if s.pair == (last.port, type(last.law))
-            ]
-            self.note_alternatives(finer)
-            self._record(base, finer, self._fitted(base, finer, gain, enough, True))
+        if last and last.port.startswith(PARAMETER) and last.law.scheduled_by and self.can_improve(self.best):
+            self._curve(base, [s for s in entries if s.pair == (last.port, type(last.law))], gain)
+
+    def _curve(self, base: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> None:
+        """Let the parameter that varies in the best hypothesis follow a curve of higher degree."""
+        if not self.in_time():
+            return
+        best = self.best
+        law = varying(best.law.scheduled_by, VARIATIONS[-1])()
+        finer = [replace(s, law=law, starts=(law.starts_as(best.law, best.own),)) for s in entries]
+        self.note_alternatives(finer)
+        self._record(base, finer, self._fitted(base, finer, gain, float(np.sqrt(self.floor2)), True))
 
     def exchange(self) -> None:
         """Try all other laws, and none, in place of each of several laws, the rest in place, until none changes."""

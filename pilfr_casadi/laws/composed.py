@@ -9,7 +9,7 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -437,12 +437,12 @@ def _heated(by: str) -> Any:
         equation = f"w = c q,  dq/dt = ({by}^2 / s_2 - q) / T"
         source = "Incropera et al. (2007), Fundamentals of Heat and Mass Transfer, sec. 5.1 (lumped capacitance)"
         sentence = f"a parameter that varies with a slow state which the square of {by} drives, as by self-heating"
-        units: ClassVar[Mapping[str, str]] = {"c": "w", "T": "s", "s_2": f"[{by}]^2"}
+        units = {"c": "w", "T": "s", "s_2": f"[{by}]^2"}
         order, signal = 1, by
         starts = {"T": ("duration", 0.03, 0.1, 0.3)}
         ranges = {"T": ("duration", 0.01, 2.0)}
 
-        def force(self, q: Any, p: Any) -> Any:
+        def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
             return p.c * q[0]
 
         def flow(self, z: Any, q: Any, p: Any) -> Any:
@@ -462,7 +462,7 @@ def _heated(by: str) -> Any:
             """Say why the data carries no information on this law; empty if it does."""
             return "" if np.ptp(local.z) > 0 else f"{by} is constant"
 
-    return _name(Heated, f"Heated_{by}", VaryingParameter.__doc__)
+    return _name(Heated, f"Heated_{by}", f"{VaryingParameter.__doc__}")
 
 
 @functools.cache

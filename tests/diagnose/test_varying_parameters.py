@@ -13,6 +13,7 @@ from pilfr_casadi.laws import (
     Delay,
     QuadraticDrag,
     Saturation,
+    heated,
     strengths_over,
     varying,
 )
@@ -87,6 +88,27 @@ def test_a_parameter_may_vary_with_a_state():
     closed, r = motor().with_element("parameter:R", law), blank(2, (20, 30))
     written = motor(lambda x, u, p: p.R + 0.02 * x.w / 10)
     np.testing.assert_allclose(closed.simulate(r), written.simulate(r), rtol=1e-9)
+
+
+def test_a_parameter_may_follow_the_heat_of_a_signal():
+    """The law has a slow state of its own, which the square of the current drives from a cold start."""
+    law = heated("i")().at({"c": 0.4, "T": 1.5, "s_2": 4.0})
+    closed, r = motor().with_element("parameter:R", law), blank(2, (20, 30))
+    written = pilfr.Simulator(
+        lambda x, u, p: {
+            "i": (u.voltage - (p.R + 0.4 * x.q) * x.i - p.K * x.w) / L,
+            "w": (p.K * x.i - p.c * x.w) / J,
+            "q": (x.i**2 / 4.0 - x.q) / 1.5,
+        },
+        lambda x: {"current": x.i, "speed": x.w},
+        states=("i", "w", "q"),
+        inputs=("voltage", "temperature"),
+        parameters=dict(motor().parameters),
+    )
+    np.testing.assert_allclose(closed.simulate(r), written.simulate(r), rtol=1e-9)
+    assert "variation of R with the heat of i" in repr(
+        pilfr.diagnose(motor(), r.with_(y=closed.simulate(r)), laws=[Delay])
+    )
 
 
 def test_a_varying_parameter_stays_within_its_bounds():
