@@ -277,14 +277,15 @@ class Search(Hypotheses):
             return
         self._record(base, entries, self._fitted(base, entries, gain, float(np.sqrt(self.floor2)), True))
         last = self.best.laws[-1] if self.best.laws else None
-        if last and last.port.startswith(PARAMETER) and last.law.scheduled_by and self.can_improve(self.best):
+        if last and last.port.startswith(PARAMETER) and last.law.scheduled_by:
             self._curve(base, [s for s in entries if s.pair == (last.port, type(last.law))], gain)
 
     def _curve(self, base: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> None:
         """Let the parameter that varies in the best hypothesis follow a curve of higher degree."""
-        if not self.in_time():
-            return
         best = self.best
+        # what the curve misses is in no force at a port, so that it may have passed for noise
+        if not (self.can_improve(best, self.least_noise2) and self.in_time()):
+            return
         law = varying(best.law.scheduled_by, VARIATIONS[-1])()
         finer = [replace(s, law=law, starts=(law.starts_as(best.law, best.own),)) for s in entries]
         self.note_alternatives(finer)
