@@ -8,6 +8,7 @@ import numpy as np
 
 from ..diagnose import Effect, Fitted, Workbench, law_signals
 from ..laws import readable_unit
+from ..simulators import PARAMETER
 from .page import Table, number_text
 
 
@@ -35,9 +36,9 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
     if not all(np.all(np.isfinite(v)) for v in (z, dz, w)):
         return None
     largest = f"{number_text(float(np.max(np.abs(w))), 3)}\u00a0{port.unit}".strip()
-    rows = [
-        ["largest force" if not port.series else "largest change of the signal", float(np.max(np.abs(w))), port.unit]
-    ]
+    of = "parameter" if port.name.startswith(PARAMETER) else "signal"
+    what = f"largest change of the {of}" if port.series else "largest force"
+    rows = [[what, float(np.max(np.abs(w))), port.unit]]
     unit = readable_unit("w*s/z", port.unit, port.position_unit).replace(" *", "")
     if port.is_speed:
         damping = (w - np.mean(w)) @ z / (z @ z)

@@ -191,7 +191,8 @@ def _hidden_forces(case: _Case) -> list[Block]:
     d, out = case.diagnosis, [block for learned in case.diagnosis.learned for block in _learned_force(case, learned)]
     for e in d.effects:
         if (number := element_of(case.after, e)) is not None:
-            out += _force_blocks(case, case.after, e.port, number, display_name(e.law))
+            if not e.port.startswith(PARAMETER):  # no force acts there
+                out += _force_blocks(case, case.after, e.port, number, display_name(e.law))
             out += _strength_pictures(case, number)
     if d.verdict != "unexplained":
         return out
