@@ -69,3 +69,26 @@ def test_laws_that_follow_better_at_other_ports_go_there(seed):
     assert {(e.port, e.law) for e in found.effects} == {("rail", "coulomb_friction"), ("pulley", "periodic_force")}
     assert found.errors["train"]["after"] < 1.1 * found.floor["nrmse"]
     assert min(e.confidence for e in found.effects) > 0.8
+
+
+def test_a_law_that_only_asks_for_finer_steps_is_no_effect():
+    """A sharp dead zone of interpolated inputs needs fine steps; a fast mode beside it only has them."""
+    rng = np.random.default_rng(1)
+    t, f = np.arange(SAMPLES) * DT, np.linspace(0.3, 12, 50)
+    u = 3 * np.sum(np.sin(2 * np.pi * f * t[:, None] + rng.uniform(0, 2 * np.pi, 50)), axis=1) / 5
+    blank = pilfr.Recording(u, np.zeros(SAMPLES), DT, ("force",), ("pos",), initial="zero", hold="linear")
+    mass = Simulator(
+        lambda x, u, p: {"x": x.v, "v": u.force - p.k * x.x - p.d * x.v},
+        lambda x: {"pos": x.x},
+        states=("x", "v"),
+        inputs=("force",),
+        parameters={"k": Parameter(5e3, bounds=(2e3, 1e4)), "d": Parameter(3.0, bounds=(0, 30))},
+        ports=(Port("ground", {"v": -1.0}, lambda x: x.x, lambda x: x.v, "N", "m"),),
+    )
+    true = mass.with_element("actuator:force", laws.DeadZone(values={"g": 1.2}))
+    model = discretise(true, DT, "linear", 40)
+    y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(model.n_state))[0]
+    recording = blank.with_(y=y + 2e-4 * np.std(y) * rng.standard_normal(y.shape))
+    found = pilfr.diagnose(mass, recording, laws=[laws.DeadZone, laws.Mode, laws.Attached], workers=1)
+    assert [(e.port, e.law) for e in found.effects] == [("actuator:force", "dead_zone")]
+    assert found.errors["train"]["after"] < 5e-4

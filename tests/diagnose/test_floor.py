@@ -31,6 +31,15 @@ def test_recordings_of_the_same_input_show_it_too(initial):
     assert found.deviation == pytest.approx(DEVIATION, rel=0.1)
 
 
+def test_rounding_repeats_and_is_noise_nevertheless():
+    """Periods of a coarse sensor are alike, so they show less than the error of rounding."""
+    exact = noisy(8, initial="periodic", period=N)
+    quiet = exact.with_(y=np.tile(exact.y[:N], (8, 1)))
+    coarse = quiet.with_(y=np.round(quiet.y / 0.1) * 0.1)
+    assert max(measured_floor([quiet]).deviation) < 1e-4
+    assert measured_floor([coarse]).deviation == pytest.approx((0.1 / 12**0.5,) * 2, rel=1e-3)
+
+
 def test_one_period_and_one_recording_show_nothing():
     assert measured_floor([noisy(1, initial="periodic", period=N)]) is None
     other = noisy(4, initial="zero")

@@ -224,6 +224,7 @@ def positioner():
 
 def test_a_law_at_the_sensor_is_weighed_against_friction_where_no_port_is_declared():
     assert positioner().unreached == {"speed"}
+    assert [port.name for port in positioner().undeclared] == ["equation:speed"]
     rubbing = replace(positioner(), ports=()).with_parameters({"tau": 0.25, "k": 1e4})
     rubbing = rubbing.with_element("equation:speed", laws.PreslidingFriction().at({"k_t": 2e4, "r": 3.75e-4}))
     rng = np.random.default_rng(2)
