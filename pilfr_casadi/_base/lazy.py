@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import itertools
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -23,15 +24,18 @@ from typing import Any
 
 
 def lazy_face(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Make `__getattr__`, `__dir__` and `__all__` of a package from its imports under ``TYPE_CHECKING``."""
-    origins = {
-        alias.asname or alias.name: "." * node.level + (node.module or "")
+    """Make `__getattr__`, `__dir__` and `__all__` of a package from its imports under ``TYPE_CHECKING``.
+
+    `__all__` lists those of the first such block; the names of further blocks are found too.
+    """
+    blocks = [
+        [node for node in block.body if isinstance(node, ast.ImportFrom)]
         for block in ast.parse(Path(file).read_text(encoding="utf-8")).body
         if isinstance(block, ast.If) and isinstance(block.test, ast.Name) and block.test.id == "TYPE_CHECKING"
-        for node in block.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
+    ]
+    listed = sorted(alias.name for node in blocks[0] for alias in node.names)
+    imports = itertools.chain(*blocks)
+    origins = {a.name: "." * node.level + (node.module or "") for node in imports for a in node.names}
 
     def load(name: str) -> Any:
         if name not in origins:
@@ -43,5 +47,4 @@ def lazy_face(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[
         vars(sys.modules[package])[name] = value  # found directly from now on
         return value
 
-    names = sorted(origins)
-    return load, lambda: sorted({*vars(sys.modules[package]), *names}), names
+    return load, lambda: sorted({*vars(sys.modules[package]), *origins}), listed
