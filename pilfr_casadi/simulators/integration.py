@@ -27,7 +27,7 @@ import numpy as np
 
 from .._base import InputError, one_at_a_time
 from ..data import Recording
-from ..models import Model, StepExpressions, accumulate_steps, from_expressions, inject_outputs, map_points
+from ..models import Model, accumulate_steps, inject_outputs, map_points, model_functions
 from .equations import Equations, Named, Placed, Port, call, in_series
 
 LARGEST_STEP = 0.25  # largest |λ| h: a phase error of (λh)⁴/120 = 3e-5 of the angle of a cycle
@@ -176,25 +176,28 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
     if ca.depends_on(ca.vertcat(x_next, y, begun), t):
         reads, columns = [*reads, "t"], [*columns, t]
     x_next, y = ca.cse([x_next, y])
-    port = None
     if s.numel() and not step.shifts.any() and not ca.depends_on(z, s):
         # memory that is moved by a port of its own makes the derivatives sparse
         channels = ca.SX.sym("z", s.numel())
-        port = z, channels, moved
-        s_next = step.equations.memory(channels, s)
+        w = s_next = step.equations.memory(channels, s)
     else:
         x_next, y, *staged = ca.substitute([x_next, y, *(stages or ())[1:]], [moved], [begun])
-        x, s, x_next, s_next = ca.vertcat(x, s), ca.SX(0, 1), ca.vertcat(x_next, begun), ca.SX(0, 1)
+        x, x_next = ca.vertcat(x, s), ca.vertcat(x_next, begun)
+        s = s_next = z = channels = moved = w = ca.SX(0, 1)
         if stages is not None:
             stages = stages[0], staged[0], staged[1], ca.vertcat(staged[2], begun)
-    model = from_expressions(
-        StepExpressions(x, s, ca.vertcat(*columns), step.vector, x_next, s_next, y, port, stages, step.resting()),
-        simulator.parameter_set,
+    u, p = ca.vertcat(*columns), step.vector
+    model = Model(
+        **model_functions(x, u, moved, p, [x_next, y], z, [channels, s, w, s_next]),
+        parameters=simulator.parameter_set,
+        element=None,
         states=simulator.states,
         inputs=simulator.inputs,
         outputs=simulator.output_names,
         reads=tuple(reads),
         substeps=substeps,
+        stages=ca.Function("stages", [x, u, moved, p, stages[0]], stages[1:]) if stages else None,
+        resting=step.resting(),
     )
     return model if simulator.observer is None else inject_outputs(model, simulator.observer)
 
