@@ -66,6 +66,7 @@ if TYPE_CHECKING:
         places as places,
         read_through as read_through,
         wiener as wiener,
+        with_port_gain as with_port_gain,
     )
     from .structures import (
         ANY as ANY,

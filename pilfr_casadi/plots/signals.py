@@ -85,7 +85,8 @@ def time(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes | N
     """Draw the measured output with the residuals of the linear model and of the fit over time, as Fig. 9 (left)."""
     recording = as_scored(fit, recording)
     ax, t, y = axes_or_new(ax), recording.t, _column(recording.y, output, "output")
-    level = _level(y[recording.skip :])
+    mean, span = float(np.mean(y[recording.skip :])), np.ptp(y[recording.skip :])
+    level = mean if abs(mean) > span > 0 else 0.0  # subtracted, so that swings show beside residuals
     plain_unit = _unit(fit, recording, recording.outputs[output])
     size, axis = scale_axis(recording.outputs[output], y - level, plain_unit)
     what = "measured output" + (f" less its mean {level:.6g} {plain_unit}".rstrip() if level else "")
@@ -272,12 +273,6 @@ def _over_time(ax: Axes, recording: Recording, label: str) -> Axes:
         ax.axvspan(0, recording.skip * recording.dt, color=PALE_GREY, label="not scored")
     ax.margins(x=0.01)
     return finish(ax, "time [s]", label, recording.name)
-
-
-def _level(y: np.ndarray) -> float:
-    """Choose the level, mean or 0, to subtract from a signal (M,) so that its swings show beside residuals."""
-    mean = float(np.mean(y))
-    return mean if abs(mean) > np.ptp(y) > 0 else 0.0
 
 
 def _without_offset(error: np.ndarray, span: float, unit: str) -> tuple[np.ndarray, str]:

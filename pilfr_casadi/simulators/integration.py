@@ -266,7 +266,11 @@ class _SubStep:
         no recording shows, and that bends a fit of the law's parameters.
         """
         counts = [n_q or n_s for n_q, n_s in zip(self.equations.n_q, self.equations.n_s, strict=True)]
-        shares = [_settled(e.law, n) for e, n in zip(self.simulator.elements, counts, strict=True)]
+        laws = [e.law for e in self.simulator.elements]
+        shares = [  # one for those states or memories that come to rest at the value at which the law's signal stands
+            np.asarray(law.standing(1.0)) if n and hasattr(law, "standing") else np.zeros(n)
+            for law, n in zip(laws, counts, strict=True)
+        ]
         if not any(np.any(share) for share in shares):
             return None
         sizes = (("x", len(self.simulator.states)), ("u", self.u0.numel()), ("p", self.vector.numel()))
@@ -278,11 +282,6 @@ class _SubStep:
             memory = ca.vertcat(ca.MX(0, 1), *(part for part, n in zip(own, self.equations.n_s, strict=True) if n))
             z = self.at(state, memory, u, 0, u, u, p)[4]
         return ca.Function("resting", [x, u, p], [ca.densify(ca.vertcat(state, memory))])
-
-
-def _settled(law: Any, n: int) -> np.ndarray:
-    """Mark those of a law's n states or memories that come to rest at the value at which its signal stands."""
-    return np.asarray(law.standing(1.0)) if n and hasattr(law, "standing") else np.zeros(n)
 
 
 def states_along(model: Model, drive: np.ndarray, p: np.ndarray, x: np.ndarray) -> np.ndarray:
