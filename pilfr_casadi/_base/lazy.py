@@ -1,4 +1,4 @@
-"""Lazy faces of packages: a public name is imported from its module when it is first used.
+"""Lazy imports: of a package's public names when they are first used, and of verbs of later folders.
 
 A face lists its names once, under ``TYPE_CHECKING``; type checkers, editors and this helper read the same list::
 
@@ -10,6 +10,10 @@ A face lists its names once, under ``TYPE_CHECKING``; type checkers, editors and
         from .operators import Play as Play
     else:
         __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+
+A folder imports only folders before it. A recording that draws itself, or a fit that writes its report, is a matter of
+spelling: the method says in one line `return later("plot_recording")(self)`, and the folder is imported when a user
+calls it. `LATER_VERBS` is the one table of what reaches forward.
 """
 
 from __future__ import annotations
@@ -48,3 +52,23 @@ def lazy_face(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[
         return value
 
     return load, lambda: sorted({*vars(sys.modules[package]), *origins}), listed
+
+
+LATER_VERBS = {  # verb -> the folder whose face has it
+    "compare": "identify",
+    "diagnosis_card": "report",
+    "diagnosis_report": "report",
+    "fit_card": "report",
+    "fit_report": "report",
+    "comparison_card": "report",
+    "plot_recording": "plots",
+    "recording_card": "report",
+    "simulator_card": "report",
+    "simulator_nrmse": "identify",
+}
+
+
+def later(verb: str) -> Callable[..., Any]:
+    """Return a function of a later folder's face, by its name in `LATER_VERBS`."""
+    folder = importlib.import_module(f"..{LATER_VERBS[verb]}", __package__)
+    return getattr(folder, verb)
