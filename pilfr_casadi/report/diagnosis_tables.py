@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import laws
 from .._base import to_json
 from ..diagnose import ERROR_NAMES, Diagnosis, Effect, Fitted, Workbench, law_signals, learned_force
 from ..identify import RUN_AWAY
@@ -200,8 +201,8 @@ def error_before(diagnosis: Diagnosis, number: int) -> float | None:
 def in_place(diagnosis: Diagnosis, number: int) -> str:
     """Name the laws that were in place in a pass; empty for the simulator alone."""
     parent = _parent(diagnosis, number)
-    laws = () if parent is None else parent.laws
-    return " and ".join(f"{display_name(e.law.id)} at {e.port}" for e in laws)
+    placed = () if parent is None else parent.laws
+    return " and ".join(f"{display_name(e.law.id)} at {e.port}" for e in placed)
 
 
 def _parent(diagnosis: Diagnosis, number: int) -> Any:
@@ -317,7 +318,8 @@ def usage(diagnosis: Diagnosis) -> str:
     for e in simulator.elements:
         imported, expression = _parts(type(e.law))
         for part in imported:
-            modules.setdefault(_home(part), set()).add(part.__name__)
+            home = laws.__name__ if getattr(laws, part.__name__, None) is part else part.__module__
+            modules.setdefault(home, set()).add(part.__name__)
         limits = {k: tuple(np.asarray(end, dtype=float).tolist() for end in ends) for k, ends in e.law.limits.items()}
         elements.append((e, expression, e.own(fitted), limits))
     return render(
@@ -339,12 +341,6 @@ def _parts(law: Any) -> tuple[tuple[Any, ...], str]:
         how = f", {law.profile!r}" if law.profile not in ("", "linear") else ""
         return (compose, base), f"{compose.__name__}({base.__name__}, {by!r}{how})"
     return (law,), law.__name__
-
-
-def _home(law: Any) -> str:
-    from .. import laws
-
-    return laws.__name__ if getattr(laws, law.__name__, None) is law else law.__module__
 
 
 @dataclass(frozen=True)
