@@ -45,8 +45,43 @@ if TYPE_CHECKING:
         studies as studies,
     )
     from ._base import InputError as InputError
+    from .control import PredictiveController as PredictiveController
+    from .data import (
+        Recording as Recording,
+        multisine as multisine,
+        nrmse as nrmse,
+        read as read,
+        read_csv as read_csv,
+        read_mat as read_mat,
+        read_npz as read_npz,
+        sine_sweep as sine_sweep,
+    )
+    from .diagnose import Check as Check, Diagnosis as Diagnosis, check as check
+    from .export import exported as exported
+    from .identify import Fit as Fit, fit as fit, load as load, save as save
+    from .laws import Law as Law, Local as Local
+    from .linear import robust_bla as robust_bla
+    from .models import (
+        NARX as NARX,
+        NOE as NOE,
+        PILFR as PILFR,
+        Combined as Combined,
+        GeneralizedPlay as GeneralizedPlay,
+        Model as Model,
+        Parameter as Parameter,
+        Play as Play,
+        PrandtlIshlinskii as PrandtlIshlinskii,
+        Stop as Stop,
+        close_loop as close_loop,
+        hammerstein as hammerstein,
+        wiener as wiener,
+    )
+    from .optimise import Constraint as Constraint, GaussNewton as GaussNewton, Ipopt as Ipopt, Problem as Problem
+    from .simulators import Port as Port, Simulator as Simulator, from_fmu as from_fmu, from_function as from_function
+    from .studies import campaign as campaign, run as run
+
+if TYPE_CHECKING:  # reached through their folders (`pilfr.models.to_plays`); these spellings still work
     from .control import (
-        PredictiveController as PredictiveController,
         do_mpc_controller as do_mpc_controller,
         do_mpc_model as do_mpc_model,
         feedforward as feedforward,
@@ -56,69 +91,42 @@ if TYPE_CHECKING:
         visibility as visibility,
     )
     from .data import (
-        Recording as Recording,
         as_recordings as as_recordings,
         mean_period as mean_period,
         merge as merge,
-        multisine as multisine,
         noise_weights as noise_weights,
-        nrmse as nrmse,
         orthogonal_multisine as orthogonal_multisine,
         period_noise as period_noise,
         prbs as prbs,
-        read as read,
-        read_csv as read_csv,
         read_frame as read_frame,
-        read_mat as read_mat,
-        read_npz as read_npz,
         rmse as rmse,
-        sine_sweep as sine_sweep,
         tukey_realizations as tukey_realizations,
     )
-    from .diagnose import Check as Check, Diagnosis as Diagnosis, check as check
-    from .export import Exported as Exported, exported as exported, to_casadi as to_casadi
+    from .export import Exported as Exported, to_casadi as to_casadi
     from .identify import (
         Comparison as Comparison,
-        Fit as Fit,
         RegularizationPath as RegularizationPath,
         compare as compare,
-        fit as fit,
-        load as load,
         one_step as one_step,
         prune as prune,
         regularization_path as regularization_path,
-        save as save,
         standard_errors as standard_errors,
     )
-    from .laws import Law as Law, Local as Local
     from .linear import (
         BLA as BLA,
         frequency_subspace as frequency_subspace,
         modal as modal,
         plain_bla as plain_bla,
-        robust_bla as robust_bla,
         select_order as select_order,
         time_subspace as time_subspace,
     )
     from .models import (
-        NARX as NARX,
-        NOE as NOE,
-        PILFR as PILFR,
-        Combined as Combined,
         Envelope as Envelope,
-        GeneralizedPlay as GeneralizedPlay,
-        Model as Model,
-        Parameter as Parameter,
         ParameterSet as ParameterSet,
         Part as Part,
-        Play as Play,
-        PrandtlIshlinskii as PrandtlIshlinskii,
         Products as Products,
         StaticNetwork as StaticNetwork,
-        Stop as Stop,
-        close_loop as close_loop,
         generalized_play as generalized_play,
-        hammerstein as hammerstein,
         network_lfr as network_lfr,
         open_model as open_model,
         play as play,
@@ -126,14 +134,9 @@ if TYPE_CHECKING:
         stop as stop,
         to_plays as to_plays,
         to_stops as to_stops,
-        wiener as wiener,
     )
     from .optimise import (
-        Constraint as Constraint,
-        GaussNewton as GaussNewton,
-        Ipopt as Ipopt,
         Limit as Limit,
-        Problem as Problem,
         Solution as Solution,
         Status as Status,
         dc_gain as dc_gain,
@@ -141,74 +144,8 @@ if TYPE_CHECKING:
         stable as stable,
     )
     from .report import fit_report as fit_report, write_report as write_report
-    from .simulators import (
-        Port as Port,
-        Simulator as Simulator,
-        from_fmu as from_fmu,
-        from_function as from_function,
-        from_mujoco as from_mujoco,
-    )
-    from .studies import campaign as campaign, fleet as fleet, read_run as read_run, run as run
+    from .simulators import from_mujoco as from_mujoco
+    from .studies import fleet as fleet, read_run as read_run
 else:
-    __getattr__, __dir__, _listed = lazy_face(__name__, __file__)
-# Reached through their folders (`pilfr.models.to_plays`); these spellings still work.
-_ELSEWHERE = {
-    "BLA",
-    "Comparison",
-    "Envelope",
-    "Exported",
-    "Limit",
-    "ParameterSet",
-    "Part",
-    "Products",
-    "RegularizationPath",
-    "Solution",
-    "StaticNetwork",
-    "Status",
-    "as_recordings",
-    "compare",
-    "dc_gain",
-    "do_mpc_controller",
-    "do_mpc_model",
-    "feedforward",
-    "fleet",
-    "fit_report",
-    "frequency_subspace",
-    "from_mujoco",
-    "generalized_play",
-    "inverse_element",
-    "kalman_filter",
-    "mean_period",
-    "merge",
-    "modal",
-    "network_lfr",
-    "noise_weights",
-    "one_step",
-    "open_model",
-    "ordered",
-    "orthogonal_multisine",
-    "period_noise",
-    "plain_bla",
-    "play",
-    "prbs",
-    "prune",
-    "read_frame",
-    "read_run",
-    "regularization_path",
-    "response_bound",
-    "rmse",
-    "select_order",
-    "ssnn",
-    "stable",
-    "standard_errors",
-    "stop",
-    "time_subspace",
-    "to_casadi",
-    "to_plays",
-    "to_stops",
-    "tukey_realizations",
-    "visibility",
-    "write_report",
-}
-if not TYPE_CHECKING:
-    __all__ = [*(name for name in _listed if name not in _ELSEWHERE), "__version__", "diagnose"]
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+    __all__ = [*__all__, "__version__", "diagnose"]

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
         to_json as to_json,
         write_atomically as write_atomically,
     )
-    from .forward import LATER_VERBS as LATER_VERBS, later as later
     from .interrupts import (
         Clock as Clock,
         deferred_interrupt as deferred_interrupt,
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
         time_limit as time_limit,
         unwrapped_interrupt as unwrapped_interrupt,
     )
+    from .lazy import LATER_VERBS as LATER_VERBS, later as later
     from .progress import (
         Progress as Progress,
         Stages as Stages,

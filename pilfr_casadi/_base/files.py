@@ -108,18 +108,18 @@ def short(path: Any) -> str:
     return text if len(text) <= 200 else f"{text[:100]}...{text[-60:]}"
 
 
-def to_json(value: Any) -> Any:
-    """Convert a value to the types of standard JSON; numbers that are not finite become None."""
+def to_json(value: Any, infinite: str | None = None) -> Any:
+    """Convert a value to the types of standard JSON; numbers that are not finite become None, infinity `infinite`."""
     if isinstance(value, Mapping):
-        return {str(k): to_json(v) for k, v in value.items()}
+        return {str(k): to_json(v, infinite) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [to_json(v) for v in value]
+        return [to_json(v, infinite) for v in value]
     if isinstance(value, np.ndarray):
-        return to_json(value.tolist())
+        return to_json(value.tolist(), infinite)
     if isinstance(value, bool | np.bool_):
         return bool(value)
     if isinstance(value, int | np.integer):
         return int(value)
     if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
+        return float(value) if np.isfinite(value) else infinite if value > 0 else None
     return value

@@ -1,4 +1,4 @@
-"""Lazy faces of packages: a public name is imported from its module when it is first used.
+"""Lazy imports: of a package's public names when they are first used, and of verbs of later folders.
 
 A face lists its names once, under ``TYPE_CHECKING``; type checkers, editors and this helper read the same list::
 
@@ -10,12 +10,17 @@ A face lists its names once, under ``TYPE_CHECKING``; type checkers, editors and
         from .operators import Play as Play
     else:
         __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+
+A folder imports only folders before it. A recording that draws itself, or a fit that writes its report, is a matter of
+spelling: the method says in one line `return later("plot_recording")(self)`, and the folder is imported when a user
+calls it. `LATER_VERBS` is the one table of what reaches forward.
 """
 
 from __future__ import annotations
 
 import ast
 import importlib
+import itertools
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -23,15 +28,18 @@ from typing import Any
 
 
 def lazy_face(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Make `__getattr__`, `__dir__` and `__all__` of a package from its imports under ``TYPE_CHECKING``."""
-    origins = {
-        alias.asname or alias.name: "." * node.level + (node.module or "")
+    """Make `__getattr__`, `__dir__` and `__all__` of a package from its imports under ``TYPE_CHECKING``.
+
+    `__all__` lists those of the first such block; the names of further blocks are found too.
+    """
+    blocks = [
+        [node for node in block.body if isinstance(node, ast.ImportFrom)]
         for block in ast.parse(Path(file).read_text(encoding="utf-8")).body
         if isinstance(block, ast.If) and isinstance(block.test, ast.Name) and block.test.id == "TYPE_CHECKING"
-        for node in block.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
+    ]
+    listed = sorted(alias.name for node in blocks[0] for alias in node.names)
+    imports = itertools.chain(*blocks)
+    origins = {a.name: "." * node.level + (node.module or "") for node in imports for a in node.names}
 
     def load(name: str) -> Any:
         if name not in origins:
@@ -43,5 +51,24 @@ def lazy_face(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[
         vars(sys.modules[package])[name] = value  # found directly from now on
         return value
 
-    names = sorted(origins)
-    return load, lambda: sorted({*vars(sys.modules[package]), *names}), names
+    return load, lambda: sorted({*vars(sys.modules[package]), *origins}), listed
+
+
+LATER_VERBS = {  # verb -> the folder whose face has it
+    "compare": "identify",
+    "diagnosis_card": "report",
+    "diagnosis_report": "report",
+    "fit_card": "report",
+    "fit_report": "report",
+    "comparison_card": "report",
+    "plot_recording": "plots",
+    "recording_card": "report",
+    "simulator_card": "report",
+    "simulator_nrmse": "identify",
+}
+
+
+def later(verb: str) -> Callable[..., Any]:
+    """Return a function of a later folder's face, by its name in `LATER_VERBS`."""
+    folder = importlib.import_module(f"..{LATER_VERBS[verb]}", __package__)
+    return getattr(folder, verb)

@@ -28,7 +28,6 @@ from ._common import (
 
 if TYPE_CHECKING:
     from ..data import Recording
-    from ..studies import Fleet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,14 +140,9 @@ def fleet_command(options: FleetOptions) -> int:
         return say(f"Interrupted; {stop}, the same command continues from there.", INTERRUPTED)
     except NoModel as missed:
         return say(str(missed), NO_RESULT)
-    return _report(result, Path(options.target))
-
-
-def _report(result: Fleet, folder: Path) -> int:
-    """Print the result and its files."""
     print(result)
     for name in ("report.html", "fleet.json", "fleet.csv"):
-        print(folder / name)
+        print(Path(options.target) / name)
     return DONE
 
 

@@ -293,10 +293,10 @@ def add_disturbances(function: ca.Function) -> ca.Function:
 
 
 def jacobians_of(function: ca.Function) -> ca.Function:
-    """Build the Jacobians `(x, u) -> (A, B, C, D)` of any `F(x, u)`."""
-    x, u = ca.SX.sym("x", function.size1_in(0)), ca.SX.sym("u", function.size1_in(1))
-    blocks = [ca.densify(ca.jacobian(f, v)) for f in function(x, u) for v in (x, u)]
-    return ca.Function("slopes", [x, u], blocks)
+    """Build the Jacobians `(x, u, ...) -> (A, B, C, D)` of any `F(x, u, ...)`."""
+    symbols = [ca.SX.sym(name, function.size1_in(name)) for name in function.name_in()]
+    blocks = [ca.densify(ca.jacobian(f, v)) for f in function(*symbols) for v in symbols[:2]]
+    return ca.Function("slopes", symbols, blocks)
 
 
 def function_of_observer(observer: Any, function: ca.Function, recording: Recording) -> ca.Function:

@@ -386,10 +386,7 @@ def _markov_errors(fit: Fit, recording: Recording, state: Array, drive: Array) -
         problem = Problem(model, known, engine=fit.engine)
     except InputError:  # everything is fixed
         return np.full(RESPONSE_SAMPLES, np.nan)
-    x, u, p = ca.SX.sym("x", model.n_state), ca.SX.sym("u"), ca.SX.sym("p", parameters.size)
-    blocks = [ca.densify(ca.jacobian(f, v)) for f in model.closed(x, u, p) for v in (x, u)]
-    slopes = ca.Function("slopes", [x, u, p], blocks)
-    derivatives = []
+    slopes, derivatives = jacobians_of(model.closed), []
     for i in np.flatnonzero(parameters.free):
         step = 1e-6 * max(abs(parameters.start[i]), 1e-3 * np.max(np.abs(parameters.start)))
         moved = [parameters.start + sign * step * (np.arange(parameters.size) == i) for sign in (1, -1)]

@@ -6,7 +6,6 @@ from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
     from .common_clock import merge as merge
-    from .correlations import BAND as BAND, chance as chance, correlation as correlation
     from .excitation import (
         excited_bins as excited_bins,
         multisine as multisine,
@@ -17,7 +16,10 @@ if TYPE_CHECKING:
         tukey_realizations as tukey_realizations,
     )
     from .metrics import (
+        BAND as BAND,
         NOTHING_SENTENCE as NOTHING_SENTENCE,
+        chance as chance,
+        correlation as correlation,
         explains_nothing as explains_nothing,
         nrmse as nrmse,
         rmse as rmse,

@@ -38,7 +38,7 @@ from platformdirs import user_cache_path
 
 from .._base import InputError, one_at_a_time
 from ..models import Model
-from .external import Bindings, calls_external, entry_point, external_names, fill_gaps, without_remarks
+from .external import bind, calls_external, entry_point, external_names, fill_gaps, without_remarks
 from .sensitivities import BLOCKS, TARGETS, Engine, Linearization, VirtualMachine, linearize
 
 _SOURCES = {"x": 0, "s": 1, "z": 2, "w": 3}
@@ -343,12 +343,12 @@ class Compiled:
         self.loops = _loops(cache_directory())
         source = source_code(self.linear)
         self.library = _load(build(source))
-        self.bindings = Bindings(self.library, external_names(source), build)
+        self.programs = external_names(source)
         self.model = ctypes.byref(ctypes.c_char.in_dll(self.library, "pilfr_model"))
 
     def _call(self, name: str, *arguments: Any) -> None:
-        if self.bindings.names:
-            self.bindings.bind()
+        if self.programs:
+            bind(self.library, self.programs, build)
         if getattr(self.loops, name)(self.model, *arguments):
             raise MemoryError("the compiled model found no memory for its slopes")
 

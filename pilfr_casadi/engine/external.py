@@ -1,7 +1,7 @@
 """Generated C that calls other programs: `simulators.leaves` in place of the code that CasADi cannot write.
 
 CasADi leaves a gap where a function is a program of its own. `fill_gaps` lets that code call the function's buffer
-(`casadi.FunctionBuffer`), and `Bindings` gives the buffers of a thread to a library. Without CasADi's entry point for
+(`casadi.FunctionBuffer`), and `bind` gives the buffers of a thread to a library. Without CasADi's entry point for
 buffers the virtual machine has to be used.
 """
 
@@ -84,27 +84,14 @@ def without_remarks() -> Iterator[None]:
             print(line, file=screen)
 
 
-class Bindings:
-    """The buffers of the programs that a library calls, one set for each thread.
+def bind(library: ctypes.CDLL, names: tuple[str, ...], build: Callable[[str], Path]) -> None:
+    """Give this thread's buffers of programs to a library's `pilfr_bind`; all libraries that it calls share them.
 
-    Parameters
-    ----------
-    library : ctypes.CDLL
-        With the function `pilfr_bind`.
-    names : tuple of str
-        Names of `leaves` in their order.
-    build : callable
-        Compiles C source; returns the path of the library.
+    `names` are those of `leaves` in their order; `build` compiles C source and returns the path of the library.
     """
-
-    def __init__(self, library: ctypes.CDLL, names: tuple[str, ...], build: Callable[[str], Path]) -> None:
-        self.library, self.names, self.build = library, names, build
-
-    def bind(self) -> None:
-        """Give this thread's buffers to the library; they are shared by all libraries that this thread calls."""
-        table = (_External * len(self.names))(*(_buffer(name, self.build) for name in self.names))
-        self.library.pilfr_bind(table)
-        _of_this_thread.table = table  # the library reads it until the next call
+    table = (_External * len(names))(*(_buffer(name, build) for name in names))
+    library.pilfr_bind(table)
+    _of_this_thread.table = table  # the library reads it until the next call
 
 
 _of_this_thread = threading.local()

@@ -34,6 +34,7 @@ from .._base import (
     ordered_digest,
     path_text,
     short,
+    to_json,
     write_atomically,
 )
 from ..models import (
@@ -201,13 +202,7 @@ def _element_table(element: Any) -> dict[str, Any]:
 
 def _to_json(value: Any, infinite: str | None = None) -> Any:
     """Convert numbers to JSON: arrays to nested lists, nan to null, infinity to `infinite`."""
-    if value is None:
-        return None
-    array = np.asarray(value, dtype=float)
-    if array.ndim:
-        return [_to_json(v, infinite) for v in array]
-    number = float(array)
-    return number if np.isfinite(number) else infinite if number > 0 else None
+    return to_json(np.asarray(value, dtype=float), infinite)
 
 
 def _layout(value: Any, depth: int = 0) -> str:

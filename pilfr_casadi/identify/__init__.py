@@ -4,8 +4,7 @@
 chooses which of them are tried and polishes the best, `context` solves with the options that all fits share,
 `penalty` adds the L1 penalty, and `lagged` trains NARX and NOE models. `result` is the `Fit`, `uncertainty` its
 standard errors, and `sparse` makes fits with fewer operators from it. `surrogates` identifies a linear modal model
-from a table of simulated inputs and outputs (`modes` converts it). `comparison` simulates models of any kind
-beside one recording.
+from a table of simulated inputs and outputs. `comparison` simulates models of any kind beside one recording.
 """
 
 from typing import TYPE_CHECKING

@@ -30,7 +30,7 @@ import numpy as np
 
 from .._base import Progress, deferred_interrupt
 from ..data import Recording, as_recordings, check_for_identification, fingerprint
-from ..models import LAYER, PILFR, Lagged, Model, PrandtlIshlinskii, Stop
+from ..models import LAYER, PILFR, Lagged, Model, PrandtlIshlinskii, Stop, with_port_gain
 from ..optimise import (
     BOUND_STEP_SOLVER,
     Constraint,
@@ -177,7 +177,8 @@ class FitContext:
             options: dict[str, Any] = {name: getattr(problem, name) for name in names}
             judged = Problem(fitted, problem.recordings, **options)
         nrmse = tuple(problem.nrmse(theta))
-        if solution.status.converged and not max(nrmse) < DIVERGES * _nrmse_of_zero(problem):
+        of_zero = [float(np.max(np.sqrt(np.mean(r.y**2, axis=0)) / problem.scale)) for r in problem.recordings]
+        if solution.status.converged and not max(nrmse) < DIVERGES * max(1.0, *of_zero):
             solution = replace(solution, status=Status.DIVERGES)
         notes = (
             note,
@@ -211,11 +212,6 @@ class FitContext:
             options=self.options,
             **fields,
         )
-
-
-def _nrmse_of_zero(problem: Problem) -> float:
-    """Compute the largest NRMSE of any output for a model whose outputs are zero, at least 1."""
-    return max(1.0, *(float(np.max(np.sqrt(np.mean(r.y**2, axis=0)) / problem.scale)) for r in problem.recordings))
 
 
 def solve_within_bounds(
@@ -374,9 +370,7 @@ def gain_over(values: Mapping[str, Array], weight: Array, samples: int | None) -
     """Compute the gain (n_y n_u,), row by row, for Σw of each channel, after `samples` or, with None, in the limit."""
     a, b, c, d = (values[k] for k in ("A", "B_u", "C_y", "D_yu"))
     if len(weight):
-        s = np.diag(weight)
-        a, b = a + values["B_w"] @ s @ values["C_z"], b + values["B_w"] @ s @ values["D_zu"]
-        c, d = c + values["D_yw"] @ s @ values["C_z"], d + values["D_yw"] @ s @ values["D_zu"]
+        a, b, c, d = with_port_gain(values, np.diag(weight))
     n = len(a)
     with np.errstate(over="ignore", invalid="ignore"):
         if samples is None:

@@ -50,6 +50,7 @@ EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
 DEFAULT_SOLVER: GaussNewton = GaussNewton(max_iterations=200, tolerance=1e-4)  # of `fit`, and of every polish
 START_KINDS: tuple[str, ...] = ("grid", "paper", "plain")
 KEEP = 4  # candidates that are polished
+KERNEL_WIDTH = 1 / 12  # of the smoothed density of weights, over the visited range
 PRIOR_MARGIN = 1.1  # on the smallest error, up to which the fit with the density prior wins
 
 
@@ -209,7 +210,6 @@ def regrid(
     reach: float,
     *,
     extent: float = 1.3,
-    smooth: float = 1 / 12,
     count: int | None = None,
     spacing: float = 0.4,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -226,8 +226,6 @@ def regrid(
         Largest |z| visited.
     extent : float
         Largest threshold, in units of `reach`; the tail is extrapolated log-linearly and never rises.
-    smooth : float
-        Kernel width in units of `reach`.
     count : int, optional
         Number of new thresholds, N by default.
     spacing : float
@@ -238,7 +236,7 @@ def regrid(
     if not (np.sum(w) > 0 and reach > 0):
         return r[:count], w[:count]
     grid = np.linspace(0.0, extent * reach, 600)
-    d = weight_density(r, w, grid, smooth * reach)
+    d = weight_density(r, w, grid, KERNEL_WIDTH * reach)
     if d.max() <= 1e-200 * np.sum(w):  # all thresholds lie far beyond the visited range: spread them evenly
         d = np.full_like(grid, np.sum(w) / grid[-1])
     tail = (grid >= 0.4 * reach) & (grid <= 0.85 * reach)
@@ -282,7 +280,6 @@ def search_starts(
     seed: int,
     executor: Executor | None,
     report: Callable[[str, list[Candidate], int], None],
-    keep: int = KEEP,
 ) -> tuple[list[Candidate], Candidate | None, bool]:
     """Explore and polish; return all explored candidates, the winner, and whether the search was interrupted.
 
@@ -301,11 +298,11 @@ def search_starts(
         )
     if search.start != "grid" or stopped:
         return found, usable[0], stopped
-    chosen = usable[:keep]
+    chosen = usable[:KEEP]
     if any(at_active_radius(search.problem(c.model), c.theta, c.solution) for c in usable):
         # At a bound the errors after exploration rank candidates poorly. Polish every candidate that was among the best
         # so far when it was explored, so that more starts are never worse than fewer.
-        chosen = [c for i, c in enumerate(found) if c in sorted(found[: i + 1], key=_merit)[:keep] and c in usable]
+        chosen = [c for i, c in enumerate(found) if c in sorted(found[: i + 1], key=_merit)[:KEEP] and c in usable]
     polished, stopped = run_tasks(polish, [(search, c) for c in chosen], executor, partial(report, "polish"))
     return found, min(polished or usable[:1], key=_merit), stopped
 

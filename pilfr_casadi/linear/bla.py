@@ -49,8 +49,7 @@ class BLA:
     """A frequency response function with its variances.
 
     The variances belong to the mean `G` over all realizations and periods: ``E|ΔG[k, i, j]|² = var[k, i, j]``. At the
-    level of one realization (as in the paper's Fig. 8 and 13) they are :attr:`var_total_realization` and
-    :attr:`var_noise_realization`, larger by the number of realizations.
+    level of one realization (as in the paper's Fig. 8 and 13) they are `n_realizations` times as large.
 
     Parameters
     ----------
@@ -86,16 +85,6 @@ class BLA:
     def n_y(self) -> int:
         """Number of outputs."""
         return self.G.shape[1]
-
-    @property
-    def var_noise_realization(self) -> Array | None:
-        """Noise variance at the level of one realization (its periods averaged), (F, n_y, n_u)."""
-        return None if self.var_noise is None else self.var_noise * self.n_realizations
-
-    @property
-    def var_total_realization(self) -> Array | None:
-        """Variance from noise and nonlinear distortion at the level of one realization, (F, n_y, n_u)."""
-        return None if self.var_total is None else self.var_total * self.n_realizations
 
     def __repr__(self) -> str:
         text = f"{self.n_y} output(s), {self.n_u} input(s), {len(self.frequency)} frequencies from "

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, one_at_a_time
-from ..models import BLOCKS, Model, Play, Stop
+from ..models import Model, Play, Stop, with_port_gain
 from .statespace import resolvent
 
 Array = np.ndarray
@@ -89,15 +89,9 @@ def linear_parts(
     waiting, every = (w * (r > 0)).sum(axis=1), w.sum(axis=1)
     gains = (every - waiting, every) if isinstance(operator, Play) else (waiting, 0 * every)
     motions = ("small motions", "large motions")
-    return {name: _with_gain(model, np.diag(gain), dt) for name, gain in zip(motions, gains, strict=True)}
-
-
-def _with_gain(model: Model, gain: Array, dt: float) -> LinearPart:
-    """Close a gain (n_w, n_w) into the port of a PI-LFR."""
-    a, b_u, b_w, c_y, d_yu, d_yw, c_z, d_zu = (model.parameters[name].value for name in BLOCKS if name != "y_0")
-    return LinearPart(
-        a + b_w @ gain @ c_z, b_u + b_w @ gain @ d_zu, c_y + d_yw @ gain @ c_z, d_yu + d_yw @ gain @ d_zu, dt
-    )
+    p = {name: parameter.value for name, parameter in model.parameters.items()}
+    closed = [LinearPart(*with_port_gain(p, np.diag(gain)), dt) for gain in gains]
+    return dict(zip(motions, closed, strict=True))
 
 
 @one_at_a_time

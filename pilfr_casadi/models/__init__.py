@@ -28,12 +28,11 @@ if TYPE_CHECKING:
     from .model import (
         Buffered as Buffered,
         Model as Model,
-        StepExpressions as StepExpressions,
         accumulate_steps as accumulate_steps,
         close_loop as close_loop,
-        from_expressions as from_expressions,
         inject_outputs as inject_outputs,
         map_points as map_points,
+        model_functions as model_functions,
         open_model as open_model,
     )
     from .operators import (
@@ -67,6 +66,7 @@ if TYPE_CHECKING:
         places as places,
         read_through as read_through,
         wiener as wiener,
+        with_port_gain as with_port_gain,
     )
     from .structures import (
         ANY as ANY,

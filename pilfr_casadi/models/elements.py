@@ -181,14 +181,10 @@ class StaticNetwork:
     hidden: int = 10
     channels: int = 1
     kind: str = field(init=False, default="static_network")
+    memory = 0
 
     def __post_init__(self) -> None:
         _check_counts("A static network", hidden=self.hidden, channels=self.channels)
-
-    @property
-    def memory(self) -> int:
-        """None."""
-        return 0
 
     def parameters(self) -> ParameterSet:
         """`gain`, `slope`, `bias`, each (channels, hidden)."""
@@ -231,6 +227,7 @@ class Products:
     channels: int = 1
     degrees: tuple[int, ...] = (2, 3)
     kind: str = field(init=False, default="products")
+    memory = 0
 
     def __post_init__(self) -> None:
         whole(self.channels, "The number of channels of products", 1)
@@ -239,11 +236,6 @@ class Products:
         for degree in self.degrees:
             whole(degree, "A degree of products", 2)
         object.__setattr__(self, "degrees", tuple(sorted({int(d) for d in self.degrees})))
-
-    @property
-    def memory(self) -> int:
-        """None."""
-        return 0
 
     @property
     def terms(self) -> tuple[tuple[int, ...], ...]:

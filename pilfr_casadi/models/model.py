@@ -183,6 +183,20 @@ class Model:
         return replace(self, parameters=parameters)
 
 
+def model_functions(
+    x: Any, u: Any, w: Any, p: Any, step: Sequence[Any], z: Any, element: Sequence[Any]
+) -> dict[str, ca.Function]:
+    """Make the functions of a `Model` of symbols x, u, w, p: of `step` (x_next, y) and of the port's signal z.
+
+    `element` holds symbols (z, s) and expressions (w, s_next) of them and p.
+    """
+    return {
+        "step": ca.Function("step", [x, u, w, p], step, ["x", "u", "w", "p"], ["x_next", "y"]),
+        "port": ca.Function("port", [x, u, p], [z], ["x", "u", "p"], ["z"]),
+        "memory": ca.Function("memory", [*element[:2], p], element[2:], ["z", "s", "p"], ["w", "s_next"]),
+    }
+
+
 def open_model(
     step: StepExpression,
     port: PortExpression,
@@ -231,76 +245,12 @@ def open_model(
             raise InputError(f"The {name} has the shape {expression.shape}; expected ({rows}, 1).")
     z_in, s = ca.SX.sym("z", n_w), ca.SX(0, 1)
     return Model(
-        step=ca.Function("step", [x, u, w, vector], [x_next, y], ["x", "u", "w", "p"], ["x_next", "y"]),
-        port=ca.Function("port", [x, u, vector], [z], ["x", "u", "p"], ["z"]),
-        memory=ca.Function("memory", [z_in, s, vector], [ca.SX(n_w, 1), s], ["z", "s", "p"], ["w", "s_next"]),
+        **model_functions(x, u, w, vector, [x_next, y], z, [z_in, s, ca.SX(n_w, 1), s]),
         parameters=parameters,
         element=None,
         states=_default_names(states, n_x, "x"),
         inputs=_default_names(inputs, n_u, "u"),
         outputs=_default_names(outputs, int(y.shape[0]), "y"),
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class StepExpressions:
-    """One step of a closed model as expressions of symbols.
-
-    Attributes
-    ----------
-    x, s, u, p
-        Symbols of the states, the memory, the drive and the parameters.
-    x_next, s_next, y
-        Expressions of the next states, the next memory and the outputs.
-    port : (z, channels, moved), optional
-        The signals that move the memory (expressions of x, u and p), the symbols by which `s_next` reads them, and the
-        symbols by which `x_next` and `y` read the moved memory; each as long as s. Without a port, s is empty.
-    stages : (c, values, by_c, x_next), optional
-        Symbols of intermediate values, and the outputs of `Model.stages`.
-    resting : casadi.Function, optional
-        That of `Model`.
-    """
-
-    x: Any
-    s: Any
-    u: Any
-    p: Any
-    x_next: Any
-    s_next: Any
-    y: Any
-    port: tuple[Any, Any, Any] | None = None
-    stages: tuple[Any, Any, Any, Any] | None = None
-    resting: ca.Function | None = None
-
-
-def from_expressions(
-    e: StepExpressions,
-    parameters: ParameterSet,
-    *,
-    states: tuple[str, ...],
-    inputs: tuple[str, ...],
-    outputs: tuple[str, ...],
-    reads: tuple[str, ...] = ("u",),
-    substeps: int = 1,
-) -> Model:
-    """Make a closed model from expressions of symbols; the names and numbers are those of `Model`."""
-    x, s, u, p = e.x, e.s, e.u, e.p
-    z, channels, moved = e.port or (ca.SX(0, 1),) * 3
-    w = e.s_next if e.port else ca.SX(0, 1)
-    c, *staged = e.stages or (ca.SX(0, 1),)
-    return Model(
-        step=ca.Function("step", [x, u, moved, p], [e.x_next, e.y], ["x", "u", "w", "p"], ["x_next", "y"]),
-        port=ca.Function("port", [x, u, p], [z], ["x", "u", "p"], ["z"]),
-        memory=ca.Function("memory", [channels, s, p], [w, e.s_next], ["z", "s", "p"], ["w", "s_next"]),
-        parameters=parameters,
-        element=None,
-        states=states,
-        inputs=inputs,
-        outputs=outputs,
-        reads=reads,
-        substeps=substeps,
-        stages=ca.Function("stages", [x, u, moved, p, c], staged) if e.stages else None,
-        resting=e.resting,
     )
 
 
@@ -342,9 +292,7 @@ def close_loop(model: Any, element: Element, port: str | None = None) -> Any:
     w_out, s_next = element.step(z, s, parameters.symbols(vector))
     return replace(
         model,
-        step=ca.Function("step", [x, u, w, vector], model.step(x, u, w, own), ["x", "u", "w", "p"], ["x_next", "y"]),
-        port=ca.Function("port", [x, u, vector], [model.port(x, u, own)], ["x", "u", "p"], ["z"]),
-        memory=ca.Function("memory", [z, s, vector], [w_out, s_next], ["z", "s", "p"], ["w", "s_next"]),
+        **model_functions(x, u, w, vector, model.step(x, u, w, own), model.port(x, u, own), [z, s, w_out, s_next]),
         parameters=parameters,
         element=element,
         stages=None,
@@ -380,11 +328,10 @@ def inject_outputs(model: Model, gain: np.ndarray, strength: Mapping[str, Parame
         c = ca.SX.sym("c", stages.size1_in(4))
         values, by_c, end = stages(x, u, w, p, c)
         stages = ca.Function("stages", [x, read, w, vector, c], [values, by_c, end + pushed])
+    element = [z, s, *model.memory(z, s, p)]
     return replace(
         model,
-        step=ca.Function("step", [x, read, w, vector], [following + pushed, y], ["x", "u", "w", "p"], ["x_next", "y"]),
-        port=ca.Function("port", [x, read, vector], [model.port(x, u, p)], ["x", "u", "p"], ["z"]),
-        memory=ca.Function("memory", [z, s, vector], list(model.memory(z, s, p)), ["z", "s", "p"], ["w", "s_next"]),
+        **model_functions(x, read, w, vector, [following + pushed, y], model.port(x, u, p), element),
         parameters=parameters,
         reads=reads,
         stages=stages,

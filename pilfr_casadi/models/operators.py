@@ -75,15 +75,19 @@ def generalized_play(
     return fmax(low, fmin(high, q, eps), eps)
 
 
+class _Plain:
+    """An operator without parameters beyond its threshold."""
+
+    def parameters(self, channels: int) -> ParameterSet:
+        """Return an empty set."""
+        return ParameterSet()
+
+
 @dataclass(frozen=True)
-class Play:
+class Play(_Plain):
     """The play operator, Eq. 5; `v = q_next`."""
 
     name = "play"
-
-    def parameters(self, channels: int) -> ParameterSet:
-        """No parameters beyond the thresholds."""
-        return ParameterSet()
 
     def step(self, z: Any, q: Any, r: Any, p: Any, eps: Any = 0.0) -> tuple[Any, Any]:
         """One step: (output, next memory); z scalar or like q and r."""
@@ -92,14 +96,10 @@ class Play:
 
 
 @dataclass(frozen=True)
-class Stop:
+class Stop(_Plain):
     """The stop operator, Eq. 3 and 9; the memory is the play state `z - v`."""
 
     name = "stop"
-
-    def parameters(self, channels: int) -> ParameterSet:
-        """No parameters beyond the thresholds."""
-        return ParameterSet()
 
     def step(self, z: Any, q: Any, r: Any, p: Any, eps: Any = 0.0) -> tuple[Any, Any]:
         """One step: (output, next memory)."""

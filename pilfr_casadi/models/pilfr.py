@@ -232,6 +232,16 @@ def _port(x: Any, u: Any, p: dict[str, Any]) -> Any:
     return p["C_z"] @ x + p["D_zu"] @ u
 
 
+def with_port_gain(p: Mapping[str, Any], gain: Any) -> tuple[Any, Any, Any, Any]:
+    """Close a gain `w = gain z`, (n_w, n_w), into the port of a PI-LFR: A, B, C, D of arrays or CasADi matrices."""
+    return (
+        p["A"] + p["B_w"] @ gain @ p["C_z"],
+        p["B_u"] + p["B_w"] @ gain @ p["D_zu"],
+        p["C_y"] + p["D_yw"] @ gain @ p["C_z"],
+        p["D_yu"] + p["D_yw"] @ gain @ p["D_zu"],
+    )
+
+
 def hammerstein(nx: int, element: Element, offset: bool = True) -> PILFR:
     """Make a PI-Hammerstein structure: the input passes the element first, so `z = u`.
 

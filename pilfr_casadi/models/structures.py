@@ -23,7 +23,7 @@ import numpy as np
 from .._base import InputError, is_number, whole
 from ..data import Recording
 from .elements import PrandtlIshlinskii, StaticNetwork
-from .model import Model
+from .model import Model, model_functions
 from .operators import GeneralizedPlay, Play, Stop
 from .parameters import Parameter, ParameterSet, check_size, or_one
 from .pilfr import PILFR, hammerstein, wiener
@@ -231,14 +231,13 @@ def reading_output(model: Model, share: float = 1.0) -> Model:
     w, y, p = ca.SX.sym("w", model.n_w), ca.SX.sym("y", n_y), ca.SX.sym("p", parameters.size)
     own, both = p[: model.parameters.size], ca.vertcat(u, y)
     z, s = ca.SX.sym("z", model.n_w), ca.SX(0, 1)
+    element = [z, s, *model.memory(z, s, own)]
     _, y_hat = model.step(x, u, ca.SX.zeros(model.n_w), own)
     corrected = ca.vertcat(x[:n_y] + p[-1] * (y - y_hat), *(x[i] for i in range(n_y, model.n_x)))
     x_next, _ = model.step(corrected, u, w, own)
     return replace(
         model,
-        step=ca.Function("step", [x, both, w, p], [x_next, y_hat], ["x", "u", "w", "p"], ["x_next", "y"]),
-        port=ca.Function("port", [x, both, p], [model.port(corrected, u, own)], ["x", "u", "p"], ["z"]),
-        memory=ca.Function("memory", [z, s, p], list(model.memory(z, s, own)), ["z", "s", "p"], ["w", "s_next"]),
+        **model_functions(x, both, w, p, [x_next, y_hat], model.port(corrected, u, own), element),
         parameters=parameters,
         reads=("u", "y"),
     )

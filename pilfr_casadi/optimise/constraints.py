@@ -26,7 +26,17 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, filled, numbers
-from ..models import PILFR, GeneralizedPlay, ParameterSet, Play, PrandtlIshlinskii, Stop, element_slopes, unknown_slope
+from ..models import (
+    PILFR,
+    GeneralizedPlay,
+    ParameterSet,
+    Play,
+    PrandtlIshlinskii,
+    Stop,
+    element_slopes,
+    unknown_slope,
+    with_port_gain,
+)
 
 TOLERATED = 1e-6  # violation, in units of a constraint, up to which it counts as met
 LARGEST_UNIT, SMALLEST_UNIT = 100.0, 1e-6  # a unit is at most 100 limits, at least this share of the change
@@ -374,9 +384,7 @@ class Gain:
         """Return the expression for named parameters p."""
         a, b, c, d = p["A"], p["B_u"], p["C_y"], p["D_yu"]
         if "w" in p:
-            s = self.slope * ca.diag(ca.sum2(p["w"]))
-            a, b = a + p["B_w"] @ s @ p["C_z"], b + p["B_w"] @ s @ p["D_zu"]
-            c, d = c + p["D_yw"] @ s @ p["C_z"], d + p["D_yw"] @ s @ p["D_zu"]
+            a, b, c, d = with_port_gain(p, self.slope * ca.diag(ca.sum2(p["w"])))
         wanted = tuple(d.shape)
         if self.shape not in ((), wanted, *([(max(wanted),)] if min(wanted) == 1 else [])):
             raise InputError(

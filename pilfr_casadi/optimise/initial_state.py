@@ -55,16 +55,12 @@ def samples_to_start(model: Model, engine: Engine, recording: Recording) -> int:
     return used
 
 
-def _deviations(recording: Recording) -> np.ndarray:
-    """Compute the outputs' standard deviations; that of another output where one is constant."""
-    spread = np.std(recording.y, axis=0)
-    return np.where(spread > 0, spread, np.max(spread) or 1.0)
-
-
 def _state_problem(model: Model, engine: Engine, recording: Recording) -> Problem:
     """Make the problem whose only variables are the initial state; the outputs are over their deviations."""
     fixed = model.parameters.change(**{k: {"fixed": True, "prior": None} for k in model.parameters})
-    return Problem(model.with_parameters(fixed), recording, engine=engine, scale=_deviations(recording))
+    spread = np.std(recording.y, axis=0)
+    scale = np.where(spread > 0, spread, np.max(spread) or 1.0)  # that of another output where one is constant
+    return Problem(model.with_parameters(fixed), recording, engine=engine, scale=scale)
 
 
 def _slope_by_state(model: Model, engine: Engine, recording: Recording) -> np.ndarray:

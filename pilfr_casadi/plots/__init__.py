@@ -11,7 +11,6 @@ from .._base.lazy import lazy_face
 if TYPE_CHECKING:
     from .canvas import new_figure as new_figure
     from .chart import chart as chart
-    from .correlations import residual_tests as residual_tests
     from .diagnosis import (
         Signal as Signal,
         force_cloud as force_cloud,
@@ -63,6 +62,7 @@ if TYPE_CHECKING:
         compared_spread as compared_spread,
         frequency_response as frequency_response,
         loops as loops,
+        residual_tests as residual_tests,
         spread as spread,
     )
 else:

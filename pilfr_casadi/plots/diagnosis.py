@@ -46,7 +46,8 @@ def mismatch_map(found: Mapping[str, Any], unit: str = "") -> Axes:
     data, (size, label) = found["map"], _size(found, unit)
     edges, rms = np.asarray(data["edges"]) * size, 100 * np.array(data["rms"], dtype=float)
     top = max(float(np.nanmax(rms, initial=0.0)), 1e-12)
-    rows = _rows(data, np.nanmax(np.nan_to_num(rms), axis=1) > 1e-3 * top)
+    seen = np.flatnonzero(np.nanmax(np.nan_to_num(rms), axis=1) > 1e-3 * top)  # bands with a residual in them
+    rows = slice(int(seen[0]), int(seen[-1]) + 1) if len(seen) else slice(0, len(rms))
     y = np.append(np.asarray(data["low"])[rows], data["high"][rows.stop - 1])
     y[0] = y[0] or y[1] / np.sqrt(2)
     shown = np.ma.masked_invalid(np.maximum(rms[rows], 1e-300))
@@ -57,12 +58,6 @@ def mismatch_map(found: Mapping[str, Any], unit: str = "") -> Axes:
     finish(ax, label, "frequency [Hz]", "residual by frequency and amplitude")
     ax.grid(False)
     return ax
-
-
-def _rows(data: Mapping[str, Any], wanted: np.ndarray) -> slice:
-    """Select the bands from the first to the last with a residual in it."""
-    where = np.flatnonzero(wanted)
-    return slice(int(where[0]), int(where[-1]) + 1) if len(where) else slice(0, len(data["low"]))
 
 
 def _size(found: Mapping[str, Any], unit: str, kind: str = "amplitude") -> tuple[float, str]:

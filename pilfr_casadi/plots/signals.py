@@ -5,7 +5,7 @@ The first part draws a fit (Krikelis et al. 2024, Fig. 9, 10 and 14), the second
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import cycle
 from typing import Any, Protocol, cast
@@ -85,7 +85,8 @@ def time(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes | N
     """Draw the measured output with the residuals of the linear model and of the fit over time, as Fig. 9 (left)."""
     recording = as_scored(fit, recording)
     ax, t, y = axes_or_new(ax), recording.t, _column(recording.y, output, "output")
-    level = _level(y[recording.skip :])
+    mean, span = float(np.mean(y[recording.skip :])), np.ptp(y[recording.skip :])
+    level = mean if abs(mean) > span > 0 else 0.0  # subtracted, so that swings show beside residuals
     plain_unit = _unit(fit, recording, recording.outputs[output])
     size, axis = scale_axis(recording.outputs[output], y - level, plain_unit)
     what = "measured output" + (f" less its mean {level:.6g} {plain_unit}".rstrip() if level else "")
@@ -274,12 +275,6 @@ def _over_time(ax: Axes, recording: Recording, label: str) -> Axes:
     return finish(ax, "time [s]", label, recording.name)
 
 
-def _level(y: np.ndarray) -> float:
-    """Choose the level, mean or 0, to subtract from a signal (M,) so that its swings show beside residuals."""
-    mean = float(np.mean(y))
-    return mean if abs(mean) > np.ptp(y) > 0 else 0.0
-
-
 def _without_offset(error: np.ndarray, span: float, unit: str) -> tuple[np.ndarray, str]:
     """Subtract the offset of an error (M,) if it exceeds the measured span and dominates the error; return a note."""
     known = error[np.isfinite(error)]
@@ -344,6 +339,13 @@ Simulated = list[tuple[str, np.ndarray | None]]  # (label, outputs (M, n_y)), be
 SIMULATED_COLOURS = (ORANGE, INK, VERMILLION, PURPLE, SKY)  # further simulations begin again
 
 
+def coloured(simulated: Sequence[tuple[str, np.ndarray | None]]) -> Iterator[tuple[str, np.ndarray, str]]:
+    """Yield label, outputs and colour of the simulations that there are."""
+    for (label, values), colour in zip(simulated, cycle(SIMULATED_COLOURS), strict=False):
+        if values is not None:
+            yield label, values, colour
+
+
 def plot_comparison(r: Recording, simulated: Simulated, noise: np.ndarray | None = None) -> Any:
     """Draw a recording beside simulations: a row per output, the largest swing on the left, all residuals on the right.
 
@@ -371,10 +373,9 @@ def compared_traces(
     part = _quiet(y, part.stop - part.start, r.skip) if quiet else part
     size, up = scale_axis(r.outputs[output], y[part], unit)
     line(ax, r.t, y / size, "measured", BLUE, part=part, linewidth=4.0, alpha=0.45)
-    for (label, values), colour in zip(simulated, cycle(SIMULATED_COLOURS), strict=False):
-        if values is not None:
-            drawn = mask_divergence(values[:, output], np.ptp(y)) / size
-            line(ax, r.t, drawn, label, colour, part=part, linewidth=1.4)
+    for label, values, colour in coloured(simulated):
+        drawn = mask_divergence(values[:, output], np.ptp(y)) / size
+        line(ax, r.t, drawn, label, colour, part=part, linewidth=1.4)
     ax.margins(x=0.01)
     return finish(ax, "time [s]", up, r.name, 3)
 
@@ -394,11 +395,7 @@ def compared_residuals(
     """Draw the residuals of simulations over the whole recording; `floor` is the deviation of the noise."""
     ax = axes_or_new(ax)
     y = r.y[:, output]
-    kept: list[tuple[str, np.ndarray, Any]] = [
-        (label, mask_divergence(v[:, output] - y, np.ptp(y)), colour)
-        for (label, v), colour in zip(simulated, cycle(SIMULATED_COLOURS), strict=False)
-        if v is not None
-    ]
+    kept = [(label, mask_divergence(v[:, output] - y, np.ptp(y)), c) for label, v, c in coloured(simulated)]
     size, up = scale_axis(f"simulated − measured {r.outputs[output]}", np.nan_to_num(kept[0][1]) if kept else y, unit)
     for label, e, colour in kept:
         line(ax, r.t, e / size, label, colour, linewidth=0.8)
@@ -411,9 +408,7 @@ def compared_spectra(r: Recording, simulated: Simulated, output: int, unit: str,
     """Draw amplitude densities of the output, of each residual, and of white noise of deviation `floor`."""
     y = r.y[:, output]
     signals = [("measured", y, BLUE)]
-    for (label, v), colour in zip(simulated, cycle(SIMULATED_COLOURS), strict=False):
-        if v is not None:
-            signals.append((f"left {label}", v[:, output] - y, colour))
+    signals += [(f"left {label}", v[:, output] - y, colour) for label, v, colour in coloured(simulated)]
     ends = amplitude_density(y, r)[0][[0, -1]]
     white = [("noise floor (white)", ends, np.full(2, 2 * r.dt * floor**2), GREEN)] if floor > 0 else []
     return _draw_densities(r, output, unit, signals, white, None)

@@ -1,9 +1,9 @@
 """Self-contained HTML pages of fits, diagnoses and anything else.
 
-`page.py` holds the general page and its blocks, `fit.py` and `diagnosis.py` fill it; `action.py` measures what a law
-does; `cards.py` holds the short pieces that a notebook shows. The look of every page (colours, fonts, layout) stands in
-`templates/report.css`, its structure in `templates/page.html` and `templates/blocks.html`; `templates/explore.js` turns
-pictures into charts.
+`page.py` holds the general page and its blocks, `fit.py` and `diagnosis.py` fill it; `diagnosis_tables.py` measures how
+a law acts; `cards.py` holds the short pieces that a notebook shows. The look of every page (colours, fonts, layout)
+stands in `templates/report.css`, its structure in `templates/page.html` and `templates/blocks.html`;
+`templates/explore.js` turns pictures into charts.
 """
 
 from typing import TYPE_CHECKING

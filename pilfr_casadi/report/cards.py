@@ -60,15 +60,9 @@ def recording_card(recording: Recording) -> str:
         *([f"period {r.period} samples"] if r.period else []),
         *([f"first {r.skip} samples not scored"] if r.skip else []),
     ]
-    table = Table(
-        ["channel", "role", "unit", "smallest", "mean", "largest", "deviation"], rows, note=_cut(r.n_u, r.n_y)
-    )
+    note = f"and {left} more" if (left := r.n_u + r.n_y - len(rows)) else ""
+    table = Table(["channel", "role", "unit", "smallest", "mean", "largest", "deviation"], rows, note=note)
     return Card(f"Recording {r.name}".strip(), "; ".join(told), tables=[table], lines=lines).html()
-
-
-def _cut(*counts: int) -> str:
-    left = sum(max(count - MOST_ROWS, 0) for count in counts)
-    return f"and {left} more" if left else ""
 
 
 def _line(x: np.ndarray) -> str:

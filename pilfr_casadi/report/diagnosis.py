@@ -28,7 +28,7 @@ from ..laws import display_name, readable_unit, strengths_over
 from ..plots import Signal
 from ..simulators import MECHANICAL, PARAMETER, Port, name_at
 from . import diagnosis_tables as tables
-from .action import Action, element_of, measure_action
+from .diagnosis_tables import Action, element_of, measure_action
 from .page import Block, Code, Page, Picture, Section, Table, Text, numbered
 
 MOST_DRAWN = 3  # outputs and recordings that are drawn; the tables have all of them

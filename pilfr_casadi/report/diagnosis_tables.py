@@ -1,17 +1,19 @@
-"""Tables and sentences of a diagnosis: errors, effects, candidates, parameters, checks, and how to use the result."""
+"""Tables and sentences of a diagnosis: errors, effects and how they act, candidates, parameters, checks, usage."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
+from .. import laws
 from .._base import to_json
-from ..diagnose import ERROR_NAMES, Diagnosis, Effect, learned_force
+from ..diagnose import ERROR_NAMES, Diagnosis, Effect, Fitted, Workbench, law_signals, learned_force
 from ..identify import RUN_AWAY
-from ..laws import VaryingParameter, display_name, heated, scaled, scheduled, short_name, varying
+from ..laws import VaryingParameter, display_name, heated, readable_unit, scaled, scheduled, short_name, varying
 from ..models import Parameter, ParameterSet
 from ..simulators import PARAMETER, name_at
 from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
@@ -205,8 +207,8 @@ def error_before(diagnosis: Diagnosis, number: int) -> float | None:
 def in_place(diagnosis: Diagnosis, number: int) -> str:
     """Name the laws that were in place in a pass; empty for the simulator alone."""
     parent = _parent(diagnosis, number)
-    laws = () if parent is None else parent.laws
-    return " and ".join(name_at(e.port, e.law.id) for e in laws)
+    placed = () if parent is None else parent.laws
+    return " and ".join(name_at(e.port, e.law.id) for e in placed)
 
 
 def _parent(diagnosis: Diagnosis, number: int) -> Any:
@@ -322,7 +324,8 @@ def usage(diagnosis: Diagnosis) -> str:
     for e in simulator.elements:
         imported, expression = _parts(type(e.law))
         for part in imported:
-            modules.setdefault(_home(part), set()).add(part.__name__)
+            home = laws.__name__ if getattr(laws, part.__name__, None) is part else part.__module__
+            modules.setdefault(home, set()).add(part.__name__)
         limits = {k: tuple(np.asarray(end, dtype=float).tolist() for end in ends) for k, ends in e.law.limits.items()}
         elements.append((e, expression, e.own(fitted), limits))
     return render(
@@ -350,7 +353,50 @@ def _parts(law: Any) -> tuple[tuple[Any, ...], str]:
     return (law,), law.__name__
 
 
-def _home(law: Any) -> str:
-    from .. import laws
+@dataclass(frozen=True)
+class Action:
+    """How a law acts along the training recordings: its largest force with its unit, and a table."""
 
-    return laws.__name__ if getattr(laws, law.__name__, None) is law else law.__module__
+    strongest: str
+    table: Table
+
+
+def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int | None) -> Action | None:
+    """Measure the force of element `number` along the training recordings; None without one, or if its run diverges.
+
+    The equivalent stiffness k and damping c are those of the line w = k z + c dz/dt nearest to the force (equivalent
+    linearisation, Krylov & Bogoliubov 1943); a cycle is one upward crossing of the mean of z. Where z is a speed, there
+    is the damping alone.
+    """
+    if number is None:
+        return None
+    port = bench.simulator.port(effect.port)
+    with np.errstate(all="ignore"):
+        runs = [law_signals(bench, fitted, number, i) for i in range(len(bench.recordings))]
+    z, dz, w = (np.concatenate(v) for v in zip(*runs, strict=True))
+    if not all(np.all(np.isfinite(v)) for v in (z, dz, w)):
+        return None
+    largest = f"{number_text(float(np.max(np.abs(w))), 3)}\u00a0{port.unit}".strip()
+    of = "parameter" if port.name.startswith(PARAMETER) else "signal"
+    what = f"largest change of the {of}" if port.series else "largest force"
+    rows = [[what, float(np.max(np.abs(w))), port.unit]]
+    unit = readable_unit("w*s/z", port.unit, port.position_unit).replace(" *", "")
+    if port.is_speed:
+        damping = (w - np.mean(w)) @ z / (z @ z)
+        rows += [["equivalent damping", float(damping), unit if port.unit and port.across_unit else ""]]
+    elif not port.series:
+        (stiffness, damping), *_ = np.linalg.lstsq(np.column_stack([z, dz]), w - np.mean(w), rcond=None)
+        taken = sum(float(np.sum((f[1:] + f[:-1]) / 2 * np.diff(x))) for x, _, f in runs)
+        cycles = sum(int(np.sum(np.diff(np.signbit(x - np.mean(x)).astype(int)) < 0)) for x, _, _ in runs)
+        units = [readable_unit(u, port.unit, port.across_unit).replace(" *", "") for u in ("w*z", "w/z")]
+        known = bool(port.unit and port.across_unit)
+        rows += [["energy taken per cycle, mean", taken / cycles, units[0] if known else ""]] if cycles else []
+        rows += [["equivalent stiffness", float(stiffness), units[1] if known else ""]]
+        rows += [["equivalent damping", float(damping), unit if known else ""]]
+    return Action(largest, Table(["how it acts in the training recordings", "value", "unit"], rows, digits=3))
+
+
+def element_of(fitted: Fitted, effect: Effect) -> int | None:
+    """Find the element of the fitted simulator that an effect is; offsets may stand before it."""
+    placed = enumerate(fitted.simulator.elements)
+    return next((i for i, p in placed if (p.port, p.law.id) == (effect.port, effect.law)), None)

@@ -27,7 +27,7 @@ import numpy as np
 
 from .._base import InputError, one_at_a_time
 from ..data import Recording
-from ..models import Model, StepExpressions, accumulate_steps, from_expressions, inject_outputs, map_points
+from ..models import Model, accumulate_steps, inject_outputs, map_points, model_functions
 from .equations import PARAMETER, Equations, Named, Placed, Port, call, in_series
 
 LARGEST_STEP = 0.25  # largest |λ| h: a phase error of (λh)⁴/120 = 3e-5 of the angle of a cycle
@@ -189,25 +189,28 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
     if ca.depends_on(ca.vertcat(x_next, y, begun), t):
         reads, columns = [*reads, "t"], [*columns, t]
     x_next, y = ca.cse([x_next, y])
-    port = None
     if s.numel() and not step.shifts.any() and not ca.depends_on(z, s):
         # memory that is moved by a port of its own makes the derivatives sparse
         channels = ca.SX.sym("z", s.numel())
-        port = z, channels, moved
-        s_next = step.equations.memory(channels, s)
+        w = s_next = step.equations.memory(channels, s)
     else:
         x_next, y, *staged = ca.substitute([x_next, y, *(stages or ())[1:]], [moved], [begun])
-        x, s, x_next, s_next = ca.vertcat(x, s), ca.SX(0, 1), ca.vertcat(x_next, begun), ca.SX(0, 1)
+        x, x_next = ca.vertcat(x, s), ca.vertcat(x_next, begun)
+        s = s_next = z = channels = moved = w = ca.SX(0, 1)
         if stages is not None:
             stages = stages[0], staged[0], staged[1], ca.vertcat(staged[2], begun)
-    model = from_expressions(
-        StepExpressions(x, s, ca.vertcat(*columns), step.vector, x_next, s_next, y, port, stages, step.resting()),
-        simulator.parameter_set,
+    u, p = ca.vertcat(*columns), step.vector
+    model = Model(
+        **model_functions(x, u, moved, p, [x_next, y], z, [channels, s, w, s_next]),
+        parameters=simulator.parameter_set,
+        element=None,
         states=simulator.states,
         inputs=simulator.inputs,
         outputs=simulator.output_names,
         reads=tuple(reads),
         substeps=substeps,
+        stages=ca.Function("stages", [x, u, moved, p, stages[0]], stages[1:]) if stages else None,
+        resting=step.resting(),
     )
     return model if simulator.observer is None else inject_outputs(model, simulator.observer)
 
@@ -276,7 +279,11 @@ class _SubStep:
         no recording shows, and that bends a fit of the law's parameters.
         """
         counts = [n_q or n_s for n_q, n_s in zip(self.equations.n_q, self.equations.n_s, strict=True)]
-        shares = [_settled(e.law, n) for e, n in zip(self.simulator.elements, counts, strict=True)]
+        laws = [e.law for e in self.simulator.elements]
+        shares = [  # one for those states or memories that come to rest at the value at which the law's signal stands
+            np.asarray(law.standing(1.0)) if n and hasattr(law, "standing") else np.zeros(n)
+            for law, n in zip(laws, counts, strict=True)
+        ]
         if not any(np.any(share) for share in shares):
             return None
         sizes = (("x", len(self.simulator.states)), ("u", self.u0.numel()), ("p", self.vector.numel()))
@@ -288,11 +295,6 @@ class _SubStep:
             memory = ca.vertcat(ca.MX(0, 1), *(part for part, n in zip(own, self.equations.n_s, strict=True) if n))
             z = self.at(state, memory, u, 0, u, u, p)[4]
         return ca.Function("resting", [x, u, p], [ca.densify(ca.vertcat(state, memory))])
-
-
-def _settled(law: Any, n: int) -> np.ndarray:
-    """Mark those of a law's n states or memories that come to rest at the value at which its signal stands."""
-    return np.asarray(law.standing(1.0)) if n and hasattr(law, "standing") else np.zeros(n)
 
 
 def states_along(model: Model, drive: np.ndarray, p: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -144,11 +144,9 @@ class _Equations:
     note: str
 
     def __call__(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
-        stack = (ca.vertcat(ca.SX(0, 1), *values) for values in self._values(x, u, p))
+        values = [x[n] for n in self.states], [u[n] for n in self.inputs], [ca.vec(p[n]) for n in self.parameters]
+        stack = (ca.vertcat(ca.SX(0, 1), *each) for each in values)
         return dict(zip(self.found, ca.vertsplit(self.traced(t, *stack)), strict=True))
-
-    def _values(self, x: Named, u: Named, p: Named) -> tuple[list[Any], list[Any], list[Any]]:
-        return [x[n] for n in self.states], [u[n] for n in self.inputs], [ca.vec(p[n]) for n in self.parameters]
 
 
 @dataclass(frozen=True)

@@ -134,16 +134,8 @@ def _scalar_function(function: Rule, ufunc: Any) -> Rule:
 
 _CREATORS = ("zeros", "ones", "empty", "full", "eye", "identity", "array", "asarray", "asanyarray")
 REPLACED: dict[Any, Rule] = {getattr(np, name): _creator(getattr(np, name)) for name in _CREATORS}
-_RENAMED = {
-    "asin": "arcsin",
-    "acos": "arccos",
-    "atan": "arctan",
-    "atan2": "arctan2",
-    "asinh": "arcsinh",
-    "acosh": "arccosh",
-    "atanh": "arctanh",
-    "pow": "power",
-}
+_RENAMED = {"pow": "power"}
+_RENAMED |= {f"a{name}": f"arc{name}" for name in ("sin", "cos", "tan", "tan2", "sinh", "cosh", "tanh")}
 _OF_MATH = {ufunc.__name__: ufunc for ufunc in RULES if hasattr(math, ufunc.__name__)}
 del _OF_MATH["remainder"]  # that of math has another sign
 _OF_MATH |= {name: getattr(np, other) for name, other in _RENAMED.items()}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from ..diagnose import SURE, add_scaled_laws, check_laws, replicate
 from ..laws import Law
 from ..simulators import as_simulator, name_at
 from .machines import DONE, PAGE, RESIDUAL, LawAt, MachineWork, measured_entry
-from .population import Population, combine, estimate_population, slope
+from .population import Population, combine, estimate_population, slope, with_nan
 from .summary import csv_text
 
 CONTENT, TABLE = "fleet.json", "fleet.csv"
@@ -110,23 +110,14 @@ class Machine:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for JSON."""
-        own = {k: v for k, v in vars(self).items() if k != "trends"}
-        trends = {name: vars(t) for name, t in self.trends.items()}
-        content: dict[str, Any] = to_json({**own, "trends": trends, "probability": self.probability})
+        content: dict[str, Any] = to_json({**asdict(self), "probability": self.probability})
         return content
 
     @classmethod
     def of(cls, content: Mapping[str, Any]) -> Machine:
         """Read it from JSON."""
-        known = {k: v for k, v in content.items() if k not in ("trends", "probability")}
-        numbers: dict[str, Any] = {k: np.nan if v is None else v for k, v in known.items()}
-        for name in ("values", "errors", "differs"):
-            numbers[name] = {k: np.nan if v is None else v for k, v in known[name].items()}
-        trends = {
-            name: Trend(*(np.nan if t[k] is None else t[k] for k in ("slope", "error", "probability")))
-            for name, t in content["trends"].items()
-        }
-        return cls(**numbers, trends=trends)
+        own = {f.name: content[f.name] if f.name == "rest" else with_nan(content[f.name]) for f in fields(cls)}
+        return cls(**{**own, "trends": {name: Trend(**t) for name, t in own["trends"].items()}})
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +287,7 @@ class Fleet:
             "schema": SCHEMA,
             "sentence": self.summary,
             "common": {
-                "laws": [law.to_dict() for law in common.laws],
+                "laws": [asdict(law) for law in common.laws],
                 "words": common.words,
                 "probability": common.probability,
                 "sample": common.sample,
@@ -468,13 +459,13 @@ def read_fleet(folder: Any, simulator: Any, laws: Sequence[type[Law]] | None = N
         if content["schema"] != SCHEMA:
             raise KeyError
         common = content["common"]
-        found = tuple(LawAt.of(law) for law in common["laws"])
+        found = tuple(LawAt(**law) for law in common["laws"])
         starts = tuple({k: np.asarray(v, dtype=float) for k, v in s.items()} for s in common["starts"])
         values = tuple(
             FleetValue(v["name"], v["unit"], Population.of(v["population"]), Population.of(v["trends"]))
             for v in content["values"]
         )
-        machines = tuple(Machine.of({k: v for k, v in m.items() if k != "reasons"}) for m in content["machines"])
+        machines = tuple(map(Machine.of, content["machines"]))
         return Fleet(
             Common(found, common["probability"], tuple(common["sample"]), starts),
             content["confirmed"],

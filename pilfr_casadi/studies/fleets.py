@@ -39,6 +39,7 @@ from .._base import (
     make_folder,
     numbers,
     processors,
+    to_json,
     whole,
 )
 from ..data import Recording, as_recordings
@@ -402,18 +403,8 @@ def _typical(k: int, laws: Sequence[Sequence[Mapping[str, Any]]]) -> LawAt:
             [np.nan_to_num(np.asarray(r[end], dtype=float), nan=free) for r in rows]
             for end, free in (("low", -np.inf), ("high", np.inf))
         )
-        parameters[name] = {
-            "value": value.tolist(),
-            "low": _finite(np.min(low, axis=0)),
-            "high": _finite(np.max(high, axis=0)),
-        }
+        parameters[name] = to_json({"value": value, "low": np.min(low, axis=0), "high": np.max(high, axis=0)})
     return LawAt(first["port"], first["law"], first["id"], first["form"], parameters)
-
-
-def _finite(value: Any) -> Any:
-    """Return nested lists with None for infinite numbers."""
-    found = np.asarray(value)
-    return [_finite(v) for v in found] if found.ndim else float(found) if np.isfinite(found) else None
 
 
 def _histories(

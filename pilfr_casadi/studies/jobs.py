@@ -87,22 +87,19 @@ def jobs_of(run: Run, inputs: Mapping[str, str], train: Sequence[Recording] | No
     if train is None:
         folds: list[Any] = [({}, {})]
     else:
-        folds = [({"fold": k}, {"fold": k, "dealt": _contents(fold(train, k, run.folds))}) for k in range(run.folds)]
+        parts = [fold(train, k, run.folds) for k in range(run.folds)]
+        dealt = [[[(fingerprint(r), r.skip) for r in part] for part in both] for both in parts]
+        folds = [({"fold": k}, {"fold": k, "dealt": own}) for k, own in enumerate(dealt)]
     return tuple(
         RunJob(
             {**cell.values, **name, "seed": seed},
-            digest({**common, "said": {**run.plain_tables, "grid": None, **cell.plain_tables}, "seed": seed, **dealt}),
+            digest({**common, "said": {**run.plain_tables, "grid": None, **cell.plain_tables}, "seed": seed, **held}),
             number,
         )
         for number, cell in enumerate(run.cells)
-        for name, dealt in folds
+        for name, held in folds
         for seed in run.seeds
     )
-
-
-def _contents(parts: Sequence[Sequence[Recording]]) -> list[list[tuple[str, int]]]:
-    """Return the fingerprint and `skip` of each recording."""
-    return [[(fingerprint(r), r.skip) for r in part] for part in parts]
 
 
 def fold(recordings: Sequence[Recording], k: int, folds: int) -> tuple[tuple[Recording, ...], tuple[Recording, ...]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -37,16 +37,6 @@ class LawAt:
     id: str
     form: str
     parameters: Mapping[str, Mapping[str, Any]]
-
-    @classmethod
-    def of(cls, content: Mapping[str, Any]) -> LawAt:
-        """Read it from JSON."""
-        return cls(*(content[k] for k in ("port", "law", "id", "form", "parameters")))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content for JSON; infinite limits are None."""
-        parameters = {name: dict(p) for name, p in self.parameters.items()}
-        return {"port": self.port, "law": self.law, "id": self.id, "form": self.form, "parameters": parameters}
 
     def build(self, known: Mapping[str, type[Law]]) -> tuple[str, Law]:
         """Return the port and the law; `known` are the classes by name."""
@@ -171,7 +161,7 @@ class MachineWork:
             if not np.isfinite(gain):
                 continue
             laws = [
-                LawAt(e.port, type(e.law).__name__, e.law.id, e.law.form, _numbers(e, trial.fitted)).to_dict()
+                asdict(LawAt(e.port, type(e.law).__name__, e.law.id, e.law.form, _numbers(e, trial.fitted)))
                 for e in trial.laws
             ]
             out.append({"laws": laws, "log_evidence": float(gain - prior), "log_prior": float(prior)})

@@ -69,7 +69,14 @@ class Population:
     @classmethod
     def of(cls, content: Mapping[str, Any]) -> Population:
         """Make it of the numbers of `to_dict`, with None for nan."""
-        return cls(**{k: np.nan if v is None else float(v) for k, v in content.items()}, differs=np.zeros(0))
+        return cls(**with_nan(content), differs=np.zeros(0))
+
+
+def with_nan(content: Any) -> Any:
+    """Put nan where JSON has null."""
+    if isinstance(content, Mapping):
+        return {k: with_nan(v) for k, v in content.items()}
+    return np.nan if content is None else content
 
 
 def estimate_population(

@@ -22,7 +22,7 @@ from .._base import InputError
 from ..data import Recording
 from ..models import Model
 from .jobs import RunJob
-from .run_file import Cell, Run, grid_keys
+from .run_file import Run, grid_keys
 
 QUARTILES = ("smallest", "lower_quartile", "median", "upper_quartile", "largest")
 FOLDS = "folds"
@@ -156,20 +156,17 @@ def box_plots(run: Run, jobs: Sequence[RunJob], scores: Sequence[Score]) -> byte
 
     cells = [cell.values for cell in run.cells]
     keys = [k for k in grid_keys(cells) if len({values.get(k) for values in cells}) > 1]
+    labels = ["\n".join(str(values.get(k, "-")) for k in keys) or "all jobs" for values in cells]
     found = errors_by_cell(run, jobs, scores)
     if any(role == "held" for role, _ in found):  # only one cell has models on all training recordings
         found = {key: cells for key, cells in found.items() if key[1] == FOLDS}
     sets = {
-        f"{name} ({role})": {_label(run.cells[number], keys): list(e.values()) for number, e in cells.items()}
-        for (role, name), cells in found.items()
+        f"{name} ({role})": {labels[number]: list(e.values()) for number, e in of_cell.items()}
+        for (role, name), of_cell in found.items()
     }
     buffer = io.BytesIO()
     compared_spread(sets, x=", ".join(keys)).savefig(buffer, format="png", dpi=110)
     return buffer.getvalue()
-
-
-def _label(cell: Cell, keys: Sequence[str]) -> str:
-    return "\n".join(str(cell.values.get(k, "-")) for k in keys) or "all jobs"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

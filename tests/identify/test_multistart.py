@@ -120,7 +120,8 @@ def test_the_first_starts_place_the_element(search, monkeypatch):
 
     monkeypatch.setattr(multistart, "grid_start", kept)
     monkeypatch.setattr(multistart, "EXPLORE", GaussNewton(max_iterations=1))
-    search_starts(replace(search, start="grid"), 4, 0, None, lambda *_: None, keep=0)
+    monkeypatch.setattr(multistart, "KEEP", 0)
+    search_starts(replace(search, start="grid"), 4, 0, None, lambda *_: None)
     assert places == ["output", "input", "random", "random"]
 
 

@@ -9,7 +9,7 @@ from random_models import random_input, random_lfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording
 from pilfr_casadi.engine import make_engine
-from pilfr_casadi.identify import fit, grid_start, network_start, paper_start, regrid, unit_states
+from pilfr_casadi.identify import fit, grid_start, multistart, network_start, paper_start, regrid, unit_states
 from pilfr_casadi.linear import frequency_subspace, robust_bla, time_subspace
 from pilfr_casadi.models import NARX, PILFR, Play, PrandtlIshlinskii, hammerstein, network_lfr, ssnn, wiener
 from pilfr_casadi.optimise import GaussNewton, Problem
@@ -129,10 +129,11 @@ def test_backlash_on_either_side_of_a_mass(where, unit):
     assert found.train_nrmse[0] < 0.0056  # noise alone: 0.0050
 
 
-def test_thresholds_follow_the_density():
+def test_thresholds_follow_the_density(monkeypatch):
     """Each stands for an equal share of density^0.4, where the weights' density is known."""
     r, w = np.linspace(0.0, 1.0, 400), 1.0 / 400 * np.linspace(2.0, 0.2, 400)
-    placed, mass = regrid(r, w, 1.0, extent=1.0, smooth=0.02)
+    monkeypatch.setattr(multistart, "KERNEL_WIDTH", 0.02)
+    placed, mass = regrid(r, w, 1.0, extent=1.0)
     assert np.sum(mass) == pytest.approx(w.sum(), rel=0.03)
     share = np.diff((2.0 - 1.8 * np.array([placed[0], *placed[50:-50:50]])) ** 1.4)
     np.testing.assert_allclose(share, share[1], rtol=0.06)
@@ -143,7 +144,7 @@ def test_thresholds_follow_the_density():
 def test_the_tail_goes_on_beyond_what_was_visited():
     r = np.linspace(0.0, 1.0, 100)
     w = np.exp(-2.0 * r)
-    placed, mass = regrid(r, w, 1.0, extent=1.3, smooth=1 / 12)
+    placed, mass = regrid(r, w, 1.0, extent=1.3)
     assert placed[-1] > 1.2 and np.all(np.diff(placed) > 0)
     density = mass[-12:] / np.gradient(placed)[-12:] / 100
     expected = np.exp(-2.0 * placed[-12:])

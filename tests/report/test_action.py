@@ -6,7 +6,7 @@ from diagnosis_rig import recordings, rig
 from pilfr_casadi.diagnose import Effect, Workbench
 from pilfr_casadi.diagnose.offsets import Offset
 from pilfr_casadi.laws import CoulombFriction
-from pilfr_casadi.report.action import element_of
+from pilfr_casadi.report.diagnosis_tables import element_of
 
 
 def test_an_effect_is_found_behind_an_offset():
