@@ -298,9 +298,9 @@ def _templates() -> Any:
     return environment
 
 
-def python_literal(value: Any) -> str:
+def python_literal(value: Any, width: int = 80) -> str:
     """Write a value as Python that `import numpy as np` reads back."""
-    text = pprint.pformat(value, width=80, sort_dicts=False, compact=True)
+    text = pprint.pformat(value, width=width, sort_dicts=False, compact=True)
     return re.sub(r"(?<![\w'])inf(?![\w'])", "np.inf", text)
 
 
