@@ -13,7 +13,7 @@ from ..diagnose import ERROR_NAMES, Diagnosis, Effect, learned_force
 from ..identify import RUN_AWAY
 from ..laws import VaryingParameter, display_name, scaled, scheduled, short_name, varying
 from ..models import Parameter, ParameterSet
-from ..simulators import name_at
+from ..simulators import PARAMETER, name_at
 from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
@@ -38,7 +38,7 @@ def correction_words(diagnosis: Diagnosis) -> str:
     if diagnosis.effects:
         unsure = [g.finding == "unsure" for g in diagnosis.gates]
         names = [
-            *(short_name(e.law, e.form) for e in diagnosis.effects),
+            *(_short_name(e) for e in diagnosis.effects),
             *(["what is not sure"] if any(unsure) else []),
         ]
         names += ["a learned force"] if diagnosis.learned else []
@@ -47,6 +47,11 @@ def correction_words(diagnosis: Diagnosis) -> str:
     if diagnosis.nameless:
         return "corrected"
     return f"with {diagnosis.freed} let go" if diagnosis.freed else ""
+
+
+def _short_name(e: Effect) -> str:
+    """Name an effect without its port, except a parameter that varies, which is its name."""
+    return name_at(e.port, e.law, e.form) if e.port.startswith(PARAMETER) else short_name(e.law, e.form)
 
 
 def tone(diagnosis: Diagnosis) -> str:
