@@ -115,6 +115,7 @@ def build_diagnosis(
     )
     decided = found.decided or search
     experiment = _next(decided, found.effects, limits)
+    blind_spots = _blind_spots(request, ready, search)
     request.say("proof", 1, 1)
     now = time.perf_counter()
     return Diagnosis(
@@ -127,7 +128,7 @@ def build_diagnosis(
         gates=(
             *_surrogate_note(request.stand_in_error),
             *_convergence_note(after),
-            *_combination_note(after, std),
+            *_combination_note(after, std, blind_spots),
             *final_gates(found.gates, after, std, bool(effects), settled),
         ),
         mismatch=mismatch(
@@ -154,7 +155,7 @@ def build_diagnosis(
         substeps=after.model.substeps,
         freed=found.freed,
         correction=found.correction,
-        blind_spots=_blind_spots(request, ready, search),
+        blind_spots=blind_spots,
     )
 
 
@@ -177,13 +178,23 @@ def _convergence_note(after: Fitted) -> tuple[Gate, ...]:
     return (Gate("simulation", "convergence", after.status.name.lower(), words, False),)
 
 
-def _combination_note(after: Fitted, std: Mapping[str, np.ndarray]) -> tuple[Gate, ...]:
-    """Note the numbers that the recordings determine only in combination, so that they have no standard error."""
+def _combination_note(
+    after: Fitted, std: Mapping[str, np.ndarray], blind_spots: Sequence[BlindSpot]
+) -> tuple[Gate, ...]:
+    """Note the numbers that the recordings determine only in combination, so that they have no standard error.
+
+    Those without any effect on the outputs are blind spots.
+    """
     own = after.model.parameters
+    dead = {name for spot in blind_spots if spot.kind == "dead" for name in spot.names}
     tied = [
         name
         for name, p in own.items()
-        if not p.value.ndim and not np.all(p.fixed) and not np.isfinite(std[name]) and not after.at_bound(name)
+        if name not in dead
+        and not p.value.ndim
+        and not np.all(p.fixed)
+        and not np.isfinite(std[name])
+        and not after.at_bound(name)
     ]
     if len(tied) < 2:
         return ()
@@ -226,7 +237,7 @@ def _effect(
     if port.series and not w_unit:  # in the unit of its signal, such as [force]
         w_unit = z_unit = f"[{port.name.partition(':')[2]}]"
     values = {k: v for k, v in fitted.values.items() if k.startswith(element.prefix)}
-    signals = {**bench.simulator.state_units, **bench.simulator.units, **bench.recordings[0].units}
+    signals = bench.simulator.signal_units(port.name, bench.recordings[0].units)
     shown: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
         unit = readable_unit(element.law.units[name.removeprefix(element.prefix)], w_unit, z_unit, signals)

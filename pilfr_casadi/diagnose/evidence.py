@@ -283,7 +283,7 @@ def log_prior(
         there = alternatives.get(e.port, ())
         forms = sum(law.id == e.law.id for law in there)
         total += EFFECT_PRIOR - np.log(ports) - np.log(max(forms, 1))
-        total -= np.log(parameters) if e.port.startswith(PARAMETER) else 0.0
+        total -= np.log(max(parameters, 1)) if e.port.startswith(PARAMETER) else 0.0
         total += _log_share(e.law.id, there, (domains or {}).get(e.port, UNKNOWN))
         total += FLEXIBLE_PRIOR if e.law.flexible else 0.0
     return float(total)

@@ -545,7 +545,7 @@ class Diagnosis:
 def _effect_lines(e: Effect) -> list[str]:
     """Describe an effect with its equation, its numbers, and the laws indistinguishable from it."""
     if e.port.startswith(PARAMETER):
-        symbols = f"where w is added to {e.port.removeprefix(PARAMETER)}"
+        symbols = f"where the change is added to {e.port.removeprefix(PARAMETER)}"
     elif in_series(e.port):
         symbols = "where u or z is the signal, and w is added to it"
     else:

@@ -116,13 +116,17 @@ class Remainder:
         tasks = [t for t in every if at in ("", t.port.name)]
         return cls(bench, short, base, left, tuple(tasks), folds(len(left), len(runs)))
 
-    def columns(self, task: Task) -> tuple[np.ndarray, np.ndarray]:
+    def columns(self, task: Task, shifted: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Compute the responses beyond the base to a port's laws, each with a force of unit size, and their sizes.
 
-        Shapes (R, n) and (n,); shapes and strengths of one law follow those of the other.
+        Shapes (R, n) and (n,); shapes and strengths of one law follow those of the other. The forces may be `shifted`
+        by half a run, so that they have no relation to it.
         """
-        forces = [unit_forces(law, task.part, s).reshape(len(task.part.z), -1) for law, s in task.pairs]
-        return self.response(task.index, np.hstack(forces))
+        forces = np.hstack([unit_forces(law, task.part, s).reshape(len(task.part.z), -1) for law, s in task.pairs])
+        if shifted:
+            parts = np.split(forces, np.cumsum([len(r.z) for r in self.runs])[:-1])
+            forces = np.concatenate([np.roll(part, len(part) // 2, axis=0) for part in parts])
+        return self.response(task.index, forces)
 
     def response(self, port: int, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute the responses beyond the base to forces (M, n) at a port, scaled to unit size, and their sizes."""

@@ -85,18 +85,18 @@ PROFILES = {
     ),
     # of what is added to a parameter, which has its own value in the middle of the signal's range
     "tilt": Profile(
-        ("",), "", "w = c (2 s - 1),  s = ({by} - low)/(high - low)", lambda share, values: [2 * share - 1]
+        ("",), "", "change = c (2 share - 1),  share = ({by} - low)/(high - low)", lambda share, values: [2 * share - 1]
     ),
     "bend": Profile(
         ("", "_high"),
         "",
-        "w = (c (1 - s) - c_high s) (1 - 2 s),  s = ({by} - low)/(high - low)",
+        "change = (c (1 - share) - c_high share) (1 - 2 share),  share = ({by} - low)/(high - low)",
         lambda share, values: _through(share, 3)[::2],
     ),
     "curve": Profile(
         ("", "_25", "_75", "_high"),
         "",
-        "w in a curve of fourth degree in {by}: c, c_25, 0, c_75, c_high at even steps from low to high",
+        "change = curve of fourth degree in {by} through c, c_25, 0, c_75, c_high, at even steps from low to high",
         lambda share, values: [weight for i, weight in enumerate(_through(share, 5)) if i != 2],
     ),
 }
@@ -154,7 +154,7 @@ class VaryingParameter(Law):
     flexible = True
     equation = "w = c"
     source = "Toth (2010), Modeling and Identification of Linear Parameter-Varying Systems, sec. 2.1"
-    sentence = "a parameter that varies with {by}: w is added to its value"
+    sentence = "a parameter that varies with {by}: a change is added to its value"
     units = {"c": "w"}
     places = ("parameter",)
 
@@ -195,7 +195,7 @@ def varying(by: str, profile: str = "tilt") -> type[Law]:
 def heated(by: str) -> type[Law]:
     """Make the law by which a parameter varies with a slow state that the square of a signal drives.
 
-    So a winding's resistance follows the heat of its current: `w = c q`, `dq/dt = (s^2 / s_2 - q) / T`, with the mean
+    So a winding's resistance follows the heat of its current: change = `c q`, `dq/dt = (s^2 / s_2 - q) / T`, with the mean
     square s_2 of the signal s in the recordings. It stands in the port `parameter:<name>`.
 
     Parameters
@@ -434,7 +434,7 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
 def _heated(by: str) -> Any:
     class Heated(VaryingParameter):
         form = f"scheduled by the heat of {by}"
-        equation = f"w = c q,  dq/dt = ({by}^2 / s_2 - q) / T"
+        equation = f"change = c q,  dq/dt = ({by}^2 / s_2 - q) / T"
         source = "Incropera et al. (2007), Fundamentals of Heat and Mass Transfer, sec. 5.1 (lumped capacitance)"
         sentence = f"a parameter that varies with a slow state which the square of {by} drives, as by self-heating"
         units = {"c": "w", "T": "s", "s_2": f"[{by}]^2"}

@@ -16,7 +16,7 @@ from ..diagnose import Diagnosis
 from ..identify import Comparison, Fit
 from ..laws import display_name
 from ..models import ParameterSet
-from ..simulators import Simulator, name_at
+from ..simulators import PARAMETER, Simulator, name_at
 from .diagnosis_tables import facts, headline, tone
 from .page import Table, number_text, render, status_tone, uncertain_text
 
@@ -138,7 +138,15 @@ def diagnosis_card(diagnosis: Diagnosis) -> str:
             f"{name} = {uncertain_text(p['value'], errors[name])} {p['unit']}".strip()
             for name, p in e.parameters.items()
         ]
-        rows.append([display_name(e.form or e.law), e.port, f"{e.confidence:.2f}", ", ".join(values)])
+        varies = e.port.startswith(PARAMETER)
+        rows.append(
+            [
+                name_at(e.port, e.law, e.form) if varies else display_name(e.form or e.law),
+                e.port,
+                f"{e.confidence:.2f}",
+                ", ".join(values),
+            ]
+        )
     tables = [Table(["law", "port", "confidence", "values"], rows, note=" ".join(diagnosis.warnings()))] if rows else []
     return Card("Diagnosis", "", headline(diagnosis), tone(diagnosis), facts(diagnosis), tables).html()
 

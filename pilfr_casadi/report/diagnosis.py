@@ -295,9 +295,11 @@ def _strength_pictures(case: _Case, number: int) -> list[Block]:
     if not by:
         return []
     port, values = case.bench.simulator.port(element.port), element.own(case.after.values)
-    across = {"z": port.across_unit, "t": "s"}.get(by) or case.unit(by)
+    known = {"t": ("time", "s")} | ({} if port.series else {"z": ("local coordinate z", port.across_unit)})
+    of_signals = case.bench.simulator.signal_units(element.port, case.bench.recordings[0].units)
     grid = np.linspace(values["low"], values["high"], 200)
-    signal = Signal({"z": "local coordinate z", "t": "time"}.get(by, by), grid, across)
+    called, across = known.get(by, (by, of_signals.get(by, "")))
+    signal = Signal(called, grid, across)
     seen = law.schedule(port_signals(case.bench, case.after, element.port))
     out: list[Block] = []
     for name, found in strengths_over(law, values, grid).items():

@@ -448,7 +448,8 @@ class Equations:
             if port.name == name:
                 return port
         own = name.removeprefix(PARAMETER)
-        if name.startswith(PARAMETER) and own in self.parameters and not self.parameters[own].value.ndim:
+        of_law = any(own.startswith(e.prefix) for e in self.elements)
+        if name.startswith(PARAMETER) and own in self.parameters and not (of_law or self.parameters[own].value.ndim):
             return Port(name, {}, lambda p: p[own], None, self.parameters[own].unit, series=True)
         known = ", ".join(port.name for port in self.all_ports())
         raise InputError(f"There is no port {name!r}; there are {known}.")
@@ -504,6 +505,14 @@ class Equations:
         shown = [(self.across(port, *at), port.across_unit) for port in self.ports]
         shown += [(y, self.units.get(name, "")) for name, y in self.measured(*at).items()]
         return {z.name(): unit for z, unit in shown if unit and z.is_symbolic() and z.name() in self.states}
+
+    def signal_units(self, port: str, recorded: Mapping[str, str] | None = None) -> dict[str, str]:
+        """Units by name of the signals with which a law at a port may vary, with those that a recording states.
+
+        A parameter varies with states as well; an output may have the name of one, in another unit.
+        """
+        own = {name: self.state_units.get(name, "") for name in self.states if port.startswith(PARAMETER)}
+        return {**self.units, **(recorded or {}), **own}
 
     @cached_property
     def _integrals(self) -> dict[str, str]:

@@ -153,7 +153,7 @@ class Simulator(Equations):
         for e in self.elements:
             if name.startswith(e.prefix):
                 port = self.port(e.port)
-                return readable_unit(unit, port.unit, port.position_unit, self.units)
+                return readable_unit(unit, port.unit, port.position_unit, self.signal_units(e.port))
         return unit
 
     def _measured(self, recording: Recording) -> np.ndarray:

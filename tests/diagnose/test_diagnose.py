@@ -203,3 +203,20 @@ def test_values_that_are_known_only_together_say_so():
     )
     assert found.parameters["gain"]["std"] is None
     assert found.parameters["zero"]["std"] is not None
+
+
+def test_values_without_effect_are_a_blind_spot_and_no_combination():
+    """An input that stands still hides its gains; no combination of them is determined."""
+    rng = np.random.default_rng(0)
+    u = np.column_stack([rng.standard_normal(400), np.zeros(400)])
+    y = 2 * u[:, 0] + 0.01 * rng.standard_normal(400)
+    r = pilfr.Recording(u, y, 0.01, ("volt", "aux"), ("gauge",), initial="zero")
+    amplifier = pilfr.Simulator(
+        lambda: {},
+        lambda u, p: {"gauge": p.g * u.volt + p.a * u.aux + p.b * u.aux**2},
+        inputs=("volt", "aux"),
+        parameters={name: pilfr.Parameter(1.5) for name in ("g", "a", "b")},
+    )
+    found = pilfr.diagnose(amplifier, r, laws=[Delay], workers=1)
+    assert "combination" not in [g.finding for g in found.gates]
+    assert ("dead", ("a", "b")) in [(spot.kind, spot.names) for spot in found.blind_spots]

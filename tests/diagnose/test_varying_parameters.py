@@ -6,6 +6,9 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
+from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose.evidence import log_prior
+from pilfr_casadi.diagnose.proof import placebo
 from pilfr_casadi.laws import (
     VARIATIONS,
     CoulombFriction,
@@ -151,7 +154,7 @@ def test_the_parameter_and_its_signal_are_named(diagnosis):
     assert effect.parameters["c"]["value"] == pytest.approx(rise / 2, rel=0.02)
     assert effect.parameters["low"]["unit"] == "degC"
     assert diagnosis.errors["test"]["after"] < 0.011 < 0.03 < diagnosis.errors["test"]["before"]
-    assert "where w is added to R" in str(diagnosis)
+    assert "where the change is added to R" in str(diagnosis)
     assert effect.placebo["own"] > 0.5 > effect.placebo["unrelated"]
 
 
@@ -178,3 +181,41 @@ def test_a_curve_starts_as_the_variation_that_it_refines():
     values = curve.starts_as(bend, own)
     np.testing.assert_allclose(strengths_over(curve, values, signal)["c"], parabola, atol=1e-12)
     assert parabola[-1] > own["c_high"] + 0.2  # it goes on outside
+
+
+def test_a_law_s_own_values_are_no_ports():
+    """They are parameters of the closed simulator, but no equation of the user's reads them."""
+    rubs = motor().with_element("bearing", CoulombFriction().at({"F_c": 0.05}))
+    with pytest.raises(InputError, match=r"no port 'parameter:bearing\.F_c'"):
+        rubs.with_element("parameter:bearing.F_c", varying("temperature")())
+
+
+def test_the_range_of_a_state_is_in_the_state_s_unit():
+    """An output may have the name of a state, and its values in another unit."""
+    simulator = pilfr.Simulator(
+        lambda x, u, p: {"i": (u.voltage - p.R * x.i) / L},
+        lambda x: {"i": 1000 * x.i},
+        states=("i",),
+        inputs=("voltage",),
+        parameters={"R": pilfr.Parameter(1.0, unit="Ohm")},
+        units={"i": "mA", "voltage": "V"},
+    )
+    law = varying("i")().at({"c": 0.1, "low": -4.0, "high": 4.0})
+    shown = str(simulator.with_element("parameter:R", law))
+    assert "parameter:R.high = 4 [i]" in shown
+    assert "parameter:R.c = 0.1 Ohm" in shown
+
+
+def test_the_placebo_of_a_variation_with_time_has_another_time():
+    """The change, shifted by half a recording, hardly explains what the change itself does."""
+    r = blank(2, (20, 30)).slice(0, 600).with_(initial="zero")
+    law = varying("t")().at({"c": 0.4, "low": 0.0, "high": 3.0})
+    true = motor().with_element("parameter:R", law)
+    bench = Workbench.of(motor(), [r.with_(y=true.simulate(r))], "zero")
+    own, unrelated = placebo(bench, bench.run(bench.simulator, {}, [np.zeros(2)]), "parameter:R", law)
+    assert own > 0.9 > 0.5 > unrelated
+
+
+def test_a_variation_that_no_search_tried_has_a_finite_prior():
+    """Replications and predictions weigh laws without the list of a search."""
+    assert np.isfinite(log_prior(motor().with_element("parameter:R", varying("w")()).elements, {}))
