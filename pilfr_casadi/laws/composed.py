@@ -195,8 +195,8 @@ def varying(by: str, profile: str = "tilt") -> type[Law]:
 def heated(by: str) -> type[Law]:
     """Make the law by which a parameter varies with a slow state that the square of a signal drives.
 
-    So a winding's resistance follows the heat of its current: `change = c q`, `dq/dt = (s^2 / s_2 - q) / T`, with the mean
-    square s_2 of the signal s in the recordings. It stands in the port `parameter:<name>`.
+    So a winding's resistance follows the heat of its current: `change = c q`, `dq/dt = (s^2 / s_2 - q) / T`, with the
+    mean square s_2 of the signal s in the recordings. It stands in the port `parameter:<name>`.
 
     Parameters
     ----------
