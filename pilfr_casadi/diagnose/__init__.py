@@ -103,8 +103,8 @@ def diagnose(
     hold : {"zero", "linear"}, optional
         Course of the inputs between samples, if neither recordings nor simulator say; by default the data decide.
     laws : sequence of Law classes, optional
-        By default the whole catalogue. Inputs that the simulator's equations do not
-        read are tried as scales of some of its laws.
+        By default the whole catalogue, and `laws.VaryingParameter`, with which parameters may vary. Inputs that the
+        simulator's equations do not read are tried as scales of some of its laws.
     effects : int, optional
         Largest number of effects to look for; by default as many as the recordings tell.
     limits : mapping, optional

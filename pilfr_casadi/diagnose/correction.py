@@ -73,7 +73,7 @@ class Correction:
             f"Of the mismatch above the noise, named laws explain {named}, a learned force {learned}; {left} is left."
         )
         if not self.elements:
-            why = "nothing that was tried is expected to predict recordings better that it was not fitted to"
+            why = "nothing that was tried is expected to predict further recordings better"
             late = "there was no time left to compare it with others"
             return f"The corrected simulator is still the refitted one: {why if np.isfinite(self.after) else late}."
         if not np.isfinite(self.after):

@@ -21,6 +21,7 @@ ABOVE_NOISE = 2.0  # ratio of the error to the noise from which results say that
 FEWEST = 30.0  # effective samples that a residual has at least
 LONGEST = 400  # longest correlation of a residual, in samples
 DISTINCT_SHARE = 0.5  # share of the samples with distinct values above which a signal is not quantised
+FEWEST_LEVELS = 10  # of a quantised signal; one with fewer is a switch
 SAME_LEVEL = 1e-9  # distance of two values, over the range, below which they are one level
 
 
@@ -68,7 +69,7 @@ def _sensor_steps(recordings: Sequence[Recording]) -> np.ndarray:
         levels = np.unique(column)
         gaps = np.diff(levels)
         gaps = gaps[gaps > SAME_LEVEL * np.ptp(column)]
-        if len(levels) < DISTINCT_SHARE * len(column) and len(gaps):
+        if FEWEST_LEVELS <= len(levels) < DISTINCT_SHARE * len(column):
             out[i] = gaps.min()
     return out
 

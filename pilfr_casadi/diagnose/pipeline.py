@@ -43,7 +43,7 @@ import numpy as np
 
 from .._base import InputError, Progress, Stages, deferred_interrupt, one_blas_thread, processors, whole
 from ..data import Recording
-from ..laws import Law, display_name
+from ..laws import Law, VaryingParameter, display_name
 from .answer import Conclusion, FinalFits, build_diagnosis
 from .arguments import (
     FEWEST_SAMPLES,
@@ -110,7 +110,7 @@ def diagnose_in_steps(
     simulator, recordings = match_recordings(simulator, train, hold)
     tests = match_tests(simulator, test, recordings)
     check_limits(simulator, limits)
-    tried = add_scaled_laws(check_laws(laws), simulator)
+    tried = (*add_scaled_laws(check_laws(laws), simulator), *((VaryingParameter,) if laws is None else ()))
     deadline = np.inf if time_limit is None else began + float(time_limit)
     request = Request(
         simulator, recordings, tried, hold, engine, workers, most_effects, stand_in_error, deadline, say, focus

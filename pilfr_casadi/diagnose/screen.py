@@ -217,7 +217,7 @@ def _parameter_tasks(
     bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list[Run], short: list[Run]
 ) -> Iterator[Task]:
     """Generate a task for each free coefficient of the equations; a change of it has a column of its own."""
-    own = [law() for law in laws if "parameter" in law.places]
+    own = [law() for law in laws if "parameter" in law.places and (law.scheduled_by or law.signal)]
     for name in bench.simulator.coefficients if own else ():
         if np.all(bench.simulator.parameters[name].fixed):
             continue

@@ -25,6 +25,7 @@ from ..laws import (
     SCALABLE,
     VARIATIONS,
     Law,
+    VaryingParameter,
     constant,
     heated,
     likely_profiles,
@@ -265,6 +266,8 @@ class Search(Hypotheses):
 
     def vary_parameters(self, base: Trial) -> None:
         """Let parameters of the simulator vary with a signal beside a hypothesis: fit those that explain most."""
+        if VaryingParameter not in self.laws:
+            return
         signals = ("t", *self.bench.simulator.inputs, *self.bench.simulator.states)
         laws = [varying(by, profile) for by in dict.fromkeys(signals) for profile in VARIATIONS[:2]]
         laws += [heated(by) for by in dict.fromkeys(signals[1:])]
@@ -272,7 +275,8 @@ class Search(Hypotheses):
             scored, gain = screen(self.bench, base.fitted, laws, self.floor.deviation, self.workers)
             self.note_alternatives(scored)
         best = list(dict.fromkeys((s.port, s.law.form) for s in scored))[:FEW]
-        entries = [s for s in scored if (s.port, s.law.form) in best]
+        taken = {e.port for e in base.laws}
+        entries = [s for s in scored if (s.port, s.law.form) in best and s.port not in taken]
         if not entries:
             return
         self._record(base, entries, self._fitted(base, entries, gain, float(np.sqrt(self.floor2)), True))

@@ -103,7 +103,8 @@ def test_a_channel_that_is_early_beside_something_unexplained_stays_shifted():
 def test_an_answer_that_is_there_outlives_an_interrupt_of_what_adds_to_it(leaking, after, answered):
     """In the conclusion, other ports are searched where no law at a declared one explains the mismatch."""
     r = leaking.with_(u=leaking.u[::-1])  # no shift explains it
-    found, _ = diagnosed(leak(), r, (), "screen", after, effects=0, engine="vm")
+    pump = replace(leak(), ports=(Port("pump", {"h": -1.0}, lambda u: u.q),))  # the outlet has no port
+    found, _ = diagnosed(pump, r, (), "screen", after, effects=0, engine="vm")
     assert found.verdict == "unexplained"
     assert ("interrupted before" in found.sentence) is not answered
 

@@ -16,6 +16,7 @@ from pilfr_casadi.laws import (
     Delay,
     QuadraticDrag,
     Saturation,
+    VaryingParameter,
     heated,
     strengths_over,
     varying,
@@ -110,7 +111,7 @@ def test_a_parameter_may_follow_the_heat_of_a_signal():
     )
     np.testing.assert_allclose(closed.simulate(r), written.simulate(r), rtol=1e-9)
     assert "variation of R with the heat of i" in repr(
-        pilfr.diagnose(motor(), r.with_(y=closed.simulate(r)), laws=[Delay])
+        pilfr.diagnose(motor(), r.with_(y=closed.simulate(r)), laws=[Delay, VaryingParameter])
     )
 
 
@@ -139,7 +140,7 @@ def test_only_a_variation_stands_at_a_parameter():
 @pytest.fixture(scope="module")
 def diagnosis():
     """Diagnosis of a motor whose resistance grows with a recorded temperature, by some of the laws."""
-    tried = [CoulombFriction, QuadraticDrag, Saturation, Delay]
+    tried = [CoulombFriction, QuadraticDrag, Saturation, Delay, VaryingParameter]
     return pilfr.diagnose(motor(), recorded(3, (20, 80)), test=recorded(5, (75, 25)), laws=tried, workers=1)
 
 
