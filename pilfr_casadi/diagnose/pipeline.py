@@ -182,6 +182,11 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
     if again.best.mean_square > search.best.mean_square or only_refitted:
         search.interrupted = again.interrupted
         return ready, search.resume(request.most_effects)
+    # the laws that were found since may have been what the hold had made up for
+    if not again.interrupted and again.prefers_other_hold():
+        resumed = search.resume(request.most_effects)
+        if resumed.best.mean_square < again.best.mean_square:
+            return ready, resumed
     ratio = float(np.sqrt(search.best.mean_square / max(again.best.mean_square, 1e-300)))
     return replace(other, gates=(*other.gates, hold_note(request.simulator, hold, ratio))), again
 

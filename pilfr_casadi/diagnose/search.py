@@ -131,9 +131,13 @@ class Search(Hypotheses):
         return len(trial.effects) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
 
     def other_hold_fits_better(self) -> bool:
+        """Tell whether nobody stated the hold, and the best hypothesis follows better with the other one."""
+        return not self.hold_said and self.prefers_other_hold()
+
+    def prefers_other_hold(self) -> bool:
         """Tell whether the best hypothesis follows the recordings better with the other hold of the inputs."""
         best = self.best.fitted
-        if self.hold_said or not self.in_time():
+        if not self.in_time():
             return False
         try:
             other = self.bench.with_other_hold().fit(
