@@ -110,9 +110,15 @@ def test_a_parameter_may_follow_the_heat_of_a_signal():
         parameters=dict(motor().parameters),
     )
     np.testing.assert_allclose(closed.simulate(r), written.simulate(r), rtol=1e-9)
-    assert "variation of R with the heat of i" in repr(
-        pilfr.diagnose(motor(), r.with_(y=closed.simulate(r)), laws=[Delay, VaryingParameter])
-    )
+
+
+@pytest.mark.slow
+def test_the_heat_of_the_current_is_named():
+    """Nobody records the temperature; the current heats the winding."""
+    true = motor().with_element("parameter:R", heated("i")().at({"c": 0.4, "T": 1.5, "s_2": 4.0}))
+    r = blank(2, (20, 30))
+    found = pilfr.diagnose(motor(), r.with_(y=true.simulate(r)), laws=[Delay, VaryingParameter], workers=1)
+    assert found.sentence == "The simulator leaves out variation of R with the heat of i."
 
 
 def test_a_varying_parameter_stays_within_its_bounds():
