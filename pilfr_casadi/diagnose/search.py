@@ -270,7 +270,8 @@ class Search(Hypotheses):
 
     def vary_parameters(self, base: Trial) -> None:
         """Let parameters of the simulator vary with a signal beside a hypothesis: fit those that explain most."""
-        if VaryingParameter not in self.laws:
+        formulas_leave = self.floor2 + self.tolerance  # no machine follows one exactly
+        if VaryingParameter not in self.laws or self.best.mean_square < formulas_leave:
             return
         signals = ("t", *self.bench.simulator.inputs, *self.bench.simulator.states)
         laws = [varying(by, profile) for by in dict.fromkeys(signals) for profile in VARIATIONS[:2]]
