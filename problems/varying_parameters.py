@@ -44,6 +44,23 @@ def measured(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
     return np.asarray(x + NOISE * x.std(axis=0) * rng.standard_normal(x.shape))
 
 
+def motor_simulator(
+    inputs: tuple[str, ...], parameters: Mapping[str, Parameter], inductance: float, inertia: float
+) -> Simulator:
+    """Make the simulator of a motor with constant parameters."""
+    return Simulator(
+        lambda x, u, p: {
+            "i": (u.voltage - p.R * x.i - p.K * x.w) / inductance,
+            "w": (p.K * x.i - p.c * x.w) / inertia,
+        },
+        lambda x: {"current": x.i, "speed": x.w},
+        states=("i", "w"),
+        inputs=inputs,
+        parameters=parameters,
+        ports=(Port("bearing", {"w": -1 / inertia}, lambda x: x.w, lambda x: x.w, "N m", "rad/s"),),
+    )
+
+
 def motor(kind: str, rng: np.random.Generator) -> Drawn:
     """Draw a motor that grows warm in training and cools down in the test."""
     dt, inertia = 5e-3, 2e-3
@@ -65,17 +82,7 @@ def motor(kind: str, rng: np.random.Generator) -> Drawn:
         y = measured(rng, trajectory(flow, np.zeros(2), u, dt, FINE))
         return Recording(u, y, dt, ("voltage", "temperature"), ("current", "speed"), initial="zero", hold="zero")
 
-    simulator = Simulator(
-        lambda x, u, p: {
-            "i": (u.voltage - p.R * x.i - p.K * x.w) / inductance,
-            "w": (p.K * x.i - p.c * x.w) / inertia,
-        },
-        lambda x: {"current": x.i, "speed": x.w},
-        states=("i", "w"),
-        inputs=("voltage", "temperature"),
-        parameters=free(p, rng),
-        ports=(Port("bearing", {"w": -1 / inertia}, lambda x: x.w, lambda x: x.w, "N m", "rad/s"),),
-    )
+    simulator = motor_simulator(("voltage", "temperature"), free(p, rng), inductance, inertia)
     return simulator, recorded(20, 80), recorded(75, 30)
 
 
@@ -104,17 +111,7 @@ def warming(_: str, rng: np.random.Generator) -> Drawn:
         y = measured(rng, trajectory(flow, np.zeros(3), u, dt, FINE)[:, :2])
         return Recording(u, y, dt, ("voltage",), ("current", "speed"), initial="zero", hold="zero")
 
-    simulator = Simulator(
-        lambda x, u, p: {
-            "i": (u.voltage - p.R * x.i - p.K * x.w) / inductance,
-            "w": (p.K * x.i - p.c * x.w) / inertia,
-        },
-        lambda x: {"current": x.i, "speed": x.w},
-        states=("i", "w"),
-        inputs=("voltage",),
-        parameters=free(p, rng),
-        ports=(Port("bearing", {"w": -1 / inertia}, lambda x: x.w, lambda x: x.w, "N m", "rad/s"),),
-    )
+    simulator = motor_simulator(("voltage",), free(p, rng), inductance, inertia)
     return simulator, recorded(), recorded()
 
 
