@@ -28,6 +28,7 @@ import numpy as np
 
 from ..data import Recording
 from ..laws import AsymmetricSaturation
+from ..simulators import ACTUATOR, SENSOR, port_name
 from .floor import DISTINCT_SHARE
 from .gates import (
     CURED_SHARE,
@@ -221,7 +222,7 @@ class Clipping(Gate):
     def apply(self, bench: Workbench) -> Workbench:
         """Return the bench with the simulator's output clipped like the recorded one, so that the rest still counts."""
         law = AsymmetricSaturation().at({"low": max(self.low, -1e300), "high": min(self.high, 1e300)})
-        placed = bench.simulator.with_element(f"sensor:{self.channel}", law)
+        placed = bench.simulator.with_element(port_name(SENSOR, self.channel), law)
         prefix = placed.elements[-1].prefix
         held = {k: replace(p, fixed=True) if k.startswith(prefix) else p for k, p in placed.parameters.items()}
         return replace(bench, simulator=placed.with_parameters(held))
@@ -257,7 +258,7 @@ def _explained_beyond(bench: Workbench, without: Fitted, fault: Clipping) -> flo
     inputs = [r.u[:, fault.column] for r in bench.recordings]
     beyond = [np.column_stack([sign * _beyond_limit(u, v) for v, sign in signs]) for u in inputs]
     left = first.left(first.error)
-    columns = first.left(first.response([f"actuator:{fault.channel}"], beyond))
+    columns = first.left(first.response([port_name(ACTUATOR, fault.channel)], beyond))
     # a positive coefficient would put the input inside its limit
     if np.any(np.linalg.lstsq(columns, left, rcond=1e-8)[0] > 0):
         return 0.0
