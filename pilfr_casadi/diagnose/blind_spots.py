@@ -35,6 +35,7 @@ from .identifiability import (
     port_units,
 )
 from .linearise import Probe, Run, linearised
+from .proof import mean_nrmse
 from .workbench import Fitted, Workbench
 
 LEAST_NOISE = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
@@ -308,7 +309,7 @@ def assess_recordings(
             "deviation": dict(zip(outputs, noise.tolist(), strict=True)),
             "share": dict(zip(outputs, (noise / bench.scale).tolist(), strict=True)),
         },
-        error=fitted.cost**0.5,
+        error=mean_nrmse(bench, fitted),
         hold=stated,
         starts=tuple(START_WORDS[r.begins] for r in bench.recordings),
     )

@@ -178,10 +178,18 @@ def _interpolate_repeats(r: Recording, side: str, column: int) -> Recording:
 
 
 def share_of_repeats(columns: Sequence[np.ndarray]) -> float:
-    """Compute the share of the samples of a channel that repeat the one before; zero if chance or rest explains it."""
+    """Compute the share of the samples of a channel that repeat the one before; zero if chance or rest explains it.
+
+    A stale sample misses the mean of its neighbours by more than others do. A repeat by chance, as of a coarse sensor
+    whose record was resampled, does not.
+    """
     together = np.concatenate(columns)
     step = _smallest_step(together)
-    repeated = float(np.mean(np.concatenate([_find_repeats(v, step) for v in columns])))
+    repeats = [_find_repeats(v, step) for v in columns]
+    repeated = float(np.mean(np.concatenate(repeats)))
+    bends, at = np.concatenate([np.diff(v, 2) for v in columns]), np.concatenate([same[1:-1] for same in repeats])
+    if not np.sum(bends[at] ** 2) * np.sum(~at) > np.sum(bends[~at] ** 2) * np.sum(at):
+        return 0.0
     by_chance = float(np.mean(np.abs(np.concatenate(list(map(np.diff, columns))) - step) < 0.5 * step))
     many = len(np.unique(together)) > DISTINCT_SHARE * len(together)
     return repeated if many and repeated > max(EXCEPTION_SHARE, CHANCE_FACTOR * by_chance) else 0.0

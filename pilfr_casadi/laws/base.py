@@ -365,7 +365,7 @@ def _tried(entry: Tried, local: Local) -> Any:
     return [getattr(local, attribute) * multiple if attribute else multiple for multiple in multiples]
 
 
-GENERAL = ("static_curve", "extra_mode")  # ids of laws that are named by their form
+GENERAL = ("static_curve", "extra_mode", "viscous_damping")  # ids of laws that are named by their form
 
 
 def display_name(law: str, form: str = "") -> str:
