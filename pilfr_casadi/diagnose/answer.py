@@ -111,6 +111,7 @@ def build_diagnosis(
         errors["free_run"] = free_run_errors(bench, tests or bench.recordings, request.simulator, without, after)
     fewer = test_errors(bench, tests, found.gates, _without_each_effect(search, found)) if tests else {}
     effects = tuple(_effect(search, e, after, std, fewer.get(e, np.nan)) for e in found.effects)
+    floor = search.least_floor if found.verdict.kind == "unexplained" else search.floor
     settled = found.verdict.kind in ("complete", "recording-fault") or (
         min((e.confidence for e in effects), default=0) > SURE
     )
@@ -136,12 +137,12 @@ def build_diagnosis(
             bench.recordings,
             without.residual,
             [e + r.y for e, r in zip(without.residual, bench.recordings, strict=True)],
-            search.floor.deviation,
+            floor.deviation,
             bench.scale,
         ),
         parameters=parameter_table(request.simulator, without, after, std),
         errors=errors,
-        floor={"nrmse": search.floor.nrmse(bench.scale), "source": search.floor.source},
+        floor={"nrmse": floor.nrmse(bench.scale), "source": floor.source},
         corrected=without_zero_offsets(after.corrected()),
         refitted=without.corrected(),
         hold=bench.hold,
@@ -152,7 +153,7 @@ def build_diagnosis(
         times={**search.times, "proof": now - proving},
         interrupted=search.interrupted,
         out_of_time=search.out_of_time,
-        evidence={"search": search, "without": final.drawn[0], "after": final.drawn[1]},
+        evidence={"search": search, "noise": floor.deviation, "without": final.drawn[0], "after": final.drawn[1]},
         substeps=after.model.substeps,
         freed=found.freed,
         correction=found.correction,

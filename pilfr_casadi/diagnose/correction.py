@@ -134,7 +134,9 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     learned += _learned_candidates(search, search.root, {e.port for e in best_laws.laws} if named else ())
     candidate, held_out = _choose(_predict(search, learned, predicted))
     fitted, base = candidate.fitted, candidate.base
-    shares = _shares(search, base.fitted, fitted)
+    # what nothing explains is no noise, though it passes for noise in the floor
+    noise2 = search.floor2 if named else search.least_noise2
+    shares = _shares(search, base.fitted, fitted, noise2)
     elements: tuple[Learned, ...] = ()
     if fitted is not base.fitted:
         laws = dict.fromkeys((*CATALOGUE, *search.laws))
@@ -209,7 +211,7 @@ def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()
 
 def named_correction(search: Search, fitted: Fitted) -> Correction:
     """Describe a simulator without a learned element, which was not compared with others."""
-    return Correction(_elements(search, fitted), _shares(search, fitted, fitted))
+    return Correction(_elements(search, fitted), _shares(search, fitted, fitted, search.floor2))
 
 
 def _may_recur(search: Search, trial: Trial) -> bool:
@@ -217,11 +219,11 @@ def _may_recur(search: Search, trial: Trial) -> bool:
     return len(search.bench.recordings) > 1 or not any("t" in e.law.reads() for e in trial.laws)
 
 
-def _shares(search: Search, named: Fitted, whole: Fitted) -> dict[str, float]:
+def _shares(search: Search, named: Fitted, whole: Fitted, noise2: float) -> dict[str, float]:
     """Compute the shares of the refit's mean square error above the noise; all are zero if there is none."""
-    if not search.root.mean_square > search.floor2:
+    if not search.root.mean_square > noise2:
         return {"named": 0.0, "learned": 0.0, "left": 0.0}
-    beside_names, left = (share_left(search, f.cost) for f in (named, whole))
+    beside_names, left = (share_left(search, f.cost, noise2=noise2) for f in (named, whole))
     left = min(beside_names, left)
     return {"named": 1 - beside_names, "learned": beside_names - left, "left": left}
 

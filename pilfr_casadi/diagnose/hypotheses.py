@@ -32,7 +32,7 @@ from .evidence import (
 )
 from .floor import FEWEST, Floor, effective_size, white_part
 from .screen import Scored, flexible_shares, screen
-from .trials import Key, Trial, Trials
+from .trials import EQUAL_COSTS, Key, Trial, Trials
 from .workbench import Fitted, Workbench
 
 MOST_PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
@@ -90,6 +90,8 @@ class Hypotheses:
         Time at which the diagnosis has to end.
     out_of_time : bool
         Whether the time limit ended the search.
+    mismatch2 : float, optional
+        Mean square of the mismatch of which the formulas of laws may leave a share, by default that of the refit.
     """
 
     bench: Workbench
@@ -109,6 +111,7 @@ class Hypotheses:
     interrupted: bool = False
     out_of_time: bool = False
     count: float = FEWEST
+    mismatch2: float | None = None
 
     @cached_property
     def fits(self) -> Trials:
@@ -128,7 +131,8 @@ class Hypotheses:
     @property
     def tolerance(self) -> float:
         """Mean square error that the formulas of laws leave of any mismatch, because no machine follows one exactly."""
-        return FORMULA_ERROR * max(self.root.mean_square - self.floor2, 0.0)
+        mismatch2 = self.root.mean_square if self.mismatch2 is None else self.mismatch2
+        return FORMULA_ERROR * max(mismatch2 - self.floor2, 0.0)
 
     @property
     def sample(self) -> Sample:
@@ -179,10 +183,18 @@ class Hypotheses:
         return {port.name: port.domain for port in self.bench.simulator.all_ports()}
 
     def held_out(self, trial: Trial) -> HeldOut:
-        """Compute the held-out errors of a hypothesis, once."""
+        """Compute the held-out errors of a hypothesis, once.
+
+        If it follows no better than with fewer laws, it is the same model, and predicts as that does.
+        """
         known = self.findings[trial.key]
         if known.held_out is None:
-            known.held_out = self.held_out_errors(trial.fitted, self.spread(trial.fitted, trial.laws))
+            fewer = [t for t in self.memo.values() if t.key < trial.key]
+            same = [t for t in fewer if t.thorough and t.mean_square < EQUAL_COSTS * trial.mean_square]
+            if same:
+                known.held_out = self.held_out(min(same, key=lambda t: len(t.key)))
+            else:
+                known.held_out = self.held_out_errors(trial.fitted, self.spread(trial.fitted, trial.laws))
         return known.held_out
 
     def held_out_errors(self, fitted: Fitted, spread: float) -> HeldOut:
@@ -254,12 +266,17 @@ class Hypotheses:
                 self.alternatives[s.port] = (*there, s.law)
 
     @property
-    def least_noise2(self) -> float:
-        """Mean square of the noise at least: what was measured, or the white part of the best residual."""
+    def least_floor(self) -> Floor:
+        """The noise at least: what was measured, or the white part of the best residual."""
         if self.floor.source != "estimated":
-            return self.floor2
+            return self.floor
         white = np.hypot(white_part(self.best.fitted.residual), self.stand_in_error * self.bench.scale)
-        return float(np.mean((white / self.bench.scale) ** 2))
+        return Floor(white, self.floor.source)
+
+    @property
+    def least_noise2(self) -> float:
+        """Mean square of the noise at least, in units of the outputs' variance."""
+        return float(np.mean((self.least_floor.deviation / self.bench.scale) ** 2))
 
     def can_improve(self, trial: Trial, noise2: float | None = None) -> bool:
         """Tell whether a law that removes all but the noise would be worth its prior beside a hypothesis."""

@@ -498,7 +498,8 @@ class Diagnosis:
             if errors:
                 shown = (f"{errors[k]:.4f}" if errors[k] < RUN_AWAY else "runs away" for k in ERROR_NAMES)
                 lines.append(f"  {kind.replace('_', ' '):<10}" + "".join(f"{text:>11}" for text in shown))
-        return [*lines, f"  noise floor {self.floor['nrmse']:.4f} ({self.floor['source']})"]
+        least = "at least " if self.verdict == "unexplained" and self.floor["source"] == "estimated" else ""
+        return [*lines, f"  noise floor {least}{self.floor['nrmse']:.4f} ({self.floor['source']})"]
 
     def gravest_blind_spots(self) -> list[str]:
         """Describe the gravest facts that the recordings cannot reveal, one a line."""

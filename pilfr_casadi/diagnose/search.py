@@ -33,7 +33,7 @@ from ..laws import (
     varying,
 )
 from ..simulators import ACTUATOR, PARAMETER, SENSOR, Placed, kind_of, port_name
-from .evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO
+from .evidence import AT_NOISE_RATIO, BETTER_RATIO, FAR_RATIO, NEAR_RATIO
 from .gates import CLEARLY_BETTER
 from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
@@ -76,6 +76,8 @@ class Search(Hypotheses):
         with self.until_interrupted():
             self.estimate_noise()
             if self._grow(effects) and self._name_rest(effects):
+                if len(self.best.effects) < effects:
+                    self._grow_to_noise()
                 self._every_sensor()
                 self.judge_on_held_out_data()
         if self.interrupted:
@@ -107,6 +109,25 @@ class Search(Hypotheses):
         if effects > 1 and len(self.best.effects) < 2 and self.can_improve(self.best) and self.in_time():
             self.add_two()
         return True
+
+    def _grow_to_noise(self) -> None:
+        """Add a law for a rest as small as the formula error of the laws before it.
+
+        An inexact formula can look like one more effect. So it counts only if white noise alone is left.
+        """
+        base = self.best
+        if not base.laws or not self.in_time():
+            return
+        self.mismatch2, found = base.mean_square, False
+        try:
+            if self.can_improve(base):
+                self.add(base, again=True)
+            at_noise = self.best.mean_square < AT_NOISE_RATIO**2 * self.least_noise2
+            found = at_noise and len(self.best.effects) > len(base.effects)
+        finally:
+            self.mismatch2 = self.mismatch2 if found else None
+        if not found:
+            self.estimate_noise()
 
     def _name_rest(self, effects: float) -> bool:
         """Name what is left beside the simulator, the best hypothesis, and that without its weakest effect.

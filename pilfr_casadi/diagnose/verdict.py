@@ -138,10 +138,17 @@ def explainable_remainder(search: Hypotheses, trial: Trial, before: Trial | None
     return left * (share + DISTURBANCE_WEIGHT * (1 - share))
 
 
-def share_left(search: Hypotheses, mean_square: float, before: Trial | None = None) -> float:
-    """Compute the share that a mean square error is of a hypothesis' error above the noise, by default the refit's."""
-    excess = max((before or search.root).mean_square - search.floor2, 1e-300)
-    return float(np.clip((mean_square - search.floor2) / excess, 0.0, 1.0))
+def share_left(
+    search: Hypotheses, mean_square: float, before: Trial | None = None, noise2: float | None = None
+) -> float:
+    """Compute the share that a mean square error is of a hypothesis' error above the noise.
+
+    The hypothesis is by default the refit, and the noise the floor. What nothing explains may have passed for noise
+    there; the white noise is the least.
+    """
+    noise2 = search.floor2 if noise2 is None else noise2
+    excess = max((before or search.root).mean_square - noise2, 1e-300)
+    return float(np.clip((mean_square - noise2) / excess, 0.0, 1.0))
 
 
 def share_named(s: float, strained: bool = False) -> float:
@@ -378,7 +385,7 @@ def _describe_vanished(search: Hypotheses, found: Posterior) -> str:
 def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, float], mode: float | None) -> str:
     root, share = search.root, max(shares.values(), default=0.0)
     where = max(shares, key=lambda k: shares[k], default="")
-    laws, left = closest.effects, share_left(search, closest.mean_square)
+    laws, left = closest.effects, share_left(search, closest.mean_square, noise2=search.least_noise2)
     if not laws or 1 - left < LEAST_EXPLAINED:
         rings = (
             f" The rest swings at the simulator's own {mode:.3g} Hz, as from a force that was not recorded or a value "
@@ -391,10 +398,10 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
             if share > LEAST_EXPLAINED
             else ""
         )
-        noise = search.floor.nrmse(search.bench.scale)
+        noise = search.least_floor.nrmse(search.bench.scale)
         return (
             "Physics is missing, and no law of the catalogue explains it. The refitted simulator is off by "
-            f"{100 * mean_nrmse(search.bench, root.fitted):.3g} % of the outputs' deviation; the noise is about "
+            f"{100 * mean_nrmse(search.bench, root.fitted):.3g} % of the outputs' deviation; the noise is at least "
             f"{100 * noise:.3g} %.{at}{rings}"
         )
     port = where if shares.get(laws[0].port, 0.0) < 0.5 * share else laws[0].port

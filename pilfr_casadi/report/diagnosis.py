@@ -79,7 +79,7 @@ class _Case:
         # of long recordings, the searched stretches
         recordings = d.train if search is None else search.bench.recordings
         bench = Workbench.of(d.refitted, recordings, d.hold)
-        noise = float(d.floor["nrmse"]) * bench.scale if search is None else np.asarray(search.floor.deviation)
+        noise = np.asarray(d.evidence.get("noise", float(d.floor["nrmse"]) * bench.scale))
         return cls(d, bench, d.evidence["without"], d.evidence["after"], np.nan_to_num(noise))
 
     def unit(self, name: str) -> str:

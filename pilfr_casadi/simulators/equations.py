@@ -254,6 +254,12 @@ class Equations:
         name = f"`term` of port {port.name!r}"
         return _scalar(call(port.term, name, z=ca.SX(z), dz=ca.SX(dz), x=x, u=u, p=p), name)
 
+    def term_parameters(self, name: str) -> tuple[str, ...]:
+        """List the parameters that the term of a port reads."""
+        x, u, p, _ = self.symbols()
+        term = self.term(self.port(name), ca.SX.sym("z"), ca.SX.sym("dz"), x, u, p)
+        return tuple(name for name in self.parameters if ca.depends_on(term, ca.vec(ca.SX(p[name]))))
+
     def rate(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Any:
         """Evaluate the rate dz/dt of a port inside the equations, inputs held."""
         if port.rate is not None:
