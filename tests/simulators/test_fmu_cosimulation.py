@@ -1,10 +1,12 @@
 """Units for co-simulation: equations found from their steps, steps where there are none, failures, plain refusals."""
 
+import sys
 import textwrap
 
 import cloudpickle
 import numpy as np
 import pytest
+from command_line import run
 from exported_fits import one_sentence
 
 from pilfr_casadi import InputError, Recording, exported, from_fmu
@@ -92,6 +94,17 @@ def test_the_equations_of_a_unit_are_found_from_its_steps(rig_unit):
     assert power.output_names == ("pos1", "vel1", "pos2", "vel2", "power")
     assert np.allclose(power.simulate(given)[:, 4], given.u[:, 0] ** 2, rtol=1e-6)
     assert not np.any(exported(found, dt=2e-3).step(np.zeros(4), [1.0])[1].full())  # it can become a file
+    again = cloudpickle.loads(cloudpickle.dumps(found))
+    assert np.array_equal(again.simulate(given), found.simulate(given))
+
+
+def test_the_command_steps_by_the_sampling_interval(rig_unit, tmp_path, capsys):
+    given, train = recording(4, samples=200), tmp_path / "train.csv"
+    rows = np.column_stack([np.arange(200) * given.dt, given.u, given.y])
+    np.savetxt(train, rows, delimiter=",", header="t,force,pos1,pos2", comments="")
+    more = ("--port", "guide=guide_force:pos1:vel1", "--bound", "k1=300:500", "--initial", "zero", "--hold", "zero")
+    status, out, _ = run(capsys, "check", rig_unit, train, *more)
+    assert status == 0 and "guide" in out
 
 
 def test_a_unit_without_such_equations_is_stepped(built):
@@ -132,6 +145,13 @@ def test_a_step_that_fails_is_a_failed_trial(built, end):
 def test_what_cannot_be_stepped_is_refused_in_one_sentence(built, body, register, says):
     with pytest.raises(InputError, match=says) as error:
         from_fmu(built(body, register), cosimulation=CoSimulation(dt=DT))
+    one_sentence(error)
+
+
+def test_it_needs_fmpy(rig_unit, monkeypatch):
+    monkeypatch.setitem(sys.modules, "fmpy", None)
+    with pytest.raises(InputError, match="needs FMPy; pip install") as error:
+        load("pythonfmu", rig_unit)
     one_sentence(error)
 
 
