@@ -9,7 +9,7 @@ MASSES = (1.2, 0.8)
 STATES = ("pos1", "vel1", "pos2", "vel2")
 
 
-class Rig(Fmi2Slave):  # type: ignore[misc]
+class Rig(Fmi2Slave):
     """Two masses on springs; the friction in the guide is missing."""
 
     def __init__(self, **kwargs: Any) -> None:

@@ -169,8 +169,8 @@ class SteppedUnit:
                 name = read[int(np.argmax(np.any(off, axis=0)))]
                 raise InputError(
                     f"{self.path} has memory that cannot be set, or depends on time: a step with the states "
-                    f"{listed(self.states)} set gives another {name!r} than the same step before; export it for model exchange or with all its "
-                    "states as outputs that can be set, or give a table of what it simulates."
+                    f"{listed(self.states)} set gives another {name!r} than the same step before; export it for model "
+                    "exchange or with all its states as outputs that can be set, or give a table of what it simulates."
                 )
 
 

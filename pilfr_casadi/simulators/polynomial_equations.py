@@ -99,7 +99,7 @@ def _function(n: int, inverse: Sequence[int], terms: Sequence[tuple[int, ...]], 
     found = []
     for row in rows.T:
         total = ca.SX(0.0)
-        for k in np.flatnonzero(row):
+        for k in np.flatnonzero(row).tolist():
             product = ca.SX(row[k])
             for j in terms[k]:
                 product = product * variables[j]
