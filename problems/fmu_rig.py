@@ -1,8 +1,9 @@
 """A two-mass rig with dry friction in its guide, diagnosed from equations and from functional mock-up units.
 
 The units lack the friction, as the equations do. One is written by hand in C (`fmu_rig.c`, FMI 2.0), one exported by
-CasADi (FMI 3.0). `python -m problems.fmu_rig --cases 20` prints the verdict, port and law of each, and the time beside
-that of the equations.
+CasADi (FMI 3.0), and one is for co-simulation, built by PythonFMU (`fmu_rig_slave.py`).
+`python -m problems.fmu_rig --cases 20` prints the verdict, port and law of each, and the time beside that of the
+equations, loading included.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import numpy as np
 from pilfr_casadi import Parameter, Port, Recording, Simulator, diagnose, from_fmu
 from pilfr_casadi.engine import compiler
 from pilfr_casadi.laws import CoulombFriction
+from pilfr_casadi.simulators import CoSimulation
 
 HERE = Path(__file__).parent
 PARAMETERS = {"k1": (380.0, 100, 2000), "k2": (1000.0, 200, 5000), "d1": (2.3, 0, 50), "d2": (1.3, 0, 50)}
@@ -157,6 +159,23 @@ def casadi_rig(path: Path) -> Path:
     return Path(path)
 
 
+def python_rig(path: Path) -> Path:
+    """Write the rig for co-simulation by PythonFMU."""
+    from pythonfmu.builder import FmuBuilder
+
+    built = Path(FmuBuilder.build_FMU(HERE / "fmu_rig_slave.py", dest=path.parent))
+    return built.replace(path)
+
+
+def load(kind: str, path: Path) -> Simulator:
+    """Make the simulator of a unit; one of PythonFMU states neither bounds nor step size."""
+    more: dict[str, Any] = {}
+    if kind == "pythonfmu":
+        bounds = {n: (low, high) for n, (_, low, high) in PARAMETERS.items()}
+        more = {"bounds": bounds, "cosimulation": CoSimulation(dt=2e-3)}
+    return from_fmu(path, ports=GUIDE, outputs=("pos1", "pos2"), **more)
+
+
 def answer(simulator: Simulator, seed: int) -> tuple[tuple[Any, ...], float]:
     """Diagnose the rig on a recording of a seed; return verdict and effects, and the seconds that it took."""
     train, test = (recording([seed, k], CoulombFriction(FRICTION)) for k in range(2))
@@ -170,21 +189,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table; return 0 where the units are answered as the equations in all cases but one of twenty."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=3, help="number of seeds (default: 3)")
-    parser.add_argument("--kinds", nargs="+", default=["c"], choices=["c", "casadi"], help="units (default: c)")
+    parser.add_argument(
+        "--kinds", nargs="+", default=["c"], choices=["c", "casadi", "pythonfmu"], help="units (default: c)"
+    )
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
-        makers = {"c": c_rig, "casadi": casadi_rig}
+        makers = {"c": c_rig, "casadi": casadi_rig, "pythonfmu": python_rig}
         files = {kind: makers[kind](Path(folder) / f"{kind}.fmu") for kind in options.kinds}
         same, ratios = dict.fromkeys(files, 0), {kind: list[float]() for kind in files}
         for seed in range(options.cases):
             wanted, seconds = answer(rig(), seed)
             print(f"{seed:3} equations {seconds:6.1f} s  {wanted}", flush=True)
             for kind, path in files.items():
-                found, longer = answer(from_fmu(path, ports=GUIDE, outputs=("pos1", "pos2")), seed)
+                begin = time.perf_counter()
+                unit = load(kind, path)
+                loading = time.perf_counter() - begin
+                found, longer = answer(unit, seed)
+                longer += loading
                 same[kind] += found == wanted
                 ratios[kind].append(longer / seconds)
-                print(f"    {kind:9} {longer:6.1f} s  {found}", flush=True)
+                print(f"    {kind:9} {longer:6.1f} s  {found}; loaded in {loading:.1f} s", flush=True)
         for kind in files:
             ratio = np.median(ratios[kind])
             print(f"{kind}: {same[kind]} of {options.cases} as the equations; {ratio:.1f} times the time")

@@ -156,19 +156,20 @@ class Reply:
     begun: bool = True
 
 
-def run_in_worker(shared: bytes, job: bytes, limit: float | None = None) -> Reply:
-    """Call `pickle.loads(shared)(pickle.loads(job))` in the child process of this thread.
+def run_in_worker(shared: bytes, job: bytes, limit: float | None = None, name: str = "") -> Reply:
+    """Call `pickle.loads(shared)(pickle.loads(job))` in the child process of this thread that has a name.
 
     The child keeps the function from one job to the next. Starting it does not count towards the `limit`, seconds.
     """
-    child: WorkerProcess | None = getattr(_of_this_thread, "child", None)
+    children: dict[str, WorkerProcess] = _of_this_thread.__dict__.setdefault("children", {})
+    child = children.get(name)
     if child is not None and child.process.poll() is None:
         reply = child.run(shared, job, limit)
         if reply.begun:
             return reply  # else it was idle for too long, just now
     if child is not None:
         child.close()
-    child = _of_this_thread.child = WorkerProcess()
+    child = children[name] = WorkerProcess()
     return child.run(shared, job, limit)
 
 

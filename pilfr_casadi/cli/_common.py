@@ -225,7 +225,7 @@ class SimulatorOptions(DataOptions):
     def _load_fmu(self, path: str) -> Any:
         """Make a simulator of the inputs and outputs of an FMU that the first recording has."""
         from ..data import column_names
-        from ..simulators import fmu_signals, from_fmu
+        from ..simulators import CoSimulation, fmu_signals, from_fmu
 
         ports = {}
         for name, text in pairs(self.port, "--port").items():
@@ -247,7 +247,8 @@ class SimulatorOptions(DataOptions):
                     f"{self.train[0]} has no column for any {role} of {path} ({listed(names)}); rename its columns, or "
                     f"say which they are, as in --column {names[0]}=COLUMN."
                 )
-        return from_fmu(path, ports=ports, bounds=bounds, inputs=kept[0], outputs=kept[1])
+        steps = CoSimulation(self.read(self.train[0], *kept, only_these=True).dt)
+        return from_fmu(path, ports=ports, bounds=bounds, inputs=kept[0], outputs=kept[1], cosimulation=steps)
 
 
 def bounds_of(texts: Sequence[str]) -> dict[str, tuple[float, float]]:

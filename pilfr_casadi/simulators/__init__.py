@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         units as units,
     )
     from .fmu import from_fmu as from_fmu
+    from .fmu_cosimulation import CoSimulation as CoSimulation
     from .fmu_description import binary_path as binary_path, fmu_signals as fmu_signals
     from .fmu_instance import FmuInstance as FmuInstance
     from .integration import (

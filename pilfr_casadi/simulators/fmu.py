@@ -1,4 +1,6 @@
-"""Simulators from functional mock-up units for model exchange (https://fmi-standard.org), FMI 2.0 and 3.0.
+"""Simulators from functional mock-up units (https://fmi-standard.org), FMI 2.0 and 3.0, for model exchange.
+
+Those for co-simulation alone are stepped (`fmu_cosimulation`).
 
 CasADi loads the unit and evaluates its derivatives and outputs; differences along directions give their derivatives
 (`external`), because CasADi takes both not to depend on parameters. Where a derivative or an output equals a state at
@@ -29,6 +31,7 @@ import numpy as np
 from .._base import InputError, check_known, listed, run_in_worker
 from ..models import Named, Parameter, parameter_within, within_a_factor
 from .external import NOMINAL, ROUNDING, call_external, equal_state, external, keep_leaf
+from .fmu_cosimulation import CoSimulation, SteppedEquations, SteppedUnit
 from .fmu_description import Variable, check_file, describe, tidy
 from .fmu_instance import FmuFile, unpack
 from .ports import Port
@@ -107,8 +110,9 @@ def from_fmu(
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
     hold: str | None = None,
+    cosimulation: CoSimulation | None = None,
 ) -> Simulator:
-    """Make a simulator from a functional mock-up unit for model exchange.
+    """Make a simulator from a functional mock-up unit, for model exchange where it can be used so.
 
     Parameters
     ----------
@@ -127,6 +131,8 @@ def from_fmu(
         Inputs and outputs that are recorded; by default all that no port uses. Other inputs keep their start values.
     hold : {"zero", "linear"}, optional
         As of `Simulator`.
+    cosimulation : CoSimulation, optional
+        Step size and states of a unit that is for co-simulation alone.
 
     Returns
     -------
@@ -136,12 +142,17 @@ def from_fmu(
     Raises
     ------
     InputError
-        If the file is no unit for model exchange on this platform, or a name is not one of its variables.
+        If the file is no unit for this platform, a name is not one of its variables, or a unit for co-simulation has
+        no states that can be set.
     """
-    path = Path(path)
-    check_file(path)
-    _check_program(path)
-    given, unit = dict(ports or {}), _Unit.load(path)
+    path, given = Path(path), dict(ports or {})
+    described = check_file(path)
+    unit: _Unit | SteppedUnit
+    if described.identifier:
+        _check_program(path)
+        unit = _Unit.load(path)
+    else:
+        unit = SteppedUnit.load(path, described, cosimulation or CoSimulation())
     for name, port in given.items():
         if not isinstance(port, Mapping):
             raise InputError(f"The port {name!r} is {port!r}; give dict(into=INPUT, across=VARIABLE, rate=VARIABLE).")
@@ -158,17 +169,23 @@ def from_fmu(
     drives = tuple(inputs) if inputs is not None else tuple(n for n in unit.inputs if n not in used)
     measured = tuple(outputs) if outputs is not None else unit.outputs
     read = {port.get(key) for port in given.values() for key in ("across", "rate")}
-    needed = [n for n in unit.outputs if n in measured or n in read]
-    equations = _Equations(_Unit.load(path, needed), drives, free, measured)
+    needed = tuple(n for n in unit.outputs if n in measured or n in read)
     made = own if isinstance(own, Mapping) else {n: _parameter(unit.variables[n], (bounds or {}).get(n)) for n in own}
+    equations: _Equations | SteppedEquations
+    if isinstance(unit, _Unit):
+        equations = _Equations(_Unit.load(path, needed), drives, free, measured)
+    else:
+        symbols = tuple(n for n in unit.inputs if n in drives or n in used)
+        equations = SteppedEquations(unit, symbols, made, needed, measured)
     return Simulator(
         equations.dynamics,
         equations.measured,
-        unit.states,
+        equations.states,
         drives,
         made,
-        tuple(equations.port(name, port) for name, port in given.items()),
+        tuple(_port(equations, name, port) for name, port in given.items()),
         hold,
+        equations.discrete,
         units={n: unit.variables[n].unit for n in (*drives, *measured)},
     )
 
@@ -185,6 +202,7 @@ class _Equations:
 
     def __init__(self, unit: _Unit, inputs: tuple[str, ...], free: tuple[str, ...], outputs: tuple[str, ...]) -> None:
         self.unit, self.inputs, self.free, self.outputs = unit, inputs, free, outputs
+        self.states, self.discrete = unit.states, False
         rows = (*map(_rate, unit.states), *unit.outputs)
         points = list(self._points())
         found = np.array([unit.values(*point) for point in points])
@@ -238,21 +256,7 @@ class _Equations:
     def _outputs(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
         return dict(zip(self.outputs, self._rows(self.outputs, x, u, p, t), strict=True))
 
-    def port(self, name: str, given: Mapping[str, Any]) -> Port:
-        """Make a port from the names of the unit's variables."""
-        factors, across, rate = _factors(given.get("into")), given.get("across"), given.get("rate")
-        unknown = [key for key in given if key not in ("into", "across", "rate")]
-        if unknown or not factors or not isinstance(across, str) or not isinstance(rate, str | None):
-            raise InputError(
-                f"The port {name!r} is {dict(given)!r}; give dict(into=INPUT, across=VARIABLE, rate=VARIABLE) with "
-                "names of the unit's variables."
-            )
-        z = self._signal(name, "across", across)
-        dz = None if rate is None else self._signal(name, "rate", rate)
-        force, coordinate = self.unit.variables[next(iter(factors))], self.unit.variables[across]
-        return Port(name, self._into(name, factors), z, dz, force.unit, coordinate.unit)
-
-    def _signal(self, port: str, key: str, name: str) -> Callable[..., Any]:
+    def signal(self, port: str, key: str, name: str) -> Callable[..., Any]:
         unit = self.unit
         if name in unit.states:
             return lambda x: x[name]
@@ -263,7 +267,7 @@ class _Equations:
             return lambda x: x[same]
         return lambda x, u, p: self._rows([name], x, u, p, 0.0)[0]
 
-    def _into(self, port: str, factors: Mapping[str, float]) -> Any:
+    def into(self, port: str, factors: Mapping[str, float]) -> Any:
         """Find how a unit force changes derivatives and outputs: constants, or differences of two calls."""
         unit, step = self.unit, np.array([factors.get(n, 0.0) for n in self.unit.inputs])
         names = (*unit.states, *unit.outputs)
@@ -292,6 +296,21 @@ class _Equations:
             return {names[i]: after[i] - before[i] for i in moved.values()}
 
         return into
+
+
+def _port(equations: _Equations | SteppedEquations, name: str, given: Mapping[str, Any]) -> Port:
+    """Make a port from the names of the unit's variables."""
+    factors, across, rate = _factors(given.get("into")), given.get("across"), given.get("rate")
+    unknown = [key for key in given if key not in ("into", "across", "rate")]
+    if unknown or not factors or not isinstance(across, str) or not isinstance(rate, str | None):
+        raise InputError(
+            f"The port {name!r} is {dict(given)!r}; give dict(into=INPUT, across=VARIABLE, rate=VARIABLE) with "
+            "names of the unit's variables."
+        )
+    z = equations.signal(name, "across", across)
+    dz = None if rate is None else equations.signal(name, "rate", rate)
+    force, coordinate = (equations.unit.variables[n] for n in (next(iter(factors)), across))
+    return Port(name, equations.into(name, factors), z, dz, force.unit, coordinate.unit)
 
 
 def _rate(state: str) -> str:

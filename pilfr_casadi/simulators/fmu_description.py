@@ -39,14 +39,21 @@ class Variable:
 
 @dataclass(frozen=True)
 class Description:
-    """The content of modelDescription.xml; `identifier` is empty where the unit is not for model exchange."""
+    """The content of modelDescription.xml.
+
+    `identifier` is empty where the unit is not for model exchange, `slave` where it is not for co-simulation;
+    `step_size` is NaN where none is stated.
+    """
 
     version: str
     token: str
     identifier: str
+    slave: str
     binary: str
     variables: dict[str, Variable]
     states: tuple[str, ...]
+    step_size: float
+    variable_steps: bool
 
 
 def describe(path: Path) -> Description:
@@ -60,13 +67,17 @@ def describe(path: Path) -> Description:
     variables = {v.name: v for entry in entries if (v := _variable(entry)) is not None}
     version = root.get("fmiVersion", "").partition(".")[0]
     token = root.get("guid" if version == "2" else "instantiationToken", "")
-    exchange = root.find("ModelExchange")
-    identifier = exchange.get("modelIdentifier", "") if exchange is not None else ""
+    kinds = [root.find(kind) for kind in ("ModelExchange", "CoSimulation")]
+    identifier, slave = ("" if kind is None else kind.get("modelIdentifier", "") for kind in kinds)
+    varies = kinds[1] is not None and kinds[1].get("canHandleVariableCommunicationStepSize") in ("true", "1")
+    experiment = root.find("DefaultExperiment")
+    step_size = _number(None if experiment is None else experiment.get("stepSize"))
     try:
         states = tuple(_state_names(root, entries, version))
     except (ValueError, IndexError, KeyError, StopIteration):
         states = ()
-    return Description(version, token, identifier, binary_path(identifier, version), variables, states)
+    binary = binary_path(identifier or slave, version)
+    return Description(version, token, identifier, slave, binary, variables, states, step_size, varies)
 
 
 def binary_path(identifier: str, version: str) -> str:
@@ -118,16 +129,13 @@ def _number(text: str | None) -> float:
         return np.nan
 
 
-def check_file(path: Path) -> None:
-    """Refuse what is no unit for model exchange with a program for this platform."""
+def check_file(path: Path) -> Description:
+    """Refuse what is no unit with a program for this platform; return its description."""
     unit = describe(path)
     if unit.version not in ("2", "3"):
         raise InputError(f"{path} is a unit of FMI {unit.version or '(none stated)'}; give one of FMI 2.0 or 3.0.")
-    if not unit.identifier:
-        raise InputError(
-            f"{path} is for co-simulation alone, which is not read yet; export it for model exchange "
-            "(in most tools an option of the FMU export)."
-        )
+    if not (unit.identifier or unit.slave):
+        raise InputError(f"{path} is neither for model exchange nor for co-simulation; export it for one of these.")
     if not any(v.causality == "output" for v in unit.variables.values()):
         raise InputError(f"{path} has no output; export it with the measured variables as outputs.")
     with zipfile.ZipFile(path) as archive:
@@ -135,6 +143,7 @@ def check_file(path: Path) -> None:
     own = unit.binary.split("/")[1]
     if own not in there:
         raise InputError(f"{path} has programs for {listed(sorted(there)) or 'no platform'}; export it for {own}.")
+    return unit
 
 
 def fmu_signals(path: str | os.PathLike[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:

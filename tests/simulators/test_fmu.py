@@ -170,7 +170,9 @@ def test_files_that_are_no_units_are_refused(tmp_path, units):
         zipped("broken.fmu", **{"modelDescription.xml": "<fmi"}): "is not a functional mock-up unit",
         zipped("bare.fmu", **{"modelDescription.xml": description()}): f"no platform; export it for {FOLDER}",
         zipped("program.fmu", **both): "cannot be evaluated",
-        zipped("cosim.fmu", **{"modelDescription.xml": description("CoSimulation")}): "for co-simulation alone",
+        zipped(
+            "events.fmu", **{"modelDescription.xml": description("ScheduledExecution")}
+        ): "neither for model exchange",
         zipped("old.fmu", **{"modelDescription.xml": description(version="1.0")}): "FMI 1; give one of FMI 2.0",
         c_rig(tmp_path / "other.fmu", folder="win32"): f"has programs for win32; export it for {FOLDER}",
         c_rig(tmp_path / "crash.fmu", "CRASHES"): "ends the process that loads it",
@@ -179,26 +181,6 @@ def test_files_that_are_no_units_are_refused(tmp_path, units):
         with pytest.raises(InputError) as error:
             from_fmu(path)
         assert says in one_sentence(error), path
-
-
-def test_a_unit_of_python_is_for_co_simulation(tmp_path):
-    """As PythonFMU makes them."""
-    builder = pytest.importorskip("pythonfmu.builder")
-    script = tmp_path / "slave.py"
-    script.write_text(
-        "from pythonfmu import Fmi2Causality, Fmi2Slave, Real\n"
-        "class Slave(Fmi2Slave):\n"
-        "    def __init__(self, **kwargs):\n"
-        "        super().__init__(**kwargs)\n"
-        "        self.y = 0.0\n"
-        "        self.register_variable(Real('y', causality=Fmi2Causality.output))\n"
-        "    def do_step(self, current_time, step_size):\n"
-        "        return True\n"
-    )
-    path = builder.FmuBuilder.build_FMU(script, dest=tmp_path)
-    with pytest.raises(InputError, match="for co-simulation alone, which is not read yet") as error:
-        from_fmu(path)
-    one_sentence(error)
 
 
 def test_what_calls_a_unit_cannot_become_a_file(tmp_path, units):

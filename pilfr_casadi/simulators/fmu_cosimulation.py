@@ -1,0 +1,359 @@
+"""Simulators from functional mock-up units for co-simulation, which only step: `x⁺ = Φ_h(x, u, p)`.
+
+A step sets states, inputs and parameters, goes on by h and reads states and outputs (`fmu_slave`). Variables are states
+where a value that was set changes a later step. Two steps must equal two steps with the states set in between, else the
+unit has memory that cannot be set, and no trial could be repeated.
+
+A diagnosis needs some ten million evaluations, an hour of a unit's steps. So its equations are looked for first: the
+derivatives `lim (Φ_h(x) - x) / h`, extrapolated from halved steps (Richardson), are fitted by polynomials
+(`polynomial_equations`). Where these agree with the unit, they are the simulator, in continuous time. Else the
+simulator is in discrete time and steps the unit at every sample, with differences as derivatives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .._base import InputError, check_known, listed, positive
+from ..models import Named, Parameter
+from .black_box import BlackBox
+from .external import NOMINAL, RELATIVE_STEP
+from .fmu_description import Description, Variable
+from .fmu_slave import Slave
+from .polynomial_equations import find_polynomials
+
+LEVELS = 5  # halvings of a step from which a derivative is extrapolated
+CONVERGED = 1e-5  # relative change by the last halving
+REPEATED = 1e-4  # relative difference that restarting the unit's solver may make
+DECADES = (-3.0, 1.0)  # powers of ten of sizes of states and inputs at which equations are checked
+PROBED = 4  # states from which a unit's memory is looked at
+
+
+@dataclass(frozen=True)
+class CoSimulation:
+    """How a unit for co-simulation is stepped.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Length of its steps, s: the sampling interval of the recordings. By default the step size that the file states.
+    states : tuple of str, optional
+        Its state variables; by default all outputs and local variables that change a step when they are set.
+    """
+
+    dt: float | None = None
+    states: Sequence[str] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SteppedUnit:
+    """A unit for co-simulation with known states."""
+
+    path: Path
+    variables: Mapping[str, Variable]
+    slave: Slave
+    dt: float
+    variable_steps: bool
+    begin: Mapping[str, float]  # values of variables when the program has started
+    states: tuple[str, ...] = ()
+
+    @classmethod
+    def load(cls, path: Path, described: Description, options: CoSimulation) -> SteppedUnit:
+        """Load a unit, find its states and refuse one that has others."""
+        dt = options.dt if options.dt is not None else described.step_size
+        if np.isnan(dt):
+            raise InputError(
+                f"{path} is for co-simulation and states no step size; give that of the recordings, as in "
+                "from_fmu(..., cosimulation=CoSimulation(dt=0.001))."
+            )
+        slave = Slave(path, described.version, described.token, described.slave)
+        unit = cls(path, described.variables, slave, positive(dt, "dt"), described.variable_steps, {})
+        candidates = unit._candidates(described)
+        names = tuple(dict.fromkeys((*candidates, *unit.inputs, *unit.parameters, *unit.outputs)))
+        begin, failure = unit.steps((), np.zeros((1, 0)), 0.0, names)
+        if not failure:
+            failure = unit.steps((), np.zeros((1, 0)), dt, unit.outputs)[1]
+        if failure:
+            raise InputError(
+                f"The program inside {path} does not step ({failure}); check it with the tool that made it."
+            )
+        unit = replace(unit, begin=dict(zip(names, begin[0].tolist(), strict=True)))
+        if options.states is not None:
+            check_known(options.states, candidates, "outputs and local variables", path)
+        chosen = tuple(options.states) if options.states is not None else candidates
+        for fresh in (False, True):
+            trial = replace(unit, slave=replace(slave, fresh=fresh))
+            if trial := trial._with_states(chosen, options.states is not None):
+                trial._check_memory()
+                return trial
+        raise InputError(
+            f"{path} is for co-simulation, and none of its variables can be set as a state; export it for model "
+            "exchange or with states that can be set, or give a table of what it simulates."
+        )
+
+    def _role(self, causality: str) -> tuple[str, ...]:
+        return tuple(v.name for v in self.variables.values() if v.causality == causality)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self._role("input")
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self._role("output")
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the tunable parameters."""
+        return tuple(n for n in self._role("parameter") if self.variables[n].variability == "tunable")
+
+    def steps(self, names: Sequence[str], values: np.ndarray, h: float, read: Sequence[str]) -> tuple[np.ndarray, str]:
+        """Set variables by name and step; see `Slave.steps`."""
+        sets, reads = ([self.variables[n].reference for n in those] for those in (names, read))
+        return self.slave.steps(sets, values, np.full(len(values), h), reads)
+
+    def _candidates(self, described: Description) -> tuple[str, ...]:
+        """List what may be a state: by the structure of the file, else outputs and local variables."""
+        local = (v.name for v in self.variables.values() if v.causality == "local" and v.variability == "continuous")
+        return described.states or (*self.outputs, *local)
+
+    def _with_states(self, names: tuple[str, ...], given: bool) -> SteppedUnit | None:
+        """Copy with those of some variables as states that can be set and, if not `given`, change a step."""
+        kept = tuple(n for n in names if not self.steps((n,), np.array([[self.begin[n]]]), self.dt, (n,))[1])
+        unit = replace(self, states=kept)
+        if not kept or (given and kept != names):
+            return None
+        if given:
+            return unit
+        z, read = unit.points(2)[0], (*kept, *unit.outputs)
+        rows = np.tile(z, (1 + len(kept), 1))
+        rows[1:, : len(kept)] += np.diag(np.maximum(np.abs(z[: len(kept)]), NOMINAL))
+        found, _ = unit.steps(unit.set_names, rows, self.dt, read)
+        moved = np.any(np.abs(found[1:] - found[0]) > 0, axis=1)
+        return replace(unit, states=tuple(n for n, m in zip(kept, moved, strict=True) if m)) if np.any(moved) else None
+
+    @property
+    def set_names(self) -> tuple[str, ...]:
+        """Names of what a step sets."""
+        return (*self.states, *self.inputs, *self.parameters)
+
+    def points(self, count: int, seed: int = 0) -> np.ndarray:
+        """Draw values of `set_names` about the start values; parameters stay."""
+        rng, sizes = np.random.default_rng(seed), [self.variables[n].nominal for n in self.set_names]
+        sizes = np.nan_to_num(np.array(sizes), nan=1.0) * 0.1
+        sizes[len(self.states) + len(self.inputs) :] = 0.0
+        return np.array([self.begin[n] for n in self.set_names]) + sizes * rng.standard_normal((count, len(sizes)))
+
+    def _check_memory(self) -> None:
+        """Refuse a unit whose steps depend on more than what is set before them."""
+        n, read = len(self.states), (*self.states, *self.outputs)
+        for z in self.points(PROBED, 1):
+            on = np.full((1, len(z)), np.nan)
+            first, failure = self.steps(self.set_names, np.vstack([z, on]), self.dt, read)
+            other = np.vstack([self.points(1, 2), z, np.append(first[0, :n], z[n:])])
+            again, more = self.steps(self.set_names, other, self.dt, read)
+            if failure or more:
+                raise InputError(f"{self.path} fails near its start values: {failure or more}; check it with its tool.")
+            both, size = np.vstack([first, again[1:]]), np.abs(first[1] - first[0])
+            off = np.abs(first - again[1:]) > REPEATED * size + RELATIVE_STEP * np.max(np.abs(both), axis=0)
+            if np.any(off):
+                name = read[int(np.argmax(np.any(off, axis=0)))]
+                raise InputError(
+                    f"{self.path} has memory that cannot be set, or depends on time: a step with the states "
+                    f"{listed(self.states)} set gives another {name!r} than the same step before; export it for model "
+                    "exchange or with all its states as outputs that can be set, or give a table of what it simulates."
+                )
+
+
+class SteppedEquations:
+    """The equations of a unit: found as polynomials (`polynomials`), else its steps.
+
+    Parameters
+    ----------
+    unit : SteppedUnit
+    inputs : tuple of str
+        Inputs that are symbols.
+    parameters : mapping
+        Parameters that are symbols.
+    needed, measured : tuple of str
+        Outputs that ports or recordings read, and those of recordings.
+    """
+
+    def __init__(
+        self,
+        unit: SteppedUnit,
+        inputs: tuple[str, ...],
+        parameters: Mapping[str, Parameter],
+        needed: tuple[str, ...],
+        measured: tuple[str, ...],
+    ) -> None:
+        self.unit, self.inputs, self.parameters, self.outputs = unit, inputs, parameters, measured
+        self.others = others = tuple(n for n in needed if n not in unit.states)
+        self.names = (*unit.states, *inputs, *parameters)
+        self.rows = (*unit.states, *others)
+        self._start = np.array([unit.begin[n] for n in self.names])
+        self._sizes = np.nan_to_num(np.array([unit.variables[n].nominal for n in self.names]), nan=1.0)
+        inverse = [j for j, n in enumerate(self.names) if n in parameters and np.prod(self._range(n)) > 0]
+        found = find_polynomials(self._derivatives, self._draw, inverse) if unit.variable_steps else None
+        self.polynomials = found
+        # an output that is no state is read after a step: it belongs to the next sample, as a state does
+        self.states = unit.states if found is not None else self.rows
+        self.discrete = found is None
+        if found is None:
+            sizes = np.concatenate([[1.0], self._sizes[: len(unit.states)], np.ones(len(others))])
+            sizes = NOMINAL * np.concatenate([sizes, self._sizes[len(unit.states) :]])
+            kinds = (self.rows, inputs, tuple(parameters))
+            self._box = BlackBox(self._step, unit.path.name, self.rows, kinds, self._slopes, sizes)
+
+    @property
+    def note(self) -> str:
+        """How the equations came about."""
+        if self.discrete:
+            return f"steps of {self.unit.dt:g} s; {self._box.note}"
+        return f"{self.unit.path.name}: equations found from its steps; it is not called any more"
+
+    def _range(self, name: str) -> tuple[float, float]:
+        """Give the values of a parameter at which equations are looked for."""
+        p = self.parameters[name]
+        value, low, high = (float(v) for v in (p.value, *p.bounds))
+        reach = 10 * abs(value) or 1.0
+        return max(low, value - reach), min(high, value + reach)
+
+    def _draw(self, count: int, wide: bool) -> np.ndarray:
+        """Draw states and inputs about the start values, and parameters within their bounds."""
+        rng, n = np.random.default_rng(int(wide)), len(self.names) - len(self.parameters)
+        spread = 10 ** rng.uniform(*DECADES, (count, 1)) if wide else np.ones((count, 1))
+        z = self._start + self._sizes * spread * rng.uniform(-1, 1, (count, len(self.names)))
+        for j, name in enumerate(self.parameters, n):
+            low, high = self._range(name)
+            log = low > 0
+            ends = np.log([low, high]) if log else np.array([low, high])
+            drawn = rng.uniform(*ends, count)
+            z[:, j] = np.exp(drawn) if log else drawn
+        z[:, :n] -= self._start[:n] * np.array([name in self.unit.states for name in self.names[:n]])
+        return z
+
+    def _results(self, z: np.ndarray, h: float) -> np.ndarray:
+        """Step from points z of `names`, states from their start values; (K, n_rows)."""
+        values = np.array(z, dtype=float)
+        n, start = len(self.unit.states), self.unit.begin
+        values[:, :n] += self._start[:n]
+        given = dict(zip(self.names, values.T, strict=True))
+        all_of = [given.get(name, np.full(len(z), start[name])) for name in self.unit.set_names]
+        out = np.full((len(z), len(self.rows)), np.nan)
+        usable = np.all(np.isfinite(values), axis=1)  # a run that has failed does not call it again
+        if np.any(usable):
+            out[usable] = self.unit.steps(self.unit.set_names, np.stack(all_of, axis=1)[usable], h, self.rows)[0]
+        return out - np.append(self._start[:n], np.zeros(len(self.others)))
+
+    def _derivatives(self, z: np.ndarray) -> np.ndarray:
+        """Extrapolate derivatives and outputs to steps of length zero; NaN where this does not converge."""
+        n, table = len(self.unit.states), list[np.ndarray]()
+        for k in range(LEVELS):
+            h = self.unit.dt / 2**k
+            found = self._results(z, h)
+            if not np.all(np.isfinite(found)):
+                return found
+            table.append(np.hstack([(found[:, :n] - z[:, :n]) / h, found[:, n:]]))
+        before = table[-1]
+        for order in range(1, LEVELS):
+            before = table[-1]
+            table = [(2**order * b - a) / (2**order - 1) for a, b in pairwise(table)]
+        best = table[0]
+        return np.where(np.abs(best - before) <= CONVERGED * np.max(np.abs(best), axis=0), best, np.nan)
+
+    def _step(self, z: np.ndarray) -> np.ndarray:
+        """Step from one point z = (t, x, u, p)."""
+        return self._results(self._reduced(z[None]), self.unit.dt)[0]
+
+    def _slopes(self, z: np.ndarray) -> np.ndarray:
+        """Differences by x, u and p, in one call."""
+        h = RELATIVE_STEP * np.maximum(np.abs(z), self._box.nominal)[1:]
+        points = np.vstack([z, z + np.hstack([np.zeros((len(h), 1)), np.diag(h)])])
+        found = self._results(self._reduced(points), self.unit.dt)
+        return np.asarray((found[1:] - found[0]).T / h)
+
+    def _reduced(self, z: np.ndarray) -> np.ndarray:
+        """Leave out time, and outputs that are kept as states."""
+        n = 1 + len(self.unit.states)
+        return np.delete(z, [0, *range(n, n + len(self.others))], axis=1)
+
+    def _evaluate(self, x: Any, u: Mapping[str, Any], p: Any) -> dict[str, Any]:
+        """Derivatives, or next values, of states, and other outputs, by name."""
+        if self.polynomials is not None:
+            return self._by_name(self.polynomials(self._stack(x, u, p)), self.rows)
+        return self._box(x, Named("input", {n: u.get(n, self.unit.begin[n]) for n in self.inputs}), p, 0.0)
+
+    def _stack(self, x: Named, u: Mapping[str, Any], p: Named) -> Any:
+        drives = (u.get(n, self.unit.begin[n]) for n in self.inputs)
+        return ca.vertcat(*(x[n] for n in self.unit.states), *drives, *(p[n] for n in self.parameters))
+
+    def _by_name(self, rows: Any, names: Sequence[str]) -> dict[str, Any]:
+        found = dict(zip(self.rows, ca.vertsplit(rows), strict=True))
+        return {n: found[n] for n in names}
+
+    @property
+    def dynamics(self) -> SteppedEquations:
+        """The dynamics of a `Simulator`, which prints its `note`."""
+        return self
+
+    def __call__(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
+        """Evaluate the derivatives, or the next states, by name."""
+        found = self._evaluate(x, u._values, p)
+        return {n: found[n] for n in self.states}
+
+    def measured(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
+        """Evaluate the outputs by name."""
+        found = {} if all(n in self.states for n in self.outputs) else self._evaluate(x, u._values, p)
+        return {n: x[n] if n in self.states else found[n] for n in self.outputs}
+
+    def signal(self, port: str, key: str, name: str) -> Callable[..., Any]:
+        """Make a local signal of a port."""
+        if name in self.states:
+            return lambda x: x[name]
+        if name in self.others:
+            return lambda x, u, p: self._evaluate(x, u._values, p)[name]
+        known = listed([*self.unit.outputs, *(n for n in self.unit.states if n not in self.unit.outputs)])
+        raise InputError(f"`{key}` of port {port!r} is {name!r}; give an output or a state of the unit: {known}.")
+
+    def into(self, port: str, factors: Mapping[str, float]) -> Any:
+        """Make the effect of a unit force on states and outputs: that on the unit at rest."""
+        z = self._draw(PROBED, True)
+        step = np.array([factors.get(n, 0.0) for n in self.names])
+        evaluate = self._derivatives if self.polynomials is not None else (lambda z: self._results(z, self.unit.dt))
+        none, once, twice = (evaluate(z + k * step) for k in (0, 1, 2))
+        once, twice = once - none, twice - none
+        size = np.max(np.abs(once), axis=0) + NOMINAL * np.max(np.abs(none), axis=0)
+        if np.any(np.abs(twice - 2 * once) > NOMINAL * size):
+            raise InputError(
+                f"The force of port {port!r} does not add up in {listed(list(factors))}: twice the input has not twice "
+                "the effect; name an input that is a force."
+            )
+        moved = [n for n, change in zip(self.rows, once.T, strict=True) if np.any(np.abs(change) > RELATIVE_STEP)]
+        moved = [n for n in moved if n in self.states or n in self.outputs]
+        if not moved:
+            raise InputError(f"The input {listed(list(factors))} of port {port!r} changes nothing; name another one.")
+
+        if self.polynomials is not None:
+            z = ca.SX.sym("z", len(step))
+            slopes = ca.jtimes(self.polynomials(z), z, ca.SX(ca.DM(step)))
+            along = ca.Function("along", [z], [slopes])
+            return lambda x, u, p: self._by_name(along(self._stack(x, u._values, p)), moved)
+
+        def effect(p: Named) -> dict[str, Any]:
+            at, start = Named("state", dict.fromkeys(self.states, ca.SX(0.0))), self.unit.begin
+            before, after = (
+                self._evaluate(at, {n: start[n] + k * factors.get(n, 0.0) for n in self.inputs}, p) for k in (0, 1)
+            )
+            return {n: after[n] - before[n] for n in moved}
+
+        return effect
