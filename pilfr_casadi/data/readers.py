@@ -239,9 +239,10 @@ class _Request:
                 raise InputError(f"{source} has {list(names).count(name)} columns named {name!r}; rename all but one.")
         if time is None and self.dt is None:
             _refuse_other_unit(names, source)
+            like = next((name for name in names if name.lower().startswith("t")), "COLUMN")
             raise InputError(
                 f"{source} has no time column; it has {listed(names)}: name one {' or '.join(TIME_NAMES)}, in "
-                "seconds, or state the step with dt=STEP."
+                f"seconds, map one, as in columns={{'t': {like!r}}}, or state the step with dt=STEP."
             )
         return time, wanted
 

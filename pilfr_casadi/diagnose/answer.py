@@ -14,6 +14,7 @@ from .._base import InputError, in_words
 from ..data import Recording
 from ..identify import surrogate_warning
 from ..laws import readable_unit
+from ..simulators import name_at
 from .arguments import Request
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction
@@ -198,7 +199,13 @@ def _combination_note(
     ]
     if len(tied) < 2:
         return ()
-    words = f"These recordings determine {in_words(tied)} only in combination, so they have no standard errors."
+    of_laws = {
+        e.prefix + own: f"{own} of the {name_at(e.port, e.law.id, e.law.form, brief=True)}"
+        for e in after.simulator.elements
+        for own in e.law.parameters()
+    }
+    together = in_words([of_laws.get(name, name) for name in tied])
+    words = f"These recordings determine {together} only in combination, so they have no standard errors."
     return (Gate("simulation", "combination", ", ".join(tied), words, False),)
 
 
@@ -272,7 +279,8 @@ def _next(search: Search, effects: Sequence[NamedEffect], limits: Mapping[str, f
             tied = [list(effect.name), list(name)]
             if best is not None:
                 return {"between": tied, **best}
-            sentence = "No sine or triangle within the allowed amplitude separates them beyond the noise."
+            rivals = in_words([name_at(*pair, brief=True) for pair in (effect.name, name)])
+            sentence = f"No sine or triangle within the allowed amplitude tells {rivals} apart beyond the noise."
             return {"between": tied, "sentence": sentence}
     return None
 

@@ -18,7 +18,7 @@ import numpy as np
 from .._base import in_words, one_blas_thread, to_json
 from ..data import Recording
 from ..laws import LINEAR, Law, display_name
-from ..simulators import in_series
+from ..simulators import ACTUATOR, in_series, kind_of, split_port
 from .arguments import check_laws, match_recordings, stated_hold
 from .floor import ABOVE_NOISE, Floor, noise_floor
 from .identifiability import (
@@ -35,6 +35,7 @@ from .identifiability import (
     port_units,
 )
 from .linearise import Probe, Run, linearised
+from .proof import mean_nrmse
 from .workbench import Fitted, Workbench
 
 LEAST_NOISE = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
@@ -308,7 +309,7 @@ def assess_recordings(
             "deviation": dict(zip(outputs, noise.tolist(), strict=True)),
             "share": dict(zip(outputs, (noise / bench.scale).tolist(), strict=True)),
         },
-        error=fitted.cost**0.5,
+        error=mean_nrmse(bench, fitted),
         hold=stated,
         starts=tuple(START_WORDS[r.begins] for r in bench.recordings),
     )
@@ -360,8 +361,8 @@ def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) 
         yield from spot(status, names, sentence + more)
     for tie in found.ties:
         yield BlindSpot("tied", tie.names, tie.sentence)
-    known = [e for e in found.excitation if not rough or e.port.startswith("actuator:")]
-    moving = [e for e in known if e.port.removeprefix("actuator:") not in still]
+    known = [e for e in found.excitation if not rough or kind_of(e.port) == ACTUATOR]
+    moving = [e for e in known if split_port(e.port)[1] not in still]
     yield from spot("no-motion", [e.port for e in moving if e.travel == 0], "Nothing moves at {}.")
     text = "No reversal at {}: hysteresis and friction look like stiffness and damping there."
     yield from spot("no-reversal", [e.port for e in moving if e.travel > 0 and e.reversals == 0], text)
@@ -409,8 +410,8 @@ def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) ->
     if "constant-input" in names:
         return f"One in which {in_words(names['constant-input'])} varies."
     drive = inputs[0] if inputs else "the input"
-    signals = [port for kind in MOTION for port in names.get(kind, ()) if port.startswith("actuator:")]
-    own = signals[0].removeprefix("actuator:") if signals else drive
+    signals = [port for kind in MOTION for port in names.get(kind, ()) if kind_of(port) == ACTUATOR]
+    own = split_port(signals[0])[1] if signals else drive
     for inside, signal in ((True, drive), (False, own)):  # forces inside first, then the signals
         for kind, sentence in MOTION.items():
             if any(in_series(port) != inside for port in names.get(kind, ())):

@@ -37,7 +37,7 @@ from .._base import InputError, side_by_side
 from ..identify import solve_within_bounds
 from ..laws import Law
 from ..optimise import GaussNewton, Problem
-from ..simulators import MECHANICAL, PARAMETER, UNKNOWN, Placed
+from ..simulators import MECHANICAL, PARAMETER, SENSOR, UNKNOWN, Placed, kind_of
 from .floor import effective_size
 from .workbench import DIVERGED, Fitted, Workbench
 
@@ -273,17 +273,17 @@ def log_prior(
     """
     total = DOUBTFUL_PRIOR if doubtful else 0.0
     in_sensors = set[type[Law]]()
-    parameters = sum(port.startswith(PARAMETER) for port in alternatives)
+    parameters = sum(kind_of(port) == PARAMETER for port in alternatives)
     ports = max(len(alternatives) - parameters + min(parameters, 1), 1)
     for e in laws:
-        if e.port.startswith("sensor:"):
+        if kind_of(e.port) == SENSOR:
             if type(e.law) in in_sensors:
                 continue
             in_sensors.add(type(e.law))
         there = alternatives.get(e.port, ())
         forms = sum(law.id == e.law.id for law in there)
         total += EFFECT_PRIOR - np.log(ports) - np.log(max(forms, 1))
-        total -= np.log(max(parameters, 1)) if e.port.startswith(PARAMETER) else 0.0
+        total -= np.log(max(parameters, 1)) if kind_of(e.port) == PARAMETER else 0.0
         total += _log_share(e.law.id, there, (domains or {}).get(e.port, UNKNOWN))
         total += FLEXIBLE_PRIOR if e.law.flexible else 0.0
     return float(total)

@@ -22,11 +22,14 @@ from ..data import Recording
 from ..linear import measurement_update
 from ..models import Model, ParameterSet, map_points
 from ..simulators import (
+    ACTUATOR,
     PARAMETER,
+    SENSOR,
     ClosedEquations,
     Instant,
     Simulator,
     discretise,
+    kind_of,
     on_grid,
     signals,
     states_along,
@@ -177,7 +180,7 @@ def hidden_force(
     The force is that of element `number` of the corrected simulator; with None it is one at `port` beside all elements.
     `noise` (n_y,) is the standard deviation of the outputs' noise.
     """
-    if port.startswith(PARAMETER):  # no force acts there
+    if kind_of(port) == PARAMETER:  # no force acts there
         return None
     r, n = bench.recordings[i], fitted.model.substeps
     drive, start = fitted.model.drive(r), np.asarray(fitted.initial[i], dtype=float)
@@ -185,7 +188,7 @@ def hidden_force(
         states = states_along(fitted.model, drive, fitted.vector, start)
         law = _law_signals(fitted, number, states[::n], r, bench) if number is not None else None
         base, x0 = _without(fitted, number, start, bench.dt / n)
-        instant = port.startswith("sensor:") or (port.startswith("actuator:") and bench.hold == "zero")
+        instant = kind_of(port) == SENSOR or (kind_of(port) == ACTUATOR and bench.hold == "zero")
         held = np.zeros(len(r)) if law is None else law[2]
         held = held if instant else (held + np.append(held[1:], held[-1])) / 2
         loud = held if law is not None else np.abs(fitted.residual[i] / bench.scale).sum(axis=1)

@@ -27,7 +27,7 @@ from .._base import in_words, one_at_a_time
 from ..data import Recording
 from ..laws import CATALOGUE, Law, readable_unit
 from ..models import map_points
-from ..simulators import Named, Port, Simulator
+from ..simulators import ACTUATOR, EQUATION, Named, Port, Simulator, port_name, split_port
 from .evidence import prior_width
 from .linearise import Probe, Run, along
 from .screen import Remainder, Task, lengths, orthonormal, own_changes, project_off
@@ -481,7 +481,8 @@ def live_ports(simulator: Simulator) -> list[Port]:
 
     Inputs that no equation reads, and equations that define a speed, are left out.
     """
-    idle = {f"actuator:{name}" for name in simulator.idle_inputs} | {f"equation:{name}" for name in simulator.kinematic}
+    idle = {port_name(ACTUATOR, name) for name in simulator.idle_inputs}
+    idle |= {port_name(EQUATION, name) for name in simulator.kinematic}
     return [port for port in simulator.all_ports() if port.name not in idle]
 
 
@@ -489,7 +490,7 @@ def port_units(port: Port, recording: Recording) -> tuple[str, str]:
     """Return the units of a port's force and position, in series both those of the signal; empty if unknown."""
     if not port.series:
         return port.unit, port.position_unit
-    unit = port.unit or recording.units.get(port.name.partition(":")[2], "")
+    unit = port.unit or recording.units.get(split_port(port.name)[1], "")
     return unit, unit
 
 

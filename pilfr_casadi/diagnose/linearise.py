@@ -23,7 +23,7 @@ from ..data import Recording
 from ..laws import Law, Local
 from ..linear import steady_state_gain, with_output_injection
 from ..models import Model, map_points
-from ..simulators import PARAMETER, Port, Simulator, discretise, signals, states_along, term_function
+from ..simulators import PARAMETER, Port, Simulator, discretise, signals, split_port, states_along, term_function
 from .workbench import FINER_STEPS, Fitted, Workbench
 
 WALL = 1.0  # largest |λ| h of a contact on the finest steps
@@ -364,16 +364,16 @@ def parameter_signals(bench: Workbench, value: float, x: Sequence[np.ndarray], u
 def port_signals(bench: Workbench, fitted: Fitted, port: str) -> Local:
     """Compute the local signals of a port, or of a parameter, along the fitted runs of all recordings."""
     simulator, model = fitted.simulator, fitted.model
-    of_parameter = port.startswith(PARAMETER)
-    index = 0 if of_parameter else [p.name for p in simulator.all_ports()].index(port)
+    kind, of = split_port(port)
+    index = 0 if kind == PARAMETER else [p.name for p in simulator.all_ports()].index(port)
     function, parts = signals(simulator), []
     for r, state in zip(bench.recordings, fitted.initial, strict=True):
         with np.errstate(over="ignore", invalid="ignore"):
             x = states_along(model, model.drive(r), fitted.vector, state)[:: model.substeps, : len(simulator.states)]
             z, dz, *_, own = local_signals(bench, function, x, r, fitted.vector)
         parts.append((z[:, index], dz[:, index], own, x, r.u))
-    if of_parameter:
-        value = float(fitted.values[port.removeprefix(PARAMETER)])
+    if kind == PARAMETER:
+        value = float(fitted.values[of])
         return parameter_signals(bench, value, *zip(*(part[3:] for part in parts), strict=True))
     z, dz, own, x, u = (np.concatenate([part[k] for part in parts]) for k in range(5))
     local = bench.local(z, dz)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..data import Recording
 from ..laws import Law
-from ..simulators import Simulator
+from ..simulators import ACTUATOR, SENSOR, Simulator, kind_of, port_name, split_port
 from .floor import ABOVE_NOISE
 from .gates import (
     CERTAIN_ERRORS,
@@ -100,8 +100,8 @@ class Constant(Gate):
 
 def constant_at(port: str, value: float = 0.0, parameter: str = "") -> Constant:
     """Return the fault that a channel has a constant offset."""
-    kind, name = port.split(":", 1)
-    where, load = ("input", ", or a constant load acts like one") if kind == "actuator" else ("output", "")
+    kind, name = split_port(port)
+    where, load = ("input", ", or a constant load acts like one") if kind == ACTUATOR else ("output", "")
     words = f"The {where} {name} has a constant offset of about {value:.3g}{load}"
     return Constant(name, "offset", value, words, parameter=parameter, port=port)
 
@@ -163,8 +163,8 @@ class VaryingOffset(Gate):
 
     def subtract(self, r: Recording, value: float) -> Recording:
         """Subtract a constant from the channel of a recording."""
-        kind, name = self.port.split(":", 1)
-        side, names = ("u", r.inputs) if kind == "actuator" else ("y", r.outputs)
+        kind, name = split_port(self.port)
+        side, names = ("u", r.inputs) if kind == ACTUATOR else ("y", r.outputs)
         at = np.array([one == name for one in names], dtype=float)
         return r.with_(**{side: getattr(r, side) - value * at})
 
@@ -192,7 +192,7 @@ def _constants_of_each(first: FirstOrder, port: str) -> tuple[float, np.ndarray]
     found[seen] = np.linalg.lstsq(rest[:, seen], first.error, rcond=1e-8)[0]
     left = first.left(first.error)
     share = 1 - np.sum((left - rest @ found) ** 2) / max(left @ left, 1e-300)
-    return float(share), found if port.startswith("actuator") else -found
+    return float(share), found if kind_of(port) == ACTUATOR else -found
 
 
 def find_varying_offset(now: Checked) -> Checked:
@@ -205,7 +205,7 @@ def find_varying_offset(now: Checked) -> Checked:
     first = FirstOrder.of(now.bench, now.fitted)
     found = {port: _constants_of_each(first, port) for port in _channels(now.bench.simulator)}
     likely = sorted(found, key=lambda port: -found[port][0])[:FEW]
-    faults = (VaryingOffset(p.split(":", 1)[1], "offset", (), port=p).at(found[p][1]) for p in likely)
+    faults = (VaryingOffset(split_port(p)[1], "offset", (), port=p).at(found[p][1]) for p in likely)
     settled = [pair for fault in faults if (pair := settle(now, fault)) is not None]
     if not settled:
         return now
@@ -215,7 +215,8 @@ def find_varying_offset(now: Checked) -> Checked:
 
 def _channels(simulator: Simulator) -> list[str]:
     """List the ports of the inputs and outputs that have no element yet."""
-    ports = [f"actuator:{n}" for n in simulator.inputs] + [f"sensor:{n}" for n in simulator.output_names]
+    ports = [port_name(ACTUATOR, n) for n in simulator.inputs]
+    ports += [port_name(SENSOR, n) for n in simulator.output_names]
     return [port for port in ports if port not in {e.port for e in simulator.elements}]
 
 

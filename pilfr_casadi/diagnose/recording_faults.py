@@ -28,6 +28,7 @@ import numpy as np
 
 from ..data import Recording
 from ..laws import AsymmetricSaturation
+from ..simulators import ACTUATOR, SENSOR, port_name
 from .floor import DISTINCT_SHARE
 from .gates import (
     CURED_SHARE,
@@ -177,10 +178,18 @@ def _interpolate_repeats(r: Recording, side: str, column: int) -> Recording:
 
 
 def share_of_repeats(columns: Sequence[np.ndarray]) -> float:
-    """Compute the share of the samples of a channel that repeat the one before; zero if chance or rest explains it."""
+    """Compute the share of the samples of a channel that repeat the one before; zero if chance or rest explains it.
+
+    A stale sample misses the mean of its neighbours by more than others do. A repeat by chance, as of a coarse sensor
+    whose record was resampled, does not.
+    """
     together = np.concatenate(columns)
     step = _smallest_step(together)
-    repeated = float(np.mean(np.concatenate([_find_repeats(v, step) for v in columns])))
+    repeats = [_find_repeats(v, step) for v in columns]
+    repeated = float(np.mean(np.concatenate(repeats)))
+    bends, at = np.concatenate([np.diff(v, 2) for v in columns]), np.concatenate([same[1:-1] for same in repeats])
+    if not np.sum(bends[at] ** 2) * np.sum(~at) > np.sum(bends[~at] ** 2) * np.sum(at):
+        return 0.0
     by_chance = float(np.mean(np.abs(np.concatenate(list(map(np.diff, columns))) - step) < 0.5 * step))
     many = len(np.unique(together)) > DISTINCT_SHARE * len(together)
     return repeated if many and repeated > max(EXCEPTION_SHARE, CHANCE_FACTOR * by_chance) else 0.0
@@ -221,7 +230,7 @@ class Clipping(Gate):
     def apply(self, bench: Workbench) -> Workbench:
         """Return the bench with the simulator's output clipped like the recorded one, so that the rest still counts."""
         law = AsymmetricSaturation().at({"low": max(self.low, -1e300), "high": min(self.high, 1e300)})
-        placed = bench.simulator.with_element(f"sensor:{self.channel}", law)
+        placed = bench.simulator.with_element(port_name(SENSOR, self.channel), law)
         prefix = placed.elements[-1].prefix
         held = {k: replace(p, fixed=True) if k.startswith(prefix) else p for k, p in placed.parameters.items()}
         return replace(bench, simulator=placed.with_parameters(held))
@@ -257,7 +266,7 @@ def _explained_beyond(bench: Workbench, without: Fitted, fault: Clipping) -> flo
     inputs = [r.u[:, fault.column] for r in bench.recordings]
     beyond = [np.column_stack([sign * _beyond_limit(u, v) for v, sign in signs]) for u in inputs]
     left = first.left(first.error)
-    columns = first.left(first.response([f"actuator:{fault.channel}"], beyond))
+    columns = first.left(first.response([port_name(ACTUATOR, fault.channel)], beyond))
     # a positive coefficient would put the input inside its limit
     if np.any(np.linalg.lstsq(columns, left, rcond=1e-8)[0] > 0):
         return 0.0

@@ -17,7 +17,7 @@ from ..data import SAME_STEP, Recording, as_recordings, nrmse
 from ..engine import make_engine
 from ..identify import RUN_AWAY, match_channels, run_free
 from ..models import ParameterSet
-from ..simulators import PARAMETER, Simulator, discretise, in_series, name_at
+from ..simulators import EQUATION, PARAMETER, Simulator, discretise, in_series, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
 from .evidence import BETTER_RATIO, FAR_RATIO, SURE
@@ -544,14 +544,14 @@ class Diagnosis:
 
 def _effect_lines(e: Effect) -> list[str]:
     """Describe an effect with its equation, its numbers, and the laws indistinguishable from it."""
-    if e.port.startswith(PARAMETER):
-        symbols = f"where the change is added to {e.port.removeprefix(PARAMETER)}"
+    kind, of = split_port(e.port)
+    if kind == PARAMETER:
+        symbols = f"where the change is added to {of}"
     elif in_series(e.port):
         symbols = "where u or z is the signal, and w is added to it"
     else:
         local = "v the speed" if re.search(r"\bv\b", e.equation) else "z the local coordinate"
-        kind, _, state = e.port.partition(":")
-        what = f"subtracted from the derivative of {state}" if kind == "equation" and state else "the force"
+        what = f"subtracted from the derivative of {of}" if kind == EQUATION else "the force"
         symbols = f"where w is {what} and {local} at the port"
     lines = [
         f"{name_at(e.port, e.law, e.form)}, confidence {e.confidence:.2f}",

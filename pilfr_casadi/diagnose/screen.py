@@ -27,7 +27,7 @@ import numpy as np
 from .._base import side_by_side
 from ..laws import Creep, Law, Local, PlayHysteresis, Relaxation, StopHysteresis, count_columns, unit_forces
 from ..models import Parameter
-from ..simulators import PARAMETER, Port
+from ..simulators import EQUATION, PARAMETER, SENSOR, Port, kind_of, port_name
 from .linearise import (
     Probe,
     Run,
@@ -198,7 +198,7 @@ def _windows(bench: Workbench, runs: Sequence[Run]) -> list[slice]:
 
 def _tasks(bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list[Run], short: list[Run]) -> list[Task]:
     by_name = {port.name: port for port in bench.simulator.all_ports()}
-    definitions = {f"equation:{state}" for state in bench.simulator.kinematic}
+    definitions = {port_name(EQUATION, state) for state in bench.simulator.kinematic}
     out = []
     for j, (name, local, part) in enumerate(
         zip(probe.ports, locals_of(bench, runs), locals_of(bench, short), strict=True)
@@ -210,7 +210,7 @@ def _tasks(bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list
         pairs = [(law, list(law.shapes(local))) for law in chosen if usable(law, local)]
         if pairs:
             out.append(Task(j, port, local, part, pairs))
-    return sorted(out, key=lambda t: t.port.name.startswith("sensor:"))
+    return sorted(out, key=lambda t: kind_of(t.port.name) == SENSOR)
 
 
 def _parameter_tasks(
@@ -224,7 +224,7 @@ def _parameter_tasks(
         at = probe.model.parameters.position(name).start
         index = int(np.searchsorted(probe.free, at)) - runs[0].n_free
         value = float(probe.values[at])
-        port = bench.simulator.port(f"{PARAMETER}{name}")
+        port = bench.simulator.port(port_name(PARAMETER, name))
         both = [parameter_signals(bench, value, [r.x for r in rs], [r.u for r in rs]) for rs in (runs, short)]
         for signal in dict.fromkeys(law.signal for law in own):
             local, part = (replace(v, z=v.inputs[signal]) if signal else v for v in both)

@@ -32,7 +32,7 @@ from ..laws import (
     scheduled,
     varying,
 )
-from ..simulators import PARAMETER, Placed
+from ..simulators import ACTUATOR, PARAMETER, SENSOR, Placed, kind_of, port_name
 from .evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO
 from .gates import CLEARLY_BETTER
 from .hypotheses import Hypotheses
@@ -286,7 +286,7 @@ class Search(Hypotheses):
             return
         self._record(base, entries, self._fitted(base, entries, gain, float(np.sqrt(self.floor2)), True))
         last = self.best.laws[-1] if self.best.laws else None
-        if last and last.port.startswith(PARAMETER) and last.law.scheduled_by:
+        if last and kind_of(last.port) == PARAMETER and last.law.scheduled_by:
             self._curve(base, [s for s in entries if s.pair == (last.port, type(last.law))], gain)
 
     def _curve(self, base: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> None:
@@ -345,7 +345,7 @@ class Search(Hypotheses):
         Linear time-invariant systems commute (Oppenheim & Willsky 1997, Signals and Systems, sec. 2.3).
         """
         best, names = self.best, self.bench.simulator.output_names
-        filters = [e for e in best.laws if e.port.startswith("actuator:") and (e.law.order or e.law.shifts)]
+        filters = [e for e in best.laws if kind_of(e.port) == ACTUATOR and (e.law.order or e.law.shifts)]
         if len(names) < 2 or len(filters) != 1 or not self.in_time():
             return
         with self.stage("every sensor"):
@@ -353,7 +353,7 @@ class Search(Hypotheses):
             joint = self.beside([e for e in best.laws if e is not source], best)
             simulator, named = joint.fitted.simulator, dict[str, object](joint.fitted.values)
             for name in names:
-                simulator = simulator.with_element(f"sensor:{name}", source.law)
+                simulator = simulator.with_element(port_name(SENSOR, name), source.law)
                 named |= simulator.elements[-1].named(source.own(best.fitted.values))
             found = self.fits.fitted(simulator, [named], len(joint.laws) + len(names), states=joint.fitted.begin)
             if found is not None:

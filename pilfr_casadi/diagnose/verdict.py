@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..simulators import Placed, name_at
+from ..simulators import SENSOR, Placed, name_at, port_name
 from .evidence import (
     AT_NOISE_RATIO,
     BETTER_RATIO,
@@ -247,7 +247,7 @@ def _indistinguishable(search: Hypotheses, best: Trial, element: Placed) -> dict
     own = (element.port, element.law.id)
     rest, out = names(best) - {own}, dict[Name, Trial]()
     least = search.evidence(best) - INDISTINGUISHABLE_NATS
-    every = [f"sensor:{name}" for name in search.bench.simulator.output_names]
+    every = [port_name(SENSOR, name) for name in search.bench.simulator.output_names]
     for t in sorted(search.memo.values(), key=search.evidence, reverse=True):
         other = names(t) - rest
         if search.evidence(t) < least or not rest <= names(t) or own in other or not other:

@@ -365,7 +365,7 @@ def _tried(entry: Tried, local: Local) -> Any:
     return [getattr(local, attribute) * multiple if attribute else multiple for multiple in multiples]
 
 
-GENERAL = ("static_curve", "extra_mode")  # ids of laws that are named by their form
+GENERAL = ("static_curve", "extra_mode", "viscous_damping")  # ids of laws that are named by their form
 
 
 def display_name(law: str, form: str = "") -> str:
@@ -389,11 +389,13 @@ def readable_unit(unit: str, w: str, z: str, signals: Mapping[str, str] | None =
     if unit == "w/z" and w == z:
         return ""
     units = {"w": w or "[w]", "z": z or "[z]", **{f"[{name}]": own for name, own in (signals or {}).items() if own}}
-    parts = []
+    parts = list[str]()
     for token in unit.replace("*", " * ").replace("/", " / ").split():
         base, _, power = token.partition("^")
         known = units.get(base, base)
-        parts.append(f"({known})^{power}" if power and " " in known else known + (f"^{power}" if power else ""))
+        divided = parts[-1:] == ["/"]
+        bracketed = f"({known})" if (power or divided) and {" ", "/", "*"} & set(known) else known
+        parts.append(bracketed + (f"^{power}" if power else ""))
     return "".join(f" {p} " if p == "*" else p for p in parts).strip()
 
 

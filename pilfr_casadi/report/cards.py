@@ -16,7 +16,7 @@ from ..diagnose import Diagnosis
 from ..identify import Comparison, Fit
 from ..laws import display_name
 from ..models import ParameterSet
-from ..simulators import PARAMETER, Simulator, name_at
+from ..simulators import PARAMETER, Simulator, kind_of, name_at
 from .diagnosis_tables import facts, headline, tone
 from .page import Table, number_text, render, status_tone, uncertain_text
 
@@ -138,7 +138,7 @@ def diagnosis_card(diagnosis: Diagnosis) -> str:
             f"{name} = {uncertain_text(p['value'], errors[name])} {p['unit']}".strip()
             for name, p in e.parameters.items()
         ]
-        varies = e.port.startswith(PARAMETER)
+        varies = kind_of(e.port) == PARAMETER
         rows.append(
             [
                 name_at(e.port, e.law, e.form) if varies else display_name(e.form or e.law),

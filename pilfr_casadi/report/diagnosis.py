@@ -26,7 +26,7 @@ from ..diagnose import (
 )
 from ..laws import display_name, readable_unit, strengths_over
 from ..plots import Signal
-from ..simulators import MECHANICAL, PARAMETER, Port, name_at
+from ..simulators import ACTUATOR, MECHANICAL, PARAMETER, SENSOR, Port, kind_of, name_at, split_port
 from . import diagnosis_tables as tables
 from .diagnosis_tables import Action, element_of, measure_action
 from .page import Block, Code, Page, Picture, Section, Table, Text, numbered
@@ -191,7 +191,7 @@ def _hidden_forces(case: _Case) -> list[Block]:
     d, out = case.diagnosis, [block for learned in case.diagnosis.learned for block in _learned_force(case, learned)]
     for e in d.effects:
         if (number := element_of(case.after, e)) is not None:
-            if not e.port.startswith(PARAMETER):  # no force acts there
+            if kind_of(e.port) != PARAMETER:  # no force acts there
                 out += _force_blocks(case, case.after, e.port, number, display_name(e.law))
             out += _strength_pictures(case, number)
     if d.verdict != "unexplained":
@@ -241,7 +241,7 @@ def _local_signals(port: Port, z: np.ndarray, dz: np.ndarray) -> tuple[Signal, S
     """Label a port's local coordinate and its rate; no rate where it is zero throughout."""
     if port.is_speed and port.domain == MECHANICAL:
         return Signal("speed", z, port.across_unit), None
-    channel = port.name.partition(":")[2]
+    channel = split_port(port.name)[1]
     across, unit = channel if port.series and channel else "local coordinate z", port.across_unit
     rate = Signal(f"rate of {across}", dz, f"{unit}/s" if unit else "") if np.ptp(dz) > 0 else None
     return Signal(across, z, unit), rate
@@ -268,8 +268,7 @@ def _force_blocks(case: _Case, fitted: Fitted, port: str, number: int | None, na
 
 def _force_pictures(h: HiddenForce, port: Port, name: str) -> list[Block]:
     """Draw a force over its local coordinate, rate and time, and the rest after subtracting the law."""
-    kind = h.port.partition(":")[0]
-    label = {"actuator": "added to the input", "sensor": "added to the output"}.get(kind, "force w")
+    label = {ACTUATOR: "added to the input", SENSOR: "added to the output"}.get(kind_of(h.port), "force w")
     (x, rate), force = _local_signals(port, h.z, h.dz), Signal(label, h.force, port.unit)
     alt, cloud = f"Recovered force at {h.port}", functools.partial(plots.force_cloud, title=h.port, name=name)
     drawn = [(cloud(x, force, h.law_z, h.law), f"{h.port}, over {x.name}.", f"{alt} over its local coordinate.")]
@@ -305,8 +304,8 @@ def _strength_pictures(case: _Case, number: int) -> list[Block]:
     for name, found in strengths_over(law, values, grid).items():
         unit = readable_unit(law.units[name], port.unit, port.across_unit)
         total, what = found if found.ndim == 1 else found.sum(axis=1), f"{name} of the {name_at(element.port, law.id)}"
-        if element.port.startswith(PARAMETER):
-            name = what = element.port.removeprefix(PARAMETER)
+        if kind_of(element.port) == PARAMETER:
+            name = what = split_port(element.port)[1]
             total = total + float(case.after.values[name])
         drawn = plots.strength_over_signal(signal, Signal(name, total, unit), seen, title=element.port)
         out.append(Picture(drawn, f"How {what} varies with {signal.name}.", f"{what} over {signal.name}."))

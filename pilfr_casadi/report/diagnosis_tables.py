@@ -15,7 +15,7 @@ from ..diagnose import ERROR_NAMES, Diagnosis, Effect, Fitted, Workbench, law_si
 from ..identify import RUN_AWAY
 from ..laws import VaryingParameter, display_name, heated, readable_unit, scaled, scheduled, short_name, varying
 from ..models import Parameter, ParameterSet
-from ..simulators import PARAMETER, name_at
+from ..simulators import PARAMETER, kind_of, name_at
 from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
@@ -53,7 +53,7 @@ def correction_words(diagnosis: Diagnosis) -> str:
 
 def _short_name(e: Effect) -> str:
     """Name an effect without its port; that of a parameter says what varies."""
-    return name_at(e.port, e.law, e.form) if e.port.startswith(PARAMETER) else short_name(e.law, e.form)
+    return name_at(e.port, e.law, e.form) if kind_of(e.port) == PARAMETER else short_name(e.law, e.form)
 
 
 def tone(diagnosis: Diagnosis) -> str:
@@ -377,7 +377,7 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
     if not all(np.all(np.isfinite(v)) for v in (z, dz, w)):
         return None
     largest = f"{number_text(float(np.max(np.abs(w))), 3)}\u00a0{port.unit}".strip()
-    of = "parameter" if port.name.startswith(PARAMETER) else "signal"
+    of = "parameter" if kind_of(port.name) == PARAMETER else "signal"
     what = f"largest change of the {of}" if port.series else "largest force"
     rows = [[what, float(np.max(np.abs(w))), port.unit]]
     unit = readable_unit("w*s/z", port.unit, port.position_unit).replace(" *", "")

@@ -1,12 +1,12 @@
 """The user's equations with ports for missing physics.
 
-`equations` evaluates them with the laws in their ports, and `integration` discretises them to a `Model`. `simulator`
-holds the class `Simulator` and the state in which its laws begin at rest. `domains` infers a port's physical domain.
-`adapters` accept a Python file (`user_file`), a state space or a fitted model in its place. `fmu` wraps a functional
-mock-up unit as a simulator (`fmu_description`, `fmu_instance`), and `mujoco` writes the equations of a MuJoCo model.
-`numpy_function` makes a simulator from a NumPy function: `tracing` calls the function with `symbols` to obtain its
-equations. A function that cannot be traced is called with numbers (`black_box`). `external` lets equations call such a
-program.
+`ports` are the places where laws may stand. `equations` evaluates the equations with the laws in their ports, and
+`integration` discretises them to a `Model`. `simulator` holds the class `Simulator` and the state in which its laws
+begin at rest. `domains` infers a port's physical domain. `adapters` accept a Python file (`user_file`), a state space
+or a fitted model in its place. `fmu` wraps a functional mock-up unit as a simulator (`fmu_description`,
+`fmu_instance`), and `mujoco` writes the equations of a MuJoCo model. `numpy_function` makes a simulator from a NumPy
+function: `tracing` calls the function with `symbols` to obtain its equations. A function that cannot be traced is
+called with numbers (`black_box`). `external` lets equations call such a program.
 """
 
 from typing import TYPE_CHECKING
@@ -26,14 +26,7 @@ if TYPE_CHECKING:
         UNKNOWN as UNKNOWN,
         infer_domain as infer_domain,
     )
-    from .equations import (
-        PARAMETER as PARAMETER,
-        Named as Named,
-        Placed as Placed,
-        Port as Port,
-        in_series as in_series,
-        name_at as name_at,
-    )
+    from .equations import Named as Named
     from .external import (
         PythonFunction as PythonFunction,
         leaves as leaves,
@@ -61,6 +54,19 @@ if TYPE_CHECKING:
     )
     from .mujoco import from_mujoco as from_mujoco
     from .numpy_function import from_function as from_function
+    from .ports import (
+        ACTUATOR as ACTUATOR,
+        EQUATION as EQUATION,
+        PARAMETER as PARAMETER,
+        SENSOR as SENSOR,
+        Placed as Placed,
+        Port as Port,
+        in_series as in_series,
+        kind_of as kind_of,
+        name_at as name_at,
+        port_name as port_name,
+        split_port as split_port,
+    )
     from .simulator import Simulator as Simulator
     from .user_file import user_variable as user_variable
 else:

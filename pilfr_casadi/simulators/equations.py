@@ -10,7 +10,7 @@ actuator or a sensor a law acts in series: it adds `w = law(u) - u` to the signa
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Self, cast
@@ -19,15 +19,24 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, listed
-from ..laws import display_name, short_name
 from ..models import Named, Parameter, ParameterSet
-from .domains import DOMAINS, MECHANICAL, UNKNOWN, common_domain, infer_domain, may_be_speed, may_convert
+from .domains import MECHANICAL, UNKNOWN, common_domain, may_be_speed
+from .ports import (
+    ACTUATOR,
+    BUILT_IN,
+    EQUATION,
+    PARAMETER,
+    SENSOR,
+    Expression,
+    Placed,
+    Port,
+    kind_of,
+    port_name,
+    split_port,
+)
 
-Expression = Callable[..., Any]
 EQUAL_DEPTH = 5  # to which two expressions are compared
 COMPARED_POINTS = 3  # random points at which expressions are compared
-PARAMETER = "parameter:"  # prefix of the port of a parameter, to whose value a law there adds
-BUILT_IN = ("actuator:", "sensor:", "equation:", PARAMETER)  # prefixes of the ports that need no declaration
 
 
 def call(function: Expression, name: str, **available: Any) -> Any:
@@ -53,161 +62,6 @@ def call(function: Expression, name: str, **available: Any) -> Any:
                 "use casadi.if_else, casadi.fmin and casadi.fmax."
             ) from error
         raise InputError(f"The {name} fails: {type(error).__name__}: {error}.") from error
-
-
-@dataclass(frozen=True, eq=False)
-class Port:
-    """A place where physics may be missing.
-
-    Parameters
-    ----------
-    name : str
-        Name in results.
-    into : callable or mapping
-        Where an internal force w enters: `{state: factor}` (added to the state's derivative) or `{output: factor}`; a
-        callable takes any of x, u, p by name. An output that is a state's derivative, such as that of an accelerometer,
-        or that reads one by `dx`, feels the force as well, without an entry of its own.
-    across : callable
-        Local coordinate z, from any of x, u, p.
-    rate : callable, optional
-        dz/dt, from any of x, u, p; by default `across` is differentiated along the dynamics. Where there is no position
-        (a drive without an angle), both are the speed, which friction opposes. That is also the default where a force
-        changes z at once, unless units say that z is no speed.
-    unit, across_unit : str
-        Units of w and of z.
-    signals : mapping of str to callable, optional
-        Further quantities with which the strength of a law here may vary, besides the inputs and z: a load that the
-        contact transmits, a temperature, `{"load": lambda x, u: ca.fabs(u.torque)}`; from any of x, u, p.
-    term : callable, optional
-        Force that the equations have here already, with the sign of w, so that they hold `into * term`: the force of a
-        spring, `lambda z, p: p.k * z`, or minus the torque of a motor, `lambda u: -u.torque`. It takes any of z, dz, x,
-        u, p by name, where z and dz are the local coordinate and its rate. Laws in line with it (a gap, a compliance, a
-        rotor on a spring) are then tried: they give it another z and dz.
-    domain : {"mechanical", "thermal", "electrical", "fluid", "unknown"}, optional
-        Physical domain, which decides what laws are tried; by default inferred from the units.
-
-    Raises
-    ------
-    InputError
-        If an argument has the wrong type, or the domain is not one of these. A simulator refuses a term that its
-        equations hold with the other sign.
-
-    Examples
-    --------
-    >>> Port("mount", into={"vel": -1.0}, across=lambda x: x.pos, unit="N").kinds
-    {'parallel'}
-    """
-
-    name: str
-    into: Any
-    across: Expression
-    rate: Expression | None = None
-    unit: str = ""
-    across_unit: str = ""
-    series: bool = False
-    domain: str = ""
-    signals: Mapping[str, Expression] = field(default_factory=dict)
-    term: Expression | None = None
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name:
-            raise InputError(f"A port's name is {self.name!r}; give a text, such as 'mount'.")
-        what = f"of port {self.name!r}"
-        if not callable(self.into) and not isinstance(self.into, Mapping):
-            raise InputError(f"`into` {what} is {self.into!r}; give {{state or output: factor}} or a function.")
-        for option, wanted in (("across", "lambda x: x.pos"), ("rate", "lambda x: x.vel")):
-            given = getattr(self, option)
-            if not callable(given) and not (option == "rate" and given is None):
-                raise InputError(f"`{option}` {what} is {given!r}; give a function, such as {wanted}.")
-        if self.term is not None and not callable(self.term):
-            raise InputError(f"`term` {what} is {self.term!r}; give a function, such as lambda z, p: p.k * z.")
-        for option in ("unit", "across_unit"):
-            if not isinstance(getattr(self, option), str):
-                raise InputError(f"`{option}` {what} is {getattr(self, option)!r}; give plain text, such as 'N'.")
-        if not isinstance(self.signals, Mapping) or not all(map(callable, self.signals.values())):
-            raise InputError(
-                f"`signals` {what} are {self.signals!r}; give functions by name, {{'load': lambda x: ...}}."
-            )
-        for name in self.signals:
-            if not isinstance(name, str) or not name.isidentifier() or name == "z":
-                raise InputError(f"A signal {what} is named {name!r}; give a name like 'load' (z is the coordinate).")
-        if self.domain not in ("", *DOMAINS, UNKNOWN):
-            raise InputError(f"The domain {what} is {self.domain!r}; give {', '.join(DOMAINS)} or {UNKNOWN}.")
-        object.__setattr__(self, "domain", self.domain or infer_domain(self.unit, self.across_unit))
-
-    @property
-    def kinds(self) -> set[str]:
-        """Kinds of places of a law that it offers: "parallel", "parameter", or "series" and at a sensor "sensor"."""
-        if self.name.startswith(PARAMETER):
-            return {"parameter"}
-        if not self.series:
-            return {"parallel"}
-        return {"series", "sensor"} if self.name.startswith("sensor:") else {"series"}
-
-    @property
-    def is_speed(self) -> bool:
-        """Whether z is a speed, so that there is no position."""
-        return self.rate is not None and self.rate is self.across
-
-    @property
-    def position_unit(self) -> str:
-        """Unit of the position at the port, in which laws are written: that of z, or if z is a speed that of z s."""
-        if not (self.is_speed and self.across_unit):
-            return self.across_unit
-        before, per_second, after = self.across_unit.rpartition("/s")
-        return before if per_second and not after else f"{self.across_unit} s"
-
-    def admits(self, law: Any) -> bool:
-        """Tell whether a law (or its class) may be missing here: by its places, physical domains and coordinate.
-
-        A port of unknown domain admits the laws of all domains, except special ones. Where z is a speed, a law of the
-        position cannot be told; if the domain is unknown, z may be something else, and a law of z alone is admitted.
-        """
-        if self.is_speed and "z" in law.reads() and (self.domain == MECHANICAL or "dz" in law.reads()):
-            return False
-        if law.in_line and self.term is None:
-            return False
-        if not self.kinds & set(law.places) or (law.across and not may_convert(self.across_unit, law.across)):
-            return False
-        return self.domain in law.domains or not (law.special or (law.domains and self.domain != UNKNOWN))
-
-
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """A law in a port, and the prefix of its parameters' names."""
-
-    port: str
-    law: Any
-    prefix: str
-
-    def own(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Extract the law's values by its own names from values by full name."""
-        return {name: values[f"{self.prefix}{name}"] for name in self.law.parameters()}
-
-    def of(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Extract the law's values by full name from all values."""
-        return self.named(self.own(values))
-
-    def named(self, own: Mapping[str, Any]) -> dict[str, Any]:
-        """Give values of the law their full names."""
-        return {f"{self.prefix}{name}": value for name, value in own.items()}
-
-
-def name_at(port: str, law: str, form: str = "", brief: bool = False) -> str:
-    """Name a law in a port by its id and form: "backlash at gear", or "variation of R with temperature".
-
-    A `brief` name has the form only where it says what the law is.
-    """
-    if port.startswith(PARAMETER):
-        _, _, by = form.rpartition("scheduled by ")
-        own = port.removeprefix(PARAMETER)
-        return f"variation of {own}" + (f" with {'time' if by == 't' else by}" if by else "")
-    return f"{(short_name if brief else display_name)(law, form)} at {port}"
-
-
-def in_series(port: str) -> bool:
-    """Tell by its name whether a port belongs to a signal: an actuator or a sensor."""
-    return port.startswith(("actuator:", "sensor:"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -447,9 +301,9 @@ class Equations:
         for port in self.all_ports():
             if port.name == name:
                 return port
-        own = name.removeprefix(PARAMETER)
+        kind, own = split_port(name)
         of_law = any(own.startswith(e.prefix) for e in self.elements)
-        if name.startswith(PARAMETER) and own in self.parameters and not (of_law or self.parameters[own].value.ndim):
+        if kind == PARAMETER and own in self.parameters and not (of_law or self.parameters[own].value.ndim):
             return Port(name, {}, lambda p: p[own], None, self.parameters[own].unit, series=True)
         known = ", ".join(port.name for port in self.all_ports())
         raise InputError(f"There is no port {name!r}; there are {known}.")
@@ -466,8 +320,8 @@ class Equations:
             inner = tuple(replace(port, domain=domain) if port.domain == UNKNOWN else port for port in inner)
         inner = tuple(map(self._with_speed, inner))
         # a voltage is a signal in all domains
-        actuators = (_series("actuator", n, lambda u, n=n: u[n], self.units, domain) for n in self.inputs)
-        sensors = (_series("sensor", n, lambda: 0, self.units, domain) for n in self.output_names)
+        actuators = (_series(ACTUATOR, n, lambda u, n=n: u[n], self.units, domain) for n in self.inputs)
+        sensors = (_series(SENSOR, n, lambda: 0, self.units, domain) for n in self.output_names)
         return (*inner, *actuators, *sensors)
 
     def _equation(self, state: str) -> Port:
@@ -480,7 +334,7 @@ class Equations:
         unit = self.state_units.get(integral, "")
         own = f"{unit}/s" if integral == state else f"{unit}/s^2"
         rate = None if integral == state else lambda x: x[state]
-        return Port(f"equation:{state}", {state: -1.0}, lambda x: x[integral], rate, own if unit else "", unit)
+        return Port(port_name(EQUATION, state), {state: -1.0}, lambda x: x[integral], rate, own if unit else "", unit)
 
     def _with_speed(self, port: Port) -> Port:
         """Mark a port whose z is a speed: a force changes it at once, and units do not deny it."""
@@ -511,7 +365,7 @@ class Equations:
 
         A parameter varies with states as well; an output may have the name of one, in another unit.
         """
-        own = {name: self.state_units.get(name, "") for name in self.states if port.startswith(PARAMETER)}
+        own = {name: self.state_units.get(name, "") for name in self.states if kind_of(port) == PARAMETER}
         return {**self.units, **(recorded or {}), **own}
 
     @cached_property
@@ -575,7 +429,7 @@ class Equations:
 
 def _series(kind: str, name: str, across: Expression, units: Mapping[str, str], domain: str) -> Port:
     unit = units.get(name, "")
-    return Port(f"{kind}:{name}", {}, across, None, unit, unit, series=True, domain=domain)
+    return Port(port_name(kind, name), {}, across, None, unit, unit, series=True, domain=domain)
 
 
 def _at_random_points(function: ca.Function) -> list[np.ndarray]:
@@ -658,9 +512,9 @@ def _checked_ports(given: Any) -> tuple[Port, ...]:
     if len(set(names)) != len(names):
         raise InputError(f"The port names {listed(names)} are not unique; name each port once.")
     for name in names:
-        if name.startswith(BUILT_IN):
+        if kind_of(name):
             raise InputError(
                 f"The port {name!r} is declared with a name that begins like those of the built-in ports "
-                f"({', '.join(BUILT_IN)}), which need no declaration; call it something else."
+                f"({', '.join(f'{kind}:' for kind in BUILT_IN)}), which need no declaration; call it something else."
             )
     return ports

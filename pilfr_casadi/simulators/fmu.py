@@ -28,10 +28,10 @@ import numpy as np
 
 from .._base import InputError, check_known, listed, run_in_worker
 from ..models import Named, Parameter, parameter_within, within_a_factor
-from .equations import Port
 from .external import NOMINAL, ROUNDING, call_external, equal_state, external, keep_leaf
 from .fmu_description import Variable, check_file, describe, tidy
 from .fmu_instance import FmuFile, unpack
+from .ports import Port
 from .simulator import Simulator
 
 COMPARED_POINTS = 8  # at which a trial compares derivatives and outputs with states, and looks at what ports do

@@ -28,7 +28,8 @@ import numpy as np
 from .._base import InputError, one_at_a_time
 from ..data import Recording
 from ..models import Model, accumulate_steps, inject_outputs, map_points, model_functions
-from .equations import PARAMETER, Equations, Named, Placed, Port, call, in_series
+from .equations import Equations, Named, call
+from .ports import ACTUATOR, PARAMETER, SENSOR, Placed, Port, split_port
 
 LARGEST_STEP = 0.25  # largest |λ| h: a phase error of (λh)⁴/120 = 3e-5 of the angle of a cycle
 MOST_SUBSTEPS = 200  # per sample
@@ -107,17 +108,15 @@ class ClosedEquations:
             signals[i] = (z, dz, w)
             return w
 
-        placed = list(enumerate(simulator.elements))
-        for i, e in placed:
-            if e.port.startswith("actuator:"):
-                name = e.port.removeprefix("actuator:")
-                at = simulator.inputs.index(name)
-                u[name] = u[name] + apply(i, u[name], v.slope[at])
+        placed = [(i, e, *split_port(e.port)) for i, e in enumerate(simulator.elements)]
+        for i, _, kind, name in placed:
+            if kind == ACTUATOR:
+                u[name] = u[name] + apply(i, u[name], v.slope[simulator.inputs.index(name)])
         inputs = Named("input", u)
         vector = self.vector
-        for i, e in placed:
-            if e.port.startswith(PARAMETER):
-                own = simulator.parameter_set.position(e.port.removeprefix(PARAMETER))
+        for i, e, kind, name in placed:
+            if kind == PARAMETER:
+                own = simulator.parameter_set.position(name)
                 low, high = (
                     ends[own].item() for ends in (simulator.parameter_set.lower, simulator.parameter_set.upper)
                 )
@@ -130,8 +129,8 @@ class ClosedEquations:
         f = bare = simulator.derivatives(x, inputs, p, t)
         seen, more = dict(x._values), list[tuple[str, Any]]()
         rates = self.local(x_only, ca.vertcat(*u.values()), v.slope, t, vector)[1]
-        for i, e in placed:
-            if in_series(e.port) or e.port.startswith(PARAMETER):
+        for i, e, kind, _ in placed:
+            if kind in (ACTUATOR, SENSOR, PARAMETER):
                 continue
             port = simulator.port(e.port)
             z = simulator.across(port, x, inputs, p, t)
@@ -150,9 +149,8 @@ class ClosedEquations:
         y = simulator.measured(Named("state", seen), inputs, p, t, bare)
         for name, part in more:
             y[name] = y[name] + part
-        for i, e in placed:
-            if e.port.startswith("sensor:"):
-                name = e.port.removeprefix("sensor:")
+        for i, e, kind, name in placed:
+            if kind == SENSOR:
                 y[name] = y[name] + apply(i, y[name], rates[self.rows[e.port]])
         return ca.vertcat(f, *flow), ca.vertcat(*y.values()), ca.vertcat(ca.SX(0, 1), *memory), signals
 
@@ -325,8 +323,8 @@ def signals(simulator: Equations) -> ca.Function:
     own_signals: list[Any] = [ca.SX(0, 1)]
     for port in simulator.all_ports():
         own_signals += simulator.port_signals(port, x, u, p, t).values()
-        here = y[port.name.removeprefix("sensor:")] if port.name.startswith("sensor:") else None
-        z = simulator.across(port, x, u, p, t) if here is None else here
+        kind, of = split_port(port.name)
+        z = y[of] if kind == SENSOR else simulator.across(port, x, u, p, t)
         if port.rate is not None:
             dz = simulator.rate(port, x, u, p, t)
         else:

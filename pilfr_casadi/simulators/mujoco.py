@@ -24,7 +24,7 @@ import numpy as np
 
 from .._base import InputError, check_known, existing_file
 from ..models import Named, Parameter, parameter_within, within_a_factor
-from .equations import Port
+from .ports import Port
 from .simulator import Simulator
 
 POINTS = 8  # at which the equations are compared with MuJoCo

@@ -17,8 +17,9 @@ from .._base import InputError, later
 from ..data import Recording
 from ..laws import readable_unit
 from ..models import Parameter, ParameterSet, accumulate_steps
-from .equations import Equations, Placed
+from .equations import Equations
 from .integration import choose_substeps, discretise
+from .ports import Placed
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -92,6 +92,15 @@ def test_stale_samples_are_interpolated(side, channel):
     assert found.cost < 0.01**2
 
 
+def test_repeats_of_a_coarse_sensor_whose_record_was_resampled_are_not_stale():
+    rng = np.random.default_rng(0)
+    t = np.arange(4000.0)
+    y = np.round(60 * np.sin(0.05 * t) + 20 * np.sin(0.11 * t) + rng.standard_normal(t.size))
+    resampled = np.interp(t, np.sort(t + 0.03 * rng.uniform(-1, 1, t.size)), y)
+    assert np.mean(np.diff(resampled) == 0) > 0.02
+    assert share_of_repeats([resampled]) == 0
+
+
 def test_stale_samples_beside_missing_physics_are_noted():
     (r,) = recordings(laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01}), count=1)
     bench = Workbench.of(rig(OFF), [lost(r, 0.1)], "zero")

@@ -346,7 +346,7 @@ def test_hysteresis_behind_a_gap_keeps_the_gap():
         "models.elements",
         "models.pilfr",
         "models.model",
-        "simulators.equations",
+        "simulators.ports",
         "simulators.simulator",
     ],
 )

@@ -1,0 +1,196 @@
+"""Ports: the places where physics may be missing, and laws placed there.
+
+A port that the user declares has a name of its own. Built-in ports need no declaration. They are named by their kind
+and by what they belong to: `actuator:<input>`, `sensor:<output>`, `equation:<state>`, `parameter:<name>`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from .._base import InputError
+from ..laws import display_name, short_name
+from .domains import DOMAINS, MECHANICAL, UNKNOWN, infer_domain, may_convert
+
+Expression = Callable[..., Any]
+ACTUATOR, SENSOR, EQUATION, PARAMETER = BUILT_IN = ("actuator", "sensor", "equation", "parameter")
+
+
+def port_name(kind: str, of: str) -> str:
+    """Name a built-in port by its kind and the input, output, state or parameter that it belongs to."""
+    return f"{kind}:{of}"
+
+
+def split_port(port: str) -> tuple[str, str]:
+    """Split a port's name into its kind and what it belongs to; the kind of a declared port is empty.
+
+    Examples
+    --------
+    >>> split_port("sensor:x"), split_port("guide")
+    (('sensor', 'x'), ('', 'guide'))
+    """
+    kind, colon, of = port.partition(":")
+    return (kind, of) if colon and kind in BUILT_IN else ("", port)
+
+
+def kind_of(port: str) -> str:
+    """Tell the kind of a port by its name: ACTUATOR, SENSOR, EQUATION, PARAMETER, or "" if it is declared."""
+    return split_port(port)[0]
+
+
+def in_series(port: str) -> bool:
+    """Tell by its name whether a port belongs to a signal: an actuator or a sensor."""
+    return kind_of(port) in (ACTUATOR, SENSOR)
+
+
+def name_at(port: str, law: str, form: str = "", brief: bool = False) -> str:
+    """Name a law in a port by its id and form: "backlash at gear", or "variation of R with temperature".
+
+    A `brief` name has the form only where it says what the law is.
+    """
+    kind, of = split_port(port)
+    if kind == PARAMETER:
+        _, _, by = form.rpartition("scheduled by ")
+        return f"variation of {of}" + (f" with {'time' if by == 't' else by}" if by else "")
+    return f"{(short_name if brief else display_name)(law, form)} at {port}"
+
+
+@dataclass(frozen=True, eq=False)
+class Port:
+    """A place where physics may be missing.
+
+    Parameters
+    ----------
+    name : str
+        Name in results.
+    into : callable or mapping
+        Where an internal force w enters: `{state: factor}` (added to the state's derivative) or `{output: factor}`; a
+        callable takes any of x, u, p by name. An output that is a state's derivative, such as that of an accelerometer,
+        or that reads one by `dx`, feels the force as well, without an entry of its own.
+    across : callable
+        Local coordinate z, from any of x, u, p.
+    rate : callable, optional
+        dz/dt, from any of x, u, p; by default `across` is differentiated along the dynamics. Where there is no position
+        (a drive without an angle), both are the speed, which friction opposes. That is also the default where a force
+        changes z at once, unless units say that z is no speed.
+    unit, across_unit : str
+        Units of w and of z.
+    signals : mapping of str to callable, optional
+        Further quantities with which the strength of a law here may vary, besides the inputs and z: a load that the
+        contact transmits, a temperature, `{"load": lambda x, u: ca.fabs(u.torque)}`; from any of x, u, p.
+    term : callable, optional
+        Force that the equations have here already, with the sign of w, so that they hold `into * term`: the force of a
+        spring, `lambda z, p: p.k * z`, or minus the torque of a motor, `lambda u: -u.torque`. It takes any of z, dz, x,
+        u, p by name, where z and dz are the local coordinate and its rate. Laws in line with it (a gap, a compliance, a
+        rotor on a spring) are then tried: they give it another z and dz.
+    domain : {"mechanical", "thermal", "electrical", "fluid", "unknown"}, optional
+        Physical domain, which decides what laws are tried; by default inferred from the units.
+
+    Raises
+    ------
+    InputError
+        If an argument has the wrong type, or the domain is not one of these. A simulator refuses a term that its
+        equations hold with the other sign.
+
+    Examples
+    --------
+    >>> Port("mount", into={"vel": -1.0}, across=lambda x: x.pos, unit="N").kinds
+    {'parallel'}
+    """
+
+    name: str
+    into: Any
+    across: Expression
+    rate: Expression | None = None
+    unit: str = ""
+    across_unit: str = ""
+    series: bool = False
+    domain: str = ""
+    signals: Mapping[str, Expression] = field(default_factory=dict)
+    term: Expression | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise InputError(f"A port's name is {self.name!r}; give a text, such as 'mount'.")
+        what = f"of port {self.name!r}"
+        if not callable(self.into) and not isinstance(self.into, Mapping):
+            raise InputError(f"`into` {what} is {self.into!r}; give {{state or output: factor}} or a function.")
+        for option, wanted in (("across", "lambda x: x.pos"), ("rate", "lambda x: x.vel")):
+            given = getattr(self, option)
+            if not callable(given) and not (option == "rate" and given is None):
+                raise InputError(f"`{option}` {what} is {given!r}; give a function, such as {wanted}.")
+        if self.term is not None and not callable(self.term):
+            raise InputError(f"`term` {what} is {self.term!r}; give a function, such as lambda z, p: p.k * z.")
+        for option in ("unit", "across_unit"):
+            if not isinstance(getattr(self, option), str):
+                raise InputError(f"`{option}` {what} is {getattr(self, option)!r}; give plain text, such as 'N'.")
+        if not isinstance(self.signals, Mapping) or not all(map(callable, self.signals.values())):
+            raise InputError(
+                f"`signals` {what} are {self.signals!r}; give functions by name, {{'load': lambda x: ...}}."
+            )
+        for name in self.signals:
+            if not isinstance(name, str) or not name.isidentifier() or name == "z":
+                raise InputError(f"A signal {what} is named {name!r}; give a name like 'load' (z is the coordinate).")
+        if self.domain not in ("", *DOMAINS, UNKNOWN):
+            raise InputError(f"The domain {what} is {self.domain!r}; give {', '.join(DOMAINS)} or {UNKNOWN}.")
+        object.__setattr__(self, "domain", self.domain or infer_domain(self.unit, self.across_unit))
+
+    @property
+    def kinds(self) -> set[str]:
+        """Kinds of places of a law that it offers: "parallel", "parameter", or "series" and at a sensor "sensor"."""
+        kind = kind_of(self.name)
+        if kind == PARAMETER:
+            return {"parameter"}
+        if not self.series:
+            return {"parallel"}
+        return {"series", "sensor"} if kind == SENSOR else {"series"}
+
+    @property
+    def is_speed(self) -> bool:
+        """Whether z is a speed, so that there is no position."""
+        return self.rate is not None and self.rate is self.across
+
+    @property
+    def position_unit(self) -> str:
+        """Unit of the position at the port, in which laws are written: that of z, or if z is a speed that of z s."""
+        if not (self.is_speed and self.across_unit):
+            return self.across_unit
+        before, per_second, after = self.across_unit.rpartition("/s")
+        return before if per_second and not after else f"{self.across_unit} s"
+
+    def admits(self, law: Any) -> bool:
+        """Tell whether a law (or its class) may be missing here: by its places, physical domains and coordinate.
+
+        A port of unknown domain admits the laws of all domains, except special ones. Where z is a speed, a law of the
+        position cannot be told; if the domain is unknown, z may be something else, and a law of z alone is admitted.
+        """
+        if self.is_speed and "z" in law.reads() and (self.domain == MECHANICAL or "dz" in law.reads()):
+            return False
+        if law.in_line and self.term is None:
+            return False
+        if not self.kinds & set(law.places) or (law.across and not may_convert(self.across_unit, law.across)):
+            return False
+        return self.domain in law.domains or not (law.special or (law.domains and self.domain != UNKNOWN))
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A law in a port, and the prefix of its parameters' names."""
+
+    port: str
+    law: Any
+    prefix: str
+
+    def own(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Extract the law's values by its own names from values by full name."""
+        return {name: values[f"{self.prefix}{name}"] for name in self.law.parameters()}
+
+    def of(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Extract the law's values by full name from all values."""
+        return self.named(self.own(values))
+
+    def named(self, own: Mapping[str, Any]) -> dict[str, Any]:
+        """Give values of the law their full names."""
+        return {f"{self.prefix}{name}": value for name, value in own.items()}
