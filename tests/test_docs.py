@@ -27,7 +27,6 @@ QUICK = {  # pages of about a second; all others are slow
     f"docs/howto/{name}.md"
     for name in (
         "fixed_parameters",
-        "fmu",
         "friction",
         "hold",
         "known_physics",
@@ -63,6 +62,8 @@ LONG = {
     "own_law",
     "diagnose",
     "identify",
+    "monotone_envelopes",
+    "sparse_weights",
 }  # examples of more than some seconds, as all of the gallery but its quickest
 QUICK_PICTURES = {"plot_06_first_look", "plot_07_operators"}
 COMMAND = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
@@ -202,6 +203,7 @@ def test_links_lead_somewhere(name):
             assert "://" in link or (ROOT / name).parent.joinpath(link).exists(), link
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_python_of_the_readme(folder, script):
     (folder / "readme.py").write_text("\n".join(snippets("python", "README.md")), encoding="utf-8")
     said = script(folder / "readme.py", folder)

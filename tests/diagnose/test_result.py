@@ -32,7 +32,6 @@ def diagnosed():
         laws=LAWS,
         effects=1,
         workers=1,
-        engine="vm",
         progress=lambda *given: reports.append(given),
     )
     return found, test, reports
@@ -57,7 +56,7 @@ def test_a_recording_is_corrected_before_it_is_simulated():
     flipped = [recorded(rig(), s, samples=400) for s in (0, 1)]
     flipped = [r.with_(y=-r.y) for r in flipped]
     found = pilfr.diagnose(
-        rig(430.0, 5.0), flipped[0], test=flipped[1], laws=LAWS[:1], hold="zero", effects=1, workers=1, engine="vm"
+        rig(430.0, 5.0), flipped[0], test=flipped[1], laws=LAWS[:1], hold="zero", effects=1, workers=1
     )
     assert found.verdict == "recording-fault"
     assert found.nrmse(flipped[1]) == pytest.approx(found.errors["test"]["after"], rel=1e-9) and found.errors["test"][
@@ -168,9 +167,7 @@ def test_a_free_vector_parameter_is_diagnosed_to_the_end(tmp_path):
         inputs=("force",),
         parameters={"c": Parameter(np.array([430.0, 5.0]), bounds=(np.array([50.0, 4.5]), np.array([2000.0, 50.0])))},
     )
-    found = pilfr.diagnose(
-        simulator, recorded(rig(), 0, samples=400), laws=LAWS[:1], hold="zero", effects=1, workers=1, engine="vm"
-    )
+    found = pilfr.diagnose(simulator, recorded(rig(), 0, samples=400), laws=LAWS[:1], hold="zero", effects=1, workers=1)
     assert any("c[1] (4.5) came out at its bound" in note for note in found.warnings())
     page = found.report(tmp_path)
     assert "c[1]" in page.read_text() and json.loads((tmp_path / "diagnosis.json").read_text())["parameters"]["c"]

@@ -165,6 +165,7 @@ def test_the_parameter_and_its_signal_are_named(diagnosis):
     assert effect.placebo["own"] > 0.5 > effect.placebo["unrelated"]
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_the_corrected_simulator_is_exported_and_reported(diagnosis, tmp_path):
     """It is an exported step like any other, and the report draws the parameter over its signal."""
     r, step, x = recorded(7, (30, 70)), diagnosis.to_casadi(), None

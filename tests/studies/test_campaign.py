@@ -46,7 +46,8 @@ run["campaign"] = {"time_limit": 10.0}
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, blank_figures):
+    """A prepared folder, for tests that read only the numbers of a campaign."""
     return prepared(tmp_path)
 
 
@@ -82,7 +83,9 @@ def serial(tmp_path_factory):
     return compared(pilfr.run(prepared(tmp_path_factory.mktemp("serial")) / "rig.toml").folder)
 
 
-def test_the_numbers_do_not_depend_on_the_executor(folder, serial):
+def test_the_numbers_do_not_depend_on_the_executor(tmp_path, serial):
+    """Neither do the bytes of the picture, which is drawn here."""
+    folder = prepared(tmp_path)
     own = pilfr.campaign(folder / "rig.toml", out=folder / "own").folder
     with ProcessPoolExecutor(2) as pool:
         given = pilfr.campaign(folder / "rig.toml", out=folder / "given", executor=pool).folder

@@ -17,7 +17,7 @@ from pilfr_casadi.studies import Cell, Manifest, executor, reasons, seeds_advice
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, blank_figures):
     return prepared(tmp_path)
 
 

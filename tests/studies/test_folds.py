@@ -12,7 +12,7 @@ from pilfr_casadi.studies import fold, jobs
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, blank_figures):
     return prepared(tmp_path)
 
 

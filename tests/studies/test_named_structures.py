@@ -25,7 +25,7 @@ max_iterations = 15
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, blank_figures):
     for seed, name in enumerate(("train", "test")):
         write_csv(tmp_path / f"{name}.csv", seed=seed, m=400)
     return tmp_path
@@ -152,7 +152,6 @@ def test_bad_options_get_one_sentence(folder, model, says):
     assert says in str(found.value) and "\n" not in str(found.value)
 
 
-@pytest.mark.usefixtures("blank_figures")
 def test_the_command_line_fits_them_too(capsys, folder):
     data = ("fit", folder / "train.csv", "--inputs", "u", "--outputs", "y", "--initial", "zero", "--starts", 1)
     tested = ("--test", folder / "test.csv", "--out", folder / "out", "--overwrite", "--hidden", 2)

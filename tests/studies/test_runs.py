@@ -44,7 +44,10 @@ def changed(folder, old, new):
     return run_files.changed(folder, (old, new), text=RUN)
 
 
-def test_a_run_gives_the_same_bytes_twice_and_skips_what_is_done(folder):
+@pytest.mark.parametrize("drawn", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_run_gives_the_same_bytes_twice_and_skips_what_is_done(folder, drawn, request):
+    if not drawn:
+        request.getfixturevalue("blank_figures")
     first = pilfr.run(changed(folder, "report = false", "report = true"))
     assert first.done == ("seed-0", "seed-1", "seed-2") and first.skipped == ()
     before = contents(first.folder)
