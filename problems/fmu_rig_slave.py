@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real  # type: ignore[import-untyped]
+from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real
 
 MASSES = (1.2, 0.8)
 STATES = ("pos1", "vel1", "pos2", "vel2")

@@ -247,8 +247,9 @@ class SimulatorOptions(DataOptions):
                     f"{self.train[0]} has no column for any {role} of {path} ({listed(names)}); rename its columns, or "
                     f"say which they are, as in --column {names[0]}=COLUMN."
                 )
-        steps = CoSimulation(self.read(self.train[0], *kept, only_these=True).dt)
-        return from_fmu(path, ports=ports, bounds=bounds, inputs=kept[0], outputs=kept[1], cosimulation=steps)
+        inputs, outputs = kept
+        steps = CoSimulation(self.read(self.train[0], inputs, outputs, only_these=True).dt)
+        return from_fmu(path, ports=ports, bounds=bounds, inputs=inputs, outputs=outputs, cosimulation=steps)
 
 
 def bounds_of(texts: Sequence[str]) -> dict[str, tuple[float, float]]:

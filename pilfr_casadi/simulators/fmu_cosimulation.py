@@ -89,8 +89,9 @@ class SteppedUnit:
             check_known(options.states, candidates, "outputs and local variables", path)
         chosen = tuple(options.states) if options.states is not None else candidates
         for fresh in (False, True):
-            trial = replace(unit, slave=replace(slave, fresh=fresh))
-            if trial := trial._with_states(chosen, options.states is not None):
+            begun = replace(unit, slave=replace(slave, fresh=fresh))
+            trial = begun._with_states(chosen, options.states is not None)
+            if trial is not None:
                 trial._check_memory()
                 return trial
         raise InputError(
@@ -210,9 +211,9 @@ class SteppedEquations:
         self.discrete = found is None
         if found is None:
             sizes = np.concatenate([[1.0], self._sizes[: len(unit.states)], np.ones(len(others))])
-            sizes = NOMINAL * np.concatenate([sizes, self._sizes[len(unit.states) :]])
+            self._nominal = NOMINAL * np.concatenate([sizes, self._sizes[len(unit.states) :]])
             kinds = (self.rows, inputs, tuple(parameters))
-            self._box = BlackBox(self._step, unit.path.name, self.rows, kinds, self._slopes, sizes)
+            self._box = BlackBox(self._step, unit.path.name, self.rows, kinds, self._slopes, self._nominal)
 
     @property
     def note(self) -> str:
@@ -236,8 +237,8 @@ class SteppedEquations:
         for j, name in enumerate(self.parameters, n):
             low, high = self._range(name)
             log = low > 0
-            ends = np.log([low, high]) if log else np.array([low, high])
-            drawn = rng.uniform(*ends, count)
+            first, last = np.log([low, high]) if log else (low, high)
+            drawn = rng.uniform(first, last, count)
             z[:, j] = np.exp(drawn) if log else drawn
         z[:, :n] -= self._start[:n] * np.array([name in self.unit.states for name in self.names[:n]])
         return z
@@ -277,7 +278,7 @@ class SteppedEquations:
 
     def _slopes(self, z: np.ndarray) -> np.ndarray:
         """Differences by x, u and p, in one call."""
-        h = RELATIVE_STEP * np.maximum(np.abs(z), self._box.nominal)[1:]
+        h = RELATIVE_STEP * np.maximum(np.abs(z), self._nominal)[1:]
         points = np.vstack([z, z + np.hstack([np.zeros((len(h), 1)), np.diag(h)])])
         found = self._results(self._reduced(points), self.unit.dt)
         return np.asarray((found[1:] - found[0]).T / h)
