@@ -36,7 +36,7 @@ LAWS = {
 PAIRS = [("ground", "ground"), ("ground", "hysteresis"), ("actuator:force", "actuator:force")]
 
 
-def recorded(true, seed, samples=700, **more):
+def recorded(true, seed, samples=700, noise=NOISE, **more):
     """A simulated recording with white noise, from rest."""
     rng = np.random.default_rng(seed)
     t = np.arange(samples) * DT
@@ -45,7 +45,7 @@ def recorded(true, seed, samples=700, **more):
     blank = Recording(u, np.zeros((samples, len(true.output_names))), DT, ("force",), true.output_names, initial="zero")
     model = Workbench.of(true, [blank.with_(y=rng.standard_normal(blank.y.shape))], "zero").model(true)
     y = make_engine(model, "vm").simulate(model.drive(blank), model.parameters.start, np.zeros(model.n_state))[0]
-    return blank.with_(y=y + NOISE * np.std(y, axis=0) * rng.standard_normal(y.shape), **more)
+    return blank.with_(y=y + noise * np.std(y, axis=0) * rng.standard_normal(y.shape), **more)
 
 
 def as_it_stands(bench, simulator):

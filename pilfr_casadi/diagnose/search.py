@@ -33,7 +33,8 @@ from ..laws import (
     varying,
 )
 from ..simulators import ACTUATOR, PARAMETER, SENSOR, Placed, kind_of, port_name
-from .evidence import AT_NOISE_RATIO, BETTER_RATIO, FAR_RATIO, NEAR_RATIO
+from .evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO
+from .floor import ABOVE_NOISE
 from .gates import CLEARLY_BETTER
 from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
@@ -116,13 +117,13 @@ class Search(Hypotheses):
         An inexact formula can look like one more effect. So it counts only if white noise alone is left.
         """
         base = self.best
-        if not base.laws or not self.in_time():
+        if not base.laws or base.mean_square < ABOVE_NOISE**2 * self.least_noise2 or not self.in_time():
             return
         self.mismatch2, found = base.mean_square, False
         try:
             if self.can_improve(base):
                 self.add(base, again=True)
-            at_noise = self.best.mean_square < AT_NOISE_RATIO**2 * self.least_noise2
+            at_noise = self.best.mean_square < ABOVE_NOISE**2 * self.least_noise2
             found = at_noise and len(self.best.effects) > len(base.effects)
         finally:
             self.mismatch2 = self.mismatch2 if found else None
