@@ -201,9 +201,7 @@ class Check:
                 strength = "{} = {:.2g} {}".format(*r.strength).rstrip() if r.strength else ""
                 rows.append((label, display_name(r.law), f"{r.force:.2g} {r.unit}".rstrip(), share, strength))
             hidden = [r for r in self.laws if r.port == port and r.status != "detectable"]
-            for why in dict.fromkeys(map(_why, hidden)):
-                names = ", ".join(display_name(r.law) for r in hidden if _why(r) == why)
-                rows.append((label, names, f"no: {why}", "", ""))
+            rows += [(label, display_name(r.law), f"no: {_why(r)}", "", "") for r in sorted(hidden, key=_why)]
         columns = ("port", "law", "detectable from (rms)", "share", "strength")
         yield from _table(columns, rows) if rows else ["No law is detectable at any port."]
 

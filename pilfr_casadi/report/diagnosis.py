@@ -145,7 +145,7 @@ def _result(d: Diagnosis, actions: Sequence[Action | None]) -> list[Block]:
         out.append(Text("Refitted within its bounds, the simulator follows the recordings down to the noise."))
     elif d.verdict == "unexplained":
         out.append(
-            Text("No law of the catalogue explains the mismatch. The pictures below show where and how it acts.")
+            Text("No law of the catalogue explains the whole mismatch. The pictures below show where and how it acts.")
         )
     elif d.verdict == "recording-fault":
         out.append(Text("Correct the recordings before you look for missing physics; see the checks above."))
