@@ -212,6 +212,7 @@ def _search(request: Request) -> tuple[Prepared, Search]:
 def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]:
     """Check and correct the recordings, refit the simulator, measure the noise, and search from there."""
     began = time.perf_counter()
+    until = began + SEARCH_SHARE * (request.deadline - began)
     ready = prepare(
         request.simulator,
         request.recordings,
@@ -220,6 +221,7 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         request.workers,
         early=shift_early,
         say=request.say,
+        until=until,
     )
     if request.focus is None:  # an unstable simulator may stay within bounds and still not follow
         ready.bench.check_followed(ready.without, USELESS_FIT)
@@ -233,7 +235,7 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         request.say,
         hold_said=request.hold_said,
         stand_in_error=request.stand_in_error,
-        until=began + SEARCH_SHARE * (request.deadline - began),
+        until=until,
         deadline=request.deadline,
         times={CHECKS: time.perf_counter() - began},
     )

@@ -6,8 +6,10 @@ about the hold: if a fault was found, the other hold goes through all checks as 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -68,10 +70,12 @@ def prepare(
     workers: int = 1,
     early: bool = True,
     say: Stages | None = None,
+    until: float = np.inf,
 ) -> Prepared:
     """Correct faults of the recordings, refit from the user's values, and measure the noise.
 
-    Without `early`, an early channel counts as a fault only where nothing else is wrong.
+    Without `early`, an early channel counts as a fault only where nothing else is wrong. No check begins after `until`
+    (a time of `time.perf_counter`).
     """
     say = say or Stages(lambda *_: None)
     say(CHECKS, 0, CHECKED)
@@ -85,7 +89,7 @@ def prepare(
         bench, held = _choose_hold(bench)
     nominal = errors_of(bench, bench.model(simulator), whole=True)
     say(CHECKS, 1, CHECKED)
-    checks = _Checks(gates, workers, early, say)
+    checks = _Checks(gates, workers, early, say, until)
     now = checks.run(bench, 1.0 if said else 0.5)
     if not said and any(g.fault for g in now.gates[len(gates) :]):  # on faulty data the better hold says nothing
         now, held = _with_better_hold(checks, now, bench, held)
@@ -107,6 +111,7 @@ class _Checks:
     workers: int
     early: bool
     say: Stages
+    until: float
 
     def run(self, bench: Workbench, part: float) -> Checked:
         """Refit, and correct one fault after the other; `part` is the unit of shifts in samples, see `timing`."""
@@ -119,10 +124,16 @@ class _Checks:
                 starts = [found.fitted.values, {}]
                 found = found.then(bench, bench.fit(bench.simulator, starts, solver=THOROUGH))
             now = found
-        now = find_gaps(mend_stale_samples(unclip(self._report(3, now))))
+        now = self._in_time(self._report(3, now), unclip, mend_stale_samples, find_gaps)
         now = now.then(*refine_steps(now.bench, self._report(4, now).fitted))
-        now = find_output_gaps(find_time_shift(now, part, self.early))
-        return find_offsets(self._report(5, now))
+        now = self._in_time(now, partial(find_time_shift, part=part, early=self.early), find_output_gaps)
+        return self._in_time(self._report(5, now), find_offsets)
+
+    def _in_time(self, now: Checked, *checks: Callable[[Checked], Checked]) -> Checked:
+        """Carry out checks one after the other until the time is over."""
+        for check in checks:
+            now = check(now) if time.perf_counter() < self.until else now
+        return now
 
     def _report(self, done: int, now: Checked) -> Checked:
         self.say(CHECKS, done, CHECKED, now.cost**0.5)

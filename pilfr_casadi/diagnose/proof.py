@@ -51,8 +51,8 @@ def errors_of(bench: Workbench, model: Model, starts: Sequence[np.ndarray] = (),
 def starts_of(fitted: Fitted) -> list[np.ndarray]:
     """Return further initial states to try: that of the first training recording.
 
-    From rest alone a search may end in a wrong minimum, as beside a contact. A learned element is uncertain at rest, out
-    of its range, and gets those of all recordings.
+    From rest alone a search may end in a wrong minimum, as beside a contact. A learned element is uncertain at rest,
+    out of its range, and gets those of all recordings.
     """
     learned = any(e.law.id == "learned" for e in fitted.simulator.elements)
     return fitted.initial if learned else fitted.initial[:1]
