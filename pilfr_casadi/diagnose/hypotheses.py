@@ -86,8 +86,6 @@ class Hypotheses:
         Samples of the best residual over its correlation time.
     until : float
         Time (of `time.perf_counter`) at which the search ends.
-    deadline : float
-        Time at which the diagnosis has to end.
     out_of_time : bool
         Whether the time limit ended the search.
     mismatch2 : float, optional
@@ -103,7 +101,6 @@ class Hypotheses:
     hold_said: bool = True
     stand_in_error: float = 0.0
     until: float = np.inf
-    deadline: float = np.inf
     memo: dict[Key, Trial] = field(default_factory=dict)
     alternatives: dict[str, tuple[Law, ...]] = field(default_factory=dict)
     findings: defaultdict[Key, Findings] = field(default_factory=lambda: defaultdict(Findings))
@@ -116,7 +113,7 @@ class Hypotheses:
     @cached_property
     def fits(self) -> Trials:
         """Fits of hypotheses, with the bench, workers and time limit of the search."""
-        return Trials(self.bench, self.workers, self.until, self.deadline)
+        return Trials(self.bench, self.workers, self.until)
 
     @property
     def samples(self) -> float:
@@ -288,7 +285,7 @@ class Hypotheses:
     @property
     def past_deadline(self) -> bool:
         """Whether the time for the whole diagnosis is over."""
-        return time.perf_counter() > self.deadline
+        return time.perf_counter() > self.bench.deadline
 
     def in_time(self) -> bool:
         """Tell whether there is time for more; if not, note that in the result."""

@@ -225,7 +225,8 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
     )
     if request.focus is None:  # an unstable simulator may stay within bounds and still not follow
         ready.bench.check_followed(ready.without, USELESS_FIT)
-    ready = replace(ready, floor=_noise(request, ready))
+    bench = replace(ready.bench, deadline=request.deadline)
+    ready = replace(ready, bench=bench, floor=_noise(request, ready))
     search = Search(
         ready.bench,
         ready.without,
@@ -236,7 +237,6 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         hold_said=request.hold_said,
         stand_in_error=request.stand_in_error,
         until=until,
-        deadline=request.deadline,
         times={CHECKS: time.perf_counter() - began},
     )
     return ready, search.run(request.most_effects)

@@ -75,7 +75,7 @@ def prepare(
     """Correct faults of the recordings, refit from the user's values, and measure the noise.
 
     Without `early`, an early channel counts as a fault only where nothing else is wrong. No check begins after `until`
-    (a time of `time.perf_counter`).
+    (a time of `time.perf_counter`), and the fits of checks end then.
     """
     say = say or Stages(lambda *_: None)
     say(CHECKS, 0, CHECKED)
@@ -116,11 +116,13 @@ class _Checks:
     def run(self, bench: Workbench, part: float) -> Checked:
         """Refit, and correct one fault after the other; `part` is the unit of shifts in samples, see `timing`."""
         now = self._report(2, find_wrong_start(Checked(bench, refitted(bench), self.gates)))
-        bench = now.bench
+        bench = replace(now.bench, deadline=self.until)  # the first refit is carried out in any case
+        now = replace(now, bench=bench)
         if now.cost > max(NEAR_NOISE_RATIO**2 * now.noise2, CHECKED_ABOVE):
             found = self._slips(now, part)
             if len(found.gates) > len(now.gates):
-                bench = Workbench.of(bench.simulator, found.bench.recordings, bench.hold, bench.engine)
+                fresh = Workbench.of(bench.simulator, found.bench.recordings, bench.hold, bench.engine)
+                bench = replace(fresh, deadline=bench.deadline)
                 starts = [found.fitted.values, {}]
                 found = found.then(bench, bench.fit(bench.simulator, starts, solver=THOROUGH))
             now = found

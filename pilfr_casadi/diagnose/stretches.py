@@ -335,7 +335,7 @@ class Everything:
 
 def _seconds_left(search: Search) -> float:
     """Return the seconds until the deadline of a search; none after an interrupt."""
-    return 0.0 if search.interrupted else search.deadline - time.perf_counter()
+    return 0.0 if search.interrupted else search.bench.deadline - time.perf_counter()
 
 
 def back_on_stretches(bench: Workbench, fitted: Fitted, states: Sequence[np.ndarray]) -> Fitted:

@@ -19,7 +19,6 @@ import numpy as np
 from .._base import InputError
 from ..data import Recording
 from ..laws import Law
-from ..optimise import GaussNewton
 from ..simulators import Placed, Simulator
 from .evidence import FAR_RATIO, FORMULA_ERROR
 from .gates import open_start
@@ -137,22 +136,17 @@ class Trial:
 class Trials:
     """Fits of hypotheses to the recordings of a bench, in parallel.
 
-    No fit begins after `until`, and all end at the `deadline` (times of `time.perf_counter`).
+    No fit begins after `until` (a time of `time.perf_counter`), and all end at the deadline of the bench.
     """
 
     bench: Workbench
     workers: int
     until: float = np.inf
-    deadline: float = np.inf
 
     @property
     def over(self) -> bool:
         """Whether the time limit has passed."""
         return time.perf_counter() > self.until
-
-    def in_time(self, solver: GaussNewton) -> GaussNewton:
-        """Return a solver that ends at the deadline."""
-        return replace(solver, time_limit=self.deadline - time.perf_counter())
 
     @functools.cached_property
     def part(self) -> Workbench:
@@ -169,7 +163,7 @@ class Trials:
         """
         part = self.part
         try:
-            found = part.fit(simulator, starts, **{**options, "solver": self.in_time(options.get("solver", QUICK))})
+            found = part.fit(simulator, starts, **options)
         except InputError:
             return None
         return self.make_trial(found, count)
@@ -190,12 +184,12 @@ class Trials:
         starts, states = knee_starts(trial.fitted, trial.knee), trial.fitted.initial
         try:
             if len(starts) > 1:
-                quick = bench.fit(placed, starts, states=states, solver=self.in_time(QUICK), model=model, engine=engine)
+                quick = bench.fit(placed, starts, states=states, solver=QUICK, model=model, engine=engine)
                 starts, states = [quick.values], quick.initial
-            fitted = bench.fit(placed, starts, states=states, solver=self.in_time(THOROUGH), model=model, engine=engine)
+            fitted = bench.fit(placed, starts, states=states, solver=THOROUGH, model=model, engine=engine)
         except InputError:
             return replace(trial, mean_square=np.inf, thorough=True)
-        if trial.knee and time.perf_counter() < self.deadline:
+        if trial.knee and time.perf_counter() < bench.deadline:
             fitted = refit_on_finer_steps(bench, fitted, trial.knee)
         return Trial(fitted.last_elements(len(trial.laws)), fitted, fitted.cost, fitted.cost, thorough=True)
 

@@ -9,6 +9,7 @@ steps. The cost then has spurious minima, and no other term of a law should make
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -147,6 +148,7 @@ class Workbench:
     typical: tuple[np.ndarray, np.ndarray] | None = None  # states and inputs along the refitted run
     chosen: int = 1  # sub-steps first chosen for the simulator, on which limits are based
     interrupted_fits: list[Status] = field(default_factory=list)  # one entry for each fit that an interrupt has ended
+    deadline: float = np.inf  # time (of `time.perf_counter`) at which every fit ends
 
     @classmethod
     def of(cls, simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str = "auto") -> Workbench:
@@ -240,7 +242,11 @@ class Workbench:
             return self._run_fixed(simulator, model, engine)
         best: tuple[float, np.ndarray, Problem, Status] | None = None
         for start in starts:
-            found = self._run(simulator, model, engine, start, states, tuple(anneal), solver)
+            left = self.deadline - time.perf_counter()
+            if best is not None and left < 0:
+                break
+            timed = replace(solver, time_limit=min(solver.time_limit, left))
+            found = self._run(simulator, model, engine, start, states, tuple(anneal), timed)
             if found is not None and (best is None or found[0] < best[0]):
                 best = found
         if best is None:
