@@ -117,7 +117,8 @@ class Search(Hypotheses):
         An inexact formula can look like one more effect. So it counts only if white noise alone is left.
         """
         base = self.best
-        if not base.laws or base.mean_square < ABOVE_NOISE**2 * self.least_noise2 or not self.in_time():
+        below_noise = base.mean_square < ABOVE_NOISE**2 * self.least_noise2
+        if not base.laws or below_noise or base.mean_square > self.floor2 + self.tolerance or not self.in_time():
             return
         self.mismatch2, found = base.mean_square, False
         try:
