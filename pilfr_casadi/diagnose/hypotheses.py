@@ -19,6 +19,7 @@ from .evidence import (
     CONTENDING_NATS,
     EFFECT_PRIOR,
     FORMULA_ERROR,
+    INDISTINGUISHABLE_NATS,
     LARGE_MODEL_ERROR,
     LOUDEST_NOISE,
     WRONG_MODEL_SAMPLES,
@@ -182,17 +183,22 @@ class Hypotheses:
     def held_out(self, trial: Trial) -> HeldOut:
         """Compute the held-out errors of a hypothesis, once.
 
-        If it follows no better than with fewer laws, it is the same model, and predicts as that does.
+        If it follows no better than with fewer laws, the others do nothing, and it predicts as without them.
         """
-        known = self.findings[trial.key]
-        if known.held_out is None:
-            fewer = [t for t in self.memo.values() if t.key < trial.key]
-            same = [t for t in fewer if t.thorough and t.mean_square < EQUAL_COSTS * trial.mean_square]
-            if same:
-                known.held_out = self.held_out(min(same, key=lambda t: len(t.key)))
-            else:
-                known.held_out = self.held_out_errors(trial.fitted, self.spread(trial.fitted, trial.laws))
-        return known.held_out
+        known = self.findings[trial.key].held_out
+        if known is None:
+            alike = [t for t in self.memo.values() if t.key < trial.key and t.thorough and self._alike(t, trial)]
+            shown = min([*alike, trial], key=lambda t: len(t.key))
+            known = self.findings[shown.key].held_out
+            known = known or self.held_out_errors(shown.fitted, self.spread(shown.fitted, shown.laws))
+            self.findings[shown.key].held_out = self.findings[trial.key].held_out = known
+        return known
+
+    def _alike(self, one: Trial, other: Trial) -> bool:
+        """Tell whether two hypotheses follow the recordings so alike that these do not distinguish them."""
+        ratio = one.mean_square / max(other.mean_square, 1e-300)
+        nats = 0.5 * self.sample.effective(0.0) * np.log(ratio)
+        return bool(ratio < EQUAL_COSTS and nats < INDISTINGUISHABLE_NATS)
 
     def held_out_errors(self, fitted: Fitted, spread: float) -> HeldOut:
         """Compute the held-out errors of a fitted simulator with a known spread for other inputs."""

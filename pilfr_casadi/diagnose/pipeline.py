@@ -238,6 +238,7 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         stand_in_error=request.stand_in_error,
         until=until,
         times={CHECKS: time.perf_counter() - began},
+        out_of_time=time.perf_counter() > until,  # then checks were left out
     )
     return ready, search.run(request.most_effects)
 
@@ -255,7 +256,9 @@ def _noise(request: Request, ready: Prepared) -> Floor:
 def _concluded(search: Search, gates: Sequence[Gate]) -> Conclusion:
     """Draw the conclusion; after an interrupt, draw it without further fits."""
     with search.until_interrupted(), search.stage("conclusion"):
-        return conclude(search, gates)
+        found = conclude(search, gates)
+        search.out_of_time = search.out_of_time or search.past_deadline
+        return found
     return conclude(search, gates)
 
 

@@ -57,6 +57,7 @@ ROUNDING = 1e-6  # relative rounding of distances, far above what occurs
 LONGEST_REST = 5  # longest rest of an encoder or a machine, in samples
 LARGEST_MOTION = 5  # largest motion of an encoder in a sample, in steps
 MOST_LEFT = 0.5  # largest share of the mismatch left by what an input may have been beyond its limit, a guess
+ON_STEP = 1e-3  # distance from a step of a coarse sensor, over the step, that rounding makes at most
 CHANCE_FACTOR = 3.0  # factor on the number of repeats that noise causes
 
 TONE_LINES = 5  # spectral lines on either side that may belong to a tone
@@ -180,16 +181,18 @@ def _interpolate_repeats(r: Recording, side: str, column: int) -> Recording:
 def share_of_repeats(columns: Sequence[np.ndarray]) -> float:
     """Compute the share of the samples of a channel that repeat the one before; zero if chance or rest explains it.
 
-    A stale sample misses the mean of its neighbours by more than others do. A repeat by chance, as of a coarse sensor
-    whose record was resampled, does not.
+    Of a coarse sensor whose record was resampled, repeats lie on its steps, and most other samples between them.
     """
     together = np.concatenate(columns)
     step = _smallest_step(together)
-    repeats = [_find_repeats(v, step) for v in columns]
-    repeated = float(np.mean(np.concatenate(repeats)))
-    bends, at = np.concatenate([np.diff(v, 2) for v in columns]), np.concatenate([same[1:-1] for same in repeats])
-    if not np.sum(bends[at] ** 2) * np.sum(~at) > np.sum(bends[~at] ** 2) * np.sum(at):
-        return 0.0
+    same = np.concatenate([_find_repeats(v, step) for v in columns])
+    repeated = float(np.mean(same))
+    coarse = _smallest_step(together[same])
+    if np.isfinite(coarse):
+        steps = (together - together[same][0]) / coarse
+        on_steps = np.abs(steps - np.round(steps)) < ON_STEP
+        if np.all(on_steps[same]) and np.mean(on_steps[~same]) < DISTINCT_SHARE:
+            return 0.0
     by_chance = float(np.mean(np.abs(np.concatenate(list(map(np.diff, columns))) - step) < 0.5 * step))
     many = len(np.unique(together)) > DISTINCT_SHARE * len(together)
     return repeated if many and repeated > max(EXCEPTION_SHARE, CHANCE_FACTOR * by_chance) else 0.0

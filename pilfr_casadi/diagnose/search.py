@@ -114,12 +114,13 @@ class Search(Hypotheses):
     def _grow_to_noise(self) -> None:
         """Add a law for a rest as small as the formula error of the laws before it.
 
-        An inexact formula can look like one more effect. So it counts only if white noise alone is left.
+        An inexact formula can look like one more effect. So it counts only if what is left can be white noise.
         """
         base = self.best
         below_noise = base.mean_square < ABOVE_NOISE**2 * self.least_noise2
         if not base.laws or below_noise or base.mean_square > self.floor2 + self.tolerance or not self.in_time():
             return
+        noise = self.floor, self.count
         self.mismatch2, found = base.mean_square, False
         try:
             if self.can_improve(base):
@@ -127,9 +128,10 @@ class Search(Hypotheses):
             at_noise = self.best.mean_square < ABOVE_NOISE**2 * self.least_noise2
             found = at_noise and len(self.best.effects) > len(base.effects)
         finally:
-            self.mismatch2 = self.mismatch2 if found else None
-        if not found:
-            self.estimate_noise()
+            if not found:
+                self.mismatch2, (self.floor, self.count) = None, noise
+        if found:  # other laws may stand beside the new one in place of those before
+            self.exchange()
 
     def _name_rest(self, effects: float) -> bool:
         """Name what is left beside the simulator, the best hypothesis, and that without its weakest effect.

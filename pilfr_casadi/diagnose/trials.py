@@ -246,14 +246,14 @@ class Trials:
         first, base = entries[0], parent.fitted
         placed, _ = place_law(base.simulator, first, first.starts[0])
         model, engine = self.bench.compile(placed, gain)
-        own = self.bench.simulator.parameters
+        users = self.bench.simulator.parameters
         # the refit may have bent the term in line with which the law stands, to make up for it
-        reset = self.bench.simulator.term_parameters(first.port) if first.law.in_line else tuple(own)
-        nominal = {**base.values, **{name: own[name].value for name in reset}}
+        reset = self.bench.simulator.term_parameters(first.port) if first.law.in_line else tuple(users)
+        nominal = {**base.values, **{name: users[name].value for name in reset}}
         starts: list[Mapping[str, Any]] = []
         # values from the observer's run, which may be near the truth if the simulation is not
         observed: list[Mapping[str, Any]] = []
-        given: list[Mapping[str, Any]] = []  # with the user's own values of the simulator's parameters
+        given: list[Mapping[str, Any]] = []  # with the user's own values of the parameters
         for entry in entries:
             for i, own in enumerate(entry.starts):
                 _, named = place_law(base.simulator, entry, own)

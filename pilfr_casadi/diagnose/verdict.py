@@ -399,9 +399,10 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
             else ""
         )
         noise = search.least_floor.nrmse(search.bench.scale)
+        least = "at least" if search.floor.source == "estimated" else "about"
         return (
             "Physics is missing, and no law of the catalogue explains it. The refitted simulator is off by "
-            f"{100 * mean_nrmse(search.bench, root.fitted):.3g} % of the outputs' deviation; the noise is at least "
+            f"{100 * mean_nrmse(search.bench, root.fitted):.3g} % of the outputs' deviation; the noise is {least} "
             f"{100 * noise:.3g} %.{at}{rings}"
         )
     port = where if shares.get(laws[0].port, 0.0) < 0.5 * share else laws[0].port

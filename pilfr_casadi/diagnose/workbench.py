@@ -242,11 +242,9 @@ class Workbench:
             return self._run_fixed(simulator, model, engine)
         best: tuple[float, np.ndarray, Problem, Status] | None = None
         for start in starts:
-            left = self.deadline - time.perf_counter()
-            if best is not None and left < 0:
+            if best is not None and time.perf_counter() > self.deadline:
                 break
-            timed = replace(solver, time_limit=min(solver.time_limit, left))
-            found = self._run(simulator, model, engine, start, states, tuple(anneal), timed)
+            found = self._run(simulator, model, engine, start, states, tuple(anneal), solver)
             if found is not None and (best is None or found[0] < best[0]):
                 best = found
         if best is None:
@@ -332,8 +330,9 @@ class Workbench:
                     return None
                 continue
             try:
+                timed = replace(solver, time_limit=min(solver.time_limit, self.deadline - time.perf_counter()))
                 with np.errstate(all="ignore"):
-                    solution = solve_within_bounds(problem, theta, solver)
+                    solution = solve_within_bounds(problem, theta, timed)
             except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
                 continue
             status = solution.status

@@ -139,7 +139,7 @@ class SteppedUnit:
         rows = np.tile(z, (1 + len(kept), 1))
         rows[1:, : len(kept)] += np.diag(np.maximum(np.abs(z[: len(kept)]), NOMINAL))
         found, _ = unit.steps(unit.set_names, rows, self.dt, read)
-        moved = np.any(np.abs(found[1:] - found[0]) > 0, axis=1)
+        moved = np.any(np.abs(found[1:] - found[0]) > REPEATED * np.abs(found[0]), axis=1)
         return replace(unit, states=tuple(n for n, m in zip(kept, moved, strict=True) if m)) if np.any(moved) else None
 
     @property
@@ -220,7 +220,15 @@ class SteppedEquations:
         """How the equations came about."""
         if self.discrete:
             return f"steps of {self.unit.dt:g} s; {self._box.note}"
-        return f"{self.unit.path.name}: equations found from its steps; it is not called any more"
+        return (
+            f"{self.unit.path.name}: equations found from its steps, at states and inputs up to ten times their "
+            "nominal size (1 where the file gives none); it is not called any more"
+        )
+
+    @property
+    def dt(self) -> float | None:
+        """Interval of the steps, s; None if equations were found."""
+        return self.unit.dt if self.discrete else None
 
     def _range(self, name: str) -> tuple[float, float]:
         """Give the values of a parameter at which equations are looked for."""
@@ -315,12 +323,17 @@ class SteppedEquations:
     def measured(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
         """Evaluate the outputs by name."""
         found = {} if all(n in self.states for n in self.outputs) else self._evaluate(x, u._values, p)
-        return {n: x[n] if n in self.states else found[n] for n in self.outputs}
+        return {n: x[n] + self._start_of(n) if n in self.states else found[n] for n in self.outputs}
+
+    def _start_of(self, state: str) -> float:
+        """Start value from which a state counts; an output that is kept as a state counts from zero."""
+        return self.unit.begin[state] if state in self.unit.states else 0.0
 
     def signal(self, port: str, key: str, name: str) -> Callable[..., Any]:
         """Make a local signal of a port."""
         if name in self.states:
-            return lambda x: x[name]
+            start = self._start_of(name)
+            return lambda x: x[name] + start
         if name in self.others:
             return lambda x, u, p: self._evaluate(x, u._values, p)[name]
         known = listed([*self.unit.outputs, *(n for n in self.unit.states if n not in self.unit.outputs)])

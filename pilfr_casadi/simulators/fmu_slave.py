@@ -13,6 +13,7 @@ import itertools
 import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,10 @@ class Slave:
         if importlib.util.find_spec("fmpy") is None:
             raise InputError(f"{self.path} is for co-simulation, which needs FMPy; pip install 'pilfr-casadi[fmu]'.")
 
+    @cached_property
+    def _unpacked(self) -> tuple[Path, str]:
+        return unpack(self.path)
+
     def steps(
         self, references: Sequence[int], values: np.ndarray, h: np.ndarray, read: Sequence[int]
     ) -> tuple[np.ndarray, str]:
@@ -61,7 +66,7 @@ class Slave:
         -------
         array, (K, len(read)), NaN where a step failed; and the first failure, empty without one
         """
-        folder, key = unpack(self.path)
+        folder, key = self._unpacked
         job = self, folder, tuple(references), values, h, tuple(read)
         limit = CALL_SECONDS + STEP_SECONDS * len(h)
         reply = run_in_worker(_SERVE, pickle.dumps(job), limit, key)

@@ -26,7 +26,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, one_at_a_time
-from ..data import Recording
+from ..data import SAME_STEP, Recording
 from ..models import Model, accumulate_steps, inject_outputs, map_points, model_functions
 from .equations import Equations, Named, call
 from .ports import ACTUATOR, PARAMETER, SENSOR, Placed, Port, split_port
@@ -176,6 +176,9 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
     `hold` says whether inputs are held between samples ("zero") or interpolated ("linear"); `substeps` counts the
     Runge-Kutta steps per sample (`choose_substeps`).
     """
+    own = getattr(simulator.dynamics, "dt", None)  # of a program that steps by itself
+    if own is not None and abs(own / dt - 1) > SAME_STEP:
+        raise InputError(f"The simulator goes in steps of {own:g} s, the recordings in {dt:g} s; give both one step.")
     simulator = on_grid(simulator, dt / substeps)
     step = _SubStep(simulator, dt / substeps, hold)
     x, s, u0, u1, t, moved = step.x, step.s, step.u0, step.u1, step.t, step.moved

@@ -2,8 +2,8 @@
 
 The candidates are all products of at most `HIGHEST` arguments, and of reciprocals of those that are never zero (masses,
 time constants). Least squares at random points give their coefficients; terms that matter nowhere are left out, as in
-sparse identification (Brunton, Proctor & Kutz 2016, PNAS 113), but without noise: the equations are exact or are
-refused. At other points, whose sizes span decades, they must agree with the program.
+sparse identification (Brunton, Proctor & Kutz 2016, PNAS 113), but without noise: at other points, whose sizes span
+decades, the equations must agree with the program to six digits.
 """
 
 from __future__ import annotations
@@ -83,6 +83,7 @@ def _fit(columns: np.ndarray, values: np.ndarray) -> np.ndarray | None:
     if not np.all(np.isfinite(values)):
         return None
     size = np.max(np.abs(columns), axis=0)
+    size[size == 0] = 1.0
     first = np.linalg.lstsq(columns / size, values, rcond=None)[0]
     out = np.zeros_like(first)
     for i, row in enumerate(first.T):

@@ -116,12 +116,12 @@ def test_after_the_deadline_and_ctrl_c_the_correction_fits_nothing_more(monkeypa
 
     monkeypatch.setattr(Trials, "polish", lambda self, trial: fitted.append(trial) or polish(self, trial))
     monkeypatch.setattr(correction, "refit_learned", refit)
-    found.deadline, answer = 0.0, posterior(found)
+    found.bench, answer = replace(found.bench, deadline=0.0), posterior(found)
     correction.find_correction(found, answer)
     unsure = replace(answer, effects=tuple(replace(e, confidence=0.4) for e in answer.effects))
     assert correction.find_correction(found, unsure, named=True)[0].elements  # no comparison has refuted the name
     assert not fitted
-    found.deadline, found.interrupted = np.inf, True
+    found.bench, found.interrupted = replace(found.bench, deadline=np.inf), True
     with monkeypatch.context() as patch:  # after Ctrl-C not even the parts that a comparison needs
         patch.setattr(type(found), "held_out_errors", lambda *_: pytest.fail("a comparison after Ctrl-C"))
         assert correction.find_correction(found, unsure, named=True)[0].elements

@@ -67,8 +67,8 @@ self.pos += h * self.vel
 PORT = {"pivot": {"into": "push", "across": "pos", "rate": "vel"}}
 
 
-def swing(u, g=9.0, friction=0.0):
-    pos, vel, found = 0.0, 0.0, []
+def swing(u, g=9.0, friction=0.0, pos=0.0):
+    vel, found = 0.0, []
     for torque in u:
         found.append(pos)
         vel += DT * (torque - g * np.sin(pos) - friction * np.tanh(vel / 0.5))
@@ -117,6 +117,16 @@ def test_a_unit_without_such_equations_is_stepped(built):
     assert np.abs(rubbed - swing(given.u[:, 0], friction=1.0)).max() <= 1e-9
     again = cloudpickle.loads(cloudpickle.dumps(unit))
     assert np.array_equal(again.simulate(given), unit.simulate(given))
+    with pytest.raises(InputError, match=r"steps of 0\.01 s, the recordings in 0\.02 s"):
+        unit.simulate(given.with_(dt=2 * DT))
+
+
+def test_outputs_count_from_zero_where_states_begin_elsewhere(built):
+    unit = from_fmu(
+        built(SWING, STATES + "\n        self.pos = 0.3"), ports=PORT, outputs=("pos",), cosimulation=CoSimulation(DT)
+    )
+    given = pulled()
+    assert np.abs(unit.simulate(given) - swing(given.u[:, 0], pos=0.3)).max() <= 1e-12
 
 
 @pytest.mark.parametrize("end", ["os.abort()", "raise ValueError"])
