@@ -180,8 +180,9 @@ def posterior(search: Hypotheses) -> Posterior:
             break
         said = fewer
     named = share_named(explainable_remainder(search, best), strained(search, best))
-    effects = tuple(replace(e, confidence=_named_beside(search, best, e) * e.confidence) for e in found)
-    return Posterior(best, named, effects, by_names.get(frozenset(), 0.0))
+    effects = (replace(e, confidence=_named_beside(search, best, e) * e.confidence) for e in found)
+    strongest_first = sorted(effects, key=lambda e: -(_without(search, best, e) or search.root).mean_square)
+    return Posterior(best, named, tuple(strongest_first), by_names.get(frozenset(), 0.0))
 
 
 def _named_beside(search: Hypotheses, best: Trial, effect: NamedEffect) -> float:
@@ -190,10 +191,15 @@ def _named_beside(search: Hypotheses, best: Trial, effect: NamedEffect) -> float
     Its own mismatch is what the others leave without it. A small effect may only make up for the formula of a large
     one, and so it has to explain its part as well as that one does.
     """
+    remainder = explainable_remainder(search, best, _without(search, best, effect))
+    return share_named(remainder, strained(search, best))
+
+
+def _without(search: Hypotheses, best: Trial, effect: NamedEffect) -> Trial | None:
+    """Return the hypothesis without one of several effects, if it was fitted."""
     others = names(best) - {effect.name}
-    without = [t for t in search.memo.values() if names(t) == others] if others else []
-    before = min(without, key=lambda t: t.mean_square, default=None)
-    return share_named(explainable_remainder(search, best, before), strained(search, best))
+    fitted = [t for t in search.memo.values() if names(t) == others] if others else []
+    return min(fitted, key=lambda t: t.mean_square, default=None)
 
 
 def strained(search: Hypotheses, trial: Trial) -> bool:
