@@ -14,7 +14,7 @@ from .._base import InputError, in_words
 from ..data import Recording
 from ..identify import surrogate_warning
 from ..laws import readable_unit
-from ..simulators import name_at
+from ..simulators import name_at, split_port
 from .arguments import Request
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction
@@ -243,7 +243,7 @@ def _effect(
     port = bench.simulator.port(element.port)
     w_unit, z_unit = port_units(port, bench.recordings[0])
     if port.series and not w_unit:  # in the unit of its signal, such as [force]
-        w_unit = z_unit = f"[{port.name.partition(':')[2]}]"
+        w_unit = z_unit = f"[{split_port(port.name)[1]}]"
     values = {k: v for k, v in fitted.values.items() if k.startswith(element.prefix)}
     signals = bench.simulator.signal_units(port.name, bench.recordings[0].units)
     shown: dict[str, dict[str, Any]] = {}

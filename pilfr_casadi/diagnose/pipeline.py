@@ -129,6 +129,7 @@ def diagnose_in_steps(
     final = _final_fits(request, ready, search, found, everything)
     with deferred_interrupt(again=False) as pressed:
         built = build_diagnosis(request, ready, search, found, final, tests, limits, began)
+    search.bench = replace(search.bench, deadline=np.inf)  # fits that a user asks for later, as by `refine`, have time
     return replace(built, interrupted=built.interrupted or bool(pressed))
 
 

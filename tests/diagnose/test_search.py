@@ -74,6 +74,7 @@ def test_at_the_time_limit_the_search_answers_from_what_it_has():
     assert found.out_of_time and list(found.memo) == [frozenset()]
     (r,) = rubbing()
     diagnosis = pilfr.diagnose(rig(OFF), r.slice(0, 800), laws=TRIED, time_limit=1e-3)
+    assert diagnosis.evidence["search"].bench.deadline == np.inf  # what is fitted later, as by `refine`, has time
     assert "The time limit ended the search" in str(diagnosis)
     with pytest.raises(pilfr.InputError, match="time_limit=0 was given"):
         pilfr.diagnose(rig(OFF), r, time_limit=0)
