@@ -89,8 +89,7 @@ class Gate:
         """Return the bench with changed recordings; errors are in units of the outputs' new deviation."""
         recordings = tuple(self.change(r) if self.change else r for r in bench.recordings)
         if recordings[0].dt != bench.dt:
-            fresh = Workbench.of(bench.simulator, recordings, bench.hold, bench.engine)
-            return replace(fresh, deadline=bench.deadline)
+            return bench.renewed(recordings)
         scale = np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
         return replace(bench, recordings=recordings, scale=scale)
 

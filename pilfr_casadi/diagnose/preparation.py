@@ -121,8 +121,7 @@ class _Checks:
         if now.cost > max(NEAR_NOISE_RATIO**2 * now.noise2, CHECKED_ABOVE):
             found = self._slips(now, part)
             if len(found.gates) > len(now.gates):
-                fresh = Workbench.of(bench.simulator, found.bench.recordings, bench.hold, bench.engine)
-                bench = replace(fresh, deadline=bench.deadline)
+                bench = bench.renewed(found.bench.recordings)
                 starts = [found.fitted.values, {}]
                 found = found.then(bench, bench.fit(bench.simulator, starts, solver=THOROUGH))
             now = found

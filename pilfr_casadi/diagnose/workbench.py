@@ -175,6 +175,10 @@ class Workbench:
         """Return the bench with other recordings; errors stay in units of the training outputs' deviation."""
         return replace(self, recordings=tuple(match_channels(self.simulator, r) for r in recordings))
 
+    def renewed(self, recordings: Sequence[Recording]) -> Workbench:
+        """Return a bench for other recordings, with sub-steps and the unit of errors chosen for them."""
+        return replace(Workbench.of(self.simulator, recordings, self.hold, self.engine), deadline=self.deadline)
+
     @one_at_a_time
     def model(self, simulator: Simulator, gain: np.ndarray | None = None) -> Model:
         """Discretise a simulator, with output injection if a gain is given."""

@@ -127,6 +127,11 @@ class Local:
         return max(self.lengths) * self.dt
 
 
+def size_to_power(z: Any, n: Any, least: float = 1e-12) -> Any:
+    """Compute |z|^n as exp(n log |z|), whose derivatives need no further power; |z| counts as at least `least`."""
+    return ca.exp(n * ca.log(ca.fabs(z) + least))
+
+
 # an attribute of `Local` ("" for none) and its multiples, or the values as a function of it
 Tried = tuple[Any, ...] | Callable[[Local], Any]
 

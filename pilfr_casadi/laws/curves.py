@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from ..models import Parameter
-from .base import Law, Local
+from .base import Law, Local, size_to_power
 
 LINEAR_POWER = 0.03  # difference of a power from one, below which it is a gain
 NARROW_RANGE = 0.05  # half the range over its middle, below which any curve is a gain and an offset
@@ -86,7 +86,7 @@ class Rectified(Polynomial):
     two_sided = True  # on one side alone it is a power
 
     def force(self, z: Any, p: Any) -> Any:
-        return (ca.fabs(z) + 1e-12) ** p.n + p.b - z
+        return size_to_power(z, p.n) + p.b - z
 
 
 class Power(Polynomial):
@@ -101,7 +101,7 @@ class Power(Polynomial):
     ranges = {"n": ("", 0.3, 5.0)}
 
     def force(self, z: Any, p: Any) -> Any:
-        return p.a * ca.sign(z) * (ca.fabs(z) + 1e-12) ** p.n
+        return p.a * ca.sign(z) * size_to_power(z, p.n)
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether the power is one, which makes it a gain, as from a wrong unit."""
@@ -272,7 +272,7 @@ class GradualSaturation(Saturation):
     ranges = {"L": ("reach", 0.1, 20), "n": ("", 0.7, 12.0)}
 
     def force(self, z: Any, p: Any) -> Any:
-        return z / (1 + (ca.fabs(z / p.L) + 1e-9) ** p.n) ** (1 / p.n) - z
+        return z * ca.exp(-ca.log(1 + size_to_power(z / p.L, p.n, 1e-9)) / p.n) - z
 
 
 class SkewSaturation(AsymmetricSaturation):

@@ -20,7 +20,7 @@ import numpy as np
 
 from .._base import InputError
 from ..models import Parameter, play
-from .base import Law, Local
+from .base import Law, Local, size_to_power
 
 PARTS = 4  # parts into which a step of a held signal is divided
 THIN_LOOPS = 0.1  # ratio of the loops' width to the bend beside them, below which a fit is a curve without memory
@@ -205,7 +205,7 @@ class BoucWen(Law):
 
     def flow(self, dz: Any, q: Any, p: Any) -> Any:
         """Rate of the hysteretic displacement q, which exceeds q_0 only where a step is too long."""
-        size = (ca.fmin(ca.fabs(q / p["q_0"]), 1) + 1e-9) ** p["n"]
+        size = size_to_power(ca.fmin(ca.fabs(q / p["q_0"]), 1), p["n"], 1e-9)
         return dz * (1 - (1 - p["s"]) * size) - p["s"] * ca.fabs(dz) * ca.sign(q) * size
 
 

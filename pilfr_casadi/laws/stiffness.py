@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .base import Law, Local, contact_onset
+from .base import Law, Local, contact_onset, size_to_power
 
 LEAST_PERIODS = 2.0  # within the motion, from which a force counts as periodic
 
@@ -62,7 +62,7 @@ class PowerStiffness(CubicStiffness):
     ranges = {"n": ("", 1.7, 6.0)}
 
     def force(self, z: Any, p: Any) -> Any:
-        return p.k_n * ca.sign(z) * (ca.fabs(z) + 1e-12) ** p.n
+        return p.k_n * ca.sign(z) * size_to_power(z, p.n)
 
 
 class GeometricStiffness(CubicStiffness):

@@ -6,7 +6,7 @@ from typing import Any
 
 import casadi as ca
 
-from .base import Law, Local
+from .base import Law, Local, size_to_power
 
 ROOM = 293.0  # temperature of the surroundings that is tried first, K
 COLDEST = 150.0  # K, below which a temperature is taken for a difference and not for an absolute one
@@ -65,4 +65,4 @@ class Convection(Law):
     ranges = {"n": ("", 1.1, 1.5)}
 
     def force(self, z: Any, p: Any) -> Any:
-        return p.h * ca.sign(z) * (ca.fabs(z) + 1e-12) ** p.n
+        return p.h * ca.sign(z) * size_to_power(z, p.n)
