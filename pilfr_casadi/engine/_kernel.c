@@ -73,9 +73,11 @@ static void rows(double *out, long ld, int n_rows, const table_t *table, const d
 int pilfr_simulate(const model_t *m, long length, const double *u, const double *p, double *state, double *y, double *z,
                    double *w) {
     const int n = m->n_x + m->n_s;
-    double *work = malloc(sizeof(double) * (m->sz_w + n + 2 * m->n_z + m->n_y + m->n_fixed + 1));
+    const int n_c = m->at_computed - m->at_c;
+    double *work = malloc(sizeof(double) * (m->sz_w + n + 2 * m->n_z + m->n_y + m->n_fixed + 1 + n_c));
     if (!work) return 1;
     double *next = work + m->sz_w, *z_k = next + n, *w_k = z_k + m->n_z, *y_k = w_k + m->n_z, *fixed = y_k + m->n_y;
+    double *stages = fixed + m->n_fixed + 1;
     const double *arg[SLOTS];
     double *res[SLOTS];
     long long iw[SLOTS];
@@ -86,7 +88,7 @@ int pilfr_simulate(const model_t *m, long length, const double *u, const double 
         const int kept = k % m->stride == 0;
         const long i = k / m->stride;
         res[0] = next; res[1] = next + m->n_x; res[2] = kept ? y + i * m->n_y : y_k;
-        res[3] = z && kept ? z + i * m->n_z : z_k; res[4] = w && kept ? w + i * m->n_z : w_k; res[5] = 0;
+        res[3] = z && kept ? z + i * m->n_z : z_k; res[4] = w && kept ? w + i * m->n_z : w_k; res[5] = stages;
         m->step(arg, res, iw, work, 0);
         memcpy(state, next, sizeof(double) * n);
     }

@@ -22,6 +22,7 @@ import functools
 import hashlib
 import os
 import platform
+import re
 import shutil
 import stat
 import subprocess
@@ -43,6 +44,12 @@ from .sensitivities import BLOCKS, TARGETS, Engine, Linearization, VirtualMachin
 
 _SOURCES = {"x": 0, "s": 1, "z": 2, "w": 3}
 _VALUES = ("constant", "p", "fixed", "u", "x", "s", "z", "w", "c", "computed")
+
+
+# what generated code tells the outside, and how it tests for absent arguments and results
+ENTRY = re.compile(r"CASADI_SYMBOL_EXPORT int pilfr_\w+\(const casadi_real\*\* arg")
+ABSENT_ARGUMENT = re.compile(r"arg\[(\d+)\]\? arg\[\1\]\[(\d+)\] : 0")
+ABSENT_RESULT = re.compile(r"if \(res\[\d+\]!=0\) ")
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,9 +149,26 @@ def source_code(linear: Linearization) -> str:
     entries["keeps"] = str(int(linear.partial.sparsity_out(BLOCKS.index(("s", "s"))).is_diag()))
     model = ", ".join(f".{name} = {value}" for name, value in entries.items())
     lines = [_text("_kernel.h"), *lines, f"const model_t pilfr_model = {{{model}}};\n"]
+    generated = _without_descriptions(generated)
     if not calls_external(linear.step):
-        return "\n".join([generated, *lines])
+        return "\n".join([_with_all_arguments(generated), *lines])
     return "\n".join([_text("_external.h"), fill_gaps(generated), *lines])
+
+
+def _without_descriptions(generated: str) -> str:
+    """Drop what nobody calls, such as CasADi's description of each function: a third of the compiler's work."""
+    kept, depth = list[str](), 0  # braces that are open in a dropped definition
+    for line in generated.splitlines():
+        if depth or (line.startswith("CASADI_SYMBOL_EXPORT ") and not ENTRY.match(line)):
+            depth += line.count("{") - line.count("}")
+        else:
+            kept.append(line)
+    return "\n".join(kept)
+
+
+def _with_all_arguments(generated: str) -> str:
+    """Drop the tests for absent arguments and results: the loops give all of them."""
+    return ABSENT_RESULT.sub("", ABSENT_ARGUMENT.sub(r"arg[\1][\2]", generated))
 
 
 def _entries(linear: Linearization, code: _Code, target: str) -> Iterator[tuple[str, int, int, int]]:
@@ -201,8 +225,8 @@ def _table(name: str, kind: str, starts: str, rows: list[list[str]]) -> tuple[st
 # without fused multiply-adds the generated step gives the bits of the virtual machine, so the same operators slip
 COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
 COMPILER_FLAGS = (("-march=native", *COMMON), COMMON)  # the second if the compiler refuses the first
-# optimising long straight-line code takes seconds and gains nothing, unlike the loops; the code tests every output for
-# being wanted, and GCC needs minutes to thread thousands of such jumps
+# optimising long straight-line code takes seconds and gains nothing, unlike the loops; code that calls other programs
+# tests every output for being wanted, and GCC needs minutes to thread thousands of such jumps
 PLAIN, LOOPS = ("-O1", "-fno-thread-jumps"), ("-O2",)
 KEPT_LIBRARIES = 40  # libraries in each of the cache's 256 folders: some hundred megabytes
 COMPILATION_SECONDS = 600.0  # seconds for one compilation

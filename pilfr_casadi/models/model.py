@@ -130,27 +130,27 @@ class Model:
             )
         return self.rest_at(given, recording.u[0], self.parameters.start)
 
-    @property
+    @cached_property
     def n_x(self) -> int:
         """States without memory; see `n_state`."""
         return int(self.step.size1_in(0))
 
-    @property
+    @cached_property
     def n_u(self) -> int:
         """Columns that the step reads: the inputs, unless `reads` says otherwise."""
         return int(self.step.size1_in(1))
 
-    @property
+    @cached_property
     def n_w(self) -> int:
         """Channels of the port."""
         return int(self.step.size1_in(2))
 
-    @property
+    @cached_property
     def n_y(self) -> int:
         """Outputs."""
         return int(self.step.size1_out(1))
 
-    @property
+    @cached_property
     def n_s(self) -> int:
         """Memory states of the element."""
         return int(self.memory.size1_in(1))
