@@ -29,7 +29,7 @@ from .result import Diagnosis, Effect
 from .search import Search
 from .trials import Trial
 from .verdict import NamedEffect, Verdict, names
-from .workbench import DIVERGED, Fitted, Workbench
+from .workbench import Fitted, Workbench
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,11 +225,9 @@ def _without_each_effect(search: Search, found: Conclusion) -> dict[NamedEffect,
         return {}
     joint, out = Trial(laws, found.fitted, found.fitted.cost, found.fitted.cost), dict[NamedEffect, Fitted]()
     for effect in found.effects:
-        rest = search.beside([e for e in laws if (e.port, e.law.id) != effect.name], joint)
-        if rest.mean_square < DIVERGED:
-            search.keep(rest)
-            with suppress(InputError):  # it diverges without the effect
-                out[effect] = search.thorough(rest).fitted
+        element = next(e for e in laws if (e.port, e.law.id) == effect.name)
+        if (rest := search.leave_out(joint, element)) is not None:
+            out[effect] = rest.fitted
     return out
 
 

@@ -34,7 +34,7 @@ from .evidence import (
 from .floor import FEWEST, Floor, effective_size, white_part
 from .screen import Scored, flexible_shares, screen
 from .trials import EQUAL_COSTS, Key, Trial, Trials
-from .workbench import Fitted, Workbench
+from .workbench import DIVERGED, Fitted, Workbench
 
 MOST_PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
 
@@ -349,6 +349,21 @@ class Hypotheses:
         bench = replace(self.bench, at_least=max(self.bench.at_least, joint.fitted.model.substeps))
         fitted = bench.run(simulator, named, joint.fitted.begin)
         return Trial(fitted.last_elements(len(laws)), fitted, fitted.cost, fitted.cost)
+
+    def leave_out(self, joint: Trial, element: Placed) -> Trial | None:
+        """Fit a hypothesis without one of its laws to convergence, once; None if it diverges or there is no time.
+
+        A law that was found only beside another one may do without it.
+        """
+        rest = self.beside([e for e in joint.laws if e is not element], joint)
+        if not rest.mean_square < DIVERGED:
+            return None
+        known = self.memo.get(rest.key)
+        as_fine = known is not None and known.fitted.model.substeps >= rest.fitted.model.substeps
+        converged = known is not None and known.thorough and as_fine and known.mean_square <= rest.mean_square
+        if not converged and not self.past_deadline:
+            self.keep(self.fits.polish(rest))
+        return self.memo.get(rest.key)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

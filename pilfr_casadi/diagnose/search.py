@@ -42,7 +42,7 @@ from .linearise import linearised
 from .relatives import choose_pairs, complements, fit_pair, relatives
 from .screen import Remainder, Scored, screen, usable
 from .trials import Trial, place_law
-from .workbench import DIVERGED, FEW, THOROUGH, Fitted
+from .workbench import FEW, THOROUGH, Fitted
 
 # Effort
 MOST_CONVERGED = 5  # trials of a step that are fitted to convergence at most
@@ -80,6 +80,7 @@ class Search(Hypotheses):
                 if len(self.best.effects) < effects:
                     self._grow_to_noise()
                 self._every_sensor()
+                self._leave_out_each()
                 self.judge_on_held_out_data()
         if self.interrupted:
             self.forget_held_out()
@@ -330,23 +331,23 @@ class Search(Hypotheses):
         for _ in range(FEW):
             best = self.best
             for element in best.effects if len(best.effects) > 1 else ():
-                rest = self.beside([e for e in best.laws if e is not element], best)
-                if not rest.mean_square < DIVERGED:
+                rest = self.leave_out(best, element)
+                if rest is None or not self.in_time():
                     continue
-                if self.in_time() and not self._expanded(rest):
-                    self.keep(rest)
+                # laws that were added at a far larger error were added in a wrong minimum
+                if not self._expanded(rest, FAR_RATIO if self.can_improve(self.best) else np.inf):
                     self.add(rest, again=True)
-                known = self.memo.get(rest.key)  # a law that was found only beside another one may do without it
-                as_fine = known is not None and known.fitted.model.substeps >= rest.fitted.model.substeps
-                converged = known is not None and known.thorough and as_fine and known.mean_square <= rest.mean_square
-                if not converged and not self.past_deadline:
-                    self.keep(self.fits.polish(rest))
-                    found = self.memo[rest.key]
-                    wrong = not self._expanded(found, FAR_RATIO)  # it had been in a wrong minimum
-                    if wrong and self.can_improve(self.best) and self.in_time():
-                        self.add(found, again=True)
             if self.best.key == best.key:
                 return
+
+    def _leave_out_each(self) -> None:
+        """Fit the best hypothesis without each of its effects, because a later effect can make an earlier one idle."""
+        with self.stage("without each effect"):
+            while len((best := self.best).effects) > 1 and not self.past_deadline:
+                for element in best.effects:
+                    self.leave_out(best, element)
+                if self.best.key == best.key:
+                    return
 
     def _expanded(self, trial: Trial, ratio: float = np.inf) -> bool:
         """Tell whether laws were added to a hypothesis, at an error of at most `ratio` times the present one."""

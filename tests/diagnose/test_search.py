@@ -106,6 +106,17 @@ def test_a_law_found_only_beside_another_one_may_do_without_it():
     assert found.best.key == single.key and found.best.mean_square < 0.1 * single.mean_square
 
 
+def test_an_effect_that_a_later_one_has_made_idle_is_left_out():
+    found = searching(rubbing(), until=0.0).run(0)
+    placed = rig(OFF)
+    for law in (laws.CubicStiffness().at({"k_3": 1.0}), FRICTION):
+        placed = placed.with_element("ground-m1", law)
+    found.keep(found.fits.make_trial(found.bench.fit(placed), 2))
+    assert len(found.best.laws) == 2
+    found.run(0)
+    assert [e.law.id for e in found.best.laws] == ["coulomb_friction"]
+
+
 def test_after_the_deadline_and_ctrl_c_the_correction_fits_nothing_more(monkeypatch):
     found = searching(rubbing()).run(1)
     found.memo = {key: replace(t, thorough=False) for key, t in found.memo.items()}
