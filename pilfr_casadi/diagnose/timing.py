@@ -21,7 +21,6 @@ from .gates import (
     CLEARLY_BETTER,
     EQUAL_RATIO,
     NEAR_NOISE_RATIO,
-    POOR_FIT,
     Checked,
     FirstOrder,
     Gate,
@@ -37,6 +36,7 @@ SHIFTS = np.union1d(np.arange(-64.0, 65.0), np.linspace(-2.0, 2.0, 17))  # sampl
 RATES = np.concatenate([-np.geomspace(1e-4, 0.05, 28)[::-1], np.geomspace(1e-4, 0.05, 28)])
 WHOLE_SHIFT = 0.12  # distance in samples within which a shift counts as whole
 LONG_SHIFT = 4.5  # shift in samples above which a whole shift is a fault of the recording
+MOST_SCREENED, MOST_SHIFTS = 4, 2  # faults that refits confirm, and shifts of one channel among them
 AVERAGED_NOISE = 0.5  # largest share of a channel's noise that interpolation between its samples removes
 
 _Curve = Callable[[np.ndarray], np.ndarray]  # a signal over time
@@ -66,9 +66,7 @@ class TimeShift(Gate):
         Samples from before the recording are skipped, samples from behind it are cut off. Without `cut`, the end values
         are held. A periodic recording wraps around. `curves` are those of the recording where they are known.
         """
-        change = self.value if self.kind == "y" else -self.value
-        at = r.t + change if self.finding == "alignment" else r.t * (1 + change)
-        wraps = self._wraps(r)
+        at, wraps = self._times(r), self._wraps(r)
         values = np.array(getattr(r, self.kind))
         for i, curve in zip(self.columns, curves or self.curves(r), strict=True):
             values[:, i] = curve(at)
@@ -81,6 +79,16 @@ class TimeShift(Gate):
         if early:
             other = other.with_(skip=min(max(r.skip, early), len(r) - 2))
         return other.slice(0, max(len(r) - late, other.skip + 2)) if late else other
+
+    def _times(self, r: Recording) -> np.ndarray:
+        """Return the times (M,) at which the channel is read."""
+        change = self.value if self.kind == "y" else -self.value
+        return r.t + change if self.finding == "alignment" else r.t * (1 + change)
+
+    def _recorded(self, r: Recording) -> np.ndarray:
+        """Mark the samples (M,) that are read inside the recording; elsewhere the end values are held."""
+        at = self._times(r)
+        return np.full(len(r), True) if self._wraps(r) else (at >= 0) & (at <= r.t[-1] + 1e-9 * r.dt)
 
     def _wraps(self, r: Recording) -> bool:
         return bool(r.period) and len(r) % (r.period or 1) == 0 and self.finding == "alignment"
@@ -102,9 +110,11 @@ class TimeShift(Gate):
             moved = self.at(value, bench.dt)
             others = [moved.read(r, False, own) for r, own in zip(bench.recordings, curves, strict=True)]
             runs = as_recorded or list(map(simulate, others, fitted.initial))
-            pairs = zip(runs, others, strict=True)
-            error = np.concatenate([((y - other.y) / bench.scale)[other.skip :].ravel() for y, other in pairs])
-            mean = float(np.mean(first.left(error) ** 2))
+            known = [moved._recorded(r)[:, None] for r in bench.recordings]
+            pairs = zip(runs, others, known, strict=True)
+            error = [np.where(k, (y - other.y) / bench.scale, 0.0)[other.skip :].ravel() for y, other, k in pairs]
+            count = len(bench.scale) * sum(int(np.sum(k[r.skip :])) for k, r in zip(known, others, strict=True))
+            mean = float(np.sum(first.left(np.concatenate(error)) ** 2)) / max(count, 1)
             return mean if np.isfinite(mean) else np.inf
 
         curves = list(map(self.curves, bench.recordings))
@@ -206,7 +216,10 @@ def run_as_given(bench: Workbench, plain: Fitted) -> Fitted:
 
 
 def _screen_shifts(bench: Workbench, plain: Fitted) -> list[TimeShift]:
-    """List the shifts and clock rates that clearly reduce the remainder, best first, three at most."""
+    """List the shifts and clock rates that clearly reduce the remainder, best first, a few at most.
+
+    A shift can lead the refit into a wrong minimum; so they are also sought along the run at the user's values.
+    """
     outputs, inputs = bench.simulator.output_names, bench.simulator.inputs
     channels: list[tuple[str, tuple[int, ...], str]] = [("y", (i,), name) for i, name in enumerate(outputs)]
     if len(outputs) > 1:
@@ -214,7 +227,7 @@ def _screen_shifts(bench: Workbench, plain: Fitted) -> list[TimeShift]:
     if len(inputs) > 1:
         channels += [("u", (i,), name) for i, name in enumerate(inputs)]
     found = list[tuple[float, TimeShift]]()
-    for reference in [plain] if plain.cost < POOR_FIT else [plain, run_as_given(bench, plain)]:
+    for reference in (plain, run_as_given(bench, plain)):
         first = FirstOrder.of(bench, reference)
         for kind, columns, name in channels:
             for finding, values in (("alignment", bench.dt * SHIFTS), ("clock", RATES)):
@@ -227,7 +240,10 @@ def _screen_shifts(bench: Workbench, plain: Fitted) -> list[TimeShift]:
                     value, share = _minimise(left, values[max(k - 1, 0)], values[min(k + 1, len(values) - 1)])
                 if share < CLEARLY_BETTER * left(0.0):
                     found.append((share / left(0.0), fault.at(value, bench.dt)))
-    best = dict[tuple[str, str], TimeShift]()
+    best = list[TimeShift]()
     for _, fault in sorted(found, key=lambda pair: pair[0]):
-        best.setdefault((fault.channel, fault.finding), fault)
-    return list(best.values())[:3]
+        known = [b.value for b in best if (b.channel, b.finding) == (fault.channel, fault.finding)]
+        apart = bench.dt if fault.finding == "alignment" else np.inf
+        if all(abs(fault.value - value) > apart for value in known) and len(known) < MOST_SHIFTS:
+            best.append(fault)
+    return best[:MOST_SCREENED]

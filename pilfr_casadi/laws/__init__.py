@@ -123,6 +123,7 @@ if TYPE_CHECKING:
         Clearance as Clearance,
         CubicStiffness as CubicStiffness,
         GeometricStiffness as GeometricStiffness,
+        Gravity as Gravity,
         HarmonicForce as HarmonicForce,
         HertzContact as HertzContact,
         LinearStiffness as LinearStiffness,
@@ -138,6 +139,7 @@ if TYPE_CHECKING:
         SlackCoupling as SlackCoupling,
         SlackSpring as SlackSpring,
         SoftClearance as SoftClearance,
+        WholeGravity as WholeGravity,
     )
     from .thermal import (
         AbsoluteRadiation as AbsoluteRadiation,

@@ -164,6 +164,8 @@ class Law:
         It is tried at ports of its domains alone, and not where the domain is unknown.
     across : str
         Unit that the local coordinate of a special law can be converted to, such as "V"; left out, any.
+    angular : bool
+        It is tried only where the unit of the local coordinate is that of an angle.
     dissipative, restoring : bool
         The force always opposes the motion, or always pushes back towards z = 0. This fixes the sign of all strengths
         except those in `signed`.
@@ -224,6 +226,7 @@ class Law:
     domains: ClassVar[tuple[str, ...]] = ()
     special: ClassVar[bool] = False
     across: ClassVar[str] = ""
+    angular: ClassVar[bool] = False
     dissipative: ClassVar[bool] = False
     restoring: ClassVar[bool] = False
     two_sided: ClassVar[bool] = False
@@ -370,7 +373,8 @@ def _tried(entry: Tried, local: Local) -> Any:
     return [getattr(local, attribute) * multiple if attribute else multiple for multiple in multiples]
 
 
-GENERAL = ("static_curve", "extra_mode", "viscous_damping")  # ids of laws that are named by their form
+# ids of laws that are named by their form
+GENERAL = ("static_curve", "extra_mode", "viscous_damping", "periodic_force")
 
 
 def display_name(law: str, form: str = "") -> str:

@@ -7,14 +7,18 @@ are mechanical; those that follow powers also describe flows. Elsewhere there is
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from ..models import Parameter
 from .base import Law, Local, contact_onset, size_to_power
 
 LEAST_PERIODS = 2.0  # within the motion, from which a force counts as periodic
+REVOLUTIONS = (2 * np.pi, 360.0, 1.0)  # one revolution in rad, degrees and turns
+LEAST_TURN = 0.1  # share of a revolution within the motion, below which gravity is a straight line
 
 
 def _hertz_limits(local: Local) -> tuple[float, float]:
@@ -278,6 +282,50 @@ class HarmonicForce(PeriodicForce):
     def force(self, z: Any, p: Any) -> Any:
         twice = 4 * np.pi * z / p.L
         return super().force(z, p) + p.a_2 * ca.sin(twice) + p.b_2 * ca.cos(twice)
+
+
+class Gravity(PeriodicForce):
+    """Gravity on a swinging arm, of whose sine the equations have the slope at zero alone."""
+
+    form = "gravity beyond small angles"
+    equation = "w = a (sin(q) - q),  q = 2 pi z / L,  L one revolution"
+    source = "Siciliano et al. (2009), Robotics: Modelling, Planning and Control, sec. 7.3"
+    sentence = "gravity on a swinging arm: a torque in proportion to the sine of the angle, not to the angle"
+    units = {"a": "w", "L": "z"}
+    angular = True
+    flexible = False
+    starts = {"L": lambda at: [L for L in REVOLUTIONS if LEAST_TURN < 2 * at.half / L < PeriodicForce.min_periods]}
+
+    def force(self, z: Any, p: Any) -> Any:
+        q = 2 * np.pi * z / p.L
+        return p.a * (ca.sin(q) - q)
+
+    def parameters(self) -> dict[str, Parameter]:
+        """Size of the torque, and the fixed revolution."""
+        out = super().parameters()
+        return {**out, "L": replace(out["L"], fixed=True)}
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {}
+
+    def why_not(self, local: Local) -> str:
+        return "" if list(self.shapes(local)) else "the motion is not a good part of one revolution"
+
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        return False
+
+
+class WholeGravity(Gravity):
+    """Gravity on an arm whose equations have none; the arm may hang at any angle."""
+
+    form = "gravity"
+    equation = "w = a sin(q) + b cos(q),  q = 2 pi z / L,  L one revolution"
+    sentence = "gravity on a swinging arm: a torque in proportion to the sine of its angle to the vertical"
+    units = {"a": "w", "b": "w", "L": "z"}
+
+    def force(self, z: Any, p: Any) -> Any:
+        q = 2 * np.pi * z / p.L
+        return p.a * ca.sin(q) + p.b * ca.cos(q)
 
 
 class Ripple(PeriodicForce):

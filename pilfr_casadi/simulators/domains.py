@@ -95,6 +95,15 @@ def may_be_speed(unit: str) -> bool:
     return not unit or (unit.endswith("/s") if size is None else size in ((0, 1, -1, 0, 0), (0, 0, -1, 0, 0)))
 
 
+def is_angle(unit: str) -> bool:
+    """Tell whether a unit is that of an angle.
+
+    >>> is_angle("rad"), is_angle("deg"), is_angle("rad/s"), is_angle("m"), is_angle("")
+    (True, True, False, False, False)
+    """
+    return unit.strip() in ("rad", "deg", "°", "rev", "turn")
+
+
 def common_domain(domains: Iterable[str]) -> str:
     """Return the domain of all whose domain is known; unknown if there is none, or more than one."""
     found = set(domains) - {UNKNOWN}

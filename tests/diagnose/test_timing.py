@@ -52,6 +52,36 @@ def test_a_clock_between_the_rates_looked_at_is_found_and_is_that_of_both_output
     assert found.cost**0.5 < 0.02
 
 
+def slow_and_late(late):
+    """A resonance far above its slow input, so that a refit follows a late output in part, by other values."""
+    simulator = Simulator(
+        lambda x, u, p: {"pos": x.vel, "vel": p.k * (u.force - x.pos) - p.d * x.vel},
+        lambda x: {"pos": x.pos},
+        states=("pos", "vel"),
+        inputs=("force",),
+        parameters={"k": Parameter(130.0, bounds=(5, 500)), "d": Parameter(1.6, bounds=(0, 20))},
+    )
+    rng, m = np.random.default_rng(0), 3000
+    u = rng.standard_normal(m)
+    for _ in range(3):
+        u = np.convolve(u, np.ones(30) / 30**0.5, "same")
+    blank = Recording(u[:, None], np.zeros((m, 1)), 0.02, ("force",), ("pos",), initial="zero")
+    y = simulator.with_parameters({"k": 100.0, "d": 1.9}).simulate(blank)
+    y += 1e-3 * y.std() * rng.standard_normal(y.shape)
+    return simulator, Recording(u[late:, None], y[:-late], 0.02, ("force",), ("pos",))
+
+
+@pytest.mark.parametrize("late", [16, 22])
+def test_a_late_output_is_found_though_the_refit_follows_it_by_wrong_values(late):
+    simulator, recording = slow_and_late(late)
+    bench = Workbench.of(simulator, [recording], "zero")
+    plain = bench.fit(simulator)
+    assert 0.1 < plain.cost**0.5 < 0.3 and not 90 < plain.values["k"] < 110
+    found = find_time_shift(Checked(bench, plain))
+    assert [(g.channel, g.finding, round(g.value / 0.02, 2)) for g in found.gates] == [("pos", "alignment", late)]
+    assert found.cost**0.5 < 1.1e-3
+
+
 @pytest.mark.parametrize("stiffening", [0.0, 1e4])
 def test_what_seems_early_while_more_is_wrong_may_be_no_fault(stiffening):
     law = CubicStiffness(values={"k_3": stiffening})

@@ -64,9 +64,11 @@ def test_special_laws_are_for_their_own_domain_alone():
     special = {law for law in laws.CATALOGUE if law.special}
     assert {laws.Radiation, laws.Diode, laws.SaturatingInductance, laws.FreeCurve} <= special
     at = {name: {law for law in laws.CATALOGUE if port(domain=name).admits(law)} for name in ("mechanical", "unknown")}
-    everywhere = {k for k in laws.CATALOGUE if "parallel" in k.places and not k.in_line}
+    everywhere = {k for k in laws.CATALOGUE if "parallel" in k.places and not (k.in_line or k.angular)}
     assert not at["mechanical"] & special and not at["unknown"] & special
     assert at["mechanical"] == at["unknown"] == everywhere - special
+    assert port("N m", "rad").admits(laws.Gravity) and port("N m", "deg").admits(laws.WholeGravity)
+    assert not port("N", "m").admits(laws.Gravity) and not port("N m", "1").admits(laws.Gravity)
     assert port("W", "K").admits(laws.Radiation) and not port("A", "V").admits(laws.Radiation)
     assert port("A", "mV").admits(laws.Diode) and not port("V", "1").admits(laws.Diode)
     assert port("V", "A").admits(laws.Overpotential) and not port("A", "V").admits(laws.Overpotential)

@@ -1,0 +1,62 @@
+"""Gravity on a swinging arm, whose equations have it for small angles alone or not at all."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import Parameter, Port, Recording, Simulator, laws
+
+DT, NOISE = 0.01, 2e-3
+TONES = ((0.8, 0.13), (0.35, 0.37), (0.25, 0.8), (0.2, 1.3))  # N m, Hz
+TRIED = (laws.LinearStiffness, laws.CubicStiffness, laws.QuinticStiffness, laws.PeriodicForce, laws.Gravity)
+
+
+def arm(gravity):
+    return Simulator(
+        lambda x, u, p: {"angle": x.speed, "speed": (u.torque - gravity(x, p) - p.d * x.speed) / p.J},
+        lambda x: {"encoder": x.angle},
+        states=("angle", "speed"),
+        inputs=("torque",),
+        parameters={
+            "J": Parameter(0.06, bounds=(0.01, 0.3)),
+            "d": Parameter(0.05, bounds=(0, 1)),
+            "G": Parameter(1.2, bounds=(0, 5)),
+        },
+        ports=Port(
+            "joint", lambda p: {"speed": -1 / p.J}, lambda x: x.angle, lambda x: x.speed, unit="N m", across_unit="rad"
+        ),
+    )
+
+
+def recorded(hang, seed):
+    """The motion of an arm that hangs at the angle -`hang`, by Runge-Kutta steps of its own."""
+    rng, t = np.random.default_rng(seed), DT * np.arange(1500)
+    torque = sum(a * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for a, f in TONES)
+
+    def slope(u, x):
+        return np.array([x[1], (u - 1.5 * np.sin(x[0] + hang) - 0.08 * x[1]) / 0.05])
+
+    x, angles, h = np.zeros(2), [], DT / 8
+    for u in torque:
+        angles.append(x[0])
+        for f in [partial(slope, u)] * 8:
+            a = f(x)
+            b = f(x + h / 2 * a)
+            c = f(x + h / 2 * b)
+            x = x + h / 6 * (a + 2 * b + 2 * c + f(x + h * c))
+    y = np.array(angles) + NOISE * rng.standard_normal(len(t))
+    return Recording(torque[:, None], y[:, None], DT, ("torque",), ("encoder",), initial="zero", hold="zero")
+
+
+@pytest.mark.parametrize(("hang", "law"), [(0.0, laws.Gravity), (0.4, laws.WholeGravity)])
+def test_gravity_is_named_where_small_angles_are_left_and_where_it_was_forgotten(hang, law):
+    simulator = arm((lambda x, p: p.G * x.angle) if not hang else (lambda x, p: 0 * p.G))
+    train, test = ([recorded(hang, seed) for seed in seeds] for seeds in ((1, 2), (3,)))
+    found = pilfr.diagnose(simulator, train, test=test, laws=[*TRIED, law], workers=1)
+    (effect,) = found.effects
+    assert (effect.law, effect.form) == ("periodic_force", law.form) and effect.confidence > 0.9
+    size = np.hypot(effect.parameters["a"]["value"], effect.parameters.get("b", {"value": 0.0})["value"])
+    assert size == pytest.approx(1.5, rel=0.01)
+    assert found.errors["test"]["after"] < 0.02 * found.errors["test"]["before"]
