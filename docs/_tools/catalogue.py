@@ -31,6 +31,8 @@ UNITS = {
     "Overpotential": ("V", "A"),
     "VoltageDrop": ("V", "A"),
     "SaturatingInductance": ("V", "A"),
+    "Gravity": ("N m", "rad"),
+    "WholeGravity": ("N m", "rad"),
     "FreeCurve": ("V", "1"),
     "thermal": ("W", "K"),
     "electrical": ("A", "V"),

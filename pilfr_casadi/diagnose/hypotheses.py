@@ -18,6 +18,7 @@ from ..simulators import Placed, Simulator
 from .evidence import (
     CONTENDING_NATS,
     EFFECT_PRIOR,
+    FAR_RATIO,
     FORMULA_ERROR,
     INDISTINGUISHABLE_NATS,
     LARGE_MODEL_ERROR,
@@ -362,7 +363,7 @@ class Hypotheses:
         as_fine = known is not None and known.fitted.model.substeps >= rest.fitted.model.substeps
         converged = known is not None and known.thorough and as_fine and known.mean_square <= rest.mean_square
         if not converged and not self.past_deadline:
-            self.keep(self.fits.polish(rest))
+            self.keep(self.fits.polish(rest, most=FAR_RATIO * joint.error))
         return self.memo.get(rest.key)
 
     @contextmanager

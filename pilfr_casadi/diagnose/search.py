@@ -212,8 +212,14 @@ class Search(Hypotheses):
             self.keep(trial)
         kept = {t.key: self.memo[t.key] for t in trials}.values()
         ranked = sorted(kept, key=self.optimistic_evidence, reverse=True)
-        near = [t for t in ranked[:MOST_CONVERGED] if not t.thorough and t.error < NEAR_RATIO * ranked[0].error]
-        for trial in side_by_side(self.fits.polish, near, self.workers):
+        most = NEAR_RATIO * min([t.error for t in (*ranked[:1], self.best)])
+        near = [t for t in ranked[:MOST_CONVERGED] if not t.thorough and t.error < most]
+        converged = side_by_side(lambda t: self.fits.polish(t, most=0.0), near, self.workers)
+        least = min((t.error for t in converged), default=np.inf)
+        # finer steps are slow, and bring no hypothesis that is far behind to the front
+        for trial in side_by_side(
+            lambda t: self.fits.sharpen(t) if t.error < NEAR_RATIO * least else t, converged, self.workers
+        ):
             self.keep(trial)
 
     def _finer(self, parent: Trial) -> None:

@@ -25,9 +25,9 @@ def fits(monkeypatch):
         begun[parent.key, (entries[0].port, type(entries[0].law))] += 1
         return found["begun"](self, parent, entries, gain)
 
-    def polish(self, trial):
+    def polish(self, trial, **limit):
         polished[trial.key] += 1
-        return found["polished"](self, trial)
+        return found["polished"](self, trial, **limit)
 
     monkeypatch.setattr(Trials, "_fit_briefly", begin)
     monkeypatch.setattr(Trials, "polish", polish)

@@ -61,7 +61,7 @@ def test_an_estimated_noise_is_no_larger_than_what_a_fit_leaves(source):
 
 
 def test_an_interrupt_leaves_what_there_is(monkeypatch):
-    def interrupted(self, trial):
+    def interrupted(self, trial, **limit):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Trials, "polish", interrupted)
@@ -126,7 +126,7 @@ def test_after_the_deadline_and_ctrl_c_the_correction_fits_nothing_more(monkeypa
         fitted.append(found)
         raise pilfr.InputError("It diverges.")
 
-    monkeypatch.setattr(Trials, "polish", lambda self, trial: fitted.append(trial) or polish(self, trial))
+    monkeypatch.setattr(Trials, "polish", lambda self, trial, **kw: fitted.append(trial) or polish(self, trial, **kw))
     monkeypatch.setattr(correction, "refit_learned", refit)
     found.bench, answer = replace(found.bench, deadline=0.0), posterior(found)
     correction.find_correction(found, answer)
