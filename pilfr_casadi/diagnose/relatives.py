@@ -3,7 +3,7 @@
 A relative is a pair of port and law with its own start values:
 
 - a special case of the best law, and a law that the best one refines;
-- another form of a law that came near;
+- another form of a law that came near, and a form that shares a shape with the best law but stayed behind it;
 - a law with one more term than one that came near, from its values;
 - a resonance of known frequency: as a mass attached at another port, or in place of a delay or a lag;
 - a law of a signal with its own time scale, at the other end of a nearly linear simulator;
@@ -73,6 +73,7 @@ def relatives(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored
         for some in (
             _special_cases,
             _other_forms,
+            _forms_of_the_best,
             _attached_masses,
             _damped_resonances,
             _other_end,
@@ -100,6 +101,18 @@ def _other_forms(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scor
     """Select untried forms of the laws that came near."""
     tried, near = {t.pair for t in trials}, {(port, law.id) for port, law in _near(trials)}
     return _first_of_pairs(s for s in scored if (s.port, s.law.id) in near and s.pair not in tried)
+
+
+def _forms_of_the_best(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """Select forms of the best law that did not come near, a few, from the values of the shape that they share."""
+    best, near = trials[0], _near(trials)
+    shape = {name: value for name, value in best.own.items() if name not in best.law.strength}
+    out = list[Scored]()
+    for s in _first_of_pairs(s for s in scored if (s.port, s.law.id) == best.name and s.pair not in near):
+        shared = {k: v for k, v in shape.items() if s.law.units.get(k) == best.law.units[k]}
+        if shared:
+            out.append(replace(s, starts=({**s.starts[0], **shared},)))
+    return out[:FEW]
 
 
 def _first_of_pairs(entries: Iterable[Scored]) -> list[Scored]:

@@ -95,6 +95,15 @@ def test_a_law_with_one_more_term_than_one_that_came_near_is_no_worse_and_so_is_
     assert asked_for([best, trend, settling], [entry("a", Settling, settling[-1])]) == []
 
 
+def test_a_form_that_stayed_behind_starts_from_the_shape_of_the_best(asked_for, entry):
+    best = ("actuator:force", Saturation, 0.1, {"L": 8.0})
+    scored = [entry(port, SoftSaturation, {"L": 2.0}) for port in ("actuator:force", "sensor:pos")]
+    (more,) = asked_for([best, ("actuator:force", SoftSaturation, 0.5, {"L": 2.0})], scored)
+    assert more.port == "actuator:force" and more.starts == ({"L": 8.0},)
+    assert asked_for([best, ("actuator:force", SoftSaturation, 0.11, {"L": 2.0})], scored) == []
+    assert asked_for([best], [entry("actuator:force", DeadZone, {"g": 1.0})]) == []  # another law
+
+
 def test_a_refinement_that_came_near_asks_for_the_law_that_it_refines(asked_for, entry):
     """Stribeck's curve without its rise is plain dry friction."""
     own = {"k_t": 800.0, "k_e": 0.0, "r": 1e-3, "v_s": 0.1}
@@ -149,7 +158,7 @@ def test_a_simple_law_stands_for_itself():
     best = Trials(on, 1).fitted(cart().with_element("actuator:force", Saturation().at({"L": 8.0})), [{}], 1)
     local = port_signals(on, best.fitted, "actuator:force")
     np.testing.assert_allclose(local.z, on.recordings[0].u[:, 0])
-    assert relatives(on, [best], [Scored("actuator:force", SoftSaturation(), 0.1, ({},), local)]) == []
+    assert relatives(on, [best], [Scored("actuator:force", DeadZone(), 0.1, ({},), local)]) == []
 
 
 @pytest.mark.parametrize(("level", "compared"), [(0.5, True), (0.0, False)])
