@@ -57,6 +57,7 @@ STATE_PRIOR = 1e-9  # precision of initial states relative to the information of
 
 # Model error: no machine follows a formula exactly
 FORMULA_ERROR = 1e-3  # share of a mismatch that the right explanation may leave: 3 % of its force
+LEAST_FORMULA_ERROR = 1e-6  # share that the right explanation leaves in any case: a thousandth of its force
 WRONG_MODEL_SAMPLES = 8.0  # effective samples of a model whose whole error is model error (n_0)
 LEAST_MODEL_ERROR = 0.05  # least share of the error that counts as model error
 LARGE_MODEL_ERROR = 0.2  # share of model error in the error above which models are judged on held-out blocks

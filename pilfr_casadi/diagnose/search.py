@@ -33,7 +33,7 @@ from ..laws import (
     varying,
 )
 from ..simulators import ACTUATOR, PARAMETER, SENSOR, Placed, kind_of, port_name
-from .evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO
+from .evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR, NEAR_RATIO
 from .floor import ABOVE_NOISE
 from .gates import CLEARLY_BETTER
 from .hypotheses import Hypotheses
@@ -115,11 +115,12 @@ class Search(Hypotheses):
     def _grow_to_noise(self) -> None:
         """Add a law for a rest as small as the formula error of the laws before it.
 
-        An inexact formula can look like one more effect. So it counts only if what is left can be white noise.
+        An inexact formula can look like one more effect. So it counts only if what is left can be white noise, and no
+        rest counts that even the right formulas may leave.
         """
-        base = self.best
-        below_noise = base.mean_square < ABOVE_NOISE**2 * self.least_noise2
-        if not base.laws or below_noise or base.mean_square > self.floor2 + self.tolerance or not self.in_time():
+        base, least = self.best, LEAST_FORMULA_ERROR * self.root.mean_square
+        is_noise = base.mean_square < ABOVE_NOISE**2 * self.least_noise2 + least
+        if not base.laws or is_noise or base.mean_square > self.floor2 + self.tolerance or not self.in_time():
             return
         noise = self.floor, self.count
         self.mismatch2, found = base.mean_square, False
