@@ -225,8 +225,8 @@ def _without_each_effect(search: Search, found: Conclusion) -> dict[NamedEffect,
         return {}
     joint, out = Trial(laws, found.fitted, found.fitted.cost, found.fitted.cost), dict[NamedEffect, Fitted]()
     for effect in found.effects:
-        element = next(e for e in laws if (e.port, e.law.id) == effect.name)
-        if (rest := search.leave_out(joint, element)) is not None:
+        rest = search.leave_out(joint, [e for e in laws if (e.port, e.law.id) == effect.name])
+        if rest is not None:
             out[effect] = rest.fitted
     return out
 

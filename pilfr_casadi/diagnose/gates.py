@@ -255,9 +255,11 @@ class FirstOrder:
         error = [(one.error / bench.scale)[skip:].ravel() for one, skip in zip(runs, skips, strict=True)]
         return cls(bench, probe, runs, followed(bench, runs, skips), np.concatenate(error))
 
-    def left(self, columns: np.ndarray) -> np.ndarray:
-        """Subtract what parameters and initial states can follow."""
-        return project_off(columns, self.base)
+    def left(self, columns: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
+        """Subtract what parameters and initial states can follow, of all rows, or of the known ones (R,) alone."""
+        if known is None or np.all(known):
+            return project_off(columns, self.base)
+        return project_off(columns[known], np.linalg.qr(self.base[known])[0])
 
     def response(self, ports: Sequence[str], forces: Sequence[np.ndarray]) -> np.ndarray:
         """Compute the stacked outputs' changes (R, n) by forces at ports, (M, n_k) a recording; see `propagate`."""

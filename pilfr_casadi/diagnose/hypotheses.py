@@ -351,20 +351,22 @@ class Hypotheses:
         fitted = bench.run(simulator, named, joint.fitted.begin)
         return Trial(fitted.last_elements(len(laws)), fitted, fitted.cost, fitted.cost)
 
-    def leave_out(self, joint: Trial, element: Placed) -> Trial | None:
-        """Fit a hypothesis without one of its laws to convergence, once; None if it diverges or there is no time.
+    def leave_out(self, joint: Trial, elements: Sequence[Placed]) -> Trial | None:
+        """Fit a hypothesis without some of its laws to convergence; None if it diverges.
 
-        A law that was found only beside another one may do without it.
+        A law that was found only beside another one may do without it. After the deadline the trial is as it was found.
         """
-        rest = self.beside([e for e in joint.laws if e is not element], joint)
+        rest = self.beside([e for e in joint.laws if not any(e is left for left in elements)], joint)
         if not rest.mean_square < DIVERGED:
             return None
         known = self.memo.get(rest.key)
         as_fine = known is not None and known.fitted.model.substeps >= rest.fitted.model.substeps
         converged = known is not None and known.thorough and as_fine and known.mean_square <= rest.mean_square
         if not converged and not self.past_deadline:
-            self.keep(self.fits.polish(rest, most=FAR_RATIO * joint.error))
-        return self.memo.get(rest.key)
+            found = self.fits.converge(rest)
+            self.keep(self.fits.sharpen(found) if found.error < FAR_RATIO * joint.error else found)
+        kept = self.memo.get(rest.key)
+        return kept if kept is not None and np.isfinite(kept.mean_square) else None
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

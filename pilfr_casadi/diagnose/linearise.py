@@ -23,7 +23,17 @@ from ..data import Recording
 from ..laws import Law, Local
 from ..linear import steady_state_gain, with_output_injection
 from ..models import Model, map_points
-from ..simulators import PARAMETER, Port, Simulator, discretise, signals, split_port, states_along, term_function
+from ..simulators import (
+    PARAMETER,
+    Port,
+    Simulator,
+    discretise,
+    revolution_in,
+    signals,
+    split_port,
+    states_along,
+    term_function,
+)
 from .workbench import FINER_STEPS, Fitted, Workbench
 
 WALL = 1.0  # largest |λ| h of a contact on the finest steps
@@ -336,7 +346,7 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
 def _with_equations(
     simulator: Simulator, port: Port, local: Local, x: np.ndarray, u: np.ndarray, p: np.ndarray
 ) -> Local:
-    """Add what the equations say of a port: whether outputs read it, and its term along states, inputs and values."""
+    """Add what else is known of a port: whether outputs read it, its term, and one revolution if z is an angle."""
     term = term_function(simulator, port) if port.term else None
     own = p[: simulator.parameter_set.size]
 
@@ -344,7 +354,8 @@ def _with_equations(
         assert term is not None
         return np.asarray(map_points(term, z[:, None], dz[:, None], x, u, own)[0][:, 0, 0])
 
-    return replace(local, shown=simulator.shown_states(port) is not None, term=along if term is not None else None)
+    shown, line = simulator.shown_states(port) is not None, along if term is not None else None
+    return replace(local, shown=shown, term=line, revolution=revolution_in(port.across_unit))
 
 
 def own_signals(simulator: Simulator, values: np.ndarray) -> list[dict[str, np.ndarray]]:

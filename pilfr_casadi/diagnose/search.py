@@ -42,7 +42,7 @@ from .linearise import linearised
 from .relatives import choose_pairs, complements, fit_pair, relatives
 from .screen import Remainder, Scored, screen, usable
 from .trials import Trial, place_law
-from .workbench import FEW, THOROUGH, Fitted
+from .workbench import DIVERGED, FEW, THOROUGH, Fitted
 
 # Effort
 MOST_CONVERGED = 5  # trials of a step that are fitted to convergence at most
@@ -213,14 +213,15 @@ class Search(Hypotheses):
             self.keep(trial)
         kept = {t.key: self.memo[t.key] for t in trials}.values()
         ranked = sorted(kept, key=self.optimistic_evidence, reverse=True)
-        most = NEAR_RATIO * min([t.error for t in (*ranked[:1], self.best)])
+        most = min(NEAR_RATIO * ranked[0].error if ranked else np.inf, FAR_RATIO * self.best.error)
         near = [t for t in ranked[:MOST_CONVERGED] if not t.thorough and t.error < most]
-        converged = side_by_side(lambda t: self.fits.polish(t, most=0.0), near, self.workers)
-        least = min((t.error for t in converged), default=np.inf)
+        converged = side_by_side(self.fits.converge, near, self.workers)
+        for trial in converged:
+            self.keep(trial)
         # finer steps are slow, and bring no hypothesis that is far behind to the front
-        for trial in side_by_side(
-            lambda t: self.fits.sharpen(t) if t.error < NEAR_RATIO * least else t, converged, self.workers
-        ):
+        least = min([t.error for t in (*converged, self.best)])
+        near = [t for t in converged if t.error < NEAR_RATIO * least]
+        for trial in side_by_side(self.fits.sharpen, near, self.workers):
             self.keep(trial)
 
     def _finer(self, parent: Trial) -> None:
@@ -338,12 +339,16 @@ class Search(Hypotheses):
         for _ in range(FEW):
             best = self.best
             for element in best.effects if len(best.effects) > 1 else ():
-                rest = self.leave_out(best, element)
-                if rest is None or not self.in_time():
+                rest = self.beside([e for e in best.laws if e is not element], best)
+                if not rest.mean_square < DIVERGED:
                     continue
-                # laws that were added at a far larger error were added in a wrong minimum
-                if not self._expanded(rest, FAR_RATIO if self.can_improve(self.best) else np.inf):
+                if self.in_time() and not self._expanded(rest):  # from the values of all laws, which may be right
+                    self.keep(rest)
                     self.add(rest, again=True)
+                found = self.leave_out(best, [element])
+                wrong = found is not None and not self._expanded(found, FAR_RATIO)  # it had been in a wrong minimum
+                if found is not None and wrong and self.can_improve(self.best) and self.in_time():
+                    self.add(found, again=True)
             if self.best.key == best.key:
                 return
 
@@ -352,7 +357,7 @@ class Search(Hypotheses):
         with self.stage("without each effect"):
             while len((best := self.best).effects) > 1 and not self.past_deadline:
                 for element in best.effects:
-                    self.leave_out(best, element)
+                    self.leave_out(best, [element])
                 if self.best.key == best.key:
                     return
 

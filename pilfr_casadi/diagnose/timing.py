@@ -37,6 +37,7 @@ RATES = np.concatenate([-np.geomspace(1e-4, 0.05, 28)[::-1], np.geomspace(1e-4, 
 WHOLE_SHIFT = 0.12  # distance in samples within which a shift counts as whole
 LONG_SHIFT = 4.5  # shift in samples above which a whole shift is a fault of the recording
 MOST_SCREENED, MOST_SHIFTS = 4, 2  # faults that refits confirm, and shifts of one channel among them
+LEAST_RECORDED = 0.5  # least share of the samples that a shift may read inside the recordings
 AVERAGED_NOISE = 0.5  # largest share of a channel's noise that interpolation between its samples removes
 
 _Curve = Callable[[np.ndarray], np.ndarray]  # a signal over time
@@ -110,11 +111,13 @@ class TimeShift(Gate):
             moved = self.at(value, bench.dt)
             others = [moved.read(r, False, own) for r, own in zip(bench.recordings, curves, strict=True)]
             runs = as_recorded or list(map(simulate, others, fitted.initial))
-            known = [moved._recorded(r)[:, None] for r in bench.recordings]
-            pairs = zip(runs, others, known, strict=True)
-            error = [np.where(k, (y - other.y) / bench.scale, 0.0)[other.skip :].ravel() for y, other, k in pairs]
-            count = len(bench.scale) * sum(int(np.sum(k[r.skip :])) for k, r in zip(known, others, strict=True))
-            mean = float(np.sum(first.left(np.concatenate(error)) ** 2)) / max(count, 1)
+            pairs = zip(runs, others, strict=True)
+            error = np.concatenate([((y - other.y) / bench.scale)[other.skip :].ravel() for y, other in pairs])
+            inside = zip(map(moved._recorded, bench.recordings), others, strict=True)
+            known = np.concatenate([np.repeat(k[other.skip :], len(bench.scale)) for k, other in inside])
+            if np.mean(known) < LEAST_RECORDED:
+                return np.inf
+            mean = float(np.mean(first.left(error, known) ** 2))
             return mean if np.isfinite(mean) else np.inf
 
         curves = list(map(self.curves, bench.recordings))

@@ -27,6 +27,7 @@ from .screen import Pair, Scored
 from .workbench import (
     BRIEF,
     COMPARED_SAMPLES,
+    DIVERGED,
     FEW,
     QUICK,
     THOROUGH,
@@ -176,8 +177,12 @@ class Trials:
             whole = replace(whole, status=found.status)
         return Trial(found.last_elements(count), whole, found.cost, whole.cost if np.isfinite(whole.cost) else np.inf)
 
-    def polish(self, trial: Trial, most: float = np.inf) -> Trial:
-        """Fit a trial to convergence and to all samples, and sharpen it if its error is then below `most`."""
+    def polish(self, trial: Trial) -> Trial:
+        """Fit a trial to convergence and to all samples, on steps that are fine enough for its knee."""
+        return self.sharpen(self.converge(trial))
+
+    def converge(self, trial: Trial) -> Trial:
+        """Fit a trial to convergence and to all samples, on steps for its present values."""
         bench = replace(self.bench, at_least=max(self.bench.at_least, trial.fitted.model.substeps))
         placed = trial.fitted.corrected()  # choose sub-steps for the fitted laws
         model, engine = bench.compile(placed)
@@ -189,12 +194,11 @@ class Trials:
             fitted = bench.fit(placed, starts, states=states, solver=THOROUGH, model=model, engine=engine)
         except InputError:
             return replace(trial, mean_square=np.inf, thorough=True)
-        found = Trial(fitted.last_elements(len(trial.laws)), fitted, fitted.cost, fitted.cost, thorough=True)
-        return self.sharpen(found) if found.error < most else found
+        return Trial(fitted.last_elements(len(trial.laws)), fitted, fitted.cost, fitted.cost, thorough=True)
 
     def sharpen(self, trial: Trial) -> Trial:
         """Refit a converged trial on steps that are fine enough for its knee, if it has one."""
-        if not trial.knee or time.perf_counter() > self.bench.deadline:
+        if not trial.knee or not trial.mean_square < DIVERGED or time.perf_counter() > self.bench.deadline:
             return trial
         fitted = refit_on_finer_steps(self.bench, trial.fitted, trial.knee)
         return Trial(fitted.last_elements(len(trial.laws)), fitted, fitted.cost, fitted.cost, thorough=True)

@@ -72,6 +72,8 @@ class Local:
         Whether each recording begins with everything at zero; else a law begins as if z had stood still before.
     shown : bool
         Whether z is a state that outputs read, itself or its rate.
+    revolution : float
+        One revolution in the unit of z, if that is the unit of an angle; else nan.
     term : callable, optional
         Force (M,) that the equations have at the port already, from another z and dz (M,); see `Port`.
     """
@@ -85,6 +87,7 @@ class Local:
     inputs: Mapping[str, np.ndarray] = field(default_factory=dict)
     from_zero: tuple[bool, ...] = ()
     shown: bool = False
+    revolution: float = np.nan
     term: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
 
     # old spellings, which laws of users may name in `starts` and `ranges`
@@ -128,7 +131,7 @@ class Local:
 
 
 def size_to_power(z: Any, n: Any, least: float = 1e-12) -> Any:
-    """Compute |z|^n as exp(n log |z|), whose derivatives need no further power; |z| counts as at least `least`."""
+    """Compute (|z| + least)^n as exp(n log(|z| + least)), whose derivatives need no further power."""
     return ca.exp(n * ca.log(ca.fabs(z) + least))
 
 
@@ -373,8 +376,7 @@ def _tried(entry: Tried, local: Local) -> Any:
     return [getattr(local, attribute) * multiple if attribute else multiple for multiple in multiples]
 
 
-# ids of laws that are named by their form
-GENERAL = ("static_curve", "extra_mode", "viscous_damping", "periodic_force")
+GENERAL = ("static_curve", "extra_mode", "viscous_damping")  # ids of laws that are named by their form
 
 
 def display_name(law: str, form: str = "") -> str:

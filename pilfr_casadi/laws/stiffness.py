@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -17,8 +17,6 @@ from ..models import Parameter
 from .base import Law, Local, contact_onset, size_to_power
 
 LEAST_PERIODS = 2.0  # within the motion, from which a force counts as periodic
-REVOLUTIONS = (2 * np.pi, 360.0, 1.0)  # one revolution in rad, degrees and turns
-LEAST_TURN = 0.1  # share of a revolution within the motion, below which gravity is a straight line
 
 
 def _hertz_limits(local: Local) -> tuple[float, float]:
@@ -284,50 +282,6 @@ class HarmonicForce(PeriodicForce):
         return super().force(z, p) + p.a_2 * ca.sin(twice) + p.b_2 * ca.cos(twice)
 
 
-class Gravity(PeriodicForce):
-    """Gravity on a swinging arm, of whose sine the equations have the slope at zero alone."""
-
-    form = "gravity beyond small angles"
-    equation = "w = a (sin(q) - q),  q = 2 pi z / L,  L one revolution"
-    source = "Siciliano et al. (2009), Robotics: Modelling, Planning and Control, sec. 7.3"
-    sentence = "gravity on a swinging arm: a torque in proportion to the sine of the angle, not to the angle"
-    units = {"a": "w", "L": "z"}
-    angular = True
-    flexible = False
-    starts = {"L": lambda at: [L for L in REVOLUTIONS if LEAST_TURN < 2 * at.half / L < PeriodicForce.min_periods]}
-
-    def force(self, z: Any, p: Any) -> Any:
-        q = 2 * np.pi * z / p.L
-        return p.a * (ca.sin(q) - q)
-
-    def parameters(self) -> dict[str, Parameter]:
-        """Size of the torque, and the fixed revolution."""
-        out = super().parameters()
-        return {**out, "L": replace(out["L"], fixed=True)}
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {}
-
-    def why_not(self, local: Local) -> str:
-        return "" if list(self.shapes(local)) else "the motion is not a good part of one revolution"
-
-    def doubtful(self, values: Mapping[str, Any]) -> bool:
-        return False
-
-
-class WholeGravity(Gravity):
-    """Gravity on an arm whose equations have none; the arm may hang at any angle."""
-
-    form = "gravity"
-    equation = "w = a sin(q) + b cos(q),  q = 2 pi z / L,  L one revolution"
-    sentence = "gravity on a swinging arm: a torque in proportion to the sine of its angle to the vertical"
-    units = {"a": "w", "b": "w", "L": "z"}
-
-    def force(self, z: Any, p: Any) -> Any:
-        q = 2 * np.pi * z / p.L
-        return p.a * ca.sin(q) + p.b * ca.cos(q)
-
-
 class Ripple(PeriodicForce):
     """An error that repeats with the signal itself: an encoder off centre, or its interpolation."""
 
@@ -337,3 +291,51 @@ class Ripple(PeriodicForce):
     places = ("sensor",)
     min_periods = 3.0
     starts = {"L": lambda at: 2 * at.half / np.arange(3.0, 60.1, 1.0)}
+
+
+class _OnArm(Law):
+    """A force over the angle of a swinging arm, whose revolution L is known by the angle's unit."""
+
+    source = "Siciliano et al. (2009), Robotics: Modelling, Planning and Control, sec. 7.3"
+    domains = ("mechanical",)
+    angular = True
+    starts = {"L": lambda at: [at.revolution]}
+    least_turn: ClassVar[float] = 0.0  # share of a revolution within the motion, below which it is another curve
+
+    def parameters(self) -> dict[str, Parameter]:
+        """Sizes of the torque, and the fixed revolution."""
+        out = super().parameters()
+        return {**out, "L": replace(out["L"], fixed=True)}
+
+    def why_not(self, local: Local) -> str:
+        known = 2 * local.half > self.least_turn * local.revolution  # not if the revolution is not known
+        return "" if known else "the motion is not a good part of one revolution"
+
+
+class Gravity(_OnArm):
+    """Gravity on a swinging arm, of whose sine the equations have the slope at zero alone."""
+
+    id = "gravity"
+    form = "beyond small angles"
+    equation = "w = a (sin(q) - q),  q = 2 pi z / L,  L one revolution"
+    sentence = "gravity on a swinging arm: a torque in proportion to the sine of the angle, not to the angle"
+    units = {"a": "w", "L": "z"}
+    least_turn = 0.25  # a cubic curve below
+
+    def force(self, z: Any, p: Any) -> Any:
+        q = 2 * np.pi * z / p.L
+        return p.a * (ca.sin(q) - q)
+
+
+class WholeGravity(_OnArm):
+    """Gravity on an arm whose equations have none; the arm may hang at any angle."""
+
+    id = "gravity"
+    equation = "w = a sin(q) + b cos(q),  q = 2 pi z / L,  L one revolution"
+    sentence = "gravity on a swinging arm: a torque in proportion to the sine of its angle to the vertical"
+    units = {"a": "w", "b": "w", "L": "z"}
+    least_turn = 0.1  # a straight line below
+
+    def force(self, z: Any, p: Any) -> Any:
+        q = 2 * np.pi * z / p.L
+        return p.a * ca.sin(q) + p.b * ca.cos(q)

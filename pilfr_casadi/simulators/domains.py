@@ -13,6 +13,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
+import numpy as np
+
 MECHANICAL = "mechanical"
 DOMAINS = (MECHANICAL, "thermal", "electrical", "fluid")
 UNKNOWN = "unknown"
@@ -42,6 +44,12 @@ _UNITS: dict[str, tuple[int, int, int, int, int]] = {
         "rad deg 1 %": (0, 0, 0, 0, 0),
     }.items()
     for unit in units.split()
+}
+_REVOLUTIONS = {
+    "rad radian radians": 2 * np.pi,
+    "mrad": 2e3 * np.pi,
+    "deg ° degree degrees": 360.0,
+    "rev revs revolution revolutions turn turns": 1.0,
 }
 _ANGLES = {"rad", "deg", "rpm"}  # units that occur in mechanics alone
 _PREFIXES = "pnuµμmcdhkMG"
@@ -95,13 +103,13 @@ def may_be_speed(unit: str) -> bool:
     return not unit or (unit.endswith("/s") if size is None else size in ((0, 1, -1, 0, 0), (0, 0, -1, 0, 0)))
 
 
-def is_angle(unit: str) -> bool:
-    """Tell whether a unit is that of an angle.
+def revolution_in(unit: str) -> float:
+    """Return one revolution in the unit of an angle; nan if it is none.
 
-    >>> is_angle("rad"), is_angle("deg"), is_angle("rad/s"), is_angle("m"), is_angle("")
-    (True, True, False, False, False)
+    >>> revolution_in("deg"), revolution_in("turns"), revolution_in("rad/s"), revolution_in("m"), revolution_in("")
+    (360.0, 1.0, nan, nan, nan)
     """
-    return unit.strip() in ("rad", "deg", "°", "rev", "turn")
+    return next((size for names, size in _REVOLUTIONS.items() if unit.strip() in names.split()), np.nan)
 
 
 def common_domain(domains: Iterable[str]) -> str:

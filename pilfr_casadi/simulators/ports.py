@@ -10,9 +10,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from .._base import InputError
 from ..laws import display_name, short_name
-from .domains import DOMAINS, MECHANICAL, UNKNOWN, infer_domain, is_angle, may_convert
+from .domains import DOMAINS, MECHANICAL, UNKNOWN, infer_domain, may_convert, revolution_in
 
 Expression = Callable[..., Any]
 ACTUATOR, SENSOR, EQUATION, PARAMETER = BUILT_IN = ("actuator", "sensor", "equation", "parameter")
@@ -168,7 +170,9 @@ class Port:
         """
         if self.is_speed and "z" in law.reads() and (self.domain == MECHANICAL or "dz" in law.reads()):
             return False
-        if (law.in_line and self.term is None) or (law.angular and not is_angle(self.across_unit)):
+        if law.in_line and self.term is None:
+            return False
+        if law.angular and np.isnan(revolution_in(self.across_unit)):
             return False
         if not self.kinds & set(law.places) or (law.across and not may_convert(self.across_unit, law.across)):
             return False

@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -56,7 +57,23 @@ def test_gravity_is_named_where_small_angles_are_left_and_where_it_was_forgotten
     train, test = ([recorded(hang, seed) for seed in seeds] for seeds in ((1, 2), (3,)))
     found = pilfr.diagnose(simulator, train, test=test, laws=[*TRIED, law], workers=1)
     (effect,) = found.effects
-    assert (effect.law, effect.form) == ("periodic_force", law.form) and effect.confidence > 0.9
+    assert (effect.law, effect.form) == ("gravity", law.form) and effect.confidence > 0.9
     size = np.hypot(effect.parameters["a"]["value"], effect.parameters.get("b", {"value": 0.0})["value"])
     assert size == pytest.approx(1.5, rel=0.01)
     assert found.errors["test"]["after"] < 0.02 * found.errors["test"]["before"]
+
+
+def test_cogging_is_no_gravity():
+    """Of a pitch far below a revolution; gravity itself is in the equations."""
+    simulator = arm(lambda x, p: p.G * ca.sin(x.angle))
+    cogging = simulator.with_parameters({"J": 0.05, "d": 0.08, "G": 1.5}).with_element(
+        "joint", laws.PeriodicForce(values={"a": 0.15, "b": 0.0, "L": 0.5})
+    )
+    train = []
+    for seed in (1, 2):
+        r = recorded(0.0, seed).with_(initial="zero")
+        y = cogging.simulate(r) + NOISE * np.random.default_rng(seed).standard_normal((len(r), 1))
+        train.append(r.with_(y=y))
+    found = pilfr.diagnose(simulator, train, laws=[*TRIED, laws.WholeGravity], workers=1)
+    assert [e.law for e in found.effects] == ["periodic_force"]
+    assert found.effects[0].parameters["L"]["value"] == pytest.approx(0.5, rel=0.01)

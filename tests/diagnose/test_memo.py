@@ -19,18 +19,18 @@ CUBIC, DRAG = laws.CubicStiffness(values={"k_3": 4e5}), laws.QuadraticDrag(value
 @pytest.fixture
 def fits(monkeypatch):
     """How often each law was begun beside its parent's, and each hypothesis fitted thoroughly."""
-    begun, polished, found = Counter(), Counter(), {"begun": Trials._fit_briefly, "polished": Trials.polish}
+    begun, polished, found = Counter(), Counter(), {"begun": Trials._fit_briefly, "polished": Trials.converge}
 
     def begin(self, parent, entries, gain):
         begun[parent.key, (entries[0].port, type(entries[0].law))] += 1
         return found["begun"](self, parent, entries, gain)
 
-    def polish(self, trial, **limit):
+    def converge(self, trial):
         polished[trial.key] += 1
-        return found["polished"](self, trial, **limit)
+        return found["polished"](self, trial)
 
     monkeypatch.setattr(Trials, "_fit_briefly", begin)
-    monkeypatch.setattr(Trials, "polish", polish)
+    monkeypatch.setattr(Trials, "converge", converge)
     return begun, polished
 
 

@@ -61,10 +61,10 @@ def test_an_estimated_noise_is_no_larger_than_what_a_fit_leaves(source):
 
 
 def test_an_interrupt_leaves_what_there_is(monkeypatch):
-    def interrupted(self, trial, **limit):
+    def interrupted(self, trial):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Trials, "polish", interrupted)
+    monkeypatch.setattr(Trials, "converge", interrupted)
     found = searching(rubbing()).run(2)
     assert found.interrupted and len(found.memo) > 1
 
@@ -120,13 +120,13 @@ def test_an_effect_that_a_later_one_has_made_idle_is_left_out():
 def test_after_the_deadline_and_ctrl_c_the_correction_fits_nothing_more(monkeypatch):
     found = searching(rubbing()).run(1)
     found.memo = {key: replace(t, thorough=False) for key, t in found.memo.items()}
-    fitted, polish = [], Trials.polish
+    fitted, converge = [], Trials.converge
 
     def refit(bench, found):
         fitted.append(found)
         raise pilfr.InputError("It diverges.")
 
-    monkeypatch.setattr(Trials, "polish", lambda self, trial, **kw: fitted.append(trial) or polish(self, trial, **kw))
+    monkeypatch.setattr(Trials, "converge", lambda self, trial: fitted.append(trial) or converge(self, trial))
     monkeypatch.setattr(correction, "refit_learned", refit)
     found.bench, answer = replace(found.bench, deadline=0.0), posterior(found)
     correction.find_correction(found, answer)

@@ -82,6 +82,15 @@ def test_a_late_output_is_found_though_the_refit_follows_it_by_wrong_values(late
     assert found.cost**0.5 < 1.1e-3
 
 
+@pytest.mark.parametrize("length", [60, 64])
+def test_a_shift_that_leaves_hardly_a_sample_inside_short_recordings_is_no_fault(length):
+    whole = shaken("zero", law=CubicStiffness(values={"k_3": 1e4}))
+    parts = [whole.slice(length * k, length * (k + 1)) for k in range(8)]
+    bench = Workbench.of(spring(), parts, "zero")
+    found = find_time_shift(Checked(bench, bench.fit(spring())))
+    assert all(abs(g.value) < length / 2 * bench.dt for g in found.gates)
+
+
 @pytest.mark.parametrize("stiffening", [0.0, 1e4])
 def test_what_seems_early_while_more_is_wrong_may_be_no_fault(stiffening):
     law = CubicStiffness(values={"k_3": stiffening})
