@@ -50,7 +50,8 @@ def motion() -> Local:
     fade = np.clip((t - 2) / 0.5, 0, 1)
     fade = fade**2 * (3 - 2 * fade)  # no jump of the rate
     z = (1 - 0.65 * fade) * np.sin(2 * np.pi * t) + 0.25 * fade
-    return Local(z=z, dz=np.gradient(z, dt), dt=dt, lengths=(len(t),), max_stiffness=1e4, max_damping=1e2)
+    limits = {"max_stiffness": 1e4, "max_damping": 1e2, "revolution": 2 * np.pi}
+    return Local(z=z, dz=np.gradient(z, dt), dt=dt, lengths=(len(t),), **limits)
 
 
 def motion_of(law: type[Law], local: Local) -> Local:

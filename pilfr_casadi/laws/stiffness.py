@@ -299,7 +299,7 @@ class _OnArm(Law):
     source = "Siciliano et al. (2009), Robotics: Modelling, Planning and Control, sec. 7.3"
     domains = ("mechanical",)
     angular = True
-    starts = {"L": lambda at: [at.revolution]}
+    starts = {"L": lambda at: [L for L in (at.revolution,) if np.isfinite(L)]}
     least_turn: ClassVar[float] = 0.0  # share of a revolution within the motion, below which it is another curve
 
     def parameters(self) -> dict[str, Parameter]:
