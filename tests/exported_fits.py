@@ -184,7 +184,7 @@ def dose(kind):
     """A law with a shape from its own grid, and strengths that matter."""
     t = np.arange(400) * 0.01
     z = 0.8 * np.sin(2 * np.pi * 1.3 * t) + 0.5 * np.sin(2 * np.pi * 3.1 * t + 1) + 0.05
-    local = Local(z, np.gradient(z, 0.01), 0.01, (400,), np.inf)
+    local = Local(z, np.gradient(z, 0.01), 0.01, (400,), np.inf, revolution=2 * np.pi)
     law = kind()
     law = law.at(next(iter(law.shapes(local))))
     law = law.at({k: 1.03 * v for k, v in law.values.items()}).at({}, law.bounds(local))  # off the kinks of its grid
