@@ -29,7 +29,7 @@ from .gates import (
     refit,
     settle,
 )
-from .workbench import Fitted, Workbench
+from .workbench import RUNAWAY, Fitted, Workbench
 
 SHIFTS = np.union1d(np.arange(-64.0, 65.0), np.linspace(-2.0, 2.0, 17))  # samples
 # clock rates tried, as relative errors: 0.01 % to 5 %
@@ -221,7 +221,8 @@ def run_as_given(bench: Workbench, plain: Fitted) -> Fitted:
 def _screen_shifts(bench: Workbench, plain: Fitted) -> list[TimeShift]:
     """List the shifts and clock rates that clearly reduce the remainder, best first, a few at most.
 
-    A shift can lead the refit into a wrong minimum; so they are also sought along the run at the user's values.
+    A shift can lead the refit into a wrong minimum; so they are also sought along the run at the user's values, unless
+    it runs away.
     """
     outputs, inputs = bench.simulator.output_names, bench.simulator.inputs
     channels: list[tuple[str, tuple[int, ...], str]] = [("y", (i,), name) for i, name in enumerate(outputs)]
@@ -230,7 +231,8 @@ def _screen_shifts(bench: Workbench, plain: Fitted) -> list[TimeShift]:
     if len(inputs) > 1:
         channels += [("u", (i,), name) for i, name in enumerate(inputs)]
     found = list[tuple[float, TimeShift]]()
-    for reference in (plain, run_as_given(bench, plain)):
+    given = run_as_given(bench, plain)
+    for reference in (plain, given) if given.cost < RUNAWAY**2 else (plain,):
         first = FirstOrder.of(bench, reference)
         for kind, columns, name in channels:
             for finding, values in (("alignment", bench.dt * SHIFTS), ("clock", RATES)):

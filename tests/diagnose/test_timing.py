@@ -7,7 +7,7 @@ from pilfr_casadi.data import Recording
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.gates import Checked, Gate
 from pilfr_casadi.diagnose.preparation import hold_note
-from pilfr_casadi.diagnose.timing import find_time_shift
+from pilfr_casadi.diagnose.timing import _screen_shifts, find_time_shift
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import Creep, CubicStiffness, PeriodicForce, Relaxation, TwoStageCreep, TwoStageRelaxation
 from pilfr_casadi.models import Parameter
@@ -80,6 +80,13 @@ def test_a_late_output_is_found_though_the_refit_follows_it_by_wrong_values(late
     found = find_time_shift(Checked(bench, plain))
     assert [(g.channel, g.finding, round(g.value / 0.02, 2)) for g in found.gates] == [("pos", "alignment", late)]
     assert found.cost**0.5 < 1.1e-3
+
+
+def test_a_run_that_diverges_at_the_users_values_tells_of_no_shift():
+    simulator = spring().with_parameters({"d": Parameter(-9.0, bounds=(-50, 20))})
+    bench = Workbench.of(simulator, [shaken("zero", law=CubicStiffness(values={"k_3": 1e4}))], "zero")
+    plain = bench.fit(simulator, [{"d": 1.4}])
+    assert [s.finding for s in _screen_shifts(bench, plain)] == []
 
 
 @pytest.mark.parametrize("late", [0, 5])
