@@ -16,6 +16,7 @@ and a real eigenvalue `-r` the equation `q' = -r q + b u`. Frequencies, dampings
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -283,7 +284,9 @@ def to_continuous(a: Array, b: Array, c: Array, d: Array, dt: float, hold: str) 
     angle = np.abs(np.angle(values))
     if np.any(angle > FAST * np.pi) or np.any(np.abs(values) < 1e-4):
         raise InputError("The model has a mode too fast for its step; simulate at a shorter step.")
-    a_c = np.real(logm(a)) / dt
+    with warnings.catch_warnings():  # of an error of 1e-11
+        warnings.simplefilter("ignore", RuntimeWarning)
+        a_c = np.real(logm(a)) / dt
     # ∫ e^{A s} ds and ∫ e^{A (Δ - s)} s ds / Δ in one exponential (Van Loan, 1978)
     block = np.zeros((3 * n, 3 * n))
     block[:n, :n], block[:n, n : 2 * n], block[n : 2 * n, 2 * n :] = a_c * dt, np.eye(n) * dt, np.eye(n)
