@@ -16,7 +16,7 @@ import numpy as np
 
 from .._base import InputError, existing_file, make_folder, to_json, write_atomically
 from ..data import Recording
-from ..diagnose import SURE, add_scaled_laws, check_laws, replicate
+from ..diagnose import SURE, check_laws, replicate
 from ..laws import Law
 from ..simulators import as_simulator, name_at
 from .machines import DONE, PAGE, RESIDUAL, LawAt, MachineWork, measured_entry
@@ -255,7 +255,7 @@ class Fleet:
         InputError
             If simulator and recordings do not fit each other.
         """
-        work, laws = self.work, [law.build(self.work.known) for law in self.common.laws]
+        work, laws = self.work, self.work.build(self.common.laws)
         found = replicate(work.simulator, recordings, laws, self.common.starts, hold=work.hold, engine=work.engine)
         return judge_entry(name, measured_entry(found), self.values, self.remainder, times)
 
@@ -452,7 +452,7 @@ def read_fleet(folder: Any, simulator: Any, laws: Sequence[type[Law]] | None = N
         If the file cannot be read or is not of a fleet.
     """
     own = as_simulator(simulator)
-    tried = add_scaled_laws(check_laws(laws), own)
+    tried = check_laws(laws)
     path = Path(folder) / CONTENT if Path(folder).is_dir() else Path(folder)
     try:
         content = json.loads(existing_file(path).read_text(encoding="utf-8"))

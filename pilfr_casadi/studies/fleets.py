@@ -43,7 +43,7 @@ from .._base import (
     whole,
 )
 from ..data import Recording, as_recordings
-from ..diagnose import SURE, add_scaled_laws, check_laws, match_recordings
+from ..diagnose import SURE, check_laws, match_recordings
 from ..laws import Law
 from ..simulators import Simulator, as_simulator
 from .execution import NoModel, PrintLine, RunInterrupted
@@ -141,7 +141,7 @@ def fleet(
     own = as_simulator(simulator, next(iter(given.values())))
     given = _matched(own, given, hold)
     most = None if effects is None else whole(effects, "effects", 0)
-    work = MachineWork(own, hold, add_scaled_laws(check_laws(laws), own), most, engine)
+    work = MachineWork(own, hold, check_laws(laws), most, engine)
     when = _checked_times(times, given)
     with _opened(out, overwrite) as manifest:
         steps = _Steps(
@@ -241,9 +241,8 @@ class _Steps:
         common, hold = common_physics(self._do(SAMPLE, names))
         if self.work.hold is None and self.work.simulator.hold is None:
             self.work = replace(self.work, hold=hold)
-        laws = tuple(law.build(self.work.known) for law in common.laws)
-        entries = self._do(MEASURE, list(self.machines), laws, common.starts)
-        values, remainder = distributions(entries, self._units(laws), times)
+        entries = self._do(MEASURE, list(self.machines), common.laws, common.starts)
+        values, remainder = distributions(entries, self._units(common.laws), times)
         if not values and not np.isfinite(remainder.mean):
             raise NoModel(f"No machine could be fitted; {entries[next(iter(entries))]['sentence']}")
         judged = {
@@ -252,7 +251,7 @@ class _Steps:
             else Machine(name, failed=e["sentence"])
             for name, e in entries.items()
         }
-        judged = self._diagnose_rest(judged, entries, laws, names)
+        judged = self._diagnose_rest(judged, entries, common.laws, names)
         ranked = sorted(judged.values(), key=lambda m: (-m.probability, -np.nan_to_num(m.ratio), m.name))
         confirmed = sum(e["status"] == DONE and e["gain"] > 0 for e in entries.values())
         result = Fleet(
@@ -272,7 +271,7 @@ class _Steps:
         self,
         step: str,
         names: Sequence[str],
-        laws: tuple[tuple[str, Law], ...] = (),
+        laws: tuple[LawAt, ...] = (),
         starts: Sequence[Mapping[str, Any]] | Mapping[str, Any] = (),
     ) -> dict[str, dict[str, Any]]:
         """Execute a step at some machines, as far as it is not complete; return the entries.
@@ -313,7 +312,7 @@ class _Steps:
         self,
         judged: Mapping[str, Machine],
         entries: Mapping[str, Mapping[str, Any]],
-        laws: tuple[tuple[str, Law], ...],
+        laws: tuple[LawAt, ...],
         sampled: Sequence[str],
     ) -> dict[str, Machine]:
         """Diagnose the machines that lack more than the common physics; add what was found and the reports."""
@@ -330,10 +329,10 @@ class _Steps:
             out[name] = replace(m, rest=rest, report=page if page in self.manifest.content["files"] else "")
         return out
 
-    def _units(self, laws: Sequence[tuple[str, Law]]) -> dict[str, str]:
+    def _units(self, laws: Sequence[LawAt]) -> dict[str, str]:
         """Return the unit of each parameter by label, in the order of the simulator with the laws."""
         placed = self.work.simulator
-        for port, law in laws:
+        for port, law in self.work.build(laws):
             placed = placed.with_element(port, law)
         own = placed.readable_parameters()
         return {label: own[label.partition("[")[0]].unit for label in own.labels}

@@ -17,7 +17,7 @@ import numpy as np
 
 from .._base import InputError, digest, to_json
 from ..data import Recording, fingerprint
-from ..diagnose import Diagnosis, Replication, diagnose, refit_error, replicate
+from ..diagnose import Diagnosis, Replication, add_scaled_laws, diagnose, refit_error, replicate
 from ..laws import Law
 from ..simulators import Simulator
 from .executor import Outcome
@@ -64,7 +64,7 @@ class MachineJob:
     machine: str
     key: str
     recordings: tuple[Recording, ...]
-    laws: tuple[tuple[str, Law], ...] = ()
+    laws: tuple[LawAt, ...] = ()  # not the laws themselves: a class made at run time is another one once it is sent
     starts: tuple[Mapping[str, Any], ...] = ()
 
     @property
@@ -90,8 +90,13 @@ class MachineWork:
 
     @property
     def known(self) -> dict[str, type[Law]]:
-        """The laws by the names of their classes."""
-        return {law.__name__: law for law in self.laws}
+        """The laws that a diagnosis tries, by the names of their classes."""
+        return {law.__name__: law for law in add_scaled_laws(self.laws, self.simulator)}
+
+    def build(self, laws: Sequence[LawAt]) -> list[tuple[str, Law]]:
+        """Return the ports and the laws."""
+        known = self.known
+        return [law.build(known) for law in laws]
 
     def __call__(self, job: MachineJob) -> Outcome:
         """Execute a step at a machine."""
@@ -101,14 +106,13 @@ class MachineWork:
 
     def key(self, job: MachineJob) -> str:
         """Compute the digest of everything that a job's result depends on, but for versions."""
-        laws = [[port, type(law).__name__, to_json(law.values), to_json(law.limits)] for port, law in job.laws]
         return digest(
             {
                 "step": job.step,
                 "simulator": simulator_digest(self.simulator),
                 "data": [_contents(r) for r in job.recordings],
-                "options": [self.hold, [law.__name__ for law in self.laws], self.effects, self.engine],
-                "laws": laws,
+                "options": [self.hold, [*self.known], self.effects, self.engine],
+                "laws": [asdict(law) for law in job.laws],
                 "starts": to_json(job.starts),
             }
         )
@@ -122,13 +126,14 @@ class MachineWork:
         return Outcome({**_answer(found), "hypotheses": self._hypotheses(found)}, files=_files(found))
 
     def _measure(self, job: MachineJob) -> Outcome:
-        found = replicate(self.simulator, job.recordings, job.laws, job.starts, hold=self.hold, engine=self.engine)
+        laws = self.build(job.laws)
+        found = replicate(self.simulator, job.recordings, laws, job.starts, hold=self.hold, engine=self.engine)
         return Outcome(measured_entry(found), files={RESIDUAL: _residual(found, job.recordings)})
 
     def _rest(self, job: MachineJob) -> Outcome:
         """Diagnose a machine that lacks more than the common physics, from the simulator with that physics."""
         corrected = self.simulator
-        for port, law in job.laws:
+        for port, law in self.build(job.laws):
             corrected = corrected.with_element(port, law)
         own = corrected.parameter_set
         corrected = corrected.with_parameters(own.at(own.pack(job.starts[0])))

@@ -367,20 +367,20 @@ def stage():
 
 @pytest.mark.slow
 def test_two_inputs_behind_plays_track_as_by_ipopt():
-    """Most plans stop at a kink here, by either solver, yet the loops follow their paths."""
+    """Most plans stop at a kink here, by either solver; where they stop scatters the errors by a quarter."""
     function, samples, horizon = stage(), 60, 15
     t = np.arange(samples + horizon)
     path = np.c_[300 * np.sin(0.05 * t), 1e-3 * np.cos(0.03 * t)] * np.minimum(1, t / 50)[:, None]
     most, errors = np.array([15.0, 0.06]), {}
     for solver in ("sqp", "ipopt"):
-        controller = PredictiveController(function, horizon, inputs=(-most, most), solver=solver, iterations=20)
+        controller = PredictiveController(function, horizon, inputs=(-most, most), solver=solver, iterations=40)
         x, u, y = np.zeros(10), np.zeros(2), []
         for k in range(samples):
             u = controller(x, path[k : k + horizon], u).u
             x, now = (np.asarray(v).ravel() for v in function(x, u))
             y.append(now)
         errors[solver] = np.sqrt(np.mean(((np.array(y) - path[:samples]) / controller.y_scale[:2])[20:] ** 2))
-    assert errors["sqp"] < 1.1 * errors["ipopt"], errors
+    assert errors["sqp"] < 1.3 * errors["ipopt"] < 0.013, errors
 
 
 @pytest.mark.slow
