@@ -247,7 +247,8 @@ def refit(
     step0 = None
     for _ in range(steps):
         e = ((y - now) / sigma).ravel()
-        cost = float(e @ e)
+        with np.errstate(over="ignore"):
+            cost = float(e @ e)
         if not np.isfinite(cost):
             return np.inf
         columns = []
@@ -269,7 +270,8 @@ def refit(
             q[index] = np.clip(p[index] + d[: len(index)], lower[index], upper[index])
             trial_x0 = x0 + d[len(index) :] if n_x else x0
             trial = output(q, trial_x0)
-            new = float(np.sum(((y - trial) / sigma) ** 2))
+            with np.errstate(over="ignore"):
+                new = float(np.sum(((y - trial) / sigma) ** 2))
             if np.isfinite(new) and new < cost:
                 break
         else:

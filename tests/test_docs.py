@@ -44,7 +44,7 @@ SAID = {
     "docs/start/axis.md": "leaves out Coulomb friction at guide.",
     "docs/start/tank.md": "leaves out dead zone at actuator:pump.",
     "docs/howto/closed_loop.md": "leaves out Coulomb friction at guide.",
-    "docs/howto/delay.md": "leaves out Coulomb friction at ground-m2 and delay at sensor:x2.",
+    "docs/howto/delay.md": "leaves out delay at sensor:x2 and Coulomb friction at ground-m2.",
     "docs/diagnose.md": "leaves out Coulomb friction at ground-m2.",
     "docs/howto/ports.md": "['equation:pos', 'equation:vel', 'actuator:force', 'sensor:position']",
 }

@@ -108,24 +108,30 @@ class Sample:
 
 
 def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
-    """Compute the eigenvalues λ of a sample's information on the laws' parameters, in units of their prior widths."""
-    own = _of_laws(fitted, laws)[fitted.model.parameters.free]
-    if not own.any():
+    """Compute the eigenvalues λ of a sample's information on the laws' parameters, in units of their prior widths.
+
+    One law in several sensors counts once, as in `log_prior`.
+    """
+    numbers = _of_laws(fitted, laws)[fitted.model.parameters.free]
+    laws_at = np.flatnonzero(numbers >= 0)
+    # of one law in several sensors, each parameter is one
+    shared = np.equal.outer(numbers[laws_at], np.unique(numbers[laws_at])).astype(float)
+    if not laws_at.size:
         return np.zeros(0)
     problem, _, hessian = _hessian(bench, fitted)
     if not np.all(np.isfinite(hessian)):  # a run at the edge of divergence has no derivatives
-        return np.full(int(own.sum()), np.inf)
-    laws_at = np.flatnonzero(np.append(own, np.zeros(len(hessian) - len(own), dtype=bool)))
+        return np.full(shared.shape[1], np.inf)
     rest = np.setdiff1d(np.arange(len(hessian)), laws_at)
-    width = _widths(fitted, laws, problem.free, np.diag(hessian)[: len(own)])[laws_at]
+    width = _widths(fitted, laws, problem.free, np.diag(hessian)[: len(numbers)])[laws_at]
     with np.errstate(all="ignore"):
         block = hessian[np.ix_(laws_at, laws_at)] * np.outer(width, width)
         size = np.sqrt(np.maximum(np.diag(hessian)[rest], 1e-300))
         across = hessian[np.ix_(rest, laws_at)] * width / size[:, None]
         inner = hessian[np.ix_(rest, rest)] / np.outer(size, size)
         block = block - across.T @ np.linalg.pinv(inner, rcond=1e-10, hermitian=True) @ across
+        block = shared.T @ block @ shared
     if not np.all(np.isfinite(block)):
-        return np.full(int(own.sum()), np.inf)
+        return np.full(len(block), np.inf)
     return np.maximum(np.linalg.eigvalsh(block), 0.0)
 
 
@@ -185,13 +191,16 @@ def _enlargement(bench: Workbench, fitted: Fitted) -> float:
 
 
 def _of_laws(fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
-    """Mark the parameters that belong to the laws."""
+    """Number the laws' parameters, with -1 for all others; the same law has the same numbers in all sensors."""
     parameters = fitted.model.parameters
-    own = np.zeros(parameters.size, dtype=bool)
+    numbers, first = np.full(parameters.size, -1), dict[tuple[object, str, int], slice]()
     for e in laws:
+        one = type(e.law) if kind_of(e.port) == SENSOR else e.prefix
         for name in e.law.parameters():
-            own[parameters.position(f"{e.prefix}{name}")] = True
-    return own
+            where = parameters.position(f"{e.prefix}{name}")
+            same = first.setdefault((one, name, where.stop - where.start), where)
+            numbers[where] = np.arange(same.start, same.stop)
+    return numbers
 
 
 def _hessian(bench: Workbench, fitted: Fitted) -> tuple[Problem, np.ndarray, np.ndarray]:

@@ -176,13 +176,9 @@ class Search(Hypotheses):
 
     def add(self, parent: Trial, again: bool = False) -> None:
         """Fit the laws that the screen selects beside a hypothesis, fewer if `again`; polish those that may win."""
-        scored, gain = self.screened(parent)
-        scored = [s for s in scored if _may_stand_beside(parent.laws, s.port, s.law)]
+        scored, gain = self._standing(parent)
         enough = float(np.sqrt(self.floor2 + NEARLY_EXPLAINED * max(parent.mean_square - self.floor2, 0.0)))
-        trials = self._fitted(parent, scored, gain, enough, again)
-        more = relatives(self.bench, trials, scored) if self.in_time() else []
-        if more:
-            trials = sorted([*trials, *self._fitted(parent, more, gain, enough, again)], key=lambda t: t.error)
+        trials = self._with_relatives(parent, scored, scored, gain, enough, again)
         with self.stage("choice"):
             self._record(parent, scored, trials)
             self.estimate_noise()
@@ -190,6 +186,27 @@ class Search(Hypotheses):
             self._finer(parent)
             if self.best is not best:
                 self.estimate_noise()
+
+    def _standing(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
+        """Return what was screened beside a hypothesis and may stand beside its laws, and the observer's gain."""
+        scored, gain = self.screened(parent)
+        return [s for s in scored if _may_stand_beside(parent.laws, s.port, s.law)], gain
+
+    def _with_relatives(
+        self,
+        parent: Trial,
+        selected: Sequence[Scored],
+        scored: Sequence[Scored],
+        gain: np.ndarray | None,
+        enough: float,
+        again: bool,
+    ) -> list[Trial]:
+        """Fit some of the pairs screened, then those to which these fits point."""
+        trials = self._fitted(parent, selected, gain, enough, again)
+        more = relatives(self.bench, trials, scored) if self.in_time() else []
+        if more:
+            trials = sorted([*trials, *self._fitted(parent, more, gain, enough, again)], key=lambda t: t.error)
+        return trials
 
     def _record(self, parent: Trial, scored: Sequence[Scored], trials: Sequence[Trial]) -> None:
         """Keep the trials of a move, and note the move."""
@@ -290,17 +307,18 @@ class Search(Hypotheses):
 
     def name_learned(self, base: Trial) -> None:
         """Fit the laws whose forces are nearest to those learned beside a hypothesis."""
-        entries = list[Scored]()
+        entries, scored = list[Scored](), self._standing(base)[0]
         for fitted in self.learned(base):
             port = fitted.simulator.elements[-1].port
-            screened = [s for s in self.screened(base)[0] if s.port == port]
             for near in nearest_to_learned(self.fits.part, fitted, self.laws):
-                alike = [s for s in screened if s.law.dissipative == near.kind.dissipative]
+                alike = [s for s in scored if s.port == port and s.law.dissipative == near.kind.dissipative]
                 if alike and _may_stand_beside(base.laws, port, near.kind):
                     entries.append(replace(alike[0], law=near.kind, starts=(near.start,)))
         if not entries:
             return
-        self._record(base, entries, self._fitted(base, entries, None, float(np.sqrt(self.floor2)), True))
+        noise = float(np.sqrt(self.floor2))
+        trials = self._with_relatives(base, entries, [*entries, *scored], None, noise, True)
+        self._record(base, entries, trials)
 
     def vary_parameters(self, base: Trial) -> None:
         """Let parameters of the simulator vary with a signal beside a hypothesis: fit those that explain most."""
@@ -353,11 +371,18 @@ class Search(Hypotheses):
                 return
 
     def _leave_out_each(self) -> None:
-        """Fit the best hypothesis without each of its effects, because a later effect can make an earlier one idle."""
+        """Fit the best hypothesis without each of its effects, and with each strength that varies held constant.
+
+        A later effect can make an earlier one, or its variation, idle.
+        """
         with self.stage("without each effect"):
             while len((best := self.best).effects) > 1 and not self.past_deadline:
                 for element in best.effects:
                     self.leave_out(best, [element])
+                    plain = constant(type(element.law))
+                    if plain is not type(element.law):
+                        others = [e for e in best.laws if e is not element]
+                        self._refine(self.beside([*others, element], best), [plain])
                 if self.best.key == best.key:
                     return
 

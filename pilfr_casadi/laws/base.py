@@ -309,6 +309,11 @@ class Law:
         refines = plain.strength and plain.units.items() <= self.units.items() and set(more) <= set(self.strength)
         return {**dict.fromkeys(more, 0.0), **own} if more and refines else {}
 
+    @classmethod
+    def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:
+        """Start values of this form for a law that was found in another form."""
+        yield {name: value for name, value in found.values.items() if name in cls.units}
+
     def size(self, values: Mapping[str, Any]) -> int:
         """Number of free numbers of the law at fitted values."""
         return sum(int(np.sum(~p.fixed)) for p in self.parameters().values())
