@@ -15,6 +15,7 @@ from pilfr_casadi.data import Recording
 
 from . import concealed_noise as dull
 from .concealed_draw import USUAL, Draw, Plan, Unsuited
+from .concealed_series import STATED
 from .concealed_table import Pair, equivalents
 from .concealed_truth import Effect, Motion, Plant
 
@@ -258,6 +259,9 @@ class _Draw(Draw):
         source = replace(rig, ports=declared).source(self._start_values(), not self.bare)
         z = [motions[0].z.get(e.port) for e in effects]
         nameable = self.kind in NAMEABLE
+        stated = tuple(
+            frozenset({(handed.get(e.port, e.port), STATED[e.variant])}) for e in effects if e.variant in STATED
+        )
         tags |= {self.kind, rig.name, noise, self.start, f"n_in={len(rig.inputs)}", f"n_out={len(rig.outputs)}"}
         tags |= {f"hold={said}", f"records={len(records) - 1}", "bare" if self.bare else "ports"}
         tags |= {t for e in effects for t in (e.law, f"{e.law}:{e.variant}")}
@@ -273,7 +277,7 @@ class _Draw(Draw):
             VERDICTS[self.kind],
             tuple(equivalents(rig, e, zz, handed, relative) for e, zz in zip(effects, z, strict=True))
             if nameable
-            else (),
+            else stated,
             fault.channels if fault else frozenset(),
             frozenset(tags),
             floor,
@@ -289,6 +293,7 @@ class _Draw(Draw):
             },
             findings=(Finding(frozenset(FINDINGS.get(fault.kind, (fault.kind,))), fault.channels),) if fault else (),
             parameters=self.same,
+            also=frozenset({"missing-physics"}) if stated else frozenset(),
         )
 
     def _start_values(self) -> dict[str, str]:

@@ -167,7 +167,7 @@ def score(case: Case, diagnosis: Mapping[str, Any], seconds: float = 0.0, crash:
         (names.matched == 2) if kind == "two" else None,
         nameable and any(not h for h in hits[1:]),
         (verdict != "complete") if kind == "none" else None,
-        (bool(pairs) and (confidence or 0) > SURE) if kind == "outside" else None,
+        (bool(pairs) and not hits[0] and (confidence or 0) > SURE) if kind == "outside" else None,
         (verdict_right and bool(found & case.channels)) if kind == "fault" else None,
         confidence,
         bool(hits) and hits[0],
