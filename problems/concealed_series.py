@@ -188,7 +188,7 @@ STATED = {"position-damping": "viscous_damping"}
 
 
 def outside(rng: np.random.Generator, c: Scale, series: bool, other: str | None) -> Draft:
-    """An effect that no law of the catalogue stated when these were drawn; `other` is a state that is not the port's own."""
+    """An effect that no law stated when these were drawn; `other` is a state that is not the port's own."""
     w = 2 * np.pi * c.frequency * rng.uniform(0.15, 0.6)
     b, t0 = rng.uniform(0.05, 0.25) * c.duration, c.duration * np.sort(rng.uniform(0.1, 0.9, 4))
 
