@@ -10,7 +10,7 @@ it on held-out data), the residual itself is the floor.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,14 +27,38 @@ SAME_LEVEL = 1e-9  # distance of two values, over the range, below which they ar
 
 @dataclass(frozen=True, eq=False)
 class Floor:
-    """Standard deviation of each output's noise (n_y,), and its source."""
+    """Standard deviation of each output's noise (n_y,), and its source.
+
+    Attributes
+    ----------
+    repeats : int
+        Number of periods, or of recordings with the same input, on which the noise is measured; 1 if it is not.
+    independent : float
+        Independent samples of the noise in a repeat.
+    """
 
     deviation: np.ndarray
     source: str
+    repeats: int = 1
+    independent: float = 1.0
+
+    def may_be(self, times: float) -> bool:
+        """Tell whether a residual, `times` as large as a measured noise, can be that noise.
+
+        Of n repeats, noise s leaves the power s² (n - 1)/n within them, and s²/n in their mean, where all that the
+        simulator lacks is as well. Of noise alone, the second over the first has an F distribution, each over its
+        independent samples. False for an estimated noise.
+        """
+        from scipy.stats import f
+
+        if self.repeats < 2:
+            return False
+        most = float(f.isf(P_VALUE, self.independent, (self.repeats - 1) * self.independent))
+        return times**2 < 1 + (most - 1) / self.repeats
 
     def beside(self, deviation: np.ndarray) -> Floor:
         """Return the floor with another independent error added, such as a surrogate's."""
-        return Floor(np.hypot(self.deviation, deviation), self.source)
+        return replace(self, deviation=np.hypot(self.deviation, deviation))
 
     def nrmse(self, scale: np.ndarray) -> float:
         """Compute the noise over the outputs' deviation, averaged over outputs."""
@@ -48,17 +72,19 @@ def noise_floor(recordings: Sequence[Recording], residuals: Sequence[np.ndarray]
 
 def measured_floor(recordings: Sequence[Recording]) -> Floor | None:
     """Measure the floor on periods, else on recordings with the same input; None if there are neither."""
-    found = [d for d in map(_from_periods, recordings) if d is not None]
-    rounding = _sensor_steps(recordings) / np.sqrt(12)
-    if found:
-        return Floor(np.maximum(np.sqrt(np.mean(np.square(found), axis=0)), rounding), "periods")
     groups: dict[bytes, list[Recording]] = {}
     for r in recordings:
         groups.setdefault(r.u.tobytes(), []).append(r)
-    repeats = [np.std([r.y[_settled(g) :] for r in g], axis=0, ddof=1) for g in groups.values() if len(g) > 1]
-    if repeats:
-        return Floor(np.maximum(np.sqrt(np.mean(np.concatenate(repeats) ** 2, axis=0)), rounding), "repeats")
-    return None
+    alike = [np.stack([r.y[_settled(g) :] for r in g]) for g in groups.values() if len(g) > 1]
+    periods = [folded for folded in map(_fold, recordings) if folded is not None]
+    repeated = periods or alike
+    if not repeated:
+        return None
+    square = np.mean(np.concatenate([np.var(y, axis=0, ddof=1) for y in repeated]), axis=0)
+    deviation = np.maximum(np.sqrt(square), _sensor_steps(recordings) / np.sqrt(12))
+    independent = effective_size([y[0] - np.mean(y, axis=0) for y in repeated])
+    source = "periods" if periods else "repeats"
+    return Floor(deviation, source, min(map(len, repeated)), max(independent, 1.0))
 
 
 def _sensor_steps(recordings: Sequence[Recording]) -> np.ndarray:
@@ -81,16 +107,14 @@ def _settled(group: Sequence[Recording]) -> int:
     return first if alike else max(first, len(group[0]) // 2)
 
 
-def _from_periods(r: Recording) -> np.ndarray | None:
+def _fold(r: Recording) -> np.ndarray | None:
+    """Stack the outputs' periods, (P, N, n_y); None if there are not two."""
     n = r.period
     if not n or r.begins != "periodic":
         return None
     y = r.y[r.skip :]
     count = len(y) // n
-    if count < 2:
-        return None
-    folded = y[: count * n].reshape(count, n, -1)
-    return np.asarray(np.sqrt(np.mean(np.var(folded, axis=0, ddof=1), axis=0)))
+    return y[: count * n].reshape(count, n, -1) if count > 1 else None
 
 
 def third_differences(residual: np.ndarray) -> np.ndarray:

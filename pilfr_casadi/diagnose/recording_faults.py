@@ -273,7 +273,8 @@ def _explained_beyond(bench: Workbench, without: Fitted, fault: Clipping) -> flo
     # a positive coefficient would put the input inside its limit
     if np.any(np.linalg.lstsq(columns, left, rcond=1e-8)[0] > 0):
         return 0.0
-    return held_out(columns, left, folds(len(left), len(first.runs)))
+    whole = [slice(r.skip, len(r)) for r in bench.recordings]
+    return held_out(columns, left, folds(bench.recordings, whole))
 
 
 def _beyond_limit(u: np.ndarray, limit: float) -> np.ndarray:

@@ -25,6 +25,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from .._base import side_by_side
+from ..data import Recording
 from ..laws import Creep, Law, Local, PlayHysteresis, Relaxation, StopHysteresis, count_columns, unit_forces
 from ..models import Parameter
 from ..simulators import EQUATION, PARAMETER, SENSOR, Port, kind_of, port_name
@@ -105,16 +106,17 @@ class Remainder:
     def of(cls, bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]], at: str = "") -> Remainder:
         """Project the error along some runs, for the laws that the data can determine; with `at`, for one port only."""
         signals = ("a", "b", "c", "d", "error", "z", "dz", "x", "u", "own")
+        windows = _windows(bench, runs)
         short = [
             replace(r, **{k: getattr(r, k)[w] for k in signals}, from_zero=r.from_zero and w.start == 0)
-            for r, w in zip(runs, _windows(bench, runs), strict=True)
+            for r, w in zip(runs, windows, strict=True)
         ]
         error = np.concatenate([(r.error / bench.scale).ravel() for r in short])
         base = followed(bench, short)
         left = project_off(error, base)
         every = (*_tasks(bench, probe, laws, runs, short), *_parameter_tasks(bench, probe, laws, runs, short))
         tasks = [t for t in every if at in ("", t.port.name)]
-        return cls(bench, short, base, left, tuple(tasks), folds(len(left), len(runs)))
+        return cls(bench, short, base, left, tuple(tasks), folds(bench.recordings, windows))
 
     def columns(self, task: Task, shifted: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Compute the responses beyond the base to a port's laws, each with a force of unit size, and their sizes.
@@ -240,9 +242,21 @@ def usable(law: Law, local: Local) -> bool:
     return not law.why_not(local)
 
 
-def folds(length: int, recordings: int) -> np.ndarray:
-    """Mark every second block of the stacked record."""
-    return (np.arange(length) * BLOCKS * recordings // max(length, 1)) % 2 == 1
+def folds(recordings: Sequence[Recording], windows: Sequence[slice]) -> np.ndarray:
+    """Mark every second block of the stacked outputs of some windows.
+
+    All periods are held out at the same phases: a force that repeats with the input could otherwise learn the noise of
+    one period, and repeat half of it in the next.
+    """
+    out = []
+    for r, window in zip(recordings, windows, strict=True):
+        length, count = window.stop - window.start, BLOCKS
+        at = np.arange(length)
+        if r.period and r.begins == "periodic" and length > r.period:
+            count = 2 * max(round(BLOCKS * r.period / length / 2), 1)  # even, so that blocks alternate across periods
+            at, length = at % r.period, r.period
+        out.append(np.repeat(at * count // max(length, 1) % 2 == 1, r.n_y))
+    return np.concatenate(out)
 
 
 def held_out(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: Sequence[float] = RIDGES[:1]) -> float:

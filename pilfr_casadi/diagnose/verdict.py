@@ -308,15 +308,17 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
     share = max(shares.values(), default=0.0)
     steady = [g for g in gates if g.finding == "tone" and not found.effects]
     mode = ringing(search.bench, search.root.fitted)
-    noise = not found.effects and _is_noise(search, steady, share, mode)
+    measured = search.floor.may_be(_times_noise(search, steady))
+    noise = not found.effects and (measured or _is_noise(search, steady, share, mode))
     if faults and (noise or cured):
         return Verdict("recording-fault", faults[0].sentence)
-    if noise and share < LEAST_EXPLAINED:
+    if noise and (measured or share < LEAST_EXPLAINED):
         beside = f" but a steady tone in {' and '.join(g.channel for g in steady)}" if steady else ""
+        rest = "the rest is as large as the noise" if measured else "no force at any port explains any of the rest"
         return Verdict(
             "complete",
             f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {off:.3g} of the "
-            "outputs' deviation, and no force at any port explains any of the rest.",
+            f"outputs' deviation, and {rest}.",
         )
     if closest is None or not closest.laws:
         closest = closest_law(search, found.best)
@@ -332,12 +334,17 @@ def closest_law(search: Hypotheses, likeliest: Trial) -> Trial:
     return max((t for t in search.memo.values() if t.laws), key=search.optimistic_evidence, default=likeliest)
 
 
-def _is_noise(search: Hypotheses, steady: Sequence[Gate], share: float, mode: float | None) -> bool:
-    """Tell whether the refit's residual can be noise: no force explains it, no mode rings, and its power is steady."""
+def _times_noise(search: Hypotheses, steady: Sequence[Gate]) -> float:
+    """Compute the refit's error, without steady tones, over the noise: the measured one, or the white part."""
     root = search.root
     quiet = root.error * max(1 - sum(1 - g.left for g in steady), 0.0) ** 0.5
     white = white_part(root.fitted.residual) if search.floor.source == "estimated" else search.floor.deviation
-    times = quiet / float(np.sqrt(np.mean((white / search.bench.scale) ** 2)))
+    return quiet / float(np.sqrt(np.mean((white / search.bench.scale) ** 2)))
+
+
+def _is_noise(search: Hypotheses, steady: Sequence[Gate], share: float, mode: float | None) -> bool:
+    """Tell whether the refit's residual can be noise: no force explains it, no mode rings, and its power is steady."""
+    root, times = search.root, _times_noise(search, steady)
     if times < AT_NOISE_RATIO:
         return True
     unexplained = share < (EXPLAINED_QUIET_NOISE if root.mean_square < NEGLIGIBLE_ERROR**2 else EXPLAINED_NOISE)

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from pilfr_casadi import Recording
-from pilfr_casadi.diagnose.floor import effective_size, measured_floor, swells_with, white_part
+from pilfr_casadi.diagnose.floor import Floor, effective_size, measured_floor, swells_with, white_part
 
 N, DEVIATION = 200, (0.02, 0.5)
 
@@ -38,6 +39,25 @@ def test_rounding_repeats_and_is_noise_nevertheless():
     coarse = quiet.with_(y=np.round(quiet.y / 0.1) * 0.1)
     assert max(measured_floor([quiet]).deviation) < 1e-4
     assert measured_floor([coarse]).deviation == pytest.approx((0.1 / 12**0.5,) * 2, rel=1e-3)
+
+
+@pytest.mark.parametrize("pole", [0.0, 0.98])
+@pytest.mark.parametrize("repeats", [2, 8])
+def test_an_error_that_repeats_is_told_from_measured_noise(pole, repeats):
+    """A residual of noise alone may be noise, one with a sine of the noise's size that repeats may not."""
+    wrong = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        noise = lfilter([1], [1, -pole], rng.standard_normal(repeats * 4 * N + 500))[500:, None]
+        blank = Recording(noise, noise, 0.01, ("u",), ("a",), initial="periodic", period=4 * N)
+        floor = measured_floor([blank])
+        sine = 1.5 * floor.deviation * np.sin(0.5 * np.arange(len(noise)))[:, None]
+        alone, both = (float(np.std(e) / floor.deviation[0]) for e in (noise, noise + sine))
+        wrong += not floor.may_be(alone)
+        wrong += floor.may_be(both) if repeats > 2 or not pole else 0
+    assert floor.repeats == repeats
+    assert wrong == 0
+    assert not Floor(floor.deviation, "estimated").may_be(1.0)
 
 
 def test_one_period_and_one_recording_show_nothing():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from cart import cart
 from diagnosis_rig import recordings, rig
+from scipy.signal import lfilter
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Recording, multisine
@@ -23,6 +24,19 @@ def test_a_value_of_the_simulator_that_a_law_replaces_is_told_to_come_out_as_zer
     found = pilfr.diagnose(cart(), r, laws=(CubicDamping,), effects=1, workers=1)
     assert found.parameters["d"]["refit_without"] > 1
     assert found.sentence == "The simulator leaves out cubic damping at ground. Beside it, d comes out as zero."
+
+
+def test_slow_noise_that_two_periods_show_is_no_missing_physics():
+    """A flexible force follows half of it: its mean over both periods repeats with the input."""
+    u = np.tile(10 * multisine(400, f_max=3.0, fs=20.0, rng=np.random.default_rng(1)), 2)
+    blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="periodic", period=400, hold="zero")
+    y = cart().simulate(blank)
+    slow = lfilter([1], [1, -0.98], np.random.default_rng(2).standard_normal(len(y) + 500))[500:, None]
+    r = blank.with_(y=y + 0.15 * np.std(y) * slow / np.std(slow))
+    found = pilfr.diagnose(cart(), r, laws=(CoulombFriction, CubicDamping), effects=1, workers=1)
+    assert max(found.evidence["search"].flexible(found.evidence["search"].root).values()) > 0.3
+    assert found.verdict == "complete"
+    assert "the rest is as large as the noise" in found.sentence
 
 
 @pytest.mark.parametrize("offset", [0.0, 3.0])
