@@ -41,7 +41,7 @@ from .workbench import (
 BEST, BEST_AGAIN = 10, 4
 MOST_REFINED = 8  # pairs fitted from several starts; only FEW if `again`
 EQUAL_COSTS = 1.02  # ratio of mean square errors within which fits count as equal
-LEAST_SHARE = 0.01  # ratio to the larger share of the two runs below which a run's start values are not used
+LEAST_SHARE = 0.01  # share over the largest of the same run below which start values are not used
 Key = frozenset[Pair]
 
 
@@ -354,10 +354,12 @@ def select_pairs(scored: Sequence[Scored], best: int) -> list[list[Scored]]:
             if not any(_is_redundant(s, other) for other in passed):  # two forms of one law are one hypothesis
                 passed.append(s)
             ports.add(s.port)
+    largest = dict[str, float]()  # the runs leave different errors, so that their shares are not comparable
     for s in scored:
+        largest[s.source] = max(largest.get(s.source, 0.0), s.share)
         if s.pair in chosen:
             chosen[s.pair].append(s)
-    return [[s for s in found if s.share > LEAST_SHARE * found[0].share] or found for found in chosen.values()]
+    return [[s for s in found if s.share > LEAST_SHARE * largest[s.source]] or found for found in chosen.values()]
 
 
 def _is_redundant(one: Scored, other: Scored) -> bool:
