@@ -197,11 +197,15 @@ def _simpler_laws(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Sco
 
 
 def _matching_forces(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Select simple laws at the best law's port with the most similar force; none if the best law is simple."""
+    """Select laws with fewer parameters than the best law, at its port, with the most similar force.
+
+    They start with everything else where the best hypothesis has it. None if the best law is in no way flexible.
+    """
     best, near = trials[0], _near(trials)
     if not best.law.flexible:
         return []
-    entries = _first_of_pairs(s for s in scored if s.port == best.port and not s.law.flexible and s.pair not in near)
+    there = (s for s in scored if s.port == best.port and s.pair not in near)
+    entries = _first_of_pairs(s for s in there if s.law.size(s.starts[0]) < best.law.size(best.own))
     local = port_signals(bench, best.fitted, best.port)
     # also excludes nan, for example from the root of a negative number
     if not entries or not np.all(np.abs([local.z, local.dz]) < HUGE):
@@ -213,7 +217,7 @@ def _matching_forces(bench: Workbench, trials: Sequence[Trial], scored: Sequence
     with np.errstate(over="ignore", invalid="ignore"):
         found = [(*_match_force(s.law, local, force), s) for s in entries]
     ranked = sorted((f for f in found if f[0] < 1), key=lambda f: f[0])[:FEW]
-    return [replace(s, starts=(start, *s.starts)) for _, start, s in ranked]
+    return [replace(s, starts=(start, *s.starts), beside=best.fitted.values) for _, start, s in ranked]
 
 
 def _match_force(law: Law, local: Local, force: np.ndarray) -> tuple[float, dict[str, Any]]:

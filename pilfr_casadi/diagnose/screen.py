@@ -19,7 +19,7 @@ noise from missing structure without knowing the floor, and a right name from on
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -316,7 +316,8 @@ class Scored:
     """A port and law with its score and start values, best first.
 
     The score is the share of the residual that a small dose removes on blocks that it was not fitted to; `sense` is
-    `linearise.Run.sense`.
+    `linearise.Run.sense`. Everything else starts at the values `beside`, by full name, or where they say nothing, at
+    those of the hypothesis that the law is added to.
     """
 
     port: str
@@ -326,6 +327,7 @@ class Scored:
     local: Local
     sense: int = 0
     source: str = "simulation"
+    beside: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def pair(self) -> Pair:

@@ -47,6 +47,7 @@ from .workbench import DIVERGED, FEW, THOROUGH, Fitted
 # Effort
 MOST_CONVERGED = 5  # trials of a step that are fitted to convergence at most
 NEARLY_EXPLAINED = 0.05  # share of the excess left by one law below which far worse laws are not refined
+TWO = "two at once"  # a stage, entered once
 MOST_LEARNED = 2  # learned forces that are kept: those with the smallest error
 
 
@@ -108,8 +109,10 @@ class Search(Hypotheses):
                 self.exchange()
             if len(self.best.laws) <= len(parent.laws):  # no added law is worth its prior
                 break
-        if effects > 1 and len(self.best.effects) < 2 and self.can_improve(self.best) and self.in_time():
+        if effects > 1 and TWO not in self.times and self.can_improve(self.best) and self.in_time():
+            best = self.best
             self.add_two()
+            return self.best is best or self._grow(effects)
         return True
 
     def _grow_to_noise(self) -> None:
@@ -392,7 +395,7 @@ class Search(Hypotheses):
 
     def add_two(self) -> None:
         """Fit two laws at once beside the simulator alone, because one after the other may hide each other."""
-        with self.stage("two at once"):
+        with self.stage(TWO):
             rest = Remainder.of(self.bench, *linearised(self.bench, self.root.fitted), self.laws)
             fits, before = self.fits, self.best
             found = side_by_side(

@@ -257,17 +257,23 @@ class Trials:
         placed, _ = place_law(base.simulator, first, first.starts[0])
         model, engine = self.bench.compile(placed, gain)
         users = self.bench.simulator.parameters
-        # the refit may have bent the term in line with which the law stands, to make up for it
-        reset = self.bench.simulator.term_parameters(first.port) if first.law.in_line else tuple(users)
+        # the refit may have bent an offset there, or the term in line with which the law stands, to make up for it
+        there = [e for e in self.bench.simulator.elements if e.port == first.port]
+        reset = tuple(f"{e.prefix}{name}" for e in there for name in e.law.strength)
+        if first.law.in_line:
+            reset = (*reset, *self.bench.simulator.term_parameters(first.port))
+        bent = bool(reset) or first.law.special  # or may be far off where the missing force is strongly curved
+        reset = reset or tuple(users)
         nominal = {**base.values, **{name: users[name].value for name in reset}}
         starts: list[Mapping[str, Any]] = []
         # values from the observer's run, which may be near the truth if the simulation is not
         observed: list[Mapping[str, Any]] = []
         given: list[Mapping[str, Any]] = []  # with the user's own values of the parameters
         for entry in entries:
+            others = {name: entry.beside.get(name, value) for name, value in base.values.items()}
             for i, own in enumerate(entry.starts):
                 _, named = place_law(base.simulator, entry, own)
-                starts.append({**base.values, **named})
+                starts.append({**others, **named})
                 if i == 0:
                     observed += [starts[-1]] if entry.source == "observer" else []
                     given.append({**nominal, **named})
@@ -277,14 +283,12 @@ class Trials:
             zero = {k: 0.0 * np.asarray(v) if k in free else v for k, v in first.starts[0].items()}
             starts.append({**base.values, **place_law(base.simulator, first, zero)[1]})
         best, *rest = self.part.by_cost(placed, model, engine, starts, base.begin)
-        others = (s for s in rest if not any(s is o for o in observed))
-        ranked = [best, *(s for s in observed if s is not best), *others]
+        last = (s for s in rest if not any(s is o for o in observed))
+        ranked = [best, *(s for s in observed if s is not best), *last]
         count = len(parent.laws) + 1
         options = {"states": base.begin, "model": model, "engine": engine}
         brief = self.fitted(placed, ranked[:1], count, solver=BRIEF, **options)
-        if (
-            first.law.special or first.law.in_line
-        ):  # the refit may be far off where the missing force is strongly curved
+        if bent:
             afresh = [s for s in ranked if any(s is n for n in given)][:1]
             again = self.fitted(placed, afresh, count, solver=BRIEF, **{**options, "states": ()})
             brief = min((t for t in (brief, again) if t is not None), key=lambda t: t.part_mean_square, default=None)
