@@ -54,5 +54,11 @@ if TYPE_CHECKING:
         fingerprint as fingerprint,
     )
     from .tables import STACK_SUFFIXES as STACK_SUFFIXES, TABLE_SUFFIXES as TABLE_SUFFIXES, read_stack as read_stack
+    from .units import (
+        conversion as conversion,
+        dimension as dimension,
+        revolution_in as revolution_in,
+        symbols as symbols,
+    )
 
 __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import one_at_a_time
-from ..data import Recording
+from ..data import Recording, revolution_in
 from ..laws import Law, Local
 from ..linear import steady_state_gain, with_output_injection
 from ..models import Model, map_points
@@ -28,7 +28,6 @@ from ..simulators import (
     Port,
     Simulator,
     discretise,
-    revolution_in,
     signals,
     split_port,
     states_along,

@@ -42,7 +42,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, Progress, Stages, deferred_interrupt, one_blas_thread, processors, whole
-from ..data import Recording
+from ..data import Recording, as_recordings
 from ..laws import Law, VaryingParameter, display_name
 from .answer import Conclusion, FinalFits, build_diagnosis
 from .arguments import (
@@ -68,7 +68,7 @@ from .other_explanations import (
     may_act_elsewhere,
 )
 from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
-from .preparation import CHECKS, Prepared, hold_note, prepare
+from .preparation import CHECKS, Prepared, hold_note, prepare, unit_notes
 from .proof import errors_of, mean_nrmse
 from .recording_faults import clipped_input, open_unsettled, remove_glitches, tones
 from .result import Diagnosis
@@ -107,13 +107,25 @@ def diagnose_in_steps(
     if focus not in (None, *FOCUS):
         raise InputError(f"focus={focus!r} was given; use 'simulation', 'prediction' or None.")
     say = Stages(progress or (lambda stage, done, total, best: None))
-    simulator, recordings = match_recordings(simulator, train, hold)
+    given = as_recordings(train)
+    simulator, recordings = match_recordings(simulator, given, hold)
     tests = match_tests(simulator, test, recordings)
     check_limits(simulator, limits)
     tried = (*add_scaled_laws(check_laws(laws), simulator), *((VaryingParameter,) if laws is None else ()))
     deadline = np.inf if time_limit is None else began + float(time_limit)
     request = Request(
-        simulator, recordings, tried, hold, engine, workers, most_effects, stand_in_error, deadline, say, focus
+        simulator,
+        recordings,
+        tried,
+        hold,
+        engine,
+        workers,
+        most_effects,
+        stand_in_error,
+        deadline,
+        say,
+        focus,
+        notes=unit_notes(simulator, given),
     )
     most = MOST_SAMPLES if search_samples is None else whole(search_samples, "search_samples", FEWEST_SAMPLES)
     request, ready, search = _search_with_focus(_on_stretches(request, most))

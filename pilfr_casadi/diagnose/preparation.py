@@ -15,6 +15,7 @@ import numpy as np
 
 from .._base import InputError, Stages
 from ..data import Recording
+from ..identify import unit_factor
 from ..simulators import Simulator
 from .arguments import stated_hold
 from .channel_faults import find_slips, open_bench
@@ -208,6 +209,21 @@ def _choose_hold(bench: Workbench) -> tuple[Workbench, Sequence[Gate]]:
         return bench, ()
     best = both[int(costs[1] < costs[0])]
     return best, [hold_note(best.simulator, best.hold, ratio)]
+
+
+def unit_notes(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Gate, ...]:
+    """Note which channels are recorded in another unit than the simulator's, by which they were multiplied."""
+    out = dict[str, Gate]()
+    for r in recordings:
+        for name in (n for n in (*simulator.inputs, *simulator.output_names) if n in r.units):
+            factor, wanted = unit_factor(simulator, r, name), simulator.units.get(name, "")
+            if factor != 1:
+                sentence = (
+                    f"{name} is recorded in {r.units[name]}, and the simulator has it in {wanted}: its values were "
+                    f"multiplied by {factor:g}."
+                )
+                out[sentence] = Gate(name, "conversion", factor, sentence)
+    return tuple(out.values())
 
 
 def hold_note(simulator: Simulator, hold: str, ratio: float) -> Gate:

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
         load as load,
         match_channels as match_channels,
         save as save,
+        unit_factor as unit_factor,
     )
     from .sparse import (
         SPREADINGS as SPREADINGS,

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, is_number, later, listed
-from ..data import NOTHING_SENTENCE, Recording, as_recordings, explains_nothing, fingerprint, nrmse
+from ..data import NOTHING_SENTENCE, Recording, as_recordings, conversion, explains_nothing, fingerprint, nrmse
 from ..engine import Engine, make_engine
 from ..export import FitContent, exported, read_model_file, write_model_file
 from ..linear import LinearPart, any_bla, linear_parts
@@ -429,19 +429,22 @@ class Fit:
 
 
 def match_channels(simulator: Simulator, recording: Recording) -> Recording:
-    """Return a recording with its columns in a simulator's order, others left out.
+    """Return a recording with its columns in a simulator's order and units, others left out.
 
     Raises
     ------
     InputError
-        If a column is missing; a recording without outputs needs none.
+        If a column is missing, or its unit measures something else; a recording without outputs needs none.
     """
     changes: dict[str, Any] = {}
+    units = {
+        name: unit for name, unit in recording.units.items() if name in (*simulator.inputs, *simulator.output_names)
+    }
     for kind, names, own, values in (
         ("input", simulator.inputs, recording.inputs, recording.u),
         ("output", simulator.output_names, recording.outputs, recording.y),
     ):
-        if tuple(own) == tuple(names) or (kind == "output" and not own):
+        if kind == "output" and not own:
             continue
         for name in names:
             if name not in own:
@@ -449,12 +452,30 @@ def match_channels(simulator: Simulator, recording: Recording) -> Recording:
                     f"{recording.label} has no {kind} {name!r}; it has {', '.join(own) or 'none'}. Map a column to "
                     "it by name."
                 )
-        changes["u" if kind == "input" else "y"] = values[:, [own.index(n) for n in names]]
-        changes[f"{kind}s"] = tuple(names)
-    if changes:
-        kept = {*changes.get("inputs", recording.inputs), *changes.get("outputs", recording.outputs)}
-        changes["units"] = {k: v for k, v in recording.units.items() if k in kept}
-    return recording.with_(**changes) if changes else recording
+        factors = [unit_factor(simulator, recording, name) for name in names]
+        if tuple(own) != tuple(names) or any(factor != 1 for factor in factors):
+            changes["u" if kind == "input" else "y"] = values[:, [own.index(n) for n in names]] * factors
+            changes[f"{kind}s"] = tuple(names)
+            units |= {n: simulator.units[n] for n, factor in zip(names, factors, strict=True) if factor != 1}
+    return recording.with_(**changes, units=units) if changes else recording
+
+
+def unit_factor(simulator: Simulator, recording: Recording, name: str) -> float:
+    """Return the factor from a channel's unit in a recording to the simulator's; 1 where one of them is not known.
+
+    Raises
+    ------
+    InputError
+        If no factor converts it.
+    """
+    unit, wanted = recording.units.get(name, ""), simulator.units.get(name, "")
+    factor = conversion(unit, wanted)
+    if factor is not None and np.isnan(factor):
+        raise InputError(
+            f"{recording.label} has {name!r} in {unit}, and the simulator has it in {wanted}; give the values in "
+            f"{wanted}, or correct the unit that is wrong."
+        )
+    return 1.0 if factor is None else factor
 
 
 def save(fit: Fit, path: str | os.PathLike[str]) -> None:

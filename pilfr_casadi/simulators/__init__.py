@@ -25,7 +25,6 @@ if TYPE_CHECKING:
         MECHANICAL as MECHANICAL,
         UNKNOWN as UNKNOWN,
         infer_domain as infer_domain,
-        revolution_in as revolution_in,
     )
     from .equations import Named as Named
     from .external import (

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError
+from ..data import revolution_in
 from ..laws import display_name, short_name
-from .domains import DOMAINS, MECHANICAL, UNKNOWN, infer_domain, may_convert, revolution_in
+from .domains import DOMAINS, MECHANICAL, UNKNOWN, infer_domain, may_convert
 
 Expression = Callable[..., Any]
 ACTUATOR, SENSOR, EQUATION, PARAMETER = BUILT_IN = ("actuator", "sensor", "equation", "parameter")

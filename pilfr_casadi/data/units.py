@@ -1,0 +1,125 @@
+"""Units as they are written: their dimensions and sizes, such as those of "N s/m", "mm" or "l/min"."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+# unit: size in SI, exponents of kg, m, s, A, K
+_UNITS: dict[str, tuple[float, tuple[int, int, int, int, int]]] = {
+    unit: (size, exponents)
+    for units, size, exponents in (
+        ("g", 1e-3, (1, 0, 0, 0, 0)),
+        ("t", 1e3, (1, 0, 0, 0, 0)),
+        ("m", 1.0, (0, 1, 0, 0, 0)),
+        ("in inch", 0.0254, (0, 1, 0, 0, 0)),
+        ("L l", 1e-3, (0, 3, 0, 0, 0)),
+        ("s", 1.0, (0, 0, 1, 0, 0)),
+        ("min", 60.0, (0, 0, 1, 0, 0)),
+        ("h", 3600.0, (0, 0, 1, 0, 0)),
+        ("Hz", 1.0, (0, 0, -1, 0, 0)),
+        ("rpm", 2 * np.pi / 60, (0, 0, -1, 0, 0)),
+        ("A", 1.0, (0, 0, 0, 1, 0)),
+        ("K °C degC", 1.0, (0, 0, 0, 0, 1)),
+        ("N", 1.0, (1, 1, -2, 0, 0)),
+        ("Nm J", 1.0, (1, 2, -2, 0, 0)),
+        ("Ncm", 1e-2, (1, 2, -2, 0, 0)),
+        ("Nmm", 1e-3, (1, 2, -2, 0, 0)),
+        ("W", 1.0, (1, 2, -3, 0, 0)),
+        ("Pa", 1.0, (1, -1, -2, 0, 0)),
+        ("bar", 1e5, (1, -1, -2, 0, 0)),
+        ("V", 1.0, (1, 2, -3, -1, 0)),
+        ("C", 1.0, (0, 0, 1, 1, 0)),
+        ("Ah", 3600.0, (0, 0, 1, 1, 0)),
+        ("F", 1.0, (-1, -2, 4, 2, 0)),
+        ("Ohm ohm Ω", 1.0, (1, 2, -3, -2, 0)),
+        ("S", 1.0, (-1, -2, 3, 2, 0)),
+        ("H", 1.0, (1, 2, -2, -2, 0)),
+        ("Wb", 1.0, (1, 2, -2, -1, 0)),
+        ("T", 1.0, (1, 0, -2, -1, 0)),
+        ("rad radian radians 1", 1.0, (0, 0, 0, 0, 0)),
+        ("deg ° degree degrees", np.pi / 180, (0, 0, 0, 0, 0)),
+        ("rev revs revolution revolutions turn turns", 2 * np.pi, (0, 0, 0, 0, 0)),
+        ("%", 1e-2, (0, 0, 0, 0, 0)),
+    )
+    for unit in units.split()
+}
+_POWERS = {"p": -12, "n": -9, "uµμ": -6, "m": -3, "c": -2, "d": -1, "h": 2, "k": 3, "M": 6, "G": 9}
+_PREFIXES = {letter: 10.0**power for letters, power in _POWERS.items() for letter in letters}
+_CELSIUS = {"°C", "degC"}  # the zero is another one than that of K
+_ANGLES = {unit for unit, (_, exponents) in _UNITS.items() if not any(exponents)} - {"1", "%"}
+
+
+def dimension(unit: str) -> tuple[int, ...] | None:
+    """Return the exponents of kg, m, s, A and K of a unit; None if it is empty or not known.
+
+    >>> dimension("N s/m"), dimension("m^3/s"), dimension("counts")
+    ((1, 0, -1, 0, 0), (0, 3, -1, 0, 0), None)
+    """
+    found = _read(unit)
+    return None if found is None else found[1]
+
+
+def conversion(unit: str, wanted: str) -> float | None:
+    """Return the factor from a unit to another: nan if no factor converts it, None if one of them is not known.
+
+    >>> conversion("mm", "m"), conversion("N m", "Nm"), conversion("counts", "m")
+    (0.001, 1.0, None)
+    >>> conversion("V", "m"), conversion("°C", "K")
+    (nan, nan)
+    """
+    if unit.strip() == wanted.strip():
+        return 1.0
+    one, other = _read(unit), _read(wanted)
+    if one is None or other is None:
+        return None
+    alike = one[1] == other[1] and len({unit.strip() in _CELSIUS, wanted.strip() in _CELSIUS}) == 1
+    return float(f"{one[0] / other[0]:.12g}") if alike else np.nan
+
+
+def revolution_in(unit: str) -> float:
+    """Return one revolution in the unit of an angle; nan if it is none.
+
+    >>> revolution_in("deg"), revolution_in("turns"), revolution_in("rad/s"), revolution_in("m"), revolution_in("")
+    (360.0, 1.0, nan, nan, nan)
+    """
+    found = _split(unit.strip())
+    return float(f"{2 * np.pi / found[1]:.15g}") if found is not None and found[0] in _ANGLES else np.nan
+
+
+def symbols(unit: str) -> list[str]:
+    """Return the symbols of a unit without their prefixes.
+
+    >>> symbols("mrad/s^2")
+    ['rad', 's']
+    """
+    found = (_split(symbol) for symbol in re.findall(r"[^\s*/·^()\d-]+", unit))
+    return [known[0] for known in found if known is not None]
+
+
+def _read(unit: str) -> tuple[float, tuple[int, ...]] | None:
+    """Return a unit's size in SI and its exponents; None if it is empty or not known."""
+    size, total, below = 1.0, [0, 0, 0, 0, 0], False
+    tokens = re.findall(r"[^\s*/·^()]+(?:\^\(?-?\d+\)?)?|/", unit.replace("²", "^2").replace("³", "^3"))
+    for token in tokens:
+        if token == "/":
+            below = True
+            continue
+        symbol, _, power = token.partition("^")
+        found = _split(symbol)
+        if found is None:
+            return None
+        times = int(power.strip("()") or 1) * (-1 if below else 1)
+        size *= found[1] ** times
+        total = [a + times * b for a, b in zip(total, _UNITS[found[0]][1], strict=True)]
+    return (size, tuple(total)) if tokens else None
+
+
+def _split(symbol: str) -> tuple[str, float] | None:
+    """Return a symbol without its prefix, and its size in SI; None if it is not known."""
+    if symbol in _UNITS:
+        return symbol, _UNITS[symbol][0]
+    if symbol[:1] in _PREFIXES and symbol[1:] in _UNITS:
+        return symbol[1:], _PREFIXES[symbol[0]] * _UNITS[symbol[1:]][0]
+    return None

@@ -1,0 +1,75 @@
+"""Units as they are written: dimensions, conversions, and recordings in other units than the simulator's."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cart import cart
+
+import pilfr_casadi as pilfr
+from pilfr_casadi.data import conversion, dimension, revolution_in
+from pilfr_casadi.laws import CoulombFriction
+
+
+@pytest.mark.parametrize(
+    ("unit", "wanted", "factor"),
+    [
+        ("mm", "m", 1e-3),
+        ("Ncm", "N m", 1e-2),
+        ("kNm", "N m", 1e3),
+        ("deg", "rad", np.pi / 180),
+        ("rpm", "rad/s", np.pi / 30),
+        ("l/min", "m^3/s", 1e-3 / 60),
+        ("mm/s", "m/s", 1e-3),
+        ("bar", "kPa", 100.0),
+        ("µm", "um", 1.0),
+        ("N*m", "Nm", 1.0),
+        ("%", "1", 1e-2),
+        ("m^2", "mm^2", 1e6),
+        ("counts", "rad", None),
+        ("", "m", None),
+        ("counts", "counts", 1.0),
+    ],
+)
+def test_a_unit_is_converted_to_another(unit, wanted, factor):
+    assert conversion(unit, wanted) == (factor if factor is None else pytest.approx(factor, rel=1e-11))
+
+
+@pytest.mark.parametrize(("unit", "wanted"), [("V", "m"), ("°C", "K"), ("m", "m/s")])
+def test_what_no_factor_converts_is_told(unit, wanted):
+    assert np.isnan(conversion(unit, wanted))
+
+
+def test_dimensions_and_revolutions_are_read():
+    assert dimension("N s/m") == dimension("kg/s") == (1, 0, -1, 0, 0)
+    assert dimension("level") is None
+    assert revolution_in("mrad") == pytest.approx(2e3 * np.pi)
+    assert revolution_in("deg") == 360
+    assert np.isnan(revolution_in("%"))
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """A cart with friction, recorded in mm and in kN; the simulator has m and N."""
+    u = 10 * pilfr.multisine(400, f_max=3.0, fs=20.0, rng=np.random.default_rng(1))
+    units = {"force": "kN", "pos": "mm"}
+    blank = pilfr.Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
+    y = cart().with_element("ground", CoulombFriction().at({"F_c": 3.0, "v_0": 0.01})).simulate(blank)
+    noise = 1e-3 * np.std(y) * np.random.default_rng(0).standard_normal(y.shape)
+    return blank.with_(u=u / 1e3, y=1e3 * (y + noise), units=units)
+
+
+def test_a_recording_in_other_units_is_converted_and_that_is_told(recorded):
+    stated = replace(cart(), units={"force": "N", "pos": "m"})
+    found = pilfr.diagnose(stated, recorded, laws=(CoulombFriction,), workers=1)
+    assert [(e.port, e.law) for e in found.effects] == [("ground", "coulomb_friction")]
+    assert found.effects[0].parameters["F_c"]["value"] == pytest.approx(3.0, rel=0.05)
+    notes = [g.sentence for g in found.gates if g.finding == "conversion"]
+    assert "pos is recorded in mm, and the simulator has it in m: its values were multiplied by 0.001." in notes
+    assert found.nrmse(recorded) == pytest.approx(found.errors["train"]["after"], rel=1e-6)
+
+
+def test_a_unit_of_something_else_is_refused(recorded):
+    stated = replace(cart(), units={"pos": "V"})
+    with pytest.raises(pilfr.InputError, match="has 'pos' in mm, and the simulator has it in V; give the values in V"):
+        pilfr.diagnose(stated, recorded, laws=(CoulombFriction,), workers=1)
