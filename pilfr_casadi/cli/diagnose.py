@@ -7,6 +7,7 @@ reveal, and writes check.json where a folder is given.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -138,17 +139,24 @@ def diagnose_command(options: DiagnoseOptions) -> int:
             )
     except KeyboardInterrupt:
         return say("Interrupted before there was a diagnosis; nothing was written.", INTERRUPTED)
-    return write_diagnosis(diagnosis, folder)
+    return write_diagnosis(diagnosis, folder, options.source or "")
 
 
-def write_diagnosis(diagnosis: Diagnosis, folder: Path) -> int:
-    """Write diagnosis.json, then the page; print the diagnosis and its paths; return the exit status."""
+def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: str = "") -> int:
+    """Write diagnosis.json, corrected.py, then the page; print the diagnosis and its paths; return the exit status.
+
+    corrected.py corrects the simulator file `source`, if the simulator is from a Python file.
+    """
     target = folder / "diagnosis.json"
     try:
         with deferred_interrupt():
             diagnosis.save(target)
             print(diagnosis, flush=True)
-            from ..report import diagnosis_report
+            from ..report import corrected_file, diagnosis_report
+
+            corrected = folder / "corrected.py" if Path(source).suffix.lower() == ".py" else None
+            if corrected is not None:
+                write_atomically(corrected, corrected_file(diagnosis, os.path.relpath(source, folder)))
         with progress_bar() as progress:
             progress("writing the report", 0, 0, np.nan)
             page = diagnosis_report(diagnosis, folder)
@@ -160,6 +168,8 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path) -> int:
         reason = f"{type(error).__name__}: {error}"
         return say(f"The diagnosis is in {target}, but a report could not be written ({reason}).", NO_RESULT)
     print(f"diagnosis: {target}\nreport: {page}")
+    if corrected is not None:
+        print(f"corrected simulator: {corrected}")
     return INTERRUPTED if diagnosis.interrupted else DONE
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
@@ -37,7 +37,7 @@ from ..data import (
 )
 from ..engine import VirtualMachine, compiler, make_engine
 from ..export import NAMES, exported
-from ..identify import Fit, check_recordings, fit, load
+from ..identify import Fit, check_recordings, fit, load, run_simulator
 from ..linear import select_order
 from ..models import ANY, PILFR, TAKES, Lagged, named_structure
 from ..optimise import GaussNewton, Ipopt, Status
@@ -255,7 +255,9 @@ def describe_test_error(result: Fit, recording: Recording) -> str:
 class SimulateOptions(DataOptions):
     """The options of `pilfr simulate`."""
 
-    model: str = typer.Argument(..., metavar="MODEL", help="A saved model, model.json.")
+    model: str = typer.Argument(
+        ..., metavar="MODEL", help="A model.json, or a Python file that sets `simulator`, such as corrected.py."
+    )
     data: str = typer.Argument(
         ...,
         metavar="DATA",
@@ -269,6 +271,8 @@ class SimulateOptions(DataOptions):
 def simulate_command(options: SimulateOptions) -> int:
     """If the file has the outputs too, the error of the simulation is printed."""
     _check_out(options)
+    if Path(options.model).suffix.lower() == ".py":
+        return _simulate_equations(options)
     fitted = load(options.model)
     inputs, outputs = options.names(fitted.model.inputs, fitted.model.outputs)
     kind = Path(options.data).suffix.lower()
@@ -280,22 +284,51 @@ def simulate_command(options: SimulateOptions) -> int:
         raise InputError(f"--out {options.out} is for several records in one array; give a name that ends in .csv.")
     if kind not in (".mat", ".npz"):  # there, a matrix stands for several names
         check_names(fitted, inputs, outputs)
+    recording, columns, measured = _read_to_simulate(options, inputs, outputs)
+    check_names(fitted, recording.inputs, recording.outputs if measured else fitted.model.outputs)
+    y = replace(fitted, engine=announce_engine(fitted, recording, "auto", quiet=True)).simulate(recording)
+    return _write_simulated(options, recording, y, fitted.model.outputs, columns, fitted.scored_from)
+
+
+def _simulate_equations(options: SimulateOptions) -> int:
+    simulator = load_simulator(options.model)
+    if {Path(options.data).suffix.lower(), Path(options.out).suffix.lower()} & set(STACK_SUFFIXES) - {".npz"}:
+        raise InputError("Several records in one array are simulated by a saved model only; give one recording.")
+    inputs, outputs = options.names(simulator.inputs, simulator.output_names)
+    recording, columns, _ = _read_to_simulate(options, inputs, outputs)
+    seen, y, first = run_simulator(simulator, recording)
+    return _write_simulated(options, seen, y, simulator.output_names, columns, lambda _: first)
+
+
+def _read_to_simulate(
+    options: SimulateOptions, inputs: tuple[str, ...], outputs: tuple[str, ...]
+) -> tuple[Recording, dict[str, str], bool]:
+    """Read a recording, with the outputs if it has them; return it, its columns by name, and whether it has."""
     columns, measured = _columns_to_read(options, inputs, outputs)
     options = replace(
         options,
         initial=options.initial or ("estimate" if measured else "zero"),
         column=[f"{name}={column}" for name, column in columns.items()],
     )
-    recording = options.read(options.data, inputs, outputs if measured else ())
-    check_names(fitted, recording.inputs, recording.outputs if measured else fitted.model.outputs)
-    y = replace(fitted, engine=announce_engine(fitted, recording, "auto", quiet=True)).simulate(recording)
+    return options.read(options.data, inputs, outputs if measured else ()), columns, measured
+
+
+def _write_simulated(
+    options: SimulateOptions,
+    recording: Recording,
+    y: np.ndarray,
+    outputs: Sequence[str],
+    columns: dict[str, str],
+    scored_from: Callable[[Recording], int],
+) -> int:
+    """Write the simulated outputs, and print their error or where the simulation began."""
     if not np.all(np.isfinite(y)):
         return say(f"The simulation of {options.model} diverges on {options.data}; nothing was written.", NO_RESULT)
-    write_atomically(Path(options.out), _table(options, fitted, recording, y, columns))
-    if measured:
-        print(_error_line(fitted, recording, y))
+    write_atomically(Path(options.out), _table(options, recording, y, outputs, columns))
+    if recording.n_y:
+        print(_error_line(recording, y, scored_from))
     else:
-        state = {"zero": "zero", "periodic": "periodic steady state"}.get(options.initial, "as given")
+        state = {"zero": "zero", "periodic": "periodic steady state"}.get(recording.begins, "as given")
         print(f"{options.data} has no outputs ({listed(outputs)}) to compare with; initial state: {state}")
     print(f"simulated outputs: {options.out}")
     return DONE
@@ -330,13 +363,15 @@ def _check_initial(options: SimulateOptions, lack: str) -> None:
         )
 
 
-def _table(options: SimulateOptions, fitted: Fit, recording: Recording, y: np.ndarray, columns: dict[str, str]) -> str:
+def _table(
+    options: SimulateOptions, recording: Recording, y: np.ndarray, outputs: Sequence[str], columns: dict[str, str]
+) -> str:
     """Write times (as they were read), inputs and simulated outputs as CSV."""
     written = None if options.resample else written_times(options.data, columns)
     times = written or [repr(float(f"{t:.12g}")) for t in recording.t]
     rows = np.column_stack([recording.u, y]).tolist()
     lines = [",".join([t.strip(), *map(repr, row)]) for t, row in zip(times, rows, strict=True)]
-    header = ",".join(["t", *fitted.model.inputs, *fitted.model.outputs])
+    header = ",".join(["t", *recording.inputs, *outputs])
     return "\n".join([header, *lines]) + "\n"
 
 
@@ -362,7 +397,7 @@ def _simulate_stack(options: SimulateOptions, fitted: Fit, u: np.ndarray, y: np.
         if not np.all(np.isfinite(found[at])):
             return say(f"The simulation of {options.model} diverges on {name}; nothing was written.", NO_RESULT)
         if y is not None:
-            print(_error_line(fitted, record, found[at]))
+            print(_error_line(record, found[at], fitted.scored_from))
             errors.append(nrmse(record.y, found[at], skip=fitted.scored_from(record)))
     write_atomically(Path(options.out), _stack_content(Path(options.out), u, found, options.dt, fitted))
     if errors:
@@ -388,9 +423,9 @@ def _stack_content(out: Path, u: np.ndarray, y: np.ndarray, dt: float, fitted: F
     return ("\n".join(lines) + "\n").encode()
 
 
-def _error_line(fitted: Fit, recording: Recording, y: np.ndarray) -> str:
+def _error_line(recording: Recording, y: np.ndarray, scored_from: Callable[[Recording], int]) -> str:
     try:
-        return f"NRMSE on {recording.name}: {nrmse(recording.y, y, skip=fitted.scored_from(recording)):.4f}"
+        return f"NRMSE on {recording.name}: {nrmse(recording.y, y, skip=scored_from(recording)):.4f}"
     except InputError as error:
         return f"no NRMSE on {recording.name}: {error}"
 

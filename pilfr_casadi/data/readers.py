@@ -153,8 +153,13 @@ def read_frame(
 
 
 def column_names(path: PathLike, wanted: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the names of a file's columns or variables; `wanted` helps to find the delimiter of a CSV file."""
-    return open_table(Path(path), wanted).names
+    """Return the names of a file's columns or variables; `wanted` helps to find the delimiter of a CSV file.
+
+    One that has a wanted name with a unit behind it, as in ``force [N]``, is returned by the wanted name.
+    """
+    names = open_table(Path(path), wanted).names
+    short = {_with_unit(name, names): name for name in wanted}
+    return tuple(short.get(name, name) for name in names)
 
 
 def written_times(path: PathLike, columns: Mapping[str, str] | None = None) -> list[str] | None:

@@ -15,8 +15,7 @@ import numpy as np
 
 from .._base import InputError, Stages
 from ..data import Recording
-from ..identify import unit_factor
-from ..simulators import Simulator
+from ..simulators import Simulator, unit_factor
 from .arguments import stated_hold
 from .channel_faults import find_slips, open_bench
 from .floor import Floor, white_part

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         Comparison as Comparison,
         compare as compare,
         run_free as run_free,
+        run_simulator as run_simulator,
         simulator_nrmse as simulator_nrmse,
     )
     from .context import (
@@ -51,7 +52,6 @@ if TYPE_CHECKING:
         load as load,
         match_channels as match_channels,
         save as save,
-        unit_factor as unit_factor,
     )
     from .sparse import (
         SPREADINGS as SPREADINGS,

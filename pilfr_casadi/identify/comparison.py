@@ -189,11 +189,7 @@ def _residual(model: Any, recording: Recording) -> tuple[np.ndarray, int]:
         seen = recording
         y, first = run_free(model, make_engine(model), recording)
     else:
-        simulator = as_simulator(model, [recording])
-        seen = match_channels(simulator, recording)
-        hold = seen.hold or simulator.hold or "zero"
-        discrete = discretise(simulator, seen.dt, hold, choose_substeps(simulator, [seen]))
-        y, first = run_free(discrete, make_engine(discrete), seen)
+        seen, y, first = run_simulator(as_simulator(model, [recording]), recording)
     missing = [name for name in recording.outputs if name not in seen.outputs]
     if missing:
         raise InputError(f"it has no output {missing[0]!r}; leave that out of the recording.")
@@ -201,6 +197,17 @@ def _residual(model: Any, recording: Recording) -> tuple[np.ndarray, int]:
     scale = np.std(recording.y, axis=0) / np.maximum(np.std(seen.y[:, order], axis=0), 1e-300)
     with np.errstate(over="ignore", invalid="ignore"):
         return np.asarray((y - seen.y)[:, order] * scale), first
+
+
+def run_simulator(simulator: Simulator, recording: Recording) -> tuple[Recording, np.ndarray, int]:
+    """Simulate along a recording: it as the simulator takes it, the outputs (M, n_y), the first sample to score.
+
+    An initial state that the recording does not give is fitted to its first samples; see `run_free`.
+    """
+    seen = match_channels(simulator, recording)
+    hold = seen.hold or simulator.hold or "zero"
+    model = discretise(simulator, seen.dt, hold, choose_substeps(simulator, [seen]))
+    return seen, *run_free(model, make_engine(model), seen)
 
 
 def run_free(

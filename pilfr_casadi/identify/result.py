@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, is_number, later, listed
-from ..data import NOTHING_SENTENCE, Recording, as_recordings, conversion, explains_nothing, fingerprint, nrmse
+from ..data import NOTHING_SENTENCE, Recording, as_recordings, explains_nothing, fingerprint, nrmse
 from ..engine import Engine, make_engine
 from ..export import FitContent, exported, read_model_file, write_model_file
 from ..linear import LinearPart, any_bla, linear_parts
@@ -37,7 +37,7 @@ from ..optimise import (
     samples_for_state,
     stability_limits,
 )
-from ..simulators import Simulator
+from ..simulators import Simulator, unit_factor
 from .uncertainty import describe_unknown_errors
 
 DENSITY_PRIOR = "weights held near a smooth density by a weak prior"  # note of a candidate and of its fit
@@ -458,24 +458,6 @@ def match_channels(simulator: Simulator, recording: Recording) -> Recording:
             changes[f"{kind}s"] = tuple(names)
             units |= {n: simulator.units[n] for n, factor in zip(names, factors, strict=True) if factor != 1}
     return recording.with_(**changes, units=units) if changes else recording
-
-
-def unit_factor(simulator: Simulator, recording: Recording, name: str) -> float:
-    """Return the factor from a channel's unit in a recording to the simulator's; 1 where one of them is not known.
-
-    Raises
-    ------
-    InputError
-        If no factor converts it.
-    """
-    unit, wanted = recording.units.get(name, ""), simulator.units.get(name, "")
-    factor = conversion(unit, wanted)
-    if factor is not None and np.isnan(factor):
-        raise InputError(
-            f"{recording.label} has {name!r} in {unit}, and the simulator has it in {wanted}; give the values in "
-            f"{wanted}, or correct the unit that is wrong."
-        )
-    return 1.0 if factor is None else factor
 
 
 def save(fit: Fit, path: str | os.PathLike[str]) -> None:

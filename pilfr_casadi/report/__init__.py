@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         simulator_card as simulator_card,
     )
     from .diagnosis import diagnosis_page as diagnosis_page, diagnosis_report as diagnosis_report
-    from .diagnosis_tables import usage as usage
+    from .diagnosis_tables import corrected_file as corrected_file, usage as usage
     from .fit import fit_page as fit_page, fit_report as fit_report
     from .fit_sections import mode_tables as mode_tables
     from .fleet import fleet_map as fleet_map, fleet_page as fleet_page

@@ -317,6 +317,16 @@ def check_table(diagnosis: Diagnosis) -> Table | None:
 
 def usage(diagnosis: Diagnosis) -> str:
     """Write Python code that builds the corrected simulator from the user's simulator and simulates a recording."""
+    return render("use_diagnosis.txt", **_correction(diagnosis))
+
+
+def corrected_file(diagnosis: Diagnosis, source: str) -> str:
+    """Write a simulator file that corrects the simulator of another file; `source` is its path from this one."""
+    return render("corrected.txt", source=source, **_correction(diagnosis)) + "\n"
+
+
+def _correction(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Collect what templates need to build the corrected simulator."""
     simulator = diagnosis.corrected
     fitted = {k: to_json(np.asarray(p.value)) for k, p in simulator.parameter_set.items()}
     modules: dict[str, set[str]] = {}
@@ -328,14 +338,14 @@ def usage(diagnosis: Diagnosis) -> str:
             modules.setdefault(home, set()).add(part.__name__)
         limits = {k: tuple(np.asarray(end, dtype=float).tolist() for end in ends) for k, ends in e.law.limits.items()}
         elements.append((e, expression, e.own(fitted), limits))
-    return render(
-        "use_diagnosis.txt",
-        diagnosis=diagnosis,
-        simulator=simulator,
-        modules=modules,
-        elements=elements,
-        values={k: v for k, v in fitted.items() if k in diagnosis.refitted.parameters},
-    )
+    values = {k: v for k, v in fitted.items() if k in diagnosis.refitted.parameters}
+    return {
+        "diagnosis": diagnosis,
+        "simulator": simulator,
+        "modules": modules,
+        "elements": elements,
+        "values": values,
+    }
 
 
 def _parts(law: Any) -> tuple[tuple[Any, ...], str]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, later
-from ..data import Recording
+from ..data import Recording, conversion
 from ..laws import readable_unit
 from ..models import Parameter, ParameterSet, accumulate_steps
 from .equations import Equations
@@ -91,9 +91,9 @@ class Simulator(Equations):
                 f"{recording.label} has the inputs {', '.join(recording.inputs) or 'none'}; the simulator has "
                 f"{', '.join(self.inputs) or 'none'}."
             )
-        own = recording.with_(
-            u=recording.u[:, [recording.inputs.index(name) for name in self.inputs]], inputs=self.inputs
-        )
+        columns = [recording.inputs.index(name) for name in self.inputs]
+        factors = [unit_factor(self, recording, name) for name in self.inputs]
+        own = recording.with_(u=recording.u[:, columns] * factors, inputs=self.inputs)
         if self.observer is not None:
             own = own.with_(y=self._measured(own), outputs=self.output_names)
         substeps = choose_substeps(self, [own])
@@ -218,3 +218,21 @@ class Simulator(Equations):
         gone = kept.pop(index)
         own = {k: p for k, p in self.parameters.items() if not k.startswith(gone.prefix)}
         return self._with(parameters=ParameterSet(own), elements=tuple(kept))
+
+
+def unit_factor(simulator: Simulator, recording: Recording, name: str) -> float:
+    """Return the factor from a channel's unit in a recording to the simulator's; 1 where one of them is not known.
+
+    Raises
+    ------
+    InputError
+        If no factor converts it.
+    """
+    unit, wanted = recording.units.get(name, ""), simulator.units.get(name, "")
+    factor = conversion(unit, wanted)
+    if factor is not None and np.isnan(factor):
+        raise InputError(
+            f"{recording.label} has {name!r} in {unit}, and the simulator has it in {wanted}; give the values in "
+            f"{wanted}, or correct the unit that is wrong."
+        )
+    return 1.0 if factor is None else factor
