@@ -180,6 +180,8 @@ class Search(Hypotheses):
     def add(self, parent: Trial, again: bool = False) -> None:
         """Fit the laws that the screen selects beside a hypothesis, fewer if `again`; polish those that may win."""
         scored, gain = self._standing(parent)
+        if self.steps and not self.in_time():
+            return
         enough = float(np.sqrt(self.floor2 + NEARLY_EXPLAINED * max(parent.mean_square - self.floor2, 0.0)))
         trials = self._with_relatives(parent, scored, scored, gain, enough, again)
         with self.stage("choice"):

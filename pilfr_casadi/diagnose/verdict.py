@@ -357,10 +357,15 @@ def _is_noise(search: Hypotheses, steady: Sequence[Gate], share: float, mode: fl
 
 
 def _swells(search: Hypotheses) -> bool:
-    """Tell whether the residual's power follows the inputs, the outputs or their rates."""
-    records = search.bench.recordings
-    signals = [np.column_stack([r.u, r.y, np.gradient(r.y, axis=0)])[r.skip :] for r in records]
-    rest = [e[r.skip :] for e, r in zip(search.root.fitted.residual, records, strict=True)]
+    """Tell whether the residual's power follows the inputs, the simulated outputs or their rates.
+
+    The measured outputs hold the noise itself, and their rates hardly anything else where the machine is slow.
+    """
+    fitted, signals, rest = search.root.fitted, [], []
+    for r, e in zip(search.bench.recordings, fitted.residual, strict=True):
+        simulated = r.y + e
+        signals.append(np.column_stack([r.u, simulated, np.gradient(simulated, axis=0)])[r.skip :])
+        rest.append(e[r.skip :])
     return swells_with(rest, signals)
 
 
@@ -419,13 +424,15 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
             f"{100 * noise:.3g} %.{at}{rings}"
         )
     port = where if shares.get(laws[0].port, 0.0) < 0.5 * share else laws[0].port
-    rest = max(search.flexible(closest).values(), default=0.0)
+    # after the time limit, this may not be worth another minute
+    looked = search.findings[closest.key].flexible is not None or not search.out_of_time
+    rest = max(search.flexible(closest).values(), default=0.0) if looked else 0.0
     words = " and ".join(name_at(e.port, e.law.id, e.law.form) for e in laws)
     named = f"laws, {words}, remove" if laws[1:] else f"law, {words}, removes"
-    explained = (
-        f"a force at a port explains {rest:.0%} of it" if rest > LEAST_EXPLAINED else "nothing tried explains it"
-    )
+    explained = ": nothing tried explains it" if looked else ""
+    if rest > LEAST_EXPLAINED:
+        explained = f": a force at a port explains {rest:.0%} of it"
     return (
         f"Physics is missing, most likely at {port}, and no law of the catalogue explains all of it. The closest "
-        f"{named} {1 - left:.0%} of the mismatch on the training recordings. The rest is not noise: {explained}."
+        f"{named} {1 - left:.0%} of the mismatch on the training recordings. The rest is not noise{explained}."
     )

@@ -349,14 +349,20 @@ def map_points(function: ca.Function, *arguments: np.ndarray) -> list[np.ndarray
     count = next(len(a) for a in arguments if np.ndim(a) == 2)
     arrays = [np.ascontiguousarray(np.broadcast_to(a, (count, np.shape(a)[-1])), dtype=float) for a in arguments]
     results = [np.empty((count, function.size2_out(i), function.size1_out(i))) for i in range(function.n_out())]
-    begin = 0
-    for length in (BLOCK, count % BLOCK):
-        run = function.map(length) if 0 < length <= count - begin else None
-        while run is not None and begin + length <= count:
-            block = slice(begin, begin + length)
-            _call(run, [a[block] for a in arrays], [out[block] for out in results])
-            begin += length
+    whole = count - count % BLOCK
+    run = _mapped(function) if whole else None
+    for begin in range(0, whole, BLOCK):
+        block = slice(begin, begin + BLOCK)
+        _call(run, [a[block] for a in arrays], [out[block] for out in results])
+    for k in range(whole, count):  # a map of another length would take longer to make, if the function is large
+        _call(function, [a[k] for a in arrays], [out[k] for out in results])
     return [out.transpose(0, 2, 1) for out in results]
+
+
+@functools.lru_cache(maxsize=16)
+def _mapped(function: ca.Function) -> ca.Function:
+    """Map a function over a block of points; that takes long for hundreds of states."""
+    return function.map(BLOCK)
 
 
 def accumulate_steps(function: ca.Function, state: np.ndarray, *arguments: np.ndarray) -> list[np.ndarray]:
