@@ -106,7 +106,12 @@ class DataOptions:
 
     inputs: str | None = option("Names of the inputs (default: the model's or simulator's).", "NAME[,NAME]")
     outputs: str | None = option("Names of the outputs (default: the model's or simulator's).", "NAME[,NAME]")
-    column: list[str] = option("Column of a name, or of the time t, where they differ (repeatable).", "NAME=COLUMN", [])
+    column: list[str] = option(
+        "Column of a name, or of the time t, where they differ (repeatable; of several for a name, each file uses its "
+        "own).",
+        "NAME=COLUMN",
+        [],
+    )
     initial: Any = initial_state(
         "State at the first sample: estimate, zero, periodic, or the states' values, such as 20,0.5 (default: "
         "estimate; zero where no outputs were measured)."
@@ -135,8 +140,23 @@ class DataOptions:
         )
 
     def columns(self, path: str) -> dict[str, str]:
-        """Return the column of each name in a file."""
-        return pairs(self.column, "--column")
+        """Return the column of each name in a file; of several columns for a name, the one that the file has counts."""
+        given: dict[str, list[str]] = {}
+        for text in self.column:
+            for name, column in pairs([text], "--column").items():
+                given.setdefault(name, []).append(column)
+        if all(len(columns) == 1 for columns in given.values()):
+            return {name: columns[0] for name, columns in given.items()}
+        from ..data import column_names  # here, so that `pilfr --help` is quick
+
+        there = column_names(path, [column for columns in given.values() for column in columns])
+        out = {}
+        for name, columns in given.items():
+            found = [column for column in dict.fromkeys(columns) if column in there]
+            if len(found) > 1:
+                raise InputError(f"{path} has {listed(found)}, which --column gives for {name}; leave out one of them.")
+            out[name] = found[0] if found else columns[0]
+        return out
 
     def read(self, path: str, inputs: tuple[str, ...], outputs: tuple[str, ...], only_these: bool = False) -> Recording:
         """Read a recording; `only_these` allows `--column` to name other channels too."""

@@ -57,7 +57,6 @@ from ._common import (
     new_file,
     numbers_of,
     option,
-    pairs,
     say,
     seconds,
     takes_options,
@@ -347,7 +346,7 @@ def _columns_to_read(
     options: SimulateOptions, inputs: Sequence[str], outputs: Sequence[str]
 ) -> tuple[dict[str, str], bool]:
     """Return the columns to read by name, and whether the file has the outputs."""
-    columns = pairs(options.column, "--column")
+    columns = options.columns(options.data)
     there = column_names(options.data, [columns.get(name, name) for name in (*inputs, *outputs)])
     if options.outputs or any(name in columns or name in there for name in outputs):
         return columns, True

@@ -368,9 +368,9 @@ def _text(path: Path) -> str:
         raise InputError(f"{path} is UTF-16 text; save it as UTF-8.")
     odd = sum(raw[:65536].count(bytes([b])) for b in range(32) if b not in (9, 10, 12, 13))
     if odd:
-        raise InputError(
-            f"{path} is not text (it holds binary data); give a CSV file, or name it .mat or .npz if it is one."
-        )
+        known = path.suffix.lower() in (".mat", ".npz", ".parquet", ".mf4")
+        what = "read it with pilfr.read" if known else "give a CSV file, or name it .mat or .npz if it is one"
+        raise InputError(f"{path} is not text (it holds binary data); {what}.")
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError:

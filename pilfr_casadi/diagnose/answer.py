@@ -124,9 +124,7 @@ def build_diagnosis(
         verdict=found.verdict.kind,
         sentence=found.verdict.sentence,
         effects=effects,
-        candidates=tuple(
-            _row(decided, decided.memo.get(t.key, t), step.parent) for step in decided.steps for t in step.trials
-        ),
+        candidates=tuple(_row(decided, t, step.parent) for step in decided.passes for t in step.trials),
         gates=(
             *_surrogate_note(request.stand_in_error),
             *_convergence_note(after),
@@ -285,13 +283,14 @@ def _next(search: Search, effects: Sequence[NamedEffect], limits: Mapping[str, f
 
 
 def _row(search: Search, t: Trial, parent: Trial) -> dict[str, Any]:
-    """Return a candidate's row for diagnosis.json."""
+    """Return a candidate's row for diagnosis.json: the law beside those of its parent."""
+    added = next((e for e in t.laws if (e.port, type(e.law)) not in parent.key), t.element)
     held_out = search.findings[t.key].held_out
     gain = search.evidence(t) - search.evidence(parent)
     return {
-        "port": t.port,
-        "law": t.law.id,
-        "form": t.law.form,
+        "port": added.port,
+        "law": added.law.id,
+        "form": added.law.form,
         "nrmse_train": t.error,
         "nrmse_validation": held_out.error if held_out and np.isfinite(held_out.error) else None,
         "delta_bic": -2 * gain,

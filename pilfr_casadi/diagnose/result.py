@@ -62,7 +62,11 @@ class Effect:
 
     @property
     def defined(self) -> dict[str, dict[str, Any]]:
-        """Quantities that the equation defines as a product, such as `F_c = k_t r` of friction with presliding."""
+        """Quantities that follow: a product of the equation, such as `F_c = k_t r`, and a clearance from end to end."""
+        if self.law == "clearance" and "g" in self.parameters:
+            half = self.parameters["g"]
+            std = None if half["std"] is None else 2 * half["std"]
+            return {"gap": {"value": 2 * half["value"], "std": std, "unit": half["unit"]}}
         found = re.search(r",  (\w+) = (\w+) (\w+)$", self.equation)
         if not found or not all(name in self.parameters for name in found.groups()[1:]):
             return {}
@@ -552,7 +556,7 @@ def _effect_lines(e: Effect) -> list[str]:
         symbols = "where u or z is the signal, and w is added to it"
     else:
         local = "v the speed" if re.search(r"\bv\b", e.equation) else "z the local coordinate"
-        what = f"subtracted from the derivative of {of}" if kind == EQUATION else "the force"
+        what = f"subtracted from the derivative of {of}" if kind == EQUATION else "the force or flow"
         symbols = f"where w is {what} and {local} at the port"
     lines = [
         f"{name_at(e.port, e.law, e.form)}, confidence {e.confidence:.2f}",

@@ -41,7 +41,7 @@ from .learned import learn_forces, nearest_to_learned
 from .linearise import linearised
 from .relatives import choose_pairs, complements, fit_pair, relatives
 from .screen import Remainder, Scored, screen, usable
-from .trials import Trial, place_law
+from .trials import Key, Trial, place_law
 from .workbench import DIVERGED, FEW, THOROUGH, Fitted
 
 # Effort
@@ -91,6 +91,16 @@ class Search(Hypotheses):
         """Continue with the present hold because the other is no better, unless the search was interrupted."""
         self.hold_said = True
         return self if self.interrupted else self.run(effects)
+
+    @property
+    def passes(self) -> list[Step]:
+        """The moves, those from one hypothesis together, with the best fit of each trial once, smallest error first."""
+        found = dict[Key, tuple[Trial, dict[Key, Trial]]]()
+        for step in self.steps:
+            own = found.setdefault(step.parent.key, (step.parent, {}))[1]
+            own |= {t.key: self.memo.get(t.key, t) for t in step.trials}
+        ranked = ((parent, sorted(trials.values(), key=lambda t: t.error)) for parent, trials in found.values())
+        return [Step(parent, (), tuple(trials)) for parent, trials in ranked if trials]
 
     def _grow(self, effects: float) -> bool:
         """Add effects while that pays; return False as soon as the other hold proves better."""

@@ -318,8 +318,7 @@ def _candidates(d: Diagnosis) -> list[Block]:
     for k, rows in enumerate(passes):
         before = tables.in_place(d, k)
         title = f"Fitted beside {before}" if before else "All fitted pairs of port and law"
-        named = d.effects[k : k + 1] if k else d.effects
-        out += tables.candidate_tables(rows, named, title, d.floor["nrmse"], tables.error_before(d, k))
+        out += tables.candidate_tables(rows, d.effects, title, d.floor["nrmse"], tables.error_before(d, k))
     return out
 
 

@@ -77,13 +77,18 @@ def errors_that_count(diagnosis: Diagnosis) -> tuple[str, Mapping[str, float]]:
 
 
 def answer(diagnosis: Diagnosis, forces: Sequence[str]) -> str:
-    """Write the result in a few words: what is missing, how strong (`forces`, one an effect), how sure; the gain."""
+    """Write the result in a few words: what is missing, how strong, how sure; the gain.
+
+    The strength is a quantity that the law defines, or else the largest force (`forces`, one an effect).
+    """
     d = diagnosis
     role, errors = errors_that_count(d)
-    named = [
-        f"{name_at(e.port, e.law, e.form, brief=True)}{strong and ', ' + strong}, {100 * e.confidence:.0f}\u00a0% sure"
-        for e, strong in zip(d.effects, forces, strict=True)
-    ]
+    named = []
+    for e, force in zip(d.effects, forces, strict=True):
+        sizes = [f"{name} {number_text(p['value'], 3)}\u00a0{p['unit']}".strip() for name, p in e.defined.items()]
+        strong = sizes[0] if sizes else force
+        name = name_at(e.port, e.law, e.form, brief=True)
+        named.append(f"{name}{strong and ', ' + strong}, {100 * e.confidence:.0f}\u00a0% sure")
     places = ", ".join(dict.fromkeys(f.port for f in d.learned))
     nameless = f"A force without a name at {places}" if places else "Something is missing that has no name"
     at_fault = dict.fromkeys(f"{display_name(g.finding)} of {g.channel}" for g in d.gates if g.corrected)
@@ -164,15 +169,8 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
     if e.indistinguishable:
         others = "; ".join(name_at(port, law) for port, law in e.indistinguishable)
         out.append(Text(f"These recordings cannot tell it apart from: {others}."))
-    best = [r for rows in candidates_by_pass(diagnosis)[number : number + 1] for r in rows]
-    mine = min((score(r) for r in best if (r["port"], r["law"]) == (e.port, e.law)), default=np.nan)
-    known = {(e.port, e.law), *e.indistinguishable}
-    close = list(dict.fromkeys((r["port"], r["law"]) for r in best if score(r) < ALIKE * mine))
-    wider = "; ".join(name_at(port, law) for port, law in close if (port, law) not in known)
-    if wider:
-        out.append(Text(f"Equally good, but more flexible than needed: {wider}."))
-    elif not e.indistinguishable:
-        out.append(Text("No other law does as well on these recordings."))
+    else:
+        out.append(Text("No other law is about as likely on these recordings."))
     return out
 
 
@@ -181,9 +179,9 @@ def _array(value: Any) -> np.ndarray:
 
 
 def candidates_by_pass(diagnosis: Diagnosis) -> list[list[dict[str, Any]]]:
-    """Return the candidates of each pass, best first; in the second pass the first effect is in place."""
+    """Return the candidates of each pass, best first: those that were fitted beside the same laws."""
     search = diagnosis.evidence.get("search")
-    sizes = [len(step.trials) for step in search.steps] if search is not None else []
+    sizes = [len(step.trials) for step in search.passes] if search is not None else []
     rows = list(diagnosis.candidates)
     if sum(sizes) != len(rows):
         sizes = [len(rows)]
@@ -214,7 +212,7 @@ def in_place(diagnosis: Diagnosis, number: int) -> str:
 def _parent(diagnosis: Diagnosis, number: int) -> Any:
     """Return the hypothesis that the candidates of a pass were put into; None if it is unknown."""
     search = diagnosis.evidence.get("search")
-    steps = [step for step in search.steps if step.trials] if search is not None else []
+    steps = search.passes if search is not None else []
     return steps[number].parent if number < len(steps) else None
 
 

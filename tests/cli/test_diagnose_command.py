@@ -139,6 +139,13 @@ def test_a_whole_diagnosis(capsys, files, catalogue):
     tried = [c for c in found["candidates"] if c["nrmse_train"] is not None]
     page = (files / "out" / "report.html").read_text()
     assert len(tried) > 5 and all(display_name(c["law"]) in page and c["port"] in page for c in tried)
+    corrected = files / "out" / "corrected.py"
+    assert f"corrected simulator: {corrected}" in out
+    simulated = ("simulate", corrected, files / "test.csv", "--initial", "zero", "--out", files / "y.csv")
+    status, out, err = run(capsys, *simulated)
+    assert status == 0, err
+    assert float(re.search(r"NRMSE on test: ([\d.]+)", out)[1]) < 0.02 * errors["before"]
+    assert run(capsys, "export", corrected, "--dt", 0.02, "--c", "--out", files / "c")[0] == 0
     before = (files / "out" / "diagnosis.json").read_text()
     refused(capsys, *given, says=("diagnosis.json exists", "--overwrite"))
     assert (files / "out" / "diagnosis.json").read_text() == before
@@ -379,3 +386,16 @@ def test_an_interrupted_diagnosis_says_so(files):
         process.kill()
     assert process.returncode == 130 and "Traceback" not in err
     assert "nterrupted" in err + out
+
+
+def test_each_recording_uses_its_own_column(capsys, files):
+    """Two columns are given for a name, and each file has one of them."""
+    (files / "other.csv").write_text((files / "test.csv").read_text().replace("force", "Force (N)", 1))
+    both = ("--column", "force=force", "--column", "force=Force (N)")
+    status, _, err = run(capsys, "check", files / "rig.py", files / "train.csv", files / "other.csv", *both)
+    assert status == 0, err
+    header = "t,force,Force (N),position"
+    rows = (files / "test.csv").read_text().splitlines()[1:]
+    doubled = [",".join([*row.split(",")[:2], *row.split(",")[1:]]) for row in rows]
+    (files / "other.csv").write_text("\n".join([header, *doubled]) + "\n")
+    refused(capsys, "check", files / "rig.py", files / "other.csv", *both, says="which --column gives for force")
