@@ -76,6 +76,8 @@ class Tie:
     def sentence(self) -> str:
         """The tie in words."""
         names = in_words(self.names)
+        if len(self.names) == 1:
+            return f"{names} cannot be identified from these recordings."
         if not self.only_as:
             return f"{names} can be identified only together, not separately."
         if len(self.only_as) == 1 and len(self.names) == 2:

@@ -229,9 +229,9 @@ def sentence(found: dict[str, Any]) -> str:
     if growth is not None and growth > 1.4:
         parts.append("grows faster than the motion and is worst at large amplitude")
     elif growth is not None and growth < 0.6:
-        parts.append("grows less than in proportion to the motion")
+        parts.append("grows less than the motion does, as friction does")
     elif growth is not None:
-        parts.append("grows about in proportion to the motion")
+        parts.append("grows in proportion to the motion, as a wrong value does")
     speed = _ratio(found["rate"])
     if speed is not None and not CLEAR_RATIO > speed > 1 / CLEAR_RATIO:
         parts.append("is larger at high speed" if speed > 1 else "is larger near standstill")
