@@ -106,19 +106,13 @@ def _other_forms(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scor
 def _forms_of_the_best(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
     """Select forms of the best law that did not come near, a few, from the values of the shape that they share."""
     best, near = trials[0], _near(trials)
-    shape = {name: value for name, value in best.own.items() if name in _free(best.law) - set(best.law.strength)}
+    shape = {name: value for name, value in best.own.items() if name in best.law.free - set(best.law.strength)}
     out = list[Scored]()
     for s in _first_of_pairs(s for s in scored if (s.port, s.law.id) == best.name and s.pair not in near):
-        free = _free(s.law)
-        shared = {k: v for k, v in shape.items() if k in free and s.law.units[k] == best.law.units[k]}
+        shared = {k: v for k, v in shape.items() if k in s.law.free and s.law.units[k] == best.law.units[k]}
         if shared:
             out.append(replace(s, starts=({**s.starts[0], **shared},)))
     return out[:FEW]
-
-
-def _free(law: Law) -> set[str]:
-    """Return the names of the parameters of a law that a fit may change."""
-    return {name for name, p in law.parameters().items() if not np.all(p.fixed)}
 
 
 def _first_of_pairs(entries: Iterable[Scored]) -> list[Scored]:

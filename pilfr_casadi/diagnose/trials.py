@@ -278,9 +278,8 @@ class Trials:
                     observed += [starts[-1]] if entry.source == "observer" else []
                     given.append({**nominal, **named})
                 starts.append(given[-1])
-        free = {name for name, p in first.law.parameters().items() if not np.all(p.fixed)}
-        if free == set(first.law.strength):  # at zero strength the simulator is unchanged
-            zero = {k: 0.0 * np.asarray(v) if k in free else v for k, v in first.starts[0].items()}
+        if first.law.free == set(first.law.strength):  # at zero strength the simulator is unchanged
+            zero = {k: 0.0 * np.asarray(v) if k in first.law.free else v for k, v in first.starts[0].items()}
             starts.append({**base.values, **place_law(base.simulator, first, zero)[1]})
         best, *rest = self.part.by_cost(placed, model, engine, starts, base.begin)
         last = (s for s in rest if not any(s is o for o in observed))

@@ -314,6 +314,11 @@ class Law:
         """Start values of this form for a law that was found in another form."""
         yield {name: value for name, value in found.values.items() if name in cls.units}
 
+    @property
+    def free(self) -> set[str]:
+        """Names of the parameters that a fit may change."""
+        return {name for name, p in self.parameters().items() if not np.all(p.fixed)}
+
     def size(self, values: Mapping[str, Any]) -> int:
         """Number of free numbers of the law at fitted values."""
         return sum(int(np.sum(~p.fixed)) for p in self.parameters().values())
