@@ -156,7 +156,8 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: str = "") -> int
 
             corrected = folder / "corrected.py" if Path(source).suffix.lower() == ".py" else None
             if corrected is not None:
-                write_atomically(corrected, corrected_file(diagnosis, os.path.relpath(source, folder)))
+                there = os.path.relpath(os.path.realpath(source), os.path.realpath(folder))
+                write_atomically(corrected, corrected_file(diagnosis, Path(there).as_posix()))
         with progress_bar() as progress:
             progress("writing the report", 0, 0, np.nan)
             page = diagnosis_report(diagnosis, folder)

@@ -41,7 +41,7 @@ from ..identify import Fit, check_recordings, fit, load, run_simulator
 from ..linear import select_order
 from ..models import ANY, PILFR, TAKES, Lagged, named_structure
 from ..optimise import GaussNewton, Ipopt, Status
-from ..simulators import load_simulator
+from ..simulators import load_simulator, unit_notes
 from ..studies import LARGEST_SIZE
 from ._common import (
     DONE,
@@ -295,6 +295,8 @@ def _simulate_equations(options: SimulateOptions) -> int:
         raise InputError("Several records in one array are simulated by a saved model only; give one recording.")
     inputs, outputs = options.names(simulator.inputs, simulator.output_names)
     recording, columns, _ = _read_to_simulate(options, inputs, outputs)
+    for note in unit_notes(simulator, recording).values():
+        print(f"note: {note}")
     seen, y, first = run_simulator(simulator, recording)
     return _write_simulated(options, seen, y, simulator.output_names, columns, lambda _: first)
 

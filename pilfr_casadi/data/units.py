@@ -6,49 +6,55 @@ import re
 
 import numpy as np
 
-# unit: size in SI, exponents of kg, m, s, A, K
-_UNITS: dict[str, tuple[float, tuple[int, int, int, int, int]]] = {
+# unit: size in SI, exponents of kg, m, s, A, K and of the angle in rad
+_UNITS: dict[str, tuple[float, tuple[int, int, int, int, int, int]]] = {
     unit: (size, exponents)
     for units, size, exponents in (
-        ("g", 1e-3, (1, 0, 0, 0, 0)),
-        ("t", 1e3, (1, 0, 0, 0, 0)),
-        ("m", 1.0, (0, 1, 0, 0, 0)),
-        ("in inch", 0.0254, (0, 1, 0, 0, 0)),
-        ("L l", 1e-3, (0, 3, 0, 0, 0)),
-        ("s", 1.0, (0, 0, 1, 0, 0)),
-        ("min", 60.0, (0, 0, 1, 0, 0)),
-        ("h", 3600.0, (0, 0, 1, 0, 0)),
-        ("Hz", 1.0, (0, 0, -1, 0, 0)),
-        ("rpm", 2 * np.pi / 60, (0, 0, -1, 0, 0)),
-        ("A", 1.0, (0, 0, 0, 1, 0)),
-        ("K °C degC", 1.0, (0, 0, 0, 0, 1)),
-        ("N", 1.0, (1, 1, -2, 0, 0)),
-        ("Nm J", 1.0, (1, 2, -2, 0, 0)),
-        ("Ncm", 1e-2, (1, 2, -2, 0, 0)),
-        ("Nmm", 1e-3, (1, 2, -2, 0, 0)),
-        ("W", 1.0, (1, 2, -3, 0, 0)),
-        ("Pa", 1.0, (1, -1, -2, 0, 0)),
-        ("bar", 1e5, (1, -1, -2, 0, 0)),
-        ("V", 1.0, (1, 2, -3, -1, 0)),
-        ("C", 1.0, (0, 0, 1, 1, 0)),
-        ("Ah", 3600.0, (0, 0, 1, 1, 0)),
-        ("F", 1.0, (-1, -2, 4, 2, 0)),
-        ("Ohm ohm Ω", 1.0, (1, 2, -3, -2, 0)),
-        ("S", 1.0, (-1, -2, 3, 2, 0)),
-        ("H", 1.0, (1, 2, -2, -2, 0)),
-        ("Wb", 1.0, (1, 2, -2, -1, 0)),
-        ("T", 1.0, (1, 0, -2, -1, 0)),
-        ("rad radian radians 1", 1.0, (0, 0, 0, 0, 0)),
-        ("deg ° degree degrees", np.pi / 180, (0, 0, 0, 0, 0)),
-        ("rev revs revolution revolutions turn turns", 2 * np.pi, (0, 0, 0, 0, 0)),
-        ("%", 1e-2, (0, 0, 0, 0, 0)),
+        ("g", 1e-3, (1, 0, 0, 0, 0, 0)),
+        ("t", 1e3, (1, 0, 0, 0, 0, 0)),
+        ("m", 1.0, (0, 1, 0, 0, 0, 0)),
+        ("in inch", 0.0254, (0, 1, 0, 0, 0, 0)),
+        ("L l", 1e-3, (0, 3, 0, 0, 0, 0)),
+        ("s", 1.0, (0, 0, 1, 0, 0, 0)),
+        ("min", 60.0, (0, 0, 1, 0, 0, 0)),
+        ("h", 3600.0, (0, 0, 1, 0, 0, 0)),
+        ("Hz", 1.0, (0, 0, -1, 0, 0, 0)),
+        ("rpm", 2 * np.pi / 60, (0, 0, -1, 0, 0, 1)),
+        ("A", 1.0, (0, 0, 0, 1, 0, 0)),
+        ("K °C degC", 1.0, (0, 0, 0, 0, 1, 0)),
+        ("N", 1.0, (1, 1, -2, 0, 0, 0)),
+        ("Nm J", 1.0, (1, 2, -2, 0, 0, 0)),
+        ("Ncm", 1e-2, (1, 2, -2, 0, 0, 0)),
+        ("Nmm", 1e-3, (1, 2, -2, 0, 0, 0)),
+        ("W", 1.0, (1, 2, -3, 0, 0, 0)),
+        ("Pa", 1.0, (1, -1, -2, 0, 0, 0)),
+        ("bar", 1e5, (1, -1, -2, 0, 0, 0)),
+        ("V", 1.0, (1, 2, -3, -1, 0, 0)),
+        ("C", 1.0, (0, 0, 1, 1, 0, 0)),
+        ("Ah", 3600.0, (0, 0, 1, 1, 0, 0)),
+        ("F", 1.0, (-1, -2, 4, 2, 0, 0)),
+        ("Ohm ohm Ω", 1.0, (1, 2, -3, -2, 0, 0)),
+        ("S", 1.0, (-1, -2, 3, 2, 0, 0)),
+        ("H", 1.0, (1, 2, -2, -2, 0, 0)),
+        ("Wb", 1.0, (1, 2, -2, -1, 0, 0)),
+        ("T", 1.0, (1, 0, -2, -1, 0, 0)),
+        ("rad radian radians", 1.0, (0, 0, 0, 0, 0, 1)),
+        ("deg ° degree degrees", np.pi / 180, (0, 0, 0, 0, 0, 1)),
+        ("rev revs revolution revolutions turn turns", 2 * np.pi, (0, 0, 0, 0, 0, 1)),
+        ("1", 1.0, (0, 0, 0, 0, 0, 0)),
+        ("%", 1e-2, (0, 0, 0, 0, 0, 0)),
     )
     for unit in units.split()
 }
 _POWERS = {"p": -12, "n": -9, "uµμ": -6, "m": -3, "c": -2, "d": -1, "h": 2, "k": 3, "M": 6, "G": 9}
+_WRITTEN = str.maketrans({"²": "^2", "³": "^3", "⋅": "·", "⁻": "^-", "¹": "1"})  # "s⁻¹" as "s^-1"
 _PREFIXES = {letter: 10.0**power for letters, power in _POWERS.items() for letter in letters}
+_NO_PREFIX = "t in inch min h rpm °C degC Ncm Nmm 1 % deg ° degree degrees radian radians"
+_NO_PREFIX += " rev revs revolution revolutions turn turns"
+_PREFIXED = set(_UNITS) - set(_NO_PREFIX.split())
 _CELSIUS = {"°C", "degC"}  # the zero is another one than that of K
-_ANGLES = {unit for unit, (_, exponents) in _UNITS.items() if not any(exponents)} - {"1", "%"}
+_AMBIGUOUS = {"g", "C", "T", "F", "h", "t"}  # also of an acceleration, a temperature, a torque, time and so on
+_ANGLES = {unit for unit, (_, exponents) in _UNITS.items() if exponents == (0, 0, 0, 0, 0, 1)}
 
 
 def dimension(unit: str) -> tuple[int, ...] | None:
@@ -58,14 +64,16 @@ def dimension(unit: str) -> tuple[int, ...] | None:
     ((1, 0, -1, 0, 0), (0, 3, -1, 0, 0), None)
     """
     found = _read(unit)
-    return None if found is None else found[1]
+    return None if found is None else found[1][:5]
 
 
 def conversion(unit: str, wanted: str) -> float | None:
-    """Return the factor from a unit to another: nan if no factor converts it, None if one of them is not known.
+    """Return the factor from a unit to another: nan if no factor converts it, None if that is not known.
 
-    >>> conversion("mm", "m"), conversion("N m", "Nm"), conversion("counts", "m")
-    (0.001, 1.0, None)
+    It is not known between an angle and a number, as between rpm and Hz.
+
+    >>> conversion("mm", "m"), conversion("N m", "Nm"), conversion("counts", "m"), conversion("rpm", "Hz")
+    (0.001, 1.0, None, None)
     >>> conversion("V", "m"), conversion("°C", "K")
     (nan, nan)
     """
@@ -74,8 +82,11 @@ def conversion(unit: str, wanted: str) -> float | None:
     one, other = _read(unit), _read(wanted)
     if one is None or other is None:
         return None
-    alike = one[1] == other[1] and len({unit.strip() in _CELSIUS, wanted.strip() in _CELSIUS}) == 1
-    return float(f"{one[0] / other[0]:.12g}") if alike else np.nan
+    if one[1] == other[1]:
+        celsius = len({name.strip() in _CELSIUS for name in (unit, wanted)}) == 1
+        return float(f"{one[0] / other[0]:.12g}") if celsius else np.nan
+    unsure = one[1][:5] == other[1][:5] or _AMBIGUOUS & {unit.strip(), wanted.strip()}
+    return None if unsure else np.nan
 
 
 def revolution_in(unit: str) -> float:
@@ -100,8 +111,11 @@ def symbols(unit: str) -> list[str]:
 
 def _read(unit: str) -> tuple[float, tuple[int, ...]] | None:
     """Return a unit's size in SI and its exponents; None if it is empty or not known."""
-    size, total, below = 1.0, [0, 0, 0, 0, 0], False
-    tokens = re.findall(r"[^\s*/·^()]+(?:\^\(?-?\d+\)?)?|/", unit.replace("²", "^2").replace("³", "^3"))
+    size, total, below = 1.0, [0, 0, 0, 0, 0, 0], False
+    plain = unit.translate(_WRITTEN)
+    if re.search(r"\([^)]*/", plain):  # a quotient in brackets
+        return None
+    tokens = re.findall(r"[^\s*/·^()]+(?:\^\(?-?\d+\)?)?|/", plain)
     for token in tokens:
         if token == "/":
             below = True
@@ -120,6 +134,6 @@ def _split(symbol: str) -> tuple[str, float] | None:
     """Return a symbol without its prefix, and its size in SI; None if it is not known."""
     if symbol in _UNITS:
         return symbol, _UNITS[symbol][0]
-    if symbol[:1] in _PREFIXES and symbol[1:] in _UNITS:
+    if symbol[:1] in _PREFIXES and symbol[1:] in _PREFIXED:
         return symbol[1:], _PREFIXES[symbol[0]] * _UNITS[symbol[1:]][0]
     return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -141,8 +141,8 @@ def build_diagnosis(
         parameters=parameter_table(request.simulator, without, after, std),
         errors=errors,
         floor={"nrmse": floor.nrmse(bench.scale), "source": floor.source},
-        corrected=without_zero_offsets(after.corrected()),
-        refitted=without.corrected(),
+        corrected=replace(without_zero_offsets(after.corrected()), substeps=after.model.substeps),
+        refitted=replace(without.corrected(), substeps=without.model.substeps),
         hold=bench.hold,
         train=bench.recordings,
         test=tests,

@@ -112,7 +112,7 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
 
     One law in several sensors counts once, as in `log_prior`.
     """
-    numbers = _of_laws(fitted, laws)[fitted.model.parameters.free]
+    numbers = _number_parameters(fitted, laws)[fitted.model.parameters.free]
     laws_at = np.flatnonzero(numbers >= 0)
     # of one law in several sensors, each parameter is one
     shared = np.equal.outer(numbers[laws_at], np.unique(numbers[laws_at])).astype(float)
@@ -124,6 +124,7 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
     rest = np.setdiff1d(np.arange(len(hessian)), laws_at)
     width = _widths(fitted, laws, problem.free, np.diag(hessian)[: len(numbers)])[laws_at]
     with np.errstate(all="ignore"):
+        width = np.array([min(width[column > 0]) for column in shared[:, np.argmax(shared, axis=1)].T])  # of its group
         block = hessian[np.ix_(laws_at, laws_at)] * np.outer(width, width)
         size = np.sqrt(np.maximum(np.diag(hessian)[rest], 1e-300))
         across = hessian[np.ix_(rest, laws_at)] * width / size[:, None]
@@ -190,7 +191,7 @@ def _enlargement(bench: Workbench, fitted: Fitted) -> float:
     return float(np.mean(moved**2) / max(np.sum(size**2), 1e-300))
 
 
-def _of_laws(fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
+def _number_parameters(fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
     """Number the laws' parameters, with -1 for all others; the same law has the same numbers in all sensors."""
     parameters = fitted.model.parameters
     numbers, first = np.full(parameters.size, -1), dict[tuple[object, str, int], slice]()

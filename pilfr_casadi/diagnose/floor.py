@@ -10,13 +10,14 @@ it on held-out data), the residual itself is the floor.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ..data import Recording
 
 CORRELATED, P_VALUE = 0.5, 1e-4  # rank correlation, and its p-value, from which a residual's power depends on a signal
+REFUTED = 0.01  # probability under measured noise below which an error is not that noise
 ABOVE_NOISE = 2.0  # ratio of the error to the noise from which results say that more is missing
 FEWEST = 30.0  # effective samples that a residual has at least
 LONGEST = 400  # longest correlation of a residual, in samples
@@ -33,28 +34,30 @@ class Floor:
     ----------
     repeats : int
         Number of periods, or of recordings with the same input, on which the noise is measured; 1 if it is not.
-    independent : float
-        Independent samples of the noise in a repeat.
+    independent : array, shape (n_y,)
+        Independent samples of each output's noise in a repeat.
     """
 
     deviation: np.ndarray
     source: str
     repeats: int = 1
-    independent: float = 1.0
+    independent: np.ndarray = field(default_factory=lambda: np.ones(1))
 
-    def may_be(self, times: float) -> bool:
-        """Tell whether a residual, `times` as large as a measured noise, can be that noise.
+    def may_be(self, rms: np.ndarray) -> bool:
+        """Tell whether a residual with the rms errors (n_y,) can be a measured noise, in every output.
 
         Of n repeats, noise s leaves the power s² (n - 1)/n within them, and s²/n in their mean, where all that the
         simulator lacks is as well. Of noise alone, the second over the first has an F distribution, each over its
-        independent samples. False for an estimated noise.
+        independent samples. False for an estimated noise, and for an error that is clearly larger.
         """
         from scipy.stats import f
 
         if self.repeats < 2:
             return False
-        most = float(f.isf(P_VALUE, self.independent, (self.repeats - 1) * self.independent))
-        return times**2 < 1 + (most - 1) / self.repeats
+        chance = REFUTED / len(self.deviation)  # that noise exceeds the limit in any output
+        most = f.isf(chance, self.independent, (self.repeats - 1) * self.independent)
+        limit = np.minimum(1 + (most - 1) / self.repeats, ABOVE_NOISE**2)
+        return bool(np.all(np.square(rms) < limit * np.square(self.deviation)))
 
     def beside(self, deviation: np.ndarray) -> Floor:
         """Return the floor with another independent error added, such as a surrogate's."""
@@ -82,9 +85,10 @@ def measured_floor(recordings: Sequence[Recording]) -> Floor | None:
         return None
     square = np.mean(np.concatenate([np.var(y, axis=0, ddof=1) for y in repeated]), axis=0)
     deviation = np.maximum(np.sqrt(square), _sensor_steps(recordings) / np.sqrt(12))
-    independent = effective_size([y[0] - np.mean(y, axis=0) for y in repeated])
+    noise = [y[0] - np.mean(y, axis=0) for y in repeated]
+    independent = np.array([effective_size([e[:, [i]] for e in noise]) for i in range(len(deviation))])
     source = "periods" if periods else "repeats"
-    return Floor(deviation, source, min(map(len, repeated)), max(independent, 1.0))
+    return Floor(deviation, source, min(map(len, repeated)), np.maximum(independent, 1.0))
 
 
 def _sensor_steps(recordings: Sequence[Recording]) -> np.ndarray:

@@ -308,7 +308,7 @@ class Hypotheses:
             self.memo[trial.key] = trial
             self.findings.pop(trial.key, None)
         if self.floor.source == "estimated" and trial.mean_square < self.floor2:  # noise is no larger than what is left
-            self.floor = Floor(np.minimum(self.floor.deviation, self._rms(trial)), "estimated")
+            self.floor = Floor(np.minimum(self.floor.deviation, self.rms(trial)), "estimated")
 
     def thorough(self, trial: Trial) -> Trial:
         """Return the same hypothesis fitted to convergence and to all samples, or as it is after the deadline."""
@@ -328,11 +328,11 @@ class Hypotheses:
         best = self.best
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
         share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
-        rest = np.minimum(np.sqrt(share) * self._rms(best), LOUDEST_NOISE * self.bench.scale)
+        rest = np.minimum(np.sqrt(share) * self.rms(best), LOUDEST_NOISE * self.bench.scale)
         known, white = self.stand_in_error * self.bench.scale, white_part(best.fitted.residual)
         self.floor = Floor(np.hypot(np.maximum(white, rest), known), "estimated")
 
-    def _rms(self, trial: Trial) -> np.ndarray:
+    def rms(self, trial: Trial) -> np.ndarray:
         """Compute the rms error of each output, (n_y,)."""
         pairs = zip(trial.fitted.residual, self.bench.recordings, strict=True)
         return np.asarray(np.sqrt(np.mean(np.concatenate([e[r.skip :] for e, r in pairs]) ** 2, axis=0)))

@@ -68,7 +68,7 @@ from .other_explanations import (
     may_act_elsewhere,
 )
 from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
-from .preparation import CHECKS, Prepared, hold_note, prepare, unit_notes
+from .preparation import CHECKS, Prepared, conversions, hold_note, prepare
 from .proof import errors_of, mean_nrmse
 from .recording_faults import clipped_input, open_unsettled, remove_glitches, tones
 from .result import Diagnosis
@@ -125,7 +125,7 @@ def diagnose_in_steps(
         deadline,
         say,
         focus,
-        notes=unit_notes(simulator, given),
+        notes=conversions(simulator, given),
     )
     most = MOST_SAMPLES if search_samples is None else whole(search_samples, "search_samples", FEWEST_SAMPLES)
     request, ready, search = _search_with_focus(_on_stretches(request, most))

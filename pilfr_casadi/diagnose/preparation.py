@@ -15,7 +15,7 @@ import numpy as np
 
 from .._base import InputError, Stages
 from ..data import Recording
-from ..simulators import Simulator, unit_factor
+from ..simulators import Simulator, unit_factor, unit_notes
 from .arguments import stated_hold
 from .channel_faults import find_slips, open_bench
 from .floor import Floor, white_part
@@ -210,19 +210,14 @@ def _choose_hold(bench: Workbench) -> tuple[Workbench, Sequence[Gate]]:
     return best, [hold_note(best.simulator, best.hold, ratio)]
 
 
-def unit_notes(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Gate, ...]:
-    """Note which channels are recorded in another unit than the simulator's, by which they were multiplied."""
-    out = dict[str, Gate]()
-    for r in recordings:
-        for name in (n for n in (*simulator.inputs, *simulator.output_names) if n in r.units):
-            factor, wanted = unit_factor(simulator, r, name), simulator.units.get(name, "")
-            if factor != 1:
-                sentence = (
-                    f"{name} is recorded in {r.units[name]}, and the simulator has it in {wanted}: its values were "
-                    f"multiplied by {factor:g}."
-                )
-                out[sentence] = Gate(name, "conversion", factor, sentence)
-    return tuple(out.values())
+def conversions(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Gate, ...]:
+    """Note which channels are recorded in another unit than the simulator's."""
+    found = {
+        sentence: Gate(name, "conversion", unit_factor(simulator, r, name), sentence)
+        for r in recordings
+        for name, sentence in unit_notes(simulator, r).items()
+    }
+    return tuple(found.values())
 
 
 def hold_note(simulator: Simulator, hold: str, ratio: float) -> Gate:

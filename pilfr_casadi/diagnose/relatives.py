@@ -193,7 +193,7 @@ def _simpler_laws(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Sco
 def _matching_forces(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
     """Select laws with fewer parameters than the best law, at its port, with the most similar force.
 
-    They start with everything else where the best hypothesis has it. None if the best law is in no way flexible.
+    They start with everything else where the best hypothesis has it. None if the best law is not flexible.
     """
     best, near = trials[0], _near(trials)
     if not best.law.flexible:

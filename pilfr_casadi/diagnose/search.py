@@ -395,7 +395,7 @@ class Search(Hypotheses):
                 for element in best.effects:
                     self.leave_out(best, [element])
                     plain = constant(type(element.law))
-                    if plain is not type(element.law):
+                    if plain is not type(element.law) and kind_of(element.port) != PARAMETER:
                         others = [e for e in best.laws if e is not element]
                         self._refine(self.beside([*others, element], best), [plain])
                 if self.best.key == best.key:

@@ -258,12 +258,12 @@ class Trials:
         model, engine = self.bench.compile(placed, gain)
         users = self.bench.simulator.parameters
         # the refit may have bent an offset there, or the term in line with which the law stands, to make up for it
-        there = [e for e in self.bench.simulator.elements if e.port == first.port]
-        reset = tuple(f"{e.prefix}{name}" for e in there for name in e.law.strength)
+        offsets = [e for e in self.bench.simulator.elements if e.port == first.port and isinstance(e.law, Offset)]
+        reset = tuple(f"{e.prefix}{name}" for e in offsets for name in e.law.strength)
         if first.law.in_line:
             reset = (*reset, *self.bench.simulator.term_parameters(first.port))
         bent = bool(reset) or first.law.special  # or may be far off where the missing force is strongly curved
-        reset = reset or tuple(users)
+        reset = tuple(users) if first.law.special or not reset else reset
         nominal = {**base.values, **{name: users[name].value for name in reset}}
         starts: list[Mapping[str, Any]] = []
         # values from the observer's run, which may be near the truth if the simulation is not

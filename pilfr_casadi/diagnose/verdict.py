@@ -308,8 +308,9 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
     share = max(shares.values(), default=0.0)
     steady = [g for g in gates if g.finding == "tone" and not found.effects]
     mode = ringing(search.bench, search.root.fitted)
-    measured = search.floor.may_be(_times_noise(search, steady))
-    noise = not found.effects and (measured or _is_noise(search, steady, share, mode))
+    quiet = max(1 - sum(1 - g.left for g in steady), 0.0) ** 0.5  # share of the error that is left without the tones
+    measured = not found.effects and search.floor.may_be(quiet * search.rms(search.root))
+    noise = not found.effects and (measured or _is_noise(search, quiet, share, mode))
     if faults and (noise or cured):
         return Verdict("recording-fault", faults[0].sentence)
     if noise and (measured or share < LEAST_EXPLAINED):
@@ -334,17 +335,14 @@ def closest_law(search: Hypotheses, likeliest: Trial) -> Trial:
     return max((t for t in search.memo.values() if t.laws), key=search.optimistic_evidence, default=likeliest)
 
 
-def _times_noise(search: Hypotheses, steady: Sequence[Gate]) -> float:
-    """Compute the refit's error, without steady tones, over the noise: the measured one, or the white part."""
+def _is_noise(search: Hypotheses, quiet: float, share: float, mode: float | None) -> bool:
+    """Tell whether the refit's residual can be noise: no force explains it, no mode rings, and its power is steady.
+
+    `quiet` is the share of its rms that is left without steady tones.
+    """
     root = search.root
-    quiet = root.error * max(1 - sum(1 - g.left for g in steady), 0.0) ** 0.5
     white = white_part(root.fitted.residual) if search.floor.source == "estimated" else search.floor.deviation
-    return quiet / float(np.sqrt(np.mean((white / search.bench.scale) ** 2)))
-
-
-def _is_noise(search: Hypotheses, steady: Sequence[Gate], share: float, mode: float | None) -> bool:
-    """Tell whether the refit's residual can be noise: no force explains it, no mode rings, and its power is steady."""
-    root, times = search.root, _times_noise(search, steady)
+    times = quiet * root.error / max(float(np.sqrt(np.mean((white / search.bench.scale) ** 2))), 1e-300)
     if times < AT_NOISE_RATIO:
         return True
     unexplained = share < (EXPLAINED_QUIET_NOISE if root.mean_square < NEGLIGIBLE_ERROR**2 else EXPLAINED_NOISE)

@@ -311,8 +311,12 @@ class Law:
 
     @classmethod
     def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:
-        """Start values of this form for a law that was found in another form."""
-        yield {name: value for name, value in found.values.items() if name in cls.units}
+        """Start values of this form for a law that was found in another form; of strengths that vary, the mean."""
+        own = {name: value for name, value in found.values.items() if name in cls.units}
+        for name in own:
+            ends = [found.values[f"{name}{end}"] for end in ("", "_mid", "_high") if f"{name}{end}" in found.values]
+            own[name] = np.mean(ends, axis=0)
+        yield own
 
     @property
     def free(self) -> set[str]:

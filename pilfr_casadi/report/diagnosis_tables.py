@@ -170,7 +170,7 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
         others = "; ".join(name_at(port, law) for port, law in e.indistinguishable)
         out.append(Text(f"These recordings cannot tell it apart from: {others}."))
     else:
-        out.append(Text("No other law is about as likely on these recordings."))
+        out.append(Text("No other law comes close on these recordings."))
     return out
 
 

@@ -18,7 +18,7 @@ from typing import Any, Self, cast
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, listed
+from .._base import InputError, listed, whole
 from ..models import Named, Parameter, ParameterSet
 from .domains import MECHANICAL, UNKNOWN, common_domain, may_be_speed
 from .ports import (
@@ -79,6 +79,7 @@ class Equations:
     elements: tuple[Placed, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
     observer: np.ndarray | None = None
+    substeps: int = 1
 
     def __post_init__(self) -> None:
         for kind in ("dynamics", "outputs"):
@@ -88,6 +89,7 @@ class Equations:
             object.__setattr__(self, kind, distinct_names(getattr(self, kind), kind))
         if self.hold not in (None, "zero", "linear"):
             raise InputError(f"hold = {self.hold!r} was given; use 'zero', 'linear' or None.")
+        object.__setattr__(self, "substeps", whole(self.substeps, "substeps", 1))
         if not isinstance(self.units, Mapping):
             raise InputError(f"The simulator's units are {self.units!r}; give {{name: unit}}.")
         object.__setattr__(self, "parameters", parameter_set(self.parameters))
@@ -275,8 +277,8 @@ class Equations:
         term = self.term(port, self.across(port, x, u, p, t), self.rate(port, x, u, p, t), x, u, p)
         name, factor = next(iter(self.into(port, x, u, p, t).items()))
         held = dict(zip(self.states, ca.vertsplit(self.derivatives(x, u, p, t)), strict=True)) if self.states else {}
-        whole = held[name] if name in held else self.measured(x, u, p, t)[name]
-        slopes = ca.Function("slopes", [known], [ca.jacobian(v, known) for v in (whole, factor * term, factor)])
+        entire = held[name] if name in held else self.measured(x, u, p, t)[name]
+        slopes = ca.Function("slopes", [known], [ca.jacobian(v, known) for v in (entire, factor * term, factor)])
         all_of, own, scale = _at_random_points(slopes)
         moving = np.any(own != 0, axis=0) & ~np.any(scale != 0, axis=0)
         same, opposite = (np.any(np.all(np.isclose(all_of, sign * own, atol=0.0), axis=0) & moving) for sign in (1, -1))

@@ -424,8 +424,10 @@ def choose_substeps(simulator: Equations, recordings: Sequence[Recording]) -> in
 
 
 def least_substeps(simulator: Equations) -> int:
-    """Give the fewest sub-steps per sample that the laws in the ports ask for; 1 for an equation in discrete time."""
-    return 1 if simulator.discrete else max((int(getattr(e.law, "substeps", 1)) for e in simulator.elements), default=1)
+    """Give the fewest sub-steps per sample that simulator and laws ask for; 1 for an equation in discrete time."""
+    if simulator.discrete:
+        return 1
+    return max([simulator.substeps, *(int(getattr(e.law, "substeps", 1)) for e in simulator.elements)])
 
 
 def _start(simulator: Equations, recording: Recording) -> np.ndarray:

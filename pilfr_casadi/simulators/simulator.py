@@ -51,6 +51,9 @@ class Simulator(Equations):
     observer : array, shape (n_x, n_y), optional
         Gain of a one-step predictor (Ljung 1999, System Identification, sec. 4.3): after each sample, it times the
         measured minus the simulated output is added to the states. Outputs are then predictions one sample ahead.
+    substeps : int
+        Least number of integration steps per sample. More are taken where the equations are fast at the beginning of a
+        recording; say how many, if they become fast later.
 
     Raises
     ------
@@ -93,9 +96,10 @@ class Simulator(Equations):
             )
         columns = [recording.inputs.index(name) for name in self.inputs]
         factors = [unit_factor(self, recording, name) for name in self.inputs]
-        own = recording.with_(u=recording.u[:, columns] * factors, inputs=self.inputs)
+        own = recording.with_(u=recording.u[:, columns] * factors, inputs=self.inputs, units={})
         if self.observer is not None:
-            own = own.with_(y=self._measured(own), outputs=self.output_names)
+            factors = [unit_factor(self, recording, name) for name in self.output_names]
+            own = own.with_(y=self._measured(own) * factors, outputs=self.output_names)
         substeps = choose_substeps(self, [own])
         model = discretise(self, own.dt, own.hold or self.hold or "zero", substeps)
         drive, start = model.drive(own), np.zeros(model.n_state)
@@ -218,6 +222,19 @@ class Simulator(Equations):
         gone = kept.pop(index)
         own = {k: p for k, p in self.parameters.items() if not k.startswith(gone.prefix)}
         return self._with(parameters=ParameterSet(own), elements=tuple(kept))
+
+
+def unit_notes(simulator: Simulator, recording: Recording) -> dict[str, str]:
+    """Say by channel which values of a recording are converted to the simulator's units."""
+    out = {}
+    for name in (n for n in (*simulator.inputs, *simulator.output_names) if n in recording.units):
+        factor = unit_factor(simulator, recording, name)
+        if factor != 1:
+            out[name] = (
+                f"{name} is recorded in {recording.units[name]}, and the simulator has it in {simulator.units[name]}: "
+                f"its values were multiplied by {factor:g}."
+            )
+    return out
 
 
 def unit_factor(simulator: Simulator, recording: Recording, name: str) -> float:

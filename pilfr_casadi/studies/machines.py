@@ -256,5 +256,5 @@ def simulator_digest(simulator: Simulator) -> str:
         for name, q in simulator.parameters.items()
     }
     elements = [[e.port, type(e.law).__name__] for e in simulator.elements]
-    said = [simulator.hold, simulator.discrete, to_json(simulator.observer)]
+    said = [simulator.hold, simulator.discrete, to_json(simulator.observer), simulator.substeps]
     return digest({"equations": equations, "ports": ports, "parameters": parameters, "laws": elements, "said": said})
