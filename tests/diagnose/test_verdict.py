@@ -11,7 +11,7 @@ from pilfr_casadi import Recording, multisine
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.correction import Correction
 from pilfr_casadi.diagnose.offsets import Offset, without_idle_offsets
-from pilfr_casadi.laws import CoulombFriction, CubicDamping
+from pilfr_casadi.laws import CoulombFriction, CubicDamping, Power as StaticPower
 
 
 def test_a_value_of_the_simulator_that_a_law_replaces_is_told_to_come_out_as_zero():
@@ -37,6 +37,23 @@ def test_slow_noise_that_two_periods_show_is_no_missing_physics():
     assert max(found.evidence["search"].flexible(found.evidence["search"].root).values()) > 0.3
     assert found.verdict == "complete"
     assert "the rest is as large as the noise" in found.sentence
+
+
+@pytest.mark.parametrize("pole", [0.3, 0.6])
+def test_noise_in_a_slow_machine_does_not_swell_with_it(pole):
+    """The rates of the measured level are those of the noise."""
+    u = np.repeat(np.random.default_rng(3).uniform(1, 5, 25), 60)[:, None]
+    tank = pilfr.Simulator(
+        lambda x, u, p: {"level": (p.k * u.pump - p.a * x.level) / 0.05},
+        lambda x: {"level": x.level},
+        states=("level",),
+        inputs=("pump",),
+        parameters={"k": pilfr.Parameter(2.4e-5, bounds=(5e-6, 1e-4)), "a": pilfr.Parameter(2e-4, bounds=(0, 1e-3))},
+    )
+    blank = Recording(u, u, 0.5, ("pump",), ("level",), initial="zero", hold="zero")
+    noise = lfilter([1], [1, -pole], np.random.default_rng(1).standard_normal((len(u), 1)), axis=0)
+    found = pilfr.diagnose(tank, blank.with_(y=tank.simulate(blank) + 2e-3 * noise), laws=(StaticPower,), workers=1)
+    assert found.verdict == "complete", found.sentence
 
 
 @pytest.mark.parametrize("offset", [0.0, 3.0])
