@@ -68,7 +68,7 @@ def test_a_case_keeps_its_promises(cases):
             assert 2900 <= len(r) <= 8000
             assert r.outputs == c.simulator.output_names and r.inputs == c.simulator.inputs
         known = {p.name for p in c.simulator.all_ports()}
-        for t, accepted in zip(c.truth, c.accepted, strict=True):
+        for t, accepted in zip(c.truth, c.accepted[: len(c.truth)], strict=True):  # an outside effect has no truth
             assert (t["port"], t["law"]) in accepted
             assert {port for port, _ in accepted} <= known and t["law"] in LAWS
         if c.truth:
