@@ -178,9 +178,15 @@ class Signal:
 def force_cloud(
     x: Signal, force: Signal, law_x: np.ndarray, law: np.ndarray, *, title: str = "", name: str = "fitted law"
 ) -> Axes:
-    """Draw a recovered force over a local signal as points, and the named law along the simulation as a line."""
+    """Draw a recovered force over a local signal as points, and the named law along the simulation as a line.
+
+    A law that is a curve of the signal is drawn from left to right: along the time, steps of it would be chords.
+    """
     ax = axes_or_new(None)
     sx, sy, across, up = _cloud(ax, x, force, alpha=0.55, label="recovered from the recording")
+    order = np.argsort(law_x, kind="stable")
+    if np.sum(np.abs(np.diff(law[order]))) <= np.sum(np.abs(np.diff(law))):
+        law_x, law = law_x[order], law[order]
     if len(law):
         ax.plot(law_x / sx, law / sy, color=VERMILLION, linewidth=0.9, alpha=0.9, label=plain(name), rasterized=True)
     ax.set_ylim(*_robust_limits(force.values / sy, law / sy))

@@ -441,3 +441,12 @@ def test_pictures_that_cannot_be_drawn_are_refused(fitted, data):
         fitted.plot(data, "nyquist")
     with pytest.raises(InputError, match="residual tests need at least 32"):
         plots.residual_tests(data.slice(0, 20), [("model", data.y[:20])])
+
+
+@pytest.mark.parametrize("kind", ["curve", "loop"])
+def test_a_curve_is_drawn_from_left_to_right_and_a_loop_along_the_time(kind):
+    x = np.repeat([3.0, 0.0, 5.0, 1.0, 4.0], 3) if kind == "curve" else np.sin(np.arange(60) / 5)
+    law = np.maximum(x - 1.5, 0) if kind == "curve" else np.sign(np.cos(np.arange(60) / 5))
+    ax = plots.force_cloud(plots.Signal("x", x, "V"), plots.Signal("w", law, "N"), x, law)
+    drawn = ax.lines[1].get_xdata()
+    assert np.array_equal(drawn, np.sort(x)) is (kind == "curve")
