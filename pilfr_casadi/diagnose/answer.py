@@ -250,11 +250,12 @@ def _effect(
             label = name.removeprefix(element.prefix) + (f"[{i}]" if len(flat) > 1 else "")
             error = float(np.ravel(std[name])[i])
             shown[label] = {"value": float(v), "std": error if np.isfinite(error) else None, "unit": unit}
+    remark = law.remark(element.own(fitted.values))
     return Effect(
         port=element.port,
         law=law.id,
         confidence=named.confidence,
-        sentence=law.sentence,
+        sentence=f"{law.sentence}; {remark}" if remark else law.sentence,
         equation=law.equation.replace("dz/dt", "v") if port.is_speed else law.equation,
         parameters=shown,
         indistinguishable=tuple(named.alike),

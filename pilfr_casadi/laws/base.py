@@ -299,6 +299,10 @@ class Law:
         """Say what is still needed before the law can stand in a port; empty if nothing."""
         return ""
 
+    def remark(self, values: Mapping[str, Any]) -> str:
+        """Say how the law at its fitted values differs from what its sentence says; empty if it does not."""
+        return ""
+
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether the law at its fitted values hardly does what its sentence says."""
         return False

@@ -18,6 +18,7 @@ MAX_THRESHOLD = 0.6  # largest threshold tried, over half the travel
 SHARP = 2e-3  # narrowest reversal that is tried in any case, over the speed
 SHARPEST_REVERSAL = 1e-4  # narrowest reversal that is tried where the steps resolve it, over the speed
 STABLE_STEP = 2.5  # |λ| h up to which a Runge-Kutta step is stable
+BROAD = 0.1  # width of the reversal over the largest speed from which an answer says that it is broad
 WIDE = 0.4  # width of the reversal over the widest that is tried; above it the force is damping that saturates
 
 
@@ -34,12 +35,19 @@ class CoulombFriction(Law):
     dissipative = True
     knee = "v_0"
     starts = {"v_0": ("speed", 0.005, 0.02, 0.06, 0.15)}
+    widest: ClassVar[float] = 0.5  # reversal that a fit may reach, over the largest speed
 
     def force(self, dz: Any, p: Any) -> Any:
         return p.F_c * ca.tanh(dz / p.v_0)
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"v_0": (_narrowest_reversal(self, local), 0.5 * local.speed)}
+        return {"v_0": (_narrowest_reversal(self, local), self.widest * local.speed)}
+
+    def remark(self, values: Mapping[str, Any]) -> str:
+        """Say that the reversal is broad, as a damper whose force saturates (a digressive one) has it."""
+        share = self.widest * values["v_0"] / self.parameters()["v_0"].bounds[1]
+        words = f"here it sets in over {share:.0%} of the largest speed, as in a damper whose force saturates"
+        return words if BROAD < share < np.inf else ""
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether the reversal is so wide that the force depends on speed nearly everywhere."""
@@ -108,6 +116,7 @@ class StribeckFriction(CoulombFriction):
     equation = "w = (F_c + F_e exp(-(dz/dt / v_s)^2)) tanh(dz/dt / v_0)"
     sentence = "dry friction that is larger at rest than in motion"
     units = {"F_c": "w", "F_e": "w", "v_s": "z/s", "v_0": "z/s"}
+    widest = 0.3
 
     def force(self, dz: Any, p: Any) -> Any:
         return (p.F_c + p.F_e * ca.exp(-((dz / p.v_s) ** 2))) * ca.tanh(dz / p.v_0)
@@ -120,7 +129,7 @@ class StribeckFriction(CoulombFriction):
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {
             "v_s": (4e-3 * local.speed, 0.8 * local.speed),
-            "v_0": (_narrowest_reversal(self, local), 0.3 * local.speed),
+            "v_0": (_narrowest_reversal(self, local), self.widest * local.speed),
         }
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
