@@ -24,6 +24,7 @@ K = TypeVar("K")
 AMPLITUDES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
 SINES = 12  # frequencies of sines that are tried
 MOST_SAMPLES = 3000  # longest simulated experiment, in samples
+SEEN = 0.01  # difference of two answers over the noise below which recordings show nothing of it
 
 
 def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
@@ -158,10 +159,11 @@ def next_experiment(
         return None
     unit = bench.recordings[0].units.get(best["input"], "")
     best["recorded"] = recorded
+    so_far = f"by {recorded:.2g} times" if recorded > SEEN else "not at all"
     best["sentence"] = (
         f"A {best['waveform']} of {best['frequency']:.3g} Hz with amplitude {best['amplitude']:.3g}"
         f"{' ' + unit if unit else ''} at {best['input']} separates them best: their outputs then differ by "
-        f"{best['separation']:.3g} times the noise ({recorded:.3g} times in the recordings)."
+        f"{best['separation']:.3g} times the noise (in these recordings {so_far})."
     )
     return best
 
