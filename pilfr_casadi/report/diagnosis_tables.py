@@ -19,7 +19,7 @@ from ..simulators import PARAMETER, kind_of, name_at
 from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
-ALIKE = 1.03  # ratio of two errors up to which two laws do equally well
+BAR_MARGIN = 1.03  # error of the smallest bar over the left end of the scale
 RANKED = 12  # rows of the ranked table above the fold
 
 
@@ -237,7 +237,7 @@ def candidate_tables(
     best = score(rows[winner or 0])
     cells = []
     errors = [score(r) for r in rows if 0 < score(r) < np.inf]
-    low, top = min([*errors, floor or np.inf]) / ALIKE, max([*errors, without or 0.0])
+    low, top = min([*errors, floor or np.inf]) / BAR_MARGIN, max([*errors, without or 0.0])
 
     def share(error: float | None) -> float:
         return float(np.log(error / low) / np.log(top / low)) if error and low < error < np.inf else 0.0
