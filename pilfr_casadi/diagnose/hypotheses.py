@@ -320,9 +320,11 @@ class Hypotheses:
         """Estimate the noise: the part of the best hypothesis' residual that no force and no law at any port explains.
 
         A measured noise is kept. Third differences give a lower limit: the white noise inside the residual. The
-        effective samples follow from the residual's correlation.
+        smallest error of any hypothesis is an upper limit. The effective samples follow from the correlation of that
+        error; the residual of a wrong model is slower than noise, and would make them fewer.
         """
-        self.count = _count_samples(self.best.fitted, self.bench)
+        nearest = min(self.memo.values(), key=lambda t: t.mean_square)
+        self.count = _count_samples(nearest.fitted, self.bench)
         if self.floor.source != "estimated":
             return
         best = self.best
@@ -330,7 +332,8 @@ class Hypotheses:
         share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
         rest = np.minimum(np.sqrt(share) * self.rms(best), LOUDEST_NOISE * self.bench.scale)
         known, white = self.stand_in_error * self.bench.scale, white_part(best.fitted.residual)
-        self.floor = Floor(np.hypot(np.maximum(white, rest), known), "estimated")
+        noise = np.minimum(np.hypot(np.maximum(white, rest), known), self.rms(nearest))
+        self.floor = Floor(noise, "estimated")
 
     def rms(self, trial: Trial) -> np.ndarray:
         """Compute the rms error of each output, (n_y,)."""

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from ..laws import DRAGS, DRY, Attached, Delay, Lag, Law, Local, Resonance, unit_forces
+from ..laws import DRAGS, DRY, Attached, Delay, Lag, Law, Local, Resonance, SprungMass, unit_forces
 from ..simulators import in_series
 from .evidence import FAR_RATIO, NEAR_RATIO
 from .linearise import port_signals
@@ -46,10 +46,15 @@ def complements(one: Law, other: Law) -> bool:
     """Tell whether two laws of a port are different physics: one opposes motion, the other is a curve of position.
 
     So are dry friction and a drag that grows with speed, and two curves of position if a signal, such as a pressure,
-    varies the strength of one alone. A constant offset may stand beside any other law.
+    varies the strength of one alone. A constant offset may stand beside any other law, and a mass on a spring beside
+    any force without such a mass.
     """
     if "offset" in (one.id, other.id):
         return one.id != other.id
+    sprung = [isinstance(law, SprungMass) for law in (one, other)]
+    if any(sprung):
+        plain = other if sprung[0] else one
+        return not all(sprung) and plain.order == 0
     if any(a.id in DRY and b.id in DRAGS for a, b in ((one, other), (other, one))):
         return True
     rubs, springs = sorted((one, other), key=lambda law: not law.dissipative)

@@ -74,6 +74,7 @@ if TYPE_CHECKING:
         Relaxation as Relaxation,
         Resonance as Resonance,
         Settling as Settling,
+        SprungMass as SprungMass,
         Swing as Swing,
         TwoStageCreep as TwoStageCreep,
         TwoStageRelaxation as TwoStageRelaxation,

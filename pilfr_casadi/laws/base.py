@@ -188,6 +188,8 @@ class Law:
         in the signal at the beginning of a step.
     in_line : bool
         The law stands in line with the port's `term`, which `force` and `flow` may call: `term(z, dz)`.
+    driven : bool
+        The term is the force of a drive, which the equations show if the port names no term.
     sensed : bool
         Outputs that read the port's coordinate or its rate read `far_side(q, p)` in their place. The law is tried only
         where the coordinate is a state that outputs read.
@@ -241,6 +243,7 @@ class Law:
     memory: ClassVar[Any] = 0
     shifts: ClassVar[bool] = False
     in_line: ClassVar[bool] = False
+    driven: ClassVar[bool] = False
     sensed: ClassVar[bool] = False
     substeps: ClassVar[int] = 1
     knee: ClassVar[str] = ""

@@ -122,6 +122,7 @@ class ElasticDrive(SprungMass, _InLine):
     units = {"k": "w/z", "W": "rad/s", "D": ""}
     strength: ClassVar[tuple[str, ...]] = ()  # the force is not linear in k
     position = False
+    driven = True
     sensed = True
     starts = {
         "k": lambda at: _stiffness(at) * np.array([2.0, 10.0, 50.0]),

@@ -69,6 +69,19 @@ def may_be_speed(unit: str) -> bool:
     return not unit or (unit.endswith("/s") if size is None else size in ((0, 1, -1, 0, 0), (0, 0, -1, 0, 0)))
 
 
+def is_motion(unit: str) -> bool:
+    """Tell whether a unit is that of a position, a speed or an acceleration, of a length or an angle.
+
+    >>> is_motion("mm"), is_motion("rad/s"), is_motion("m/s^2"), is_motion("N m"), is_motion("V"), is_motion("")
+    (True, True, True, False, False, False)
+    """
+    size = dimension(unit)
+    if size is None:
+        return False
+    plain = size[0] == size[3] == size[4] == 0 and size[2] in (0, -1, -2)
+    return plain and (size[1] == 1 or (size[1] == 0 and bool(_TURNING & set(symbols(unit)))))
+
+
 def common_domain(domains: Iterable[str]) -> str:
     """Return the domain of all whose domain is known; unknown if there is none, or more than one."""
     found = set(domains) - {UNKNOWN}

@@ -20,7 +20,7 @@ import numpy as np
 
 from .._base import InputError, listed, whole
 from ..models import Named, Parameter, ParameterSet
-from .domains import MECHANICAL, UNKNOWN, common_domain, may_be_speed
+from .domains import MECHANICAL, UNKNOWN, common_domain, is_motion, may_be_speed
 from .ports import (
     ACTUATOR,
     BUILT_IN,
@@ -326,7 +326,7 @@ class Equations:
         domain = common_domain(port.domain for port in inner)
         if not self.ports:
             inner = tuple(replace(port, domain=domain) if port.domain == UNKNOWN else port for port in inner)
-        inner = tuple(map(self._with_speed, inner))
+        inner = self._with_drives(tuple(map(self._with_speed, inner)))
         # a voltage is a signal in all domains
         actuators = (_series(ACTUATOR, n, lambda u, n=n: u[n], self.units, domain) for n in self.inputs)
         sensors = (_series(SENSOR, n, lambda: 0, self.units, domain) for n in self.output_names)
@@ -359,6 +359,54 @@ class Equations:
             speed = not at_once.is_zero() and port.domain in (MECHANICAL, UNKNOWN) and may_be_speed(port.across_unit)
             speed = speed and not (z.is_symbolic() and z.name() in self.kinematic)  # which are positions
         return replace(port, rate=port.across) if speed else port
+
+    def _with_drives(self, ports: tuple[Port, ...]) -> tuple[Port, ...]:
+        """Find the force of a drive in the equations, as `term` of the first port at each driven motion without one.
+
+        A drive may be elastic wherever a force acts on a position, whether its user has thought of that or not.
+        """
+        if self.discrete or not self.states:
+            return ports
+        at = self.symbols()
+        targets = [tuple(self.into(port, *at)) for port in ports]
+        taken = {target for port, target in zip(ports, targets, strict=True) if port.term is not None}
+        out = []
+        for port, target in zip(ports, targets, strict=True):
+            if target not in taken and (drive := self._drive(port, *at)) is not None:
+                taken.add(target)
+                port = replace(port, term=drive, implied=True)
+            out.append(port)
+        return tuple(out)
+
+    def _drive(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Expression | None:
+        """Return the force of a drive at a port, with the sign of w; None if none acts on a position there.
+
+        A drive acts by inputs, and by states that only inputs move, such as the lagged torque of an actuator.
+        """
+        into, z = self.into(port, x, u, p, t), self.across(port, x, u, p, t)
+        speed = next(iter(into))
+        driven = len(into) == 1 and z.is_symbolic() and self._integrals.get(z.name()) == speed
+        if not driven or port.domain not in (MECHANICAL, UNKNOWN):
+            return None
+        rates = dict(zip(self.states, ca.vertsplit(self.derivatives(x, u, p, t)), strict=True))
+        free = set(self.states) - {z.name(), speed}
+        while moved := {n for n in free if any(ca.depends_on(rates[n], x[m]) for m in set(self.states) - free)}:
+            free -= moved
+        forces = [n for n in self.inputs if not is_motion(self.units.get(n, ""))]
+        actuators = sorted(free)
+        acting = ca.vertcat(*(u[n] for n in forces), *(x[n] for n in actuators))
+        slope = ca.jacobian(rates[speed], acting) / into[speed]
+        if not slope.nnz() or ca.depends_on(slope, ca.vertcat(*u._values.values(), *(x[n] for n in actuators), t)):
+            return None
+        positions, parameters = ca.vertcat(*(x[n] for n in self.states)), ca.vertcat(*map(ca.vec, p._values.values()))
+        of = ca.Function("slope", [positions, parameters], [slope])
+
+        def drive(x: Named, u: Named, p: Named) -> Any:
+            states = ca.vertcat(*(x[n] for n in self.states))
+            own = ca.vertcat(*(ca.vec(ca.SX(p[n])) for n in self.parameters))
+            return ca.mtimes(of(states, own), ca.vertcat(*(u[n] for n in forces), *(x[n] for n in actuators)))
+
+        return drive
 
     @cached_property
     def state_units(self) -> dict[str, str]:

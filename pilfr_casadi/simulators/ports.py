@@ -87,7 +87,10 @@ class Port:
         Force that the equations have here already, with the sign of w, so that they hold `into * term`: the force of a
         spring, `lambda z, p: p.k * z`, or minus the torque of a motor, `lambda u: -u.torque`. It takes any of z, dz, x,
         u, p by name, where z and dz are the local coordinate and its rate. Laws in line with it (a gap, a compliance, a
-        rotor on a spring) are then tried: they give it another z and dz.
+        rotor on a spring) are then tried: they give it another z and dz. Where no term is given, that of a drive is
+        found in the equations.
+    implied : bool
+        The simulator has found `term` in its equations.
     domain : {"mechanical", "thermal", "electrical", "fluid", "unknown"}, optional
         Physical domain, which decides what laws are tried; by default inferred from the units.
 
@@ -113,6 +116,7 @@ class Port:
     domain: str = ""
     signals: Mapping[str, Expression] = field(default_factory=dict)
     term: Expression | None = None
+    implied: bool = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -163,6 +167,10 @@ class Port:
         before, per_second, after = self.across_unit.rpartition("/s")
         return before if per_second and not after else f"{self.across_unit} s"
 
+    def has_term_for(self, law: Any) -> bool:
+        """Tell whether it has the force that a law in line needs: its own term, or that of a drive."""
+        return self.term is not None and (law.driven or not self.implied)
+
     def admits(self, law: Any) -> bool:
         """Tell whether a law (or its class) may be missing here: by its places, physical domains and coordinate.
 
@@ -171,7 +179,7 @@ class Port:
         """
         if self.is_speed and "z" in law.reads() and (self.domain == MECHANICAL or "dz" in law.reads()):
             return False
-        if law.in_line and self.term is None:
+        if law.in_line and not self.has_term_for(law):
             return False
         if law.angular and np.isnan(revolution_in(self.across_unit)):
             return False

@@ -192,7 +192,7 @@ class Simulator(Equations):
         if not place.kinds & set(allowed):
             kind = "a parameter" if place.kinds == {"parameter"} else "series" if place.series else "parallel"
             raise InputError(f"The law {law.id!r} cannot stand in {kind} at {port!r}; choose another port or law.")
-        if getattr(law, "in_line", False) and place.term is None:
+        if getattr(law, "in_line", False) and not place.has_term_for(law):
             raise InputError(
                 f"The law {law.id!r} ({law.form or 'plain'}) stands in line with a term of the equations, and the port "
                 f"{port!r} names none; give Port(..., term=...), or choose another law."

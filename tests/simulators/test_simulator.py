@@ -513,6 +513,7 @@ def test_other_values_check_no_equation_again(record):
         return dynamics(x, u, p)
 
     simulator = rig(dynamics=counted)
+    simulator.all_ports()  # finds the force of the inputs in the equations
     before = len(calls)
     stiffer = simulator.with_parameters({**simulator.parameters, "k": Parameter(95.0)})
     law = stiffer.with_element("ground", CubicStiffness(values={"k_3": 700.0}))
