@@ -11,7 +11,7 @@ import numpy as np
 from .._base import InputError, Stages, listed
 from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
 from ..identify import match_channels
-from ..laws import CATALOGUE, SCALABLE, Law, LinearStiffness, ViscousDamping, scaled, scheduled
+from ..laws import CATALOGUE, SCALABLE, Law, LinearStiffness, ViscousDamping, scaled, scheduled, seen_by
 from ..simulators import Simulator, as_simulator
 from .gates import Gate
 from .stretches import Stretches
@@ -94,12 +94,15 @@ def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[ty
 
     An input that the equations do not read may scale a law. A spring or damper of the simulator's own may vary with the
     time, an input, or a port's own signal, and a damper with the position. Other laws are found first, and then let
-    vary (`Search`).
+    vary (`Search`). Of several sensors at an elastic joint or drive, one alone may be on the far side.
     """
     by_input = [scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs]
     signals = ["t", *simulator.inputs, *sorted({name for port in simulator.ports for name in port.signals})]
     pairs = [(law, by) for law in (LinearStiffness, ViscousDamping) for by in signals] + [(ViscousDamping, "z")]
-    return (*laws, *by_input, *(scheduled(law, by, "quadratic") for law, by in pairs if law in laws))
+    varying = [scheduled(law, by, "quadratic") for law, by in pairs if law in laws]
+    read = [names for port in simulator.all_ports() if len(names := simulator.readers(port)) > 1]
+    sensors = sorted({name for names in read for name in names})
+    return (*laws, *by_input, *varying, *(seen_by(law, name) for law in laws if law.sensed for name in sensors))
 
 
 def check_limits(simulator: Simulator, limits: Mapping[str, float] | None) -> None:

@@ -353,8 +353,8 @@ def _with_equations(
         assert term is not None
         return np.asarray(map_points(term, z[:, None], dz[:, None], x, u, own)[0][:, 0, 0])
 
-    shown, line = simulator.shown_states(port) is not None, along if term is not None else None
-    return replace(local, shown=shown, term=line, revolution=revolution_in(port.across_unit))
+    line = along if term is not None else None
+    return replace(local, readers=simulator.readers(port), term=line, revolution=revolution_in(port.across_unit))
 
 
 def own_signals(simulator: Simulator, values: np.ndarray) -> list[dict[str, np.ndarray]]:

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         likely_profiles as likely_profiles,
         scaled as scaled,
         scheduled as scheduled,
+        seen_by as seen_by,
         strengths_over as strengths_over,
         varying as varying,
     )

@@ -70,8 +70,8 @@ class Local:
         The simulator's inputs, for laws whose strength is scaled by one of them.
     from_zero : tuple of bool
         Whether each recording begins with everything at zero; else a law begins as if z had stood still before.
-    shown : bool
-        Whether z is a state that outputs read, itself or its rate.
+    readers : tuple of str
+        Outputs that read z or its rate, if these are states.
     revolution : float
         One revolution in the unit of z, if that is the unit of an angle; else nan.
     term : callable, optional
@@ -86,7 +86,7 @@ class Local:
     max_damping: float = np.inf
     inputs: Mapping[str, np.ndarray] = field(default_factory=dict)
     from_zero: tuple[bool, ...] = ()
-    shown: bool = False
+    readers: tuple[str, ...] = ()
     revolution: float = np.nan
     term: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
 
@@ -193,6 +193,8 @@ class Law:
     sensed : bool
         Outputs that read the port's coordinate or its rate read `far_side(q, p)` in their place. The law is tried only
         where the coordinate is a state that outputs read.
+    seen_by : str
+        The one output that reads the far side; empty for all outputs that read the coordinate. See `seen_by`.
     substeps : int
         Smallest number of integration steps per sample.
     knee : str
@@ -245,6 +247,7 @@ class Law:
     in_line: ClassVar[bool] = False
     driven: ClassVar[bool] = False
     sensed: ClassVar[bool] = False
+    seen_by: ClassVar[str] = ""
     substeps: ClassVar[int] = 1
     knee: ClassVar[str] = ""
     scaled_by: ClassVar[str] = ""
@@ -292,8 +295,10 @@ class Law:
 
     def why_not(self, local: Local) -> str:
         """Say why the data carries no information on this law; empty if it does."""
-        if self.sensed and not local.shown:
+        if self.sensed and not local.readers:
             return "no output reads the coordinate"
+        if self.seen_by and (self.seen_by not in local.readers or len(local.readers) == 1):
+            return f"{self.seen_by} does not read the coordinate, or does so alone"
         hidden = self.two_sided and min(-local.low, local.high) <= MIN_SIDE * local.reach
         return "one side of zero is hardly visited" if hidden else ""
 

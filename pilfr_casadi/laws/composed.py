@@ -276,6 +276,39 @@ def strengths_over(law: Law, values: Mapping[str, Any], signal: np.ndarray) -> d
     }
 
 
+def seen_by(law: type[Law], output: str) -> type[Law]:
+    """Make a law with a far side that one output alone reads, such as a drive with a sensor at either end.
+
+    Parameters
+    ----------
+    law : class of Law
+        A law that changes what outputs read, such as `ElasticDrive`.
+    output : str
+        The output that reads the far side; others that read the port's coordinate still do so.
+
+    Raises
+    ------
+    InputError
+        If the law has no far side.
+    """
+    base: Any = law
+    if not getattr(base, "sensed", False):
+        raise InputError(f"{law!r} was given; give a class of laws that outputs see, such as ElasticDrive.")
+    return _seen_by(base, output)
+
+
+@functools.cache
+def _seen_by(base: Any, output: str) -> Any:
+    class Seen(base):
+        form = f"{base.form}, seen by {output}"
+        equation = base.equation.replace("outputs read", f"{output} reads")
+        sentence = f"{base.sentence}; {output} alone is on the far side"
+        units = base.units
+        seen_by = output
+
+    return _name(Seen, f"{base.__name__}SeenBy_{output}", f"{base.__doc__}\n\n    {output} alone reads its far side.")
+
+
 @functools.cache  # the same class for the same arguments
 def _scaled(base: Any, by: str) -> Any:
     strengths = {name: f"{unit}/[{by}]" if name in base.strength else unit for name, unit in base.units.items()}
@@ -359,7 +392,7 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
 
         def why_not(self, local: Local) -> str:
             """Say why the data carries no information on this law; empty if it does."""
-            unknown = not (local.shown or (local.from_zero and all(local.from_zero)))
+            unknown = not (local.readers or (local.from_zero and all(local.from_zero)))
             if with_z and unknown:  # a level of each recording's own would pass for a variation with z
                 return "no output reads the coordinate, and its start is unknown"
             return super().why_not(local) or ("" if with_z else _not_there(by, local))

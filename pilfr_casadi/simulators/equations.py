@@ -301,6 +301,15 @@ class Equations:
         read = ca.vertcat(*self.measured(x, u, p, t).values())
         return (name, rate) if ca.depends_on(read, ca.vertcat(x[name], x[rate])) else None
 
+    def readers(self, port: Port) -> tuple[str, ...]:
+        """List the outputs that read a port's coordinate or its rate, if these are states."""
+        x, u, p, t = self.symbols()
+        states = self.shown_states(port)
+        if states is None:
+            return ()
+        motion = ca.vertcat(*(x[name] for name in states))
+        return tuple(name for name, y in self.measured(x, u, p, t).items() if ca.depends_on(y, motion))
+
     def port(self, name: str) -> Port:
         """Find a port by name: declared, `actuator:<input>`, `sensor:<output>`, `equation:<state>`, `parameter:<name>`.
 

@@ -127,7 +127,7 @@ class ClosedEquations:
         if vector is not self.vector:
             p = Named("parameter", simulator.parameter_set.symbols(vector))
         f = bare = simulator.derivatives(x, inputs, p, t)
-        seen, more = dict(x._values), list[tuple[str, Any]]()
+        seen, more = {"": dict(x._values)}, list[tuple[str, Any]]()  # states as all outputs read them, and as one does
         rates = self.local(x_only, ca.vertcat(*u.values()), v.slope, t, vector)[1]
         for i, e, kind, _ in placed:
             if kind in (ACTUATOR, SENSOR, PARAMETER):
@@ -144,9 +144,12 @@ class ClosedEquations:
                 else:
                     more.append((name, factor * w))
             if getattr(e.law, "sensed", False):
-                shown = simulator.shown_states(port) or ()
-                seen |= zip(shown, e.law.far_side(q[i], self._own(e)), strict=False)
-        y = simulator.measured(Named("state", seen), inputs, p, t, bare)
+                far = dict(zip(simulator.shown_states(port) or (), e.law.far_side(q[i], self._own(e)), strict=False))
+                for name in (e.law.seen_by,) if e.law.seen_by else (*seen,):
+                    seen[name] = seen.get(name, seen[""]) | far
+        y = simulator.measured(Named("state", seen.pop("")), inputs, p, t, bare)
+        for name, values in seen.items():
+            y[name] = simulator.measured(Named("state", values), inputs, p, t, bare)[name]
         for name, part in more:
             y[name] = y[name] + part
         for i, e, kind, name in placed:

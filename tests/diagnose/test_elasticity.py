@@ -87,7 +87,7 @@ def test_a_term_is_there_with_its_sign_and_laws_in_line_want_one():
 
 def test_a_law_in_line_says_why_a_term_is_none_for_it():
     t = np.linspace(0, 9, 300)
-    local = Local(np.sin(t), np.cos(t), t[1], (300,), shown=True)
+    local = Local(np.sin(t), np.cos(t), t[1], (300,), readers=("z",))
     spring, drive = (replace(local, term=term) for term in (lambda z, dz: 5 * z, lambda z, dz: np.sin(3 * t)))
     damped, curved = (replace(local, term=term) for term in (lambda z, dz: 5 * z + dz, lambda z, dz: z + dz**3))
     assert "names no term" in LineGap().why_not(local)

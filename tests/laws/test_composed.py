@@ -136,7 +136,7 @@ def test_a_strength_that_varies_is_found_with_its_signal(kind, by, values, ends)
 )
 def test_a_strength_varies_with_the_position_where_that_is_known(shown, from_zero, usable):
     z = np.linspace(-1.0, 2.0, 50)
-    local = Local(z, np.ones(50), 0.1, (50,), shown=shown, from_zero=(from_zero,))
+    local = Local(z, np.ones(50), 0.1, (50,), readers=("z",) * shown, from_zero=(from_zero,))
     assert (not scheduled(CoulombFriction, "z")().why_not(local)) is usable
 
 
@@ -201,7 +201,7 @@ def test_operators_vary_each_by_itself(profile):
     """A layer of stops has a weight of each operator at each value of the signal."""
     kind = scheduled(StopHysteresis, "z", profile)
     z = np.linspace(-1.0, 1.0, 50)
-    local = Local(z, np.ones(50), 0.1, (50,), shown=True)
+    local = Local(z, np.ones(50), 0.1, (50,), readers=("z",))
     shape = next(iter(kind().shapes(local)))
     columns = unit_forces(kind(), local, [shape])[:, 0]
     values = start_values(kind(), shape, np.arange(1.0, 1 + columns.shape[1]))

@@ -41,7 +41,9 @@ EVERY = (*CATALOGUE, *(finer for kinds in FINER.values() for finer in kinds))
 COMPILED = (CubicStiffness, StopHysteresis, BoucWen, Delay, StribeckFriction, Mode)  # one of each kind of step
 T = np.arange(M) * DT
 Z = 0.8 * np.sin(2 * np.pi * 1.3 * T) + 0.5 * np.sin(2 * np.pi * 3.1 * T + 1) + 0.05
-LOCAL = Local(Z, np.gradient(Z, DT), DT, (M,), np.inf, shown=True, revolution=2 * np.pi, term=lambda z, dz: 60 * z + dz)
+LOCAL = Local(
+    Z, np.gradient(Z, DT), DT, (M,), np.inf, readers=("z",), revolution=2 * np.pi, term=lambda z, dz: 60 * z + dz
+)
 DRIVEN = replace(LOCAL, term=lambda z, dz: -20 * np.cos(9 * T))
 
 
