@@ -109,15 +109,15 @@ def _other_forms(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scor
 
 
 def _forms_of_the_best(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Select forms of the best law that did not come near, a few, from the values of the shape that they share."""
+    """Select forms of the best law that did not come near: those that share most of its shape, from its values."""
     best, near = trials[0], _near(trials)
     shape = {name: value for name, value in best.own.items() if name in best.law.free - set(best.law.strength)}
-    out = list[Scored]()
+    out = list[tuple[int, Scored]]()
     for s in _first_of_pairs(s for s in scored if (s.port, s.law.id) == best.name and s.pair not in near):
         shared = {k: v for k, v in shape.items() if k in s.law.free and s.law.units[k] == best.law.units[k]}
         if shared:
-            out.append(replace(s, starts=({**s.starts[0], **shared},)))
-    return out[:FEW]
+            out.append((len(shared), replace(s, starts=({**s.starts[0], **shared},))))
+    return [entry for _, entry in sorted(out, key=lambda found: -found[0])[:FEW]]
 
 
 def _first_of_pairs(entries: Iterable[Scored]) -> list[Scored]:
