@@ -320,14 +320,15 @@ class Hypotheses:
         """Estimate the noise: the part of the best hypothesis' residual that no force and no law at any port explains.
 
         A measured noise is kept. Third differences give a lower limit: the white noise inside the residual. The
-        smallest error of any hypothesis is an upper limit. The effective samples follow from the correlation of that
-        error; the residual of a wrong model is slower than noise, and would make them fewer.
+        smallest error of any hypothesis is an upper limit. The effective samples follow from the residual's
+        correlation. The slow residual of a wrong model would make them so few that no evidence could refute it; so a
+        hypothesis that leaves a far smaller error takes its place.
         """
-        nearest = min(self.memo.values(), key=lambda t: t.mean_square)
-        self.count = _count_samples(nearest.fitted, self.bench)
+        best, nearest = self.best, min(self.memo.values(), key=lambda t: t.mean_square)
+        best = nearest if FAR_RATIO * nearest.error < best.error else best
+        self.count = _count_samples(best.fitted, self.bench)
         if self.floor.source != "estimated":
             return
-        best = self.best
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
         share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
         rest = np.minimum(np.sqrt(share) * self.rms(best), LOUDEST_NOISE * self.bench.scale)
