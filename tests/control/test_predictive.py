@@ -430,7 +430,7 @@ def test_do_mpc_takes_scales_and_limits_for_each_signal():
     refused(lambda: do_mpc_controller(function, 6, wanted, inputs=(-1, 1), y_scale=scales), "changes over the horizon")
 
 
-def test_do_mpc_takes_what_a_controller_plans_with(small):
+def test_do_mpc_accepts_every_model_of_a_controller(small):
     pytest.importorskip("do_mpc")
     fit, _, observer = small
     for given_model in (fit, observer, fit.export(), fit.to_casadi()):
@@ -440,7 +440,7 @@ def test_do_mpc_takes_what_a_controller_plans_with(small):
     refused(lambda: do_mpc_model("f"), "A str cannot be used for planning; give a Fit")
 
 
-def test_without_do_mpc_one_sentence_says_what_to_install(monkeypatch):
+def test_without_do_mpc_an_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "do_mpc", None)
     refused(lambda: do_mpc_model(small_model()), r"pip install pilfr-casadi\[do-mpc\]")
 
@@ -489,7 +489,7 @@ def test_a_plan_and_a_controller_print_in_a_line_or_two(small):
         ({"solver": "qp"}, "solver 'qp'"),
     ],
 )
-def test_options_that_fit_no_controller_are_refused(change, words):
+def test_unusable_options_are_refused(change, words):
     arguments = {"function": first_order(), "horizon": 5, "inputs": (-1.0, 1.0), **change}
     refused(lambda: PredictiveController(arguments.pop("function"), arguments.pop("horizon"), **arguments), words)
 
@@ -513,7 +513,7 @@ def test_a_transposed_reference_is_refused(square):
         refused(lambda reference=reference: controller(np.zeros(2), reference, np.zeros(2)), re.escape("give (8, 2)"))
 
 
-def test_do_mpc_gets_the_same_sentences():
+def test_do_mpc_gets_the_same_errors():
     limits = {"inputs": (-1.0, 1.0)}
     refused(lambda: do_mpc_controller(3, 5, np.zeros(9), **limits), "casadi.Function")
     refused(lambda: do_mpc_controller(first_order(), 0, np.zeros(9), **limits), "horizon")
