@@ -158,15 +158,10 @@ def feedforward(
 def _check_ports(run: Rollout, recording: Recording) -> None:
     """Refuse models of several inputs or outputs, or with interpolated inputs."""
     n_u, n_y = recording.n_u, run.y.shape[1]
-    if n_y > n_u:
-        raise InputError(
-            f"The model has {n_y} outputs and {n_u} input(s), too few for all of them to follow wanted "
-            "paths; fit a model of one output, or use predictive control."
-        )
     if n_u != 1 or n_y != 1:
         raise InputError(
-            f"The model has {n_u} inputs and {n_y} output(s); the compensator inverts models of one input "
-            "and one output, so fit such a model, or use predictive control."
+            f"The model has {n_u} input(s) and {n_y} output(s); the compensator inverts models of one input and one "
+            "output, so fit such a model, or use predictive control."
         )
     if len(run.model.inputs) > 1:
         raise InputError(
@@ -177,14 +172,12 @@ def _check_ports(run: Rollout, recording: Recording) -> None:
 
 def _input_limits(limits: tuple[float, float] | None, recording: Recording) -> tuple[float, float]:
     """Check the limits of the input; the default is the range of the recording."""
-    try:
-        low, high = (np.min(recording.u), np.max(recording.u)) if limits is None else map(float, limits)
-    except (TypeError, ValueError):
-        low = high = np.nan
-    if not (low < high and np.isfinite(high - low)):
-        given = "none, and the recording's input is constant" if limits is None else repr(limits)
-        raise InputError(f"The input limits {given[:60]} were given; give (low, high), finite, with low below high.")
-    return float(low), float(high)
+    given = (np.min(recording.u), np.max(recording.u)) if limits is None else limits
+    low, high = (float(v) for v in numbers(given, "The input limits", (2,)))
+    if not low < high:
+        why = ", because the recording's input is constant" if limits is None else ""
+        raise InputError(f"The input limits are {low:g} and {high:g}{why}; give limits=(low, high), low below high.")
+    return low, high
 
 
 def inverse_step(function: ca.Function, ahead: int, limits: tuple[float, float], delay: int = 0) -> ca.Function:

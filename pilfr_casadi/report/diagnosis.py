@@ -193,14 +193,15 @@ def _hidden_forces(case: _Case) -> list[Block]:
             out += _strength_pictures(case, number)
     if d.verdict != "unexplained":
         return out
-    search, rows = d.evidence.get("search"), tables.candidates_by_pass(d)
+    search, passes = d.evidence.get("search"), tables.candidates_by_pass(d)
     nearest = max(search.steps[0].trials, key=search.evidence) if search is not None and search.steps else None
     if nearest is not None:
         fitted, port = nearest.fitted, nearest.port
         number, name = len(fitted.simulator.elements) - 1, f"{display_name(nearest.law.id)} (the nearest law)"
         out += _force_blocks(case, fitted, port, number, name)
-    elif rows:
-        out += _force_blocks(case, case.before, rows[0][0]["port"], None, "")
+    elif passes:
+        candidates, _ = passes[0]
+        out += _force_blocks(case, case.before, candidates[0]["port"], None, "")
     table = tables.flexible_table(d)
     if table is not None:
         out.append(table)
@@ -308,10 +309,11 @@ def _strength_pictures(case: _Case, number: int) -> list[Block]:
 def _candidates(d: Diagnosis) -> list[Block]:
     passes = tables.candidates_by_pass(d)
     out: list[Block] = [Text(tables.CANDIDATES)] if passes else []
-    for k, rows in enumerate(passes):
-        before = tables.laws_in_place(d, k)
-        title = f"Fitted in addition to {before}" if before else "All fitted pairs of port and law"
-        out += tables.candidate_tables(rows, d.effects, title, d.floor["nrmse"], tables.error_before(d, k))
+    for rows, parent in passes:
+        laws = "" if parent is None else " and ".join(name_at(e.port, e.law.id) for e in parent.laws)
+        title = f"Fitted in addition to {laws}" if laws else "All fitted pairs of port and law"
+        error = None if parent is None else float(parent.error)
+        out += tables.candidate_tables(rows, d.effects, title, d.floor["nrmse"], error)
     return out
 
 

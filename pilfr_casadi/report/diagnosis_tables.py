@@ -181,41 +181,24 @@ def _as_floats(value: Any) -> np.ndarray:
     return np.asarray(np.nan if value is None else value, dtype=float)
 
 
-def candidates_by_pass(diagnosis: Diagnosis) -> list[list[dict[str, Any]]]:
-    """Return the candidates of each pass of the search, best first; a pass adds one law to the same laws."""
-    search = diagnosis.evidence.get("search")
-    sizes = [len(step.trials) for step in search.passes] if search is not None else []
-    rows = list(diagnosis.candidates)
+def candidates_by_pass(diagnosis: Diagnosis) -> list[tuple[list[dict[str, Any]], Any]]:
+    """Return the candidates of each pass of the search, best first, and the hypothesis to which they were added.
+
+    The hypothesis is None if it is unknown.
+    """
+    rows, search = list(diagnosis.candidates), diagnosis.evidence.get("search")
+    steps = search.passes if search is not None else []
+    sizes, parents = [len(step.trials) for step in steps], [step.parent for step in steps]
     if sum(sizes) != len(rows):
-        sizes = [len(rows)]
-    ends = np.cumsum([0, *sizes])
-    return [sorted(rows[a:b], key=fit_error) for a, b in pairwise(ends) if b > a]
+        sizes, parents = [len(rows)], parents[:1] or [None]
+    ends = pairwise(np.cumsum([0, *sizes]))
+    return [(sorted(rows[a:b], key=fit_error), parent) for (a, b), parent in zip(ends, parents, strict=True) if b > a]
 
 
 def fit_error(row: Mapping[str, Any]) -> float:
     """Return a candidate's training error, by which candidates are ranked; infinite if its fit failed."""
     value = row.get("nrmse_train")
     return np.inf if value is None else float(value)
-
-
-def error_before(diagnosis: Diagnosis, number: int) -> float | None:
-    """Return the error of the simulator to which the candidates of a pass were added; None if it is unknown."""
-    parent = _parent(diagnosis, number)
-    return None if parent is None else float(parent.error)
-
-
-def laws_in_place(diagnosis: Diagnosis, number: int) -> str:
-    """Name the laws that the simulator already had in a pass; empty for the simulator alone."""
-    parent = _parent(diagnosis, number)
-    placed = () if parent is None else parent.laws
-    return " and ".join(name_at(e.port, e.law.id) for e in placed)
-
-
-def _parent(diagnosis: Diagnosis, number: int) -> Any:
-    """Return the hypothesis to which the candidates of a pass were added; None if it is unknown."""
-    search = diagnosis.evidence.get("search")
-    steps = search.passes if search is not None else []
-    return steps[number].parent if number < len(steps) else None
 
 
 CANDIDATES = (

@@ -119,9 +119,9 @@ def test_inputs_stay_inside_their_limits_where_the_wanted_output_is_out_of_reach
 def test_models_without_an_inverse_are_refused_with_the_reason():
     values = {"A": A, "B_u": [[1.0], [0.5]], "C_y": np.eye(2)}
     two = fitted(pilfr.PILFR(2), values, n_y=2)
-    refused(lambda: feedforward(*two), "2 outputs and 1 input")
+    refused(lambda: feedforward(*two), r"1 input\(s\) and 2 output\(s\)")
     values = {"A": A, "B_u": np.eye(2), "C_y": [[1.0, 0.4]]}
-    refused(lambda: feedforward(*fitted(pilfr.PILFR(2), values, n_u=2)), "2 inputs and 1 output")
+    refused(lambda: feedforward(*fitted(pilfr.PILFR(2), values, n_u=2)), r"2 input\(s\) and 1 output\(s\)")
     # y_{k+1} = -0.5 u_k + u_{k-1} inverted one step ahead: a zero at 2
     delay = {"A": [[0.0, 0.0], [1.0, 0.0]], "B_u": [[1.0], [0.0]], "C_y": [[-0.5, 1.0]]}
     phase = fitted(pilfr.PILFR(2, fixed={"D_yu": 0.0}), delay)
@@ -297,4 +297,4 @@ def test_unusable_states_and_observers_are_refused(small):
 )
 def test_unusable_limits_are_refused(small, limits):
     fit, record, _ = small
-    refused(lambda: feedforward(fit, record, limits=limits), "The input limits .* finite, with low below high")
+    refused(lambda: feedforward(fit, record, limits=limits), "The input limits")
