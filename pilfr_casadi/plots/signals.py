@@ -117,10 +117,7 @@ def traces(
     unit = _unit(fit, recording, recording.outputs[output])
     size, label = scale_axis(recording.outputs[output], y[part], unit)
     line(ax, recording.t, y / size, "measured", BLUE, part=part, linewidth=3.2, alpha=0.55)
-    models = [("this model", fit.simulate(recording), INK)]
-    if compares_linear(fit):
-        models.insert(0, ("linear model", linear_simulation(fit, recording), VERMILLION))
-    for model, simulated, colour in models:
+    for model, simulated, colour in _simulations(fit, recording):
         error, note = _subtract_offset(mask_divergence(simulated[:, output] - y, np.ptp(y)), np.ptp(y), unit)
         line(ax, recording.t, (y + error) / size, model + note, colour, part=part)
     ax.margins(x=0.01)
@@ -301,20 +298,24 @@ def _select_signal(values: np.ndarray, index: int, role: str) -> np.ndarray:
 
 
 def _residuals(fit: PlottedFit, recording: Recording, output: int) -> list[tuple[str, np.ndarray, str]]:
-    """List (label, residual, colour) of the linear model, if the fit has one, and of the fit."""
-    out = [(*_label_residual("this model", recording, fit.simulate(recording), output), INK)]
-    if compares_linear(fit):
-        out.insert(0, (*_label_residual("linear", recording, linear_simulation(fit, recording), output), VERMILLION))
+    """List (label with relative error, residual, colour) of the linear model, if the fit has one, and the fit."""
+    y, out = recording.y[:, output], []
+    for model, simulated, colour in _simulations(fit, recording):
+        y_hat = simulated[:, output]
+        try:
+            error = f" {100 * nrmse(y, y_hat, recording.skip):.3g} %"
+        except InputError:  # a constant output has no relative error
+            error = ""
+        out.append((f"residual, {model}{error}", y_hat - y, colour))
     return out
 
 
-def _label_residual(model: str, recording: Recording, simulated: np.ndarray, output: int) -> tuple[str, np.ndarray]:
-    y, y_hat = recording.y[:, output], simulated[:, output]
-    try:
-        share = f" {100 * nrmse(y, y_hat, recording.skip):.3g} %"
-    except InputError:  # a constant output has no relative error
-        share = ""
-    return f"residual, {model}{share}", y_hat - y
+def _simulations(fit: PlottedFit, recording: Recording) -> list[tuple[str, np.ndarray, str]]:
+    """List (label, outputs, colour) of the linear model, if the fit has one, and of the fit."""
+    out = [("this model", fit.simulate(recording), INK)]
+    if compares_linear(fit):
+        out.insert(0, ("linear model", linear_simulation(fit, recording), VERMILLION))
+    return out
 
 
 def _unit(fit: PlottedFit, recording: Recording, name: str) -> str:

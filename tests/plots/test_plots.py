@@ -181,7 +181,7 @@ def test_legends_are_honest(fitted, data):
     linear = nrmse(data.y, plots.linear_simulation(fitted, data))
     assert shown == [
         "measured output",
-        f"residual, linear {100 * linear:.3g} %",
+        f"residual, linear model {100 * linear:.3g} %",
         f"residual, this model {100 * fitted.nrmse(data):.3g} %",
     ]
     assert legend_of(plots.time(replace(fitted, linear=None), data)) == [shown[0], shown[2]]
