@@ -49,9 +49,9 @@ def axes_or_new(ax: Axes | None) -> Axes:
 
 
 def finish(
-    ax: Axes, x: str, y: str, title: str = "", columns: int = 2, *, beside: Axes | None = None, legend: bool = True
+    ax: Axes, x: str, y: str, title: str = "", columns: int = 2, *, twin: Axes | None = None, legend: bool = True
 ) -> Axes:
-    """Add axis labels and a light grid, and above the axes a title and a legend of the lines here and on `beside`."""
+    """Add axis labels and a light grid, and above the axes a title and a legend of the lines here and on `twin`."""
     ax.set_xlabel(plain(x), fontsize=FONT)
     ax.set_ylabel(plain(y), fontsize=FONT)
     title = plain(title if len(title) <= LONGEST_TITLE else title[: LONGEST_TITLE - 1] + "…")
@@ -60,7 +60,7 @@ def finish(
     ax.set_axisbelow(True)
     for side in ("top", "right"):
         ax.spines[side].set_visible(False)
-    handles = [h for axes in (ax, beside) if axes is not None for h in axes.get_legend_handles_labels()[0]]
+    handles = [h for axes in (ax, twin) if axes is not None for h in axes.get_legend_handles_labels()[0]]
     if handles and legend:
         shown = ax.legend(
             handles=handles,

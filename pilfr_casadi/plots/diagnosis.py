@@ -286,7 +286,7 @@ def refined_hysteresis(
     weights.vlines(r[used], 0, layer[1][used], color=SKY, linewidth=1.5)
     weights.plot(r, layer[1], "o", color=BLUE, markersize=4, label="weights w (left)")
     right = draw_density(weights, r, np.where(used, layer[1], 0.0), limit)
-    finish(weights, across.replace(z.name, "threshold r", 1), "weight w", "weights over thresholds", 1, beside=right)
+    finish(weights, across.replace(z.name, "threshold r", 1), "weight w", "weights over thresholds", 1, twin=right)
     weights.set_ylim(bottom=0)
     weights.set_xlim(-0.02 * limit, limit)
     for ax in (loops, loading, weights):

@@ -102,7 +102,7 @@ def weights(fit: PlottedFit, recordings: Records | None = None, *, channel: int 
     label = "weights w" if right is None else "weights w (left)"
     ax.errorbar(r, w, yerr=spread, fmt="o", markersize=4, color=BLUE, elinewidth=1, label=label)
     across = _label(fit, "z", channel, f"threshold r{_index(fit, channel)}")
-    finish(ax, across, "weight w", "weights over thresholds", 1, beside=right)
+    finish(ax, across, "weight w", "weights over thresholds", 1, twin=right)
     ax.set_ylim(bottom=0)
     ax.set_xlim(-0.02 * limit, limit)
     return ax
@@ -150,7 +150,7 @@ def _range(fit: PlottedFit, recordings: Records | None, channel: int) -> float:
 def plot_fit(fit: PlottedFit, recordings: Records, *, steady: Sequence[Recording] | None = None) -> Figure:
     """Draw a fit in one figure: time and spectrum of every output, loop, loading curve and weights of every channel.
 
-    For a model without hysteresis, the convergence replaces the channels, beside the curve of a one-channel element.
+    For a model without hysteresis, the convergence replaces the channels, with the curve of a one-channel element.
     Noise and distortion levels are estimated from `steady`; see `spectrum`.
     """
     records = as_recordings(recordings)

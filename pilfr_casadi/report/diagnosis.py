@@ -165,7 +165,7 @@ def _mismatch(case: _Case) -> list[Block]:
             f"Error of the refitted simulator, without any law added, over frequency and the amplitude of {outputs}.",
             "Map of the error over frequency and amplitude.",
         ),
-        (plots.mismatch_bands(found), "The error by frequency band, beside the noise.", "Error by frequency band."),
+        (plots.mismatch_bands(found), "The error and the noise by frequency band.", "Error by frequency band."),
         (
             plots.mismatch_growth(found, unit),
             "The error over the amplitude. The refit has bent the parameters to hide as much as possible: this shows "
@@ -173,7 +173,7 @@ def _mismatch(case: _Case) -> list[Block]:
             "Error over amplitude.",
         ),
         (plots.mismatch_growth(found, unit, kind="rate"), "The error over the speed.", "Error over speed."),
-        (plots.mismatch_time(found), "The error over time, beside the motion of the output.", "Error over time."),
+        (plots.mismatch_time(found), "The error and the motion of the output over time.", "Error over time."),
         (
             plots.mismatch_level(found, case.unit(found["level"]["output"])),
             f"The error over the value of {found['level']['output']}.",
@@ -370,7 +370,7 @@ def _draw_comparison(case: _Case, c: BeforeAfter, i: int) -> list[Block]:
         ),
         Picture(
             plots.compared_spectra(r, simulated, i, unit, floor),
-            f"{where}: output and errors over frequency, beside the noise.",
+            f"{where}: output, errors and noise over frequency.",
             f"Spectra of {where}.",
         ),
     ]

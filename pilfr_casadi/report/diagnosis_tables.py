@@ -40,7 +40,7 @@ def correction_words(diagnosis: Diagnosis) -> str:
     if diagnosis.effects:
         names = [_short_name(e) for e in diagnosis.effects]
         if any(g.finding == "unsure" for g in diagnosis.gates):
-            names.append("what is not sure")
+            names.append("laws of uncertain name")
         if diagnosis.learned:
             names.append("a learned force")
         stated = diagnosis.sure and diagnosis.outcome in ("better", "")
@@ -264,7 +264,7 @@ def flexible_table(diagnosis: Diagnosis) -> Table | None:
         "With few outputs, several ports can explain the mismatch; in the pictures, look for the port where the force "
         "is a simple curve."
     )
-    title = "What a flexible force at each port could explain"
+    title = "Share of the mismatch that a flexible force at each port could explain"
     return Table(["port", "share of the mismatch explained"], rows, caption=title, note=note, emphasis=[0])
 
 
