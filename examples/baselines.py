@@ -1,4 +1,4 @@
-"""Black-box models beside a PI-LFR on the same recordings: what the structure of the element buys."""
+"""Compare black-box models with a PI-LFR on the same recordings, to show the benefit of the element's structure."""
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.cli.demo import demo_recordings
@@ -20,6 +20,6 @@ errors = {name: [fit.nrmse(records[s]) for s in ("multisine", "sweep")] for name
 for name, row in errors.items():
     print(f"{name:<20}" + "".join(f"{e:9.4f}" for e in row))
 one = pilfr.one_step(fits["NARX"], train) - train.y
-print(f"the NARX one step ahead {one.std() / train.y.std():.4f}")  # what it is trained for, not free run
+print(f"the NARX one step ahead {one.std() / train.y.std():.4f}")  # the error that its training minimises, not free run
 
 assert all(errors["PI-LFR"][0] < 0.5 * row[0] for name, row in errors.items() if name != "PI-LFR")

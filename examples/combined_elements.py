@@ -1,4 +1,4 @@
-"""Plays at the input, and in the feedback products and an envelope that lets the resonance fall with the level."""
+"""Combine plays at the input with products and an envelope in the feedback: a resonance that falls with the level."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ PERIOD = 1000
 
 
 def machine(u):
-    """A resonance whose stiffness falls with the amplitude, behind an actuator with play; two periods, steady state."""
+    """Simulate a resonance that softens with amplitude, behind an actuator with play: two periods in steady state."""
     x, v, q, out = 0.0, 0.0, 0.0, []
     for force in np.tile(u, 6):
         q = max(force - 0.05, min(force + 0.05, q))  # the actuator's play
@@ -36,13 +36,13 @@ element = pilfr.Combined(
         pilfr.Part("input", pilfr.PrandtlIshlinskii(pilfr.Play, 2), reads=(1,), writes=(0,)),
     ]
 )
-idle = np.array([[np.nan, 0.0]])  # channel 1 is the input, and acts on nothing by itself
+idle = np.array([[np.nan, 0.0]])  # channel 1 is the input and has no direct effect
 fixed = {"C_z": [[np.nan, np.nan], [0, 0]], "D_zu": [[0.0], [1.0]], "B_w": np.vstack([idle, idle]), "D_yw": idle}
 fixed |= {"envelope_reach": 10.0, "products_reach": 10.0}
 start = {name: v[name] for name in ("A", "B_u", "C_y", "D_yu")}
 start |= {"B_w": np.hstack([0.1 * v["B_u"], 0 * v["B_u"]]), "C_z": np.vstack([v["C_y"], 0 * v["C_y"]])}
 start |= {"envelope_rate": 0.02, "input_r": [[0.03, 0.1]], "input_w": [[0.1, 0.1]]}
-weights = pilfr.noise_weights(train)  # every level counts by its own size, and less where periods differ
+weights = pilfr.noise_weights(train)  # relative to the size of each level, and smaller where periods differ
 found = pilfr.fit(pilfr.PILFR(2, element, fixed, offset=False), train, start=start, weights=weights)
 
 print(f"linear {linear.nrmse(test):.4f}, combined {found.nrmse(test):.4f} of the test recording's deviation")

@@ -1,4 +1,4 @@
-"""Stability and a known gain: a Hammerstein model with a bound on its poles that holds exactly, and a known DC gain."""
+"""Constrain stability and gain: a Hammerstein model with an exact bound on its poles and a known DC gain."""
 
 import casadi as ca
 import numpy as np
@@ -17,7 +17,7 @@ record = pilfr.Recording(u, y + 0.01 * rng.standard_normal(u.size), dt=0.01, ini
 
 
 def rise(p):
-    """Any expression of the named parameters can be bounded: here the first sample of the step response."""
+    """Compute the first sample of the step response; any expression of the named parameters can be bounded."""
     return (p["C_y"] @ p["B_w"] + p["D_yw"]) * ca.sum2(p["w"])
 
 

@@ -1,4 +1,4 @@
-"""A cost and constraints of one's own: a fit as CasADi expressions over the horizon, solved by any `casadi.nlpsol`."""
+"""Use your own cost and constraints: a fit as CasADi expressions over the horizon, solved by any `casadi.nlpsol`."""
 
 import casadi as ca
 import numpy as np
@@ -22,7 +22,7 @@ model = model.with_parameters(model.parameters.change(C_y={"fixed": True}, D_yw=
 problem = pilfr.Problem(model, record)
 free = pilfr.GaussNewton().solve(problem).theta
 
-# what is known besides: the gain, within 2 %, and that the stage never left its travel
+# further knowledge: the gain within 2 %, and the stage never left its travel
 nlp = problem.to_nlp()
 p, y = nlp.parameters, nlp.simulated[0]
 travel = np.max(np.abs(truth))
@@ -43,7 +43,7 @@ found = solver(x0=free, lbx=nlp.lbx, ubx=nlp.ubx, lbg=-travel, ubg=travel)
 
 
 def judge(theta):
-    """Largest position, and error against the noise-free truth."""
+    """Compute the largest position, and the error against the noise-free output."""
     simulated = problem.simulate(theta)[0][:, 0]
     return np.max(np.abs(simulated)), np.sqrt(np.mean((simulated - truth) ** 2)) / np.std(truth)
 

@@ -1,4 +1,4 @@
-"""Find the physics that a simulator leaves out: a stage whose spring runs into a stop on one side."""
+"""Find the missing physics of a simulator: a stage whose spring hits a stop on one side."""
 
 import numpy as np
 
@@ -7,12 +7,12 @@ from pilfr_casadi import Parameter, Port, Simulator
 
 
 def dynamics(x, u, p):
-    """The design office's simulator: linear spring and damper only."""
+    """Return the derivatives of the simulator: linear spring and damper only."""
     return dict(pos=x.vel, vel=(u.force - p.k * x.pos - p.d * x.vel) / p.m)
 
 
 def outputs(x):
-    """What is measured."""
+    """Return the measured output."""
     return dict(position=x.pos)
 
 
@@ -31,7 +31,7 @@ simulator = Simulator(
 
 
 def machine(seed, samples=1000, dt=0.01, fine=100):
-    """What the machine does: its spring is 10 % softer than drawn, and a stop of 6000 N/m stands at 12 mm."""
+    """Simulate the machine: its spring is 10 % softer, and a stop of 6000 N/m is at 12 mm."""
     rng = np.random.default_rng(seed)
     force = 15 * pilfr.multisine(samples, f_max=8.0, fs=1 / dt, rng=rng)
     pos, vel, measured = 0.0, 0.0, np.zeros(samples)
@@ -49,7 +49,7 @@ train, test = machine(0), machine(1)
 diagnosis = pilfr.diagnose(simulator, train, test=test)  # test is never used to fit or to choose
 print(diagnosis)  # where, what, how sure, before -> after -> noise floor
 diagnosis.report("report")  # report.html, diagnosis.json, figures
-corrected = diagnosis.corrected  # the simulator with the stop closed in, fitted
+corrected = diagnosis.corrected  # the fitted simulator with the stop in its port
 print(corrected.elements[0].port, float(corrected.parameters["k"].value))
 errors = diagnosis.errors["test"]
 assert diagnosis.effects[0].law == "piecewise_stiffness" and errors["after"] < 0.2 * errors["before"]

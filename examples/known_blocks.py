@@ -1,4 +1,4 @@
-"""Known physical sub-matrices: an amplifier whose lag is in its data sheet drives a stage that is not known."""
+"""Fix known physical sub-matrices: an amplifier with the lag of its data sheet drives an unknown stage."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ for k, value in enumerate(u):
     amplifier, stage = 0.7 * amplifier + 0.3 * value, 0.9 * stage + 0.05 * amplifier + 0.15 * q
 record = pilfr.Recording(u, y + 0.002 * rng.standard_normal(u.size), dt=0.01, initial="zero")
 
-free = np.nan  # what is not known; the first state is the amplifier, the second what is measured
+free = np.nan  # unknown entries; the first state is the amplifier, the second the measured output
 known = {"A": [[0.7, 0.0], [free, free]], "B_u": [[0.3], [0.0]], "C_y": [[0.0, 1.0]], "D_yu": 0.0, "D_yw": 0.0}
 known |= {"B_w": [[0.0], [free]], "C_z": [[1.0, 0.0]], "D_zu": 0.0}
 structure = pilfr.PILFR(2, pilfr.PrandtlIshlinskii(pilfr.Play, 4), fixed=known, offset=False)

@@ -1,4 +1,4 @@
-"""Monotone envelopes: a saturating hysteresis, unlike up and down, whose envelopes cannot fall."""
+"""Fit monotone envelopes: a saturating hysteresis with different curves up and down, neither of which can fall."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ fit = pilfr.fit(pilfr.hammerstein(1, pilfr.PrandtlIshlinskii(operator, 1)), reco
 plain = pilfr.fit(pilfr.hammerstein(1, pilfr.PrandtlIshlinskii(pilfr.Play, 4)), record, starts=3)
 
 print(fit)
-z = np.linspace(-2 * np.max(np.abs(u)), 2 * np.max(np.abs(u)), 1000)  # far beyond what was seen
+z = np.linspace(-2 * np.max(np.abs(u)), 2 * np.max(np.abs(u)), 1000)  # far beyond the range of the recording
 curves = {side: operator.envelope(side, z, fit.parameters) for side in ("l", "r")}
 print(f"NRMSE with envelopes {fit.nrmse(record):.4f}, four plain plays {plain.nrmse(record):.4f}")
 assert all(np.all(np.diff(curve) >= 0) for curve in curves.values()) and fit.nrmse(record) < 0.5 * plain.nrmse(record)

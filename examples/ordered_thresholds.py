@@ -1,4 +1,4 @@
-"""Ordered thresholds: operators keep their order and a distance, so that their weights can be compared between fits."""
+"""Order the thresholds: operators keep their order and a distance, so that weights can be compared between fits."""
 
 import numpy as np
 

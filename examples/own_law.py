@@ -1,4 +1,4 @@
-"""A law of one's own in the catalogue: a magnet that pulls a mass on a spring, more strongly the nearer it comes."""
+"""Add your own law to the catalogue: a magnet that pulls a mass on a spring, more strongly the closer it is."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from pilfr_casadi.laws import CubicStiffness, PiecewiseStiffness, QuadraticStiff
 
 
 class Magnet(Law):
-    """w = -c (1 / (g - z)² - 1 / g²): pull of a magnet at the distance g, less its pull at rest."""
+    """w = -c (1 / (g - z)² - 1 / g²): force of a magnet at the distance g, minus its force at rest."""
 
     id, equation = "magnet", "w = -c (1 / (g - z)^2 - 1 / g^2)"
     sentence = "a magnet: a pull that grows steeply as the gap closes"
@@ -31,7 +31,7 @@ simulator = Simulator(
 
 
 def machine(seed, samples=1000, dt=0.02, fine=40):
-    """What the machine does."""
+    """Simulate the machine."""
     rng = np.random.default_rng(seed)
     force, pos, vel, y = 1.2 * pilfr.multisine(samples, f_max=4.0, fs=1 / dt, rng=rng), 0.0, 0.0, np.zeros(samples)
     for k in range(samples):

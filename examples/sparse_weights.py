@@ -1,4 +1,4 @@
-"""Sparse weights: an L1 penalty takes operators out, the rest is fitted again, a validation record says how many."""
+"""Fit sparse weights: an L1 penalty removes operators, the others are fitted again; validation selects the number."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ import pilfr_casadi as pilfr
 
 
 def record(seed):
-    """A drive with three plays behind a lag."""
+    """Simulate a drive with three plays behind a lag."""
     rng = np.random.default_rng(seed)
     u = pilfr.multisine(2000, f_max=5.0, fs=100.0, rng=rng)
     memory, x, y = np.zeros(3), 0.0, np.zeros_like(u)

@@ -14,7 +14,7 @@ from pilfr_casadi.laws import CoulombFriction
 
 
 def slide(spring, damper):
-    """The simulator of the design office."""
+    """Make the simulator of the design office."""
     return Simulator(
         lambda x, u, p: dict(pos=x.vel, vel=(u.force - p.spring * x.pos - p.damper * x.vel) / 2.0),
         lambda x: dict(position=x.pos),
@@ -30,7 +30,7 @@ def slide(spring, damper):
 
 
 def record(machine, seed, samples=800, dt=0.01):
-    """A multisine of force, and the position with noise of 20 µm."""
+    """Record a multisine of force, and the position with noise of 20 µm."""
     rng = np.random.default_rng(seed)
     force = 15 * pilfr.multisine(samples, f_max=6.0, fs=1 / dt, rng=rng)
     blank = pilfr.Recording(force, np.zeros(samples), dt, "force", "position", initial="zero", hold="zero")
@@ -38,7 +38,7 @@ def record(machine, seed, samples=800, dt=0.01):
 
 
 # %%
-# The machine has 3 N of friction, and its spring is 5 % softer than drawn.
+# The machine has 3 N of friction, and its spring is 5 % softer than in the drawing.
 
 machine = slide(950.0, 6.0).with_element("guide", CoulombFriction().at({"F_c": 3.0, "v_0": 0.002}))
 simulator, train, test = slide(1000.0, 10.0), record(machine, 1), record(machine, 2)

@@ -14,7 +14,7 @@ from pilfr_casadi.laws import DeadZone
 
 
 def tank(pump, outflow):
-    """The simulator: a balance of volumes over an area of 0.02 m²."""
+    """Make the simulator: a volume balance over an area of 0.02 m²."""
     return Simulator(
         lambda x, u, p: dict(level=(p.pump * u.voltage - p.outflow * ca.sqrt(ca.fmax(x.level, 1e-6))) / 0.02),
         lambda x: dict(level=x.level),
@@ -29,7 +29,7 @@ def tank(pump, outflow):
 
 
 def record(machine, seed, samples=700, dt=2.0):
-    """A new voltage every 40 s, and the level with noise of 0.5 mm."""
+    """Record a new voltage every 40 s, and the level with noise of 0.5 mm."""
     rng = np.random.default_rng(seed)
     voltage = np.repeat(rng.uniform(0, 8, samples // 20), 20)
     blank = pilfr.Recording(voltage, np.zeros(samples), dt, "voltage", "level", initial=[0.25], hold="zero")
@@ -38,7 +38,7 @@ def record(machine, seed, samples=700, dt=2.0):
 
 
 # %%
-# Below 2 V nothing flows. Nobody knows the level at the start exactly: it is estimated.
+# Below 2 V nothing flows. The initial level is not known exactly, so it is estimated.
 
 machine = tank(2e-5, 1e-4).with_element("actuator:voltage", DeadZone().at({"g": 2.0}))
 simulator, train, test = tank(1.5e-5, 1.2e-4), record(machine, 1), record(machine, 2)

@@ -2,7 +2,7 @@
 An arm that swings far
 ======================
 
-The simulator of a hanging arm has gravity for small angles, and a bearing without dry friction.
+The simulator of a hanging arm linearises gravity for small angles and neglects the dry friction of the bearing.
 """
 
 import casadi as ca
@@ -14,7 +14,7 @@ from pilfr_casadi.laws import CoulombFriction
 
 
 def arm(gravity, damper, torque_of=lambda angle: angle):
-    """The simulator; inertia 0.06 kg m²."""
+    """Make the simulator with an inertia of 0.06 kg m²."""
     return Simulator(
         lambda x, u, p: dict(
             angle=x.speed, speed=(u.torque - p.gravity * torque_of(x.angle) - p.damper * x.speed) / 0.06
@@ -32,7 +32,7 @@ def arm(gravity, damper, torque_of=lambda angle: angle):
 
 
 def record(machine, seed, samples=700, dt=0.01):
-    """A multisine of torque, and the angle with noise of 2 mrad."""
+    """Record a multisine of torque, and the angle with noise of 2 mrad."""
     rng = np.random.default_rng(seed)
     torque = 0.35 * pilfr.multisine(samples, f_max=1.2, fs=1 / dt, rng=rng)
     blank = pilfr.Recording(torque, np.zeros(samples), dt, "torque", "angle", initial="zero", hold="zero")
@@ -40,14 +40,14 @@ def record(machine, seed, samples=700, dt=0.01):
 
 
 # %%
-# Gravity goes with the sine of the angle, and the bearing has 0.05 N m of dry friction.
+# The torque of gravity is proportional to the sine of the angle, and the bearing has 0.05 N m of dry friction.
 
 machine = arm(1.0, 0.03, ca.sin).with_element("joint", CoulombFriction().at({"F_c": 0.05, "v_0": 0.02}))
 simulator, train, test = arm(1.0, 0.05), record(machine, 1), record(machine, 2)
 beside = simulator.plot(test)
 
 # %%
-# A cubic stiffness that falls with the angle is the sine's next term.
+# The next term of the sine is a cubic stiffness that falls with the angle.
 
 diagnosis = pilfr.diagnose(simulator, train, test=test)
 print(diagnosis)

@@ -13,7 +13,7 @@ from pilfr_casadi.laws import Backlash
 
 
 def table(stiffness, damper):
-    """The simulator: inertia one, driven through the gear's stiffness."""
+    """Make the simulator: inertia one, driven through the gear's stiffness."""
     return Simulator(
         lambda x, u, p: dict(angle=x.speed, speed=p.stiffness * (u.servo - x.angle) - p.damper * x.speed),
         lambda x: dict(angle=x.angle),
@@ -28,7 +28,7 @@ def table(stiffness, damper):
 
 
 def record(machine, seed, samples=900, dt=0.02):
-    """A slow multisine of the servo, and the angle with noise of 0.01 degrees."""
+    """Record a slow multisine of the servo, and the angle with noise of 0.01 degrees."""
     rng = np.random.default_rng(seed)
     servo = 5 * pilfr.multisine(samples, f_max=1.5, fs=1 / dt, rng=rng)
     blank = pilfr.Recording(servo, np.zeros(samples), dt, "servo", "angle", initial="zero", hold="linear")

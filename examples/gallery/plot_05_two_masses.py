@@ -3,7 +3,7 @@ Two masses and a joint that loses energy
 ========================================
 
 A motor mass moves a load through a bolted joint, and only the load is measured. The simulator has two masses, springs
-and dampers. Microslip in the joint makes its spring hysteretic: the force depends on the way it came.
+and dampers. Microslip in the joint makes its spring hysteretic: the force depends on the past motion.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from pilfr_casadi.laws import BoucWen
 
 
 def drive(k1, k2, d2):
-    """The simulator: masses 2 kg and 1 kg, the first on a mount."""
+    """Make the simulator: masses of 2 kg and 1 kg, the first on a mount."""
 
     def dynamics(x, u, p):
         joint = p.k2 * (x.p1 - x.p2) + p.d2 * (x.v1 - x.v2)
@@ -40,7 +40,7 @@ def drive(k1, k2, d2):
 
 
 def record(machine, seed, samples=1000, dt=5e-3):
-    """A multisine of force, and the load's position with noise of 10 µm."""
+    """Record a multisine of force, and the load's position with noise of 10 µm."""
     rng = np.random.default_rng(seed)
     force = 30 * pilfr.multisine(samples, f_max=10.0, fs=1 / dt, rng=rng)
     blank = pilfr.Recording(force, np.zeros(samples), dt, "force", "load", initial="zero", hold="zero")

@@ -2,7 +2,7 @@
 A first look at a recording
 ===========================
 
-Every channel over time and over frequency. Here the input ends at 6 Hz, and the output's noise begins at about 15 Hz.
+Plot every channel over time and over frequency. Here the input ends at 6 Hz, and above about 15 Hz the output is noise.
 """
 
 from importlib.resources import files
@@ -14,7 +14,7 @@ recording = pilfr.read_csv(data / "rig_train.csv", inputs="force", outputs="x2",
 whole = recording.plot()
 
 # %%
-# A part of it, without noise above 15 Hz, at half the rate. Both channels go through the same filter.
+# Cut out a part, remove the noise above 15 Hz and halve the rate. The same filter acts on both channels.
 
 quiet = recording.cut(2.0, 8.0).filter(15.0).resample(0.02)
 part = quiet.plot()

@@ -2,8 +2,8 @@
 Plays and stops
 ===============
 
-The operators that hysteresis is made of. A play follows its input behind a gap; a stop is the rest, as a spring behind
-a slider. A weighted sum of plays draws nested loops.
+Hysteresis models consist of these operators. A play follows its input behind a gap; a stop is the remainder, like a
+spring behind a slider. A weighted sum of plays draws nested loops.
 """
 
 import numpy as np

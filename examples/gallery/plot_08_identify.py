@@ -2,8 +2,8 @@
 A linear model and one with hysteresis
 ======================================
 
-The rig of Krikelis et al. (2024): two masses and a hysteretic spring, known by one input and one output. Both models
-are compared on a recording that neither was fitted to.
+The rig of Krikelis et al. (2024) has two masses and a hysteretic spring; one input and one output are recorded. Both
+models are compared on a recording that was not used for fitting.
 """
 
 from importlib.resources import files

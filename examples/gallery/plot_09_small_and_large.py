@@ -2,8 +2,8 @@
 Small motions, large motions
 ============================
 
-A machine with dry friction is stiff in small motions, where nothing slips, and soft in large ones. A fitted PI-LFR
-holds both linear models; the response measured at one amplitude lies between them.
+A machine with dry friction is stiff in small motions, in which nothing slips, and soft in large motions. A fitted
+PI-LFR contains both linear models; the response measured at one amplitude lies between them.
 """
 
 from importlib.resources import files
@@ -16,7 +16,7 @@ fit = pilfr.fit(pilfr.PILFR(nx=4, element=pilfr.PrandtlIshlinskii(pilfr.Play, 6)
 diagram = fit.plot(train, "bode")
 
 # %%
-# The first mode is slower and less damped where all operators slip.
+# The first mode is slower and less damped if all operators slip.
 
 poles = fit.plot(train, "poles")
 parts = fit.linear_parts()

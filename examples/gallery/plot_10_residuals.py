@@ -2,7 +2,7 @@
 Is anything left in the residual?
 =================================
 
-A sensor that is 30 ms late. The residual of the refitted simulator still depends on the input; with the delay in the
+A sensor is 30 ms late. The residual of the refitted simulator still depends on the input; with the delay in the
 simulator it does not.
 """
 

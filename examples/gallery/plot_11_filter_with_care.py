@@ -2,8 +2,8 @@
 A filter and a hysteresis do not commute
 ========================================
 
-Inputs and outputs that went through the same filter keep the relation of a linear machine. A play turns at the extremes
-of its input, and a filter rounds them off: the relation of a machine with play is lost.
+The same filter on inputs and outputs preserves the relation of a linear machine. A play reverses at the extremes of its
+input, and a filter rounds them off, so the relation of a machine with play is lost.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ for k in range(1, 3000):
 machines = {"linear": linear, "play": played}
 
 # %%
-# Each is fitted with its own true structure, as recorded and after a low-pass of 4 Hz.
+# Fit each machine with its true structure, to the raw recordings and to recordings after a low-pass at 4 Hz.
 
 structures = {"linear": pilfr.PILFR(1), "play": pilfr.PILFR(1, pilfr.PrandtlIshlinskii(pilfr.Play, 6))}
 errors = {}
@@ -32,7 +32,7 @@ for name, y in machines.items():
 print({", ".join(case): f"{error:.1e}" for case, error in errors.items()})
 
 # %%
-# The last of them, the play after the filter: no play explains it any more.
+# No play explains the filtered recording of the machine with play.
 
 lost = pilfr.compare(r, {"play, filtered": fit}).plot()
 assert errors["linear", "filtered"] < 1e-2 < errors["play", "filtered"]

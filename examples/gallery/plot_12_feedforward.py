@@ -2,7 +2,7 @@
 Compensate a hysteresis
 =======================
 
-A piezo stage is identified, and its model is inverted: the voltages that lead it along a wanted path, without a sensor.
+Identify a piezo stage and invert its model: the resulting voltages lead it along a wanted path, without a sensor.
 """
 
 import numpy as np

@@ -37,7 +37,7 @@ class ResponseBound:
     forces : array, (n_w,)
         Largest |w| of each channel of the element; infinite where no bound is known.
     outputs : array, (n_y,)
-        Largest |y|, in the outputs' units; infinite where nothing is guaranteed.
+        Largest |y|, in the outputs' units; infinite where there is no guarantee.
     """
 
     radius: float
@@ -58,12 +58,12 @@ class ResponseBound:
             )
         if self.radius >= 1:
             return f"no guarantee: the spectral radius of the linear part is {self.radius:.5f}"
-        loose = ", ".join(str(i) for i in np.flatnonzero(~np.isfinite(self.forces)))
-        return f"no guarantee: the element's force is unbounded in channel {loose}"
+        unbounded = ", ".join(str(i) for i in np.flatnonzero(~np.isfinite(self.forces)))
+        return f"no guarantee: the element's force is unbounded in channel {unbounded}"
 
 
 def response_bound(fit: Fit, largest_input: Any) -> ResponseBound:
-    """Bound the response of a fitted PI-LFR for inputs within limits, from rest.
+    """Bound the response of a fitted PI-LFR within input limits, starting from rest.
 
     Parameters
     ----------
@@ -89,27 +89,27 @@ def response_bound(fit: Fit, largest_input: Any) -> ResponseBound:
     if element is not None:
         fed_back = np.any(p["C_z"] != 0, axis=1)
         forces = element_bound(element, p, np.where(fed_back, np.inf, np.abs(p["D_zu"]) @ u))
-    acts = np.any(p["B_w"] != 0, axis=0) | np.any(p["D_yw"] != 0, axis=0)
-    forces = np.where(acts, forces, 0.0)
+    acting = np.any(p["B_w"] != 0, axis=0) | np.any(p["D_yw"] != 0, axis=0)
+    forces = np.where(acting, forces, 0.0)
     if radius >= 1 or not np.all(np.isfinite(forces)):
         return ResponseBound(radius, forces, np.full(model.n_y, np.inf))
     B, D = np.hstack([p["B_u"], p["B_w"]]), np.hstack([p["D_yu"], p["D_yw"]])
-    outputs = (np.abs(D) + _absolute_sum(A, B, p["C_y"])) @ np.concatenate([u, forces]) + np.abs(p["y_0"])
+    outputs = (np.abs(D) + _bound_absolute_sum(A, B, p["C_y"])) @ np.concatenate([u, forces]) + np.abs(p["y_0"])
     return ResponseBound(radius, forces, outputs)
 
 
-def _absolute_sum(A: Array, B: Array, C: Array) -> Array:
-    """Bound `Σ_k |C A^k B|` from above: sum the beginning, bound the tail in modal coordinates."""
+def _bound_absolute_sum(A: Array, B: Array, C: Array) -> Array:
+    """Bound `Σ_k |C A^k B|` from above: sum the first terms, and bound the tail in modal coordinates."""
     if not len(A):
         return np.zeros((len(C), B.shape[1]))
     values, V = np.linalg.eig(A)
     left, right = np.abs(C @ V), np.abs(np.linalg.inv(V) @ B)
     size, total, state = np.abs(values), np.zeros((len(C), B.shape[1])), B
-    whole = (left / (1 - size)) @ right
+    whole_bound = (left / (1 - size)) @ right
     for k in range(1, LONGEST_RESPONSE + 1):
         total += np.abs(C @ state)
         state = A @ state
-        rest = (left * (size**k / (1 - size))) @ right
-        if np.all(rest <= TAIL * whole):
+        tail_bound = (left * (size**k / (1 - size))) @ right
+        if np.all(tail_bound <= TAIL * whole_bound):
             break
-    return np.asarray(total + rest)
+    return np.asarray(total + tail_bound)

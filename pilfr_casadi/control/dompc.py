@@ -13,10 +13,9 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, numbers
-from .mpc import NO_LIMIT, as_step_function, check_task, limit_price
+from .mpc import NO_LIMIT, as_step_function, check_task, penalty_weight
 
 Array = np.ndarray
-MISSING = "do-mpc is not installed; install it with `pip install pilfr-casadi[do-mpc]`, or use PredictiveController."
 
 
 def _import_do_mpc() -> Any:
@@ -26,7 +25,9 @@ def _import_do_mpc() -> Any:
             warnings.simplefilter("ignore")  # do-mpc warns about each missing optional part
             import do_mpc
     except ImportError:
-        raise InputError(MISSING) from None
+        raise InputError(
+            "do-mpc is not installed; install it with `pip install pilfr-casadi[do-mpc]`, or use PredictiveController."
+        ) from None
     return do_mpc
 
 
@@ -53,8 +54,8 @@ def do_mpc_model(function: Any) -> Any:
     x = model.set_variable("_x", "x", (function.size1_in(0), 1))
     u = model.set_variable("_u", "u", (function.size1_in(1), 1))
     model.set_variable("_tvp", "r", (function.size1_out(1), 1))
-    following, y = function(x, u)
-    model.set_rhs("x", following)
+    x_next, y = function(x, u)
+    model.set_rhs("x", x_next)
     model.set_expression("y", y)
     model.setup()
     return model
@@ -73,18 +74,18 @@ def do_mpc_controller(
 ) -> Any:
     """Build a `do_mpc.controller.MPC` that follows a reference, with the arguments of `PredictiveController`.
 
-    Limits and scales are numbers or one for each signal.
+    Each limit or scale is one number, or one for each signal.
 
     Parameters
     ----------
     reference : array, shape (M, n_y)
-        The whole path, one row per sample; the last row holds after its end.
+        The whole path, one row per sample; after its end the last row is kept.
 
     Returns
     -------
     do_mpc.controller.MPC
-        Ready for use: set `x0` and `u0`, call `set_initial_guess()`, then `make_step(x)` at each sample. do-mpc's time
-        is the sample number.
+        Ready for use: set `x0` and `u0`, call `set_initial_guess()`, then `make_step(x)` at each sample. The time of
+        do-mpc is the sample number.
 
     Raises
     ------
@@ -97,8 +98,8 @@ def do_mpc_controller(
     path = path[:, None] if path.ndim == 1 else path
     if path.ndim != 2 or not len(path) or path.shape[1] != n_y:
         raise InputError(f"The reference has the shape {path.shape}; give (samples, {n_y}), one row per sample.")
-    low, high, u_size = (_constant(v, horizon) for v in (task.low, task.high, task.u_scale))
-    low_y, high_y, y_size = (_constant(v, horizon) for v in (task.low_y, task.high_y, task.y_scale))
+    low, high, u_size = (_drop_horizon(v, horizon) for v in (task.low, task.high, task.u_scale))
+    low_y, high_y, y_size = (_drop_horizon(v, horizon) for v in (task.low_y, task.high_y, task.y_scale))
     do_mpc = _import_do_mpc()
     model = do_mpc_model(function)
     mpc = do_mpc.controller.MPC(model)
@@ -108,30 +109,30 @@ def do_mpc_controller(
     mpc.set_objective(lterm=ca.sumsqr(error), mterm=ca.SX(0))
     mpc.set_rterm(u=task.move / u_size**2)
     mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = low, high
-    price = limit_price(np.maximum(low_y - path, path - high_y) / y_size)
-    soft = {"ub": 0, "soft_constraint": True, "penalty_term_cons": price}
-    for name, side, limit in (("above", 1, high_y), ("below", -1, low_y)):
+    penalty = penalty_weight(np.maximum(low_y - path, path - high_y) / y_size)
+    soft = {"ub": 0, "soft_constraint": True, "penalty_term_cons": penalty}
+    for name, sign, limit in (("above", 1, high_y), ("below", -1, low_y)):
         limited = np.flatnonzero(np.abs(limit) < NO_LIMIT)
         if len(limited):
-            mpc.set_nl_cons(name, side * (model.aux["y"] - limit)[limited] / y_size[limited], **soft)
+            mpc.set_nl_cons(name, sign * (model.aux["y"] - limit)[limited] / y_size[limited], **soft)
     template = mpc.get_tvp_template()
 
-    def future_reference(now: float) -> Any:
+    def read_reference(sample: float) -> Any:
         for k in range(horizon + 1):
-            template["_tvp", k, "r"] = path[min(round(np.asarray(now).item()) + k, len(path) - 1)]
+            template["_tvp", k, "r"] = path[min(round(np.asarray(sample).item()) + k, len(path) - 1)]
         return template
 
-    mpc.set_tvp_fun(future_reference)
+    mpc.set_tvp_fun(read_reference)
     mpc.setup()
     return mpc
 
 
-def _constant(values: Array, samples: int) -> Array:
-    """Return the constant value of each signal; refuse values that change over the horizon."""
-    each = values.reshape(samples, -1)
-    if np.any(each != each[0]):
+def _drop_horizon(values: Array, samples: int) -> Array:
+    """Return the value of each signal; refuse values that change over the horizon."""
+    rows = values.reshape(samples, -1)
+    if np.any(rows != rows[0]):
         raise InputError(
-            "A limit or a scale changes over the horizon, which do-mpc cannot take here; give one for each signal, or "
-            "use PredictiveController."
+            "A limit or a scale changes over the horizon; for do-mpc give one value for each signal, or use "
+            "PredictiveController."
         )
-    return np.asarray(each[0])
+    return np.asarray(rows[0])

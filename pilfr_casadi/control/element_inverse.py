@@ -10,9 +10,8 @@ Kuhnen (2001), IEE Proc. Control Theory Appl. 148, give the inverse in closed fo
 r' are the values of the virgin loading curve at the kinks, w' the changes of slope of its inverse function. The
 memories q' follow from the memories of the plays at the moment when play i slipped last. Stops become plays by
 `S_r[z] = z - P_r[z]`: `Σ w_j S_rj = (Σ w_j) z - Σ w_j P_rj`. A sum of stops alone saturates and has no inverse; with a
-spring of stiffness `gain` beside it, the inverse exists. If all partial sums are negative, the output falls as the
-input rises. Then the formulas hold with -r' for r', because plays are odd: `P_r[-z] = -P_r[z]` from the negative
-memory.
+parallel spring of stiffness `gain`, the inverse exists. If all partial sums are negative, the output falls as the input
+rises. The formulas then hold with -r' for r', because plays are odd: `P_r[-z] = -P_r[z]` with the negative memory.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ Array = np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class Inverse:
-    """The inverse of `gain z + Σ w_j H_rj[z]`: plays again, the first with threshold 0.
+    """The inverse of `gain z + Σ w_j H_rj[z]`, a sum of plays; the first has the threshold 0.
 
     Attributes
     ----------
@@ -54,19 +53,19 @@ class Inverse:
     __repr__ = __str__
 
     def memory(self, s: Array | None = None) -> Array:
-        """Convert the element's memory s, (n,), at rest by default, to the memory of the inverse.
+        """Convert the element's memory s, (n,), zero by default, to the memory of the inverse.
 
-        s holds the states of the plays, also for stops, in the order of the given thresholds. It must be reachable by
-        some input.
+        s holds the states of the plays (also for stops) in the order of the given thresholds. Some input must be able
+        to reach it.
         """
         order, _, w = self._sorted
         q = np.zeros(len(order)) if s is None else numbers(s, "The memory").ravel()
         if len(q) != len(order):
             raise InputError(f"{len(q)} memories were given for {len(order)} operators; give one each.")
         q = np.concatenate([[0.0], q[order]])
-        own = np.cumsum(w) * q + np.sum(w * q) - np.cumsum(w * q)
-        own[0] = 0.0  # the play of threshold 0 forgets at once
-        return np.asarray(own)
+        q_inverse = np.cumsum(w) * q + np.sum(w * q) - np.cumsum(w * q)
+        q_inverse[0] = 0.0  # a play of threshold 0 has no memory
+        return np.asarray(q_inverse)
 
 
 def inverse_element(r: Any, w: Any, *, gain: float = 0.0, operator: Any = Play, name: str = "inverse") -> Inverse:
@@ -90,8 +89,8 @@ def inverse_element(r: Any, w: Any, *, gain: float = 0.0, operator: Any = Play, 
     Raises
     ------
     InputError
-        If the element has no inverse: its slope right after a reversal or along its loading curve is zero or
-        changes its sign.
+        If the element has no inverse: its slope right after a reversal, or along its loading curve, is zero or
+        changes sign.
     """
     kind = operator() if isinstance(operator, type) else operator
     r, w = numbers(r, "The thresholds").ravel(), numbers(w, "The weights").ravel()
@@ -117,12 +116,12 @@ def inverse_element(r: Any, w: Any, *, gain: float = 0.0, operator: Any = Play, 
             f"{slope[-1]:.4g} once everything slips, and all slopes must be above zero, or all below; add a linear "
             "part with gain=."
         )
-    own = np.zeros(len(r))
-    own[0] = 1 / slope[first - 1]
-    own[first:] = -w[first:] / (slope[first:] * slope[first - 1 : -1])
-    low = sign * np.array([np.sum(w[: i + 1] * (r[i] - r[: i + 1])) for i in range(len(r))])
+    w_inverse = np.zeros(len(r))
+    w_inverse[0] = 1 / slope[first - 1]
+    w_inverse[first:] = -w[first:] / (slope[first:] * slope[first - 1 : -1])
+    r_inverse = sign * np.array([np.sum(w[: i + 1] * (r[i] - r[: i + 1])) for i in range(len(r))])
     q, v = ca.SX.sym("memory", len(r)), ca.SX.sym("wanted")
-    following = ca.vertcat(*[play(v, q[i], low[i]) for i in range(len(r))])
+    q_next = ca.vertcat(*[play(v, q[i], r_inverse[i]) for i in range(len(r))])
     names = ["memory", "wanted"], ["memory_next", "u"]
-    step = ca.Function(name, [q, v], [following, ca.dot(ca.DM(own), following)], *names)
-    return Inverse(step, low, own, (order, r, w))
+    step = ca.Function(name, [q, v], [q_next, ca.dot(ca.DM(w_inverse), q_next)], *names)
+    return Inverse(step, r_inverse, w_inverse, (order, r, w))

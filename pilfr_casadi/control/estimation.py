@@ -1,60 +1,57 @@
-"""State estimation of a fitted model: its run along a recording, an extended Kalman filter, observability of memory.
+"""Estimate the state of a fitted model: simulation along a recording, extended Kalman filter, observability of memory.
 
 With `F(x, u) = (f, h)`, `C = ∂h/∂x` at the prediction and `A = ∂f/∂x` at the corrected state, the filter is
 
     x̂ = x + K (y - h(x, u)),   x⁺ = f(x̂, u),   P⁺ = A P̂ A' + Q,
 
-with the gain K and the covariance P̂ of `linear.measurement_update`. The Jacobian of min and max is the one of the
+with the gain K and the covariance P̂ of `linear.measurement_update`. The derivatives of min and max are taken on the
 active branch, so the filter switches with the operators: a play that sticks keeps the variance of its memory, and a
 play that slips takes over the variance of the signal that drives it. Memory has process noise; without it the filter
 would become certain and stop correcting the memory. Anderson & Moore (1979), Optimal Filtering, Sec. 8.2. An unscented
-filter predicts as well, within three percent, at four times the work (`python -m problems.observer`).
+filter predicts equally well, within three percent, at four times the cost (`python -m problems.observer`).
 
 Observability of memory: the outputs of a window depend on the state at its beginning as `δY = O δx`. With noise of
-variance R and a state known to within its usual spread S, the covariance after the window is
+variance R and a prior standard deviation S of the state, the covariance after the window is
 
     P = (S⁻² + O' R⁻¹ O)⁻¹,
 
 and a memory is hidden if its standard deviation `sqrt(P_jj)` stays near `S_j`. The columns of O show the reason. A zero
-column means that the memory is wiped out before it leaves a trace, or that no output depends on it. Several operators
-that stick throughout act as one, by their weighted sum.
+column means that the memory is wiped out before it affects an output, or that no output depends on it. Several
+operators that stick throughout act as one, by their weighted sum.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
 
 from .._base import LARGEST, InputError, is_number, numbers
 from ..data import SAME_STEP, Recording
+from ..diagnose import Diagnosis
 from ..export import Exported, exported
 from ..identify import Fit
 from ..linear import measurement_update
 from ..models import PrandtlIshlinskii
 from ..simulators import Simulator
 
-if TYPE_CHECKING:
-    from ..diagnose import Diagnosis
-
 Array = np.ndarray
-SMALLEST_SPREAD = 1e-6  # of the largest: keeps the covariance of a state that never moves from being singular
+SMALLEST_SPREAD = 1e-6  # of the largest: keeps the covariance regular if a state never moves
 DISTURBANCE = 0.1  # of an output's standard deviation: least size of a disturbance, above the error of a usable model
-SHARES = 10.0 ** np.arange(-4.5, -0.4, 0.5)  # process noise per step over the states' spread: values to choose from
-JUDGED = 2048  # samples on which the shares of process noise are compared
-PROBES = 5  # states and inputs at which an observer's model is compared with a fit
-HIDDEN = 0.5  # of the spread: a memory counts as hidden if the outputs cannot halve its uncertainty
-TRACE = 1e-9  # of the largest column of O: a smaller column is rounding
+NOISE_SHARES = 10.0 ** np.arange(-4.5, -0.4, 0.5)  # candidates for the process noise per step over the states' spread
+COMPARED_SAMPLES = 2048  # samples on which these candidates are compared
+PROBE_POINTS = 5  # states and inputs at which an observer's model is compared with a fit
+HIDDEN_SHARE = 0.5  # of the spread: a memory counts as hidden if the outputs cannot halve its uncertainty
+ZERO_COLUMN = 1e-9  # of the largest column of O: smaller columns are rounding errors
 
-
-ModelSource: TypeAlias = "Fit | Diagnosis | Simulator | Exported"
+ModelSource: TypeAlias = Fit | Diagnosis | Simulator | Exported
 
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """The step of a model and its free run along a recording.
+    """A model and its free run along a recording.
 
     Attributes
     ----------
@@ -65,7 +62,7 @@ class Rollout:
     states : array, shape (n, M + 1)
         States before each sample and after the last.
     linear, clock : list of int
-        Entries of x that are neither memory of operators nor the time; the entry of the time, if there is one.
+        Entries of x that are neither memory nor time; the entry of the time, if there is one.
     first_scored : int
         First sample of the recording that is scored.
     """
@@ -80,26 +77,25 @@ class Rollout:
 
 
 def roll_out(source: Any, recording: Recording, verb: str) -> Rollout:
-    """Run the step of a fit, a diagnosis, a simulator or an export along a recording; `verb` names the caller."""
-    model = _export_for(source, recording, verb)
+    """Run a fit, a diagnosis, a simulator or an export along a recording; errors name the called `verb`."""
+    model = _export_step(source, recording, verb)
     u = recording.u
     if len(model.inputs) > recording.n_u:
         u = np.hstack([u, np.vstack([u[1:], u[-1:]])])
     start = model.x0()
-    following, y = (np.asarray(v) for v in model.step.mapaccum("rollout", len(u))(start, u.T))
+    x_next, y = (np.asarray(v) for v in model.step.mapaccum("rollout", len(u))(start, u.T))
     first = source.scored_from(recording) if isinstance(source, Fit) else recording.skip
-    if not (np.all(np.abs(following) < LARGEST) and np.all(np.abs(y[:, first:]) < LARGEST)):
+    if not (np.all(np.abs(x_next) < LARGEST) and np.all(np.abs(y[:, first:]) < LARGEST)):
         raise InputError(f"The model diverges along the recording, so {verb} cannot use it; give a stable model.")
     memory = {model.states[name] for name in model.memory_names}
     clock = [len(model.states) - 1] if model.timed else []
     linear = [i for i in range(len(model.states)) if i not in memory and i not in clock]
-    return Rollout(model, u, y.T, np.column_stack([start, following]), linear, clock, first)
+    return Rollout(model, u, y.T, np.column_stack([start, x_next]), linear, clock, first)
 
 
-def _export_for(source: Any, recording: Recording, verb: str) -> Exported:
-    """Export the step of a model that starts where the recording starts."""
-    diagnosed = not isinstance(source, type) and isinstance(getattr(source, "corrected", None), Simulator)
-    if not (isinstance(source, Fit | Simulator | Exported) or diagnosed):
+def _export_step(source: Any, recording: Recording, verb: str) -> Exported:
+    """Export a model with the initial state of the recording."""
+    if not isinstance(source, ModelSource):
         raise InputError(
             f"A {type(source).__name__} was given to {verb}; give a Fit, a Diagnosis, a Simulator or an export."
         )
@@ -111,7 +107,7 @@ def _export_for(source: Any, recording: Recording, verb: str) -> Exported:
             raise InputError(
                 f"The export steps by {source.dt:g} s from {', '.join(source.inputs)} to {', '.join(source.outputs)}, "
                 f"the recording by {recording.dt:g} s from {', '.join(recording.inputs)} to "
-                f"{', '.join(recording.outputs)}; they must be the same."
+                f"{', '.join(recording.outputs)}; give an export with the step and the signals of the recording."
             )
         return source
     if isinstance(source, Simulator):
@@ -121,13 +117,13 @@ def _export_for(source: Any, recording: Recording, verb: str) -> Exported:
 
 @dataclass(frozen=True, eq=False)
 class KalmanFilter:
-    """An observer with its noise levels and its start.
+    """An observer with its noise levels and its initial state.
 
     Attributes
     ----------
     function : casadi.Function
-        The observed model `(x, u) -> (x_next, y)`; with `disturbance=True` the disturbances of the outputs follow its
-        state.
+        The observed model `(x, u) -> (x_next, y)`; with `disturbance=True` its state ends with the disturbances of the
+        outputs.
     step : casadi.Function
         `(x, P, u, y) -> (x_next, P_next, y_pred)`. x and y_pred are predictions from earlier samples only.
     x0, P0 : array, shape (n,), (n, n)
@@ -135,7 +131,7 @@ class KalmanFilter:
     Q, R : array, shape (n, n), (n_y, n_y)
         Covariances of process and measurement noise.
     spread : array, shape (n,)
-        Root mean square of each state over the recording that the noise levels come from.
+        Root mean square of each state over the recording from which the noise levels come.
     """
 
     function: ca.Function
@@ -152,7 +148,7 @@ class KalmanFilter:
         return (
             f"extended Kalman filter of {len(self.x0)} states (memory included), {self.step.size1_in(2)} inputs and "
             f"{self.step.size1_in(3)} outputs\nnoise of the outputs, std: {noise}; process noise per step: {share:.2g} "
-            "of each state's size"
+            "of each state's rms value"
         )
 
     __repr__ = __str__
@@ -165,7 +161,7 @@ class KalmanFilter:
         u, y : array, shape (M, n_u), (M, n_y)
             Inputs and measured outputs.
         x0, P0 : array, optional
-            Start state and its covariance; unknown by default. For a known start give `P0=filter.Q`.
+            Initial state and its covariance, by default `self.x0` and `self.P0`. For a known state give `P0=filter.Q`.
 
         Returns
         -------
@@ -214,17 +210,17 @@ def kalman_filter(
     Parameters
     ----------
     fit : Fit, Diagnosis, Simulator or Exported
-        The model. A diagnosis gives its corrected simulator; an export needs `start=` the recording. Where inputs are
-        interpolated, the filter's u holds the inputs of this sample and of the next one, as in the export.
+        The model. A diagnosis stands for its corrected simulator; an export must be made with `start=` the recording.
+        With interpolated inputs, the filter's u holds the inputs of this sample and of the next one, as in the export.
     recording : Recording
         Usually the training recording.
     disturbance : bool
-        Observe a slow disturbance of each output as well, `y = h(x, u) + d, d⁺ = d`, which absorbs model errors and
-        makes control free of offset. Its usual size is the rms of the residual, and at least a tenth of the output's
-        standard deviation.
+        Also estimate a slow disturbance of each output, `y = h(x, u) + d, d⁺ = d`. It absorbs model errors and removes
+        the steady-state error of a controller. Its initial standard deviation is the rms of the residual, and at least
+        a tenth of the output's standard deviation.
     share : float, optional
-        Standard deviation of the process noise per step over the root mean square of the state. By default the share
-        with the most likely one-step predictions of the recording.
+        Standard deviation of the process noise per step over the root mean square of the state. The default maximises
+        the likelihood of the one-step predictions of the recording.
 
     Returns
     -------
@@ -253,8 +249,8 @@ def kalman_filter(
         start, spread = np.concatenate([start, np.zeros(len(level))]), np.concatenate([spread, size])
     noise = np.diag(np.maximum(level, 1e-16 * np.mean(recording.y**2, axis=0) + 1e-300))
     if share is not None:
-        return _filter(function, spread, noise, share)
-    filters = [_filter(function, spread, noise, s) for s in SHARES]
+        return _build_filter(function, spread, noise, share)
+    filters = [_build_filter(function, spread, noise, s) for s in NOISE_SHARES]
     return min(filters, key=lambda f: _prediction_cost(f, run.u, recording.y, start))
 
 
@@ -271,61 +267,61 @@ def ekf_step(function: ca.Function, Q: Array, R: Array) -> ca.Function:
     n, n_u, n_y = function.size1_in(0), function.size1_in(1), function.size1_out(1)
     x, u, y, p = (ca.MX.sym(k, *size) for k, size in (("x", (n,)), ("u", (n_u,)), ("y", (n_y,)), ("P", (n, n))))
     symbols = ca.SX.sym("x", n), ca.SX.sym("u", n_u)
-    following, output = function(*symbols)
-    slopes = ca.Function("slopes", symbols, [ca.jacobian(following, symbols[0]), ca.jacobian(output, symbols[0])])
+    x_next, output = function(*symbols)
+    slopes = ca.Function("slopes", symbols, [ca.jacobian(x_next, symbols[0]), ca.jacobian(output, symbols[0])])
     _, predicted = function(x, u)
-    _, gain, certain = measurement_update(p, ca.densify(slopes(x, u)[1]), ca.DM(R))
+    _, gain, p_corrected = measurement_update(p, ca.densify(slopes(x, u)[1]), ca.DM(R))
     corrected = x + gain @ (y - predicted)
     a = ca.densify(slopes(corrected, u)[0])
-    covariance = a @ certain @ a.T + Q
-    covariance = (covariance + covariance.T) / 2
+    p_next = a @ p_corrected @ a.T + Q
+    p_next = (p_next + p_next.T) / 2
     names = ["x", "P", "u", "y"], ["x_next", "P_next", "y_pred"]
-    return ca.Function("observer", [x, p, u, y], [function(corrected, u)[0], covariance, predicted], *names)
+    return ca.Function("observer", [x, p, u, y], [function(corrected, u)[0], p_next, predicted], *names)
 
 
 def add_disturbances(function: ca.Function) -> ca.Function:
     """Append a constant disturbance of each output to the state of `F(x, u)`."""
     n, n_u, n_y = function.size1_in(0), function.size1_in(1), function.size1_out(1)
     x, d, u = (ca.SX.sym(k, m) for k, m in (("x", n), ("d", n_y), ("u", n_u)))
-    following, y = function(x, u)
+    x_next, y = function(x, u)
     names = ["x", "u"], ["x_next", "y"]
-    return ca.Function("disturbed", [ca.vertcat(x, d), u], [ca.vertcat(following, d), y + d], *names)
+    return ca.Function("disturbed", [ca.vertcat(x, d), u], [ca.vertcat(x_next, d), y + d], *names)
 
 
-def jacobians_of(function: ca.Function) -> ca.Function:
+def build_jacobians(function: ca.Function) -> ca.Function:
     """Build the Jacobians `(x, u, ...) -> (A, B, C, D)` of any `F(x, u, ...)`."""
     symbols = [ca.SX.sym(name, function.size1_in(name)) for name in function.name_in()]
     blocks = [ca.densify(ca.jacobian(f, v)) for f in function(*symbols) for v in symbols[:2]]
     return ca.Function("slopes", symbols, blocks)
 
 
-def function_of_observer(observer: Any, function: ca.Function, recording: Recording) -> ca.Function:
-    """Return the function of an observer; refuse one of another model (disturbances are allowed)."""
+def observer_function(observer: Any, function: ca.Function, recording: Recording) -> ca.Function:
+    """Return the function of an observer; refuse an observer of another model (disturbances are allowed)."""
     if not isinstance(observer, KalmanFilter):
         raise InputError(f"A {type(observer).__name__} was given as the observer; give a kalman_filter of this fit.")
-    theirs, n = observer.function, function.size1_in(0)
-    extra = theirs.size1_in(0) - n
-    same = extra in (0, function.size1_out(1)) and theirs.size1_in(1) == function.size1_in(1)
+    observed, n = observer.function, function.size1_in(0)
+    extra = observed.size1_in(0) - n
+    same = extra in (0, function.size1_out(1)) and observed.size1_in(1) == function.size1_in(1)
     rng, size = np.random.default_rng(0), float(np.max(np.abs(recording.u)))
-    for _ in range(PROBES if same else 0):
+    for _ in range(PROBE_POINTS if same else 0):
         x, u = size * rng.standard_normal(n), size * rng.standard_normal(function.size1_in(1))
-        own, other = function(x, u), theirs(np.append(x, np.zeros(extra)), u)
-        pairs = (own[0], other[0][:n]), (own[1], other[1])
+        expected, found = function(x, u), observed(np.append(x, np.zeros(extra)), u)
+        pairs = (expected[0], found[0][:n]), (expected[1], found[1])
         same = same and all(np.allclose(np.asarray(a), np.asarray(b), rtol=1e-9, atol=0.0) for a, b in pairs)
     if not same:
         raise InputError("The observer belongs to another model; give a kalman_filter of the same fit.")
-    return theirs
+    return observed
 
 
-def _filter(function: ca.Function, spread: Array, noise: Array, share: float) -> KalmanFilter:
+def _build_filter(function: ca.Function, spread: Array, noise: Array, share: float) -> KalmanFilter:
     process = np.diag((share * spread) ** 2)
     step = ekf_step(function, process, noise)
     return KalmanFilter(function, step, np.zeros(len(spread)), np.diag(spread**2), process, noise, spread)
 
 
 def _prediction_cost(observer: KalmanFilter, u: Array, y: Array, start: Array) -> float:
-    """Compute minus twice the mean log-likelihood of one-step predictions with errors of their own size."""
-    u, y = u[:JUDGED], y[:JUDGED]
+    """Compute minus twice the mean log-likelihood of one-step predictions, with the variance of their errors."""
+    u, y = u[:COMPARED_SAMPLES], y[:COMPARED_SAMPLES]
     _, predicted, _ = observer.run(u, y, start, observer.Q + 1e-6 * observer.P0)
     error = (y - predicted)[len(y) // 10 :]
     size = np.mean(error**2, axis=0)
@@ -333,7 +329,7 @@ def _prediction_cost(observer: KalmanFilter, u: Array, y: Array, start: Array) -
 
 
 def _is_semidefinite(P: Array) -> bool:
-    """Tell whether no direction has a negative variance, after scaling, since sizes of states differ by decades."""
+    """Tell whether P is positive semidefinite, after scaling, because the states differ by decades."""
     size = np.sqrt(np.maximum(np.diag(P), 0.0))
     if np.any(np.diag(P) < 0) or np.any(P[size == 0] != 0):
         return False
@@ -351,14 +347,14 @@ class Visibility:
     Attributes
     ----------
     left : array, shape (n,)
-        Standard deviation of each state and memory once the outputs are known, over its usual spread: 0 if it is
-        determined exactly, 1 if the outputs do not show it.
+        Standard deviation of each state and memory once the outputs are known, over its prior standard deviation: 0 if
+        the outputs determine it exactly, 1 if they do not show it.
     unseen : tuple of int
-        Entries of the state, counted from 0, that are memory and keep at least half their spread.
+        Entries of the state, counted from 0, that are memory and keep at least half of that deviation.
     sentences : tuple of str
         One sentence per reason.
     rank : int
-        Number of directions of the state about which the outputs add information.
+        Number of directions in the state space that the outputs determine.
     """
 
     left: Array
@@ -378,7 +374,7 @@ def visibility(fit: Fit | Diagnosis | Exported, observer: KalmanFilter, x: Array
     fit : Fit, Diagnosis or Exported
         The model.
     observer : KalmanFilter
-        The filter of the model; it gives the noise and the usual spread.
+        The filter of the model; it gives the noise and the prior standard deviations.
     x : array, shape (n,)
         State of the observer at the start of the window.
     u : array, shape (samples, n_u)
@@ -394,8 +390,7 @@ def visibility(fit: Fit | Diagnosis | Exported, observer: KalmanFilter, x: Array
     InputError
         If x or u do not fit the model.
     """
-    usable = isinstance(fit, Exported) or (callable(getattr(fit, "export", None)) and not isinstance(fit, type))
-    if not usable or not isinstance(observer, KalmanFilter):
+    if not isinstance(fit, Fit | Diagnosis | Exported) or not isinstance(observer, KalmanFilter):
         raise InputError(
             f"A {type(fit).__name__} and a {type(observer).__name__} were given; give a Fit and its kalman_filter."
         )
@@ -411,63 +406,68 @@ def visibility(fit: Fit | Diagnosis | Exported, observer: KalmanFilter, x: Array
             f"A state of {len(x)} numbers and inputs {u.shape} were given; give {n} numbers and "
             f"(samples, {len(model.inputs)})."
         )
-    traces, slip = _sensitivities(observer, x, u)
-    information = np.linalg.eigvalsh(traces.T @ traces)
-    left = np.sqrt(np.clip(np.diag(np.linalg.inv(np.eye(n) + traces.T @ traces)), 0, 1))
-    kind, names = _memory_names(fit, model)
-    unseen = [j for j in names if left[j] > HIDDEN]
-    sentences = _reasons(kind, names, unseen, np.linalg.norm(traces, axis=0), slip, len(u))
-    return Visibility(left, tuple(unseen), tuple(sentences), int(np.sum(information > 1)))
+    sensitivity, first_slip = _differentiate_outputs(observer, x, u)
+    information = sensitivity.T @ sensitivity
+    left = np.sqrt(np.clip(np.diag(np.linalg.inv(np.eye(n) + information)), 0, 1))
+    kind, names = _name_memory(fit, model)
+    unseen = [j for j in names if left[j] > HIDDEN_SHARE]
+    norms = np.linalg.norm(sensitivity, axis=0)
+    sentences = _explain_hidden_memory(kind, names, unseen, norms, first_slip, len(u))
+    return Visibility(left, tuple(unseen), tuple(sentences), int(np.sum(np.linalg.eigvalsh(information) > 1)))
 
 
-def _sensitivities(observer: KalmanFilter, x: Array, u: Array) -> tuple[Array, Array]:
-    """Differentiate the outputs of a window by its start state, in units of noise and spread; find each first slip."""
-    n, slopes = len(x), jacobians_of(observer.function)
-    root = 1 / np.sqrt(np.diag(observer.R))
-    carried, rows, slip = np.eye(n), [], np.full(n, -1)
+def _differentiate_outputs(observer: KalmanFilter, x: Array, u: Array) -> tuple[Array, Array]:
+    """Compute `R^-½ O S` and the sample at which each memory first slips, -1 if it never does."""
+    n, slopes = len(x), build_jacobians(observer.function)
+    weight = 1 / np.sqrt(np.diag(observer.R))
+    transition, rows, first_slip = np.eye(n), [], np.full(n, -1)
     for k, value in enumerate(u):
         a, _, c, _ = (np.asarray(block) for block in slopes(x, value))
         x = np.asarray(observer.function(x, value)[0]).ravel()
-        rows.append(root[:, None] * (c @ carried))
-        carried = a @ carried
-        slip[np.flatnonzero((slip < 0) & (np.diag(a) == 0))] = k
-    return np.vstack(rows) * observer.spread, slip
+        rows.append(weight[:, None] * (c @ transition))
+        transition = a @ transition
+        first_slip[(first_slip < 0) & (np.diag(a) == 0)] = k
+    return np.vstack(rows) * observer.spread, first_slip
 
 
-def _reasons(kind: str, names: dict[int, str], unseen: list[int], size: Array, slip: Array, samples: int) -> list[str]:
+def _explain_hidden_memory(
+    kind: str, names: dict[int, str], unseen: list[int], column_norm: Array, first_slip: Array, samples: int
+) -> list[str]:
     """Write a sentence for each reason why memory is hidden."""
     if not names:
-        return ["The model has no memory to see."]
-    tiny = TRACE * np.max(size, initial=0.0)
-    wiped = [j for j in unseen if size[j] <= tiny and slip[j] >= 0]
-    idle = [j for j in unseen if size[j] <= tiny and slip[j] < 0]
-    rest = [j for j in unseen if size[j] > tiny]
-    joint, faint = ([j for j in rest if slip[j] < 0], [j for j in rest if slip[j] >= 0])
-    several = (
-        f"stick over all {samples} samples, so the outputs show only their weighted sum; an excursion that makes them "
-        "slip one after the other tells them apart"
-    )
-    one = (
-        f"sticks over all {samples} samples, and its effect on the outputs drowns in noise or looks like the effect "
-        "of others; an excursion that makes it slip settles it"
-    )
-    slipping = (
-        f"{'slip' if len(faint) > 1 else 'slips'} within the window, and the trace left before drowns in noise or "
-        "looks like that of others; from then on the signal that drives the operator determines its memory"
-    )
-    reasons = {
-        "wiped out before a trace reaches an output; its value does not matter": wiped,
-        "no output depends on it, because its weight is zero": idle,
-        several if len(joint) > 1 else one: joint,
-        slipping: faint,
-    }
+        return ["The model has no memory to observe."]
     if not unseen:
         return [f"The outputs of {samples} samples show all {len(names)} memories."]
+    slips, zero = first_slip >= 0, column_norm <= ZERO_COLUMN * np.max(column_norm, initial=0.0)
+    wiped_out = [j for j in unseen if zero[j] and slips[j]]
+    weightless = [j for j in unseen if zero[j] and not slips[j]]
+    sticking = [j for j in unseen if not zero[j] and not slips[j]]
+    slipping = [j for j in unseen if not zero[j] and slips[j]]
+    sticks = (
+        f"sticks over all {samples} samples, and its effect on the outputs drowns in noise or looks like the effect "
+        "of others; an excursion that makes it slip determines it"
+    )
+    if len(sticking) > 1:
+        sticks = (
+            f"stick over all {samples} samples, so the outputs show only their weighted sum; an excursion that makes "
+            "them slip one after the other tells them apart"
+        )
+    slip = (
+        f"{'slip' if len(slipping) > 1 else 'slips'} within the window, and the earlier effect on the outputs drowns "
+        "in noise or looks like the effect of others; after the slip the signal that drives the operator determines "
+        "its memory"
+    )
+    reasons = {
+        "wiped out before a trace reaches an output; its value does not matter": wiped_out,
+        "no output depends on it, because its weight is zero": weightless,
+        sticks: sticking,
+        slip: slipping,
+    }
     return [f"{kind} {', '.join(names[j] for j in entries)}: {why}." for why, entries in reasons.items() if entries]
 
 
-def _memory_names(fit: Any, model: Exported) -> tuple[str, dict[int, str]]:
-    """Return the kind of the memory, and name and threshold of each entry of the state that is memory."""
+def _name_memory(fit: Any, model: Exported) -> tuple[str, dict[int, str]]:
+    """Return the kind of the memory, and the name and threshold of each entry of the state that is memory."""
     places = {model.states[name]: name for name in model.memory_names}
     element = fit.model.element if isinstance(fit, Fit) else None
     if isinstance(fit, Fit) and not isinstance(element, PrandtlIshlinskii):

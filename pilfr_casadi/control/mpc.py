@@ -1,6 +1,6 @@
 """Predictive control: inputs that make the predicted outputs follow a reference within limits.
 
-    minimise   Σ |(y_k - r_k) / y_scale|² + move |(u_k - u_{k-1}) / u_scale|² + price · s_k / y_scale
+    minimise   Σ |(y_k - r_k) / y_scale|² + move |(u_k - u_{k-1}) / u_scale|² + penalty · s_k / y_scale
     subject to low_u <= u_k <= high_u,   |u_k - u_{k-1}| <= rate,   low_y - s_k <= y_k <= high_y + s_k,   s_k >= 0
 
 over N samples from a state x with memory. Each output and sample has its own slack s, so an unavoidable
@@ -14,19 +14,19 @@ converged, which is rare with one input and common with several inputs behind pl
 one shifted, and it always keeps the limits of inputs and rates. Nocedal & Wright (2006), Numerical Optimization, ch.
 18.
 
-A scale is the deviation that counts as one in the cost. Scales follow from the options alone, so the cost is the same
-in every call and does not depend on the units:
+A scale is the deviation that costs one. Scales follow from the options alone, so the cost is the same in every call and
+does not depend on the units:
 
     u_scale   half of the width between the limits of an input; 1 where it has no limits;
-    y_scale   the smaller of half the width between the limits of an output, and half of the range that it covers when
-              the lowest or highest inputs drive the model from rest over the horizon. Without output limits, a tenth
-              of that range; 1 if neither is known.
+    y_scale   the smaller of two values: half of the width between the limits of an output, and half of the range that
+              it covers when the lowest or highest inputs drive the model from rest over the horizon. Without output
+              limits, a tenth of that range; 1 if neither is known.
 
 A violated limit costs in proportion to y_scale and a deviation with its square, so a small y_scale makes limits that
 cannot be kept count less against the reference. Therefore y_scale is larger with limits than without.
 
-The price of a violation is an exact penalty. A reference that lies `e` scales beyond a limit pulls with at most `2 e`
-per sample, so a price of 30, or `30 e` for `e > 1`, keeps a limit wherever that is possible.
+The penalty of a violation is exact. A reference that lies `e` scales beyond a limit pulls with at most `2 e` per
+sample, so a penalty of 30, or `30 e` for `e > 1`, keeps a limit wherever that is possible.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ from ..models import Buffered
 
 Array = np.ndarray
 NO_LIMIT = 1e20  # stands for infinity in limits of outputs; IPOPT's convention
-PRICE = 30.0  # cost of a violated limit per y_scale; 15 times the steepest pull of a reference one scale beyond it
+PENALTY = 30.0  # of a violation by one y_scale; 15 times the steepest pull of a reference one scale beyond the limit
 UNLIMITED_SHARE = 0.1  # of an output's range: the scale without limits, so that errors of a few per cent count
-PROBE = 2.0  # u_scale from zero: the range of inputs over which an output's range is probed
+PROBED_INPUTS = 2.0  # u_scale from zero: the range of inputs over which an output's range is probed
 LARGEST, SMALLEST = 1e15, 1e-300  # limits and ranges beyond these count as unknown
-FIRST = 10  # times as many iterations for the first plan, which starts from a held input
+FIRST_PLAN_FACTOR = 10  # times as many iterations for the first plan, which starts from a constant input
 LIMIT_TOLERANCE = 1e-5  # of y_scale: smaller violations of an output limit lie within the solver's tolerance
-SLACK_CURVATURE = 0.1  # Hessian of the slacks: makes the QP strictly convex, small against the price of 30
+SLACK_HESSIAN = 0.1  # Hessian of the slacks: makes the QP strictly convex, small against the penalty of 30
 QUIET = {"print_time": False, "error_on_fail": False}
 SQP = {
     "qpsol": "daqp",
@@ -59,9 +59,9 @@ SQP = {
     "tol_pr": 1e-5,  # of the scaled constraints: DAQP's own tolerance with the curvature of the slacks
     "tol_du": 1e-4,
     "beta": 0.5,  # the line search halves a step until the cost falls: kinks stand in the way of full steps
-    "max_iter_ls": 12,  # shorter steps than 2^-12 no longer gain; with 8, plans of several inputs cost 3 % more
+    "max_iter_ls": 12,  # steps below 2^-12 gain nothing; with 8, plans of several inputs cost 3 % more
     "merit_memory": 1,
-    "min_step_size": 1e-6,  # of u_scale: a smaller step has nothing to gain
+    "min_step_size": 1e-6,  # of u_scale: a smaller step gains nothing
     **dict.fromkeys(("print_header", "print_iteration", "print_status"), False),
 }
 IPOPT = {"ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 200}}
@@ -125,22 +125,22 @@ class PredictiveController:
     inputs : (low, high)
         Limits of the inputs, numbers or arrays (n_u,); infinite for no limit.
     outputs : (low, high), optional
-        Limits of the outputs, kept wherever possible; otherwise the output comes as close as it can.
+        Limits of the outputs, kept wherever possible; otherwise the violation is as small as possible.
     rate : float or array, optional
-        Largest change of an input from sample to sample. If the previous input is so far outside the limits that both
-        cannot be kept, the first change is as large as needed.
+        Largest change of an input from sample to sample. If the previous input lies too far outside the limits, the
+        first change exceeds the rate as much as it must to reach them.
     move : float
         Weight of changes of the inputs.
     y_scale, u_scale : float or array, optional
-        Size that counts as one in the cost. By default half of the width between the limits of an input and of an
-        output, and no more than the output can cover within the horizon; a tenth of that range without output limits.
+        Deviation that costs one. By default half of the width between the limits of an input or output, and for an
+        output at most half of the range that it can cover within the horizon (a tenth of the range without limits).
         The attributes `y_scale` and `u_scale` hold the values in use.
     solver : {"sqp", "ipopt"}
         `"sqp"` takes about a millisecond, `"ipopt"` some ten times as long.
     iterations : int
         Largest number of SQP iterations in a call; the first call may take ten times as many. With 1 each sample costs
-        one QP, the real-time iteration of Diehl, Bock & Schlöder (2005), SIAM J. Control Optim. 43: the loops of
-        `problems.mpc_piezo` track as well so, although few plans converge. IPOPT has its own limit.
+        one QP, the real-time iteration of Diehl, Bock & Schlöder (2005), SIAM J. Control Optim. 43. The loops of
+        `problems.mpc_piezo` then track as well, although few plans converge. IPOPT has its own limit.
 
     Raises
     ------
@@ -171,7 +171,7 @@ class PredictiveController:
         self.function, self.horizon, self.solver, self.iterations = task.function, task.horizon, solver, iterations
         self.y_scale, self.u_scale = task.y_scale, task.u_scale
         self._task, self._problem = task, Transcription(task)
-        self._first = self._problem.solver(solver, FIRST * iterations)
+        self._first = self._problem.solver(solver, FIRST_PLAN_FACTOR * iterations)
         self._next = self._problem.solver(solver, iterations) if solver == "sqp" else self._first
         self._plan: Array | None = None
 
@@ -188,43 +188,43 @@ class PredictiveController:
     def __call__(self, x: Array, reference: Array, u_previous: Array) -> Plan:
         """Plan from the state x of sample k, towards the reference (N, n_y) of the samples k to k + N - 1.
 
-        The plan's first input acts in sample k. Its first output, like the first row of the reference, belongs to
-        sample k: in a model without feedthrough no input can change it any more. `u_previous` is the input of sample
-        k - 1. The search starts from the last plan, shifted by a sample.
+        The first planned input acts in sample k. The first output and the first row of the reference belong to sample
+        k too; in a model without feedthrough no input can change that output any more. `u_previous` is the input of
+        sample k - 1. The search starts from the last plan, shifted by a sample.
         """
         begin = perf_counter()
         task, problem = self._task, self._problem
         n, n_u, n_y = task.sizes
-        wanted = _reference(reference, self.horizon, n_y)
-        before, state = numbers(u_previous, "The previous input").reshape(-1), numbers(x, "The state").ravel()
-        if len(before) != n_u or len(state) != n:
+        r = _flatten_reference(reference, self.horizon, n_y)
+        u_before, state = numbers(u_previous, "The previous input").reshape(-1), numbers(x, "The state").ravel()
+        if len(u_before) != n_u or len(state) != n:
             raise InputError(
-                f"A state of {len(state)} numbers and {len(before)} previous inputs were given; give {n} and {n_u}."
+                f"A state of {len(state)} numbers and {len(u_before)} previous inputs were given; give {n} and {n_u}."
             )
-        rate, last = task.first_rate(before), self._plan
-        start = np.tile(before, self.horizon) if last is None else np.append(last[n_u:], last[-n_u:])
-        start = task.clip(start, before, rate)
-        at = state, wanted, before
-        found, converged = problem.solve(self._first if last is None else self._next, start, rate, *at)
-        u = task.clip(found, before, rate)
-        cost, y = problem.cost(u, *at)
+        rate, last = task.first_rate(u_before), self._plan
+        start = np.tile(u_before, self.horizon) if last is None else np.append(last[n_u:], last[-n_u:])
+        start = task.clip(start, u_before, rate)
+        given = state, r, u_before
+        found, converged = problem.solve(self._first if last is None else self._next, start, rate, *given)
+        u = task.clip(found, u_before, rate)
+        cost, y = problem.cost(u, *given)
         if not converged:
-            kept, y_kept = problem.cost(start, *at)
-            if not cost <= kept:
-                u, cost, y = start, kept, y_kept
+            start_cost, start_y = problem.cost(start, *given)
+            if not cost <= start_cost:
+                u, cost, y = start, start_cost, start_y
         self._plan = u
-        beyond = task.beyond(y)
-        slack = float(np.max(beyond[beyond > LIMIT_TOLERANCE * task.y_scale], initial=0.0))
-        shaped = u.reshape(-1, n_u), y.reshape(-1, n_y)
+        violation = task.violation(y)
+        slack = float(np.max(violation[violation > LIMIT_TOLERANCE * task.y_scale], initial=0.0))
         converged = converged and bool(np.isfinite(cost))
-        return Plan(*shaped, cost, slack, perf_counter() - begin, converged, task.limited)
+        seconds = perf_counter() - begin
+        return Plan(u.reshape(-1, n_u), y.reshape(-1, n_y), cost, slack, seconds, converged, task.limited)
 
 
 class Transcription:
     """The nonlinear program of a task, in units of u_scale and y_scale.
 
     Variables are the inputs (N n_u,) and, with output limits, a slack for each output and sample; parameters are the
-    state, the reference, the previous input and the price of a violated limit.
+    state, the reference, the previous input and the penalty of a violated limit.
     """
 
     def __init__(self, task: ControlTask) -> None:
@@ -232,31 +232,32 @@ class Transcription:
         n, n_u, n_y = task.sizes
         samples, slacks = task.horizon, task.horizon * n_y * task.limited
         v, s, x = ca.SX.sym("v", samples * n_u), ca.SX.sym("s", slacks), ca.SX.sym("x", n)
-        wanted, before, price = ca.SX.sym("r", samples * n_y), ca.SX.sym("u_before", n_u), ca.SX.sym("price")
+        r, u_before, penalty = ca.SX.sym("r", samples * n_y), ca.SX.sym("u_before", n_u), ca.SX.sym("penalty")
         u, state, outputs = v * task.u_scale, x, []
         for k in range(samples):
             state, y = task.function(state, u[k * n_u : (k + 1) * n_u])
             outputs.append(y)
         y = ca.vertcat(*outputs) / task.y_scale
-        changes = (u - ca.vertcat(before, u[:-n_u])) / task.u_scale
-        residual = ca.vertcat(y - wanted / task.y_scale, np.sqrt(task.move) * changes)
-        self._variables, self._parameters = ca.vertcat(v, s), ca.vertcat(x, wanted, before, price)
-        self._cost = ca.sumsqr(residual) + price * ca.sum1(s)
+        changes = (u - ca.vertcat(u_before, u[:-n_u])) / task.u_scale
+        residual = ca.vertcat(y - r / task.y_scale, np.sqrt(task.move) * changes)
+        self._variables, self._parameters = ca.vertcat(v, s), ca.vertcat(x, r, u_before, penalty)
+        self._cost = ca.sumsqr(residual) + penalty * ca.sum1(s)
         jacobian = ca.jacobian(residual, self._variables)
-        curvature = ca.diag(ca.vertcat(ca.SX.zeros(samples * n_u), SLACK_CURVATURE * ca.SX.ones(slacks)))
+        curvature = ca.diag(ca.vertcat(ca.SX.zeros(samples * n_u), SLACK_HESSIAN * ca.SX.ones(slacks)))
         self._hessian = 2 * jacobian.T @ jacobian + curvature
-        rated = np.flatnonzero(np.isfinite(task.rate))
-        self._rated, rows = rated, [changes[rated.tolist()]]
+        rate_limited = np.flatnonzero(np.isfinite(task.rate))
+        self._rate_limited, rows = rate_limited, [changes[rate_limited.tolist()]]
         low, high, free = task.low_y / task.y_scale, task.high_y / task.y_scale, np.full(slacks, np.inf)
-        self._sides = np.zeros(0), np.zeros(0)
+        self._constraint_bounds = np.zeros(0), np.zeros(0)
         if task.limited:
             rows += [y + s, y - s]
-            self._sides = np.concatenate([low, -free]), np.concatenate([free, high])
+            self._constraint_bounds = np.concatenate([low, -free]), np.concatenate([free, high])
         self._constraints = ca.vertcat(*rows)
-        self._box = np.append(task.low / task.u_scale, np.zeros(slacks)), np.append(task.high / task.u_scale, free)
-        self._none = np.zeros(slacks)
+        self._zero_slacks = np.zeros(slacks)
+        lbx, ubx = np.append(task.low / task.u_scale, self._zero_slacks), np.append(task.high / task.u_scale, free)
+        self._variable_bounds = lbx, ubx
         names = ["u", "x", "reference", "u_before"], ["cost", "y"]
-        predict = ca.Function("predict", [v, x, wanted, before], [ca.sumsqr(residual), ca.densify(y)], *names)
+        predict = ca.Function("predict", [v, x, r, u_before], [ca.sumsqr(residual), ca.densify(y)], *names)
         self._predict = Buffered(predict)
 
     def solver(self, name: str, iterations: int) -> Buffered:
@@ -265,34 +266,36 @@ class Transcription:
         factor, multipliers = ca.SX.sym("lam_f"), ca.SX.sym("lam_g", g.shape[0])
         hessian = ca.triu(factor * self._hessian)
         names, out = ["x", "p", "lam_f", "lam_g"], "triu_hess_gamma_x_x"
-        if name == "sqp":  # each entry is computed once
+        plugin, options = "ipopt", dict[str, Any](IPOPT)
+        if name == "sqp":
+            plugin, options = "sqpmethod", {**SQP, "max_iter": iterations}
             hessian, out = ca.triu2symm(hessian), "hess_gamma_x_x"
         gauss_newton = ca.Function("gauss_newton", [x, p, factor, multipliers], [hessian], names, [out])
-        own = {**SQP, "max_iter": iterations} if name == "sqp" else IPOPT
-        plugin = "sqpmethod" if name == "sqp" else "ipopt"
         program = {"x": x, "p": p, "f": self._cost, "g": g}
-        return Buffered(ca.nlpsol("mpc", plugin, program, {**QUIET, **own, "hess_lag": gauss_newton}))
+        return Buffered(ca.nlpsol("mpc", plugin, program, {**QUIET, **options, "hess_lag": gauss_newton}))
 
     def solve(
-        self, solver: Buffered, start: Array, rate: Array, x: Array, wanted: Array, before: Array
+        self, solver: Buffered, start: Array, rate: Array, x: Array, r: Array, u_before: Array
     ) -> tuple[Array, bool]:
         """Find inputs (N n_u,) from a start; also tell whether the solver converged."""
-        task, most = self._task, (rate / self._task.u_scale)[self._rated]
-        p = np.concatenate([x, wanted, before, [task.price(wanted)]])
-        low, high = np.append(-most, self._sides[0]), np.append(most, self._sides[1])
-        found = solver(np.append(start / task.u_scale, self._none), p, *self._box, low, high)[0][: len(start)]
+        task, (low, high) = self._task, self._constraint_bounds
+        largest = (rate / task.u_scale)[self._rate_limited]
+        lbg, ubg = np.append(-largest, low), np.append(largest, high)
+        v = np.append(start / task.u_scale, self._zero_slacks)
+        p = np.concatenate([x, r, u_before, [task.penalty(r)]])
+        found = solver(v, p, *self._variable_bounds, lbg, ubg)[0][: len(start)]
         return found * task.u_scale, solver.status in SUCCESS and bool(np.all(np.isfinite(found)))
 
-    def cost(self, u: Array, x: Array, wanted: Array, before: Array) -> tuple[float, Array]:
+    def cost(self, u: Array, x: Array, r: Array, u_before: Array) -> tuple[float, Array]:
         """Compute the cost of inputs (N n_u,), violated limits included, and their outputs (N n_y,)."""
         task = self._task
-        cost, y = self._predict(u / task.u_scale, x, wanted, before)
+        cost, y = self._predict(u / task.u_scale, x, r, u_before)
         y = y * task.y_scale
-        over = float(np.sum(task.beyond(y) / task.y_scale)) if task.limited else 0.0
-        return float(cost[0]) + task.price(wanted) * over, y
+        violation = float(np.sum(task.violation(y) / task.y_scale)) if task.limited else 0.0
+        return float(cost[0]) + task.penalty(r) * violation, y
 
 
-def _reference(reference: Any, samples: int, n_y: int) -> Array:
+def _flatten_reference(reference: Any, samples: int, n_y: int) -> Array:
     """Flatten a reference (samples, n_y); for a single output (samples,) is accepted."""
     found = numbers(reference, "The reference")
     if found.shape == (samples, n_y) or (n_y == 1 and found.size == samples == max(found.shape, default=0)):
@@ -305,7 +308,7 @@ def _reference(reference: Any, samples: int, n_y: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ControlTask:
-    """A checked problem of predictive control; vectors over the horizon, sample by sample: (N n_u,) or (N n_y,)."""
+    """A checked problem of predictive control; arrays hold one sample after the other: (N n_u,) or (N n_y,)."""
 
     function: ca.Function
     horizon: int
@@ -324,28 +327,28 @@ class ControlTask:
         """Numbers of states, inputs and outputs."""
         return self.function.size1_in(0), self.function.size1_in(1), self.function.size1_out(1)
 
-    def beyond(self, y: Array) -> Array:
+    def violation(self, y: Array) -> Array:
         """Compute how far each output (N n_y,) is outside its limits."""
         return np.maximum(0, np.maximum(self.low_y - y, y - self.high_y))
 
-    def price(self, reference: Array) -> float:
-        """Compute the cost of a violated output limit per y_scale, for a reference (N n_y,)."""
-        return limit_price(self.beyond(reference) / self.y_scale)
+    def penalty(self, reference: Array) -> float:
+        """Compute the penalty of a violated output limit per y_scale, for a reference (N n_y,)."""
+        return penalty_weight(self.violation(reference) / self.y_scale)
 
-    def first_rate(self, before: Array) -> Array:
+    def first_rate(self, u_before: Array) -> Array:
         """Compute the largest changes (N n_u,); the first may be as large as needed to return inside the limits."""
-        rate, n_u = self.rate.copy(), len(before)
-        rate[:n_u] = np.maximum(rate[:n_u], np.maximum(self.low[:n_u] - before, before - self.high[:n_u]))
+        rate, n_u = self.rate.copy(), len(u_before)
+        rate[:n_u] = np.maximum(rate[:n_u], np.maximum(self.low[:n_u] - u_before, u_before - self.high[:n_u]))
         return rate
 
-    def clip(self, u: Array, before: Array, rate: Array) -> Array:
-        """Move inputs into the limits and the rates, sample by sample, after the input `before`."""
-        n, u = len(before), np.clip(u, self.low, self.high)
-        if np.any(np.abs(u - np.concatenate([before, u[:-n]])) > rate):
+    def clip(self, u: Array, u_before: Array, rate: Array) -> Array:
+        """Clip inputs to the limits and the rates, sample by sample, starting from the input `u_before`."""
+        n, u = len(u_before), np.clip(u, self.low, self.high)
+        if np.any(np.abs(u - np.concatenate([u_before, u[:-n]])) > rate):
             for k in range(0, len(u), n):
                 now = slice(k, k + n)
-                slow = np.clip(u[now], before - rate[now], before + rate[now])
-                u[now] = before = np.clip(slow, self.low[now], self.high[now])
+                slow = np.clip(u[now], u_before - rate[now], u_before + rate[now])
+                u[now] = u_before = np.clip(slow, self.low[now], self.high[now])
         return u
 
 
@@ -371,7 +374,7 @@ def check_task(
         u_size = numbers(u_scale, "u_scale", (horizon, n_u)).ravel()
     if y_scale is None:
         rest = np.clip(0.0, low, high)
-        ends = np.maximum(low, rest - PROBE * u_size), np.minimum(high, rest + PROBE * u_size)
+        ends = np.maximum(low, rest - PROBED_INPUTS * u_size), np.minimum(high, rest + PROBED_INPUTS * u_size)
         y_size = _output_scale(function, low_y, high_y, ends)
     else:
         y_size = numbers(y_scale, "y_scale", (horizon, n_y)).ravel()
@@ -407,9 +410,9 @@ def as_step_function(given: Any) -> ca.Function:
     return function
 
 
-def limit_price(beyond: Array) -> float:
-    """Compute the price of a violated limit for a reference that lies `beyond` the limits, in units of y_scale."""
-    return PRICE * max(1.0, float(np.max(beyond, initial=0.0)))
+def penalty_weight(violation: Array) -> float:
+    """Compute the penalty per y_scale for a reference that itself violates the limits by `violation`, in y_scale."""
+    return PENALTY * max(1.0, float(np.max(violation, initial=0.0)))
 
 
 def _limits(limits: Any, of: str, shape: tuple[int, int]) -> tuple[Array, Array]:

@@ -1,7 +1,7 @@
-"""Shared parts of all figures: a canvas without global state, colours, decibels, and lines thinned in long records.
+"""Shared parts of all figures: a canvas without global state, colours, decibels, and thinned lines of long records.
 
-The colours of Okabe & Ito (2008) are distinct for every kind of colour vision. Figures are made with matplotlib's
-object interface: no pyplot, no change of settings, so they work in scripts, notebooks and servers alike.
+The colours of Okabe & Ito (2008) are distinct for every kind of colour vision. Figures use matplotlib's object
+interface without pyplot and without changed settings, so they work in scripts, notebooks and servers.
 """
 
 from __future__ import annotations
@@ -18,41 +18,40 @@ from matplotlib.textpath import TextPath
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 SKY, ORANGE, INK, GREY = "#56B4E9", "#E69F00", "#222222", "#7A7A7A"
 GRID = "#DDDDDD"
-PALE_GREY, PALE_BLUE = "#EEEEEE", "#E8F1F7"  # areas: not scored or not visited; the range of the recordings
+PALE_GREY, PALE_BLUE = "#EEEEEE", "#E8F1F7"  # areas: not scored or not visited; range of the recordings
 BOX = "#D6E8F4"  # inside of box plots
-SHADES, LOOPS = "cividis", "viridis"  # colormaps of maps of errors, and of loops; distinct for all, and in grey
+MAP_COLOURS, LOOP_COLOURS = "cividis", "viridis"  # colormaps of error maps and loops; also readable in grey
 FONT = 10.5  # points
-SCREEN = 90  # dots per inch in a notebook, whose column is about 1000 pixels wide
+SCREEN_DPI = 90  # dots per inch in a notebook, whose column is about 1000 pixels wide
 MOST_POINTS = 3000  # points of a line before it is thinned: more than a page has pixels
 LONGEST_TITLE = 46  # letters that fit above a figure of the usual width
-DEPTH = 200.0  # dB below the largest value down to which curves are drawn; rounding errors lie deeper
-RUNAWAY = 1e3  # times the span of the measured signal above which a simulation is not drawn
-ALL = slice(None)
+DECIBEL_RANGE = 200.0  # dB below the largest value down to which curves are drawn; rounding errors lie deeper
+RUNAWAY = 1e3  # times the span of the measured signal; a simulation is not drawn above it
 
 
 class ShownFigure(Figure):
-    """A figure that a notebook shows where it ends a cell; of figures without pyplot it knows only the text."""
+    """A figure that a notebook shows at the end of a cell; without pyplot it would show only the text."""
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
-        self.savefig(buffer, format="png", dpi=SCREEN)
+        self.savefig(buffer, format="png", dpi=SCREEN_DPI)
         return buffer.getvalue()
 
 
 def new_figure(width: float = 5.2, height: float = 3.5) -> Figure:
-    """Make an empty figure of a size in inches, laid out so that nothing overlaps or is cut off."""
+    """Make an empty figure of the given size in inches, with a layout that prevents overlap and clipping."""
     return ShownFigure(figsize=(width, height), layout="constrained")
 
 
 def axes_or_new(ax: Axes | None) -> Axes:
-    """Return the axes given, or the axes of a new figure."""
+    """Return the given axes, or those of a new figure."""
     return new_figure().add_subplot() if ax is None else ax
 
 
 def finish(
-    ax: Axes, x: str, y: str, title: str = "", columns: int = 2, *, beside: Axes | None = None, legend: bool = True
+    ax: Axes, x: str, y: str, title: str = "", columns: int = 2, *, twin: Axes | None = None, legend: bool = True
 ) -> Axes:
-    """Add labels, a light grid, and above the axes a title and a legend of the labelled lines here and on `beside`."""
+    """Add axis labels and a light grid, and above the axes a title and a legend of the lines here and on `twin`."""
     ax.set_xlabel(plain(x), fontsize=FONT)
     ax.set_ylabel(plain(y), fontsize=FONT)
     title = plain(title if len(title) <= LONGEST_TITLE else title[: LONGEST_TITLE - 1] + "…")
@@ -61,7 +60,7 @@ def finish(
     ax.set_axisbelow(True)
     for side in ("top", "right"):
         ax.spines[side].set_visible(False)
-    handles = [h for axes in (ax, beside) if axes is not None for h in axes.get_legend_handles_labels()[0]]
+    handles = [h for axes in (ax, twin) if axes is not None for h in axes.get_legend_handles_labels()[0]]
     if handles and legend:
         shown = ax.legend(
             handles=handles,
@@ -69,7 +68,7 @@ def finish(
             alignment="left",
             loc="lower left",
             bbox_to_anchor=(0.0, 1.0),
-            ncols=_columns_that_fit(ax, [str(h.get_label()) for h in handles], columns),
+            ncols=_choose_columns(ax, [str(h.get_label()) for h in handles], columns),
             fontsize=FONT - 1,
             title_fontsize=FONT + 0.5,
             frameon=False,
@@ -85,8 +84,8 @@ def finish(
     return ax
 
 
-def _columns_that_fit(ax: Axes, labels: list[str], most: int) -> int:
-    """Choose the columns of a legend so that it is not wider than its axes."""
+def _choose_columns(ax: Axes, labels: list[str], most: int) -> int:
+    """Choose the number of columns of a legend so that it is no wider than its axes."""
     em = (FONT - 1) / 72
     room = 1.1 * ax.get_position().width * ax.figure.bbox.width / ax.figure.dpi
     widths = [TextPath((0, 0), label, size=FONT - 1).get_extents().width / 72 + 2.4 * em for label in labels]
@@ -103,12 +102,12 @@ def plain(text: str) -> str:
 
 
 def with_unit(name: str, unit: str = "") -> str:
-    """Return `name [unit]`, or the name alone where the unit is not known."""
+    """Return `name [unit]`, or the name alone if the unit is unknown."""
     return f"{name} [{unit}]" if unit else name
 
 
 def choose_scale(values: np.ndarray, unit: str = "") -> tuple[float, str]:
-    """Choose a power of a thousand that brings the values near one; return it and the unit: (1e-3, "10⁻³ m")."""
+    """Choose a power of a thousand that scales the values to about one; return it and the unit: (1e-3, "10⁻³ m")."""
     size = float(np.max(np.abs(values), initial=0.0))
     if not np.isfinite(size) or size == 0 or 0.02 <= size < 5000:
         return 1.0, unit
@@ -118,7 +117,7 @@ def choose_scale(values: np.ndarray, unit: str = "") -> tuple[float, str]:
 
 
 def scale_axis(name: str, values: np.ndarray, unit: str = "") -> tuple[float, str]:
-    """Choose the power of a thousand that divides the values on an axis; return it and the axis label."""
+    """Choose the power of a thousand by which to divide the values of an axis; return it and the axis label."""
     size, unit = choose_scale(values, unit)
     return size, with_unit(name, unit)
 
@@ -126,8 +125,8 @@ def scale_axis(name: str, values: np.ndarray, unit: str = "") -> tuple[float, st
 def thin(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.ndarray, np.ndarray]:
     """Keep about `most` points that draw the same picture: the smallest and largest of each stretch, in their order.
 
-    Where x turns back, as in a loop, these are the extremes of both x and y. Shorter lines come back unchanged, and a
-    stretch of gaps (nan) stays a gap.
+    If x turns back, as in a loop, the extremes of both x and y are kept. Shorter lines stay unchanged, and a stretch of
+    gaps (nan) stays a gap.
     """
     if len(y) <= most:
         return x, y
@@ -145,7 +144,7 @@ def thin(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.ndar
 
 
 def mask_divergence(values: np.ndarray, span: float) -> np.ndarray:
-    """Replace values far beyond the span of the measured signal by nan, so that lines have a gap there."""
+    """Replace values far beyond the span of the measured signal by nan, so that lines have gaps there."""
     with np.errstate(invalid="ignore"):
         return np.where(np.abs(values) <= RUNAWAY * span, values, np.nan)
 
@@ -156,9 +155,11 @@ class SampledLine(Line2D):
     samples: tuple[np.ndarray, np.ndarray]
 
 
-def line(ax: Axes, x: np.ndarray, y: np.ndarray, label: str, colour: str, *, part: slice = ALL, **style: Any) -> None:
+def line(
+    ax: Axes, x: np.ndarray, y: np.ndarray, label: str, colour: str, *, part: slice | None = None, **style: Any
+) -> None:
     """Draw a line, or a part of it, thinned where it is dense; the legend notes a line without finite values."""
-    x, y = np.asarray(x), np.asarray(y)
+    x, y, part = np.asarray(x), np.asarray(y), part or slice(None)
     if not np.any(np.isfinite(y[part])):
         label = f"{label}: nothing to draw"
     shown = SampledLine(*thin(x[part], y[part]), label=plain(label), color=colour, **{"linewidth": 1.2, **style})
@@ -168,26 +169,26 @@ def line(ax: Axes, x: np.ndarray, y: np.ndarray, label: str, colour: str, *, par
 
 
 def decibel(power: np.ndarray) -> np.ndarray:
-    """Return `10 log10` of a power of any shape; nan (a gap in the line) where it is zero or not finite."""
+    """Return `10 log10` of a power of any shape, with nan (a gap in the line) for zero and non-finite values."""
     power = np.asarray(power, dtype=float)
     usable = np.isfinite(power) & (power > 0)
     return np.where(usable, 10 * np.log10(np.where(usable, power, 1.0)), np.nan)
 
 
 def limit_depth(ax: Axes, *curves: np.ndarray) -> None:
-    """Keep an axis in decibels readable: rounding errors hundreds of decibels down must not stretch it."""
+    """Limit an axis in decibels, so that rounding errors hundreds of decibels down do not stretch it."""
     values = np.concatenate([c[np.isfinite(c)] for c in curves] or [np.zeros(0)])
-    if len(values) and np.min(values) < np.max(values) - DEPTH:
-        ax.set_ylim(np.max(values) - DEPTH, np.max(values) + 0.05 * DEPTH)
+    if len(values) and np.min(values) < np.max(values) - DECIBEL_RANGE:
+        ax.set_ylim(np.max(values) - DECIBEL_RANGE, np.max(values) + 0.05 * DECIBEL_RANGE)
 
 
 def noise_band(ax: Axes, deviation: float, label: str) -> None:
-    """Draw a deviation above and below zero, if it is known, as dashed lines."""
+    """Draw dashed lines at ± a deviation, if it is known."""
     for side in (deviation, -deviation) if deviation > 0 else ():
         ax.axhline(side, color=GREEN, linestyle="--", linewidth=1.3, label=label if side > 0 else None)
 
 
 def noise_line(ax: Axes, level: float) -> None:
-    """Draw the noise level, if it is known, as a dashed line."""
+    """Draw a dashed line at the noise level, if it is known."""
     if level > 0:
         ax.axhline(level, color=GREEN, linestyle="--", linewidth=1.4, label="noise floor")

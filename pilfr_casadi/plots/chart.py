@@ -1,8 +1,8 @@
-"""An axes as data, so that a page can draw it again and the reader can zoom into it.
+"""Convert axes to data, so that a page can draw them again and the reader can zoom.
 
-Lines, points, steps, bars and bands are read; maps of colours, a second axis and several axes in one figure are not,
-and such a figure stays a picture. Lines keep all their samples (`SampledLine`), so that a picture of a few swings
-becomes a chart of the whole recording that opens at these swings.
+Lines, points, steps, bars and bands are converted. A figure with a colour map, a second axis or several axes stays a
+picture. Lines keep all their samples (`SampledLine`), so a picture of a few swings becomes a chart of the whole
+recording that opens at these swings.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from matplotlib.text import Annotation
 
 from .canvas import SampledLine, thin
 
-ENDLESS = 3e38  # end of a band that crosses the whole axes; the largest number of single precision
+ENDLESS = 3e38  # end of a band across the whole axes: about the largest number of single precision
 Shape = tuple[dict[str, Any], np.ndarray, np.ndarray]  # style, x, y
 MARKERS = {"o": "ring", "x": "cross", ".": "dot", "D": "dot"}
 
 
 def chart(axes: Axes, views: Mapping[str, Axes], most: int) -> dict[str, Any] | None:
-    """Read an axes as numbers and text that JSON can hold; None if it has parts that cannot be read.
+    """Convert axes to numbers and text for JSON; return None if some part cannot be converted.
 
     Parameters
     ----------
     axes : Axes
-        Its limits are those at which the chart opens.
+        The chart opens at the limits of these axes.
     views : mapping
-        Further axes of the same lines by name, whose limits the reader may choose.
+        Further axes with the same lines, by name; the reader may choose their limits.
     most : int
-        Points of a line that are kept, in each view and outside of all: the smallest and largest of each stretch.
+        Largest number of points of a line in each view, and outside all views.
     """
     if len(axes.figure.axes) > 1:
         return None
     try:
-        shapes = [*map(_area, [*axes.patches, *axes.collections]), *map(_line, axes.lines)]
+        shapes = [*map(_read_area, [*axes.patches, *axes.collections]), *map(_read_line, axes.lines)]
     except TypeError:
         return None
     ranges = {name: [list(v.get_xlim()), list(v.get_ylim())] for name, v in {"": axes, **views}.items()}
@@ -49,35 +49,35 @@ def chart(axes: Axes, views: Mapping[str, Axes], most: int) -> dict[str, Any] | 
     legend = axes.get_legend()
     title = legend.get_title().get_text() if legend else axes.get_title(loc="left")
     return {
-        "title": _text(title),
-        "x": {"label": _text(axes.get_xlabel()), "log": axes.get_xscale() == "log"},
-        "y": {"label": _text(axes.get_ylabel()), "log": axes.get_yscale() == "log"},
+        "title": _unescape(title),
+        "x": {"label": _unescape(axes.get_xlabel()), "log": axes.get_xscale() == "log"},
+        "y": {"label": _unescape(axes.get_ylabel()), "log": axes.get_yscale() == "log"},
         "equal": axes.get_aspect() == 1.0,
         "views": ranges,
-        "notes": [_note(a) for a in axes.texts if isinstance(a, Annotation) and a.xycoords == "data"],
-        "lines": [_packed_shape(shape, windows, most) for shape in shapes],
+        "notes": [_read_note(a) for a in axes.texts if isinstance(a, Annotation) and a.xycoords == "data"],
+        "lines": [_pack_shape(shape, windows, most) for shape in shapes],
     }
 
 
-def _note(note: Any) -> dict[str, Any]:
+def _read_note(note: Any) -> dict[str, Any]:
     (x, y), (right, up) = note.xy, note.xyann
     place = {"x": float(x), "y": float(y), "right": float(right), "up": float(up), "align": note.get_ha()}
-    return {**place, "text": _text(note.get_text()), "colour": to_hex(note.get_color())}
+    return {**place, "text": _unescape(note.get_text()), "colour": to_hex(note.get_color())}
 
 
-def _text(text: str) -> str:
+def _unescape(text: str) -> str:
     """Undo the escape of `plain`."""
     return text.replace(r"\$", "$")
 
 
-def _named(artist: Any, colour: Any) -> dict[str, Any]:
+def _read_label_and_colour(artist: Any, colour: Any) -> dict[str, Any]:
     label, alpha = artist.get_label(), artist.get_alpha()
-    named = {} if not label or label.startswith("_") else {"label": _text(label)}
-    return {**named, "colour": to_hex(colour), "alpha": 1.0 if alpha is None else alpha}
+    style = {} if not label or label.startswith("_") else {"label": _unescape(label)}
+    return {**style, "colour": to_hex(colour), "alpha": 1.0 if alpha is None else alpha}
 
 
-def _line(line: Any) -> Shape:
-    style = {**_named(line, line.get_color()), "width": line.get_linewidth()}
+def _read_line(line: Any) -> Shape:
+    style = {**_read_label_and_colour(line, line.get_color()), "width": line.get_linewidth()}
     if line.get_linestyle() == "None":
         style["width"] = 0
     if (marker := str(line.get_marker())) in MARKERS:
@@ -92,12 +92,12 @@ def _line(line: Any) -> Shape:
     return style, x, y
 
 
-def _area(patch: Any) -> Shape:
-    """Read a filled shape, or a line of steps; raise a `TypeError` for any other."""
+def _read_area(patch: Any) -> Shape:
+    """Read a filled shape or a line of steps; raise a `TypeError` for any other shape."""
     shape: Any = patch
     if isinstance(patch, StepPatch):
         values, edges, _ = shape.get_data()
-        style = {**_named(shape, shape.get_edgecolor()), "width": shape.get_linewidth()}
+        style = {**_read_label_and_colour(shape, shape.get_edgecolor()), "width": shape.get_linewidth()}
         if shape.get_linestyle() in ("--", "dashed"):
             style["dash"] = [6, 4]
         return style, np.repeat(edges, 2)[1:-1], np.repeat(values, 2)
@@ -108,21 +108,21 @@ def _area(patch: Any) -> Shape:
     else:
         raise TypeError(f"{type(shape).__name__} has no counterpart in a chart.")
     x, y = np.array(corners, dtype=float).T
-    style = {**_named(shape, colour[:3]), "area": True, "width": 0}
+    style = {**_read_label_and_colour(shape, colour[:3]), "area": True, "width": 0}
     if isinstance(patch, Rectangle) and shape.get_transform() != shape.get_patch_transform() + shape.axes.transData:
         y, style["level"] = np.where(y > 0.5, ENDLESS, -ENDLESS), True  # `axvspan`
     return style, x, y
 
 
-def _packed_shape(shape: Shape, windows: list[float], most: int) -> dict[str, Any]:
+def _pack_shape(shape: Shape, windows: list[float], most: int) -> dict[str, Any]:
     style, x, y = shape
     if not style.get("area"):
-        x, y = _thinned(x, y, windows, most)
-    return {**style, "x": _packed(x), "y": _packed(y)}
+        x, y = _thin_in_windows(x, y, windows, most)
+    return {**style, "x": _pack_numbers(x), "y": _pack_numbers(y)}
 
 
-def _thinned(x: np.ndarray, y: np.ndarray, windows: list[float], most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Thin a line by itself between the ends of windows; a curve that turns back has no windows."""
+def _thin_in_windows(x: np.ndarray, y: np.ndarray, windows: list[float], most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Thin a line separately between the ends of windows; a curve that turns back is thinned as a whole."""
     if len(x) <= most or np.any(np.diff(x) < 0):
         return thin(x, y, most)
     cuts = np.unique([0, *np.searchsorted(x, windows), len(x)])
@@ -130,10 +130,10 @@ def _thinned(x: np.ndarray, y: np.ndarray, windows: list[float], most: int) -> t
     return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
 
 
-def _packed(values: np.ndarray) -> Any:
-    """Write numbers as base64 of single precision, or as first value, step and count where they are uniform."""
+def _pack_numbers(values: np.ndarray) -> Any:
+    """Write numbers as base64 of single precision; write equidistant numbers as first value, step and count."""
     steps = np.diff(values)
     if len(values) > 2 and np.ptp(steps) <= 1e-6 * abs(steps[0]):
         return [float(values[0]), float((values[-1] - values[0]) / (len(values) - 1)), len(values)]
-    held = np.where(np.abs(values) <= ENDLESS, values, np.nan)
-    return base64.b64encode(held.astype("<f4").tobytes()).decode()
+    finite = np.where(np.abs(values) <= ENDLESS, values, np.nan)
+    return base64.b64encode(finite.astype("<f4").tobytes()).decode()

@@ -1,11 +1,12 @@
-"""Figures of a fit: its element (loop, loading curve, weights over thresholds), its convergence, all in one figure.
+"""Figures of a fit: its element (loop, loading curve, weights over thresholds), its convergence, and a summary figure.
 
 Krikelis et al. (2024), Eq. 16 and Fig. 15.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,12 +16,12 @@ from .._base import InputError
 from ..data import Recording, as_recordings
 from ..models import weight_density
 from ..optimise import Iteration
-from .canvas import BLUE, GREY, INK, PALE_BLUE, SKY, VERMILLION, axes_or_new, finish, new_figure, with_unit
+from .canvas import BLUE, GREY, PALE_BLUE, SKY, VERMILLION, axes_or_new, finish, new_figure, with_unit
 from .signals import PlottedFit, as_scored, spectrum, time
 
 Records = Recording | Sequence[Recording]
-Curve = Callable[[np.ndarray], np.ndarray]
 FEWEST_FOR_DENSITY = 4  # operators in use; fewer weights do not sample a density
+CURVE_POINTS = 300  # points of a drawn curve
 
 
 def loop(
@@ -28,49 +29,39 @@ def loop(
 ) -> Axes:
     """Draw the identified hysteresis: the element's output w over its input z along a recording, as Fig. 15.
 
-    `bare` subtracts the line through the origin that fits w best, which leaves only the hysteresis.
+    `bare` subtracts the line through the origin that fits w best, so that only the hysteresis remains.
     """
     _check_channel(fit, channel)
     signals, index = fit.signals(recording), _index(fit, channel)
     first = as_scored(fit, recording).skip
     z, w = (signals[key][first:, channel] for key in "zw")
-    what, title = f"w{index}", "loop" if fit.model.n_s else "curve"
+    name, title = f"w{index}", "loop" if fit.model.n_s else "curve"
     if bare:
         slope = float(z @ w / (z @ z)) if np.any(z) else 0.0
-        w, what, title = w - slope * z, f"w{index} − {slope:.3g} z{index}", "loop without its slope"
+        w, name, title = w - slope * z, f"w{index} − {slope:.3g} z{index}", "loop without its slope"
     ax = axes_or_new(ax)
     order = slice(None) if fit.model.n_s else np.argsort(z)
     ax.plot(z[order], w[order], color=BLUE, linewidth=0.7, rasterized=True)
-    across, up = _label(fit, "z", channel), _label(fit, "w", channel, what)
+    across, up = _label(fit, "z", channel), _label(fit, "w", channel, name)
     return finish(ax, across, up, ", ".join(filter(None, (title, recording.name))))
 
 
 def loading_curve(
-    fit: PlottedFit,
-    recordings: Records | None = None,
-    *,
-    channel: int = 0,
-    reference: Curve | None = None,
-    ax: Axes | None = None,
+    fit: PlottedFit, recordings: Records | None = None, *, channel: int = 0, ax: Axes | None = None
 ) -> Axes:
-    """Draw the element's response to z growing from rest (virgin curve), the range of the recordings shaded.
-
-    `reference` is a curve to compare with, from z (G,) to w (G,), in the scale of the model.
-    """
+    """Draw the element's response to z growing from rest (virgin curve), and shade the range of the recordings."""
     _check_channel(fit, channel)
     ax, reach, limit = axes_or_new(ax), _reach(fit, recordings, channel), _range(fit, recordings, channel)
-    z = np.linspace(0.0, limit, 300)
+    z = np.linspace(0.0, limit, CURVE_POINTS)
     if reach:
         ax.axvspan(0, reach, color=PALE_BLUE, linewidth=0, label="|z| in the recordings")
     ax.plot(z, virgin_curve(fit, z, channel), color=BLUE, linewidth=1.8, label="fitted")
-    if reference is not None:
-        ax.plot(z, reference(z), color=INK, linewidth=1.4, linestyle="--", label="reference")
     ax.margins(x=0)
     return finish(ax, _label(fit, "z", channel), _label(fit, "w", channel), "loading curve")
 
 
 def virgin_curve(fit: PlottedFit, z: np.ndarray, channel: int = 0) -> np.ndarray:
-    """Return w (G,) while one channel's z runs through the values given (G,), from empty memory."""
+    """Compute w (G,) while one channel's z runs through the values (G,), from zero memory."""
     model, p = fit.model, fit.model.parameters.start
     memory, out = np.zeros(model.n_s), np.empty(len(z))
     for k, value in enumerate(z):
@@ -79,37 +70,21 @@ def virgin_curve(fit: PlottedFit, z: np.ndarray, channel: int = 0) -> np.ndarray
     return out
 
 
-def density_beside(ax: Axes, r: np.ndarray, w: np.ndarray, limit: float, reference: Curve | None = None) -> Axes | None:
-    """Draw the smoothed density of weights w over thresholds r on axes at the right; None if there are too few."""
-    smooth = np.count_nonzero(w) >= FEWEST_FOR_DENSITY
-    if not smooth and reference is None:
+def draw_density(ax: Axes, r: np.ndarray, w: np.ndarray, limit: float) -> Axes | None:
+    """Draw the smoothed density of weights w over thresholds r on a right axis; None if there are too few weights."""
+    if np.count_nonzero(w) < FEWEST_FOR_DENSITY:
         return None
-    right, grid = ax.twinx(), np.linspace(0.0, limit, 300)
-    if smooth:
-        drawn = weight_density(r, w, grid, limit / 12)
-        right.plot(grid, drawn, color=VERMILLION, linewidth=1.8, label="smoothed density (right)")
-    if reference is not None:
-        drawn = reference(grid)
-        right.plot(grid, drawn, color=INK, linestyle="--", linewidth=1.4, label="reference density (right)")
+    right, grid = ax.twinx(), np.linspace(0.0, limit, CURVE_POINTS)
+    density = weight_density(r, w, grid, limit / 12)
+    right.plot(grid, density, color=VERMILLION, linewidth=1.8, label="smoothed density (right)")
     finish(right, "", "density dw/dr", legend=False).grid(False)
     right.spines["right"].set_visible(True)
     right.set_ylim(bottom=0)
     return right
 
 
-def weights(
-    fit: PlottedFit,
-    recordings: Records | None = None,
-    *,
-    channel: int = 0,
-    reference: Curve | None = None,
-    ax: Axes | None = None,
-) -> Axes:
-    """Draw the weight over threshold of every operator, and the density of weights over thresholds.
-
-    With fewer than four operators in use no density is drawn. `reference` is a density to compare with, from r (G,) to
-    weight per unit of r (G,), in the scale of the model.
-    """
+def weights(fit: PlottedFit, recordings: Records | None = None, *, channel: int = 0, ax: Axes | None = None) -> Axes:
+    """Draw the weight over the threshold of every operator, and with four operators or more the density of weights."""
     _check_channel(fit, channel)
     values = fit.parameters
     if not {"r", "w"} <= set(values):
@@ -123,11 +98,11 @@ def weights(
     ax.vlines(r, 0, w, color=SKY, linewidth=1.5)
     errors = fit.errors.get("w")
     spread = None if errors is None else np.nan_to_num(errors[channel][order], posinf=0.0)
-    right = density_beside(ax, r, w, limit, reference)
+    right = draw_density(ax, r, w, limit)
     label = "weights w" if right is None else "weights w (left)"
     ax.errorbar(r, w, yerr=spread, fmt="o", markersize=4, color=BLUE, elinewidth=1, label=label)
     across = _label(fit, "z", channel, f"threshold r{_index(fit, channel)}")
-    finish(ax, across, "weight w", "weights over thresholds", 1, beside=right)
+    finish(ax, across, "weight w", "weights over thresholds", 1, twin=right)
     ax.set_ylim(bottom=0)
     ax.set_xlim(-0.02 * limit, limit)
     return ax
@@ -150,12 +125,12 @@ def _label(fit: PlottedFit, signal: str, channel: int, name: str = "") -> str:
     parameters, name = fit.model.parameters, name or f"{signal}{index}"
     if set(blocks) <= set(parameters) and (signal == "z" or len(names) == fit.model.n_w):
         rows = [parameters[block].value[channel] for block in blocks]
-        held = all(np.all(np.broadcast_to(parameters[b].fixed, parameters[b].value.shape)[channel]) for b in blocks)
+        fixed = all(np.all(np.broadcast_to(parameters[b].fixed, parameters[b].value.shape)[channel]) for b in blocks)
         *others, last = rows
-        own = int(np.argmax(last))
-        alone = np.count_nonzero(last) == 1 and last[own] == 1.0 and not any(np.any(row) for row in others)
-        if held and alone and (signal == "z" or own == channel):
-            return with_unit(name, fit.units.get(names[own], ""))
+        i = int(np.argmax(last))
+        passed_through = np.count_nonzero(last) == 1 and last[i] == 1.0 and not any(np.any(row) for row in others)
+        if fixed and passed_through and (signal == "z" or i == channel):
+            return with_unit(name, fit.units.get(names[i], ""))
     return f"{name} (model scale)"
 
 
@@ -165,18 +140,17 @@ def _reach(fit: PlottedFit, recordings: Records | None, channel: int) -> float:
 
 
 def _range(fit: PlottedFit, recordings: Records | None, channel: int) -> float:
-    """Choose the range in which an element is drawn: the visited range, and thresholds not far beyond."""
+    """Choose the range in which to draw an element: the visited range, and thresholds not far beyond."""
     reach, r = _reach(fit, recordings, channel), fit.parameters.get("r")
-    far = 0.0 if r is None else float(np.max(r[channel]))
-    limit = 1.05 * (max(reach, min(far, 1.5 * reach)) if reach else far)
+    largest = 0.0 if r is None else float(np.max(r[channel]))
+    limit = 1.05 * (max(reach, min(largest, 1.5 * reach)) if reach else largest)
     return limit if limit > 0 and np.isfinite(limit) else 1.0
 
 
 def plot_fit(fit: PlottedFit, recordings: Records, *, steady: Sequence[Recording] | None = None) -> Figure:
     """Draw a fit in one figure: time and spectrum of every output, loop, loading curve and weights of every channel.
 
-    Without hysteresis: convergence, beside the curve of an element of one channel.
-
+    For a model without hysteresis, the convergence replaces the channels, with the curve of a one-channel element.
     Noise and distortion levels are estimated from `steady`; see `spectrum`.
     """
     records = as_recordings(recordings)
@@ -201,19 +175,17 @@ def plot_fit(fit: PlottedFit, recordings: Records, *, steady: Sequence[Recording
 
 
 def convergence(fit: PlottedFit, *, ax: Axes | None = None) -> Axes:
-    """Draw the training error over iterations, of every start and of the winning solve."""
+    """Draw the training error over the iterations of every start and of the final solve."""
     ax = axes_or_new(ax)
+
+    def draw(history: Sequence[Iteration], label: str | None, **style: Any) -> None:
+        error = np.sqrt(2 * np.maximum([h.cost for h in history], 0.0))
+        ax.plot([h.number for h in history], error, label=label, **style)
+
     starts = [c.solution.history for c in fit.candidates if c.solution.history]
     for k, history in enumerate(starts):
-        label = "starts" if k == 0 else None
-        ax.plot(*_training_errors(history), color=GREY, linewidth=0.9, alpha=0.7, label=label)
+        draw(history, "starts" if k == 0 else None, color=GREY, linewidth=0.9, alpha=0.7)
     if fit.solution.history:
-        label = "last solve of the best"
-        ax.plot(*_training_errors(fit.solution.history), color=VERMILLION, linewidth=2.0, label=label)
+        draw(fit.solution.history, "last solve of the best", color=VERMILLION, linewidth=2.0)
     ax.set_yscale("log")
     return finish(ax, "iteration", "training error √(2 · cost)", "convergence")
-
-
-def _training_errors(history: Sequence[Iteration]) -> tuple[list[int], np.ndarray]:
-    """Return the numbers and errors of the iterations."""
-    return [h.number for h in history], np.sqrt(2 * np.maximum([h.cost for h in history], 0.0))

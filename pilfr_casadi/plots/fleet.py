@@ -1,4 +1,4 @@
-"""Figures of a fleet: where its machines lie, what their residuals look like, and how values drift."""
+"""Figures of a fleet: map of the machines, their values, their residuals, and values that drift."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
@@ -13,13 +14,13 @@ from .canvas import BLUE, FONT, GREEN, INK, PALE_BLUE, VERMILLION, choose_scale,
 
 ERRORS = 2.0  # standard errors that are drawn, about 95 %
 MOST_NAMED = 12  # machines whose names are written into a map
-ACROSS = 3  # small pictures side by side
+COLUMNS = 3  # small pictures side by side
 
 Column = tuple[str, str, np.ndarray, np.ndarray]  # name, unit, values and standard errors of the machines
 
 
 def machine_map(x: Column, y: Column, names: Sequence[str], differs: np.ndarray) -> Figure:
-    """Draw the machines by two of their values, with ellipses of two standard errors.
+    """Draw the machines over two of their values, with ellipses of two standard errors.
 
     Parameters
     ----------
@@ -28,11 +29,11 @@ def machine_map(x: Column, y: Column, names: Sequence[str], differs: np.ndarray)
     names : sequence of str
         Names of the machines.
     differs : array of bool, shape (n,)
-        Machines that are drawn in another colour, with their names.
+        Machines to draw in another colour, with their names.
     """
     figure = new_figure(7.2, 4.6)
     ax = figure.add_subplot()
-    (a, a_error, a_label), (b, b_error, b_label) = map(_scaled, (x, y))
+    (a, a_error, a_label), (b, b_error, b_label) = map(_scale_column, (x, y))
     for k in np.flatnonzero(np.isfinite(a) & np.isfinite(b)):
         colour = VERMILLION if differs[k] else BLUE
         size = [2 * ERRORS * float(np.nan_to_num(e[k])) for e in (a_error, b_error)]
@@ -47,22 +48,14 @@ def machine_map(x: Column, y: Column, names: Sequence[str], differs: np.ndarray)
 
 
 def machine_strips(columns: Sequence[Column], names: Sequence[str], differs: np.ndarray) -> Figure:
-    """Draw each value of all machines as a strip, with bars of two standard errors; arguments as for `machine_map`."""
+    """Draw each value of all machines as a strip, with bars of two standard errors; see `machine_map`."""
     figure = new_figure(7.2, 0.6 + 1.6 * max(len(columns), 1))
     rank = np.arange(len(names))
     for i, column in enumerate(columns):
         ax = figure.add_subplot(len(columns), 1, i + 1)
-        value, error, label = _scaled(column)
+        value, error, label = _scale_column(column)
         for group, colour in ((~differs, BLUE), (differs, VERMILLION)):
-            ax.errorbar(
-                rank[group],
-                value[group],
-                ERRORS * np.nan_to_num(error[group]),
-                fmt="o",
-                color=colour,
-                markersize=3,
-                elinewidth=1.0,
-            )
+            _draw_values(ax, rank[group], value[group], error[group], colour)
         for k in np.flatnonzero(differs)[:MOST_NAMED]:
             if np.isfinite(value[k]):
                 place = (rank[k], value[k])
@@ -72,7 +65,7 @@ def machine_strips(columns: Sequence[Column], names: Sequence[str], differs: np.
 
 
 def small_multiples(residuals: Sequence[Mapping[str, Any]], titles: Sequence[str]) -> Figure:
-    """Draw residuals over time, one small picture each, with the noise as a band of two deviations.
+    """Draw residuals over time, one small picture each, and the noise as a band of two standard deviations.
 
     Parameters
     ----------
@@ -81,42 +74,55 @@ def small_multiples(residuals: Sequence[Mapping[str, Any]], titles: Sequence[str
     titles : sequence of str
         Titles of the pictures.
     """
-    figure, rows, across = _small_pictures(len(residuals), 1.7)
+    figure, rows, columns = _make_grid(len(residuals), 1.7)
     largest = max((np.max(np.abs([r["low"], r["high"]])) for r in residuals), default=1.0)
     for k, (r, title) in enumerate(zip(residuals, titles, strict=True)):
-        ax = figure.add_subplot(rows, across, k + 1)
+        ax = figure.add_subplot(rows, columns, k + 1)
         t = np.linspace(0, r["seconds"], len(r["low"]))
         ax.axhspan(-2 * r["noise"], 2 * r["noise"], color=GREEN, alpha=0.25, linewidth=0)
         ax.fill_between(t, r["low"], r["high"], color=VERMILLION, linewidth=0.4)
-        finish(ax, "time [s]" if k // across == rows - 1 else "", "error" if k % across == 0 else "", title)
+        finish(ax, "time [s]" if k // columns == rows - 1 else "", "error" if k % columns == 0 else "", title)
         ax.set_ylim(-1.05 * largest, 1.05 * largest)
     return figure
 
 
 def machine_trends(trends: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw values over time, one small picture each: `title`, `times`, `values`, `errors`, `slope`, `mean`, `unit`."""
-    figure, rows, across = _small_pictures(len(trends), 1.9)
+    """Draw values over time with their trend, one small picture each.
+
+    Parameters
+    ----------
+    trends : sequence of mapping
+        `title`; `name` and `unit` of the value; `times`, `values`, `errors`; `slope`; `regular`, the range (low, high)
+        of regular machines.
+    """
+    figure, rows, columns = _make_grid(len(trends), 1.9)
     for k, r in enumerate(trends):
-        ax = figure.add_subplot(rows, across, k + 1)
+        ax = figure.add_subplot(rows, columns, k + 1)
         t, v, e = (np.asarray(r[name], dtype=float) for name in ("times", "values", "errors"))
         ax.axhspan(*r["regular"], color=PALE_BLUE, linewidth=0)
-        ax.errorbar(t, v, ERRORS * np.nan_to_num(e), fmt="o", color=BLUE, markersize=3, elinewidth=1.0)
+        _draw_values(ax, t, v, e, BLUE)
         known = np.isfinite(v) & (np.nan_to_num(e) > 0)
         weight = 1 / e[known] ** 2
         centre = [float(np.sum(weight * a[known]) / np.sum(weight)) for a in (t, v)]
         ax.plot(t, centre[1] + r["slope"] * (t - centre[0]), color=VERMILLION, linewidth=1.2)
-        finish(ax, "time" if k // across == rows - 1 else "", with_unit(r["name"], r["unit"]), r["title"])
+        finish(ax, "time" if k // columns == rows - 1 else "", with_unit(r["name"], r["unit"]), r["title"])
     return figure
 
 
-def _small_pictures(count: int, height: float) -> tuple[Figure, int, int]:
-    """Make a figure for some small pictures; return it, and the numbers of rows and columns."""
-    rows, across = max(-(-count // ACROSS), 1), min(max(count, 1), ACROSS)
-    return new_figure(7.2 / ACROSS * across, 0.4 + height * rows), rows, across
+def _draw_values(ax: Axes, x: np.ndarray, values: np.ndarray, errors: np.ndarray, colour: str) -> None:
+    """Draw values (n,) over x (n,) as points, with bars of two standard errors where these are known."""
+    bars = ERRORS * np.nan_to_num(errors)
+    ax.errorbar(x, values, bars, fmt="o", color=colour, markersize=3, elinewidth=1.0)
 
 
-def _scaled(column: Column) -> tuple[np.ndarray, np.ndarray, str]:
-    """Divide values by a power of a thousand near them; return them, their errors and the label."""
+def _make_grid(count: int, height: float) -> tuple[Figure, int, int]:
+    """Make a figure for `count` small pictures; return it with the numbers of rows and columns."""
+    rows, columns = max(-(-count // COLUMNS), 1), min(max(count, 1), COLUMNS)
+    return new_figure(7.2 / COLUMNS * columns, 0.4 + height * rows), rows, columns
+
+
+def _scale_column(column: Column) -> tuple[np.ndarray, np.ndarray, str]:
+    """Divide values by a power of a thousand of their size; return them, their errors and the label."""
     name, unit, values, errors = column
     size, unit = choose_scale(values[np.isfinite(values)], unit)
     return values / size, errors / size, with_unit(name, unit)

@@ -13,18 +13,18 @@ from ..linear import BLA, LinearPart
 from .canvas import BLUE, GREY, GRID, INK, ORANGE, VERMILLION, decibel, finish, line, new_figure, plain
 
 COLOURS = (INK, VERMILLION, ORANGE)
-POINTS = 600  # frequencies of a curve
-DECADES = 3.5  # below the Nyquist frequency that are drawn by default
-DAMPINGS = (0.1, 0.3, 0.5, 0.7, 0.9)  # damping ratios of the lines behind the poles
-MOST_NAMED = 6  # poles with their frequency and damping beside them
-MARGIN = 0.5  # of the extent of the poles, around them
-SMALLEST = 0.02  # extent of the picture
+FREQUENCIES = 600  # of a curve
+DECADES = 3.5  # range of frequencies below the Nyquist frequency without a BLA
+DAMPINGS = (0.1, 0.3, 0.5, 0.7, 0.9)  # damping ratios of the spirals behind the poles
+MOST_NAMED = 6  # poles labelled with frequency and damping
+MARGIN = 0.5  # room around the poles, over their extent
+SMALLEST_EXTENT = 0.02  # of the picture, in the z-plane
 
 
 def bode(
     parts: Mapping[str, LinearPart], bla: BLA | None = None, *, output: int = 0, input: int = 0, unit: str = ""
 ) -> Figure:
-    """Draw magnitude and phase of linear models by name, over the measured best linear approximation if it is given.
+    """Draw magnitude and phase of linear models by name, with the measured best linear approximation if it is given.
 
     `unit` is the output's unit per input unit.
     """
@@ -32,7 +32,7 @@ def bode(
     up, down = figure.subplots(2, 1, sharex=True)
     dt = next(iter(parts.values())).dt
     low = 0.5 / dt * 10.0**-DECADES if bla is None else float(bla.frequency[0])
-    frequency = np.geomspace(low, 0.5 / dt, POINTS)
+    frequency = np.geomspace(low, 0.5 / dt, FREQUENCIES)
     if bla is not None:
         g = bla.G[:, output, input]
         line(up, bla.frequency, decibel(np.abs(g) ** 2), "measured (BLA)", BLUE, linewidth=2.6, alpha=0.6)
@@ -57,20 +57,20 @@ def _phase(response: np.ndarray) -> np.ndarray:
 def pole_zero(parts: Mapping[str, LinearPart], *, output: int = 0, input: int = 0, ax: Axes | None = None) -> Axes:
     """Draw poles (crosses) and the zeros from one input to one output (circles) in the upper half of the z-plane.
 
-    The unit circle bounds stability; grey spirals are lines of equal damping ratio. Oscillating poles have their
-    frequency in Hz and their damping ratio beside them. Zeros far from the poles lie outside of the picture.
+    The unit circle is the limit of stability; grey spirals are lines of equal damping ratio. Labels give the frequency
+    in Hz and the damping ratio of oscillating poles. Zeros far from the poles may lie outside the picture.
     """
     ax = new_figure(6.2, 5.0).add_subplot() if ax is None else ax
-    turn = np.linspace(0.0, np.pi, 300)
-    ax.plot(np.cos(turn), np.sin(turn), color=GREY, linewidth=1.0)
+    angle = np.linspace(0.0, np.pi, 300)
+    ax.plot(np.cos(angle), np.sin(angle), color=GREY, linewidth=1.0)
     for damping in DAMPINGS:
-        spiral = np.exp((-damping / np.sqrt(1 - damping**2) + 1j) * turn)
+        spiral = np.exp((-damping / np.sqrt(1 - damping**2) + 1j) * angle)
         ax.plot(spiral.real, spiral.imag, color=GRID, linewidth=0.8)
     points = [1.0 + 0.0j]
     for k, ((name, part), colour) in enumerate(zip(parts.items(), COLOURS, strict=False)):
         poles, zeros = (z[z.imag >= 0] for z in (part.poles, part.zeros(output, input)))
         points += [*poles]
-        style: dict[str, Any] = {"color": colour, "markersize": 8, "markerfacecolor": "none", "clip_on": True}
+        style: dict[str, Any] = {"color": colour, "markersize": 8, "markerfacecolor": "none"}
         ax.plot(poles.real, poles.imag, "x", markeredgewidth=1.8, label=plain(name), **style)
         ax.plot(zeros.real, zeros.imag, "o", **style)
         for pole in poles[(poles.imag > 0) & (np.abs(poles) > 0)][:MOST_NAMED]:
@@ -85,7 +85,7 @@ def pole_zero(parts: Mapping[str, LinearPart], *, output: int = 0, input: int = 
                 fontsize=8.5,
             )
     x, y = np.real(points), np.imag(points)
-    extent = (1 + MARGIN) * max(np.ptp(x), np.max(y), SMALLEST)
+    extent = (1 + MARGIN) * max(np.ptp(x), np.max(y), SMALLEST_EXTENT)
     middle, height = (x.max() + x.min()) / 2, max(np.max(y) * (1 + MARGIN / 2), extent / 2)
     ax.set_xlim(middle - extent / 2, max(middle + extent / 2 - MARGIN / 4 * extent, x.max() + MARGIN / 4 * extent))
     ax.set_ylim(-0.06 * height, height)

@@ -1,6 +1,6 @@
-"""Figures of a recording beside its simulations: over time, over frequency, over an input.
+"""Figures that compare a recording with its simulations: over time, over frequency, over an input.
 
-The first part draws a fit (Krikelis et al. 2024, Fig. 9, 10 and 14), the second simulations before and after a change.
+The first part draws a fit (Krikelis et al. 2024, Fig. 9, 10 and 14), the second draws any list of simulations.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ from .canvas import (
 
 
 class PlottedFit(FittedModel, Protocol):
-    """The parts of a fit that figures show, as a `Fit` has them."""
+    """The interface of a `Fit` that figures use."""
 
     @property
     def linear(self) -> Model | None:
-        """Linear model that the search began with."""
+        """Linear model from which the search started."""
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -65,11 +65,11 @@ class PlottedFit(FittedModel, Protocol):
 
     @property
     def solution(self) -> Solution:
-        """The winning solve."""
+        """The final solve."""
 
     @property
     def candidates(self) -> Sequence[Candidate]:
-        """Every start that was tried."""
+        """The solves from all starts."""
 
     def simulate(self, recording: Recording) -> np.ndarray:
         """Simulated outputs, (M, n_y)."""
@@ -84,17 +84,17 @@ class PlottedFit(FittedModel, Protocol):
 def time(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:
     """Draw the measured output with the residuals of the linear model and of the fit over time, as Fig. 9 (left)."""
     recording = as_scored(fit, recording)
-    ax, t, y = axes_or_new(ax), recording.t, _column(recording.y, output, "output")
+    ax, t, y = axes_or_new(ax), recording.t, _select_signal(recording.y, output, "output")
     mean, span = float(np.mean(y[recording.skip :])), np.ptp(y[recording.skip :])
-    level = mean if abs(mean) > span > 0 else 0.0  # subtracted, so that swings show beside residuals
-    plain_unit = _unit(fit, recording, recording.outputs[output])
-    size, axis = scale_axis(recording.outputs[output], y - level, plain_unit)
-    what = "measured output" + (f" less its mean {level:.6g} {plain_unit}".rstrip() if level else "")
-    line(ax, t, (y - level) / size, what, BLUE, linewidth=0.9)
+    level = mean if abs(mean) > span > 0 else 0.0  # subtracted, so that swings are visible next to residuals
+    unit = _unit(fit, recording, recording.outputs[output])
+    size, axis = scale_axis(recording.outputs[output], y - level, unit)
+    measured = "measured output" + (f" less its mean {level:.6g} {unit}".rstrip() if level else "")
+    line(ax, t, (y - level) / size, measured, BLUE, linewidth=0.9)
     for label, residual, colour in _residuals(fit, recording, output):
-        drawn, note = _without_offset(mask_divergence(residual, np.ptp(y)), np.ptp(y), plain_unit)
-        line(ax, t, drawn / size, label + note, colour, linewidth=1.1)
-    return _over_time(ax, recording, axis)
+        shifted, note = _subtract_offset(mask_divergence(residual, np.ptp(y)), np.ptp(y), unit)
+        line(ax, t, shifted / size, label + note, colour, linewidth=1.1)
+    return _finish_over_time(ax, recording, axis)
 
 
 def traces(
@@ -105,29 +105,27 @@ def traces(
     between: tuple[float, float] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw measured and simulated output over a stretch of time in s, by default a few swings around the largest."""
-    ax, y = axes_or_new(ax), _column(recording.y, output, "output")
-    begin, end = between or busiest(y - np.mean(y), recording)
+    """Draw measured and simulated output `between` two times in s, by default a few swings around the largest."""
+    ax, y = axes_or_new(ax), _select_signal(recording.y, output, "output")
+    begin, end = between or find_largest_swings(y - np.mean(y), recording)
     part = slice(*np.clip(np.round(np.array([begin, end]) / recording.dt).astype(int), 0, len(y)))
     if part.stop - part.start < 2:
         raise InputError(
-            f"From {begin:g} to {end:g} s there are no two samples; the recording lasts {len(y) * recording.dt:g} s."
+            f"There are no two samples from {begin:g} to {end:g} s; give times within the {len(y) * recording.dt:g} s "
+            "of the recording."
         )
-    plain_unit = _unit(fit, recording, recording.outputs[output])
-    size, label = scale_axis(recording.outputs[output], y[part], plain_unit)
+    unit = _unit(fit, recording, recording.outputs[output])
+    size, label = scale_axis(recording.outputs[output], y[part], unit)
     line(ax, recording.t, y / size, "measured", BLUE, part=part, linewidth=3.2, alpha=0.55)
-    models = [("this model", fit.simulate(recording), INK)]
-    if compares_linear(fit):
-        models.insert(0, ("linear model", linear_simulation(fit, recording), VERMILLION))
-    for model, simulated, colour in models:
-        error, note = _without_offset(mask_divergence((simulated[:, output] - y), np.ptp(y)), np.ptp(y), plain_unit)
+    for model, simulated, colour in _simulations(fit, recording):
+        error, note = _subtract_offset(mask_divergence(simulated[:, output] - y, np.ptp(y)), np.ptp(y), unit)
         line(ax, recording.t, (y + error) / size, model + note, colour, part=part)
     ax.margins(x=0.01)
     return finish(ax, "time [s]", label, recording.name, 3)
 
 
-def busiest(y: np.ndarray, recording: Recording) -> tuple[float, float]:
-    """Find start and end, s, of about eight swings around the largest excursion; small ripple is not counted."""
+def find_largest_swings(y: np.ndarray, recording: Recording) -> tuple[float, float]:
+    """Find start and end, s, of about eight swings around the largest excursion; ignore small ripple."""
     peak = int(np.argmax(np.abs(y)))
     large = np.flatnonzero(np.abs(y) >= 0.2 * np.abs(y[peak]))
     swings = large[1:][np.diff(np.signbit(y[large]))]
@@ -138,26 +136,30 @@ def busiest(y: np.ndarray, recording: Recording) -> tuple[float, float]:
 
 
 def remains(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:
-    """Draw the residual of the fit alone over time, in its own scale."""
+    """Draw only the residual of the fit over time, in its own scale."""
     recording = as_scored(fit, recording)
-    ax, y = axes_or_new(ax), _column(recording.y, output, "output")
+    ax, y = axes_or_new(ax), _select_signal(recording.y, output, "output")
     residual = mask_divergence(fit.simulate(recording)[:, output] - y, np.ptp(y))
     size, unit = choose_scale(residual[np.isfinite(residual)], _unit(fit, recording, recording.outputs[output]))
     rms = float(np.sqrt(np.mean((residual[recording.skip :] / size) ** 2)))
     label = f"residual, this model (rms {rms:.3g} {unit}".rstrip() + ")"
     line(ax, recording.t, residual / size, label, INK, linewidth=0.8)
-    return _over_time(ax, recording, with_unit(f"simulated − measured {recording.outputs[output]}", unit))
+    return _finish_over_time(ax, recording, with_unit(f"simulated − measured {recording.outputs[output]}", unit))
 
 
 def output_over_input(
     fit: PlottedFit, recording: Recording, *, input: int = 0, output: int = 0, ax: Axes | None = None
 ) -> Axes:
-    """Draw measured and simulated output over an input, where scored: the nested loops of a quasi-static device."""
-    ax, u, y = axes_or_new(ax), _column(recording.u, input, "input"), _column(recording.y, output, "output")
+    """Draw measured and simulated output over an input: the nested loops of a quasi-static device (scored samples)."""
+    ax, u, y = (
+        axes_or_new(ax),
+        _select_signal(recording.u, input, "input"),
+        _select_signal(recording.y, output, "output"),
+    )
     name, simulated = recording.outputs[output], fit.simulate(recording)[:, output]
     u, y, simulated = (column[as_scored(fit, recording).skip :] for column in (u, y, simulated))
     size, up = scale_axis(name, y, _unit(fit, recording, name))
-    error, note = _without_offset(mask_divergence(simulated - y, np.ptp(y)), np.ptp(y), _unit(fit, recording, name))
+    error, note = _subtract_offset(mask_divergence(simulated - y, np.ptp(y)), np.ptp(y), _unit(fit, recording, name))
     ax.plot(u, y / size, color=BLUE, linewidth=3.0, alpha=0.4, label="measured", rasterized=True)
     ax.plot(u, (y + error) / size, color=INK, linewidth=0.5, label=plain(f"this model{note}"), rasterized=True)
     across = recording.inputs[input]
@@ -174,19 +176,19 @@ def spectrum(
 ) -> Axes:
     """Draw amplitude densities of output and residuals, with noise and total distortion, as Fig. 9 (right).
 
-    All lines are densities (per root hertz) of the signals as recorded, so records of any length and levels from
-    periods can be compared: a residual that lies on the noise line cannot be improved.
+    All lines are densities (per root hertz) of the recorded signals, so recordings of any length and levels from
+    periods can be compared. A residual on the noise line cannot be improved.
 
     A recording with a period is transformed period by period after its `skip`, any other in overlapping windowed
-    stretches. Levels come from `steady`: periodic steady-state recordings of the same signals under the same kind of
-    input, one for each realization; by default from `recording` itself, if it is periodic. The noise level is estimated
-    from several periods, the total distortion (noise and nonlinear distortion) from several realizations.
+    stretches. Levels come from `steady`: periodic steady-state recordings of the same signals with the same kind of
+    input, one for each realization; by default `recording` itself, if it is periodic. Several periods give the noise
+    level, several realizations the total distortion (noise and nonlinear distortion).
     """
-    y = _column(recording.y, output, "output")
+    y = _select_signal(recording.y, output, "output")
     signals = [("measured output", y, BLUE), *_residuals(fit, recording, output)]
     periodic = steady if steady is not None else [recording] if recording.period else []
     unit = _unit(fit, recording, recording.outputs[output])
-    return _draw_densities(recording, output, unit, signals, _levels(periodic, output), ax)
+    return _draw_densities(recording, output, unit, signals, _estimate_levels(periodic, output), ax)
 
 
 def _draw_densities(
@@ -214,7 +216,7 @@ def _draw_densities(
 
 
 def amplitude_density(x: np.ndarray, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies (F,) above zero, Hz, and one-sided power density (F,) of a signal (M,) of the recording."""
+    """Compute the one-sided power density of a signal (M,); return frequencies above zero, Hz, and density, (F,)."""
     x, period = x[recording.skip :], recording.period
     if not np.all(np.isfinite(x)):
         x = np.full(len(x), np.nan)
@@ -228,8 +230,8 @@ def amplitude_density(x: np.ndarray, recording: Recording) -> tuple[np.ndarray, 
     return f[1:], power[1:]
 
 
-def _levels(periodic: Sequence[Recording], output: int) -> list[tuple[str, np.ndarray, np.ndarray, str]]:
-    """List (label, frequency, power density, colour) of noise and total distortion, as in a single period."""
+def _estimate_levels(periodic: Sequence[Recording], output: int) -> list[tuple[str, np.ndarray, np.ndarray, str]]:
+    """Estimate noise and total distortion of a single period: (label, frequency, power density, colour) each."""
     if not periodic:
         return []
     try:
@@ -251,31 +253,31 @@ def _levels(periodic: Sequence[Recording], output: int) -> list[tuple[str, np.nd
 
 
 def linear_simulation(fit: PlottedFit, recording: Recording) -> np.ndarray:
-    """Simulate the linear model that the fit began with from its own initial state: outputs (M, n_y)."""
+    """Simulate the linear model from which the fit started, with its own initial state: outputs (M, n_y)."""
     if fit.linear is None:
-        raise InputError("The fit holds no linear model to compare with.")
+        raise InputError("The fit has no linear model to compare with; give the fit of a PI-LFR.")
     given = not isinstance(recording.initial, str)
     linear: PlottedFit = replace(cast(Any, fit), model=fit.linear, linear=None, initial={})
     return linear.simulate(recording.with_(initial="estimate") if given else recording)
 
 
 def as_scored(fit: PlottedFit, recording: Recording) -> Recording:
-    """Set `skip` of a recording to its first scored sample, after the samples used to estimate its initial state."""
+    """Set `skip` of a recording to its first scored sample, after those that estimate its initial state."""
     try:
         return recording.with_(skip=fit.scored_from(recording))
-    except InputError:  # the recording is too short to leave a scored sample
+    except InputError:  # the recording is too short to score any sample
         return recording
 
 
-def _over_time(ax: Axes, recording: Recording, label: str) -> Axes:
-    """Finish a picture over time; samples that are not scored are grey."""
+def _finish_over_time(ax: Axes, recording: Recording, label: str) -> Axes:
+    """Finish a figure over time, with a grey area over samples that are not scored."""
     if recording.skip:
         ax.axvspan(0, recording.skip * recording.dt, color=PALE_GREY, label="not scored")
     ax.margins(x=0.01)
     return finish(ax, "time [s]", label, recording.name)
 
 
-def _without_offset(error: np.ndarray, span: float, unit: str) -> tuple[np.ndarray, str]:
+def _subtract_offset(error: np.ndarray, span: float, unit: str) -> tuple[np.ndarray, str]:
     """Subtract the offset of an error (M,) if it exceeds the measured span and dominates the error; return a note."""
     known = error[np.isfinite(error)]
     if not known.size or abs(np.mean(known)) <= span or np.ptp(known) > 3 * span or not span:
@@ -284,11 +286,11 @@ def _without_offset(error: np.ndarray, span: float, unit: str) -> tuple[np.ndarr
 
 
 def compares_linear(fit: PlottedFit) -> bool:
-    """Tell whether there is a linear model to compare with."""
+    """Tell whether the fit has a linear model to compare with."""
     return fit.linear is not None and fit.model.n_w > 0
 
 
-def _column(values: np.ndarray, index: int, role: str) -> np.ndarray:
+def _select_signal(values: np.ndarray, index: int, role: str) -> np.ndarray:
     """Return one of the recording's inputs or outputs, (M,)."""
     if not 0 <= index < values.shape[1]:
         raise InputError(f"The {role} {index} was given; the recording has {values.shape[1]}, counted from 0.")
@@ -296,20 +298,24 @@ def _column(values: np.ndarray, index: int, role: str) -> np.ndarray:
 
 
 def _residuals(fit: PlottedFit, recording: Recording, output: int) -> list[tuple[str, np.ndarray, str]]:
-    """List (label, residual, colour) of the linear model, where the fit has one, and of the fit."""
-    out = [(*_labelled_residual("this model", recording, fit.simulate(recording), output), INK)]
-    if compares_linear(fit):
-        out.insert(0, (*_labelled_residual("linear", recording, linear_simulation(fit, recording), output), VERMILLION))
+    """List (label with relative error, residual, colour) of the linear model, if the fit has one, and the fit."""
+    y, out = recording.y[:, output], []
+    for model, simulated, colour in _simulations(fit, recording):
+        y_hat = simulated[:, output]
+        try:
+            error = f" {100 * nrmse(y, y_hat, recording.skip):.3g} %"
+        except InputError:  # a constant output has no relative error
+            error = ""
+        out.append((f"residual, {model}{error}", y_hat - y, colour))
     return out
 
 
-def _labelled_residual(model: str, recording: Recording, simulated: np.ndarray, output: int) -> tuple[str, np.ndarray]:
-    y, y_hat = recording.y[:, output], simulated[:, output]
-    try:
-        share = f" {100 * nrmse(y, y_hat, recording.skip):.3g} %"
-    except InputError:  # a constant output has no relative error
-        share = ""
-    return f"residual, {model}{share}", y_hat - y
+def _simulations(fit: PlottedFit, recording: Recording) -> list[tuple[str, np.ndarray, str]]:
+    """List (label, outputs, colour) of the linear model, if the fit has one, and of the fit."""
+    out = [("this model", fit.simulate(recording), INK)]
+    if compares_linear(fit):
+        out.insert(0, ("linear model", linear_simulation(fit, recording), VERMILLION))
+    return out
 
 
 def _unit(fit: PlottedFit, recording: Recording, name: str) -> str:
@@ -325,7 +331,7 @@ def plot_recording(r: Recording) -> Figure:
         unit, colour = r.units.get(name, ""), INK if k < r.n_u else BLUE
         size, up = scale_axis(name, x, unit)
         line(left, r.t, x / size, "input" if k < r.n_u else "output", colour, linewidth=0.9)
-        _over_time(left, r.with_(name="" if k else r.name), up)
+        _finish_over_time(left, r.with_(name="" if k else r.name), up)
         f, power = amplitude_density(x, r)
         curve = decibel(power)
         line(right, f, curve, "", colour, linewidth=0.9)
@@ -335,19 +341,19 @@ def plot_recording(r: Recording) -> Figure:
     return figure
 
 
-Simulated = list[tuple[str, np.ndarray | None]]  # (label, outputs (M, n_y)), before first, after last
-SIMULATED_COLOURS = (ORANGE, INK, VERMILLION, PURPLE, SKY)  # further simulations begin again
+Simulated = list[tuple[str, np.ndarray | None]]  # (label, outputs (M, n_y)); None if the simulation diverges
+SIMULATED_COLOURS = (ORANGE, INK, VERMILLION, PURPLE, SKY)  # repeated for further simulations
 
 
-def coloured(simulated: Sequence[tuple[str, np.ndarray | None]]) -> Iterator[tuple[str, np.ndarray, str]]:
-    """Yield label, outputs and colour of the simulations that there are."""
+def assign_colours(simulated: Sequence[tuple[str, np.ndarray | None]]) -> Iterator[tuple[str, np.ndarray, str]]:
+    """Yield label, outputs and colour of each simulation that does not diverge."""
     for (label, values), colour in zip(simulated, cycle(SIMULATED_COLOURS), strict=False):
         if values is not None:
             yield label, values, colour
 
 
 def plot_comparison(r: Recording, simulated: Simulated, noise: np.ndarray | None = None) -> Any:
-    """Draw a recording beside simulations: a row per output, the largest swing on the left, all residuals on the right.
+    """Draw a recording and simulations: a row per output, the largest swings on the left, residuals on the right.
 
     `noise` holds the standard deviation of each output's noise, shape (n_y,).
     """
@@ -364,24 +370,24 @@ def plot_comparison(r: Recording, simulated: Simulated, noise: np.ndarray | None
 def compared_traces(
     r: Recording, simulated: Simulated, output: int = 0, unit: str = "", *, quiet: bool = False, ax: Axes | None = None
 ) -> Axes:
-    """Draw measured output and simulations: a few swings around the largest one, or a `quiet` stretch."""
+    """Draw measured output and simulations: a few swings around the largest, or a `quiet` stretch."""
     ax = axes_or_new(ax)
     y = r.y[:, output]
-    begin, end = busiest(y - np.mean(y), r)
+    begin, end = find_largest_swings(y - np.mean(y), r)
     first = round(begin / r.dt)
     part = slice(first, max(round(end / r.dt), first + 2))
-    part = _quiet(y, part.stop - part.start, r.skip) if quiet else part
+    part = _find_quiet_stretch(y, part.stop - part.start, r.skip) if quiet else part
     size, up = scale_axis(r.outputs[output], y[part], unit)
     line(ax, r.t, y / size, "measured", BLUE, part=part, linewidth=4.0, alpha=0.45)
-    for label, values, colour in coloured(simulated):
-        drawn = mask_divergence(values[:, output], np.ptp(y)) / size
-        line(ax, r.t, drawn, label, colour, part=part, linewidth=1.4)
+    for label, values, colour in assign_colours(simulated):
+        y_hat = mask_divergence(values[:, output], np.ptp(y))
+        line(ax, r.t, y_hat / size, label, colour, part=part, linewidth=1.4)
     ax.margins(x=0.01)
     return finish(ax, "time [s]", up, r.name, 3)
 
 
-def _quiet(y: np.ndarray, length: int, skip: int) -> slice:
-    """Select a stretch with less motion than three quarters of all stretches."""
+def _find_quiet_stretch(y: np.ndarray, length: int, skip: int) -> slice:
+    """Find a stretch with less motion than three quarters of all stretches."""
     length = min(length, max((len(y) - skip) // 6, 2))
     starts = np.arange(skip, len(y) - length + 1, max(length // 4, 1))
     motion = np.array([np.std(y[a : a + length]) for a in starts])
@@ -392,12 +398,13 @@ def _quiet(y: np.ndarray, length: int, skip: int) -> slice:
 def compared_residuals(
     r: Recording, simulated: Simulated, output: int, unit: str, floor: float, ax: Axes | None = None
 ) -> Axes:
-    """Draw the residuals of simulations over the whole recording; `floor` is the deviation of the noise."""
+    """Draw the residuals of simulations over the whole recording; `floor` is the noise's standard deviation."""
     ax = axes_or_new(ax)
     y = r.y[:, output]
-    kept = [(label, mask_divergence(v[:, output] - y, np.ptp(y)), c) for label, v, c in coloured(simulated)]
-    size, up = scale_axis(f"simulated − measured {r.outputs[output]}", np.nan_to_num(kept[0][1]) if kept else y, unit)
-    for label, e, colour in kept:
+    errors = [(label, mask_divergence(v[:, output] - y, np.ptp(y)), c) for label, v, c in assign_colours(simulated)]
+    scaled = np.nan_to_num(errors[0][1]) if errors else y
+    size, up = scale_axis(f"simulated − measured {r.outputs[output]}", scaled, unit)
+    for label, e, colour in errors:
         line(ax, r.t, e / size, label, colour, linewidth=0.8)
     noise_band(ax, 2 * floor / size, "± 2 noise")
     ax.margins(x=0.01)
@@ -405,10 +412,10 @@ def compared_residuals(
 
 
 def compared_spectra(r: Recording, simulated: Simulated, output: int, unit: str, floor: float) -> Axes:
-    """Draw amplitude densities of the output, of each residual, and of white noise of deviation `floor`."""
+    """Draw amplitude densities of the output, of each residual, and of white noise of standard deviation `floor`."""
     y = r.y[:, output]
     signals = [("measured", y, BLUE)]
-    signals += [(f"left {label}", v[:, output] - y, colour) for label, v, colour in coloured(simulated)]
+    signals += [(f"left {label}", v[:, output] - y, colour) for label, v, colour in assign_colours(simulated)]
     ends = amplitude_density(y, r)[0][[0, -1]]
     white = [("noise floor (white)", ends, np.full(2, 2 * r.dt * floor**2), GREEN)] if floor > 0 else []
     return _draw_densities(r, output, unit, signals, white, None)

@@ -1,7 +1,7 @@
 """Figures of many recordings or fits: best linear approximation, loops, spread of errors; tests of residuals.
 
-Krikelis et al. (2024), Fig. 7 (loops), 8 and 13 (best linear approximation), 11 (spread over starts). The theory of
-residual tests stands in `data.correlation`.
+Krikelis et al. (2024), Fig. 7 (loops), 8 and 13 (best linear approximation), 11 (spread over starts). For the theory of
+residual tests see `data.correlation`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from .._base import InputError
 from ..data import BAND, Recording, chance, correlation
-from ..linear import BLA, resolvent
+from ..linear import BLA, LinearPart
 from ..models import Model
 from .canvas import (
     BLUE,
@@ -23,7 +23,7 @@ from .canvas import (
     FONT,
     GREEN,
     INK,
-    LOOPS,
+    LOOP_COLOURS,
     MOST_POINTS,
     ORANGE,
     PALE_GREY,
@@ -38,11 +38,11 @@ from .canvas import (
     noise_line,
     plain,
 )
-from .signals import Simulated, coloured
+from .signals import Simulated, assign_colours
 
-SHARE = 8  # of the scored samples: the largest lag that they can show
-LAGS = 100  # largest lag by default, in samples
-FEWEST = 32  # scored samples, for a band that means something
+LAG_SHARE = 8  # scored samples over the largest lag by default
+DEFAULT_LAGS = 100  # largest lag by default, samples
+FEWEST_SAMPLES = 32  # scored samples below which the band means nothing
 
 
 def best_linear_approximation(
@@ -51,8 +51,8 @@ def best_linear_approximation(
     """Draw magnitudes of the BLA and a model, their difference, and the estimate's deviations, as Fig. 8.
 
     `model` is linear (a `Model` without an element, or a `control.StateSpace`), or a response at `bla.frequency`,
-    (F, n_y, n_u). The deviations hold for the mean over realizations: a model whose error equals the total deviation is
-    as good as the data can show. `unit` is the output's unit per input unit.
+    (F, n_y, n_u). The deviations are those of the mean over realizations: the data cannot distinguish a model from the
+    true system if its error is below the total deviation. `unit` is the output's unit per input unit.
     """
     ax = axes_or_new(ax)
     f, G = bla.frequency, bla.G[:, output, input]
@@ -76,11 +76,11 @@ def best_linear_approximation(
 
 
 def frequency_response(model: Any, frequency: np.ndarray, dt: float) -> np.ndarray:
-    """Return the response `C (e^{jω dt} I - A)⁻¹ B + D` of a discrete-time linear model, (F, n_y, n_u), at (F,) Hz."""
+    """Compute the response `C (e^{jω dt} I - A)⁻¹ B + D` of a discrete-time linear model, (F, n_y, n_u), at (F,) Hz."""
     if isinstance(model, Model):
         names = ("A", "B_u", "C_y", "D_yu")
         if model.element is not None or not set(names) <= set(model.parameters):
-            raise InputError("A frequency response needs a linear model; give one without an element.")
+            raise InputError("The model is not linear; give a linear model, without an element.")
         a, b, c, d = (model.parameters[name].value for name in names)
     elif all(hasattr(model, name) for name in "ABCD"):
         a, b, c, d = (np.asarray(getattr(model, name), dtype=float) for name in "ABCD")
@@ -89,13 +89,13 @@ def frequency_response(model: Any, frequency: np.ndarray, dt: float) -> np.ndarr
         if response.ndim != 3 or len(response) != len(frequency):
             raise InputError(f"A response of shape {response.shape} was given; expected ({len(frequency)}, n_y, n_u).")
         return response
-    return resolvent(a, c, np.exp(2j * np.pi * np.asarray(frequency) * dt)) @ b + d
+    return LinearPart(a, b, c, d, dt).response(frequency)
 
 
 def loops(
     curves: Mapping[str, tuple[np.ndarray, np.ndarray]], x: str, y: str, *, title: str = "", ax: Axes | None = None
 ) -> Axes:
-    """Draw loops of one signal over another, for example at several frequencies, dark to light, as Fig. 7.
+    """Draw loops of one signal over another, for example at several frequencies, from dark to light, as Fig. 7.
 
     `curves` maps labels to (x, y), each (M,); `x` and `y` are axis labels with units.
     """
@@ -103,7 +103,7 @@ def loops(
 
     ax = axes_or_new(ax)
     for k, (label, (horizontal, vertical)) in enumerate(curves.items()):
-        colour = colormaps[LOOPS](0.88 * k / max(len(curves) - 1, 1))
+        colour = colormaps[LOOP_COLOURS](0.88 * k / max(len(curves) - 1, 1))
         dense = len(horizontal) > MOST_POINTS
         ax.plot(horizontal, vertical, color=colour, linewidth=1.3, label=plain(label), rasterized=dense)
     return finish(ax, x, y, title, 3)
@@ -122,8 +122,9 @@ def spread(
 ) -> Axes:
     """Draw box plots of the errors of many fits, as Fig. 11: median, quartiles, whiskers to 1.5 box heights, crosses.
 
-    `errors` maps the label of a group to its errors; infinite errors (no model, or a diverging one) are counted, not
-    drawn. `published` has a reference value by group, drawn as a diamond and called `source`; `floor` is a line.
+    `errors` maps the label of a group to its errors; the number of infinite errors (no model, or a diverging one) is
+    written above the box. `published` maps a group to a reference value, drawn as a diamond with the label `source`.
+    `floor` is the noise level, drawn as a line.
     """
     ax = axes_or_new(ax)
     groups = [np.asarray(e, dtype=float).ravel() for e in errors.values()]
@@ -147,22 +148,22 @@ def spread(
     noise_line(ax, floor or 0.0)
     ax.set_yscale("log")
     ax.set_xticks(range(len(groups)), [plain(name) for name in errors])
-    if _crowded(errors):
+    if _labels_overlap(errors):
         ax.set_xticks(range(len(groups)), [plain(", ".join(name.split("\n"))) for name in errors], rotation=90)
-    lost = {k: len(group) - len(drawn) for k, (group, drawn) in enumerate(zip(groups, finite, strict=True))}
-    if any(lost.values()):  # room above the boxes
+    failed = {k: len(group) - len(drawn) for k, (group, drawn) in enumerate(zip(groups, finite, strict=True))}
+    if any(failed.values()):  # leave room above the boxes
         low, high = ax.get_ylim()
-        most = max([*(float(np.max(g)) for g in finite if len(g)), *(published or {}).values(), low])
-        ax.set_ylim(low, max(high, most * (most / low) ** 0.16))
-    for k, n in lost.items():
+        top = max([*(float(np.max(g)) for g in finite if len(g)), *(published or {}).values(), low])
+        ax.set_ylim(low, max(high, top * (top / low) ** 0.16))
+    for k, n in failed.items():
         if n:
             at_top = ("data", "axes fraction")
             ax.annotate(f"{n}\nfailed", (k, 0.99), xycoords=at_top, ha="center", va="top", fontsize=9)
     return finish(ax, x, y, title, 3)
 
 
-def _crowded(labels: Iterable[str]) -> bool:
-    """Tell whether labels side by side, half an inch each, would overlap."""
+def _labels_overlap(labels: Iterable[str]) -> bool:
+    """Tell whether adjacent labels, half an inch each, would overlap."""
     longest = [max(map(len, label.split("\n"))) for label in labels]
     return len(longest) > 3 and max(longest, default=0) > 6
 
@@ -176,9 +177,9 @@ def compared_spread(
     x: str = "",
     y: str = "NRMSE",
 ) -> Figure:
-    """Draw box plots of several data sets on one scale, one `spread` each; keys are titles, then groups."""
+    """Draw one `spread` for each data set on a common scale; `sets` maps titles to groups of errors."""
     widest = max((len(groups) for groups in sets.values()), default=0)
-    upright = max((len(label) for groups in sets.values() if _crowded(groups) for label in groups), default=0)
+    upright = max((len(label) for groups in sets.values() if _labels_overlap(groups) for label in groups), default=0)
     figure = new_figure(max(3.6, 0.5 * widest) * max(len(sets), 1) + 0.6, 4.0 + 0.08 * upright)
     first: Axes | None = None
     for k, (title, errors) in enumerate(sets.items()):
@@ -198,30 +199,31 @@ def compared_spread(
 def residual_tests(recording: Recording, simulated: Simulated, *, lags: int | None = None) -> Figure:
     """Draw correlations of residuals: with themselves, with every input, and with every input's square.
 
-    Values beyond the grey band are chance in 1 of 100 cases. Correlation with an input at positive lags is dynamics
-    that the model lacks; at negative lags, feedback from the output to the input. Correlation with the square is a
-    nonlinearity that it lacks. A free-run residual may be correlated with itself: it holds the coloured noise. To pass
-    is no proof: a missing odd law, such as friction, may show in neither; `diagnose` has sharper tests.
+    By chance, 1 of 100 values lies beyond the grey band. Correlation with an input at positive lags shows dynamics that
+    the model lacks, at negative lags feedback from the output to the input. Correlation with the square shows a missing
+    nonlinearity. A free-run residual may be correlated with itself, because it contains the coloured noise. A model
+    that passes may still lack an odd law, such as friction; `diagnose` has sharper tests.
 
     Parameters
     ----------
     recording : Recording
         Samples before its `skip` are left out.
     simulated : list of (label, outputs)
-        Outputs (M, n_y); simulations that diverge are not drawn.
+        Outputs (M, n_y); diverging simulations are not drawn.
     lags : int, optional
         Largest lag in samples; 100 by default, or an eighth of the samples.
 
     Raises
     ------
     InputError
-        If the recording has too few scored samples for the lags.
+        If the recording has too few scored samples.
     """
     r, first = recording, recording.skip
-    most = LAGS if lags is None else lags
-    most = min(most, (len(r) - first) // SHARE) if lags is None else most
-    if len(r) - first < FEWEST:
-        raise InputError(f"{r.label} has {len(r) - first} scored samples; residual tests need at least {FEWEST}.")
+    most = min(DEFAULT_LAGS, (len(r) - first) // LAG_SHARE) if lags is None else lags
+    if len(r) - first < FEWEST_SAMPLES:
+        raise InputError(
+            f"{r.label} has {len(r) - first} scored samples; residual tests need at least {FEWEST_SAMPLES}."
+        )
     figure = new_figure(11.0, 3.0 * r.n_y)
     axes = figure.subplots(r.n_y, 1 + 2 * r.n_u, squeeze=False)
     u = [(name, x[first:]) for name, x in zip(r.inputs, r.u.T, strict=True)]
@@ -231,7 +233,7 @@ def residual_tests(recording: Recording, simulated: Simulated, *, lags: int | No
         for ax in row:
             ax.axhspan(-BAND, BAND, color=PALE_GREY, linewidth=0)
             ax.axhline(0.0, color=INK, linewidth=0.6)
-        for label, y, colour in coloured(drawn):
+        for label, y, colour in assign_colours(drawn):
             e = y[first:, i] - r.y[first:, i]
             _draw_correlation(row[0], correlation(e, e, most)[most + 1 :] * np.sqrt(len(e)), 1, label, colour)
             for ax, (_, x) in zip(row[1:], tested, strict=True):
@@ -244,6 +246,6 @@ def residual_tests(recording: Recording, simulated: Simulated, *, lags: int | No
 
 
 def _draw_correlation(ax: Axes, values: np.ndarray, first: int, label: str, colour: str) -> None:
-    """Draw correlations in standard deviations over lags; the label says the share beyond the band."""
+    """Draw correlations in standard deviations over lags; the label gives the share beyond the band."""
     beyond = float(np.mean(np.abs(values) > BAND))
     line(ax, first + np.arange(len(values)), values, f"{label}: {100 * beyond:.0f} % beyond", colour)

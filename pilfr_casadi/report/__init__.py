@@ -1,8 +1,8 @@
 """Self-contained HTML pages of fits, diagnoses and anything else.
 
-`page.py` holds the general page and its blocks, `fit.py` and `diagnosis.py` fill it; `diagnosis_tables.py` measures how
-a law acts; `cards.py` holds the short pieces that a notebook shows. The look of every page (colours, fonts, layout)
-stands in `templates/report.css`, its structure in `templates/page.html` and `templates/blocks.html`;
+`page.py` holds the general page and its blocks. `fit.py`, `diagnosis.py` and `fleet.py` fill it, with the sections and
+tables in `fit_sections.py` and `diagnosis_tables.py`. `cards.py` makes the short summaries for notebooks.
+`templates/report.css` sets colours, fonts and layout, `templates/page.html` and `templates/blocks.html` the structure;
 `templates/explore.js` turns pictures into charts.
 """
 

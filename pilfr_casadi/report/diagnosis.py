@@ -29,7 +29,7 @@ from ..plots import Signal
 from ..simulators import ACTUATOR, MECHANICAL, PARAMETER, SENSOR, Port, kind_of, name_at, split_port
 from . import diagnosis_tables as tables
 from .diagnosis_tables import Action, element_of, measure_action
-from .page import Block, Code, Page, Picture, Section, Table, Text, numbered
+from .page import Block, Code, Page, Picture, Section, Table, Text, label_recording
 
 MOST_DRAWN = 3  # outputs and recordings that are drawn; the tables have all of them
 
@@ -37,7 +37,7 @@ MOST_DRAWN = 3  # outputs and recordings that are drawn; the tables have all of 
 def diagnosis_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Path:
     """Write `report.html`, `diagnosis.json` and `figures/*.png` of a diagnosis into a folder; return the page's path.
 
-    Each file is written atomically, the page last. Figures of an earlier diagnosis are removed.
+    Each file is written atomically, the page last. Figures of an earlier diagnosis are deleted.
     """
     page = diagnosis_page(diagnosis)
     html, figures = page.html(), _figures(page)
@@ -55,17 +55,17 @@ def diagnosis_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pa
 
 def _figures(page: Page) -> dict[str, bytes]:
     """Draw the pictures of a page; return PNG files by name."""
+    pictures = [block for section in page.sections for block in section.blocks if isinstance(block, Picture)]
     files: dict[str, bytes] = {}
-    for block in (block for section in page.sections for block in section.blocks):
-        if isinstance(block, Picture):
-            short = "".join(c if c.isascii() and c.isalnum() else "-" for c in block.alt.lower())[:50].strip("-")
-            files[f"diagnosis-{len(files) + 1:02d}-{short}.png"] = block.png
+    for k, picture in enumerate(pictures, 1):
+        short = "".join(c if c.isascii() and c.isalnum() else "-" for c in picture.alt.lower())[:50].strip("-")
+        files[f"diagnosis-{k:02d}-{short}.png"] = picture.png
     return files
 
 
 @dataclass(frozen=True, eq=False)
 class _Case:
-    """A diagnosis with the data that its pictures need."""
+    """A diagnosis with the data for its pictures."""
 
     diagnosis: Diagnosis
     bench: Workbench
@@ -76,14 +76,13 @@ class _Case:
     @classmethod
     def of(cls, d: Diagnosis) -> _Case:
         search = d.evidence.get("search")
-        # of long recordings, the searched stretches
-        recordings = d.train if search is None else search.bench.recordings
+        recordings = d.train if search is None else search.bench.recordings  # stretches of long recordings
         bench = Workbench.of(d.refitted, recordings, d.hold)
         noise = np.asarray(d.evidence.get("noise", float(d.floor["nrmse"]) * bench.scale))
         return cls(d, bench, d.evidence["without"], d.evidence["after"], np.nan_to_num(noise))
 
     def unit(self, name: str) -> str:
-        """Unit of an input or output; empty where it is unknown."""
+        """Return the unit of an input or output; empty if it is unknown."""
         known = self.bench.recordings[0].units
         return known.get(name, self.diagnosis.refitted.units.get(name, ""))
 
@@ -91,21 +90,19 @@ class _Case:
 def diagnosis_page(diagnosis: Diagnosis) -> Page:
     """Fill the page of a diagnosis; see `diagnosis_report`."""
     case, d = _Case.of(diagnosis), diagnosis
-    actions, checks = (
-        [measure_action(case.bench, case.after, e, element_of(case.after, e)) for e in d.effects],
-        tables.check_table(d),
-    )
-    notes = Section("What the recordings' checks found", [checks] if checks else [])
+    actions = [measure_action(case.bench, case.after, e, element_of(case.after, e)) for e in d.effects]
+    checks = tables.check_table(d)
+    check_section = Section("What the recordings' checks found", [checks] if checks else [])
     faulty = d.verdict == "recording-fault"
     sections = [
-        *([notes] if faulty else []),
+        *([check_section] if faulty else []),
         Section(_result_title(d), _result(d, actions)),
         Section("Where the simulator is off", _mismatch(case)),
         Section("The hidden force", _hidden_forces(case)),
         Section("Candidates", _candidates(d)),
         Section("The simulator's parameters", [tables.parameter_table(d)] if d.parameters else []),
         Section("The proof" if d.test else "Measured and simulated", _proof(case)),
-        *([] if faulty else [notes]),
+        *([] if faulty else [check_section]),
         Section("The next experiment", _next_experiment(d)),
         Section(_usage_title(d), _usage(d)),
     ]
@@ -168,7 +165,7 @@ def _mismatch(case: _Case) -> list[Block]:
             f"Error of the refitted simulator, without any law added, over frequency and the amplitude of {outputs}.",
             "Map of the error over frequency and amplitude.",
         ),
-        (plots.mismatch_bands(found), "The error by frequency band, beside the noise.", "Error by frequency band."),
+        (plots.mismatch_bands(found), "The error and the noise by frequency band.", "Error by frequency band."),
         (
             plots.mismatch_growth(found, unit),
             "The error over the amplitude. The refit has bent the parameters to hide as much as possible: this shows "
@@ -176,7 +173,7 @@ def _mismatch(case: _Case) -> list[Block]:
             "Error over amplitude.",
         ),
         (plots.mismatch_growth(found, unit, kind="rate"), "The error over the speed.", "Error over speed."),
-        (plots.mismatch_time(found), "The error over time, beside the motion of the output.", "Error over time."),
+        (plots.mismatch_time(found), "The error and the motion of the output over time.", "Error over time."),
         (
             plots.mismatch_level(found, case.unit(found["level"]["output"])),
             f"The error over the value of {found['level']['output']}.",
@@ -187,7 +184,7 @@ def _mismatch(case: _Case) -> list[Block]:
 
 
 def _hidden_forces(case: _Case) -> list[Block]:
-    """Draw the forces of the named effects; without a name, beside the nearest law and at the freest port."""
+    """Draw the forces of the named effects; without a name, with the nearest law and at the most likely port."""
     d, out = case.diagnosis, [block for learned in case.diagnosis.learned for block in _learned_force(case, learned)]
     for e in d.effects:
         if (number := element_of(case.after, e)) is not None:
@@ -196,25 +193,26 @@ def _hidden_forces(case: _Case) -> list[Block]:
             out += _strength_pictures(case, number)
     if d.verdict != "unexplained":
         return out
-    search, rows = d.evidence.get("search"), tables.candidates_by_pass(d)
+    search, passes = d.evidence.get("search"), tables.candidates_by_pass(d)
     nearest = max(search.steps[0].trials, key=search.evidence) if search is not None and search.steps else None
     if nearest is not None:
         fitted, port = nearest.fitted, nearest.port
         number, name = len(fitted.simulator.elements) - 1, f"{display_name(nearest.law.id)} (the nearest law)"
         out += _force_blocks(case, fitted, port, number, name)
-    elif rows:
-        out += _force_blocks(case, case.before, rows[0][0]["port"], None, "")
+    elif passes:
+        candidates, _ = passes[0]
+        out += _force_blocks(case, case.before, candidates[0]["port"], None, "")
     table = tables.flexible_table(d)
     if table is not None:
         out.append(table)
-        freest = str(table.rows[0][0])
-        if nearest is None or freest != nearest.port:
-            out += _force_blocks(case, case.before, freest, None, "")
+        port = str(table.rows[0][0])
+        if nearest is None or port != nearest.port:
+            out += _force_blocks(case, case.before, port, None, "")
     return out
 
 
 def _learned_force(case: _Case, learned: Learned) -> list[Block]:
-    """Draw a learned force over the local coordinate and its rate, with the nearest named laws."""
+    """Draw a learned force over the local coordinate and its rate, with the named laws nearest to it."""
     port = case.bench.simulator.port(learned.port)
     force = Signal("learned force w", learned.force, port.unit)
     laws = [(f"{display_name(n.law)}, off by {100 * n.error:.2g} %", n.force) for n in learned.nearest]
@@ -222,23 +220,17 @@ def _learned_force(case: _Case, learned: Learned) -> list[Block]:
         f"The blue points are the learned force at {learned.port} along the training recordings. The lines are the "
         "named laws that come nearest to it, drawn along the stretch where it is strongest."
     )
-    coordinate, rate = _local_signals(port, learned.z, learned.dz)
-    drawn = [(coordinate, "its local coordinate"), *([(rate, "its rate")] if rate else [])]
-    return [
-        Text(text),
-        *(
-            Picture(
-                plots.learned_force(x, force, laws, title=learned.port),
-                f"The learned force at {learned.port} over {name}, with the nearest laws.",
-                f"Learned force at {learned.port} over {name}.",
-            )
-            for x, name in drawn
-        ),
-    ]
+    out: list[Block] = [Text(text)]
+    for x, name in zip(_local_signals(port, learned.z, learned.dz), ("its local coordinate", "its rate"), strict=True):
+        if x is not None:
+            figure = plots.learned_force(x, force, laws, title=learned.port)
+            caption = f"The learned force at {learned.port} over {name}, with the nearest laws."
+            out.append(Picture(figure, caption, f"Learned force at {learned.port} over {name}."))
+    return out
 
 
 def _local_signals(port: Port, z: np.ndarray, dz: np.ndarray) -> tuple[Signal, Signal | None]:
-    """Label a port's local coordinate and its rate; no rate where it is zero throughout."""
+    """Label a port's local coordinate and its rate; the rate is None if it is zero throughout."""
     if port.is_speed and port.domain == MECHANICAL:
         return Signal("speed", z, port.across_unit), None
     channel = split_port(port.name)[1]
@@ -248,26 +240,26 @@ def _local_signals(port: Port, z: np.ndarray, dz: np.ndarray) -> tuple[Signal, S
 
 
 def _force_blocks(case: _Case, fitted: Fitted, port: str, number: int | None, name: str) -> list[Block]:
-    """Recover the force in a port along the loudest recording and draw it; `name` is the law's, empty without a law."""
+    """Recover the force in a port along the recording with the most energy, and draw it with the law called `name`."""
     bench, records = case.bench, case.bench.recordings
-    loud = int(np.argmax([np.std(r.y[r.skip :] / bench.scale) * np.sqrt(len(r)) for r in records]))
+    strongest = int(np.argmax([np.std(r.y[r.skip :] / bench.scale) * np.sqrt(len(r)) for r in records]))
     try:
-        hidden = hidden_force(bench, fitted, port, number, case.noise, loud)
+        hidden = hidden_force(bench, fitted, port, number, case.noise, strongest)
     except (InputError, np.linalg.LinAlgError, RuntimeError):
         hidden = None
     if hidden is None:
         return [Text(f"The outputs do not show the force at {port}, so it cannot be recovered.")]
-    recording = hidden.recording or (f"training recording {loud + 1}" if len(records) > 1 else "the recording")
-    how = (
+    recording = hidden.recording or (f"training recording {strongest + 1}" if len(records) > 1 else "the recording")
+    text = (
         f"The blue points are the force at {port} that makes the simulator follow {recording}. A smoother computed "
         "it with the fitted parameters, assuming only that the force changes in random steps; it uses no law."
     )
-    how += f" The orange line is the fitted {name} along the simulation." if name else ""
-    return [Text(how), *_force_pictures(hidden, bench.simulator.port(port), name)]
+    text += f" The orange line is the fitted {name} along the simulation." if name else ""
+    return [Text(text), *_force_pictures(hidden, bench.simulator.port(port), name)]
 
 
 def _force_pictures(h: HiddenForce, port: Port, name: str) -> list[Block]:
-    """Draw a force over its local coordinate, rate and time, and the rest after subtracting the law."""
+    """Draw a force over its local coordinate, rate and time, and the remainder after subtracting the law."""
     label = {ACTUATOR: "added to the input", SENSOR: "added to the output"}.get(kind_of(h.port), "force w")
     (x, rate), force = _local_signals(port, h.z, h.dz), Signal(label, h.force, port.unit)
     alt, cloud = f"Recovered force at {h.port}", functools.partial(plots.force_cloud, title=h.port, name=name)
@@ -281,44 +273,47 @@ def _force_pictures(h: HiddenForce, port: Port, name: str) -> list[Block]:
     caption = "The same force over time, around its largest value. The band is the uncertainty due to noise."
     drawn.append((plots.force_time(h.t, force, h.std, h.law, name), caption, f"{alt} over time."))
     if len(h.law):
-        left = plots.force_remainder(x, Signal("recovered − law", h.force - h.law_held, port.unit), h.std)
+        remainder = plots.force_remainder(x, Signal("recovered − law", h.force - h.law_held, port.unit), h.std)
         caption = "The recovered force minus the law. Where the mean bends away from zero, the law's form is wrong."
-        drawn.append((left, caption, f"{alt} without the law."))
+        drawn.append((remainder, caption, f"{alt} without the law."))
     return [Picture(*picture) for picture in drawn]
 
 
 def _strength_pictures(case: _Case, number: int) -> list[Block]:
-    """Draw the strength of an element over the signal that varies it; nothing if none does."""
+    """Draw the strength of an element over the signal that varies it; empty if the strength is constant."""
     element = case.after.simulator.elements[number]
     law, by = element.law, element.law.scheduled_by
     if not by:
         return []
     port, values = case.bench.simulator.port(element.port), element.own(case.after.values)
-    known = {"t": ("time", "s")} | ({} if port.series else {"z": ("local coordinate z", port.across_unit)})
-    of_signals = case.bench.simulator.signal_units(element.port, case.bench.recordings[0].units)
+    units = case.bench.simulator.signal_units(element.port, case.bench.recordings[0].units)
     grid = np.linspace(values["low"], values["high"], 200)
-    called, across = known.get(by, (by, of_signals.get(by, "")))
-    signal = Signal(called, grid, across)
+    signal = Signal(by, grid, units.get(by, ""))
+    if by == "t":
+        signal = Signal("time", grid, "s")
+    elif by == "z" and not port.series:
+        signal = Signal("local coordinate z", grid, port.across_unit)
     seen = law.schedule(port_signals(case.bench, case.after, element.port))
     out: list[Block] = []
     for name, found in strengths_over(law, values, grid).items():
         unit = readable_unit(law.units[name], port.unit, port.across_unit)
-        total, what = found if found.ndim == 1 else found.sum(axis=1), f"{name} of the {name_at(element.port, law.id)}"
+        total, title = found if found.ndim == 1 else found.sum(axis=1), f"{name} of the {name_at(element.port, law.id)}"
         if kind_of(element.port) == PARAMETER:
-            name = what = split_port(element.port)[1]
+            name = title = split_port(element.port)[1]
             total = total + float(case.after.values[name])
-        drawn = plots.strength_over_signal(signal, Signal(name, total, unit), seen, title=element.port)
-        out.append(Picture(drawn, f"How {what} varies with {signal.name}.", f"{what} over {signal.name}."))
+        figure = plots.strength_over_signal(signal, Signal(name, total, unit), seen, title=element.port)
+        out.append(Picture(figure, f"How {title} varies with {signal.name}.", f"{title} over {signal.name}."))
     return out
 
 
 def _candidates(d: Diagnosis) -> list[Block]:
     passes = tables.candidates_by_pass(d)
     out: list[Block] = [Text(tables.CANDIDATES)] if passes else []
-    for k, rows in enumerate(passes):
-        before = tables.in_place(d, k)
-        title = f"Fitted beside {before}" if before else "All fitted pairs of port and law"
-        out += tables.candidate_tables(rows, d.effects, title, d.floor["nrmse"], tables.error_before(d, k))
+    for rows, parent in passes:
+        laws = "" if parent is None else " and ".join(name_at(e.port, e.law.id) for e in parent.laws)
+        title = f"Fitted in addition to {laws}" if laws else "All fitted pairs of port and law"
+        error = None if parent is None else float(parent.error)
+        out += tables.candidate_tables(rows, d.effects, title, d.floor["nrmse"], error)
     return out
 
 
@@ -333,8 +328,8 @@ def _proof(case: _Case) -> list[Block]:
         )
     role, recordings = ("test", d.test) if d.test else ("training", d.train)
     for k, r in enumerate(recordings[:MOST_DRAWN]):
-        label = r.name or numbered(role, k, len(recordings))
         compared = d.before_and_after(r)
+        label = label_recording(r, role, k, len(recordings))
         compared = replace(compared, recording=compared.recording.with_(name=label))
         for i in range(min(r.n_y, MOST_DRAWN)):
             out += _draw_comparison(case, compared, i)
@@ -342,7 +337,7 @@ def _proof(case: _Case) -> list[Block]:
 
 
 def _draw_comparison(case: _Case, c: BeforeAfter, i: int) -> list[Block]:
-    """Draw one output of a recording: two stretches, the errors over time, and the spectra."""
+    """Draw one output of a recording: two stretches, errors over time, and spectra."""
     r, name = c.recording, c.recording.outputs[i]
     unit, floor = case.unit(name), float(case.noise[i])
     simulated: plots.Simulated = [("as given", c.given), ("refitted", c.before)]
@@ -375,7 +370,7 @@ def _draw_comparison(case: _Case, c: BeforeAfter, i: int) -> list[Block]:
         ),
         Picture(
             plots.compared_spectra(r, simulated, i, unit, floor),
-            f"{where}: output and errors over frequency, beside the noise.",
+            f"{where}: output, errors and noise over frequency.",
             f"Spectra of {where}.",
         ),
     ]
@@ -397,6 +392,6 @@ def _usage_title(d: Diagnosis) -> str:
 
 
 def _usage(d: Diagnosis) -> list[Block]:
-    kind = "with what was found closed in, at the fitted values" if d.effects or d.nameless else "refitted"
+    kind = "with the correction, at the fitted values," if d.effects or d.nameless else "refitted"
     text = f"In the session that made the diagnosis, diagnosis.corrected is the simulator {kind}. Anywhere else, run:"
     return [Text(text), Code(tables.usage(d))]

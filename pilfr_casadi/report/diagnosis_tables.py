@@ -19,12 +19,12 @@ from ..simulators import PARAMETER, kind_of, name_at
 from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
-BAR_MARGIN = 1.03  # error of the smallest bar over the left end of the scale
-RANKED = 12  # rows of the ranked table above the fold
+BAR_MARGIN = 1.03  # smallest error over the left end of the bars' scale
+OPEN_ROWS = 12  # candidates in the open table; a folded table holds the others
 
 
 def percent(value: float | None) -> str:
-    """Write a relative error as a percentage; a dash where it was not computed."""
+    """Write a relative error as a percentage, or a dash if it was not computed."""
     if value is None:
         return "\u2014"
     if not value < RUN_AWAY:
@@ -35,15 +35,14 @@ def percent(value: float | None) -> str:
 def correction_words(diagnosis: Diagnosis) -> str:
     """Describe how the corrected simulator differs from the refitted one; empty if it does not.
 
-    Laws are "put back" only if their names are certain and they help on the test recordings.
+    The text says "put back" only if the names are certain and the laws help on the test recordings.
     """
     if diagnosis.effects:
-        unsure = [g.finding == "unsure" for g in diagnosis.gates]
-        names = [
-            *(_short_name(e) for e in diagnosis.effects),
-            *(["what is not sure"] if any(unsure) else []),
-        ]
-        names += ["a learned force"] if diagnosis.learned else []
+        names = [_short_name(e) for e in diagnosis.effects]
+        if any(g.finding == "unsure" for g in diagnosis.gates):
+            names.append("laws of uncertain name")
+        if diagnosis.learned:
+            names.append("a learned force")
         stated = diagnosis.sure and diagnosis.outcome in ("better", "")
         return f"with {' and '.join(names)} {'put back' if stated else 'added'}"
     if diagnosis.nameless:
@@ -52,7 +51,7 @@ def correction_words(diagnosis: Diagnosis) -> str:
 
 
 def _short_name(e: Effect) -> str:
-    """Name an effect without its port; that of a parameter says what varies."""
+    """Name an effect without its port; for a parameter say which one varies."""
     return name_at(e.port, e.law, e.form) if kind_of(e.port) == PARAMETER else short_name(e.law, e.form)
 
 
@@ -64,25 +63,26 @@ def tone(diagnosis: Diagnosis) -> str:
     return "warning" if doubtful else TONES.get(diagnosis.verdict, "plain")
 
 
-def _steps(diagnosis: Diagnosis) -> dict[str, str]:
-    """Return the keys of the errors to show, with their names."""
-    last = correction_words(diagnosis)
-    return ERROR_NAMES | {"after": last} if last else {k: name for k, name in ERROR_NAMES.items() if k != "after"}
+def _name_errors(diagnosis: Diagnosis) -> dict[str, str]:
+    """Return the errors to show: names by key."""
+    correction = correction_words(diagnosis)
+    names = {key: name for key, name in ERROR_NAMES.items() if key != "after"}
+    return names | ({"after": correction} if correction else {})
 
 
-def errors_that_count(diagnosis: Diagnosis) -> tuple[str, Mapping[str, float]]:
-    """Return the role that the answer is judged on, test if there are any, and its errors."""
+def judged_errors(diagnosis: Diagnosis) -> tuple[str, Mapping[str, float]]:
+    """Return the role of the recordings that judge the answer, test if there are any, and their errors."""
     errors = diagnosis.errors.get("test")
     return ("test", errors) if errors else ("training", diagnosis.errors["train"] or {})
 
 
 def answer(diagnosis: Diagnosis, forces: Sequence[str]) -> str:
-    """Write the result in a few words: what is missing, how strong, how sure; the gain.
+    """Write the result in a few words: the missing physics, its strength and confidence, the gain.
 
-    The strength is a quantity that the law defines, or else the largest force (`forces`, one an effect).
+    The strength is a quantity that the law defines, or else the largest force (`forces`, one for each effect).
     """
     d = diagnosis
-    role, errors = errors_that_count(d)
+    role, errors = judged_errors(d)
     named = []
     for e, force in zip(d.effects, forces, strict=True):
         sizes = [f"{name} {number_text(p['value'], 3)}\u00a0{p['unit']}".strip() for name, p in e.defined.items()]
@@ -106,11 +106,11 @@ def answer(diagnosis: Diagnosis, forces: Sequence[str]) -> str:
 
 def headline(diagnosis: Diagnosis) -> str:
     """Write the verdict with its errors."""
-    role, errors = errors_that_count(diagnosis)
+    role, errors = judged_errors(diagnosis)
     on = "On held-out recordings" if role == "test" else "On the training recordings (no test was given)"
     ahead = " of predictions one sample ahead" if "free_run" in diagnosis.errors else ""
     summary = diagnosis.summary
-    if diagnosis.nameless:  # the section below tells what it consists of
+    if diagnosis.nameless:  # a section of the page describes the correction
         summary = summary.replace(f" {diagnosis.nameless.sentence}", "")
     text = f"{summary.rstrip('. ')}. {on} the error{ahead} is {percent(errors.get('nominal'))} as given"
     text += f", {percent(errors.get('before'))} refitted"
@@ -121,8 +121,8 @@ def headline(diagnosis: Diagnosis) -> str:
 
 def facts(diagnosis: Diagnosis) -> dict[str, str]:
     """Collect the figures of merit."""
-    role, errors = errors_that_count(diagnosis)
-    out = {f"{role} error, {name}": percent(errors.get(k)) for k, name in _steps(diagnosis).items()}
+    role, errors = judged_errors(diagnosis)
+    out = {f"{role} error, {name}": percent(errors.get(k)) for k, name in _name_errors(diagnosis).items()}
     kind = {"periods": "from periods", "repeats": "from repeats"}.get(diagnosis.floor["source"], "estimated")
     out[f"noise floor, {kind}"] = percent(diagnosis.floor["nrmse"])
     if diagnosis.effects:
@@ -131,39 +131,42 @@ def facts(diagnosis: Diagnosis) -> dict[str, str]:
 
 
 def error_table(diagnosis: Diagnosis) -> Table:
-    """Tabulate the errors before and after, on training and test recordings."""
-    steps = _steps(diagnosis)
+    """Tabulate the errors before and after the correction, on training and test recordings."""
+    steps = _name_errors(diagnosis)
     rows: list[list[Any]] = []
-    led = "free_run" in diagnosis.errors
+    predicted = "free_run" in diagnosis.errors
     for kind, name in (("train", "training"), ("test", "test (held out)"), ("free_run", "the same, free run")):
         errors = diagnosis.errors.get(kind)
         if errors:
             rows.append([name, *(percent(errors.get(k)) for k in steps), percent(diagnosis.floor["nrmse"])])
     note = (
-        f"Rms error of {'the predictions one sample ahead' if led else 'the free-run simulation'} divided by the "
+        f"Rms error of {'the predictions one sample ahead' if predicted else 'the free-run simulation'} divided by the "
         "standard deviation of the measured output, averaged over outputs."
     )
     if diagnosis.floor["source"] == "estimated":
         note += " The noise floor is estimated from the residual; coloured noise would make it larger."
-    return Table(["recordings", *steps.values(), "noise floor"], rows, note=note, emphasis=[len(rows) - 1 - led])
+    emphasis = [len(rows) - 1 - predicted]
+    return Table(["recordings", *steps.values(), "noise floor"], rows, note=note, emphasis=emphasis)
 
 
 def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> list[Block]:
-    """Describe an effect: its law, how it acts, its parameters, and the laws that cannot be told apart from it."""
+    """Describe an effect: its law, how it acts, its parameters, and the laws that are indistinguishable from it."""
     e = diagnosis.effects[number]
     name = name_at(e.port, e.law, e.form)
     out: list[Block] = [
         Text(f"{name[0].upper()}{name[1:]}. In words: {e.sentence}. Confidence {e.confidence:.2f} of 1."),
+        Code(e.equation),
     ]
-    out += [Code(e.equation), *([action] if action else [])]
-    worth = diagnosis.worth(e)
-    out += [Text(f"{worth[0].upper()}{worth[1:]}.")] if worth else []
+    if action:
+        out.append(action)
+    if worth := diagnosis.worth(e):
+        out.append(Text(f"{worth[0].upper()}{worth[1:]}."))
     rows = [
-        [name, uncertain_text(p["value"], float(_array(p["std"]))), p["unit"] or "–"]
+        [name, uncertain_text(p["value"], float(_as_floats(p["std"]))), p["unit"] or "–"]
         for name, p in (e.defined | e.parameters).items()
     ]
     if rows:
-        given = any(np.isfinite(float(_array(p["std"]))) for p in e.parameters.values())
+        given = any(np.isfinite(float(_as_floats(p["std"]))) for p in e.parameters.values())
         note = "± one standard deviation." if given else ""
         out.append(Table(["parameter", "value", "unit"], rows, note=note))
     if e.indistinguishable:
@@ -174,69 +177,53 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
     return out
 
 
-def _array(value: Any) -> np.ndarray:
+def _as_floats(value: Any) -> np.ndarray:
     return np.asarray(np.nan if value is None else value, dtype=float)
 
 
-def candidates_by_pass(diagnosis: Diagnosis) -> list[list[dict[str, Any]]]:
-    """Return the candidates of each pass, best first: those that were fitted beside the same laws."""
-    search = diagnosis.evidence.get("search")
-    sizes = [len(step.trials) for step in search.passes] if search is not None else []
-    rows = list(diagnosis.candidates)
+def candidates_by_pass(diagnosis: Diagnosis) -> list[tuple[list[dict[str, Any]], Any]]:
+    """Return the candidates of each pass of the search, best first, and the hypothesis to which they were added.
+
+    The hypothesis is None if it is unknown.
+    """
+    rows, search = list(diagnosis.candidates), diagnosis.evidence.get("search")
+    steps = search.passes if search is not None else []
+    sizes, parents = [len(step.trials) for step in steps], [step.parent for step in steps]
     if sum(sizes) != len(rows):
-        sizes = [len(rows)]
-    cuts = np.cumsum([0, *sizes])
-    out = [sorted(rows[a:b], key=score) for a, b in pairwise(cuts)]
-    return [part for part in out if part]
+        sizes, parents = [len(rows)], parents[:1] or [None]
+    ends = pairwise(np.cumsum([0, *sizes]))
+    return [(sorted(rows[a:b], key=fit_error), parent) for (a, b), parent in zip(ends, parents, strict=True) if b > a]
 
 
-def score(row: Mapping[str, Any]) -> float:
-    """Rank a candidate: its error after the fit."""
+def fit_error(row: Mapping[str, Any]) -> float:
+    """Return a candidate's training error, by which candidates are ranked; infinite if its fit failed."""
     value = row.get("nrmse_train")
     return np.inf if value is None else float(value)
 
 
-def error_before(diagnosis: Diagnosis, number: int) -> float | None:
-    """Return the error of the simulator that the candidates of a pass were put into; None if it is unknown."""
-    parent = _parent(diagnosis, number)
-    return None if parent is None else float(parent.error)
-
-
-def in_place(diagnosis: Diagnosis, number: int) -> str:
-    """Name the laws that were in place in a pass; empty for the simulator alone."""
-    parent = _parent(diagnosis, number)
-    placed = () if parent is None else parent.laws
-    return " and ".join(name_at(e.port, e.law.id) for e in placed)
-
-
-def _parent(diagnosis: Diagnosis, number: int) -> Any:
-    """Return the hypothesis that the candidates of a pass were put into; None if it is unknown."""
-    search = diagnosis.evidence.get("search")
-    steps = search.passes if search is not None else []
-    return steps[number].parent if number < len(steps) else None
-
-
 CANDIDATES = (
-    "Each law is fitted together with the simulator's own parameters. Where a model is wrong, the likeliest also "
-    "predict blocks that they are not fitted to. Bars: from the noise to the error without a law, logarithmic; the "
-    "thin line reaches to the error on held-out blocks, where it was computed. Margin: error of the fit divided by "
-    "the winner's. ΔBIC: twice the log evidence lost; below zero is better than no law."
+    "Each law is fitted together with the simulator's own parameters. Where a model is wrong, the likeliest laws are "
+    "also judged on held-out blocks, which are not used in the fit. Bars: from the noise to the error without a law, "
+    "logarithmic; the thin line ends at the error on held-out blocks, if it was computed. Margin: error of the fit "
+    "divided by the winner's. ΔBIC: twice the loss of log evidence; below zero is better than no law."
 )
 
 
 def candidate_tables(
     rows: Sequence[Mapping[str, Any]], chosen: Sequence[Effect], title: str, floor: float, without: float | None
 ) -> list[Block]:
-    """Rank the candidates with their margins, best first; fold the tail.
+    """Tabulate the candidates with their margins, best first; a folded table holds those beyond `OPEN_ROWS`.
 
     Bars reach from the noise `floor` to the error `without` a law, on a logarithmic scale.
     """
     named = {(e.port, e.law): e.form for e in chosen}
-    alike = [i for i, r in enumerate(rows) if (r["port"], r["law"]) in named]
-    winner = min(alike, key=lambda i: rows[i].get("form", "") != named[rows[i]["port"], rows[i]["law"]], default=None)
-    best = score(rows[winner or 0])
+    named_rows = [i for i, r in enumerate(rows) if (r["port"], r["law"]) in named]
+    winner = min(
+        named_rows, key=lambda i: rows[i].get("form", "") != named[rows[i]["port"], rows[i]["law"]], default=None
+    )
+    best = fit_error(rows[winner or 0])
     cells = []
-    errors = [score(r) for r in rows if 0 < score(r) < np.inf]
+    errors = [fit_error(r) for r in rows if 0 < fit_error(r) < np.inf]
     low, top = min([*errors, floor or np.inf]) / BAR_MARGIN, max([*errors, without or 0.0])
 
     def share(error: float | None) -> float:
@@ -244,7 +231,7 @@ def candidate_tables(
 
     for i, r in enumerate(rows):
         form = f" ({display_name(r['form'])})" if r.get("form") else ""
-        margin = score(r) / best if best > 0 and np.isfinite(score(r)) else np.inf
+        margin = fit_error(r) / best if best > 0 and np.isfinite(fit_error(r)) else np.inf
         gain = np.inf if r["delta_bic"] is None else r["delta_bic"]
         cells.append(
             [
@@ -256,13 +243,12 @@ def candidate_tables(
                 f"{gain:+.0f}".replace("-", "−") if np.isfinite(gain) else "–",
             ]
         )
-    emphasis = [] if winner is None else [winner]
     columns = ["law", "port", "error of the fit", "error, held-out blocks", "margin", "ΔBIC"]
-    out: list[Block] = [Table(columns, cells[:RANKED], caption=title, emphasis=[i for i in emphasis if i < RANKED])]
-    if len(cells) > RANKED:
-        rest = [i - RANKED for i in emphasis if i >= RANKED]
-        title = f"{len(cells) - RANKED} more, with larger errors"
-        out.append(Table(columns, cells[RANKED:], caption=title, emphasis=rest, folded=True))
+    emphasis = [] if winner is None else [winner]  # an index outside a table marks no row
+    out: list[Block] = [Table(columns, cells[:OPEN_ROWS], caption=title, emphasis=emphasis)]
+    if len(cells) > OPEN_ROWS:
+        title, emphasis = f"{len(cells) - OPEN_ROWS} more, with larger errors", [i - OPEN_ROWS for i in emphasis]
+        out.append(Table(columns, cells[OPEN_ROWS:], caption=title, emphasis=emphasis, folded=True))
     return out
 
 
@@ -275,10 +261,10 @@ def flexible_table(diagnosis: Diagnosis) -> Table | None:
     rows = [[port, percent(share)] for port, share in sorted(opened.items(), key=lambda item: -item[1])]
     note = (
         "The flexible force is a smooth function of the local coordinate and its rate, not a law of the catalogue. "
-        "With few outputs, several ports can explain the mismatch: look in the pictures for the port where the force "
+        "With few outputs, several ports can explain the mismatch; in the pictures, look for the port where the force "
         "is a simple curve."
     )
-    title = "What a flexible force at each port could explain"
+    title = "Share of the mismatch that a flexible force at each port could explain"
     return Table(["port", "share of the mismatch explained"], rows, caption=title, note=note, emphasis=[0])
 
 
@@ -289,7 +275,7 @@ def parameter_table(diagnosis: Diagnosis) -> Table:
         known = ParameterSet({name: Parameter(p["nominal"])})
         shape = np.shape(p["nominal"])
         given, without, after, std = (
-            np.ravel(np.broadcast_to(_array(p[k]), shape), order="F")
+            np.ravel(np.broadcast_to(_as_floats(p[k]), shape), order="F")
             for k in ("nominal", "refit_without", "refit_with", "std")
         )
         for i, label in enumerate(known.labels):
@@ -315,22 +301,22 @@ def check_table(diagnosis: Diagnosis) -> Table | None:
 
 def usage(diagnosis: Diagnosis) -> str:
     """Write Python code that builds the corrected simulator from the user's simulator and simulates a recording."""
-    return render("use_diagnosis.txt", **_correction(diagnosis))
+    return render("use_diagnosis.txt", **_collect_correction(diagnosis))
 
 
 def corrected_file(diagnosis: Diagnosis, source: str) -> str:
     """Write a simulator file that corrects the simulator of another file; `source` is its path from this one."""
-    return render("corrected.txt", source=source, **_correction(diagnosis)) + "\n"
+    return render("corrected.txt", source=source, **_collect_correction(diagnosis)) + "\n"
 
 
-def _correction(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Collect what templates need to build the corrected simulator."""
+def _collect_correction(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Collect the values with which templates build the corrected simulator."""
     simulator = diagnosis.corrected
     fitted = {k: to_json(np.asarray(p.value)) for k, p in simulator.parameter_set.items()}
     modules: dict[str, set[str]] = {}
     elements = []
     for e in simulator.elements:
-        imported, expression = _parts(type(e.law))
+        imported, expression = _write_law_expression(type(e.law))
         for part in imported:
             home = laws.__name__ if getattr(laws, part.__name__, None) is part else part.__module__
             modules.setdefault(home, set()).add(part.__name__)
@@ -346,8 +332,8 @@ def _correction(diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _parts(law: Any) -> tuple[tuple[Any, ...], str]:
-    """List what has to be imported to make the class of a law, and write the expression that makes it."""
+def _write_law_expression(law: Any) -> tuple[tuple[Any, ...], str]:
+    """Return the imports and the Python expression that make the class of a law."""
     if getattr(law, "factor", ""):
         return (learned_force,), f"learned_force({law.factor!r})"
     if issubclass(law, VaryingParameter) and law.signal:
@@ -372,9 +358,8 @@ class Action:
 def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int | None) -> Action | None:
     """Measure the force of element `number` along the training recordings; None without one, or if its run diverges.
 
-    The equivalent stiffness k and damping c are those of the line w = k z + c dz/dt nearest to the force (equivalent
-    linearisation, Krylov & Bogoliubov 1943); a cycle is one upward crossing of the mean of z. Where z is a speed, there
-    is the damping alone.
+    The equivalent stiffness k and damping c minimise the rms of w - k z - c dz/dt (equivalent linearisation, Krylov &
+    Bogoliubov 1943); a cycle is one upward crossing of the mean of z. If z is a speed, only the damping is measured.
     """
     if number is None:
         return None
@@ -405,6 +390,6 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
 
 
 def element_of(fitted: Fitted, effect: Effect) -> int | None:
-    """Find the element of the fitted simulator that an effect is; offsets may stand before it."""
+    """Return the index of an effect's element in the fitted simulator, where offsets may precede it, or None."""
     placed = enumerate(fitted.simulator.elements)
     return next((i for i, p in placed if (p.port, p.law.id) == (effect.port, effect.law)), None)

@@ -15,7 +15,7 @@ from ..models import BLOCKS, ParameterSet
 from .page import Block, Picture, Table, Text, uncertain_text
 
 MOST_DRAWN = 4  # outputs of a recording that are drawn; the table has all of them
-ALIKE = 0.9  # correlation of output and input above which a device counts as quasi-static and is drawn over its input
+QUASI_STATIC = 0.9  # correlation of output and input above which the output is drawn over the input
 
 
 def output_pictures(fit: Fit, recordings: Sequence[Recording]) -> list[Block]:
@@ -32,27 +32,24 @@ def output_pictures(fit: Fit, recordings: Sequence[Recording]) -> list[Block]:
 def _draw_output(fit: Fit, r: Recording, i: int) -> list[Block]:
     """Draw one output: over its input for a quasi-static device, over time for any other."""
     name = f"{r.outputs[i]} in {r.name}"
-    likeness = [abs(np.corrcoef(u, r.y[:, i])[0, 1]) if np.ptp(u) > 0 else 0.0 for u in r.u.T]
-    j = int(np.argmax(likeness))
-    if likeness[j] > ALIKE:
+    correlation = [abs(np.corrcoef(u, r.y[:, i])[0, 1]) if np.ptp(u) > 0 else 0.0 for u in r.u.T]
+    j = int(np.argmax(correlation))
+    if correlation[j] > QUASI_STATIC:
         across = r.inputs[j]
         drawn = plots.output_over_input(fit, r, input=j, output=i)
         whole = Picture(drawn, f"{name}, over {across}.", f"Measured and simulated {name} over {across}.")
     else:
         caption = f"{name}: the whole recording, with the errors of the models."
         whole = Picture(plots.time(fit, r, output=i), caption, f"Output and errors of {name} over time.")
+    swings, error = plots.traces(fit, r, output=i), plots.remains(fit, r, output=i)
+    spectrum = plots.spectrum(fit, r, output=i)
     around = f"{name}, measured and simulated, around the largest excursion."
     over = f"{name}: output and errors over frequency."
-    swings = plots.traces(fit, r, output=i)
     return [
         Picture(swings, around, f"Simulated over measured {name}.", views={"largest swing": swings}),
         whole,
-        Picture(
-            plots.remains(fit, r, output=i),
-            f"{name}: the error of this model, enlarged.",
-            f"Error of {name} over time.",
-        ),
-        Picture(plots.spectrum(fit, r, output=i), over, f"Amplitude densities of output and errors of {name}."),
+        Picture(error, f"{name}: the error of this model, enlarged.", f"Error of {name} over time."),
+        Picture(spectrum, over, f"Amplitude densities of output and errors of {name}."),
     ]
 
 
@@ -65,7 +62,7 @@ def curve(fit: Fit, recording: Recording) -> list[Block]:
 def hysteresis(fit: Fit, recordings: Sequence[Recording]) -> list[Block]:
     """Draw loops, loading curves and weights of every channel of the element."""
     intro = (
-        "The element maps its local input z to w. Its scale is arbitrary, because the linear part can absorb it: "
+        "The element maps its local input z to w. Its scale is arbitrary, because the linear part can absorb it, so "
         "compare the shape, not the size."
     )
     out: list[Block] = [Text(intro)]
@@ -87,16 +84,13 @@ def hysteresis(fit: Fit, recordings: Sequence[Recording]) -> list[Block]:
 
 
 def linear_part(fit: Fit, train: Sequence[Recording]) -> list[Block]:
-    """Tabulate the modes, and draw the linear model of the start over the best linear approximation of the data."""
+    """Tabulate the modes, and draw the initial linear model over the best linear approximation of the data."""
     out = mode_tables(fit)
     if out:
         caption = "Poles in the z-plane with frequency and damping ratio, and zeros from the first input to the output."
         out.append(Picture(plots.pole_zero(fit.linear_parts()), caption, "Poles and zeros."))
     linear = fit.linear if fit.linear is not None else fit.model if fit.model.element is None else None
-    if linear is None or "A" not in linear.parameters:
-        return out
-    bla = any_bla(train)
-    if bla is None:
+    if linear is None or "A" not in linear.parameters or (bla := any_bla(train)) is None:
         return out
     for i in range(min(bla.n_y, 2)):
         for j in range(min(bla.n_u, 2)):
@@ -112,7 +106,7 @@ def linear_part(fit: Fit, train: Sequence[Recording]) -> list[Block]:
 
 
 def mode_tables(fit: Fit) -> list[Block]:
-    """Tabulate the modes in small motions, where no operator slips, and in large motions, where all slip."""
+    """Tabulate the modes in small motions, in which no operator slips, and in large motions, in which all slip."""
     a = fit.parameters.get("A")
     if a is None or not len(a) or a.shape != (fit.model.n_x,) * 2:
         return []
@@ -131,7 +125,7 @@ def mode_tables(fit: Fit) -> list[Block]:
 
 
 def _modes(part: LinearPart) -> tuple[list[str], list[list[Any]]]:
-    """Return columns and rows of a table of the poles."""
+    """Return the columns and rows of a table of poles."""
     rows: list[list[Any]] = []
     for value in sorted(part.poles, key=lambda v: abs(np.angle(v))):
         if value.imag < 0:
@@ -154,11 +148,9 @@ def parameter_blocks(fit: Fit) -> list[Block]:
         if set(BLOCKS) <= set(parameters)
         else ""
     )
-    text = (
-        f"Values with standard errors (±), the spread over recordings that differ in noise.{basis}"
-        if known
-        else "Values; standard errors are not known."
-    )
+    text = "Values; standard errors are not known."
+    if known:
+        text = f"Values with standard errors (±), the spread over recordings that differ in noise.{basis}"
     layer = [name for name in ("r", "w") if name in parameters and parameters[name].value.ndim == 2]
     matrices = [name for name, p in parameters.items() if min(p.shape) > 1 and name not in layer]
     out: list[Block] = []
@@ -169,12 +161,10 @@ def parameter_blocks(fit: Fit) -> list[Block]:
         for label, value, error, fixed in _entries(fit, name)
     ]
     if rows:
-        kept = [k for k in range(5) if k != 3 or any(row[3] for row in rows)]  # no column of units without units
         columns = ["parameter", "value", "standard error", "unit", "fixed"]
-        caption = "Vectors and scalars" if layer else "Parameters"
-        out.append(
-            Table([columns[k] for k in kept], [[row[k] for k in kept] for row in rows], caption, folded=bool(layer))
-        )
+        if not any(row[3] for row in rows):
+            columns, rows = columns[:3] + columns[4:], [row[:3] + row[4:] for row in rows]
+        out.append(Table(columns, rows, "Vectors and scalars" if layer else "Parameters", folded=bool(layer)))
     for name in matrices:
         values, errors = parameters[name].value, _errors_of(fit, name)
         rows = [
@@ -203,7 +193,7 @@ def _errors_of(fit: Fit, name: str) -> np.ndarray:
 
 
 def _entries(fit: Fit, name: str) -> list[tuple[str, float, float, bool]]:
-    """Return label, value, standard error and whether it is fixed for every entry of a parameter."""
+    """Return (label, value, standard error, fixed) for every entry of a parameter."""
     p = fit.model.parameters[name]
     columns = [np.ravel(a, order="F") for a in (p.value, _errors_of(fit, name), p.fixed)]
     return [
@@ -216,18 +206,11 @@ def limit_blocks(fit: Fit) -> list[Block]:
     """Tabulate constraints and active bounds with their multipliers; empty without limits."""
     if not fit.limits:
         return []
-    rows = [
-        [
-            limit.name,
-            "active" if limit.active else "not active" if limit.met else "NOT MET",
-            limit.value,
-            limit.lower if np.isfinite(limit.lower) else "",
-            limit.upper if np.isfinite(limit.upper) else "",
-            limit.multiplier,
-            limit.kind,
-        ]
-        for limit in fit.limits
-    ]
+    rows = []
+    for v in fit.limits:
+        state = "active" if v.active else "not active" if v.met else "NOT MET"
+        lower, upper = (end if np.isfinite(end) else "" for end in (v.lower, v.upper))
+        rows.append([v.name, state, v.value, lower, upper, v.multiplier, v.kind])
     note = (
         "Multiplier: the decrease of the objective (half the mean square error divided by the output's variance) per "
         "unit by which the limit is relaxed. Spectral radii are computed from the eigenvalues of the fitted matrices."

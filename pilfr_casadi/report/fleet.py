@@ -1,4 +1,4 @@
-"""The page of a fleet, from the content of its fleet.json: what all machines lack, and which of them differ."""
+"""The page of a fleet, from its fleet.json: the physics missing in all machines, and the machines that differ."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import numpy as np
 from .. import plots
 from .page import Block, Link, Page, Picture, Section, Table, Text, uncertain_text
 
+Column = tuple[str, str, np.ndarray, np.ndarray]  # name, unit, values and standard errors of the machines
 MOST_PICTURES = 12  # small pictures of residuals, and of trends
-MOST_STRIPS = 6  # values that are drawn as strips
-MOST_ROWS = 30  # machines in the open table; a folded one has all
+MOST_STRIPS = 6  # values drawn as strips
+MOST_ROWS = 30  # machines in an open table; with more, the table is folded
 
 
 def fleet_page(content: Mapping[str, Any], residuals: Mapping[str, Mapping[str, Any]]) -> Page:
@@ -64,49 +65,54 @@ def _name(machine: Mapping[str, Any]) -> str:
     return Link(machine["name"], machine["report"].replace(" ", "%20")) if machine["report"] else machine["name"]
 
 
-def _columns(content: Mapping[str, Any]) -> list[tuple[str, str, np.ndarray, np.ndarray]]:
-    """Return the values of all machines, those first that vary most over their errors."""
-    out = []
+def _columns(content: Mapping[str, Any]) -> list[Column]:
+    """Return the values of all machines; first the values with the largest spread over their errors."""
+    out: list[Column] = []
     for v in content["values"]:
-        own = [[m[kind].get(v["name"]) for m in content["machines"]] for kind in ("values", "errors")]
-        value, error = (np.array(column, dtype=float) for column in own)
+        value, error = (
+            np.array([m[kind].get(v["name"]) for m in content["machines"]], dtype=float)
+            for kind in ("values", "errors")
+        )
         if np.any(np.isfinite(value)):
             out.append((v["name"], v["unit"], value, error))
 
-    def telling(column: tuple[str, str, np.ndarray, np.ndarray]) -> float:
-        known = np.isfinite(column[2]) & np.isfinite(column[3])
-        return float(np.std(column[2][known]) / max(np.median(column[3][known]), 1e-300)) if np.any(known) else 0.0
+    def spread_over_error(column: Column) -> float:
+        _, _, value, error = column
+        known = np.isfinite(value) & np.isfinite(error)
+        return float(np.std(value[known]) / max(np.median(error[known]), 1e-300)) if np.any(known) else 0.0
 
-    return sorted(out, key=telling, reverse=True)
+    return sorted(out, key=spread_over_error, reverse=True)
+
+
+def _names_and_differing(content: Mapping[str, Any]) -> tuple[list[str], np.ndarray]:
+    """Return the names of the machines, and for each whether it differs from the others."""
+    names = [m["name"] for m in content["machines"]]
+    return names, np.array([name in content["differing"] for name in names])
 
 
 def fleet_map(content: Mapping[str, Any]) -> Any:
-    """Draw the machines by their two most telling values, or as a strip where there is only one."""
+    """Draw the machines by the two values with the largest spread over their errors, or one value as a strip."""
     columns = _columns(content)
-    names = [m["name"] for m in content["machines"]]
-    differs = np.array([name in content["differing"] for name in names])
     if len(columns) < 2:
-        return plots.machine_strips(columns, names, differs)
-    return plots.machine_map(columns[0], columns[1], names, differs)
+        return plots.machine_strips(columns, *_names_and_differing(content))
+    return plots.machine_map(columns[0], columns[1], *_names_and_differing(content))
 
 
 def _maps(content: Mapping[str, Any]) -> list[Block]:
     columns = _columns(content)
     if not columns:
         return []
-    names = [m["name"] for m in content["machines"]]
-    differs = np.array([name in content["differing"] for name in names])
     out: list[Block] = []
     if len(columns) > 1:
-        told = f"The machines by {columns[0][0]} and {columns[1][0]}; ellipses are two standard errors."
-        out.append(Picture(fleet_map(content), told, "map of the machines", wide=True))
-    strips = plots.machine_strips(columns[:MOST_STRIPS], names, differs)
-    caption = "Values of the machines, the surest to differ first; bars are two standard errors."
+        caption = f"The machines by {columns[0][0]} and {columns[1][0]}; ellipses are two standard errors."
+        out.append(Picture(fleet_map(content), caption, "map of the machines", wide=True))
+    caption = "Values of the machines, sorted by the probability that they differ; bars are two standard errors."
+    strips = plots.machine_strips(columns[:MOST_STRIPS], *_names_and_differing(content))
     return [*out, Picture(strips, caption, "values of the machines", wide=True)]
 
 
 def _rest(content: Mapping[str, Any], residuals: Mapping[str, Mapping[str, Any]]) -> list[Block]:
-    """Draw the residuals of machines that lack more, and link their reports."""
+    """Draw the residuals of machines with more missing physics, and link their reports."""
     shown = [m for m in content["machines"] if m["rest"] and m["name"] in residuals][:MOST_PICTURES]
     if not shown:
         return []
@@ -114,35 +120,44 @@ def _rest(content: Mapping[str, Any], residuals: Mapping[str, Mapping[str, Any]]
     caption = "Error with the common physics, over the output's deviation; the band is two deviations of the noise."
     rows = [[_name(m), m["rest"].get("verdict", ""), m["rest"].get("sentence", "")] for m in shown]
     return [
-        Picture(figure, caption, "residuals of machines that lack more", wide=True),
-        Table(["machine", "verdict", "diagnosis of what is left"], rows),
+        Picture(figure, caption, "residuals of machines with more missing physics", wide=True),
+        Table(["machine", "verdict", "diagnosis of the remaining mismatch"], rows),
     ]
 
 
 def _drift(content: Mapping[str, Any]) -> list[Block]:
-    populations = {v["name"]: v for v in content["values"]}
-    found = []
+    values = {v["name"]: v for v in content["values"]}
+    trends = []
     for m in content["machines"]:
         for label, history in content["histories"].get(m["name"], {}).items():
-            own = populations[label]["population"]
-            band = [own["mean"] - 2 * own["deviation"], own["mean"] + 2 * own["deviation"]]
-            more = {"title": m["name"], "name": label, "unit": populations[label]["unit"], "regular": band}
-            found.append({**history, **more, "slope": m["trends"][label]["slope"]})
-    if not found:
+            population = values[label]["population"]
+            mean, deviation = population["mean"], population["deviation"]
+            trends.append(
+                {
+                    **history,
+                    "title": m["name"],
+                    "name": label,
+                    "unit": values[label]["unit"],
+                    "regular": [mean - 2 * deviation, mean + 2 * deviation],
+                    "slope": m["trends"][label]["slope"],
+                }
+            )
+    if not trends:
         return []
-    caption = "Values by recording with two standard errors; the band holds regular machines."
-    left = f" {len(found) - MOST_PICTURES} more are in the tables." if len(found) > MOST_PICTURES else ""
-    figure = plots.machine_trends(found[:MOST_PICTURES])
-    return [Picture(figure, caption + left, "values that drift", wide=True)]
+    caption = "Values by recording with two standard errors; regular machines lie in the band."
+    if len(trends) > MOST_PICTURES:
+        caption += f" {len(trends) - MOST_PICTURES} more are in the tables."
+    figure = plots.machine_trends(trends[:MOST_PICTURES])
+    return [Picture(figure, caption, "values that drift", wide=True)]
 
 
 def _values(content: Mapping[str, Any]) -> Table:
     rows = []
     for v in content["values"]:
-        own = v["population"]
-        mean = uncertain_text(_number(own["mean"]), _number(own["mean_error"]))
+        population = v["population"]
+        mean = uncertain_text(_number(population["mean"]), _number(population["mean_error"]))
         drifting = sum((m["trends"].get(v["name"], {}).get("probability") or 0) > 0.5 for m in content["machines"])
-        rows.append([v["name"], v["unit"], mean, own["deviation"], own["varies"], v["kind"], drifting])
+        rows.append([v["name"], v["unit"], mean, population["deviation"], population["varies"], v["kind"], drifting])
     columns = ["value", "unit", "mean", "between machines", "probability that it varies", "kind", "machines that drift"]
     note = "Standard deviation between regular machines, and the probability that it is not zero."
     return Table(columns, rows, note=note, digits=3)
@@ -161,6 +176,6 @@ def _table(content: Mapping[str, Any], machines: Sequence[Mapping[str, Any]], fo
         rows.append([_name(m), *numbers, *values])
     columns = ["machine", "differs", "refitted", "with the common physics", "noise", "log evidence", *labels]
     emphasis = [i for i, m in enumerate(machines) if m["name"] in content["differing"]]
-    note = "The errors are NRMSE. The log evidence is that of the common physics against the simulator as given."
-    caption = f"{len(machines)} machines, the surest to differ first"
+    note = "The errors are NRMSE. The log evidence compares the common physics with the simulator as given."
+    caption = f"{len(machines)} machines, sorted by the probability that they differ"
     return Table(columns, rows, caption=caption, note=note, emphasis=emphasis, folded=folded, digits=3)

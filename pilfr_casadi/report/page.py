@@ -1,12 +1,12 @@
-"""Self-contained HTML pages: one file with its pictures inside, readable offline, on a phone, in the dark and on paper.
+"""Self-contained HTML pages: one file including its pictures, readable offline, on a phone, in dark mode and in print.
 
 A `Page` is a title, a headline, a few figures of merit, and sections of blocks (`Text`, `Table`, `Picture`, `Code`).
-The templates stand in `templates/`: `page.html` for the page, `blocks.html` for its blocks, `report.css` for colours
-and layout, `explore.js` for the charts. They escape all text. The page allows its own two scripts by their hash, and
-no other script nor any access to the network.
+The folder `templates/` holds `page.html` for the page, `blocks.html` for its blocks, `report.css` for colours and
+layout, `explore.js` for the charts. The templates escape all text. The page allows its own two scripts by their hash,
+and neither other scripts nor network access.
 
-Every picture of lines carries its numbers, and the script replaces it by a chart to explore; without the script, and
-in print, the picture stands. The charts are drawn by uPlot (`uplot/`, MIT licence), which was chosen by measurement:
+Every picture of lines carries its numbers, and the script replaces it by an interactive chart; without the script, and
+in print, the reader sees the picture. uPlot (`uplot/`, MIT licence) draws the charts. It was chosen by measurement:
 bytes of script in every page, and time to draw 12 charts of 4 lines with 6144 points (Chromium, two busy cores).
 
     uPlot 1.6.32                           52,938 bytes    0.26 s
@@ -14,8 +14,8 @@ bytes of script in every page, and time to draw 12 charts of 4 lines with 6144 p
     plotly.js-basic 4.1.1               1,191,749 bytes    1.49 s
     Bokeh 3.9.2                         1,268,134 bytes    not run: it evaluates text as code, which the policy forbids
 
-All three that ran under the policy are equally legible at 420 pixels. uPlot has no legend for keyboards, no values of
-loops under the pointer and no zoom by buttons; `explore.js` adds them in about 250 lines.
+The three libraries that run under the policy are equally legible at 420 pixels. uPlot lacks a keyboard legend, values
+of loops under the pointer and zoom buttons; `explore.js` adds them in about 250 lines.
 """
 
 from __future__ import annotations
@@ -38,14 +38,15 @@ import numpy as np
 from PIL import Image
 
 from .. import plots
-from .._base import InputError, write_atomically
+from .._base import InputError, __version__, write_atomically
+from ..data import Recording
 from ..optimise import Status
 
 TONES = ("plain", "good", "warning", "bad")
 DPI = 160  # dots per inch of the pictures: sharp at twice the resolution of an ordinary screen
-COLOURS = 64  # of a picture: a third of the bytes, and lines stay smooth
-CHART_BYTES = 1_200_000  # of all charts of a page: with its pictures it stays below 3 MB
-MOST_POINTS, FEWEST_POINTS = 16_000, 500  # points of a line in a view of a chart, as far as the bytes allow
+PALETTE_SIZE = 64  # colours of a picture: a third of the bytes, and lines stay smooth
+CHART_BYTES = 1_200_000  # all charts of a page; with its pictures the page stays below 3 MB
+MOST_POINTS, FEWEST_POINTS = 16_000, 500  # points of a line in a view of a chart; CHART_BYTES decides
 
 
 def number_text(value: float, digits: int = 4) -> str:
@@ -56,7 +57,7 @@ def number_text(value: float, digits: int = 4) -> str:
 
 
 def uncertain_text(value: float, error: float) -> str:
-    """Write `value ± error`, to two digits of the error; only the value if the error is not finite."""
+    """Write `value ± error` to two digits of the error, or only the value if the error is not finite."""
     if not np.isfinite(error):
         return number_text(value)
     decimals = 1 - int(np.floor(np.log10(error))) if error > 0 else 9
@@ -67,9 +68,9 @@ def uncertain_text(value: float, error: float) -> str:
     return "\u00a0±\u00a0".join(texts)
 
 
-def numbered(word: str, i: int, count: int) -> str:
-    """Name the i-th of some recordings without a name: "test 2", or "test" if it is the only one."""
-    return word if count == 1 else f"{word} {i + 1}"
+def label_recording(recording: Recording, role: str, i: int, count: int) -> str:
+    """Return a recording's name; without a name its role and number: "test 2", or "test" for the only one."""
+    return recording.name or (role if count == 1 else f"{role} {i + 1}")
 
 
 def status_tone(status: Status) -> str:
@@ -90,30 +91,29 @@ class Code:
     """Text for the reader to copy, shown verbatim."""
 
     code: str
-    caption: str = ""
     kind: str = field(init=False, default="code")
 
 
 class Link(str):
-    """Text of a table's cell that leads to another page, by an address relative to this one."""
+    """Text of a table cell with a link to another page; the address is relative to this page."""
 
     address: str
 
     def __new__(cls, text: str, address: str) -> Link:
-        """Make it of the text and the address."""
+        """Make a link of its text and address."""
         link = super().__new__(cls, text)
         link.address = address
         return link
 
 
 class Bar(str):
-    """Text of a table's cell above a bar; `length` and the end of its line `reach` are shares of the full bar."""
+    """Text of a table cell above a bar; `length`, and `reach`, the end of a thin line, are shares of the full bar."""
 
     length: float
     reach: float
 
     def __new__(cls, text: str, length: float, reach: float) -> Bar:
-        """Make it of the text and the two shares, which are clipped to 0 ... 1."""
+        """Make a bar of its text and the two shares, clipped to 0 ... 1."""
         bar = super().__new__(cls, text)
         bar.length, bar.reach = (float(np.clip(share, 0.0, 1.0)) for share in (length, reach))
         return bar
@@ -123,10 +123,9 @@ class Bar(str):
 class Table:
     """A table; the first column names the rows.
 
-    Cells are text, a `Link`, a `Bar`, or numbers, which are written with `digits` significant digits; None and nan
-    become a dash. Rows whose index is in `emphasis` are bold. `caption` stands above the table, `note` below; a
-    `folded` table is closed until the reader opens it. A row whose number of cells differs from the number of columns
-    raises an `InputError`.
+    A cell is text, a `Link`, a `Bar`, or a number, written with `digits` significant digits; None and nan become a
+    dash. Rows whose index is in `emphasis` are bold. `caption` is above the table, `note` below; a `folded` table is
+    closed until the reader opens it. A row needs one cell per column, otherwise an `InputError` is raised.
     """
 
     columns: Sequence[str]
@@ -165,9 +164,9 @@ class Picture:
     """A matplotlib figure, its axes, or the bytes of a PNG file, with a caption.
 
     `alt` describes it to readers who cannot see it. A `wide` picture fills the width of the page; others stand side by
-    side where there is room. Axes become a chart to explore, as far as `plots.chart` can read them; `views` names
-    further axes of the same lines, whose limits the reader may choose. The picture is `replaced` where the chart of
-    another picture shows all of it.
+    side if there is room. Axes become an interactive chart if `plots.chart` can convert them; `views` names further
+    axes of the same lines, whose limits the reader may choose. A `replaced` picture is hidden if the chart of another
+    picture shows all of it.
     """
 
     figure: Any
@@ -187,11 +186,11 @@ class Picture:
         figure = self.figure if hasattr(self.figure, "savefig") else self.figure.figure
         figure.savefig(buffer, format="png", dpi=DPI)
         small = io.BytesIO()
-        Image.open(buffer).convert("RGB").quantize(COLOURS).save(small, format="png", optimize=True)
+        Image.open(buffer).convert("RGB").quantize(PALETTE_SIZE).save(small, format="png", optimize=True)
         return small.getvalue()
 
     def chart(self, most: int) -> str:
-        """Return the chart as JSON with at most so many points of a line in each view; empty without one."""
+        """Return the chart as JSON with at most `most` points of a line in each view; empty if there is no chart."""
         content = plots.chart(self.figure, self.views, most) if hasattr(self.figure, "get_xlim") else None
         return json.dumps(content) if content and not self.replaced else ""
 
@@ -210,14 +209,14 @@ Block = Text | Code | Table | Picture
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page under its own heading."""
+    """A read_asset of a page under its own heading."""
 
     title: str
     blocks: Sequence[Block]
 
     @property
     def groups(self) -> list[list[Block]]:
-        """The blocks in their order; pictures that may stand side by side are in one group."""
+        """The blocks in order; adjacent narrow pictures form one group."""
         out: list[list[Block]] = []
         for block in self.blocks:
             narrow = isinstance(block, Picture) and not block.wide
@@ -231,9 +230,9 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A report: its headline `answer` gives the result in a few words, `status` in sentences, both in a colour `tone`.
+    """A report: its headline `answer` gives the result in a few words, `status` in sentences.
 
-    The tone is one of `TONES`. `facts` are a few figures of merit by name; the `footer` is the last line.
+    `tone`, one of `TONES`, is the colour of the headline. `facts` are a few figures of merit by name.
     """
 
     title: str
@@ -243,7 +242,6 @@ class Page:
     status: str = ""
     tone: str = "plain"
     facts: Mapping[str, str] = field(default_factory=dict)
-    footer: str = ""
 
     def __post_init__(self) -> None:
         if self.tone not in TONES:
@@ -251,16 +249,18 @@ class Page:
 
     def html(self) -> str:
         """The page as one HTML document."""
-        from .._base import __version__
-
         charts, most = self._charts(MOST_POINTS), MOST_POINTS
         while sum(map(len, charts.values())) > CHART_BYTES and most > FEWEST_POINTS:
             most //= 2
             charts = self._charts(most)
-        scripts = [part("uplot/uPlot.iife.min.js"), part("templates/explore.js")] if any(charts.values()) else []
-        style = part("templates/report.css") + (part("uplot/uPlot.min.css") if scripts else "")
-        more = {"charts": charts, "scripts": scripts, "style": style, "licence": part("uplot/LICENSE")}
-        return render("page.html", page=self, version=__version__, **more)
+        scripts, style = [], read_asset("templates/report.css")
+        if any(charts.values()):
+            scripts = [read_asset("uplot/uPlot.iife.min.js"), read_asset("templates/explore.js")]
+            style += read_asset("uplot/uPlot.min.css")
+        licence = read_asset("uplot/LICENSE")
+        return render(
+            "page.html", page=self, version=__version__, charts=charts, scripts=scripts, style=style, licence=licence
+        )
 
     def _charts(self, most: int) -> dict[Block, str]:
         pictures = [b for s in self.sections for b in s.blocks if isinstance(b, Picture)]
@@ -268,18 +268,18 @@ class Page:
 
 
 def render(template: str, **values: Any) -> str:
-    """Fill a template of the folder `templates`; text is escaped only in HTML."""
+    """Fill a template of the folder `templates`; only HTML templates escape text."""
     return str(_templates().get_template(template).render(**values)).rstrip("\n")
 
 
 @cache
-def part(name: str) -> str:
+def read_asset(name: str) -> str:
     """Read a file of this folder."""
     return (Path(__file__).parent / name).read_text(encoding="utf-8")
 
 
 def script_hash(script: str) -> str:
-    """Return the source expression of a content security policy that allows one script."""
+    """Return the expression that allows one script in a content security policy."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
 
 
@@ -299,7 +299,7 @@ def _templates() -> Any:
 
 
 def python_literal(value: Any, width: int = 80) -> str:
-    """Write a value as Python that `import numpy as np` reads back."""
+    """Write a value as Python code, with `np.inf` for infinity."""
     text = pprint.pformat(value, width=width, sort_dicts=False, compact=True)
     return re.sub(r"(?<![\w'])inf(?![\w'])", "np.inf", text)
 

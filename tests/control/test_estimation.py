@@ -120,7 +120,7 @@ def test_covariances_of_states_of_unlike_sizes_are_taken(small):
         assert np.all(np.isfinite(observer.run(record.u[:5], record.y[:5], None, P0)[1]))
 
 
-def test_what_sticks_is_seen_in_sum_and_what_slips_early_is_wiped(small):
+def test_sticking_operators_are_seen_as_a_sum_and_an_early_slip_wipes_memory(small):
     fit, record, _ = small
     made = kalman_filter(fit, record, share=1e-2)
     rest = visibility(fit, made, np.zeros(5), np.zeros((30, 1)))
@@ -175,7 +175,7 @@ def test_interpolated_inputs_are_observed_and_not_inverted():
     refused(lambda: feedforward(found, data[0]), "input is interpolated between samples")
 
 
-def test_the_time_is_no_state_to_be_corrected():
+def test_an_observer_does_not_correct_the_time():
     simulator = pilfr.Simulator(
         lambda x, u, t: {"a": -x.a + u.f + 0.1 * ca.sin(t)}, lambda x: {"y": x.a}, states=("a",), inputs=("f",)
     )
@@ -204,7 +204,7 @@ def test_a_corrected_simulator_is_inverted(corrected, late):
     assert np.sqrt(np.mean((y - wanted) ** 2)) < 0.1 * np.std(wanted)
 
 
-def test_what_does_not_fit_the_recording_is_refused(corrected):
+def test_models_of_another_recording_are_refused(corrected):
     found, train, _ = corrected
     export = found.export(start=train)
     other = pilfr.Recording(train.u, train.y, 2 * DT, inputs=("force",), outputs=("x2",), initial="zero")
@@ -214,11 +214,11 @@ def test_what_does_not_fit_the_recording_is_refused(corrected):
 
 
 @pytest.mark.parametrize("share", ["a", [1e-3], np.inf, np.nan, 0, -1])
-def test_shares_that_are_none(small, share):
+def test_unusable_shares_are_refused(small, share):
     refused(lambda: kalman_filter(*small[:2], share=share), "share of process noise")
 
 
-def test_what_the_observer_cannot_use(small):
+def test_unusable_arguments_of_an_observer_are_refused(small):
     fit, record, observer = small
     u, y = record.u[:50], record.y[:50]
     refused(lambda: kalman_filter(None, record), "give a Fit")

@@ -147,17 +147,20 @@ def test_plans_of_a_model_with_two_inputs_are_optimal(square):
 # --- scales
 
 
-def loop(controller, function, path):
-    """Outputs, and whether each plan converged."""
-    x, u, y, converged = np.zeros(10), np.zeros(1), [], []
+def close_loop(controller, path, x, u):
+    """Outputs and plans of a loop along a path (samples + N, n_y), from the state x and the input u."""
+    y, plans = [], []
     for k in range(len(path) - N):
-        plan = controller(x, path[k : k + N], u)
-        u = plan.u
-        x, now = function(x, u)
-        x = np.asarray(x).ravel()
-        y.append(float(now))
-        converged.append(plan.converged)
-    return np.array(y), np.array(converged)
+        plans.append(controller(x, path[k : k + N], u))
+        u = plans[-1].u
+        x, now = (np.asarray(v).ravel() for v in controller.function(x, u))
+        y.append(now)
+    return np.array(y), plans
+
+
+def constant(values, samples):
+    """A constant path."""
+    return np.tile(values, (samples + N, 1))
 
 
 def test_a_loop_needs_no_scales_in_any_units():
@@ -166,10 +169,10 @@ def test_a_loop_needs_no_scales_in_any_units():
         function = eight_plays(y_unit, u_unit)
         for outputs in (None, (-0.8 * y_unit, 0.8 * y_unit)):
             controller = PredictiveController(function, N, inputs=(-3 * u_unit, 3 * u_unit), outputs=outputs)
-            y, said = loop(controller, function, y_unit * path)
+            y, plans = close_loop(controller, y_unit * path, np.zeros(10), np.zeros(1))
             wanted = path[: len(y)] if outputs is None else np.clip(path[: len(y)], -0.8, 0.8)
-            errors.append(np.sqrt(np.mean((y / y_unit - wanted)[10:] ** 2)))
-            converged.append(np.mean(said))
+            errors.append(np.sqrt(np.mean((y[:, 0] / y_unit - wanted)[10:] ** 2)))
+            converged.append(np.mean([plan.converged for plan in plans]))
             scales.append(controller.y_scale[0] / y_unit)
     assert np.max(errors) < 0.02 * np.std(path), errors
     np.testing.assert_allclose(scales[2:], scales[:2] * 2, rtol=1e-9)
@@ -190,39 +193,26 @@ def test_scales_that_are_given_are_taken():
 # --- limits
 
 
-def closed(function, controller, x, wanted, u, samples):
-    """Outputs of a loop and its plans."""
-    y, plans = [], []
-    for _ in range(samples):
-        plans.append(controller(x, np.tile(wanted, (controller.horizon, 1)), u))
-        u = plans[-1].u
-        x, now = (np.asarray(v).ravel() for v in function(x, u))
-        y.append(now)
-    return np.array(y), plans
-
-
 def test_limits_hold_by_default_for_a_reference_beyond_them():
-    function = eight_plays(1e-4)
-    controller = PredictiveController(function, N, inputs=(-3, 3), outputs=(-8e-5, 8e-5))
-    y, _ = loop(controller, function, np.full(40, 1.2e-4))
+    controller = PredictiveController(eight_plays(1e-4), N, inputs=(-3, 3), outputs=(-8e-5, 8e-5))
+    y, _ = close_loop(controller, constant([1.2e-4], 28), np.zeros(10), np.zeros(1))
     assert np.max(y) < 8e-5 * 1.001 and y[-1] > 7.9e-5
 
 
 @BOTH
 def test_an_output_beyond_its_limit_comes_back_at_once(solver):
     controller = PredictiveController(lags(0.8), N, inputs=(-3, 3), outputs=(-1.5, 1.5), solver=solver)
-    y, plans = closed(lags(0.8), controller, np.array([1.9]), [2.0], np.array([1.9]), 5)
+    y, plans = close_loop(controller, constant([2.0], 5), np.array([1.9]), np.array([1.9]))
     assert y[0] == 1.9 and np.all(np.abs(y[1:] - 1.5) < 1e-6), y
     assert "beyond their limits by 0.4" in str(plans[0]) and "within their limits" in str(plans[-1])
     without = PredictiveController(lags(0.8), N, inputs=(-3, 3), solver=solver)
-    assert "limits" not in str(closed(lags(0.8), without, np.zeros(1), [2.0], np.zeros(1), 1)[1][0])
+    assert "limits" not in str(close_loop(without, constant([2.0], 1), np.zeros(1), np.zeros(1))[1][0])
 
 
 @BOTH
-def test_an_output_beyond_its_limit_gives_no_leave_to_another(solver):
-    function = lags(0.99, 0.8)
-    controller = PredictiveController(function, N, inputs=(-3, 3), outputs=(-1.5, 1.5), solver=solver)
-    y, plans = closed(function, controller, np.array([2.0, 0.0]), [0.0, 1.9], np.array([2.0, 0.0]), 10)
+def test_an_output_beyond_its_limit_does_not_permit_another(solver):
+    controller = PredictiveController(lags(0.99, 0.8), N, inputs=(-3, 3), outputs=(-1.5, 1.5), solver=solver)
+    y, plans = close_loop(controller, constant([0.0, 1.9], 10), np.array([2.0, 0.0]), np.array([2.0, 0.0]))
     assert np.min(y[:, 0]) > 1.5  # the first takes longer than that
     assert np.max(y[:, 1]) < 1.5 + 1e-6 and abs(y[-1, 1] - 1.5) < 1e-6
     assert np.max([plan.outputs[:, 1].max() for plan in plans]) < 1.5 + 1e-6
@@ -233,7 +223,7 @@ def test_an_output_beyond_its_limit_gives_no_leave_to_another(solver):
 def test_limits_are_kept_and_reached_however_far_the_reference_is(solver, far):
     for options in ({}, {"y_scale": 0.5}):
         kept = PredictiveController(lags(0.8), N, inputs=(-3, 3), outputs=(-1.5, 1.5), solver=solver, **options)
-        y, plans = closed(lags(0.8), kept, np.zeros(1), [far], np.zeros(1), 12)
+        y, plans = close_loop(kept, constant([far], 12), np.zeros(1), np.zeros(1))
         assert np.max(y) < 1.5 + 1e-6 and y[-1] > 1.5 - 1e-5 and plans[-1].converged
         free = PredictiveController(lags(0.8), N, inputs=(-3, 3), solver=solver, **options)
         plan = free(np.zeros(1), np.full((N, 1), far if far > 3 else 3.0), np.zeros(1))
@@ -430,7 +420,7 @@ def test_do_mpc_takes_scales_and_limits_for_each_signal():
     refused(lambda: do_mpc_controller(function, 6, wanted, inputs=(-1, 1), y_scale=scales), "changes over the horizon")
 
 
-def test_do_mpc_takes_what_a_controller_plans_with(small):
+def test_do_mpc_accepts_every_model_of_a_controller(small):
     pytest.importorskip("do_mpc")
     fit, _, observer = small
     for given_model in (fit, observer, fit.export(), fit.to_casadi()):
@@ -440,7 +430,7 @@ def test_do_mpc_takes_what_a_controller_plans_with(small):
     refused(lambda: do_mpc_model("f"), "A str cannot be used for planning; give a Fit")
 
 
-def test_without_do_mpc_one_sentence_says_what_to_install(monkeypatch):
+def test_without_do_mpc_an_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "do_mpc", None)
     refused(lambda: do_mpc_model(small_model()), r"pip install pilfr-casadi\[do-mpc\]")
 
@@ -489,7 +479,7 @@ def test_a_plan_and_a_controller_print_in_a_line_or_two(small):
         ({"solver": "qp"}, "solver 'qp'"),
     ],
 )
-def test_options_that_fit_no_controller_are_refused(change, words):
+def test_unusable_options_are_refused(change, words):
     arguments = {"function": first_order(), "horizon": 5, "inputs": (-1.0, 1.0), **change}
     refused(lambda: PredictiveController(arguments.pop("function"), arguments.pop("horizon"), **arguments), words)
 
@@ -513,7 +503,7 @@ def test_a_transposed_reference_is_refused(square):
         refused(lambda reference=reference: controller(np.zeros(2), reference, np.zeros(2)), re.escape("give (8, 2)"))
 
 
-def test_do_mpc_gets_the_same_sentences():
+def test_do_mpc_gets_the_same_errors():
     limits = {"inputs": (-1.0, 1.0)}
     refused(lambda: do_mpc_controller(3, 5, np.zeros(9), **limits), "casadi.Function")
     refused(lambda: do_mpc_controller(first_order(), 0, np.zeros(9), **limits), "horizon")

@@ -96,8 +96,8 @@ SINGLE = {
     "output over input": lambda f, d, ax: plots.output_over_input(f, d, ax=ax),
     "loop": lambda f, d, ax: plots.loop(f, d, ax=ax),
     "bare loop": lambda f, d, ax: plots.loop(f, d, bare=True, ax=ax),
-    "loading curve": lambda f, d, ax: plots.loading_curve(f, d, reference=np.square, ax=ax),
-    "weights": lambda f, d, ax: plots.weights(f, d, reference=np.exp, ax=ax),
+    "loading curve": lambda f, d, ax: plots.loading_curve(f, d, ax=ax),
+    "weights": lambda f, d, ax: plots.weights(f, d, ax=ax),
     "convergence": lambda f, d, ax: plots.convergence(f, ax=ax),
     "bla": lambda f, d, ax: plots.best_linear_approximation(some_bla(), f.linear, unit="m/N", ax=ax),
     "loops": lambda f, d, ax: plots.loops({"1 Hz": (d.u[:, 0], d.y[:, 0])}, "force [N]", "x [m]", ax=ax),
@@ -181,7 +181,7 @@ def test_legends_are_honest(fitted, data):
     linear = nrmse(data.y, plots.linear_simulation(fitted, data))
     assert shown == [
         "measured output",
-        f"residual, linear {100 * linear:.3g} %",
+        f"residual, linear model {100 * linear:.3g} %",
         f"residual, this model {100 * fitted.nrmse(data):.3g} %",
     ]
     assert legend_of(plots.time(replace(fitted, linear=None), data)) == [shown[0], shown[2]]
@@ -278,7 +278,7 @@ def test_decibels_of_nothing_are_gaps():
     )
     ax = canvas.axes_or_new(None)
     canvas.limit_depth(ax, np.array([-900.0, 10.0]), np.array([np.nan]))
-    assert ax.get_ylim()[0] == 10 - canvas.DEPTH
+    assert ax.get_ylim()[0] == 10 - canvas.DECIBEL_RANGE
 
 
 def test_densities_are_those_of_the_signals():
@@ -399,7 +399,7 @@ def test_studies(fitted):
         (lambda f, d: plots.linear_simulation(replace(f, linear=None), d), "no linear model"),
     ],
 )
-def test_what_cannot_be_drawn_is_one_sentence(draw, words, fitted, data):
+def test_requests_that_cannot_be_drawn_are_refused(draw, words, fitted, data):
     with pytest.raises(InputError, match=words):
         draw(fitted, data)
 

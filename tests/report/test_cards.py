@@ -55,7 +55,13 @@ def test_a_recording_shows_channels_with_units_and_escapes_their_names():
     u = np.sin(np.arange(5000) / 50)
     r = Recording(u, np.column_stack([u, u**2]), 1e-3, ("<force>",), ("x", "v"), units={"x": "mm"}, name="run 3")
     text = card(r)
-    for said in ("Recording run 3", "5000 samples, step 0.001 s, 5 s", "<force> input", "x output mm", "hold not said"):
+    for said in (
+        "Recording run 3",
+        "5000 samples, step 0.001 s, 5 s",
+        "<force> input",
+        "x output mm",
+        "hold not stated",
+    ):
         assert said in text
     assert "<force>" not in r._repr_html_() and r._repr_html_().count("<polyline") == 3
     assert "and 8 more" in card(Recording(np.tile(u[:, None], 20), u, 1e-3), 30_000)

@@ -66,7 +66,7 @@ def test_without_test_recordings_it_says_so(tmp_path):
 
 @pytest.mark.usefixtures("blank_figures")
 @pytest.mark.slow
-def test_it_says_what_makes_the_answer_less_certain(tmp_path):
+def test_reasons_for_less_confidence_are_mentioned(tmp_path):
     d = example()
     assert "far above the training error" not in Reader(diagnosis_report(d, tmp_path).read_text()).text
     worse = {**d.errors, "test": {**d.errors["test"], "after": 100 * d.errors["train"]["after"]}}
@@ -76,11 +76,11 @@ def test_it_says_what_makes_the_answer_less_certain(tmp_path):
 
 @pytest.mark.usefixtures("blank_figures")
 @pytest.mark.slow
-def test_what_is_closed_in_without_a_name_is_said_with_the_error(tmp_path):
+def test_a_correction_without_a_name_is_mentioned_with_the_error(tmp_path):
     d, note = example(), Gate("ground", "unsure", "creep", "Beside it something more is missing.", False)
-    assert "what is not sure" not in Reader(diagnosis_report(d, tmp_path).read_text()).text
+    assert "laws of uncertain name" not in Reader(diagnosis_report(d, tmp_path).read_text()).text
     text = Reader(diagnosis_report(replace(d, gates=(note,)), tmp_path).read_text()).text
-    assert "with cubic stiffness and what is not sure put back" in text
+    assert "with cubic stiffness and laws of uncertain name put back" in text
 
 
 def test_it_is_simulated_in_the_steps_of_the_fits():

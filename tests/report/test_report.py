@@ -114,9 +114,9 @@ def own_scripts_alone(html):
 
 
 def test_users_text_is_text():
-    blocks = [Text(EVIL), Code(EVIL, EVIL), Table([EVIL], [[EVIL]], EVIL, EVIL), Table(["a"], [[1]], EVIL, folded=True)]
+    blocks = [Text(EVIL), Code(EVIL), Table([EVIL], [[EVIL]], EVIL, EVIL), Table(["a"], [[1]], EVIL, folded=True)]
     blocks += [Picture(square(), EVIL, EVIL)]
-    page = Page(EVIL, [Section(EVIL, blocks)] * 3, EVIL, EVIL, facts={EVIL: EVIL}, footer=EVIL)
+    page = Page(EVIL, [Section(EVIL, blocks)] * 3, EVIL, EVIL, facts={EVIL: EVIL})
     html = page.html()
     reader = Reader(html)
     assert "<script" not in html and not any("onload" in attrs for _, attrs in reader.tags)

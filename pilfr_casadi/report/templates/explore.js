@@ -1,10 +1,10 @@
-/* Replaces each picture that carries its data by a chart of uPlot: hover, zoom, lines on and off, by keyboard too.
-   Where this script does not run, the pictures stand. */
+/* Replaces each picture that carries its data by an interactive chart of uPlot: values, zoom, lines on and off, also by
+   keyboard. Without this script the reader sees the pictures. */
 (() => {
 "use strict";
-const INK = { "#222222": "--ink", "#dddddd": "--line", "#7a7a7a": "--soft" };  // of plots/canvas.py, which draws on white
+const INK = { "#222222": "--ink", "#dddddd": "--line", "#7a7a7a": "--soft" };  // colours of plots/canvas.py for a white background
 const AREA = { "#eeeeee": "--line", "#e8f1f7": "--line" };
-const REACH = 40;  // pixels from the pointer to a point that is told
+const REACH = 40;  // pixels: a point this close to the pointer shows its values
 const style = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const make = (tag, parent, settings = {}) => parent.appendChild(Object.assign(document.createElement(tag), settings));
 const digits = v => Math.abs(v) >= 1e6 || (v && Math.abs(v) < 1e-4) ? v.toExponential(3) : String(+v.toPrecision(5));
@@ -21,7 +21,7 @@ function nearest(x, at) {  // of increasing x
   return at - x[low] < x[high] - at ? low : high;
 }
 
-function ticks(low, high) {  // of a logarithmic axis: few enough to name each
+function ticks(low, high) {  // of a logarithmic axis, few enough to label each
   const decades = Math.log10(high / low), out = [];
   const steps = decades > 3 ? [1] : decades > 1.4 ? [1, 3] : decades > 0.7 ? [1, 2, 5] : [1, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9];
   const every = Math.ceil(decades / 6);
@@ -76,7 +76,7 @@ function explore(figure) {
   tools.className = "tools"; box.appendChild(tools);
   const spoken = make("output", box, { className: "spoken" });
 
-  function extent(axis, within) {  // of what is shown; y over a range of x
+  function extent(axis, within) {  // of the visible lines; for y within a range of x
     let low = Infinity, high = -Infinity;
     for (const l of lines) {
       if (!l.shown || (l.level && axis === "x")) continue;
@@ -99,7 +99,7 @@ function explore(figure) {
     x = toX;
     y = toY || (overTime && extent("y", x)) || y;
     const scales = { x: [...x], y: [...y] };
-    if (spec.equal) {  // one unit is as long across as up
+    if (spec.equal) {  // equal scales on both axes
       const perX = (x[1] - x[0]) / (u.over.clientWidth || 1), perY = (y[1] - y[0]) / (u.over.clientHeight || 1);
       const [axis, per, size] = perX < perY ? ["x", perY, u.over.clientWidth] : ["y", perX, u.over.clientHeight];
       const middle = (scales[axis][0] + scales[axis][1]) / 2;
@@ -235,7 +235,7 @@ function explore(figure) {
   new ResizeObserver(() => { if (plot.clientWidth && plot.clientWidth !== u.width) { u.setSize(size()); look(x, y); } }).observe(plot);
   repaint.push(() => u.redraw(false));
   look(...home);
-  if (spec.equal) setTimeout(() => look(...home));  // now that the axes have their size
+  if (spec.equal) setTimeout(() => look(...home));  // after the axes have got their size
 }
 
 const repaint = [];
