@@ -101,7 +101,7 @@ PROFILES = {
     ),
 }
 SCHEDULES = ("linear", "quadratic", "exponential")  # profiles of a law's strength
-NODES = {"": 0.0, "_25": 0.25, "_75": 0.75, "_high": 1.0}  # shares of the range at which a curve has its values
+CURVE_NODES = {"": 0.0, "_25": 0.25, "_75": 0.75, "_high": 1.0}  # shares of the range at which a curve has its values
 VARIATIONS = ("tilt", "bend", "curve")  # profiles of a parameter
 
 
@@ -164,7 +164,7 @@ class VaryingParameter(Law):
     def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
         """Start values at which a curve equals another variation with the same signal, fitted to `own`."""
         ends = {name: own[name] for name in ("low", "high")}
-        shares = np.array([NODES[name.removeprefix("c")] for name in self.strength])
+        shares = np.array([CURVE_NODES[name.removeprefix("c")] for name in self.strength])
         levels = strengths_over(plain, own, ends["low"] + shares * (ends["high"] - ends["low"]))["c"]
         return ends | dict(zip(self.strength, levels.tolist(), strict=True))
 
