@@ -150,7 +150,7 @@ class Hypotheses:
         return max(self.memo.values(), key=self.optimistic_evidence)
 
     def optimistic_evidence(self, trial: Trial) -> float:
-        """Compute the log evidence of a hypothesis with the sample size of an error at the noise."""
+        """Compute the log evidence of a hypothesis with as many effective samples as at the noise level."""
         return self._log_evidence(trial, trial.mean_square, self.sample.effective(0.0))
 
     def evidence(self, trial: Trial) -> float:

@@ -20,7 +20,7 @@ class _Electrical(Law):
 
 
 class _ElectricalCurve(_Electrical):
-    """A curve of current over voltage, or of voltage over current, of a part that takes power."""
+    """A static curve, current over voltage or voltage over current, of a part that takes power."""
 
     id = "static_curve"
     restoring = True
