@@ -1,4 +1,4 @@
-"""From a conclusion to a Diagnosis: the values, errors and tables that are stated with it."""
+"""Turn a conclusion into a Diagnosis: compute the values, errors and tables that it states."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .evidence import SURE, deviations
 from .gates import Gate
 from .identifiability import port_units
 from .mismatch_map import mismatch
-from .offsets import final_gates, without_zero_offsets
+from .offsets import remove_zero_offsets, update_offsets
 from .preparation import Prepared
 from .proof import errors_of, free_run_errors, mean_nrmse, next_experiment, parameter_table, placebo, test_errors
 from .result import Diagnosis, Effect
@@ -97,26 +97,16 @@ def build_diagnosis(
     request.say("proof", 0, 1)
     bench, without, after = final.bench, final.without, final.after
     std = deviations(bench, after)
-    errors: dict[str, dict[str, float] | None] = {
-        "train": {"nominal": final.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
-        "test": None,
-    }
-    if tests:
-        judged, fits = bench.on(tests), {"before": without, "after": after}
-        errors["test"] = {
-            "nominal": errors_of(judged, judged.model(request.simulator)),  # on the recordings as they are
-            **test_errors(bench, tests, found.gates, fits),
-        }
-    if bench.simulator.observer is not None:
-        errors["free_run"] = free_run_errors(bench, tests or bench.recordings, request.simulator, without, after)
+    errors = _compute_errors(request, found, final, tests)
     fewer = test_errors(bench, tests, found.gates, _without_each_effect(search, found)) if tests else {}
-    effects = tuple(_effect(search, e, after, std, fewer.get(e, np.nan)) for e in found.effects)
+    effects = tuple(_make_effect(search, e, after, std, fewer.get(e, np.nan)) for e in found.effects)
     floor = search.least_floor if found.verdict.kind == "unexplained" else search.floor
     settled = found.verdict.kind in ("complete", "recording-fault") or (
         min((e.confidence for e in effects), default=0) > SURE
     )
+    simulated = [e + r.y for e, r in zip(without.residual, bench.recordings, strict=True)]
     decided = found.decided or search
-    experiment = _next(decided, found.effects, limits)
+    experiment = _design_experiment(decided, found.effects, limits)
     blind_spots = _blind_spots(request, ready, search)
     request.say("proof", 1, 1)
     now = time.perf_counter()
@@ -124,24 +114,18 @@ def build_diagnosis(
         verdict=found.verdict.kind,
         sentence=found.verdict.sentence,
         effects=effects,
-        candidates=tuple(_row(decided, t, step.parent) for step in decided.passes for t in step.trials),
+        candidates=tuple(_candidate_row(decided, t, step.parent) for step in decided.passes for t in step.trials),
         gates=(
             *_surrogate_note(request.stand_in_error),
             *_convergence_note(after),
             *_combination_note(after, std, blind_spots),
-            *final_gates(found.gates, after, std, bool(effects), settled),
+            *update_offsets(found.gates, after, std, bool(effects), settled),
         ),
-        mismatch=mismatch(
-            bench.recordings,
-            without.residual,
-            [e + r.y for e, r in zip(without.residual, bench.recordings, strict=True)],
-            floor.deviation,
-            bench.scale,
-        ),
+        mismatch=mismatch(bench.recordings, without.residual, simulated, floor.deviation, bench.scale),
         parameters=parameter_table(request.simulator, without, after, std),
         errors=errors,
         floor={"nrmse": floor.nrmse(bench.scale), "source": floor.source},
-        corrected=replace(without_zero_offsets(after.corrected()), substeps=after.model.substeps),
+        corrected=replace(remove_zero_offsets(after.corrected()), substeps=after.model.substeps),
         refitted=replace(without.corrected(), substeps=without.model.substeps),
         hold=bench.hold,
         train=bench.recordings,
@@ -159,8 +143,28 @@ def build_diagnosis(
     )
 
 
+def _compute_errors(
+    request: Request, found: Conclusion, final: FinalFits, tests: tuple[Recording, ...]
+) -> dict[str, dict[str, float] | None]:
+    """Compute the table of errors; see `Diagnosis`."""
+    bench, without, after = final.bench, final.without, final.after
+    errors: dict[str, dict[str, float] | None] = {
+        "train": {"nominal": final.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
+        "test": None,
+    }
+    if tests:
+        as_given = bench.on(tests)
+        errors["test"] = {
+            "nominal": errors_of(as_given, as_given.model(request.simulator)),
+            **test_errors(bench, tests, found.gates, {"before": without, "after": after}),
+        }
+    if bench.simulator.observer is not None:
+        errors["free_run"] = free_run_errors(bench, tests or bench.recordings, request.simulator, without, after)
+    return errors
+
+
 def _surrogate_note(error: float) -> tuple[Gate, ...]:
-    """Note that a surrogate stands for the simulation and misses it by an NRMSE of `error`; no note if that is zero."""
+    """Note that a surrogate replaces the simulation, with an NRMSE of `error`; no note if the error is zero."""
     if not error:
         return ()
     words = f"A linear model stands for the simulation, which it follows to NRMSE {error:.4f}; that counts as noise."
@@ -173,7 +177,7 @@ def _convergence_note(after: Fitted) -> tuple[Gate, ...]:
         return ()
     words = (
         f"The fit of the corrected simulator ended early. {after.status.value} Its parameters may still change by more "
-        "than their standard errors; bound those that are known, or add a recording that tells them apart."
+        "than their standard errors; bound known ones, or add a recording that distinguishes them."
     )
     return (Gate("simulation", "convergence", after.status.name.lower(), words, False),)
 
@@ -183,7 +187,7 @@ def _combination_note(
 ) -> tuple[Gate, ...]:
     """Note the numbers that the recordings determine only in combination, so that they have no standard error.
 
-    Those without any effect on the outputs are blind spots.
+    Numbers without any effect on the outputs are blind spots and not in this note.
     """
     own = after.model.parameters
     dead = {name for spot in blind_spots if spot.kind == "dead" for name in spot.names}
@@ -209,7 +213,7 @@ def _combination_note(
 
 
 def _blind_spots(request: Request, ready: Prepared, search: Search) -> tuple[BlindSpot, ...]:
-    """Find what the recordings cannot reveal of the refitted simulator; empty if that cannot be computed."""
+    """Find the blind spots of the recordings for the refitted simulator; empty if they cannot be computed."""
     stated = search.bench.hold if request.hold_said else ""
     with suppress(InputError, np.linalg.LinAlgError):
         return assess_recordings(search.bench, search.root.fitted, ready.floor, stated).blind_spots
@@ -229,7 +233,7 @@ def _without_each_effect(search: Search, found: Conclusion) -> dict[NamedEffect,
     return out
 
 
-def _effect(
+def _make_effect(
     search: Search, named: NamedEffect, fitted: Fitted, std: dict[str, np.ndarray], test_without: float
 ) -> Effect:
     bench = search.bench
@@ -265,7 +269,9 @@ def _effect(
     )
 
 
-def _next(search: Search, effects: Sequence[NamedEffect], limits: Mapping[str, float] | None) -> dict[str, Any] | None:
+def _design_experiment(
+    search: Search, effects: Sequence[NamedEffect], limits: Mapping[str, float] | None
+) -> dict[str, Any] | None:
     """Design the experiment that would separate the first tie, if there is one."""
     if search.bench.simulator.observer is not None:  # a proposed input has no outputs to be led by
         return None
@@ -283,8 +289,8 @@ def _next(search: Search, effects: Sequence[NamedEffect], limits: Mapping[str, f
     return None
 
 
-def _row(search: Search, t: Trial, parent: Trial) -> dict[str, Any]:
-    """Return a candidate's row for diagnosis.json: the law beside those of its parent."""
+def _candidate_row(search: Search, t: Trial, parent: Trial) -> dict[str, Any]:
+    """Return a candidate's row for diagnosis.json, with the law that it adds to its parent."""
     added = next((e for e in t.laws if (e.port, type(e.law)) not in parent.key), t.element)
     held_out = search.findings[t.key].held_out
     gain = search.evidence(t) - search.evidence(parent)

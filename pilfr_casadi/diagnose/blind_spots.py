@@ -1,9 +1,9 @@
-"""Blind spots: what recordings and sensors cannot reveal of a simulator, found without fitting a law (`pilfr check`).
+"""Find blind spots of recordings and sensors: facts that they cannot reveal, without fitting a law (`pilfr check`).
 
 The simulator's own parameters are refitted once. `identifiability` then tells which parameters are identifiable and
 which laws are detectable at which ports, and `excitations` counts reversals and amplitudes of the motion. A parameter
 or law that is not identifiable or detectable is a blind spot, and so is a motion without reversals. The gravest blind
-spot that another recording can mend decides what to record next.
+spot that another recording can remove decides what to record next.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from .identifiability import (
     live_ports,
     port_units,
 )
-from .linearise import Probe, Run, linearised
+from .linearise import Probe, Run, linearise_runs
 from .proof import mean_nrmse
 from .workbench import Fitted, Workbench
 
-LEAST_NOISE = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
-# mean square error over the outputs' power above which the linearisation may be far from the machine: the simulator
-# then explains less of the outputs than it misses
+SENSOR_RESOLUTION = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
+# mean square error over the outputs' power above which the linearisation may be far from the machine, because the
+# simulator explains less of the outputs than it misses
 ROUGH = 0.5
 SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
 
@@ -55,7 +55,7 @@ IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the bl
     "tied": ("no: traded off, see above", ""),
     "port": ("only with a law at its port", ""),
 }
-MOTION = {  # by kind of blind spot: the record that mends it
+MOTION = {  # by kind of blind spot: the record that removes it
     "no-reversal": "A slow triangle of {} with reversals, at two amplitudes.",
     "one-amplitude": "A second amplitude of {}, such as half of it.",
 }
@@ -289,8 +289,8 @@ def assess_recordings(
 ) -> Check:
     """Assess the recordings of a bench along a refitted run; `stated` is the stated hold, "" if none was stated."""
     began, inputs, outputs = time.perf_counter(), bench.simulator.inputs, bench.simulator.output_names
-    noise = np.maximum(floor.deviation, LEAST_NOISE * bench.scale)
-    probe, runs = linearised(bench, fitted)
+    noise = np.maximum(floor.deviation, SENSOR_RESOLUTION * bench.scale)
+    probe, runs = linearise_runs(bench, fitted)
     quiet = replace(bench, scale=noise)  # from here on, the noise is the unit of all outputs
     response = Sensitivity.of(quiet, fitted, runs)
     parameters, ties = assess_parameters(response)
@@ -329,7 +329,7 @@ def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[Param
     given = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model)
     if not np.isfinite(given.cost):
         return ()
-    response = Sensitivity.of(bench, given, linearised(bench, given)[1])
+    response = Sensitivity.of(bench, given, linearise_runs(bench, given)[1])
     reach = dict(zip(response.names, response.reach, strict=True))
     return tuple(name for name in doubtful if reach[name] >= 1)
 
@@ -401,7 +401,7 @@ def _alike_ports(found: Check) -> list[list[str]]:
 
 
 def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) -> str:
-    """Say what to record next, from the gravest blind spot that a recording can mend."""
+    """Say what to record next, from the gravest blind spot that a recording can remove."""
     names = {b.kind: b.names for b in reversed(found.blind_spots)}
     if "rough" in names:
         return "None before the simulator follows these better: check its values and units, the start and the hold."
@@ -444,27 +444,27 @@ def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator
             reversals += max(len(turns) - 2, 0)
             swings += np.abs(np.diff(z[turns])).tolist()
             longest = 2 * float(np.median(np.diff(turns))) if len(turns) > 2 else SMALL_SHARE * len(z)
-            rests += _rests(z, least, longest)
+            rests += _count_rests(z, least, longest)
         unit = port.across_unit or port_units(port, bench.recordings[0])[1]
-        yield Excitation(port.name, travel, unit, reversals, _distinct(np.array(swings)), rests)
+        yield Excitation(port.name, travel, unit, reversals, _count_distinct(np.array(swings)), rests)
 
 
 def _turning_points(z: np.ndarray, least: float) -> list[int]:
     """Find the turning points of z between swings of at least `least`, the first and the last included."""
-    turns, extreme, way = [0], 0, 0.0
+    turns, extreme, direction = [0], 0, 0.0
     for k, value in enumerate(z.tolist()):
-        if way == 0:
+        if direction == 0:
             if abs(value - z[0]) >= least:
-                way, extreme = np.sign(value - z[0]), k
-        elif way * (value - z[extreme]) >= 0:
+                direction, extreme = np.sign(value - z[0]), k
+        elif direction * (value - z[extreme]) >= 0:
             extreme = k
-        elif way * (z[extreme] - value) >= least:
+        elif direction * (z[extreme] - value) >= least:
             turns.append(extreme)
-            way, extreme = -way, k
+            direction, extreme = -direction, k
     return [*turns, extreme] if extreme > turns[-1] else turns
 
 
-def _distinct(swings: np.ndarray) -> int:
+def _count_distinct(swings: np.ndarray) -> int:
     """Count the distinct sizes of nine tenths of the swings; sizes within a tenth of the largest count once."""
     if not len(swings):
         return 0
@@ -478,7 +478,7 @@ def _distinct(swings: np.ndarray) -> int:
     return int(np.searchsorted(share, 1 - SMALL_SHARE - 1e-9) + 1)
 
 
-def _rests(z: np.ndarray, least: float, samples: float) -> int:
+def _count_rests(z: np.ndarray, least: float, samples: float) -> int:
     """Count the stretches of more than `samples` samples in which z stays within `least`."""
     count, begin, low, high = 0, 0, z[0], z[0]
     for k, value in enumerate(z):

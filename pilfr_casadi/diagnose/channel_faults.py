@@ -17,7 +17,7 @@ from ..engine import make_engine
 from ..optimise import GaussNewton
 from ..simulators import SENSOR, port_name
 from .gates import CLEARLY_BETTER, CURED_SHARE, POOR_FIT, USELESS_FIT, Checked, Gate, accept, correct
-from .offsets import constant_at
+from .offsets import describe_constant
 from .workbench import Workbench
 
 # metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
@@ -96,7 +96,7 @@ def find_slips(now: Checked, workers: int) -> Checked:
     # with an offset there is a working point, which a run from rest would have to reach first
     found = _accept_best(now, _possible_slips(now, _from_rest(bench)), workers)
     for i, name in enumerate(bench.simulator.output_names if found.cost > POOR_FIT else ()):
-        offset = constant_at(port_name(SENSOR, name))
+        offset = describe_constant(port_name(SENSOR, name))
         level = correct(now, offset, [{}, now.fitted.values], now.fitted.begin)
         if level is None:
             continue

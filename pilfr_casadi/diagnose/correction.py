@@ -1,11 +1,11 @@
 """The corrected simulator: the candidate that best predicts data it was not fitted to, with or without a named law.
 
 If the named answer is not sure, or leaves error above the noise, several candidates compete on held-out parts of the
-training recordings (`evidence`): the refitted simulator, the named laws (with and without those that are not sure) or
-else all likely hypotheses, and a learned force alone or beside them. The score is the held-out error plus the spread of
-predictions for other inputs (`evidence.spread`), which is large if many parameters are hardly determined. The smallest
-score wins. Candidates are predicted in the order of their fit error plus spread, until that exceeds the smallest score.
-Test recordings are never used.
+training recordings (`evidence`): the refitted simulator; the named laws, all of them and the sure ones alone; all
+likely hypotheses if no law is named; and a learned force, alone or beside laws. The score is the held-out error plus
+the spread of predictions for other inputs (`evidence.spread`), which is large if many parameters are hardly determined.
+The smallest score wins. Candidates are predicted in the order of their fit error plus spread, until that exceeds the
+smallest score. Test recordings are never used.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Correction:
 
     @property
     def sentence(self) -> str:
-        """Say what is named, what is learned, what is left, and how much better the simulator predicts."""
+        """State the elements, the shares that they explain, and how much better the simulator predicts."""
         named, learned, left = (f"{100 * self.shares[k]:.3g} %" for k in ("named", "learned", "left"))
         shares = (
             f"Of the mismatch above the noise, named laws explain {named}, a learned force {learned}; {left} is left."
@@ -115,12 +115,12 @@ _Predicted = tuple[_Candidate, HeldOut]
 def find_correction(search: Search, answer: Posterior, named: bool = False) -> tuple[Correction, Fitted]:
     """Choose the corrected simulator from the candidates that can be tried before the deadline.
 
-    With `named`, the answer names its effects. If a learned element at another port predicts as well without them, the
-    correction omits them. Learned elements at their own ports would only imitate them, and are not tried. After the
-    deadline nothing more is fitted, and after an interrupt the named laws stay.
+    With `named`, the answer names its effects. If a learned element at another port predicts better without them, the
+    correction omits them. A learned element at the port of a named effect would only imitate it, and is not tried.
+    After the deadline nothing more is fitted, and after an interrupt the named laws stay.
     """
     best_laws = answer.best
-    if named and (search.interrupted or _settled(search, answer)):
+    if named and (search.interrupted or _is_settled(search, answer)):
         return named_correction(search, best_laws.fitted), best_laws.fitted
     refitted = _predict(search, [_make_candidate(search, search.root)], [])
     tried = _named_hypotheses(search, answer) if named else _hypotheses_with_laws(search)
@@ -134,7 +134,7 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     learned += _learned_candidates(search, search.root, {e.port for e in best_laws.laws} if named else ())
     candidate, held_out = _choose(_predict(search, learned, predicted))
     fitted, base = candidate.fitted, candidate.base
-    # what nothing explains is no noise, though it passes for noise in the floor
+    # without a name, the floor may contain error that no law explains; only the least noise is then certain
     noise2 = search.floor2 if named else search.least_noise2
     shares = _shares(search, base.fitted, fitted, noise2)
     elements: tuple[Learned, ...] = ()
@@ -142,16 +142,16 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
         laws = dict.fromkeys((*CATALOGUE, *search.laws))
         elements = (describe_learned(search.bench, fitted, shares["learned"], laws),)
     errors = refitted[0][1].error, held_out.error
-    return Correction(_elements(search, fitted), shares, elements, *errors, base), fitted
+    return Correction(_describe_elements(search, fitted), shares, elements, *errors, base), fitted
 
 
-def _settled(search: Search, answer: Posterior) -> bool:
+def _is_settled(search: Search, answer: Posterior) -> bool:
     """Tell whether the names are sure and leave nothing that a force at a port could explain."""
     return answer.sure > SURE and explainable_remainder(search, answer.best) < FORMULA_ERROR
 
 
 def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_Predicted]) -> list[_Predicted]:
-    """Predict held-out data with further candidates, the most promising first; leave out those that cannot be best."""
+    """Predict held-out data with further candidates, the most promising first, as long as they can be best."""
     out = list(predicted)
     for c in sorted(candidates, key=lambda c: c.least):
         least = min((h.mean_square for _, h in out), default=np.inf)
@@ -206,12 +206,12 @@ def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()
         fitted = refit_learned(search.bench, found)
     except InputError:  # it diverges
         return []
-    return [_Candidate(fitted, base, search.spread(fitted, _own_elements(search, fitted)))]
+    return [_Candidate(fitted, base, search.spread(fitted, _added_elements(search, fitted)))]
 
 
 def named_correction(search: Search, fitted: Fitted) -> Correction:
     """Describe a simulator without a learned element, which was not compared with others."""
-    return Correction(_elements(search, fitted), _shares(search, fitted, fitted, search.floor2))
+    return Correction(_describe_elements(search, fitted), _shares(search, fitted, fitted, search.floor2))
 
 
 def _may_recur(search: Search, trial: Trial) -> bool:
@@ -228,11 +228,11 @@ def _shares(search: Search, named: Fitted, whole: Fitted, noise2: float) -> dict
     return {"named": 1 - beside_names, "learned": beside_names - left, "left": left}
 
 
-def _elements(search: Search, fitted: Fitted) -> tuple[tuple[str, str, str], ...]:
+def _describe_elements(search: Search, fitted: Fitted) -> tuple[tuple[str, str, str], ...]:
     """Return port, law and form of the elements that the diagnosis has added."""
-    return tuple((e.port, e.law.id, e.law.form) for e in _own_elements(search, fitted))
+    return tuple((e.port, e.law.id, e.law.form) for e in _added_elements(search, fitted))
 
 
-def _own_elements(search: Search, fitted: Fitted) -> Sequence[Placed]:
+def _added_elements(search: Search, fitted: Fitted) -> Sequence[Placed]:
     """Return the elements that the diagnosis has added."""
     return fitted.simulator.elements[len(search.bench.simulator.elements) :]

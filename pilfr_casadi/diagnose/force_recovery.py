@@ -5,9 +5,9 @@ by a random step each sample,
 
     Δx⁺ = A Δx + B Δw,   w⁺ = w + ε,   y_measured - y = C Δx + D Δw + noise.
 
-All of it is estimated from all outputs, past and future (Rauch, Tung & Striebel 1965, AIAA J. 3(8)). The variances of ε
-and of the noise (at least the given one) are chosen from a few by maximum likelihood. A nonlinear simulator is
-linearised again along the result.
+States and force are estimated from all outputs, past and future (Rauch, Tung & Striebel 1965, AIAA J. 3(8)). The
+variances of ε and of the noise (at least the given one) are chosen from a grid by maximum likelihood. A nonlinear
+simulator is linearised again along the result.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from ..simulators import (
     signals,
     states_along,
 )
-from .linearise import Constant, input_slope, local_signals, loudest_stretch, over_samples
+from .linearise import Constant, compose_substeps, input_slope, local_signals, loudest_stretch, simulate_states
 from .workbench import Fitted, Workbench
 
-LOUDER = (1.0, 3.0, 9.0)  # factors on the given noise that are tried
-MOST_SAMPLES = 4000  # longest stretch of a recording that is smoothed: the one with the most energy
+NOISE_FACTORS = (1.0, 3.0, 9.0)  # factors on the given noise that are tried
+SMOOTHED_SAMPLES = 4000  # longest stretch of a recording that is smoothed: the one with the most energy
 PASSES = 3  # linearisations at most
 # random steps of the force that are tried, in units of the force that explains the residual
-TRIED = np.logspace(-4.0, 0.5, 10)
+RANDOM_STEPS = np.logspace(-4.0, 0.5, 10)
 
 
 @dataclass(frozen=True, eq=False)
 class _Smoother:
-    """The linear system that is smoothed, with state [Δx; Δw] scaled to unit size.
+    """The linear system of the smoother, with state [Δx; Δw] scaled to unit size.
 
     f (M, n, n), h (M, n_y, n), outputs e (M, n_y) in units of the noise; known change `steps` (M,) of w; `unit` (n,).
     """
@@ -64,7 +64,7 @@ class _Smoother:
         blocks: list[np.ndarray],
         error: np.ndarray,
         noise: np.ndarray,
-        held: np.ndarray,
+        expected: np.ndarray,
         states: np.ndarray,
         n: int,
     ) -> _Smoother:
@@ -72,7 +72,7 @@ class _Smoother:
         m, n_x, n_y = len(error), states.shape[1], error.shape[1]
         a, b, c, d = blocks
         constant = np.allclose(a, a[0], rtol=1e-9, atol=1e-12)
-        f, g = over_samples(a, b, n)
+        f, g = compose_substeps(a, b, n)
         g, c, d = g[:, :, 0], c[::n], d[::n, :, 0]
         noise = np.maximum(noise, 1e-6 * np.std(error, axis=0) + 1e-300)
         x, total = np.zeros(n_x), 0.0  # response of the outputs to a lasting unit force
@@ -81,7 +81,7 @@ class _Smoother:
             x = f[0] @ x + g[0]
         response = np.sqrt(total / min(m, 500)) if np.isfinite(total) else 0.0
         spread = float(np.sqrt(np.mean((error / noise) ** 2)))
-        size = max(spread / response if response > 0 else 0.0, float(np.std(held)), 1e-300)
+        size = max(spread / response if response > 0 else 0.0, float(np.std(expected)), 1e-300)
         size = size if response > 0 else 0.0
         unit = np.append(np.maximum(np.std(states, axis=0), 1e-12), size)
         whole, seen = np.zeros((m, n_x + 1, n_x + 1)), np.zeros((m, n_y, n_x + 1))
@@ -92,7 +92,7 @@ class _Smoother:
             whole / divided[:, None] * unit,
             seen * unit / noise[:, None],
             error / noise,
-            np.append(-np.diff(held), 0.0) / divided[-1],
+            np.append(-np.diff(expected), 0.0) / divided[-1],
             unit,
             bool(constant),
         )
@@ -101,7 +101,7 @@ class _Smoother:
         """Find the likeliest random step of the force and factor on the noise; None if the force is not observable."""
         if not self.unit[-1] > 0:
             return None
-        q, r = (v.ravel() for v in np.meshgrid(TRIED, LOUDER, indexing="ij"))
+        q, r = (v.ravel() for v in np.meshgrid(RANDOM_STEPS, NOISE_FACTORS, indexing="ij"))
         costs, _ = self._filter(q, r, min(len(self.e), 1200))
         if not np.any(np.isfinite(costs)):
             return None
@@ -152,7 +152,7 @@ class _Smoother:
 
 @dataclass(frozen=True, eq=False)
 class HiddenForce:
-    """The force in a port along one recording; arrays have the shape (K,), those of the law (K + 1,)."""
+    """The force in a port along one recording; arrays have the shape (K,), the law's arrays (K + 1,)."""
 
     port: str
     recording: str
@@ -175,25 +175,23 @@ class HiddenForce:
 def hidden_force(
     bench: Workbench, fitted: Fitted, port: str, number: int | None, noise: np.ndarray, i: int = 0
 ) -> HiddenForce | None:
-    """Recover the force in a port along one recording; None if the outputs do not show it.
+    """Recover the force in a port along one recording; None if the outputs do not reveal it.
 
-    The force is that of element `number` of the corrected simulator; with None it is one at `port` beside all elements.
-    `noise` (n_y,) is the standard deviation of the outputs' noise.
+    Element `number` of the corrected simulator is removed, and its force recovered; with None, the force is recovered
+    that acts at `port` beside all elements. `noise` (n_y,) is the standard deviation of the outputs' noise.
     """
     if kind_of(port) == PARAMETER:  # no force acts there
         return None
-    r, n = bench.recordings[i], fitted.model.substeps
-    drive, start = fitted.model.drive(r), np.asarray(fitted.initial[i], dtype=float)
+    r = bench.recordings[i]
     with np.errstate(all="ignore"):
-        states = states_along(fitted.model, drive, fitted.vector, start)
-        law = _law_signals(fitted, number, states[::n], r, bench) if number is not None else None
-        base, x0 = _without(fitted, number, start, bench.dt / n)
+        law = law_signals(bench, fitted, number, i) if number is not None else None
+        base, x0 = _remove_element(fitted, number, fitted.initial[i], bench.dt / fitted.model.substeps)
         instant = kind_of(port) == SENSOR or (kind_of(port) == ACTUATOR and bench.hold == "zero")
-        held = np.zeros(len(r)) if law is None else law[2]
-        held = held if instant else (held + np.append(held[1:], held[-1])) / 2
-        loud = held if law is not None else np.abs(fitted.residual[i] / bench.scale).sum(axis=1)
-        window = loudest_stretch(loud**2, MOST_SAMPLES, r.skip)
-        found = _recover(bench, fitted, _Target(base, port, x0, r, held, noise, window))
+        expected = np.zeros(len(r)) if law is None else law[2]
+        expected = expected if instant else (expected + np.append(expected[1:], expected[-1])) / 2
+        size = expected if law is not None else np.abs(fitted.residual[i] / bench.scale).sum(axis=1)
+        window = loudest_stretch(size**2, SMOOTHED_SAMPLES, r.skip)
+        found = _recover(bench, fitted, _Target(base, port, x0, r, expected, noise, window))
     if found is None:
         return None
     z, dz, force, std = found
@@ -205,15 +203,8 @@ def hidden_force(
 
 def law_signals(bench: Workbench, fitted: Fitted, number: int, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute local coordinate, rate and force, (M,) each, of an element along the fitted run of recording i."""
-    r, n = bench.recordings[i], fitted.model.substeps
-    drive, start = fitted.model.drive(r), np.asarray(fitted.initial[i], dtype=float)
-    return _law_signals(fitted, number, states_along(fitted.model, drive, fitted.vector, start)[::n], r, bench)
-
-
-def _law_signals(
-    fitted: Fitted, number: int, states: np.ndarray, r: Recording, bench: Workbench
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute local coordinate, rate and force, (M,) each, of an element along a run."""
+    r = bench.recordings[i]
+    states = simulate_states(fitted, r, fitted.initial[i])
     simulator = on_grid(fitted.simulator, bench.dt / fitted.model.substeps)
     own = simulator.parameter_set
     vector = ca.SX.sym("p", own.size)
@@ -227,7 +218,7 @@ def _law_signals(
     return rows[:, 0, 0], rows[:, 1, 0], rows[:, 2, 0]
 
 
-def _without(fitted: Fitted, number: int | None, start: np.ndarray, h: float) -> tuple[Simulator, np.ndarray]:
+def _remove_element(fitted: Fitted, number: int | None, start: np.ndarray, h: float) -> tuple[Simulator, np.ndarray]:
     """Return the simulator without one of its elements, and its initial state without that element's part."""
     simulator = fitted.simulator
     if number is None:
@@ -251,7 +242,7 @@ class _Target:
     port: str
     x0: np.ndarray
     recording: Recording
-    held: np.ndarray  # the force expected over each sample
+    expected: np.ndarray  # the force expected over each sample
     noise: np.ndarray
     window: slice
 
@@ -261,25 +252,25 @@ def _recover(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
     """Smooth the force in passes; return local coordinate and rate (M,), force and standard deviation (M - 1,)."""
     n, window, r = fitted.model.substeps, target.window, target.recording
-    probed = target.simulator.with_element(target.port, Constant())
-    model = discretise(probed, bench.dt, bench.hold, n)
+    open_ = target.simulator.with_element(target.port, Constant())
+    model = discretise(open_, bench.dt, bench.hold, n)
     drive = model.drive(r)
     values = {k: v for k, v in fitted.values.items() if k in target.simulator.parameters}
     p = np.tile(model.parameters.pack(values), (len(drive), 1))
-    row = model.parameters.position(f"{probed.elements[-1].prefix}w").start
+    row = model.parameters.position(f"{open_.elements[-1].prefix}w").start
     step = _linearised_step(model, row)
-    x0, held = target.x0, target.held
-    best: tuple[float, Any] | None = None
+    x0, force = target.x0, target.expected
+    best: tuple[float, tuple[np.ndarray, np.ndarray, np.ndarray]] | None = None
     size: tuple[float, float] | None = None
     for _ in range(PASSES):
-        p[:, row] = np.repeat(held, n)
+        p[:, row] = np.repeat(force, n)
         states = states_along(model, drive, p, x0)
         cut = slice(window.start * n, window.stop * n)
         simulated, *blocks = map_points(step, states[cut], drive[cut], p[cut])
         error = r.y[window] - simulated[::n, :, 0]
         if not np.all(np.isfinite(error)):
             break
-        system = _Smoother.of(blocks, error, target.noise, held[window], states[cut][::n], n)
+        system = _Smoother.of(blocks, error, target.noise, force[window], states[cut][::n], n)
         size = size or system.likeliest()
         if size is None:
             return None
@@ -287,17 +278,17 @@ def _recover(
         score = float(np.mean((error / bench.scale) ** 2))
         if best is not None and score > best[0]:
             break
-        best = (score, (states[cut][::n] + dx, held[window] + dw, std))
+        best = (score, (states[cut][::n] + dx, force[window] + dw, std))
         if system.constant:
             break
         x0 = x0 + dx[0] if window.start == 0 else x0
-        held = held.copy()
-        held[window] += dw
+        force = force.copy()
+        force[window] += dw
     if best is None:
         return None
-    path, force, std = best[1]
-    states = path[:, : len(target.simulator.states)]
-    z, dz = _local(bench, target.simulator, values, target.port, states, r.slice(window.start, window.stop))
+    states, force, std = best[1]
+    states = states[:, : len(target.simulator.states)]
+    z, dz = _local_motion(bench, target.simulator, values, target.port, states, r.slice(window.start, window.stop))
     return z, dz, force[:-1], std[:-1]
 
 
@@ -309,7 +300,7 @@ def _linearised_step(model: Model, row: int) -> ca.Function:
     return ca.Function("step", [x, u, q], [y, *blocks])
 
 
-def _local(
+def _local_motion(
     bench: Workbench, base: Simulator, values: dict[str, Any], port: str, states: np.ndarray, r: Recording
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute local coordinate and rate, (M,) each, of a port along states (M, n_x)."""

@@ -25,7 +25,7 @@ from ..data import Recording
 from ..optimise import GaussNewton
 from ..simulators import Simulator
 from .floor import FEWEST, Floor, effective_size, noise_floor
-from .linearise import Probe, Run, linearised
+from .linearise import Probe, Run, linearise_runs
 from .screen import followed, moved, project_off
 from .workbench import QUICK, Fitted, Workbench
 
@@ -250,7 +250,7 @@ class FirstOrder:
     @classmethod
     def of(cls, bench: Workbench, fitted: Fitted) -> FirstOrder:
         """Linearise a fit."""
-        probe, runs = linearised(bench, fitted)
+        probe, runs = linearise_runs(bench, fitted)
         skips = [r.skip for r in bench.recordings]
         error = [(one.error / bench.scale)[skip:].ravel() for one, skip in zip(runs, skips, strict=True)]
         return cls(bench, probe, runs, followed(bench, runs, skips), np.concatenate(error))

@@ -1,4 +1,4 @@
-"""The hypotheses of a search: sets of laws in ports, each fitted once and kept, all compared by one log evidence."""
+"""The hypotheses of a search: sets of laws in ports, each fitted once and kept, and compared by one log evidence."""
 
 from __future__ import annotations
 
@@ -33,8 +33,9 @@ from .evidence import (
     spread,
 )
 from .floor import FEWEST, Floor, effective_size, white_part
+from .gates import EQUAL_RATIO
 from .screen import Scored, flexible_shares, screen
-from .trials import EQUAL_COSTS, Key, Trial, Trials
+from .trials import Key, Trial, Trials
 from .workbench import DIVERGED, Fitted, Workbench
 
 MOST_PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
@@ -64,7 +65,7 @@ class Findings:
 
 @dataclass(eq=False)
 class Hypotheses:
-    """The hypotheses that were fitted to some recordings, by key, with all that is known of each.
+    """The hypotheses that were fitted to some recordings, and the results about each.
 
     Attributes
     ----------
@@ -91,7 +92,7 @@ class Hypotheses:
     out_of_time : bool
         Whether the time limit ended the search.
     mismatch2 : float, optional
-        Mean square of the mismatch of which the formulas of laws may leave a share, by default that of the refit.
+        Mean square of the mismatch; formulas of laws may leave a share of it. By default the error of the refit.
     """
 
     bench: Workbench
@@ -129,7 +130,7 @@ class Hypotheses:
 
     @property
     def tolerance(self) -> float:
-        """Mean square error that the formulas of laws leave of any mismatch, because no machine follows one exactly."""
+        """Mean square error that any law may leave, because no machine follows a formula exactly."""
         mismatch2 = self.root.mean_square if self.mismatch2 is None else self.mismatch2
         return FORMULA_ERROR * max(mismatch2 - self.floor2, 0.0)
 
@@ -145,11 +146,11 @@ class Hypotheses:
 
     @property
     def best(self) -> Trial:
-        """The most promising hypothesis, from which the search goes on."""
+        """The most promising hypothesis, from which the search continues."""
         return max(self.memo.values(), key=self.optimistic_evidence)
 
     def optimistic_evidence(self, trial: Trial) -> float:
-        """Compute the log evidence of a hypothesis as if the missing rest were found: samples count as at the noise."""
+        """Compute the log evidence of a hypothesis with as many effective samples as at the noise level."""
         return self._log_evidence(trial, trial.mean_square, self.sample.effective(0.0))
 
     def evidence(self, trial: Trial) -> float:
@@ -184,7 +185,7 @@ class Hypotheses:
     def held_out(self, trial: Trial) -> HeldOut:
         """Compute the held-out errors of a hypothesis, once.
 
-        If it follows no better than with fewer laws, the others do nothing, and it predicts as without them.
+        If it follows no better than with fewer laws, it has the errors of the hypothesis with fewer laws.
         """
         known = self.findings[trial.key].held_out
         if known is None:
@@ -199,7 +200,7 @@ class Hypotheses:
         """Tell whether two hypotheses follow the recordings so alike that these do not distinguish them."""
         ratio = one.mean_square / max(other.mean_square, 1e-300)
         nats = 0.5 * self.sample.effective(0.0) * np.log(ratio)
-        return bool(ratio < EQUAL_COSTS and nats < INDISTINGUISHABLE_NATS)
+        return bool(ratio < EQUAL_RATIO and nats < INDISTINGUISHABLE_NATS)
 
     def held_out_errors(self, fitted: Fitted, spread: float) -> HeldOut:
         """Compute the held-out errors of a fitted simulator with a known spread for other inputs."""
@@ -207,7 +208,7 @@ class Hypotheses:
 
     def spread(self, fitted: Fitted, laws: Sequence[Placed]) -> float:
         """Compute the mean square uncertainty of a fitted simulator's predictions for other inputs."""
-        own = Sample(self.floor2, _count_samples(fitted, self.bench))
+        own = Sample(self.floor2, count_samples(fitted, self.bench))
         return spread(self.bench, fitted, laws, fitted.cost + self.tolerance, own.effective(0.0))
 
     @property
@@ -218,8 +219,8 @@ class Hypotheses:
     def judge_on_held_out_data(self) -> None:
         """Compute the held-out errors of the likeliest hypotheses.
 
-        If only one is likely and its error is noise, the fit error is enough. A wrong model may overfit; and of several
-        that follow the recordings equally well, the right one predicts best.
+        If only one is likely and its error is noise, the fit error is enough. Otherwise held-out data decide, because a
+        wrong model may overfit, and among models that follow the recordings equally well the right one predicts best.
         """
         if not self._all_wrong and len({frozenset((e.port, e.law.id) for e in t.laws) for t in self._likeliest()}) < 2:
             return
@@ -231,7 +232,7 @@ class Hypotheses:
                 left = [t for t in likely if self.findings[t.key].held_out is None]
                 if not left or (done >= MOST_PREDICTED and left[0] is not likely[0]):
                     break
-                if not self.in_time():  # a comparison that was not finished favours what was not judged
+                if not self.in_time():  # an unfinished comparison favours the hypotheses that were not judged
                     self.forget_held_out()
                     break
                 self.held_out(left[0])
@@ -242,7 +243,7 @@ class Hypotheses:
             known.held_out = None
 
     def _likeliest(self) -> list[Trial]:
-        """List the hypotheses that may be the likeliest."""
+        """List the hypotheses whose evidence is near the largest."""
         return likeliest(list(self.memo.values()), self.evidence)
 
     def flexible(self, trial: Trial) -> dict[str, float]:
@@ -271,7 +272,7 @@ class Hypotheses:
 
     @property
     def least_floor(self) -> Floor:
-        """The noise at least: what was measured, or the white part of the best residual."""
+        """Lower limit of the noise: the measured noise, or the white part of the best residual."""
         if self.floor.source != "estimated":
             return self.floor
         white = np.hypot(white_part(self.best.fitted.residual), self.stand_in_error * self.bench.scale)
@@ -279,11 +280,11 @@ class Hypotheses:
 
     @property
     def least_noise2(self) -> float:
-        """Mean square of the noise at least, in units of the outputs' variance."""
+        """Mean square of the least floor, in units of the outputs' variance."""
         return float(np.mean((self.least_floor.deviation / self.bench.scale) ** 2))
 
     def can_improve(self, trial: Trial, noise2: float | None = None) -> bool:
-        """Tell whether a law that removes all but the noise would be worth its prior beside a hypothesis."""
+        """Tell whether a further law would be worth its prior if it left only the noise."""
         noise2 = self.floor2 if noise2 is None else noise2
         left, noise = (v + self.tolerance for v in (trial.mean_square, noise2))
         most = 0.5 * self.sample.effective(0.0) * np.log(max(left / noise, 1.0))
@@ -307,7 +308,7 @@ class Hypotheses:
         if known is None or trial.supersedes(known):
             self.memo[trial.key] = trial
             self.findings.pop(trial.key, None)
-        if self.floor.source == "estimated" and trial.mean_square < self.floor2:  # noise is no larger than what is left
+        if self.floor.source == "estimated" and trial.mean_square < self.floor2:  # noise is no larger than the residual
             self.floor = Floor(np.minimum(self.floor.deviation, self.rms(trial)), "estimated")
 
     def thorough(self, trial: Trial) -> Trial:
@@ -317,16 +318,16 @@ class Hypotheses:
         return self.memo[trial.key]
 
     def estimate_noise(self) -> None:
-        """Estimate the noise: the part of the best hypothesis' residual that no force and no law at any port explains.
+        """Estimate the noise as the part of the best hypothesis' residual that no force or law at any port explains.
 
-        A measured noise is kept. Third differences give a lower limit: the white noise inside the residual. The
+        A measured noise is kept. Third differences give a lower limit: the white noise in the residual. The
         smallest error of any hypothesis is an upper limit. The effective samples follow from the residual's
         correlation. The slow residual of a wrong model would make them so few that no evidence could refute it; so a
         hypothesis that leaves a far smaller error takes its place.
         """
         best, nearest = self.best, min(self.memo.values(), key=lambda t: t.mean_square)
         best = nearest if FAR_RATIO * nearest.error < best.error else best
-        self.count = _count_samples(best.fitted, self.bench)
+        self.count = count_samples(best.fitted, self.bench)
         if self.floor.source != "estimated":
             return
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
@@ -341,10 +342,10 @@ class Hypotheses:
         pairs = zip(trial.fitted.residual, self.bench.recordings, strict=True)
         return np.asarray(np.sqrt(np.mean(np.concatenate([e[r.skip :] for e, r in pairs]) ** 2, axis=0)))
 
-    def beside(self, laws: Sequence[Placed], joint: Trial) -> Trial:
-        """Make a trial of some laws of a hypothesis, perhaps of another search, at the values that they have there.
+    def run_laws(self, laws: Sequence[Placed], joint: Trial) -> Trial:
+        """Run some laws of a hypothesis, perhaps of another search, at its values, and return them as a trial.
 
-        It runs on steps as fine as the hypothesis, because a law that only asks for finer steps explains nothing.
+        The steps are as fine as those of the hypothesis, because a law that only needs finer steps explains nothing.
         """
         simulator: Simulator = self.bench.simulator
         named: dict[str, object] = {k: joint.fitted.values.get(k, v) for k, v in self.root.fitted.values.items()}
@@ -358,9 +359,9 @@ class Hypotheses:
     def leave_out(self, joint: Trial, elements: Sequence[Placed]) -> Trial | None:
         """Fit a hypothesis without some of its laws to convergence; None if it diverges.
 
-        A law that was found only beside another one may do without it. After the deadline the trial is as it was found.
+        A law that was found beside another one may not need it. After the deadline the trial is not fitted.
         """
-        rest = self.beside([e for e in joint.laws if not any(e is left for left in elements)], joint)
+        rest = self.run_laws([e for e in joint.laws if not any(e is left for left in elements)], joint)
         if not rest.mean_square < DIVERGED:
             return None
         known = self.memo.get(rest.key)
@@ -396,7 +397,10 @@ class Hypotheses:
 
 @dataclass(frozen=True)
 class UntilInterrupted:
-    """A context that an interrupt ends; the search is marked as interrupted then."""
+    """A context that an interrupt ends; it then marks the search as interrupted.
+
+    It is a class because type checkers know by the `bool` of `__exit__` that code after the context is reached.
+    """
 
     hypotheses: Hypotheses
 
@@ -413,12 +417,12 @@ class UntilInterrupted:
 
 
 def likeliest(trials: Sequence[Trial], evidence: Callable[[Trial], float]) -> list[Trial]:
-    """List the hypotheses that may be the likeliest by an evidence, the likeliest first."""
+    """List the hypotheses whose evidence is near the largest, the likeliest first."""
     ranked = sorted(trials, key=evidence, reverse=True)
     return [t for t in ranked if evidence(t) > evidence(ranked[0]) - CONTENDING_NATS]
 
 
-def _count_samples(fitted: Fitted, bench: Workbench) -> float:
+def count_samples(fitted: Fitted, bench: Workbench) -> float:
     """Compute the number of samples over the correlation time of a fit's residual."""
     residual = [e[r.skip :] for e, r in zip(fitted.residual, bench.recordings, strict=True)]
     return max(effective_size(residual), FEWEST)

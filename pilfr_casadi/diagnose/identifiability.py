@@ -29,12 +29,12 @@ from ..laws import CATALOGUE, Law, readable_unit
 from ..models import map_points
 from ..simulators import ACTUATOR, EQUATION, Named, Port, Simulator, port_name, split_port
 from .evidence import prior_width
-from .linearise import Probe, Run, along
+from .linearise import Probe, Run, sample_run
 from .screen import Remainder, Task, lengths, orthonormal, own_changes, project_off
 from .workbench import Fitted, Workbench
 
 LARGEST_EXPONENT = 3  # in numerators and denominators; physical laws have small exponents
-TRIAL_FACTOR = 1.1  # factor of a trial step that tells a product from a sum; they differ by a twentieth of the step
+TRIAL_FACTOR = 1.1  # factor of a trial step that distinguishes a product from a sum; they differ by a twentieth of it
 ZERO_SHARE = 0.01  # share of a change that counts as zero: steps along any other curve leave more
 DETECTION_ERRORS = 3.29  # standard errors: 5 % false alarms and 5 % misses (Currie 1968)
 SMALL_SHARE = 0.1  # of an effect: real machines follow a catalogue formula no more closely
@@ -51,8 +51,8 @@ class ParameterRow:
         Standard error due to the noise alone; None where the parameter is not identifiable.
     status : str
         "identifiable", "dead" (no output reacts), "flat" (the standard error is as large as the range of the bounds),
-        "tied" (traded off with others), "start" (traded off with the unknown initial state), or "port" (read by the
-        ports alone, so that it acts only through a law).
+        "tied" (traded off with others), "start" (traded off with the unknown initial state), or "port" (only the ports
+        read it, so that it acts only through a law).
     at_bound : bool
         Whether the refit ended at one of its bounds.
     """
@@ -171,7 +171,7 @@ def assess_parameters(response: Sensitivity) -> tuple[tuple[ParameterRow, ...], 
     status[response.reach == 0] = "dead"
     status[_read_by_ports_alone(response.bench.simulator)] = "port"
     rest = np.flatnonzero(status == "identifiable")
-    groups = [rest[members] for members in _groups(scaled[:, rest])]
+    groups = [rest[members] for members in _find_ties(scaled[:, rest])]
     for group in groups:
         status[group] = "tied"
     _, s, v = np.linalg.svd(scaled[:, rest])
@@ -183,28 +183,30 @@ def assess_parameters(response: Sensitivity) -> tuple[tuple[ParameterRow, ...], 
     at_bound = (response.values <= own.lower[own.free]) | (response.values >= own.upper[own.free])
     columns = (response.names, response.values.tolist(), units.tolist(), std, status, at_bound.tolist())
     rows = tuple(ParameterRow(*row) for row in zip(*columns, strict=True))
-    return rows, tuple(Tie(tuple(response.names[i] for i in group), _only_as(response, group)) for group in groups)
+    return rows, tuple(
+        Tie(tuple(response.names[i] for i in group), _find_combinations(response, group)) for group in groups
+    )
 
 
 def _read_by_ports_alone(simulator: Simulator) -> np.ndarray:
     """Mark the free entries of parameters that ports read and no equation does, shape (n,), bool."""
     symbols = simulator.symbols()
-    parameters = stacked(symbols[2])
+    parameters = stack_symbols(symbols[2])
     equations = ca.vertcat(simulator.derivatives(*symbols), *simulator.measured(*symbols).values())
     factors = ca.vertcat(ca.SX(0, 1), *(f for port in simulator.ports for f in simulator.into(port, *symbols).values()))
     own, ports = (np.array(ca.which_depends(e, parameters), dtype=bool) for e in (equations, factors))
     return np.asarray((ports & ~own)[simulator.parameter_set.free])
 
 
-def stacked(symbols: Named) -> ca.SX:
+def stack_symbols(symbols: Named) -> ca.SX:
     """Stack symbols into one column."""
     return ca.vertcat(ca.SX(0, 1), *(ca.vec(symbols[name]) for name in symbols))
 
 
-def _groups(scaled: np.ndarray) -> list[list[int]]:
+def _find_ties(scaled: np.ndarray) -> list[list[int]]:
     """Find the groups of columns that trade off.
 
-    Columns that the undetermined directions do not need are dropped, starting with those of the smallest components.
+    Columns that the undetermined directions do not need are dropped, smallest components first.
     The remaining columns are one group if a direction links them.
     """
     from scipy.sparse.csgraph import connected_components
@@ -220,27 +222,30 @@ def _groups(scaled: np.ndarray) -> list[list[int]]:
     return [[j for j, own in zip(members, group, strict=True) if own == k] for k in range(count)]
 
 
-def _only_as(response: Sensitivity, group: np.ndarray) -> tuple[str, ...]:
-    """Write the identifiable combinations of a group: monomials or sums with small integers, or nothing."""
+def _find_combinations(response: Sensitivity, group: np.ndarray) -> tuple[str, ...]:
+    """Write the identifiable combinations of a group: monomials or sums with small integers, if there are any."""
     names, values = [response.names[i] for i in group], response.values[group]
     found = []
     for unit, write in ((values, _monomial), (np.ones(len(group)), _sum)):
-        if np.all(unit != 0) and (rows := _whole(response.scaled[:, group], response.span[group] / unit)) is not None:
+        if (
+            np.all(unit != 0)
+            and (rows := _integer_rows(response.scaled[:, group], response.span[group] / unit)) is not None
+        ):
             change = _finite_change(response, group, rows, write is _monomial)
             found.append((change, tuple(write(names, row) for row in rows)))
     change, best = min(found, default=(np.inf, ()))
     return best if change < ZERO_SHARE else ()
 
 
-def _whole(columns: np.ndarray, span: np.ndarray) -> np.ndarray | None:
+def _integer_rows(columns: np.ndarray, span: np.ndarray) -> np.ndarray | None:
     """Find rows of small integers that are constant along a group's undetermined directions, or None.
 
-    `columns` are those of J D; `span` is D in the wanted coordinates, with sign.
+    `columns` are columns of J D; `span` is D in the wanted coordinates, with sign.
     """
     free = _undetermined(columns) * span
-    if not len(free):  # the direction of these is undetermined only because of other parameters
+    if not len(free):  # undetermined only together with parameters outside the group
         return None
-    rows = _reduced(_complement(free))
+    rows = _reduce_rows(_complement(free))
     for factor in range(1, LARGEST_EXPONENT + 1):
         whole = np.round(rows * factor)
         if np.any(np.abs(whole) > LARGEST_EXPONENT) or not np.all(np.any(whole, axis=1)):
@@ -257,7 +262,7 @@ def _complement(rows: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.svd(rows)[2][len(rows) :])
 
 
-def _reduced(rows: np.ndarray) -> np.ndarray:
+def _reduce_rows(rows: np.ndarray) -> np.ndarray:
     """Combine orthonormal rows so that the last independent columns hold the identity."""
     pivots: list[int] = []
     for j in reversed(range(rows.shape[1])):
@@ -294,16 +299,16 @@ def _sum(names: Sequence[str], factors: np.ndarray) -> str:
 def _finite_change(response: Sensitivity, group: np.ndarray, rows: np.ndarray, logarithmic: bool) -> float:
     """Compute the change of the outputs by a step of a tenth along which the rows are constant.
 
-    The result is relative to the change by the first parameter alone, and zero if it is below the noise. Unknown
-    initial states are projected off both.
+    The result is relative to the change by the first parameter alone, and zero if it is below the noise. Both changes
+    exclude the part that unknown initial states can follow.
     """
     bench, fitted, value = response.bench, response.fitted, response.values[group]
     direction, alone = _complement(rows)[0], np.eye(len(group))[0]
     step = (TRIAL_FACTOR - 1) * np.min(np.abs(value))
     sizes = []
-    for way in (direction / np.max(np.abs(direction)), alone):
+    for along in (direction / np.max(np.abs(direction)), alone):
         vector = fitted.vector.copy()
-        vector[response.places[group]] = value * TRIAL_FACTOR**way if logarithmic else value + step * way
+        vector[response.places[group]] = value * TRIAL_FACTOR**along if logarithmic else value + step * along
         values = fitted.model.parameters.unpack(vector)
         there = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model)
         if not np.isfinite(there.cost):
@@ -315,10 +320,10 @@ def _finite_change(response: Sensitivity, group: np.ndarray, rows: np.ndarray, l
 
 
 def helpful_sensors(response: Sensitivity, runs: Sequence[Run]) -> tuple[str, ...]:
-    """Find the states whose sensor, as quiet as the present ones, would determine more parameters; best first."""
+    """Find the states with which a further sensor, as quiet as the present ones, determines more; best first."""
     bench = response.bench
     signal = np.std(np.concatenate([r.y for r in bench.recordings]), axis=0)
-    noise = np.mean(bench.scale / signal) * np.std(along(bench, response.fitted)[0], axis=0)
+    noise = np.mean(bench.scale / signal) * np.std(sample_run(bench, response.fitted)[0], axis=0)
     count, found = len(_undetermined(response.scaled)), list[tuple[int, str]]()
     for j in np.flatnonzero(noise > 0):
         row = np.eye(runs[0].a.shape[1])[j]
@@ -383,9 +388,9 @@ def assess_laws(
 ) -> tuple[tuple[LawRow, ...], tuple[tuple[tuple[str, str], ...], ...]]:
     """Assess every law at every port, and group laws that look the same; the bench's scale is the noise.
 
-    Without `laws`, take the plainest form of each law of the catalogue. `names` are those of the free parameters.
+    Without `laws`, take the plainest form of each law of the catalogue. `names` are the names of the free parameters.
     """
-    tried = {port.name: _laws_at(port, laws) for port in live_ports(bench.simulator)}
+    tried = {port.name: _select_laws(port, laws) for port in live_ports(bench.simulator)}
     rest = Remainder.of(bench, probe, runs, tuple(dict.fromkeys(law for own in tried.values() for law in own)))
     own, start = own_changes(bench, rest.runs, known=[r.from_zero for r in rest.runs])
     base = orthonormal(np.hstack([own, start]))
@@ -398,24 +403,24 @@ def assess_laws(
         if not wanted:
             continue
         task = replace(task, pairs=[(law, shapes) for law, shapes in task.pairs if type(law) in wanted])
-        for row, response in _at_port(rest, task, base, own, levels[task.index], names):
+        for row, response in _assess_port(rest, task, base, own, levels[task.index], names):
             rows.append(row)
             responses += [response] if response else []
         seen = {type(law) for law, _ in task.pairs}
         for law in (law for law in wanted if law not in seen):
             why = law().why_not(task.local) or "its signals do not change"
             rows.append(LawRow(task.port.name, law.id, "no data", why=why))
-    return tuple(rows), _classes(responses)
+    return tuple(rows), _group_responses(responses)
 
 
-def _laws_at(port: Port, laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
-    """Return the laws allowed at a port; from the catalogue only the first form of each, since finer ones are alike."""
+def _select_laws(port: Port, laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
+    """Return the laws allowed at a port; from the catalogue only the first form of each, because all are alike."""
     placed = [law for law in (CATALOGUE if laws is None else laws) if port.admits(law)]
     first = {law.id: law for law in reversed(placed)}
     return tuple(law for law in placed if laws is not None or law is first[law.id])
 
 
-def _at_port(
+def _assess_port(
     rest: Remainder, task: Task, base: np.ndarray, own: np.ndarray, level: float | None, names: Sequence[str]
 ) -> Iterator[tuple[LawRow, _Response | None]]:
     """Assess the laws of one port; yield the row of each law, and its response if it is detectable."""
@@ -453,7 +458,7 @@ def _undetectable(row: LawRow, phi: np.ndarray, most: float, own: np.ndarray, na
     return replace(row, status="followed", why=names[int(np.argmax(cosines))] if alike else "the unknown start")
 
 
-def _classes(responses: list[_Response]) -> tuple[tuple[tuple[str, str], ...], ...]:
+def _group_responses(responses: list[_Response]) -> tuple[tuple[tuple[str, str], ...], ...]:
     """Group responses: each member explains the most visible one within a tenth, and vice versa."""
     order = sorted(responses, key=lambda r: -r.most)
     if not order:
@@ -489,7 +494,7 @@ def live_ports(simulator: Simulator) -> list[Port]:
 
 
 def port_units(port: Port, recording: Recording) -> tuple[str, str]:
-    """Return the units of a port's force and position, in series both those of the signal; empty if unknown."""
+    """Return the units of a port's force and position (in series twice the signal's unit); empty if unknown."""
     if not port.series:
         return port.unit, port.position_unit
     unit = port.unit or recording.units.get(split_port(port.name)[1], "")
@@ -503,11 +508,11 @@ def _local_levels(bench: Workbench, fitted: Fitted, runs: list[Run]) -> list[flo
     Terms are the summands of the equation as it is written, such as the force of a spring. For a port in series it is
     the deviation of the signal. Ports where nothing moves have None.
     """
-    simulator, z, at = bench.simulator, np.concatenate([r.z for r in runs]), along(bench, fitted)
+    simulator, z, at = bench.simulator, np.concatenate([r.z for r in runs]), sample_run(bench, fitted)
     own = simulator.parameter_set
     values = own.pack({k: v for k, v in fitted.values.items() if k in own})
     symbols = x, u, p, _ = (*simulator.symbols()[:3], ca.SX(0))
-    vectors = stacked(x), stacked(u), stacked(p)
+    vectors = stack_symbols(x), stack_symbols(u), stack_symbols(p)
     changes = ca.vertsplit(simulator.derivatives(*symbols)) if simulator.states else []
     equations = {**simulator.measured(*symbols), **dict(zip(simulator.states, changes, strict=True))}
     found: list[float | None] = []

@@ -5,8 +5,8 @@
 The features phi_j are stops of z with fixed thresholds and their powers (loops), low powers of z and |z| (curves), and
 curves of dz/dt (friction), some of them times z. u~ is an input of the simulator, standardised, where one scales the
 force. The force is linear in its weights c and d, which are fitted together with the simulator's own parameters in
-simulation error. They start from the linear solution of the projected sensitivities (`screen`), with a ridge prior
-on the size of the force, whose strength is chosen on held-out blocks. This is the discrepancy of Kennedy & O'Hagan
+simulation error. They start from the linear solution of the projected sensitivities (`screen`), with a ridge prior on
+the size of the force; held-out blocks choose its strength. This is the discrepancy of Kennedy & O'Hagan
 (2001, J. R. Statist. Soc. B 63), placed inside the loop.
 
 Outside the range of z, dz/dt and u in the training recordings, the signals are saturated: the force changes a little
@@ -29,7 +29,7 @@ from .._base import InputError, side_by_side
 from ..laws import POSITION_GAINS, SCALABLE, Law, Local, display_name, likely_profiles, scaled, scheduled, unit_forces
 from ..models import Parameter, play
 from .force_recovery import law_signals
-from .linearise import linearised, port_signals
+from .linearise import linearise_runs, port_signals
 from .screen import Remainder, Task, fit_shapes, held_out_squares, lengths, ridge_solution, start_values, usable
 from .workbench import COMPARED_SAMPLES, FEW, Fitted, Workbench
 
@@ -99,10 +99,8 @@ class LearnedForce(Law):
         c, std = (np.broadcast_to(np.asarray(given[name], dtype=float), shape) for name in ("c", "std"))
         felt = std > 0
         weights = Parameter(np.where(felt, c, 0.0), "w", fixed=~felt, prior=(0.0, np.where(felt, std, 1.0)))
-        held = {
-            k: Parameter(float(given[k]), unit, fixed=True) for k, unit in self.units.items() if k not in ("c", "std")
-        }
-        return {"c": weights, **held}
+        scales = {k: unit for k, unit in self.units.items() if k not in ("c", "std")}
+        return {"c": weights, **{k: Parameter(float(given[k]), unit, fixed=True) for k, unit in scales.items()}}
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         """Generate the scales of the signals along recordings; |z| bends at zero if z takes both signs."""
@@ -147,7 +145,7 @@ def learned_force(factor: str = "") -> type[LearnedForce]:
 class Start:
     """A learned element from the linear problem: the law at its start values, and the share that it explains.
 
-    The share is that of the residual's power on blocks that the weights were not fitted to.
+    It is a share of the residual's power on blocks that the weights were not fitted to.
     """
 
     port: str
@@ -156,8 +154,8 @@ class Start:
 
 
 def linear_starts(bench: Workbench, base: Fitted, port_names: Sequence[str]) -> list[Start]:
-    """Solve the linear problem at each port, without and with each input that may scale the force, best first."""
-    probe, runs = linearised(bench, base)
+    """Solve the linear problem at each port, also with each input that may scale the force; best first."""
+    probe, runs = linearise_runs(bench, base)
     rest = Remainder.of(bench, probe, runs, (LearnedForce,))
     samples = sum(len(r) - r.skip for r in bench.recordings) * len(bench.scale)
     out = []
@@ -185,7 +183,7 @@ def _solve_weights(
 ) -> Start:
     """Fit the weights to the projected residual by ridge regression; its strength is chosen on held-out blocks.
 
-    `repeated` is the number of scored samples per fitted sample; the prior counts once.
+    `repeated` is the number of scored samples per sample used here; the prior counts once.
     """
     scales, columns = dict(shape), forces.copy()
     if factor:

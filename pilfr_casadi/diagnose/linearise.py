@@ -1,6 +1,6 @@
-"""The simulator linearised along its own run: outputs' responses to forces at ports, parameters and initial states.
+"""Linearise the simulator along its own run: outputs' responses to forces at ports, parameters and initial states.
 
-With a force held over each sample,
+With a force that is constant over each sample,
 
     X⁺ = A_k X + B_k [dθ, w_k],    Y = C_k X + D_k [dθ, w_k].
 
@@ -39,7 +39,7 @@ WALL = 1.0  # largest |λ| h of a contact on the finest steps
 
 BLOCK = 256  # samples propagated at a time
 CHUNK, ENTRIES = 300, 2e7  # samples linearised at a time, and entries of their matrices, at most
-POINTS = 60  # samples of a run at which the user's equations are evaluated
+POINTS, MOST_SAMPLED = 60, 3000  # samples at which the user's equations are evaluated, among the first of a run
 
 
 class Constant(Law):
@@ -56,7 +56,7 @@ class Constant(Law):
         return p.w
 
 
-def probed(simulator: Simulator) -> Simulator:
+def with_probes(simulator: Simulator) -> Simulator:
     """Return the simulator with a constant force at every port, in the order of `all_ports`."""
     for port in simulator.all_ports():
         simulator = simulator.with_element(port.name, Constant())
@@ -90,7 +90,7 @@ class Probe:
     def of(cls, bench: Workbench, fitted: Fitted) -> Probe:
         """Differentiate the probed simulator."""
         simulator = fitted.simulator
-        model = discretise(probed(simulator), bench.dt, bench.hold, fitted.model.substeps)
+        model = discretise(with_probes(simulator), bench.dt, bench.hold, fitted.model.substeps)
         x, (u, p) = ca.SX.sym("x", model.n_state), model.symbols()[2:]
         following, y = model.closed(x, u, p)
         parameters = model.parameters
@@ -129,7 +129,7 @@ class Run:
     back : array, shape (n_ports,)
         The same for a positive force that pushes the port back.
     lift, push : array, shape (n_ports,)
-        Largest effect of a unit force on the local coordinate's first and second derivative.
+        Largest effects of a unit force on the local coordinate's first and second derivative.
     from_zero : bool
         Whether all states begin at zero.
     """
@@ -169,9 +169,8 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
 
     An observer may push a simulator out of its range; then the run is not finite.
     """
-    r, model = bench.recordings[i], probe.model
+    r, model, p = bench.recordings[i], probe.model, probe.values
     n = model.substeps
-    p = probe.values
     drive, x = model.drive(r), np.asarray(fitted.initial[i], dtype=float)[: model.n_state]
     if gain is None:
         states = states_along(model, drive, p, x)
@@ -182,20 +181,20 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     means = []
     size = n * model.n_state * (model.n_state + probe.step.size2_out(2))
     chunk = int(np.clip(ENTRIES / max(size, 1), 1, CHUNK)) * n
-    for begin in range(0, len(states), chunk):  # matrices of all sub-steps would be large
+    for begin in range(0, len(states), chunk):  # the matrices of all sub-steps together would be large
         now = slice(begin, begin + chunk)
         y, a, b, c, d = map_points(probe.step, states[now], drive[now])
         means.append([len(y) * v.mean(axis=0) for v in (a, b, c)])
         if gain is not None:
             a, b = a - gain @ c, b - gain @ d
-        part = (*over_samples(a, b, n), c[::n], d[::n], y[::n, :, 0])
-        kept = kept or [np.empty((len(r), *v.shape[1:])) for v in part]  # with many states, too large to hold twice
+        part = (*compose_substeps(a, b, n), c[::n], d[::n], y[::n, :, 0])
+        kept = kept or [np.empty((len(r), *v.shape[1:])) for v in part]  # too large to hold twice if states are many
         for whole, v in zip(kept, part, strict=True):
             whole[begin // n : begin // n + len(v)] = v
     a, b, c, d, y = kept
     mean = tuple(sum(v) / len(states) for v in zip(*means, strict=True))
-    along_run = states[::n, : probe.n_x]
-    z, dz, lift, push, own = local_signals(bench, probe.local, along_run, r, p[: len(p) - len(probe.ports)])
+    x_run = states[::n, : probe.n_x]
+    z, dz, lift, push, own = local_signals(bench, probe.local, x_run, r, p[: len(p) - len(probe.ports)])
     moved, sign = np.abs(lift).max(axis=0) > 0, -np.sign(np.median(push, axis=0))
     speed = np.array([port.is_speed for port in bench.simulator.all_ports()])
     sense = {
@@ -203,9 +202,8 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
         "back": np.where(moved, -np.sign(np.median(lift, axis=0)), sign),
     }
     felt = {"lift": np.abs(lift).max(axis=0), "push": np.abs(push).max(axis=0)}
-    rest = r.begins == "zero"
-    beside = {"z": z, "dz": dz, "x": along_run, "u": r.u, "p": p, "own": own}
-    return Run(a, b, c, d, mean, error=y - r.y, **beside, **sense, **felt, from_zero=rest)
+    along_run = {"z": z, "dz": dz, "x": x_run, "u": r.u, "p": p, "own": own}
+    return Run(a, b, c, d, mean, error=y - r.y, **along_run, **sense, **felt, from_zero=r.begins == "zero")
 
 
 def local_signals(
@@ -235,8 +233,8 @@ def loudest_stretch(power: np.ndarray, length: int, skip: int) -> slice:
     return slice(at, at + length)
 
 
-def over_samples(a: np.ndarray, b: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Compose the sub-steps' matrices (K, n_x, n_x) and (K, n_x, n_c) into those of samples of n sub-steps each."""
+def compose_substeps(a: np.ndarray, b: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Compose the matrices (K, n_x, n_x) and (K, n_x, n_c) of sub-steps into matrices of samples, n sub-steps each."""
     total, moved = a[::n], b[::n]
     for j in range(1, n):
         moved = a[j::n] @ moved + b[j::n]
@@ -244,19 +242,25 @@ def over_samples(a: np.ndarray, b: np.ndarray, n: int) -> tuple[np.ndarray, np.n
     return total, moved
 
 
+def simulate_states(fitted: Fitted, r: Recording, state: np.ndarray) -> np.ndarray:
+    """Run a simulator at its fitted values from an initial state; return the states at samples, (M, n_state)."""
+    model = fitted.model
+    return states_along(model, model.drive(r), fitted.vector, state)[:: model.substeps]
+
+
 @functools.lru_cache(maxsize=2)  # the screen and the flexible force use the same fit
-def linearised(bench: Workbench, fitted: Fitted) -> tuple[Probe, list[Run]]:
+def linearise_runs(bench: Workbench, fitted: Fitted) -> tuple[Probe, list[Run]]:
     """Return the probe of a fitted simulator, and its run of every recording."""
     probe = Probe.of(bench, fitted)
     return probe, [run(bench, probe, fitted, i) for i in range(len(bench.recordings))]
 
 
-def along(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
+def sample_run(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
     """Return some states of the user's equations (n, n_x) and inputs (n, n_u) along the longest fitted run."""
     i = int(np.argmax([len(r) for r in bench.recordings]))
-    r, model, n_x = bench.recordings[i], fitted.model, len(bench.simulator.states)
-    short = r.slice(0, min(len(r), 3000))
-    states = states_along(model, model.drive(short), fitted.vector, fitted.initial[i])[:: model.substeps, :n_x]
+    r = bench.recordings[i]
+    short = r.slice(0, min(len(r), MOST_SAMPLED))
+    states = simulate_states(fitted, short, fitted.initial[i])[:, : len(bench.simulator.states)]
     step = max(len(states) // POINTS, 1)
     return states[::step], short.u[::step]
 
@@ -345,26 +349,30 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
 def _with_equations(
     simulator: Simulator, port: Port, local: Local, x: np.ndarray, u: np.ndarray, p: np.ndarray
 ) -> Local:
-    """Add what else is known of a port: whether outputs read it, its term, and one revolution if z is an angle."""
+    """Add whether outputs read the port's coordinate, the port's term, and one revolution if z is an angle."""
     term = term_function(simulator, port) if port.term else None
     own = p[: simulator.parameter_set.size]
 
-    def along(z: np.ndarray, dz: np.ndarray) -> np.ndarray:
+    def term_along(z: np.ndarray, dz: np.ndarray) -> np.ndarray:
         assert term is not None
         return np.asarray(map_points(term, z[:, None], dz[:, None], x, u, own)[0][:, 0, 0])
 
-    line = along if term is not None else None
-    return replace(local, readers=simulator.readers(port), term=line, revolution=revolution_in(port.across_unit))
+    return replace(
+        local,
+        readers=simulator.readers(port),
+        term=term_along if term is not None else None,
+        revolution=revolution_in(port.across_unit),
+    )
 
 
 def own_signals(simulator: Simulator, values: np.ndarray) -> list[dict[str, np.ndarray]]:
-    """Divide the ports' own signals (M, n) into those of each port, by name."""
+    """Return the own signals of each port by name, from the own signals (M, n) of all ports."""
     columns = iter(values.T)
     return [{name: next(columns) for name in port.signals} for port in simulator.all_ports()]
 
 
 def parameter_signals(bench: Workbench, value: float, x: Sequence[np.ndarray], u: Sequence[np.ndarray]) -> Local:
-    """Return what a parameter may vary with: states (M, n_x) and inputs (M, n_u) of each run, by name, and the time."""
+    """Return the signals that a parameter may vary with: states (M, n_x) and inputs (M, n_u) of each run, and time."""
     states = zip(bench.simulator.states, np.concatenate(x).T, strict=True)
     signals = {**bench.signals_of(u), **dict(states)}
     z = np.full(len(signals["t"]), value)
@@ -373,13 +381,13 @@ def parameter_signals(bench: Workbench, value: float, x: Sequence[np.ndarray], u
 
 def port_signals(bench: Workbench, fitted: Fitted, port: str) -> Local:
     """Compute the local signals of a port, or of a parameter, along the fitted runs of all recordings."""
-    simulator, model = fitted.simulator, fitted.model
+    simulator = fitted.simulator
     kind, of = split_port(port)
     index = 0 if kind == PARAMETER else [p.name for p in simulator.all_ports()].index(port)
     function, parts = signals(simulator), []
     for r, state in zip(bench.recordings, fitted.initial, strict=True):
         with np.errstate(over="ignore", invalid="ignore"):
-            x = states_along(model, model.drive(r), fitted.vector, state)[:: model.substeps, : len(simulator.states)]
+            x = simulate_states(fitted, r, state)[:, : len(simulator.states)]
             z, dz, *_, own = local_signals(bench, function, x, r, fitted.vector)
         parts.append((z[:, index], dz[:, index], own, x, r.u))
     if kind == PARAMETER:

@@ -1,19 +1,18 @@
-"""Lost samples: in all channels, after which every state jumps, or in some outputs, which are too early from there on.
+"""Lost samples, in all channels (then every state jumps) or in some outputs (these are too early from then on).
 
-If all channels have lost samples and the time was renumbered, every state jumps at once. Along the refitted run, a jump
+If all channels have lost samples and the time was renumbered, all states jump together. Along the refitted run, a jump
 δ of the state at sample k changes the later outputs by `Φ_k δ`. With e the error that parameters and initial states
 leave, and base the directions that these can follow, the best jump removes
 
     s' (S - G G')⁻¹ s,    S = Φ_k'Φ_k,  G = Φ_k' base,  s = Φ_k' e
 
-of e'e. S, G and s follow from those of the next sample by recursion, so that every sample is tried. A shock or a stop
-moves no state that is the integral of another, and a step of a force or of a sensor moves none. If one of these
-explains about as much, or if no state is such an integral, no gap is reported. A jump is confirmed by a refit to the
-two pieces.
+of e'e. S, G and s follow by recursion from the next sample's, so that every sample is tried. A shock or a stop
+moves no state that is the integral of another, and a step of a force or of a sensor moves none. No gap is reported if
+one of these explains about as much, or if no state is such an integral. A refit to the two pieces confirms a jump.
 
-If only some outputs have lost samples, as by one of two loggers, their later samples come too early against the others.
-Every sample is tried with every number of lost samples, by sums of the error that parameters and initial states leave
-with these outputs as recorded before it, and moved after it.
+If only some outputs have lost samples, as in one of two loggers, their later samples are early relative to the others.
+Every sample is tried with every number of lost samples: before it the outputs count as recorded, after it moved.
+Cumulative sums of the error that parameters and initial states leave make this fast.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ from typing import ClassVar
 import numpy as np
 
 from ..data import Recording
-from ..simulators import states_along
 from .floor import ABOVE_NOISE, third_differences
 from .gates import (
     CLEARLY_BETTER,
@@ -40,10 +38,10 @@ from .gates import (
     robust_deviation,
     settle,
 )
-from .linearise import Run
+from .linearise import Run, simulate_states
+from .timing import LARGEST_SHIFT
 from .workbench import THOROUGH, Fitted, Workbench
 
-MOST_LOST = 64  # lost samples of some outputs that are tried at most
 MOST_GAPS = 3  # gaps that are sought at most
 SHORTEST_PIECE = 40  # samples of a piece at least
 RIVAL_DISTANCE = 5  # samples around a jump at which rivals are tried, and at which a drift would explain as much
@@ -52,7 +50,28 @@ RIDGE = 1e-6  # on the normal equations, against jumps that initial states can f
 
 
 @dataclass(frozen=True, eq=False)
-class Jump(Gate):
+class _Gap(Gate):
+    """A gap at which a recording is cut in two; its value begins with (recording, sample)."""
+
+    states: Sequence[np.ndarray] = ()  # initial states of the recordings when this one is cut
+
+    def begin(self, previous: Fitted) -> Sequence[np.ndarray]:
+        """Return the initial states of the recordings in pieces."""
+        return self.states
+
+    def put_pieces(self, bench: Workbench, pieces: tuple[Recording, Recording]) -> Workbench:
+        """Return the bench with two pieces in place of the recording."""
+        i = self.value[0]
+        return replace(bench, recordings=(*bench.recordings[:i], *pieces, *bench.recordings[i + 1 :]))
+
+    def run_whole(self, bench: Workbench, fitted: Fitted) -> Fitted:
+        """Run the whole recording at the values of a fit to its two pieces."""
+        initial = [x for i, x in enumerate(fitted.initial) if i != self.value[0] + 1]
+        return bench.result(bench.simulator, fitted.values, initial, fitted.engine, fitted.model)
+
+
+@dataclass(frozen=True, eq=False)
+class Jump(_Gap):
     """A jump of the state, as where samples were lost; until it is reported, its value is (recording, sample).
 
     Attributes
@@ -61,18 +80,15 @@ class Jump(Gate):
         Share of the mean square that the jump removes.
     rival : float
         Share that a shock nearby, or a step of one force or sensor there, removes.
-    beside : float
+    neighbour : float
         Share that a jump some samples away removes.
-    states : list of array
-        Initial states of the recordings when this one is cut there.
     places : tuple of (int, int)
         Once reported: each recording that is cut, and the sample at which its later piece begins.
     """
 
     share: float = 0.0
     rival: float = 0.0
-    beside: float = 0.0
-    states: Sequence[np.ndarray] = ()
+    neighbour: float = 0.0
     places: tuple[tuple[int, int], ...] = ()
     remedy: ClassVar[str] = "with the recording cut there"
 
@@ -80,31 +96,26 @@ class Jump(Gate):
         """Tell whether this jump leaves at most a share of the error that a rival leaves, which removes `other`."""
         return 1 - self.share < share * (1 - other)
 
+    def cut(self, r: Recording, k: int) -> tuple[Recording, Recording]:
+        """Cut a recording at sample k; the state there is estimated."""
+        return r.slice(0, k), r.slice(k).with_(initial="estimate", period=None)
+
     def apply(self, bench: Workbench) -> Workbench:
-        """Cut the recording; the state at the first sample of the later piece is estimated."""
+        """Return the bench with the recording cut."""
         i, k = self.value
-        r = bench.recordings[i]
-        pieces = r.slice(0, k), r.slice(k).with_(initial="estimate", period=None)
-        return replace(bench, recordings=(*bench.recordings[:i], *pieces, *bench.recordings[i + 1 :]))
+        return self.put_pieces(bench, self.cut(bench.recordings[i], k))
+
+    def relocate(self, now: Checked, after: Checked) -> Jump | None:
+        """Find the jump along the run of the whole recording."""
+        return find_jump(now.bench, self.run_whole(now.bench, after.fitted))
 
     def apply_to_whole(self, whole: list[Recording], places: Sequence[tuple[int, int]]) -> list[Recording]:
         """Cut the recordings where samples are missing in a stretch."""
         out = list(whole)
         for i, k in sorted(((places[i][0], places[i][1] + k) for i, k in self.places), reverse=True):
-            r = out[i]
-            later = r.slice(k).with_(initial="estimate", period=None, name=f"{r.name} from {k * r.dt:.6g} s".strip())
-            out[i : i + 1] = [r.slice(0, k), later]
+            earlier, later = self.cut(out[i], k)
+            out[i : i + 1] = [earlier, later.with_(name=_name_from(out[i], k))]
         return out
-
-    def begin(self, previous: Fitted) -> Sequence[np.ndarray]:
-        """Return the states after the jump for the later piece."""
-        return self.states
-
-    def relocate(self, now: Checked, after: Checked) -> Jump | None:
-        """Find the jump along the run that a fit to the two pieces makes of the whole recording."""
-        fitted, bench = after.fitted, now.bench
-        initial = [x for i, x in enumerate(fitted.initial) if i != self.value[0] + 1]
-        return find_jump(bench, bench.result(bench.simulator, fitted.values, initial, fitted.engine, fitted.model))
 
 
 def settle_jump(now: Checked) -> tuple[Jump, Checked] | None:
@@ -114,9 +125,9 @@ def settle_jump(now: Checked) -> tuple[Jump, Checked] | None:
 
 
 def find_gaps(now: Checked) -> Checked:
-    """Find lost samples; cut the recordings there if the rule accepts it.
+    """Find lost samples of all channels; cut the recordings there if the rule accepts it.
 
-    The state at the first sample of a later piece is estimated. Recordings in periodic steady state are not checked.
+    Recordings in periodic steady state are not checked.
     """
     noise2 = min(now.noise2, _quiet_noise2(now) or np.inf)
     origins = [(r, 0) for r in now.bench.recordings]  # recording as given, and the sample at which a piece begins
@@ -130,17 +141,22 @@ def find_gaps(now: Checked) -> Checked:
         r, begin = origins[i]
         origins.insert(i + 1, (r, begin + k))
         # jumps around a drift also imitate it
-        sharp = jump.beats(jump.beside, CLEARLY_BETTER) or last.cost < NEAR_NOISE_RATIO**2 * noise2
+        sharp = jump.beats(jump.neighbour, CLEARLY_BETTER) or last.cost < NEAR_NOISE_RATIO**2 * noise2
         if sharp and jump.beats(jump.rival, CURED_SHARE):
             accepted = accept(now, _name_pieces(last, origins), _describe_gaps(jump, origins))
             found = accepted if len(accepted.gates) > len(now.gates) else found
     return found
 
 
+def _name_from(r: Recording, k: int) -> str:
+    """Name the piece of a recording that begins at sample k, by its time."""
+    return f"{r.name} from {k * r.dt:.6g} s".strip()
+
+
 def _name_pieces(now: Checked, origins: Sequence[tuple[Recording, int]]) -> Checked:
     """Name each piece by the time at which it begins."""
     named = [
-        piece.with_(name=f"{r.name} from {k * r.dt:.6g} s".strip()) if k else piece
+        piece.with_(name=_name_from(r, k)) if k else piece
         for piece, (r, k) in zip(now.bench.recordings, origins, strict=True)
     ]
     return now.then(replace(now.bench, recordings=tuple(named)), now.fitted)
@@ -174,36 +190,41 @@ def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
         return None
     first = FirstOrder.of(bench, fitted)
     error = first.left(first.error)
-    total, at = max(float(error @ error), 1e-300), 0
+    total = max(float(error @ error), 1e-300)
     moved = [i for i, name in enumerate(simulator.states) if name not in simulator.kinematic]
     best, best_size = Jump(", ".join([*simulator.inputs, *simulator.output_names]), "gap", None), np.zeros(0)
-    for i, (r, one) in enumerate(zip(bench.recordings, first.runs, strict=True)):
-        rows = slice(at, at + (len(r) - r.skip) * r.n_y)
-        at = rows.stop
-        if r.begins == "periodic" or len(r) - r.skip < 2 * SHORTEST_PIECE:
-            continue
+    for i, r, rows in _long_recordings(bench, 2 * SHORTEST_PIECE):
         read = np.column_stack([first.base, error])[rows].reshape(-1, r.n_y, first.base.shape[1] + 1)
-        shares, rivals, sizes = _jump_shares(one, bench.scale, read, r.skip, len(simulator.states), moved)
+        shares, rivals, sizes = _jump_shares(first.runs[i], bench.scale, read, r.skip, len(simulator.states), moved)
         shares, rivals = shares / total, rivals / total
         shares[: r.skip + SHORTEST_PIECE] = shares[len(r) - SHORTEST_PIECE :] = 0.0
         k = int(np.argmax(shares))
         if shares[k] > best.share:
             around = slice(max(k - RIVAL_DISTANCE, 0), k + RIVAL_DISTANCE + 1)
-            rival, beside = float(np.max(rivals[around])), float(max(shares[around.start], shares[k + RIVAL_DISTANCE]))
-            best = replace(best, value=(i, k), share=float(shares[k]), rival=rival, beside=beside)
+            rival = float(np.max(rivals[around]))
+            neighbour = float(max(shares[around.start], shares[k + RIVAL_DISTANCE]))
+            best = replace(best, value=(i, k), share=float(shares[k]), rival=rival, neighbour=neighbour)
             best_size = sizes[k]
     if best.share < 1 - CLEARLY_BETTER:
         return None
-    (i, k), model = best.value, fitted.model
-    run = states_along(model, model.drive(bench.recordings[i]), fitted.vector, fitted.initial[i])
-    state = run[k * model.substeps, : len(best_size)] - best_size
+    i, k = best.value
+    state = simulate_states(fitted, bench.recordings[i], fitted.initial[i])[k, : len(best_size)] - best_size
     return replace(best, states=[*fitted.begin[: i + 1], np.asarray(state), *fitted.begin[i + 1 :]])
+
+
+def _long_recordings(bench: Workbench, shortest: int) -> Iterator[tuple[int, Recording, slice]]:
+    """Generate the recordings of `shortest` scored samples or more, not in steady state, and their rows of an error."""
+    end = 0
+    for i, r in enumerate(bench.recordings):
+        begin, end = end, end + (len(r) - r.skip) * r.n_y
+        if r.begins != "periodic" and len(r) - r.skip >= shortest:
+            yield i, r, slice(begin, end)
 
 
 def _jump_shares(
     run: Run, scale: np.ndarray, read: np.ndarray, skip: int, n_x: int, moved: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute, at each sample, what the best jump of the state removes, what its best rival removes, and the jump.
+    """Compute, at each sample, the share that the best jump of the state removes, the best rival's share, and the jump.
 
     `read` are the base and the error from `skip` on, `moved` the states that a shock moves. Shapes of the results are
     (M,), (M,) and (M, n_x). Forces that stay constant from a sample on are further states.
@@ -225,24 +246,26 @@ def _jump_shares(
     later = a - np.eye(full)
     later[:, :, n:] = 0.0
     rivals = [shock + part * later @ shock for part in SHOCK_DELAYS] + [unit[:, [j]] for j in range(n, full)]
-    return removed, np.max([_solve_jumps(left, size2, along, way)[0] for way in rivals], axis=0), size
+    return removed, np.max([_solve_jumps(left, size2, along, rival)[0] for rival in rivals], axis=0), size
 
 
-def _solve_jumps(left: np.ndarray, s: np.ndarray, e: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute what jumps along some directions, (n, k) or (M, n, k), remove, and their lengths."""
-    across = np.swapaxes(ways, -1, -2)
-    size = np.sqrt(np.maximum(np.einsum("...ii->...i", across @ s @ ways), 0.0))
+def _solve_jumps(
+    left: np.ndarray, s: np.ndarray, e: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the squares that jumps in given directions, (n, k) or (M, n, k), remove, and the jumps' lengths."""
+    across = np.swapaxes(directions, -1, -2)
+    size = np.sqrt(np.maximum(np.einsum("...ii->...i", across @ s @ directions), 0.0))
     size = np.where(size > 0, size, 1.0)
-    matrix = across @ left @ ways / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(ways.shape[-1])
+    matrix = across @ left @ directions / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(directions.shape[-1])
     wanted = (across @ e[:, :, None])[:, :, 0] / size
     lost = ~(np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(wanted).all(axis=1))  # the run diverges
-    matrix[lost], wanted[lost] = np.eye(ways.shape[-1]), 0.0
+    matrix[lost], wanted[lost] = np.eye(directions.shape[-1]), 0.0
     found = np.linalg.solve(matrix, wanted[:, :, None])[:, :, 0]
     return np.sum(found * wanted, axis=1), found / size
 
 
 @dataclass(frozen=True, eq=False)
-class OutputGap(Gate):
+class OutputGap(_Gap):
     """Lost samples of some outputs; until it is reported, its value is (recording, sample, number of lost samples).
 
     A negative number says that all other channels have lost samples, so that these outputs come too late.
@@ -253,57 +276,45 @@ class OutputGap(Gate):
         The outputs.
     share : float
         Share of the mean square that is left.
-    states : list of array
-        Initial states of the recordings when this one is cut there.
     """
 
     columns: tuple[int, ...] = (0,)
     share: float = 1.0
-    states: Sequence[np.ndarray] = ()
     parameters: ClassVar[int] = 2
-    remedy: ClassVar[str] = "with the recording cut there and what follows moved back"
+    remedy: ClassVar[str] = "with the recording cut there and the later outputs moved back"
 
     def apply(self, bench: Workbench) -> Workbench:
-        """Cut the recording, and move the outputs of the later piece; the state at its first sample is estimated."""
+        """Return the bench with the recording cut, and its later piece corrected."""
         i, k, lost = self.value
-        pieces = self.pieces(bench.recordings[i], k, lost)
-        return replace(bench, recordings=(*bench.recordings[:i], *pieces, *bench.recordings[i + 1 :]))
+        return self.put_pieces(bench, self.cut(bench.recordings[i], k, lost))
 
-    def pieces(self, r: Recording, k: int, lost: int) -> tuple[Recording, Recording]:
-        """Return what was recorded before sample k, and the corrected rest."""
+    def cut(self, r: Recording, k: int, lost: int) -> tuple[Recording, Recording]:
+        """Cut a recording at sample k, and move the later outputs; the state where they begin is estimated."""
         y, begin, end = np.array(r.y), k + max(lost, 0), len(r) + min(lost, 0)
         y[begin:end, self.columns] = r.y[begin - lost : end - lost, self.columns]
-        name = f"{r.name} from {begin * r.dt:.6g} s".strip()
-        return r.slice(0, k), r.with_(y=y).slice(begin, end).with_(initial="estimate", period=None, name=name)
+        later = r.with_(y=y).slice(begin, end)
+        return r.slice(0, k), later.with_(initial="estimate", period=None, name=_name_from(r, begin))
 
     def apply_to_whole(self, whole: list[Recording], places: Sequence[tuple[int, int]]) -> list[Recording]:
-        """Cut and correct the recording of which a stretch was checked."""
+        """Cut and correct the recording that a checked stretch comes from."""
         i, k, lost = self.value
         j, begin = places[i]
-        return [*whole[:j], *self.pieces(whole[j], begin + k, lost), *whole[j + 1 :]]
+        return [*whole[:j], *self.cut(whole[j], begin + k, lost), *whole[j + 1 :]]
 
     def to_dict(self) -> dict[str, object]:
         """Return the finding as in diagnosis.json."""
         i, k, lost = self.value
         return {**super().to_dict(), "value": {"recording": i, "sample": k, "lost": lost}}
 
-    def begin(self, previous: Fitted) -> Sequence[np.ndarray]:
-        """Return the states along the run for the later piece."""
-        return self.states
-
     def relocate(self, now: Checked, after: Checked) -> OutputGap | None:
-        """Find the gap along the run that a fit to the two pieces makes of the whole recording."""
-        fitted, bench = after.fitted, now.bench
-        initial = [x for i, x in enumerate(fitted.initial) if i != self.value[0] + 1]
-        return find_output_gap(
-            bench, bench.result(bench.simulator, fitted.values, initial, fitted.engine, fitted.model)
-        )
+        """Find the gap along the run of the whole recording."""
+        return find_output_gap(now.bench, self.run_whole(now.bench, after.fitted))
 
 
 def find_output_gaps(now: Checked) -> Checked:
-    """Find samples that some outputs have lost; cut the recording there if the rule accepts it and that is all.
+    """Find samples that some outputs have lost; cut the recording there if the rule accepts it and only noise is left.
 
-    Where more is wrong, a gap may imitate a slow clock or a delay that varies.
+    If more is wrong, a slow clock or a delay that varies may look like a gap.
     """
     if any(g.finding == "gap" for g in now.gates) or now.cost < ABOVE_NOISE**2 * now.noise2:
         return now
@@ -327,11 +338,11 @@ def find_output_gaps(now: Checked) -> Checked:
 
 
 def _place(now: Checked, gap: OutputGap, after: Checked) -> tuple[OutputGap, Checked]:
-    """Move a gap by smaller and smaller steps to where the refit is best: lost inputs also leave a wrong state."""
-    step = MOST_LOST if after.cost > NEAR_NOISE_RATIO**2 * now.noise2 else 0
+    """Move a gap in ever smaller steps to the best refit, because lost inputs also leave a wrong state before it."""
+    step = LARGEST_SHIFT if after.cost > NEAR_NOISE_RATIO**2 * now.noise2 else 0
     while step:
         i, k, lost = gap.value
-        last = len(now.bench.recordings[i]) - MOST_LOST - SHORTEST_PIECE
+        last = len(now.bench.recordings[i]) - LARGEST_SHIFT - SHORTEST_PIECE
         for other in (k - step, k + step):
             moved = replace(gap, value=(i, other, lost))
             if SHORTEST_PIECE <= other <= last:
@@ -344,17 +355,12 @@ def _place(now: Checked, gap: OutputGap, after: Checked) -> tuple[OutputGap, Che
 
 @np.errstate(over="ignore", invalid="ignore")
 def find_output_gap(bench: Workbench, fitted: Fitted) -> OutputGap | None:
-    """Find the gap of some outputs that leaves least, to first order; None if none is clearly better than a shift."""
+    """Find the gap of some outputs with the least error, to first order; None if a shift is about as good."""
     first, names = FirstOrder.of(bench, fitted), bench.simulator.output_names
     groups = [(i,) for i in range(len(names))] + ([tuple(range(len(names)))] if len(names) > 1 else [])
     whole = float(np.mean(first.left(first.error) ** 2))
     best: OutputGap | None = None
-    at = 0
-    for i, r in enumerate(bench.recordings):
-        rows = slice(at, at + (len(r) - r.skip) * r.n_y)
-        at = rows.stop
-        if r.begins == "periodic" or len(r) - r.skip < 2 * SHORTEST_PIECE + MOST_LOST:
-            continue
+    for i, r, rows in _long_recordings(bench, 2 * SHORTEST_PIECE + LARGEST_SHIFT):
         sums = _Sums.of(first, rows, r.y[r.skip :] / bench.scale)
         for columns in groups:
             for lost, left in sums.left(columns):
@@ -366,15 +372,14 @@ def find_output_gap(bench: Workbench, fitted: Fitted) -> OutputGap | None:
                     best = OutputGap(channel, "gap", value, columns=columns, share=left[k] / whole)
     if best is None:
         return None
-    (i, k, lost), model = best.value, fitted.model
-    run = states_along(model, model.drive(bench.recordings[i]), fitted.vector, fitted.initial[i])
-    state = run[(k + max(lost, 0)) * model.substeps]
+    i, k, lost = best.value
+    state = simulate_states(fitted, bench.recordings[i], fitted.initial[i])[k + max(lost, 0)]
     return replace(best, states=[*fitted.initial[: i + 1], state, *fitted.initial[i + 1 :]])
 
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """A recording's part of the error, and what the other recordings add to its sums.
+    """A recording's part of the error, and the contributions of the other recordings to its sums.
 
     error, y (M, n_y) in units of the outputs' deviation; base (M, n_y, n); square and along (n,) of the others.
     """
@@ -398,7 +403,7 @@ class _Sums:
         """Generate each number of lost samples with the mean square that is left for a gap at each sample."""
         m = len(self.y)
         before, along_before = self._sums(self.error)
-        for lost in (n for n in range(-MOST_LOST, MOST_LOST + 1) if n):
+        for lost in (n for n in range(-LARGEST_SHIFT, LARGEST_SHIFT + 1) if n):
             begin, end = max(lost, 0), m + min(lost, 0)
             moved = np.array(self.error[begin:end])
             moved[:, columns] += self.y[begin:end, columns] - self.y[begin - lost : end - lost, columns]

@@ -39,7 +39,7 @@ def mismatch(
     residuals : sequence of array, (M, n_y)
         Simulated minus measured outputs of each recording, unscored samples included.
     simulated : sequence of array, (M, n_y)
-        Outputs that amplitude, rate and level are taken from: free of noise.
+        Simulated outputs, which have no noise; they define amplitude, rate and level.
     floor_deviation, scale : array, (n_y,)
         Deviation of the noise, and of each output.
 
@@ -54,43 +54,47 @@ def mismatch(
         (`even`, `odd`, `excited`, `noise`: rms a line) or None.
     """
     scale = np.where(np.asarray(scale) > 0, scale, 1.0)
-    parts = [slice(r.skip, None) for r in recordings]
-    e = [np.asarray(v)[p] / scale for v, p in zip(residuals, parts, strict=True)]
-    e = [np.where(np.isfinite(v), v, 0.0) for v in e]
-    y = [np.asarray(v)[p] / scale for v, p in zip(simulated, parts, strict=True)]
-    y = [np.where(np.isfinite(v), v, 0.0) for v in y]
-    u = [r.u[p] for r, p in zip(recordings, parts, strict=True)]
+    e, y = (_scored(v, recordings, scale) for v in (residuals, simulated))
+    outputs, dt = recordings[0].outputs, recordings[0].dt
     noise = np.asarray(floor_deviation) / scale
     floor2 = float(np.mean(noise**2))
     power = np.concatenate([np.mean(v**2, axis=1) for v in e])
-    dt = recordings[0].dt
     low, high = _bands(max(map(len, e)), dt)
     envelope = [_envelope(v) for v in y]
     rates = [np.sqrt(np.mean(np.gradient(v, dt, axis=0) ** 2, axis=1)) for v in y]
+    u = [r.u[r.skip :] for r in recordings]
     spread = np.std(np.concatenate(u), axis=0)
     inputs = [_envelope(v / np.where(spread > 0, spread, 1.0)) for v in u]
     by_output = np.maximum(np.mean(np.concatenate(e) ** 2, axis=0) - noise**2, 0.0)
     worst = int(np.argmax(by_output))
-    amplitude = _binned(np.concatenate(envelope), power, from_zero=True)
+    level = _rms_by_bin(np.concatenate([v[:, worst] for v in y]), np.concatenate([v[:, worst] ** 2 for v in e]))
+    amplitude, by_input, rate = (
+        _rms_by_bin(np.concatenate(v), power, from_zero=True) for v in (envelope, inputs, rates)
+    )
     total = max(float(np.sum(by_output)), 1e-300)
     found: dict[str, Any] = {
         "rms": float(np.sqrt(np.mean(power))),
         "floor": float(np.sqrt(floor2)),
-        "scale": {n: float(v) for n, v in zip(recordings[0].outputs, scale, strict=True)},
-        "outputs": {n: float(v / total) for n, v in zip(recordings[0].outputs, by_output, strict=True)},
+        "scale": {n: float(v) for n, v in zip(outputs, scale, strict=True)},
+        "outputs": {n: float(v / total) for n, v in zip(outputs, by_output, strict=True)},
         "frequency": _by_frequency(e, low, high, floor2, dt),
         "amplitude": amplitude,
-        "input": _binned(np.concatenate(inputs), power, from_zero=True),
-        "rate": _binned(np.concatenate(rates), power, from_zero=True),
-        "level": {"output": recordings[0].outputs[worst]}
-        | _binned(np.concatenate([v[:, worst] for v in y]), np.concatenate([v[:, worst] ** 2 for v in e])),
+        "input": by_input,
+        "rate": rate,
+        "level": {"output": outputs[worst], **level},
         "map": _map(e, envelope, low, high, np.asarray(amplitude["edges"]), dt),
         "time": [_over_time(r, a, b) for r, a, b in zip(recordings, e, y, strict=True)],
         "thirds": _thirds(e, y),
         "distortion": _distortion(recordings, e),
     }
-    found["sentence"] = sentence(found)
+    found["sentence"] = _describe(found)
     return found
+
+
+def _scored(signals: Sequence[np.ndarray], recordings: Sequence[Recording], scale: np.ndarray) -> list[np.ndarray]:
+    """Return the scored samples of each signal over the outputs' deviation; zero where a signal is not finite."""
+    parts = [np.asarray(v)[r.skip :] / scale for v, r in zip(signals, recordings, strict=True)]
+    return [np.where(np.isfinite(v), v, 0.0) for v in parts]
 
 
 def _bands(samples: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -129,16 +133,16 @@ def _envelope(v: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt(np.mean(np.abs(hilbert(v - np.mean(v, axis=0), axis=0)) ** 2, axis=1)))
 
 
-def _bins(x: np.ndarray, edges: np.ndarray) -> np.ndarray:
+def _bin_indices(x: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Return the bin of each value; values outside join the outer bins."""
     return np.clip(np.searchsorted(edges, x, side="right") - 1, 0, BINS - 1)
 
 
-def _binned(x: np.ndarray, power: np.ndarray, from_zero: bool = False) -> dict[str, Any]:
+def _rms_by_bin(x: np.ndarray, power: np.ndarray, from_zero: bool = False) -> dict[str, Any]:
     """Compute the rms of the residual in bins of x; the outermost half percents join the outer bins."""
     a, b = (0.0 if from_zero else float(np.quantile(x, 0.005))), float(np.quantile(x, 0.995))
     edges = np.linspace(a, b if b > a else a + 1.0, BINS + 1)
-    index = _bins(x, edges)
+    index = _bin_indices(x, edges)
     count = np.bincount(index, minlength=BINS)
     mean = np.bincount(index, power, minlength=BINS) / np.maximum(count, 1)
     rms = [float(np.sqrt(m)) if c else None for m, c in zip(mean, count, strict=True)]
@@ -154,7 +158,7 @@ def _map(
     dt: float,
 ) -> dict[str, Any]:
     """Compute the residual's rms by frequency band and amplitude bin; None for bins with few samples."""
-    index = _bins(np.concatenate(envelope), edges)
+    index = _bin_indices(np.concatenate(envelope), edges)
     count = np.bincount(index, minlength=BINS)
     spectra = [(np.fft.rfft(v, axis=0), np.fft.rfftfreq(len(v), dt), len(v)) for v in e]
     rows: list[list[float | None]] = []
@@ -219,8 +223,8 @@ def _distortion(recordings: Sequence[Recording], e: Sequence[np.ndarray]) -> dic
     return {"even": rms(even), "odd": rms(odd), "excited": rms(driven), "noise": rms(noise)}
 
 
-def sentence(found: dict[str, Any]) -> str:
-    """Describe in a sentence or two what the map shows most clearly."""
+def _describe(found: dict[str, Any]) -> str:
+    """Describe the clearest features of the map in a sentence or two."""
     rms, floor = found["rms"], found["floor"]
     if rms < 1.1 * floor:
         return "The residual is at the noise floor; no band, amplitude or stretch of time stands out."
@@ -236,11 +240,11 @@ def sentence(found: dict[str, Any]) -> str:
     if speed is not None and not CLEAR_RATIO > speed > 1 / CLEAR_RATIO:
         parts.append("is larger at high speed" if speed > 1 else "is larger near standstill")
     thirds = found["thirds"]
-    own = thirds["rms"][2] / max(thirds["rms"][0], 1e-300)
-    beside = own * thirds["output"][0] / max(thirds["output"][2], 1e-300)
-    if min(own, beside) > CLEAR_RATIO:
+    absolute = thirds["rms"][2] / max(thirds["rms"][0], 1e-300)
+    relative = absolute * thirds["output"][0] / max(thirds["output"][2], 1e-300)
+    if min(absolute, relative) > CLEAR_RATIO:
         parts.append("grows toward the end of the recording")
-    elif max(own, beside) < 1 / CLEAR_RATIO:
+    elif max(absolute, relative) < 1 / CLEAR_RATIO:
         parts.append("fades toward the end of the recording")
     text = parts[0]
     if len(parts) > 1:
@@ -267,11 +271,11 @@ def _where_in_frequency(found: dict[str, Any]) -> str:
     for i in range(len(share)):
         j = int(np.searchsorted(total, total[i] + 0.75 - 1e-12))
         if j <= len(share):
-            held = float(total[j] - total[i])
-            if best is None or (j - i, -held) < best[:2]:
-                best = (j - i, -held, i, j)
-    _, held, i, j = best or (0, -1.0, 0, len(share))
-    amount = "Almost all" if held < -0.95 else f"{-100 * held:.0f} %"
+            inside = float(total[j] - total[i])
+            if best is None or (j - i, -inside) < best[:2]:
+                best = (j - i, -inside, i, j)
+    _, negative, i, j = best or (0, -1.0, 0, len(share))
+    amount = "Almost all" if -negative > 0.95 else f"{-100 * negative:.0f} %"
     low, high = found["low"][i], found["high"][j - 1]
     where = f"below {high:.3g} Hz" if low == 0 else f"between {low:.3g} and {high:.3g} Hz"
     return f"{amount} of the mismatch lies {where}"

@@ -1,7 +1,7 @@
-"""Constants that the recordings have beside the simulation: offsets of channels, and initial states not as stated.
+"""Constant errors of recordings: offsets of channels, and wrong initial states.
 
-An offset of a channel that all recordings share stays a parameter of the simulator, because a constant load acts alike.
-If offsets differ between the recordings, they are subtracted.
+An offset that all recordings share becomes a parameter of the simulator, because a constant load has the same effect.
+Offsets that differ between the recordings are subtracted.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from .screen import lengths
 from .workbench import FEW, THOROUGH, Fitted, Workbench
 
 KEPT_OFFSET = 0.1  # share of its first value that an offset must keep beside effects to be reported
+VISIBLE_SHARE = 1e-6  # share of a constant's response above which initial states cannot follow it
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class Offset(Law):
 
 @dataclass(frozen=True)
 class Constant(Gate):
-    """A constant at an input or an output; as a parameter of the simulator, it may leave any error to other physics."""
+    """A constant at an input or an output, a parameter of the simulator; other physics may remain beside it."""
 
     port: str = ""
     parameters: ClassVar[int] = 1
@@ -98,7 +99,7 @@ class Constant(Gate):
         return replace(bench, simulator=bench.simulator.with_element(self.port, Offset()))
 
 
-def constant_at(port: str, value: float = 0.0, parameter: str = "") -> Constant:
+def describe_constant(port: str, value: float = 0.0, parameter: str = "") -> Constant:
     """Return the fault that a channel has a constant offset."""
     kind, name = split_port(port)
     where, load = ("input", ", or a constant load acts like one") if kind == ACTUATOR else ("output", "")
@@ -109,7 +110,8 @@ def constant_at(port: str, value: float = 0.0, parameter: str = "") -> Constant:
 def find_offsets(now: Checked) -> Checked:
     """Find constants at inputs and outputs, the most useful first, and keep them as parameters of the simulator.
 
-    They count as a fault if they explain most of the mismatch.
+    They count as a fault if they explain most of the mismatch. Offsets of each recording's own take their place where
+    more than noise is left and they gain enough.
     """
     begin, ports = now, _channels(now.bench.simulator)
     while ports:
@@ -117,11 +119,11 @@ def find_offsets(now: Checked) -> Checked:
         port = max(share, key=lambda name: share[name])
         if share[port] < EXCEPTION_SHARE:
             break
-        after = correct(now, constant_at(port), [now.fitted.values], now.fitted.initial, THOROUGH)
+        after = correct(now, describe_constant(port), [now.fitted.values], now.fitted.initial, THOROUGH)
         if after is None:
             break
         name = f"{after.bench.simulator.elements[-1].prefix}w_0"
-        before, now = now, accept(now, after, constant_at(port, float(after.fitted.values[name]), name))
+        before, now = now, accept(now, after, describe_constant(port, float(after.fitted.values[name]), name))
         if now.bench is before.bench:
             break
         ports.remove(port)
@@ -140,7 +142,7 @@ def find_offsets(now: Checked) -> Checked:
 class VaryingOffset(Gate):
     """Constants of a channel that differ between the recordings, as of a sensor that is zeroed before each.
 
-    `value` has one constant for each recording; `port` is that of the channel.
+    `value` has one constant for each recording; `port` is the channel's port.
     """
 
     port: str = ""
@@ -185,9 +187,7 @@ def _constants_of_each(first: FirstOrder, port: str) -> tuple[float, np.ndarray]
     """Compute the share of the mean square that a constant of each recording's own removes, and the constants."""
     n = len(first.runs)
     forces = [np.tile(one, (len(r), 1)) for one, r in zip(np.eye(n), first.bench.recordings, strict=True)]
-    columns = first.response([port], forces)
-    rest = first.left(columns)
-    seen = lengths(rest) > 1e-6 * lengths(columns)  # exclude constants that the initial state can follow
+    rest, seen = _visible(first, first.response([port], forces))
     found = np.zeros(n)
     found[seen] = np.linalg.lstsq(rest[:, seen], first.error, rcond=1e-8)[0]
     left = first.left(first.error)
@@ -195,10 +195,16 @@ def _constants_of_each(first: FirstOrder, port: str) -> tuple[float, np.ndarray]
     return float(share), found if kind_of(port) == ACTUATOR else -found
 
 
-def find_varying_offset(now: Checked) -> Checked:
-    """Subtract constants of a channel that differ between the recordings if the rule accepts them and noise is left.
+def _visible(first: FirstOrder, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the parts of responses that parameters and initial states cannot follow, and mark the visible ones."""
+    rest = first.left(columns)
+    return rest, lengths(rest) > VISIBLE_SHARE * lengths(columns)
 
-    If more is missing, its mean may differ between the recordings as well.
+
+def find_varying_offset(now: Checked) -> Checked:
+    """Subtract constants that differ between the recordings if the rule accepts them and only noise is left.
+
+    The mean effect of missing physics may differ between the recordings as well.
     """
     if len(now.bench.recordings) < 2:
         return now
@@ -223,28 +229,26 @@ def _channels(simulator: Simulator) -> list[str]:
 def share_of_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[str, float]:
     """Compute the share of the mean square that a constant at each port removes, to first order."""
     first = FirstOrder.of(bench, fitted)
-    columns = first.response(ports, [np.ones((len(r), 1)) for r in bench.recordings])
-    rest = first.left(columns)
-    seen = lengths(rest) > 1e-6 * lengths(columns)  # exclude constants that the initial state can follow
+    rest, seen = _visible(first, first.response(ports, [np.ones((len(r), 1)) for r in bench.recordings]))
     along = np.where(seen, rest.T @ first.error / np.maximum(lengths(rest), 1e-150), 0.0)
     return dict(zip(ports, (along**2 / max(first.error @ first.error, 1e-300)).tolist(), strict=True))
 
 
-def offset_gates(elements: Sequence[Any], values: Mapping[str, Any]) -> list[Gate]:
+def list_offsets(elements: Sequence[Any], values: Mapping[str, Any]) -> list[Gate]:
     """List the offsets among fitted laws as findings."""
     placed = [(e.port, f"{e.prefix}w_0") for e in elements if isinstance(e.law, Offset)]
-    found = [constant_at(port, float(values[name]), name) for port, name in placed]
+    found = [describe_constant(port, float(values[name]), name) for port, name in placed]
     return [replace(c, sentence=f"{c.sentence}; it is a parameter of the corrected simulator.") for c in found]
 
 
-def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
-    """Fix offsets at zero that gain nothing beside effects: an effect may have looked like an offset."""
+def fix_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
+    """Fix offsets at zero that gain nothing beside effects, because an effect may have looked like an offset."""
     before = len(bench.simulator.elements)
     placed = fitted.simulator.elements
-    for offset in offset_gates(placed[:before], fitted.values) if len(placed) > before else ():
+    for offset in list_offsets(placed[:before], fitted.values) if len(placed) > before else ():
         name = offset.parameter
-        held = replace(fitted.simulator.parameters[name], value=0.0, fixed=True)
-        simulator = fitted.simulator.with_parameters({**fitted.simulator.parameters, name: held})
+        zero = replace(fitted.simulator.parameters[name], value=0.0, fixed=True)
+        simulator = fitted.simulator.with_parameters({**fitted.simulator.parameters, name: zero})
         start = {k: v for k, v in fitted.values.items() if k != name}
         found = refit(bench, [start], simulator, states=fitted.initial, solver=THOROUGH)
         if found is not None and gain(found.cost, fitted.cost, fitted.residual) <= LEAST_GAIN:
@@ -252,7 +256,7 @@ def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
     return fitted
 
 
-def without_zero_offsets(simulator: Simulator) -> Simulator:
+def remove_zero_offsets(simulator: Simulator) -> Simulator:
     """Return a simulator without the offsets that are fixed at zero."""
     for i, e in reversed(list(enumerate(simulator.elements))):
         if isinstance(e.law, Offset) and np.all(simulator.parameters[f"{e.prefix}w_0"].fixed):
@@ -260,11 +264,11 @@ def without_zero_offsets(simulator: Simulator) -> Simulator:
     return simulator
 
 
-def final_gates(
+def update_offsets(
     gates: Sequence[Gate], after: Fitted, std: Mapping[str, np.ndarray], effects: bool, sure: bool
 ) -> tuple[Gate, ...]:
-    """Return the findings with the offsets that remain, at their fitted values beside the effects, if any."""
-    fitted = {g.parameter: g for g in offset_gates(after.simulator.elements, after.values)}
+    """Return the findings with the offsets at their fitted values; drop offsets that the effects have replaced."""
+    fitted = {g.parameter: g for g in list_offsets(after.simulator.elements, after.values)}
     out = []
     for gate in gates:
         if not gate.parameter:
@@ -274,7 +278,7 @@ def final_gates(
         certain = abs(remaining.value) > CERTAIN_ERRORS * float(std[gate.parameter])
         if not (certain and abs(remaining.value) > KEPT_OFFSET * abs(gate.value)):
             continue
-        sentence = remaining.sentence if effects else gate.sentence  # fitted without the effects, it says little
+        sentence = remaining.sentence if effects else gate.sentence  # the value before the effects says little
         if not sure:
             sentence += " As long as the mismatch has no sure name, it may be a part of that."
         out.append(replace(gate, value=remaining.value, sentence=sentence))

@@ -1,12 +1,13 @@
 """Explanations other than a law at a declared port: a pinned parameter, an undeclared port, a machine that changed.
 
-- A missing law may be equivalent to other values of parameters, as a spring beside a spring. It comes out as missing
-  only if these values are fixed, or if their bounds exclude the new ones; then the pinned values are reported.
-  If the bounds are in another unit, no law helps; values powers of ten away are tried.
+- A missing law may be equivalent to other values of parameters, as a spring beside a spring. A search finds it only if
+  these values are fixed, or if their bounds exclude the new ones; then the pinned values are reported. If the bounds
+  are in another unit, no law helps; values powers of ten away are tried.
 - A mismatch that no declared port explains may have a sure name in the equation of a state.
-- Laws that occur in one physical domain alone are not tried at a port whose domain is unknown; that is noted.
-- One set of values for all recordings is compared with one set for each, or with one for the first halves and one for
-  the second. If separate sets follow far better, the differing values are reported; the cause is left to the engineer.
+- Laws of a single physical domain are not tried at a port whose domain is unknown; a note says so.
+- One set of values for all recordings is compared with one set for each recording, or with one for the first halves and
+  one for the second. If separate sets follow far better, the differing values are reported; the engineer has to find
+  the cause.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from .._base import InputError, listed
 from ..data import Recording
 from ..laws import display_name
-from ..simulators import UNKNOWN, Placed, in_series, name_at, states_along
+from ..simulators import UNKNOWN, Placed, in_series, name_at
 from .evidence import AT_NOISE_RATIO, BETTER_RATIO, CONTENDING_NATS, FAR_RATIO, NEAR_RATIO, SURE, deviations
 from .gates import (
     CERTAIN_ERRORS,
@@ -33,6 +34,7 @@ from .gates import (
     open_start,
     refit,
 )
+from .linearise import simulate_states
 from .search import Search
 from .trials import Trial
 from .verdict import Posterior, posterior, strained
@@ -54,8 +56,8 @@ class PinnedParameters:
 def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameters | None:
     """Find the fewest pinned parameters that explain as much, once freed, as the named laws; None if there are none.
 
-    A law is often equivalent to another value: a spring beside a spring, a gain at the input of a known capacity. Where
-    one value does not suffice, the next is freed beside the best, up to the number of the laws' own parameters.
+    A law is often equivalent to another value: a spring beside a spring, a gain at the input of a known capacity. If
+    one value does not suffice, further ones are freed beside the best, up to the number of the laws' own parameters.
     """
     named = [e.element for e in answer.effects]
     bench, without = search.bench, search.root.fitted
@@ -76,7 +78,7 @@ def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameter
     best = without
     while len(freed) < min(len(pinned), most):
         if len(freed) == 1:
-            together = _free(search, pinned, best, enough)  # if all of them do not suffice, no few do
+            together = _free(search, pinned, best, enough)  # if all of them do not suffice, no subset does
             if together is None or together.cost > NEAR_RATIO**2 * enough:
                 return None
         found = {name: _free(search, [*freed, name], best, enough) for name in pinned if name not in freed}
@@ -85,7 +87,7 @@ def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameter
             return None
         name = min(gained, key=lambda n: gained[n].cost)
         freed, best = (*freed, name), gained[name]
-        # a law that hardly explains anything is equalled by any value
+        # any value equals a law that hardly explains anything
         if best.cost <= enough and gain(without.cost, best.cost, best.residual, len(freed)) > LEAST_GAIN:
             return PinnedParameters(freed, best, _describe_pinned(search, freed, best, named))
     return None
@@ -119,7 +121,7 @@ def _free(search: Search, names: Sequence[str], start: Fitted, enough: float) ->
 
 
 def _went_beyond(search: Search, names: Sequence[str], found: Fitted) -> bool:
-    """Tell whether each freed value is one that it could not have while it was pinned."""
+    """Tell whether each freed value is one that the pinned parameter could not have."""
     own = search.bench.simulator.parameters
     ends = [(own[n], float(found.values[n])) for n in names]
     return all(bool(np.all(p.fixed)) or not np.all((p.bounds[0] <= v) & (v <= p.bounds[1])) for p, v in ends)
@@ -145,9 +147,9 @@ def _describe_pinned(search: Search, names: Sequence[str], found: Fitted, named:
 
 
 def may_act_elsewhere(search: Search, trial: Trial) -> bool:
-    """Tell whether the laws of a hypothesis may stand for others in an equation where no port is declared.
+    """Tell whether the laws of a hypothesis may imitate laws in an equation where no port is declared.
 
-    Then they drive a parameter to a bound, or they are at an actuator or sensor and leave more than white noise.
+    Such laws drive a parameter to a bound, or they are at an actuator or sensor and leave more than white noise.
     """
     if not search.bench.simulator.unreached:
         return False
@@ -166,7 +168,7 @@ def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[tu
         return nothing
     open_ = search.bench.simulator.with_ports(ports)
     bench = replace(search.bench, simulator=open_)
-    forces = [law for law in search.laws if "parallel" in law.places]  # at actuators and sensors all was tried
+    forces = [law for law in search.laws if "parallel" in law.places]  # actuators and sensors were already searched
     try:
         with search.until_interrupted():
             without = bench.fit(open_, [search.root.fitted.values], states=search.root.fitted.begin)
@@ -240,7 +242,7 @@ def _by_half(bench: Workbench, whole: Fitted) -> list[Group]:
         cut = (r.skip + len(r)) // 2
         first.append(open_start(r.slice(0, cut)))
         second.append(open_start(r.slice(cut)))
-        middle.append(states_along(whole.model, whole.model.drive(r), whole.vector, x)[cut * whole.model.substeps])
+        middle.append(simulate_states(whole, r, x)[cut])
     return [("first", first, whole.initial), ("second", second, middle)]
 
 
@@ -265,9 +267,9 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
     if not values:
         return None
     listed = "; ".join(f"{name}: {' / '.join(f'{v:.4g}' for v in found)}" for name, found in values)
-    called = " / ".join(name for name, *_ in groups)
+    names = " / ".join(name for name, *_ in groups)
     sentence = (
-        f"With values of their own, {where} ({called}) are followed to {cost**0.5:.3g} of the outputs' deviation "
+        f"With values of their own, {where} ({names}) are followed to {cost**0.5:.3g} of the outputs' deviation "
         f"instead of {whole.cost**0.5:.3g} ({listed}): something differs between them, such as a setting, a "
         "temperature or a level that the simulator does not know."
     )

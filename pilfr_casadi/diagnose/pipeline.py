@@ -59,7 +59,7 @@ from .correction import find_correction, named_correction
 from .evidence import AS_GIVEN_RATIO, SURE
 from .floor import Floor, measured_floor
 from .gates import USELESS_FIT, Gate
-from .offsets import Offset, offset_gates, without_idle_offsets
+from .offsets import Offset, fix_idle_offsets, list_offsets
 from .other_explanations import (
     find_pinned_parameters,
     find_undeclared_port,
@@ -70,10 +70,10 @@ from .other_explanations import (
 from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
 from .preparation import CHECKS, Prepared, conversions, hold_note, prepare
 from .proof import errors_of, mean_nrmse
-from .recording_faults import clipped_input, open_unsettled, remove_glitches, tones
+from .recording_faults import find_clipped_input, find_tones, open_unsettled, remove_glitches
 from .result import Diagnosis
 from .search import Search
-from .stretches import MOST_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
+from .stretches import SEARCHED_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
 from .verdict import Posterior, Verdict, judge, names, posterior
 from .workbench import RunsAway, converge
 
@@ -127,7 +127,7 @@ def diagnose_in_steps(
         focus,
         notes=conversions(simulator, given),
     )
-    most = MOST_SAMPLES if search_samples is None else whole(search_samples, "search_samples", FEWEST_SAMPLES)
+    most = SEARCHED_SAMPLES if search_samples is None else whole(search_samples, "search_samples", FEWEST_SAMPLES)
     request, ready, search = _search_with_focus(_on_stretches(request, most))
     everything: Everything | None = None
     if request.stretches is not None:
@@ -289,7 +289,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     """
     answer, interrupted = posterior(search), search.interrupted
     finished, elsewhere = not (interrupted or search.out_of_time), tuple[Gate, ...]()
-    gates = (*gates, *tones(search.bench, answer.best.fitted))
+    gates = (*gates, *find_tones(search.bench, answer.best.fitted))
     verdict = judge(search, answer, gates)
     if verdict.kind in ("missing-physics", "unexplained") and not (interrupted or search.past_deadline):
         found = _without_a_law(search, answer, verdict, gates)
@@ -305,7 +305,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
             verdict = judge(search, answer, gates)
         if verdict.kind == "missing-physics":
             said = f"{verdict.sentence} {correction.sentence}" if correction.learned else verdict.sentence
-            zeros = offset_gates(answer.best.laws, answer.best.fitted.values)
+            zeros = list_offsets(answer.best.laws, answer.best.fitted.values)
             notes = (*gates, *elsewhere, *zeros)
             return Conclusion(Verdict(verdict.kind, said), notes, fitted, correction, answer.effects)
     if verdict.kind == "unexplained" and finished:
@@ -341,7 +341,7 @@ def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: S
         return None
     refitted = search.root.fitted
     left = answer.best.mean_square / search.root.mean_square if named else 1.0
-    clipping = clipped_input(search.bench, refitted, left)
+    clipping = find_clipped_input(search.bench, refitted, left)
     if clipping is None:
         return None
     fault = Verdict("recording-fault", clipping.sentence)
@@ -369,7 +369,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
     if named.verdict.kind != "missing-physics" or {e.name for e in named.effects} != names(best):
         return found
     with search.stage("fit in free run"):
-        search.keep(search.beside(best.laws, best))
+        search.keep(search.run_laws(best.laws, best))
         trial = search.thorough(search.memo[best.key])
         before, after = search.held_out(search.root), search.held_out(trial)
     if not after.error < before.error:
@@ -394,7 +394,7 @@ def _final_fits(
     bench, without, after = search.bench, search.root.fitted, found.fitted
     if found.effects and not np.isfinite(found.correction.after):  # a held-out comparison chose what it compared
         with search.until_interrupted():
-            after = without_idle_offsets(bench, after)
+            after = fix_idle_offsets(bench, after)
     if everything is None:
         if not search.interrupted:
             with search.until_interrupted(), search.stage("convergence"):
@@ -402,7 +402,7 @@ def _final_fits(
         return FinalFits(bench, without, after, ready.nominal, (without, after))
     with search.stage("fits to all recordings"):
         whole, pair = everything.bench, (without, after)
-        to_all = [everything.fitted(search, one) for one in pair]
+        to_all = [everything.fit(search, one) for one in pair]
         drawn = [back_on_stretches(bench, f, one.initial) for f, one in zip(to_all, pair, strict=True)]
         nominal = errors_of(whole, whole.model(request.simulator), whole=True)
     return FinalFits(whole, to_all[0], to_all[1], nominal, (drawn[0], drawn[1]))

@@ -1,18 +1,18 @@
-"""Prediction focus: the recordings lead the simulator, and its errors are those of one-step predictions.
+"""Prediction focus: the recordings lead the simulator, and its errors are errors of one-step predictions.
 
-An unstable simulator cannot be run by its inputs alone, and one with a drift or an unrecorded disturbance leaves its
-recordings however good it is. An observer leads it (Ljung 1999, System Identification, sec. 4.3),
+An unstable simulator cannot be run by its inputs alone, and a simulator with a drift or an unrecorded disturbance
+leaves the recordings however good it is. An observer leads it (Ljung 1999, System Identification, sec. 4.3),
 
     x̂ₖ₊₁ = f(x̂ₖ, uₖ) + L (yₖ - ŷₖ),
 
-so that it forgets its past within a memory τ. The gain L is that of a predictor without process noise for e^(dt/τ) A
+so that it forgets its past within a memory τ. The gain L belongs to a predictor without process noise for e^(dt/τ) A
 in place of A: every eigenvalue of A - L C is then within e^(-dt/τ) (prescribed degree of stability: Anderson & Moore
-1971, Linear Optimal Control, sec. 3.5), and eigenvalues that are there already stay.
+1971, Linear Optimal Control, sec. 3.5), and eigenvalues within this radius stay.
 
-A long memory shows missing physics best, because its effect adds up over τ; and it is nearest to the predictor of a
-machine without disturbances, so that feedback of noise by a controller bends the fit least. So the longest memory is
-used with which the refitted simulator follows the recordings; if it follows with none, the one that it follows with
-best.
+A long memory shows missing physics best, because its effect adds up over τ. It is also nearest to the predictor of a
+machine without disturbances, so that noise that a controller feeds back biases the fit least. Therefore the longest
+memory is used with which the refitted simulator follows the recordings; if it follows with none, the memory with the
+smallest error.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ..data import Recording
 from ..linear import steady_state_gain
 from ..simulators import Simulator, discretise, growth_rate
 from .gates import USELESS_FIT, Gate
-from .linearise import linearised
+from .linearise import linearise_runs
 from .workbench import MOST_GROWTH, Fitted, Workbench
 
 FOCUS = "simulation", "prediction"
@@ -51,11 +51,11 @@ def can_be_led(simulator: Simulator, recordings: Sequence[Recording]) -> bool:
 
 
 def drifts(bench: Workbench, fitted: Fitted) -> bool:
-    """Tell whether small forces at ports add up in a free run, because it remembers longer than the recordings last.
+    """Tell whether small forces at ports add up in a free run, because its memory is longer than the recordings.
 
-    A mode that slow has to feel a port's force, and an output has to show it.
+    That is so if a port's force excites a mode that slow, and an output shows the mode.
     """
-    probe, runs = linearised(bench, fitted)
+    probe, runs = linearise_runs(bench, fitted)
     a, b, c = max(runs, key=lambda r: len(r.z)).mean
     inner = [i for i, name in enumerate(probe.ports) if not bench.simulator.port(name).series]
     if not len(a) or not inner:
@@ -69,7 +69,7 @@ def drifts(bench: Workbench, fitted: Fitted) -> bool:
 
 
 def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str) -> tuple[Simulator, float]:
-    """Give a simulator the observer with the longest memory that follows the recordings; return it and its memory, s.
+    """Add the observer with the longest memory that follows the recordings; return the simulator and the memory, s.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, 
     """
     rate, duration = _growth(simulator, recordings), max(len(r) * r.dt for r in recordings)
     memories = [times / rate for times in OF_GROWTH] if rate else [times * duration for times in OF_DURATION]
-    memories = [max(memory, recordings[0].dt) for memory in memories]  # what is measured once a sample leads no faster
+    memories = [max(memory, recordings[0].dt) for memory in memories]  # corrections come once a sample
     best: tuple[float, Simulator, float] | None = None
     for memory in memories:
         led = replace(simulator, observer=observer(simulator, recordings, hold, memory))
@@ -100,7 +100,7 @@ def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, 
 
 
 def prediction_note(simulator: Simulator, recordings: Sequence[Recording], memory: float) -> Gate:
-    """Note that the errors are those of predictions, and that the simulator is unstable if it is."""
+    """Note that the errors are errors of predictions, and if so that the simulator is unstable."""
     rate = _growth(simulator, recordings)
     why = f"The simulator is unstable by itself (it grows e-fold in {1 / rate:.2g} s). " if rate else ""
     sentence = (

@@ -28,7 +28,7 @@ from .gates import (
     Gate,
     refit,
 )
-from .linearise import along, linearised, observer_gain
+from .linearise import linearise_runs, observer_gain, sample_run
 from .lost_samples import find_gaps, find_output_gaps
 from .offsets import find_offsets, find_wrong_start
 from .proof import errors_of
@@ -98,7 +98,7 @@ def prepare(
         led = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
         without = min(led, bench.fit(bench.simulator, [{}, led.values], solver=THOROUGH), key=lambda f: f.cost)
     bench.check_followed(without)
-    bench = replace(bench, typical=along(bench, without))
+    bench = replace(bench, typical=sample_run(bench, without))
     say(CHECKS, CHECKED, CHECKED, without.cost**0.5)
     return Prepared(bench, without, nominal, (*now.gates, *held), Checked(bench, without).floor)
 
@@ -184,7 +184,7 @@ def refitted(bench: Workbench) -> Fitted:
     plain = bench.fit(bench.simulator, solver=THOROUGH)
     if plain.cost < POOR_FIT:
         return plain
-    probe, runs = linearised(bench, run_as_given(bench, plain))
+    probe, runs = linearise_runs(bench, run_as_given(bench, plain))
     gain = observer_gain(probe, runs, white_part(plain.residual))
     if not gain.any():
         return plain

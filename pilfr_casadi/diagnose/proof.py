@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -14,17 +14,18 @@ from ..identify import run_free
 from ..laws import Law
 from ..models import Model
 from ..simulators import Simulator, discretise
+from .evidence import BETTER_RATIO
 from .gates import Gate
-from .linearise import linearised
+from .linearise import linearise_runs
 from .screen import RIDGES, Remainder, held_out
 from .workbench import Fitted, Workbench
 
 K = TypeVar("K")
 
 AMPLITUDES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
-SINES = 12  # frequencies of sines that are tried
-MOST_SAMPLES = 3000  # longest simulated experiment, in samples
-SEEN = 0.01  # difference of two answers over the noise below which recordings show nothing of it
+SINES, TRIANGLES = 12, 5  # frequencies that are tried
+LONGEST_EXPERIMENT = 3000  # longest simulated experiment, in samples
+VISIBLE_DIFFERENCE = 0.01  # difference of two answers over the noise, above which a recording shows it
 
 
 def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
@@ -36,8 +37,8 @@ def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
 def errors_of(bench: Workbench, model: Model, starts: Sequence[np.ndarray] = (), *, whole: bool = False) -> float:
     """Compute the NRMSE of a model at its start values, averaged over recordings; infinite if the simulation diverges.
 
-    Unknown initial states are sought from rest and from `starts`, on a first part that is not scored. With `whole` they
-    are fitted to all samples, which are all scored: so do errors on training recordings compare with those of fits.
+    Unknown initial states are estimated from rest and from `starts`, on a first part that is not scored. With `whole`
+    they are fitted to all samples, which are all scored; use it to compare errors on training recordings with fits.
     """
     engine = make_engine(model, bench.engine)
     errors = []
@@ -50,10 +51,10 @@ def errors_of(bench: Workbench, model: Model, starts: Sequence[np.ndarray] = (),
 
 
 def starts_of(fitted: Fitted) -> list[np.ndarray]:
-    """Return further initial states to try: that of the first training recording.
+    """Return further initial states to try: the state of the first training recording.
 
-    From rest alone a search may end in a wrong minimum, as beside a contact. A learned element is uncertain at rest,
-    out of its range, and gets those of all recordings.
+    From rest alone a search may end in a wrong minimum, for example beside a contact. A learned element is uncertain at
+    rest, outside its range; with one, the states of all recordings are returned.
     """
     learned = any(e.law.id == "learned" for e in fitted.simulator.elements)
     return fitted.initial if learned else fitted.initial[:1]
@@ -118,8 +119,8 @@ def next_experiment(
         (the separation in the recordings) and `sentence`; None if nothing within the limits separates them.
     """
     u = np.concatenate([r.u for r in bench.recordings])
-    m, dt = min(max(map(len, bench.recordings)), MOST_SAMPLES), bench.dt
-    t, rest = np.arange(m) * dt, np.median(u, axis=0)
+    m = min(max(map(len, bench.recordings)), LONGEST_EXPERIMENT)
+    rest = np.median(u, axis=0)
     best: dict[str, Any] | None = None
 
     def separation(drive: np.ndarray) -> float:
@@ -134,38 +135,45 @@ def next_experiment(
             value = float(np.sqrt(np.mean(((y[0] - y[1]) / np.maximum(noise, 1e-300)) ** 2)))
         return value if np.isfinite(value) else 0.0
 
-    recorded = max(separation(r.u[:m]) for r in bench.recordings)
     for i, name in enumerate(bench.simulator.inputs):
         most = (limits or {}).get(name, float(np.max(np.abs(u[:, i] - rest[i]))))
-        trials = [("sine", f) for f in np.geomspace(4 / (m * dt), 0.2 / dt, SINES)]
-        trials += [("triangle", f) for f in np.geomspace(2 / (m * dt), 0.02 / dt, 5)]
-        for waveform, f in trials:
-            wave = np.sin(2 * np.pi * f * t)
-            if waveform == "triangle":
-                wave = 2 / np.pi * np.arcsin(wave)
+        for waveform, f, wave in _waves(m, bench.dt):
             for share in AMPLITUDES:
                 drive = np.tile(rest, (m, 1))
                 drive[:, i] += share * most * wave
                 value = separation(drive)
-                if best is None or value > 1.05 * best["separation"]:
+                if best is None or value > BETTER_RATIO * best["separation"]:
                     best = {
                         "input": name,
                         "waveform": waveform,
                         "amplitude": share * most,
-                        "frequency": float(f),
+                        "frequency": f,
                         "separation": value,
                     }
     if best is None or best["separation"] < 1.0:
         return None
+    recorded = max(separation(r.u[:m]) for r in bench.recordings)
+    return {**best, "recorded": recorded, "sentence": _describe_experiment(bench, best, recorded)}
+
+
+def _waves(m: int, dt: float) -> Iterator[tuple[str, float, np.ndarray]]:
+    """Generate the waveforms to try: name, frequency in Hz, and `m` samples of unit amplitude."""
+    t = np.arange(m) * dt
+    for f in np.geomspace(4 / (m * dt), 0.2 / dt, SINES).tolist():
+        yield "sine", f, np.sin(2 * np.pi * f * t)
+    for f in np.geomspace(2 / (m * dt), 0.02 / dt, TRIANGLES).tolist():
+        yield "triangle", f, 2 / np.pi * np.arcsin(np.sin(2 * np.pi * f * t))
+
+
+def _describe_experiment(bench: Workbench, best: Mapping[str, Any], recorded: float) -> str:
+    """Describe an experiment; `recorded` is the separation in the recordings."""
     unit = bench.recordings[0].units.get(best["input"], "")
-    best["recorded"] = recorded
-    so_far = f"by {recorded:.2g} times" if recorded > SEEN else "not at all"
-    best["sentence"] = (
+    so_far = f"by {recorded:.2g} times" if recorded > VISIBLE_DIFFERENCE else "not at all"
+    return (
         f"A {best['waveform']} of {best['frequency']:.3g} Hz with amplitude {best['amplitude']:.3g}"
         f"{' ' + unit if unit else ''} at {best['input']} separates them best: their outputs then differ by "
         f"{best['separation']:.3g} times the noise (in these recordings {so_far})."
     )
-    return best
 
 
 def placebo(bench: Workbench, fitted: Fitted, port: str, law: Law) -> tuple[float, float]:
@@ -174,7 +182,7 @@ def placebo(bench: Workbench, fitted: Fitted, port: str, law: Law) -> tuple[floa
     The unrelated signal is the law's own force, shifted by half a recording: it has the same statistics but no relation
     to the residual.
     """
-    probe, runs = linearised(bench, fitted)
+    probe, runs = linearise_runs(bench, fitted)
     rest = Remainder.of(bench, probe, runs, [type(law)], at=port)
     if not rest.tasks:
         return 0.0, 0.0

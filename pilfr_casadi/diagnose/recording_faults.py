@@ -1,19 +1,20 @@
 """Faults visible in the recorded samples themselves: glitches, stale, clipped and unsettled samples, and steady tones.
 
 - Glitches, for example from a lost bit or a loose contact: a sample far off the cubic through its four neighbours,
-  relative to the distances nearby. Replacing it by that cubic makes its neighbours inconspicuous; this does not hold at
-  a step or a shock.
-- Stale samples: a channel sometimes repeats its last value, which it otherwise never does. Interpolation replaces them.
-  Three other causes are told apart: a coarse converter, or an encoder that moves by no more than its step, has few
+  relative to the distances nearby. Once the cubic replaces it, its neighbours are inconspicuous; at a step or a shock
+  they are not.
+- Stale samples: a channel that otherwise never repeats a value sometimes repeats its last one. Interpolation replaces
+  them. Other repeats are not stale: a coarse converter, or an encoder that moves by no more than its step, has few
   values; a machine at rest repeats one value for long; a clipped channel repeats its limit.
 - Clipped channels: exactly repeated extremes. A clipped output can be compared with an equally clipped simulation; the
   part of a clipped input beyond its limit is lost.
-- Unsettled periods: the rms differences of neighbouring periods are equal if only noise differs, and larger at first if
-  a transient decays. Then the first sample is not on the steady cycle, and the periods' differences are not the noise.
+- Unsettled periods: the rms differences of neighbouring periods are all equal if only noise differs, and larger at
+  first if a transient decays. Then the first sample is not on the steady cycle, and the differences do not measure the
+  noise.
 - Tones, for example from mains hum, a fan or an unbalanced motor: a line of the residual's spectrum far above its
   neighbours (Fisher 1929). Its amplitude and phase are constant over the record, and it is neither in an input nor a
   harmonic or a mixture of an input's few lines. A residual at one of the simulator's own frequencies is not noise
-  either: an unrecorded force leaves such a residual, and no law at any port explains it.
+  either: an unrecorded force causes it, and no law at any port explains it.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from .gates import (
     open_start,
     robust_deviation,
 )
-from .linearise import linearised
+from .linearise import linearise_runs
 from .screen import folds, held_out
 from .workbench import Fitted, Workbench
 
@@ -52,11 +53,11 @@ CUBIC, STENCIL = np.array([-1, 4, 0, 4, -1]) / 6, 2  # through the neighbours at
 GLITCH_SIZE = 0.1  # least distance of a glitch over the output's deviation
 ISOLATED_SHARE = 0.12  # distance of neighbours, and deviation nearby, over a glitch's distance; a kink leaves 1/6
 
-ROUNDING = 1e-6  # relative rounding of distances, far above what occurs
+ROUNDING = 1e-6  # bound on the relative rounding of distances
 
 LONGEST_REST = 5  # longest rest of an encoder or a machine, in samples
 LARGEST_MOTION = 5  # largest motion of an encoder in a sample, in steps
-MOST_LEFT = 0.5  # largest share of the mismatch left by what an input may have been beyond its limit, a guess
+MOST_LEFT = 0.5  # largest share of the mismatch that the guessed course of an input beyond its limit may leave
 ON_STEP = 1e-3  # distance from a step of a coarse sensor, over the step, that rounding makes at most
 CHANCE_FACTOR = 3.0  # factor on the number of repeats that noise causes
 
@@ -83,7 +84,7 @@ def remove_glitches(recordings: Sequence[Recording]) -> tuple[tuple[Recording, .
         first = next(r.dt * k[0] for r, k in zip(recordings, places, strict=True) if len(k))
         sentence = (
             f"Single samples of {name} are far off their neighbours, as from glitches: {count}, the first at "
-            f"t = {first:.6g} s. What lies between their neighbours is taken instead."
+            f"t = {first:.6g} s. Values interpolated between their neighbours replace them."
         )
         before, after = (sum(float(np.sum(distances(y) ** 2)) for y in ys) for ys in zip(*pairs, strict=True))
         gates.append(Gate(name, "glitch", count, sentence, fault=after < CURED_SHARE * before, change=mend))
@@ -117,7 +118,7 @@ def distances(y: np.ndarray) -> np.ndarray:
 
 
 def _may_stand_alone(d: np.ndarray, large: np.ndarray) -> np.ndarray:
-    """Tell for which samples a replacement may make both neighbours inconspicuous, by their distances; fast."""
+    """Mark the samples whose replacement may make both neighbours inconspicuous; a fast test by distances."""
     possible = np.ones(len(large), dtype=bool)
     for step in (-1, 1):
         beside = large + step
@@ -151,7 +152,7 @@ class Stale(Gate):
 
 
 def mend_stale_samples(now: Checked) -> Checked:
-    """Interpolate stale samples if the rule accepts it; else note those of outputs."""
+    """Interpolate stale samples if the rule accepts it; else note stale outputs."""
     first = now.bench.recordings[0]
     for side, names in (("u", first.inputs), ("y", first.outputs)):
         for i, name in enumerate(names):
@@ -162,7 +163,7 @@ def mend_stale_samples(now: Checked) -> Checked:
             fault = Stale(name, "stale", repeated, words, change=partial(_interpolate_repeats, side=side, column=i))
             found = accept(now, correct(now, fault, [{}, now.fitted.values], now.fitted.begin), fault)
             if found is now and side == "y":
-                words = f"{words}; the error that this makes is taken for noise: record again, or leave them out."
+                words = f"{words}; the error that this causes counts as noise: record again, or leave them out."
                 found = now.then(now.bench, now.fitted, Gate(name, "stale", repeated, words, False))
             now = found
     return now
@@ -181,7 +182,7 @@ def _interpolate_repeats(r: Recording, side: str, column: int) -> Recording:
 def share_of_repeats(columns: Sequence[np.ndarray]) -> float:
     """Compute the share of the samples of a channel that repeat the one before; zero if chance or rest explains it.
 
-    Of a coarse sensor whose record was resampled, repeats lie on its steps, and most other samples between them.
+    In a resampled record of a coarse sensor, repeats lie on its steps, and most other samples between them.
     """
     together = np.concatenate(columns)
     step = _smallest_step(together)
@@ -235,8 +236,8 @@ class Clipping(Gate):
         law = AsymmetricSaturation().at({"low": max(self.low, -1e300), "high": min(self.high, 1e300)})
         placed = bench.simulator.with_element(port_name(SENSOR, self.channel), law)
         prefix = placed.elements[-1].prefix
-        held = {k: replace(p, fixed=True) if k.startswith(prefix) else p for k, p in placed.parameters.items()}
-        return replace(bench, simulator=placed.with_parameters(held))
+        fixed = {k: replace(p, fixed=True) if k.startswith(prefix) else p for k, p in placed.parameters.items()}
+        return replace(bench, simulator=placed.with_parameters(fixed))
 
 
 def unclip(now: Checked) -> Checked:
@@ -246,8 +247,8 @@ def unclip(now: Checked) -> Checked:
     return now
 
 
-def clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gate | None:
-    """Find a clipped input that explains most of the mismatch, if no law leaves less (`remains`) of it.
+def find_clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gate | None:
+    """Find a clipped input that explains most of the mismatch, unless a law leaves a smaller share (`remains`).
 
     The true input beyond the limit is not recorded; a smooth continuation replaces it (`_beyond_limit`).
     """
@@ -255,8 +256,8 @@ def clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gate | N
         explained = _explained_beyond(bench, without, fault)
         if 1 - explained < min(MOST_LEFT, remains):
             sentence = (
-                f"{fault.sentence}, and what it may have been beyond explains {explained:.0%} of the mismatch: what "
-                "went into the machine there is not in the recording. Record it with a larger range."
+                f"{fault.sentence}, and its likely course beyond the limit explains {explained:.0%} of the mismatch: "
+                "the recording does not contain the true input there. Record it with a larger range."
             )
             return replace(fault, sentence=sentence, corrected=False, fault=True)
     return None
@@ -347,17 +348,17 @@ def _settled_shares(r: Recording) -> np.ndarray:
 # tones, and ringing modes
 
 
-def tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
+def find_tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
     """Note each output whose residual holds the same tone in every recording."""
     found = []
     for i, name in enumerate(bench.simulator.output_names):
         pairs = zip(fitted.residual, bench.recordings, strict=True)
         each = [find_tone(e[r.skip :, i], r) for e, r in pairs if len(r) - r.skip >= 8 * NEIGHBOURHOOD * TONE_LINES]
-        told = [t for t in each if t is not None]
+        steady = [t for t in each if t is not None]
         longest = max((len(r) for r in bench.recordings), default=0) * bench.dt
-        if not told or len(told) < len(each) or np.ptp([f for f, _ in told]) > 2 / longest:
+        if not steady or len(steady) < len(each) or np.ptp([f for f, _ in steady]) > 2 / longest:
             continue
-        f, amplitude = (float(v) for v in np.mean(told, axis=0))
+        f, amplitude = (float(v) for v in np.mean(steady, axis=0))
         unit = bench.recordings[0].units.get(name, "")
         sentence = (
             f"{name} holds a steady tone of {f:.4g} Hz, amplitude {amplitude:.3g}{f' {unit}' if unit else ''}, that is "
@@ -389,7 +390,7 @@ def _spectrum(v: np.ndarray) -> np.ndarray:
 
 
 def _stands_out(power: np.ndarray, k: int, width: int, tried: int = 1) -> bool:
-    """Tell whether a spectrum at line k, or at one of `tried` lines, is above its level on both sides.
+    """Tell whether a spectrum at line k, the largest of `tried` lines, is above its level on both sides.
 
     The power of noise is exponentially distributed about its level, so that the ratio is the gain in nats.
     """
@@ -438,9 +439,9 @@ def _comes_from_input(u: np.ndarray, f: float, r: Recording) -> bool:
     return bool(np.any(np.abs(np.abs(made - np.round(made)) - f) * n < 2))
 
 
-def ringing(bench: Workbench, fitted: Fitted) -> float | None:
-    """Find the frequency, Hz, of a lightly damped mode that is visible in a fit's residual, or None."""
-    a = linearised(bench, fitted)[1][0].mean[0]
+def find_ringing_mode(bench: Workbench, fitted: Fitted) -> float | None:
+    """Find the frequency, Hz, of a lightly damped mode that is visible in the residual of a fit, or None."""
+    a = linearise_runs(bench, fitted)[1][0].mean[0]
     with np.errstate(divide="ignore"):
         poles = np.log(np.linalg.eigvals(a).astype(complex)) * fitted.model.substeps / bench.dt
     modes = [abs(s) / (2 * np.pi) for s in poles if s.imag > 0 and -s.real < LIGHT_DAMPING * abs(s)]

@@ -1,18 +1,18 @@
 """Identify a Prandtl-Ishlinskii element in the port where a diagnosis has found hysteresis.
 
-The catalogue describes hysteresis by few numbers, so that it can be told from other physics. Once its port is known,
-a layer of many operators takes the place of the found law (Krikelis et al. 2024, Eq. 16),
+The catalogue describes hysteresis by few numbers, to distinguish it from other physics. Once its port is known, a layer
+of many operators takes the place of the found law (Krikelis et al. 2024, Eq. 16),
 
     w(k) = Σ_i w_i H_{r_i}[z](k),   w_i ≥ 0, r_i ≥ 0,
 
 with H a stop, a play or a generalized play; `laws.hysteresis_layer` adds a linear term where it belongs. Thresholds
 start on grids over the range of z along the diagnosed run, weights at the non-negative least-squares fit of the
 diagnosed law's force there. Then all of them are fitted together with the simulator's own parameters and the other
-laws, on the recordings, the steps and the hold of the diagnosis. The bounds are bounds of the solver. As in `fit`,
-thresholds of the best fit are spread anew along the density of their weights, because some have clustered or are idle,
+laws, on the recordings, the steps and the hold of the diagnosis; the solver keeps the bounds. As in `fit`, the
+thresholds of the best fit are then spread along the density of their weights, because some have clustered or are idle,
 and the layer is fitted again, as long as that helps.
 
-The layer replaces the law if it predicts held-out parts of the training recordings better (`evidence`): error on
+The layer replaces the law if it predicts held-out parts of the training recordings better (`evidence`): by the error on
 blocks or second halves that a fit has not seen, plus the spread of predictions for other inputs, which grows with every
 parameter that the recordings hardly determine. Test recordings are never used. Otherwise the diagnosed law stays.
 
@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, Self
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +35,6 @@ from ..identify import regrid
 from ..laws import OPERATORS, Law, Local, display_name, hysteresis_layer, unit_forces
 from ..models import check_size, play
 from ..simulators import Placed, Simulator, discretise, in_series, on_grid
-from .correction import Correction
 from .evidence import HeldOut, Sample, held_out_errors, spread
 from .floor import effective_size
 from .learned import signals_along
@@ -43,57 +42,18 @@ from .proof import mean_nrmse
 from .search import Search
 from .workbench import THOROUGH, Fitted, Workbench
 
-FINE_THRESHOLDS = 40  # thresholds of each of the two fine grids from which the density of weights is estimated
+FINE_THRESHOLDS = 40  # thresholds of each of the two fine grids that estimate the density of weights
 BENDS = (-0.2, 0.0, 0.2)  # tried bends of generalized plays, a_2 times the largest |z|, as in the catalogue
-SPLIT = 0.2  # distance of the thresholds that one threshold of the diagnosed law is split into, over this threshold
+SPLIT = 0.2  # distance of the parts into which a threshold of the diagnosed law is split, over the threshold
 LEAST_START_WEIGHT = 0.01  # least weight of an operator at a start, over the mean weight
-IDLE_SHARE = 1e-9  # deviation of an operator's output, over that of the strongest, below which it is idle
+IDLE_SHARE = 1e-9  # deviation of an operator's output, over the largest, below which it is idle
 EXTENT = 1.2  # range in which thresholds are spread, over the threshold below which 99 % of the weight lies
-ROUNDS, GAIN = 3, 0.99  # rounds of spreading thresholds anew; ratio of costs above which there is no further round
+ROUNDS, GAIN = 3, 0.99  # rounds of spreading the thresholds; ratio of costs above which no further round follows
 PRINTED_WEIGHT = 1e-3  # weight of an operator, over the largest, below which it is not printed
 CURVE_POINTS = 201  # points of a loading curve
 PER_OPERATOR = 10  # least samples for each operator: its weight, its threshold and their standard errors
 DIAGNOSED = "diagnosed"  # key of the law that the diagnosis has found
 HYSTERETIC = ("hysteresis", "backlash")  # ids of laws with rate-independent memory; friction with presliding has it too
-
-
-class Answer(Protocol):
-    """The part of a `Diagnosis` that a refinement reads; the file of the class imports this one."""
-
-    @property
-    def corrected(self) -> Simulator:
-        """The corrected simulator."""
-
-    @property
-    def effects(self) -> Sequence[Any]:
-        """The named effects."""
-
-    @property
-    def correction(self) -> Correction | None:
-        """The elements beside the refit."""
-
-    @property
-    def evidence(self) -> Mapping[str, Any]:
-        """The search, and the fits."""
-
-    @property
-    def test(self) -> tuple[Recording, ...]:
-        """The test recordings."""
-
-    def with_fit(self, fitted: Fitted) -> Self:
-        """Copy with another corrected simulator."""
-
-    def simulate(self, recording: Recording) -> np.ndarray:
-        """Simulate the corrected simulator."""
-
-    def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
-        """Compute its NRMSE."""
-
-    def export(self, **options: Any) -> Any:
-        """Export it."""
-
-    def to_casadi(self, name: str = "model", smooth: float = 0.0) -> Any:
-        """Export it as a function."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,14 +95,15 @@ class Refinement:
     held_out: Mapping[str, HeldOut]
     errors: Mapping[str, Mapping[str, float] | None]
     layer: Simulator
-    _chosen: Answer
+    _chosen: Any  # the Diagnosis with `simulator`; its file imports this one
     _law: str
     _loops: tuple[np.ndarray, ...]
 
     @property
     def simulator(self) -> Simulator:
         """The simulator with the layer, or with the diagnosed law if the layer does not predict better."""
-        return self._chosen.corrected
+        corrected: Simulator = self._chosen.corrected
+        return corrected
 
     @property
     def sentence(self) -> str:
@@ -156,11 +117,11 @@ class Refinement:
 
     def simulate(self, recording: Recording) -> np.ndarray:
         """Simulate the chosen simulator along the inputs of a recording, shape (M, n_y); see `Diagnosis.simulate`."""
-        return self._chosen.simulate(recording)
+        return np.asarray(self._chosen.simulate(recording))
 
     def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
         """Compute the NRMSE of the chosen simulator; see `Diagnosis.nrmse`."""
-        return self._chosen.nrmse(recordings)
+        return float(self._chosen.nrmse(recordings))
 
     def export(self, **options: Any) -> Any:
         """Export the chosen simulator as a step over one sample; see `Diagnosis.export`."""
@@ -168,7 +129,7 @@ class Refinement:
 
     def to_casadi(self, name: str = "model", smooth: float = 0.0) -> Any:
         """Export the chosen simulator as a `casadi.Function (x, u) -> (x_next, y)`; see `pilfr.to_casadi`."""
-        return self._chosen.to_casadi(name, smooth)
+        return self.export(name=name, smooth=smooth).step
 
     def plot(self) -> Any:
         """Draw the loops along the training recordings, the loading curve, and the weights over thresholds.
@@ -209,8 +170,8 @@ class Refinement:
 
 
 @one_blas_thread
-def refine(diagnosis: Answer, operators: int, kind: str | None, port: str | None) -> Refinement:
-    """Carry out `Diagnosis.refine`; see there."""
+def refine(diagnosis: Any, operators: int, kind: str | None, port: str | None) -> Refinement:
+    """Carry out `Diagnosis.refine` for a Diagnosis; see there."""
     n = whole(operators, "operators", 1)
     check_size("A layer", 2 * n)
     if kind is not None and kind not in OPERATORS:
@@ -229,7 +190,7 @@ def refine(diagnosis: Answer, operators: int, kind: str | None, port: str | None
     kinds: tuple[str, ...] = ("play", "stop", "generalized_play") if series else ("stop", "play")
     if kind is not None:
         kinds = (kind,)
-    laws = {name: hysteresis_layer(name, n, series) for name in kinds}  # refuses what cannot stand there
+    laws = {name: hysteresis_layer(name, n, series) for name in kinds}  # refuses kinds that the port does not allow
     held_out = {DIAGNOSED: _predict(search, after)}
     layers: dict[str, Fitted] = {}
     for name, law in laws.items():
@@ -242,17 +203,17 @@ def refine(diagnosis: Answer, operators: int, kind: str | None, port: str | None
             "the diagnosed law."
         )
     best, *others = layers
-    for name in others:  # plays and stops differ by a line only: of two that are alike, the first stays
+    for name in others:  # plays and stops differ only by a line; another kind has to be better in both errors
         one, other = held_out[best], held_out[name]
         best = name if other.error < one.error and other.mean_square < one.mean_square else best
-    return _build(diagnosis, search.bench, best, layers[best], number, held_out)
+    return _build_refinement(diagnosis, search.bench, best, layers[best], number, held_out)
 
 
 def _predict(search: Search, fitted: Fitted) -> HeldOut:
     """Compute the errors of a fitted simulator on held-out data, and its spread for other inputs.
 
-    The spread takes the held-out error for the mean square error. A search adds what a formula may leave and still be
-    the right name; a layer has no name to defend.
+    The spread uses the held-out error as mean square error, without the error that a search allows the formula of a
+    named law.
     """
     bench = search.bench
     found = held_out_errors(bench, fitted, search.workers)
@@ -263,8 +224,8 @@ def _predict(search: Search, fitted: Fitted) -> HeldOut:
     return replace(found, spread=spread(bench, fitted, own, v, n) if np.isfinite(v) else np.inf)
 
 
-def _found_hysteresis(diagnosis: Answer, after: Fitted, given: int, port: str | None) -> int:
-    """Return the index of the law with rate-independent memory, the surest one at the port if several are there."""
+def _found_hysteresis(diagnosis: Any, after: Fitted, given: int, port: str | None) -> int:
+    """Return the index of the surest law with rate-independent memory (at the port, if one is given)."""
     elements = after.simulator.elements
     found = [i for i in range(given, len(elements)) if _is_hysteretic(elements[i].law)]
     if not found:
@@ -292,18 +253,18 @@ def _fit_layer(bench: Workbench, after: Fitted, number: int, kind: type[Law]) ->
     z, dz, force = signals_along(bench, after, number)
     local = bench.local(z, dz)
     starts = _start_values(kind(), local, force, old.own(after.values))
-    placed = _exchange(after.simulator, number, kind().at(starts[0], kind().bounds(local)))
+    placed = _replace_law(after.simulator, number, kind().at(starts[0], kind().bounds(local)))
     element = placed.elements[number]
     model = discretise(placed, bench.dt, bench.hold, after.model.substeps)
     engine = make_engine(model, bench.engine)
     first, h = np.cumsum([0, *local.lengths])[:-1], bench.dt / after.model.substeps
-    states = [_initial(after, s, number, element.law, z[k], h) for s, k in zip(after.initial, first, strict=True)]
+    states = [_initial_state(after, s, number, element.law, z[k], h) for s, k in zip(after.initial, first, strict=True)]
     own = [{**after.values, **element.named(start)} for start in starts]
     try:
         best = bench.fit(placed, own, states=states, model=model, engine=engine)
         for _ in range(ROUNDS):
             values = element.own(best.values)
-            moved = {**values, **_spread_anew(values["r"], values["w"], local.half, len(values["r"]))}
+            moved = {**values, **_spread_thresholds(values["r"], values["w"], local.half, len(values["r"]))}
             own = [{**best.values, **element.named(moved)}, best.values]
             found = bench.fit(placed, own, states=best.initial, solver=THOROUGH, model=model, engine=engine)
             gained, best = found.cost < GAIN * best.cost, min(found, best, key=lambda f: f.cost)
@@ -335,14 +296,14 @@ def _start_values(law: Any, local: Local, force: np.ndarray, found: Mapping[str,
         copies = -(-n // len(own))
         about = np.outer(1 + SPLIT * (np.arange(copies) - (copies - 1) / 2), own)
         grids.append(np.clip(np.ravel(about)[:n], 0.0, 0.95 * local.half))
-    along_density = {**dense, **_spread_anew(fine, dense["w"], local.half, n)}
+    along_density = {**dense, **_spread_thresholds(fine, dense["w"], local.half, n)}
     return [along_density, *(_fit_weights(law, local, force, {"r": grid, **bend})[1] for grid in grids)]
 
 
 def _fit_weights(law: Any, local: Local, force: np.ndarray, shape: dict[str, Any]) -> tuple[float, dict[str, Any]]:
     """Fit weights at given thresholds (and bend) to a force (M,); return the squared error and all values.
 
-    A constant is free, since memory may begin anywhere. No weight is left at zero, where its threshold has no slope.
+    A constant is free, since memory may begin anywhere. Weights stay above zero, where their thresholds have no slope.
     """
     from scipy.optimize import lsq_linear
 
@@ -366,7 +327,7 @@ def _fit_weights(law: Any, local: Local, force: np.ndarray, shape: dict[str, Any
     return float(found.cost), {**shape, **values, "w": np.maximum(w, LEAST_START_WEIGHT * np.mean(w))}
 
 
-def _spread_anew(r: np.ndarray, w: np.ndarray, half: float, n: int) -> dict[str, np.ndarray]:
+def _spread_thresholds(r: np.ndarray, w: np.ndarray, half: float, n: int) -> dict[str, np.ndarray]:
     """Spread n thresholds along the smoothed density of weights over thresholds; see `identify.regrid`."""
     order = np.argsort(r)
     mass = np.cumsum(w[order])
@@ -375,7 +336,7 @@ def _spread_anew(r: np.ndarray, w: np.ndarray, half: float, n: int) -> dict[str,
     return {"r": r, "w": np.maximum(w, LEAST_START_WEIGHT * np.mean(w))}
 
 
-def _exchange(simulator: Simulator, number: int, law: Law) -> Simulator:
+def _replace_law(simulator: Simulator, number: int, law: Law) -> Simulator:
     """Return the simulator with another law in place of an element; all other parameters keep value and bounds."""
     kept = {k: p for k, p in simulator.parameters.items() if not k.startswith(simulator.elements[number].prefix)}
     bare = simulator
@@ -386,10 +347,10 @@ def _exchange(simulator: Simulator, number: int, law: Law) -> Simulator:
     return bare.with_parameters({**bare.parameters, **kept})
 
 
-def _initial(after: Fitted, state: np.ndarray, number: int, law: Law, z: float, h: float) -> np.ndarray:
-    """Return an initial state with the layer's memory at z, so that no operator is saturated, in place of a law's."""
+def _initial_state(after: Fitted, state: np.ndarray, number: int, law: Law, z: float, h: float) -> np.ndarray:
+    """Return an initial state in which the layer's memory is z, so that no operator is saturated."""
     own = len(after.simulator.states)
-    elements = on_grid(after.simulator, h).elements  # on which the memory of a delay depends
+    elements = on_grid(after.simulator, h).elements  # the memory of a delay depends on the step
     sizes = [int(getattr(e.law, "order", 0)) for e in elements] + [_memory(e) for e in elements]
     parts = np.split(np.asarray(state, dtype=float)[own:], np.cumsum(sizes)[:-1])
     parts[number] = np.zeros(0)
@@ -402,8 +363,8 @@ def _memory(element: Placed) -> int:
     return int(element.law.memory) if hasattr(element.law, "step") else 0
 
 
-def _build(
-    diagnosis: Answer, bench: Workbench, kind: str, fitted: Fitted, number: int, held_out: Mapping[str, HeldOut]
+def _build_refinement(
+    diagnosis: Any, bench: Workbench, kind: str, fitted: Fitted, number: int, held_out: Mapping[str, HeldOut]
 ) -> Refinement:
     """Put the best layer into a Refinement."""
     element, after = fitted.simulator.elements[number], diagnosis.evidence["after"]
@@ -428,7 +389,7 @@ def _build(
         thresholds=np.asarray(values["r"])[order],
         weights=np.asarray(values["w"])[order],
         linear=float(values.get("k_0", 0.0)),
-        loading_curve=(z, _loading(element.law, values, z) + signal * z),
+        loading_curve=(z, _loading_curve(element.law, values, z) + signal * z),
         held_out=dict(held_out),
         errors=errors,
         layer=refined.corrected,
@@ -438,7 +399,7 @@ def _build(
     )
 
 
-def _loading(law: Law, values: Mapping[str, Any], z: np.ndarray) -> np.ndarray:
+def _loading_curve(law: Law, values: Mapping[str, Any], z: np.ndarray) -> np.ndarray:
     """Compute the law's response (G,) to z (G,) that grows from zero with empty memory."""
     local = Local(z, np.gradient(z), 1.0, (len(z),), from_zero=(True,))
     shape = {name: values[name] for name in law.units if name not in law.strength}

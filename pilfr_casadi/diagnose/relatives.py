@@ -325,4 +325,4 @@ def fit_pair(trials: Trials, root: Fitted, rest: Remainder, pair: tuple[_Block, 
         named |= own
     nominal = {k: p.value for k, p in root.simulator.parameters.items()}
     starts = [{**root.values, **named}, {**nominal, **named}]
-    return trials.fitted(simulator, starts, 2, states=root.begin, solver=BRIEF)
+    return trials.fit(simulator, starts, 2, states=root.begin, solver=BRIEF)

@@ -1,15 +1,15 @@
-"""Fit laws that were found elsewhere to further recordings: on another machine of the same kind, or on another day.
+"""Fit known laws to further recordings: of another machine of the same kind, or of another day.
 
-Nothing is searched. The simulator is fitted as given and with the laws in its ports. The log evidence of both says
-whether the machine has these laws. With several recordings, each is then fitted alone from the common values, so that
-values may drift from one to the next; the errors that remain say whether something else is missing. They are compared
-with the noise by the logarithm of their ratio,
+Nothing is searched. The simulator is fitted as given and with the laws in its ports, and the log evidences say whether
+the machine has these laws. With several recordings, each is then fitted alone from the common values, so that values
+may drift from one to the next. The remaining errors say whether something else is missing. They are compared with the
+noise by the logarithm of their ratio,
 
     l = log(e / σ),
 
-with e the rms error and σ the noise, both in units of the outputs' deviation. For a machine that lacks nothing else it
-scatters because both are estimated from N samples: the variance of log e is 1/(2 n), with n the independent samples of
-the residual; that of log σ is 1/(2 N) times the correlation of third differences, 1 + 2 Σ ρ² = 2.31.
+with e the rms error and σ the noise, both in units of the outputs' deviation. If nothing else is missing, it
+scatters because both are estimated from N samples: log e has the variance 1/(2 n), with n the independent samples of
+the residual, and log σ the variance 1/(2 N) times the correlation of third differences, 1 + 2 Σ ρ² = 2.31.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
 from .arguments import match_recordings, stated_hold
 from .evidence import FORMULA_ERROR, Sample, deviations, information, log_evidence, log_prior, prior_width
 from .floor import effective_size, measured_floor, third_differences
-from .linearise import along
+from .linearise import sample_run
 from .proof import mean_nrmse
 from .trials import Trials
 from .workbench import FINER_STEPS, THOROUGH, Fitted, Workbench
@@ -53,19 +53,19 @@ class Replication:
     without, after : Fitted
         The simulator as given, and with the laws; both refitted.
     estimate : Values
-        Of `after`, on all recordings.
+        Parameters of `after`, on all recordings.
     by_recording : tuple of Values
-        Of each recording alone, if there are several.
+        Parameters of each recording alone, if there are several.
     widths : mapping
         Width of each parameter's prior range.
     nrmse_before, nrmse_after : float
-        NRMSE (Eq. 27) without and with the laws; the last with values of each recording.
+        NRMSE (Eq. 27) without the laws, and with the laws at the values of each recording.
     noise : float
         Noise over the outputs' deviation.
     remainder, remainder_error : float
         `l` of the module docstring, and its standard error.
     gain : float
-        Log evidence of the laws minus that of none, prior included; 0 without laws.
+        Log evidence with the laws minus the log evidence without, prior included; 0 without laws.
     residuals : tuple of array
         Simulated minus measured outputs of each recording, over the outputs' deviation.
     """
@@ -93,15 +93,15 @@ class Replication:
 def refit_error(simulator: Any, recordings: Any, *, hold: str | None = None, engine: str = "auto") -> float:
     """Refit a simulator as given to recordings; return the NRMSE (Eq. 27), averaged over outputs and recordings.
 
-    The arguments and errors are those of `replicate`.
+    For arguments and errors see `replicate`.
     """
     bench = _bench(simulator, recordings, hold, engine)
     fitted = bench.fit(bench.simulator, solver=THOROUGH)
-    _pass_on_interrupt(bench)
+    _raise_if_interrupted(bench)
     return mean_nrmse(bench, fitted)
 
 
-def _pass_on_interrupt(bench: Workbench) -> None:
+def _raise_if_interrupted(bench: Workbench) -> None:
     """Raise KeyboardInterrupt if Ctrl-C has ended a fit, which then returned its best values so far."""
     if bench.interrupted_fits:
         raise KeyboardInterrupt
@@ -142,16 +142,16 @@ def replicate(
     """
     bench = _bench(simulator, recordings, hold, engine)
     plain = bench.fit(bench.simulator, [{}, *starts], solver=THOROUGH)
-    bench = replace(bench, typical=along(bench, plain))
-    after = _with_laws(bench, plain, laws, starts) if laws else plain
-    after = _on_accurate_steps(bench, after)
-    alone, values = _each_recording(bench, after)
-    _pass_on_interrupt(bench)
+    bench = replace(bench, typical=sample_run(bench, plain))
+    after = _fit_with_laws(bench, plain, laws, starts) if laws else plain
+    after = _refine_steps(bench, after)
+    alone, values = _fit_each_recording(bench, after)
+    _raise_if_interrupted(bench)
     residuals = tuple((e / bench.scale)[r.skip :] for e, r in zip(alone, bench.recordings, strict=True))
     noise2 = _noise2(bench, residuals)
     square = float(np.mean(np.concatenate(residuals) ** 2))
     total = sum(e.size for e in residuals)
-    # repeats and periods tell the noise of as many samples as third differences, or more
+    # repeats and periods determine the noise at least as well as third differences
     variance = 0.5 / max(effective_size(residuals), 1.0) + 0.5 * THIRD_DIFFERENCES / total
     return Replication(
         without=plain,
@@ -169,7 +169,7 @@ def replicate(
     )
 
 
-def _with_laws(
+def _fit_with_laws(
     bench: Workbench, plain: Fitted, laws: Sequence[tuple[str, Law]], starts: Sequence[Mapping[str, Any]]
 ) -> Fitted:
     """Fit the simulator with the laws, to convergence and on steps fine enough for a sharp knee."""
@@ -183,11 +183,11 @@ def _with_laws(
     return found.fitted if np.isfinite(found.mean_square) else quick
 
 
-def _on_accurate_steps(bench: Workbench, fitted: Fitted) -> Fitted:
+def _refine_steps(bench: Workbench, fitted: Fitted) -> Fitted:
     """Refit on finer integration steps until the values no longer depend on them.
 
-    In a search, steps are fine enough if their error is below the noise. Values are means over many samples, so their
-    standard errors are smaller than that by far.
+    A search needs an integration error below the noise. Values need more: they are means over many samples, so their
+    standard errors are far smaller.
     """
     most = min(FINER_STEPS**2 * bench.chosen, MOST_SUBSTEPS)
     while fitted.model.substeps < most and not fitted.simulator.discrete and np.any(fitted.model.parameters.free):
@@ -204,7 +204,7 @@ def _on_accurate_steps(bench: Workbench, fitted: Fitted) -> Fitted:
     return fitted
 
 
-def _each_recording(bench: Workbench, after: Fitted) -> tuple[list[np.ndarray], tuple[Values, ...]]:
+def _fit_each_recording(bench: Workbench, after: Fitted) -> tuple[list[np.ndarray], tuple[Values, ...]]:
     """Fit each of several recordings alone from the common values; return the residuals and the values."""
     if len(bench.recordings) < 2:
         return after.residual, ()
@@ -233,7 +233,7 @@ def _noise2(bench: Workbench, residuals: Sequence[np.ndarray]) -> float:
 
 
 def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ...], noise2: float) -> float:
-    """Compute the log evidence of the laws minus that of the simulator as given."""
+    """Compute the log evidence with the laws minus the log evidence of the simulator as given."""
     tolerance = FORMULA_ERROR * max(plain.cost - noise2, 0.0)
     costs = plain.cost + tolerance, after.cost + tolerance
     n = Sample(noise2 + tolerance, max(effective_size(after.residual), 1.0)).effective(min(costs))
@@ -250,7 +250,7 @@ def _values(bench: Workbench, fitted: Fitted) -> Values:
 
 
 def _widths(fitted: Fitted) -> dict[str, float]:
-    """Return the width of the prior range of each free parameter: that of a uniform distribution as wide."""
+    """Return the width of the prior of each free parameter, as that of a uniform distribution."""
     own, vector = fitted.model.parameters, fitted.vector
     width = np.sqrt(12) * prior_width(np.maximum(np.abs(vector), 1e-300), own.lower, own.upper)
     return {label: float(width[k]) for k, label in enumerate(own.labels) if own.free[k]}

@@ -32,8 +32,8 @@ VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
 ERROR_NAMES = {"nominal": "as given", "before": "refitted", "after": "corrected"}  # the errors that are printed
 MOST_PRINTED = 8  # parameters and blind spots that are printed at most
-GRAVEST_SPOTS = 2  # blind spots that are told right after the verdict
-CONSTANT_ERROR = 0.9  # error above which a refitted simulator is hardly better than a constant
+GRAVEST_SPOTS = 2  # blind spots that are printed right after the verdict
+NEAR_CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
 OUT_OF_TIME = "The time limit ended the search: the answer rests on the fits made until then."
 
@@ -62,7 +62,7 @@ class Effect:
 
     @property
     def defined(self) -> dict[str, dict[str, Any]]:
-        """Quantities that follow: a product of the equation, such as `F_c = k_t r`, and a clearance from end to end."""
+        """Derived quantities: a product in the equation, such as `F_c = k_t r`, or the whole gap of a clearance."""
         if self.law == "clearance" and "g" in self.parameters:
             half = self.parameters["g"]
             std = None if half["std"] is None else 2 * half["std"]
@@ -122,13 +122,13 @@ class Diagnosis:
     verdict : str
         One of `VERDICTS`.
     sentence : str
-        The verdict in words; `summary` adds what has to be said first.
+        The verdict in words; `summary` adds the gravest warnings.
     effects : tuple of Effect
         The missing physics that has a name: port, law, confidence, equation, values with standard errors.
     candidates : tuple of dict
         All laws that were fitted, in the order of the search.
     gates : tuple of Gate
-        Findings about recordings and simulator, with what was corrected.
+        Findings about recordings and simulator, and their corrections.
     mismatch : dict
         Where the refitted simulator misses: by output, band, amplitude, rate and time.
     parameters : dict
@@ -137,8 +137,7 @@ class Diagnosis:
         The simulator with the effects added, at the fitted values (without effects: refitted).
     errors : dict
         `train`, `test` -> `nominal`, `before`, `after`: NRMSE averaged over outputs. With an observer these are errors
-        of predictions, and `free_run` has those of the same simulators without it, on the test recordings if there
-        are any.
+        of predictions; `free_run` then has the errors without it, on the test recordings if there are any.
     floor : dict
         `nrmse` and `source`.
     out_of_time : bool
@@ -201,10 +200,7 @@ class Diagnosis:
 
     @property
     def summary(self) -> str:
-        """The verdict's sentence, and what else has to be said first.
-
-        That is whether the search was cut short, and whether the correction does not help on the test recordings.
-        """
+        """The verdict's sentence, with a warning if the search was cut short or the correction fails the test."""
         errors, said = self.errors.get("test"), self.sentence
         if self.effects and (self.interrupted or self.out_of_time):
             said += " The search was cut short, so that a further effect may not have been tried."
@@ -219,7 +215,7 @@ class Diagnosis:
         )
 
     def worth(self, effect: Effect) -> str:
-        """Say what one of several effects does to the error on the test recordings; empty if that is unknown."""
+        """State the test error with and without one of several effects; empty if it is unknown."""
         errors = self.errors.get("test")
         if not errors or np.isnan(effect.test_without):
             return ""
@@ -227,7 +223,7 @@ class Diagnosis:
         return f"error on the test recordings: {with_it} with it, {without} without it (the rest refitted)"
 
     def _better_without(self) -> str:
-        """Name the effect without which a correction that harms would help most, if there is one."""
+        """Name the effect of a harmful correction without which the test error is lowest, if that helps."""
         errors = self.errors.get("test") or {}
         known = [e for e in self.effects if not np.isnan(e.test_without)]
         least = min(known, key=lambda e: e.test_without, default=None)
@@ -355,7 +351,7 @@ class Diagnosis:
         array, shape (M, n_y)
             Outputs; not finite where the simulation diverges.
         int
-            First scored sample: after those that an initial state is estimated from.
+            First scored sample; an initial state is estimated from the samples before it.
         """
         simulator = simulator or self.corrected
         r, dt = match_channels(simulator, recording), self.train[0].dt
@@ -375,7 +371,7 @@ class Diagnosis:
 
         An observer (`focus="prediction"`) is left out.
 
-        `options` are those of `pilfr.exported`; the result has `step`, `c_code` and the other exports.
+        For `options` see `pilfr.exported`; the result has `step`, `c_code` and the other exports.
         """
         from ..export import exported
 
@@ -445,7 +441,7 @@ class Diagnosis:
                 f"{'it has' if one else 'they have'} too little room."
             )
         test, train = self.errors["test"], self.errors["train"]
-        if train and train["before"] > CONSTANT_ERROR and self.verdict in ("missing-physics", "unexplained"):
+        if train and train["before"] > NEAR_CONSTANT and self.verdict in ("missing-physics", "unexplained"):
             out.append(
                 f"Refitted, the simulator alone is hardly better than a constant (error {train['before']:.2g} of the "
                 "outputs' deviation). Check its values, units and bounds before you trust a name."
@@ -482,7 +478,7 @@ class Diagnosis:
         for e in self.effects:
             lines += _effect_lines(e)
             lines += [f"  {self.worth(e)}"] if self.worth(e) else []
-        lines += [*self._nameless_lines(), *self._own(), *self._error_lines(), *self._blind_lines()]
+        lines += [*self._nameless_lines(), *self._value_lines(), *self._error_lines(), *self._blind_lines()]
         lines += [f"note: {text}" for text in (*(g.sentence for g in self.gates), *self.warnings())]
         if self.next_experiment:
             lines.append(f"next experiment: {self.next_experiment['sentence']}")
@@ -510,11 +506,11 @@ class Diagnosis:
         return [f"Blind spot of these recordings: {b.sentence}" for b in self.blind_spots[:GRAVEST_SPOTS]]
 
     def _blind_lines(self) -> list[str]:
-        """List the blind spots that are not told after the verdict."""
-        told = [f"  {b.sentence}" for b in self.blind_spots[GRAVEST_SPOTS:MOST_PRINTED]]
+        """List the blind spots that are not printed after the verdict."""
+        further = [f"  {b.sentence}" for b in self.blind_spots[GRAVEST_SPOTS:MOST_PRINTED]]
         left = len(self.blind_spots) - MOST_PRINTED
         more = [f"  and {left} more, see pilfr check"] if left > 0 else []
-        return ["further blind spots of these recordings:", *told, *more] if told else []
+        return ["further blind spots of these recordings:", *further, *more] if further else []
 
     def _nameless_lines(self) -> list[str]:
         """List the laws of a correction without a sure name, with their values."""
@@ -529,11 +525,11 @@ class Diagnosis:
                 lines += [f"  {name} = {float(p.value):.5g} {p.unit}".rstrip() for name, p in numbers.items()]
         return lines
 
-    def _own(self) -> list[str]:
+    def _value_lines(self) -> list[str]:
         """List the simulator's own estimated values, largest changes first."""
         own = self.corrected.parameters
         free = {k: p for k, p in self.parameters.items() if not own[k].fixed.all() and own[k].value.ndim == 0}
-        moved = sorted(free, key=lambda k: -abs(_change(free[k])))
+        moved = sorted(free, key=lambda k: -abs(_relative_change(free[k])))
         lines = []
         for name in moved[:MOST_PRINTED]:
             p = free[name]
@@ -577,7 +573,7 @@ def _percent(value: float) -> str:
     return f"{100 * value:.3g} %" if np.isfinite(value) else "infinite (the simulation diverges)"
 
 
-def _change(row: Mapping[str, Any]) -> float:
+def _relative_change(row: Mapping[str, Any]) -> float:
     """Compute the relative change of a parameter."""
     nominal = float(row["nominal"])
     return (float(row["refit_with"]) - nominal) / (abs(nominal) or 1e-300)

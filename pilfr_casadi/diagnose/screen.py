@@ -32,7 +32,7 @@ from ..simulators import EQUATION, PARAMETER, SENSOR, Port, kind_of, port_name
 from .linearise import (
     Probe,
     Run,
-    linearised,
+    linearise_runs,
     locals_of,
     loudest_stretch,
     observer_gain,
@@ -349,7 +349,7 @@ def screen(
     workers : int
         Ports processed in parallel.
     """
-    probe, runs = linearised(bench, fitted)
+    probe, runs = linearise_runs(bench, fitted)
     gain = observer_gain(probe, runs, noise)
     observed = [run(bench, probe, fitted, i, gain) for i in range(len(runs))] if gain.any() else []
     if not all(_stays_bounded(r, bench.scale) for r in observed):
@@ -483,6 +483,6 @@ def flexible_shares(bench: Workbench, fitted: Fitted) -> dict[str, float]:
     most = max(MOST_WORK // size, min(LEAST_SAMPLES, MOST_MEMORY // size)) // len(bench.recordings)
     if any(len(r) > most for r in bench.recordings):
         bench = bench.on([r.slice(0, max(most, r.skip + LEAST_SAMPLES // 10)) for r in bench.recordings])
-    probe, runs = linearised(bench, fitted)
+    probe, runs = linearise_runs(bench, fitted)
     rest = Remainder.of(bench, probe, runs, FLEXIBLE)
     return {t.port.name: held_out(rest.columns(t)[0], rest.left, rest.odd, RIDGES) for t in rest.tasks}

@@ -38,7 +38,7 @@ from .floor import ABOVE_NOISE
 from .gates import CLEARLY_BETTER
 from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
-from .linearise import linearised
+from .linearise import linearise_runs
 from .relatives import choose_pairs, complements, fit_pair, relatives
 from .screen import Remainder, Scored, screen, usable
 from .trials import Key, Trial, place_law
@@ -233,7 +233,7 @@ class Search(Hypotheses):
     ) -> list[Trial]:
         began = time.perf_counter()
         stage = f"fits, effect {len(parent.laws) + 1}" if parent.laws else "fits"
-        trials = self.fits.beside(parent, scored, gain, enough, partial(self.say, stage), again)
+        trials = self.fits.fit_pairs(parent, scored, gain, enough, partial(self.say, stage), again)
         self.times["fits"] = self.times.get("fits", 0.0) + time.perf_counter() - began
         if self.bench.interrupted_fits:
             raise KeyboardInterrupt
@@ -302,7 +302,7 @@ class Search(Hypotheses):
             starts = list(kind.finer_starts(trial.law.at(trial.own), entry.local))
             placed = [place_law(bare, replace(entry, law=kind()), own) for own in starts]
             values = [{**base.values, **named} for _, named in placed]
-            return self.fits.fitted(placed[0][0], values, len(trial.laws), states=base.begin)
+            return self.fits.fit(placed[0][0], values, len(trial.laws), states=base.begin)
 
         found = side_by_side(fit, [kind for kind in kinds if usable(kind(), entry.local)], self.workers)
         self._keep_all([t for t in found if t is not None])
@@ -372,7 +372,7 @@ class Search(Hypotheses):
         for _ in range(FEW):
             best = self.best
             for element in best.effects if len(best.effects) > 1 else ():
-                rest = self.beside([e for e in best.laws if e is not element], best)
+                rest = self.run_laws([e for e in best.laws if e is not element], best)
                 if not rest.mean_square < DIVERGED:
                     continue
                 if self.in_time() and not self._expanded(rest):  # from the values of all laws, which may be right
@@ -397,7 +397,7 @@ class Search(Hypotheses):
                     plain = constant(type(element.law))
                     if plain is not type(element.law) and kind_of(element.port) != PARAMETER:
                         others = [e for e in best.laws if e is not element]
-                        self._refine(self.beside([*others, element], best), [plain])
+                        self._refine(self.run_laws([*others, element], best), [plain])
                 if self.best.key == best.key:
                     return
 
@@ -408,7 +408,7 @@ class Search(Hypotheses):
     def add_two(self) -> None:
         """Fit two laws at once beside the simulator alone, because one after the other may hide each other."""
         with self.stage(TWO):
-            rest = Remainder.of(self.bench, *linearised(self.bench, self.root.fitted), self.laws)
+            rest = Remainder.of(self.bench, *linearise_runs(self.bench, self.root.fitted), self.laws)
             fits, before = self.fits, self.best
             found = side_by_side(
                 lambda pair: fit_pair(fits, self.root.fitted, rest, pair), choose_pairs(rest), self.workers
@@ -428,12 +428,12 @@ class Search(Hypotheses):
             return
         with self.stage("every sensor"):
             source = filters[0]
-            joint = self.beside([e for e in best.laws if e is not source], best)
+            joint = self.run_laws([e for e in best.laws if e is not source], best)
             simulator, named = joint.fitted.simulator, dict[str, object](joint.fitted.values)
             for name in names:
                 simulator = simulator.with_element(port_name(SENSOR, name), source.law)
                 named |= simulator.elements[-1].named(source.own(best.fitted.values))
-            found = self.fits.fitted(simulator, [named], len(joint.laws) + len(names), states=joint.fitted.begin)
+            found = self.fits.fit(simulator, [named], len(joint.laws) + len(names), states=joint.fitted.begin)
             if found is not None:
                 self.keep(self.fits.polish(found))
 

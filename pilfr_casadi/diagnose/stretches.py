@@ -1,8 +1,8 @@
 """Long records: the search runs on the most informative stretches, the final fits on everything.
 
 A search fits hundreds of hypotheses. If the training recordings have more samples than it can use in minutes, it runs
-on a few stretches of them. Neighbouring stretches of a long record tell much the same, and what is rare tells most. So
-each candidate stretch gets features, and the stretches are chosen far apart in them (farthest-point selection, Gonzalez
+on a few stretches of them. Neighbouring stretches of a long record are much alike, and rare ones add most. Therefore
+each candidate stretch gets features, and stretches far apart in them are chosen (farthest-point selection, Gonzalez
 1985):
 
 - For each port, the size of the residual that forces of a family explain there beyond the simulator's own parameters,
@@ -11,11 +11,11 @@ each candidate stretch gets features, and the stretches are chosen far apart in 
 - Amplitude, rate and operating point of each channel.
 
 The initial state of a stretch from within a recording is estimated, with the memory of laws. All its samples are
-scored: a state before unscored samples is hardly determined, and could be far outside the recorded range.
+scored, because a state before unscored samples is hardly determined and could be far outside the recorded range.
 
 The leading hypotheses are then fitted to everything, by normal equations that are summed over the recordings piece by
-piece (`optimise.Problem.normal`), so that memory does not grow with their length. A hypothesis that everything refutes
-is dropped; errors, values and standard errors come from everything.
+piece (`optimise.Problem.normal`), so that memory does not grow with their length. A hypothesis that all recordings
+together refute is dropped; errors, values and standard errors come from all recordings.
 """
 
 from __future__ import annotations
@@ -35,22 +35,21 @@ from ..laws import Creep, Law, StopHysteresis
 from ..models import Model
 from ..optimise import GaussNewton, estimate_initial_state, samples_for_state
 from ..simulators import Simulator
-from .floor import FEWEST, effective_size
 from .gates import Gate
-from .hypotheses import Findings, likeliest
+from .hypotheses import Findings, count_samples, likeliest
 from .linearise import Probe, loudest_stretch, run
 from .screen import Remainder, Surface, Task, orthonormal
 from .search import Search
 from .trials import Trial
 from .workbench import DIVERGED, FEW, Fitted, Workbench
 
-MOST_SAMPLES = 60_000  # samples of the training recordings up to which everything is searched: effort
-SHARE, COUNT = 2 / 3, 10  # share of these samples that the stretches have together, and their largest number
+SEARCHED_SAMPLES = 60_000  # samples of the training recordings up to which everything is searched: effort
+STRETCH_SHARE, MOST_STRETCHES = 2 / 3, 10  # share of these samples in all stretches together, and their largest number
 SHORTEST_STRETCH = 500  # least length of a stretch in samples: a law with memory needs some history
 MOST_LINEARISED = 300  # stretches that are linearised at most
 LINEARISED_SAMPLES = 1000  # samples of each that are linearised
-FAMILIES = (Surface, StopHysteresis, Creep)  # forces near whose span the catalogue's laws are
-# the stretches' fits are near those to everything, so that few steps suffice
+FAMILIES = (Surface, StopHysteresis, Creep)  # the catalogue's laws are near the span of these forces
+# few steps suffice from the values on the stretches
 FINAL = GaussNewton(max_iterations=40, tolerance=1e-5, patience=3)
 
 
@@ -117,18 +116,18 @@ def choose_stretches(
     recordings: Sequence[Recording],
     hold: str,
     engine: str = "auto",
-    most: int = MOST_SAMPLES,
+    most: int = SEARCHED_SAMPLES,
     workers: int = 1,
 ) -> tuple[Stretch, ...]:
-    """Choose the stretches of recordings that tell most of missing forces; see the module docstring.
+    """Choose the stretches of recordings that say most about missing forces; see the module docstring.
 
     Parameters
     ----------
     most : int
         Samples up to which everything would be searched; the stretches have two thirds of it together at most.
     """
-    length = max(int(SHARE * most) // COUNT, SHORTEST_STRETCH)
-    count = int(np.clip(int(SHARE * most) // length, 1, COUNT))
+    length = max(int(STRETCH_SHARE * most) // MOST_STRETCHES, SHORTEST_STRETCH)
+    count = int(np.clip(int(STRETCH_SHARE * most) // length, 1, MOST_STRETCHES))
     stretches = [s for i, r in enumerate(recordings) for s in divide(i, len(r), r.skip, length)]
     signals = signal_features(recordings, stretches)
     if len(stretches) > MOST_LINEARISED:
@@ -150,7 +149,7 @@ def divide(recording: int, samples: int, skip: int, length: int) -> list[Stretch
 
 
 def spread_out(features: np.ndarray, count: int, first: int) -> list[int]:
-    """Select `count` rows of features (n, k), each as far from those before it as any; `first` is the first of them."""
+    """Select `count` rows of features (n, k), from `first` on each as far as possible from the rows before it."""
     chosen = [first]
     distance = np.sum((features - features[first]) ** 2, axis=1)
     while len(chosen) < min(count, len(features)):
@@ -297,7 +296,7 @@ class Everything:
 
     @classmethod
     def of(cls, search: Search, stretches: Stretches, gates: Sequence[Gate]) -> Everything | None:
-        """Fit the leading hypotheses of a search to everything, and drop from its memo those that everything refutes.
+        """Fit the leading hypotheses of a search to everything, and drop the refuted ones from its memo.
 
         After an interrupt, or past the deadline, their values stay as they are. None if the refitted simulator runs
         away from the whole recordings.
@@ -317,15 +316,14 @@ class Everything:
         for trial, fitted in zip(trials, fits, strict=True):
             there.keep(Trial(trial.laws, fitted, fitted.cost, fitted.cost, True))
         best = max(there.memo.values(), key=there.evidence)
-        scored = [e[r.skip :] for e, r in zip(best.fitted.residual, whole.recordings, strict=True)]
-        there.count = max(effective_size(scored), FEWEST)
+        there.count = count_samples(best.fitted, whole)
         kept = {t.key for t in likeliest(list(there.memo.values()), there.evidence)} | {search.root.key}
         for trial in trials:
             if trial.key not in kept:
                 del search.memo[trial.key]
         return cls(whole, {trial.fitted: fitted for trial, fitted in zip(trials, fits, strict=True)})
 
-    def fitted(self, search: Search, fitted: Fitted) -> Fitted:
+    def fit(self, search: Search, fitted: Fitted) -> Fitted:
         """Return the fit to everything of a simulator fitted to the stretches."""
         if fitted not in self.fits:
             self.fits[fitted] = fit_to_all(self.bench, fitted, _seconds_left(search))

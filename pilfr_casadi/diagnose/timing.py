@@ -1,9 +1,9 @@
 """Faults of time: a channel recorded too early or too late, or by another clock.
 
-One channel is read at another time, and the error of the refitted simulator is projected off the
-directions that parameters and initial states can follow. The shift (or clock rate) with the smallest remainder is
-confirmed by a refit. A late output may be physics (a delay). A shift of many whole samples is typical of a recorder,
-and an output before its cause can be nothing else.
+One channel is read at shifted times, and the error of the refitted simulator is projected off the directions that
+parameters and initial states can follow. A refit confirms the shift (or clock rate) with the smallest remainder. A late
+output may be physics (a delay). A shift of many whole samples is typical of a recorder, and only a recorder puts an
+output before its cause.
 """
 
 from __future__ import annotations
@@ -31,14 +31,15 @@ from .gates import (
 )
 from .workbench import RUNAWAY, Fitted, Workbench
 
-SHIFTS = np.union1d(np.arange(-64.0, 65.0), np.linspace(-2.0, 2.0, 17))  # samples
+LARGEST_SHIFT = 64  # largest shift that is tried, and largest number of lost samples of an output
+SHIFTS = np.union1d(np.arange(-LARGEST_SHIFT, LARGEST_SHIFT + 1.0), np.linspace(-2.0, 2.0, 17))  # samples
 # clock rates tried, as relative errors: 0.01 % to 5 %
 RATES = np.concatenate([-np.geomspace(1e-4, 0.05, 28)[::-1], np.geomspace(1e-4, 0.05, 28)])
 WHOLE_SHIFT = 0.12  # distance in samples within which a shift counts as whole
 LONG_SHIFT = 4.5  # shift in samples above which a whole shift is a fault of the recording
 MOST_SCREENED, MOST_SHIFTS = 4, 2  # faults that refits confirm, and shifts of one channel among them
 LEAST_RECORDED = 0.5  # least share of the samples that a shift may read inside the recordings
-AVERAGED_NOISE = 0.5  # largest share of a channel's noise that interpolation between its samples removes
+AVERAGED_NOISE = 0.5  # share of a noise that the mean of two samples removes, the most that interpolation can
 
 _Curve = Callable[[np.ndarray], np.ndarray]  # a signal over time
 
@@ -65,7 +66,7 @@ class TimeShift(Gate):
         """Read the channels at the times of the others, interpolated: outputs by cubic splines, inputs by chords.
 
         Samples from before the recording are skipped, samples from behind it are cut off. Without `cut`, the end values
-        are held. A periodic recording wraps around. `curves` are those of the recording where they are known.
+        are held. A periodic recording wraps around. `curves` are its interpolants, if they are known.
         """
         at, wraps = self._times(r), self._wraps(r)
         values = np.array(getattr(r, self.kind))
@@ -132,7 +133,7 @@ class TimeShift(Gate):
         return self if abs(value - self.value) < 2e-3 * width else self.at(value, now.bench.dt)
 
     def is_like_delay(self, dt: float, part: float) -> bool:
-        """Tell whether it is late as by a delay: by a fraction of `part` samples, or by little."""
+        """Tell whether it may be a delay: late by a fraction of `part` samples, or by few samples."""
         late = self.finding == "alignment" and self.value > -WHOLE_SHIFT * dt
         return late and not (in_steps(self.value, dt, part) and self.value > LONG_SHIFT * dt)
 
@@ -199,7 +200,8 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True) -> Chec
 
 def _is_lag(now: Checked, after: Checked, fault: TimeShift) -> bool:
     """Tell whether lags follow a late channel better than the shift that was found."""
-    if fault.finding == "clock" or (fault.value > 0) != (fault.kind == "y"):  # an early input looks like late outputs
+    late = (fault.value > 0) == (fault.kind == "y")  # an early input looks like late outputs
+    if fault.finding == "clock" or not late:
         return False
     simulator = now.bench.simulator
     names, place = (simulator.output_names, "sensor") if fault.kind == "y" else (simulator.inputs, "actuator")
@@ -221,8 +223,8 @@ def run_as_given(bench: Workbench, plain: Fitted) -> Fitted:
 def _screen_shifts(bench: Workbench, plain: Fitted) -> list[TimeShift]:
     """List the shifts and clock rates that clearly reduce the remainder, best first, a few at most.
 
-    A shift can lead the refit into a wrong minimum; so they are also sought along the run at the user's values, unless
-    it runs away.
+    A shift can lead the refit into a wrong minimum. Therefore the run at the user's values is screened too, unless it
+    runs away.
     """
     outputs, inputs = bench.simulator.output_names, bench.simulator.inputs
     channels: list[tuple[str, tuple[int, ...], str]] = [("y", (i,), name) for i, name in enumerate(outputs)]

@@ -1,8 +1,8 @@
 """Fits of hypotheses: a simulator with laws put into its ports, all parameters estimated together.
 
 A pair of port and law is fitted briefly from its best initial values. The best pairs are fitted again from several
-initial values. Those that may win are fitted to convergence and to all samples. A sharp knee, such as that of dry
-friction, is fitted on steps that are fine enough for it.
+initial values. Candidates that may win are fitted to convergence and to all samples. A sharp knee, as of dry friction,
+is fitted on steps that are fine enough for it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ..data import Recording
 from ..laws import Law
 from ..simulators import Placed, Simulator
 from .evidence import FAR_RATIO, FORMULA_ERROR
-from .gates import open_start
+from .gates import EQUAL_RATIO, open_start
 from .offsets import Offset
 from .screen import Pair, Scored
 from .workbench import (
@@ -40,7 +40,6 @@ from .workbench import (
 # Effort: pairs of each list of the screen that are fitted, besides the best of each port; the same if `again`
 BEST, BEST_AGAIN = 10, 4
 MOST_REFINED = 8  # pairs fitted from several starts; only FEW if `again`
-EQUAL_COSTS = 1.02  # ratio of mean square errors within which fits count as equal
 LEAST_SHARE = 0.01  # share over the largest of the same run below which start values are not used
 Key = frozenset[Pair]
 
@@ -83,7 +82,7 @@ class Trial:
     def supersedes(self, other: Trial) -> bool:
         """Tell whether this fit of a hypothesis replaces another; a thorough one has priority."""
         if self.thorough != other.thorough:
-            return self.thorough or self.mean_square < other.mean_square / EQUAL_COSTS
+            return self.thorough or self.mean_square < other.mean_square / EQUAL_RATIO
         return self.mean_square < other.mean_square
 
     @property
@@ -155,12 +154,12 @@ class Trials:
         share = COMPARED_SAMPLES / sum(map(len, self.bench.recordings))
         return self.bench if share >= 1 else self.bench.on([_head(r, share) for r in self.bench.recordings])
 
-    def fitted(
+    def fit(
         self, simulator: Simulator, starts: Sequence[Mapping[str, Any]], count: int, **options: Any
     ) -> Trial | None:
         """Fit a simulator whose last `count` elements are the hypothesis' laws; None if every start diverges.
 
-        `options` are those of `Workbench.fit`.
+        For `options` see `Workbench.fit`.
         """
         part = self.part
         try:
@@ -203,7 +202,7 @@ class Trials:
         fitted = refit_on_finer_steps(self.bench, trial.fitted, trial.knee)
         return Trial(fitted.last_elements(len(trial.laws)), fitted, fitted.cost, fitted.cost, thorough=True)
 
-    def beside(
+    def fit_pairs(
         self,
         parent: Trial,
         scored: Sequence[Scored],
@@ -214,8 +213,8 @@ class Trials:
     ) -> list[Trial]:
         """Fit every pair of port and law that the screen selects beside a parent's laws, smallest error first.
 
-        If one of the first comes below the error `enough`, those far behind it are not refined. With `again`, in place
-        of a known law, fewer pairs are fitted.
+        If one of the first pairs has an error below `enough`, pairs far behind it are not refined. With `again`, which
+        looks for a law in place of a known one, fewer pairs are fitted.
         """
         pairs = select_pairs(scored, BEST_AGAIN if again else BEST)
         most = FEW if again else MOST_REFINED
@@ -257,16 +256,16 @@ class Trials:
         placed, _ = place_law(base.simulator, first, first.starts[0])
         model, engine = self.bench.compile(placed, gain)
         users = self.bench.simulator.parameters
-        # the refit may have bent an offset there, or the term in line with which the law stands, to make up for it
+        # the refit may have compensated for the law by an offset there, or by the term that the law is in line with
         offsets = [e for e in self.bench.simulator.elements if e.port == first.port and isinstance(e.law, Offset)]
         reset = tuple(f"{e.prefix}{name}" for e in offsets for name in e.law.strength)
         if first.law.in_line:
             reset = (*reset, *self.bench.simulator.term_parameters(first.port))
-        bent = bool(reset) or first.law.special  # or may be far off where the missing force is strongly curved
+        afresh = bool(reset) or first.law.special  # strongly curved forces may leave the refit far off
         reset = tuple(users) if first.law.special or not reset else reset
         nominal = {**base.values, **{name: users[name].value for name in reset}}
         starts: list[Mapping[str, Any]] = []
-        # values from the observer's run, which may be near the truth if the simulation is not
+        # values from the observer's run, which may be near the truth where the simulation is not
         observed: list[Mapping[str, Any]] = []
         given: list[Mapping[str, Any]] = []  # with the user's own values of the parameters
         for entry in entries:
@@ -286,19 +285,19 @@ class Trials:
         ranked = [best, *(s for s in observed if s is not best), *last]
         count = len(parent.laws) + 1
         options = {"states": base.begin, "model": model, "engine": engine}
-        brief = self.fitted(placed, ranked[:1], count, solver=BRIEF, **options)
-        if bent:
-            afresh = [s for s in ranked if any(s is n for n in given)][:1]
-            again = self.fitted(placed, afresh, count, solver=BRIEF, **{**options, "states": ()})
+        brief = self.fit(placed, ranked[:1], count, solver=BRIEF, **options)
+        if afresh:
+            nearest = [s for s in ranked if any(s is n for n in given)][:1]
+            again = self.fit(placed, nearest, count, solver=BRIEF, **{**options, "states": ()})
             brief = min((t for t in (brief, again) if t is not None), key=lambda t: t.part_mean_square, default=None)
         return _BriefFit(placed, options, ranked, count, brief)
 
     def _refine(self, pairs: Sequence[_BriefFit], observer: bool, pool: ThreadPoolExecutor) -> Iterator[Trial | None]:
-        """Fit pairs from several starts, with `observer` along the observer as well; three that agree are enough."""
+        """Fit pairs from several starts, and with `observer` also along the observer; stop if three fits agree."""
 
         def submit(pair: _BriefFit, some: slice) -> list[Future[Trial | None]]:
             return [
-                pool.submit(self.fitted, pair.placed, [start], pair.count, anneal=anneal, **pair.options)
+                pool.submit(self.fit, pair.placed, [start], pair.count, anneal=anneal, **pair.options)
                 for start, anneal in pair.starts_again(observer)[some]
             ]
 
@@ -314,7 +313,7 @@ class Trials:
 
 @dataclass(frozen=True, eq=False)
 class _BriefFit:
-    """A pair with its compiled model among the options of its fits, its starts, best first, and its brief fit."""
+    """A pair of port and law: options of its fits (with the compiled model), starts (best first), and brief fit."""
 
     placed: Simulator
     options: dict[str, Any]
@@ -323,7 +322,7 @@ class _BriefFit:
     trial: Trial | None
 
     def starts_again(self, observer: bool) -> list[tuple[Mapping[str, Any], tuple[float, ...]]]:
-        """Return the starts for further fits, each with the observer's gains; those with the observer come first."""
+        """Return the starts for further fits, each with its observer gains; starts along the observer come first."""
         starts = self.starts[:FEW]
         if self.trial is not None:
             starts = [self.trial.fitted.values, *starts[1:]]
@@ -333,7 +332,7 @@ class _BriefFit:
 def _agree(found: Sequence[Trial | None]) -> bool:
     """Tell whether three fits came to the same minimum."""
     costs = sorted(t.part_mean_square for t in found if t)
-    return len(costs) > 2 and costs[2] < EQUAL_COSTS * costs[0]
+    return len(costs) > 2 and costs[2] < EQUAL_RATIO * costs[0]
 
 
 def _head(r: Recording, share: float) -> Recording:
@@ -343,10 +342,10 @@ def _head(r: Recording, share: float) -> Recording:
 
 
 def select_pairs(scored: Sequence[Scored], best: int) -> list[list[Scored]]:
-    """Select the pairs worth a full fit: the best of both lists and of each port, and the laws that belong to a port.
+    """Select the pairs worth a full fit: the best of both lists and of each port, and the laws made for a port.
 
-    These are laws of its domain, and laws in line with its term. Their forces are so curved that a small dose may tell
-    little of them.
+    These are special laws of its domain, and laws in line with its term. Their forces are so curved that a small dose
+    says little about them.
     """
     chosen: dict[Pair, list[Scored]] = {}
     for source in ("simulation", "observer"):
@@ -357,7 +356,7 @@ def select_pairs(scored: Sequence[Scored], best: int) -> list[list[Scored]]:
             if not any(_is_redundant(s, other) for other in passed):  # two forms of one law are one hypothesis
                 passed.append(s)
             ports.add(s.port)
-    largest = dict[str, float]()  # the runs leave different errors, so that their shares are not comparable
+    largest = dict[str, float]()  # by run, because shares of different residuals are not comparable
     for s in scored:
         largest[s.source] = max(largest.get(s.source, 0.0), s.share)
         if s.pair in chosen:
@@ -366,7 +365,7 @@ def select_pairs(scored: Sequence[Scored], best: int) -> list[list[Scored]]:
 
 
 def _is_redundant(one: Scored, other: Scored) -> bool:
-    """Tell whether, of two laws at a port, one refines the other and they score the same."""
+    """Tell whether one of two laws at a port refines the other, and they score the same."""
     a, b = type(one.law), type(other.law)
     return one.port == other.port and (issubclass(a, b) or issubclass(b, a)) and other.share - one.share < FORMULA_ERROR
 

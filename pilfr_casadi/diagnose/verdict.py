@@ -50,7 +50,7 @@ from .floor import ABOVE_NOISE, swells_with, white_part
 from .gates import Gate
 from .hypotheses import Hypotheses
 from .proof import mean_nrmse
-from .recording_faults import ringing
+from .recording_faults import find_ringing_mode
 from .trials import Trial
 
 Name = tuple[str, str]  # port and law id
@@ -307,7 +307,7 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
     shares = search.flexible(search.root)
     share = max(shares.values(), default=0.0)
     steady = [g for g in gates if g.finding == "tone" and not found.effects]
-    mode = ringing(search.bench, search.root.fitted)
+    mode = find_ringing_mode(search.bench, search.root.fitted)
     quiet = max(1 - sum(1 - g.left for g in steady), 0.0) ** 0.5  # share of the error that is left without the tones
     measured = not found.effects and search.floor.may_be(quiet * search.rms(search.root))
     noise = not found.effects and (measured or _is_noise(search, quiet, share, mode))

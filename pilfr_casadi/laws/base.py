@@ -3,7 +3,7 @@
 A law is a force `w = Σ_i c_i φ_i(z, ż, q, t; shape)`, linear in its *strengths* c and nonlinear in its *shape*
 parameters (threshold, gap, knee, delay). Here z is the local coordinate at the port, ż its rate, and w the force. A law
 may have states q of its own, with `q̇ = flow(...)`, or a discrete memory s, with `step(z, s, p)` in place of `force`. In
-series at an actuator or a sensor, w is the deviation of the signal: `w = law(u) - u`.
+series, at an actuator or a sensor, w is the deviation of the signal: `w = law(u) - u`.
 
 To add a law, state its equation, its sentence and the units of its parameters, and write `force`. Parameters whose unit
 begins with w are strengths; all others are shape parameters. For each shape parameter, `starts` gives the start values
@@ -46,7 +46,7 @@ ONSET_WIDTH = 0.05  # of a contact, as a share of its gap
 
 MIN_SIDE = 0.05  # share of the reach that a signal must visit on either side, to tell the sides apart
 
-PEOPLE = ("coulomb", "stribeck", "hertz")  # laws and forms that bear a person's name
+PEOPLE = ("coulomb", "stribeck", "hertz")  # persons in the names of laws and forms
 PROPER_NAMES = {"bouc_wen": "Bouc-Wen", "prandtl_ishlinskii": "Prandtl-Ishlinskii"}
 
 
@@ -136,7 +136,7 @@ def size_to_power(z: Any, n: Any, least: float = 1e-12) -> Any:
 
 
 # an attribute of `Local` ("" for none) and its multiples, or the values as a function of it
-Tried = tuple[Any, ...] | Callable[[Local], Any]
+Grid = tuple[Any, ...] | Callable[[Local], Any]
 
 
 @dataclass(frozen=True)
@@ -160,15 +160,15 @@ class Law:
     defaults : mapping
         Values of parameters before any are given; otherwise strengths are zero and shapes one.
     places : tuple of {"parallel", "series", "sensor", "parameter"}
-        Allowed places: inside the dynamics, at an actuator or a sensor, at a sensor alone, or at a parameter.
+        Allowed places: inside the dynamics, at an actuator or a sensor, at a sensor only, or at a parameter.
     domains : tuple of {"mechanical", "thermal", "electrical", "fluid"}
         Physical domains in which it occurs; left out, all of them.
     special : bool
-        It is tried at ports of its domains alone, and not where the domain is unknown.
+        It is tried only at ports of its domains, and not where the domain is unknown.
     across : str
         Unit that the local coordinate of a special law can be converted to, such as "V"; left out, any.
     angular : bool
-        It is tried only where the unit of the local coordinate is that of an angle.
+        It is tried only where the local coordinate has the unit of an angle.
     dissipative, restoring : bool
         The force always opposes the motion, or always pushes back towards z = 0. This fixes the sign of all strengths
         except those in `signed`.
@@ -182,17 +182,17 @@ class Law:
         The data carries information on the law only if z is both above and below zero.
     order, follows : int
         `order` is the number of its own states. If the signal stands still, the first `follows` of its states or its
-        memory are at the signal's value, the others at zero. A play is where the signal's way from zero has left it.
+        memory are at the signal's value, the others at zero, as for plays after the signal has moved there from zero.
     memory, shifts : int, bool
-        `memory` is the length of its discrete memory. `shifts` says that the memory is a shift register, which takes
-        in the signal at the beginning of a step.
+        `memory` is the length of its discrete memory. `shifts` says that the memory is a shift register, which reads
+        the signal at the beginning of a step.
     in_line : bool
         The law stands in line with the port's `term`, which `force` and `flow` may call: `term(z, dz)`.
     driven : bool
         The term is the force of a drive, which the equations show if the port names no term.
     sensed : bool
-        Outputs that read the port's coordinate or its rate read `far_side(q, p)` in their place. The law is tried only
-        where the coordinate is a state that outputs read.
+        Outputs that read the port's coordinate or its rate read `far_side(q, p)` instead. The law is tried only where
+        the coordinate is a state that outputs read.
     seen_by : str
         The one output that reads the far side; empty for all outputs that read the coordinate. See `seen_by`.
     substeps : int
@@ -226,8 +226,8 @@ class Law:
     form: ClassVar[str] = ""
     units: ClassVar[Mapping[str, str]] = {}
     strength: ClassVar[tuple[str, ...]] = ()
-    starts: ClassVar[Mapping[str, Tried]] = {}
-    ranges: ClassVar[Mapping[str, Tried]] = {}
+    starts: ClassVar[Mapping[str, Grid]] = {}
+    ranges: ClassVar[Mapping[str, Grid]] = {}
     defaults: ClassVar[Mapping[str, Any]] = {}
     places: ClassVar[tuple[str, ...]] = ("parallel",)
     domains: ClassVar[tuple[str, ...]] = ()
@@ -285,12 +285,12 @@ class Law:
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         """Generate the values of the shape parameters to try: every combination of `starts`."""
-        for values in itertools.product(*(_tried(entry, local) for entry in self.starts.values())):
+        for values in itertools.product(*(_evaluate(entry, local) for entry in self.starts.values())):
             yield {name: float(value) for name, value in zip(self.starts, values, strict=True)}
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         """Bounds of the parameters on which the data carries information: `ranges`."""
-        found = {name: _tried(entry, local) for name, entry in self.ranges.items()}
+        found = {name: _evaluate(entry, local) for name, entry in self.ranges.items()}
         return {name: (low, high) for name, (low, high) in found.items()}
 
     def why_not(self, local: Local) -> str:
@@ -304,26 +304,26 @@ class Law:
 
     @property
     def lacks(self) -> str:
-        """Say what is still needed before the law can stand in a port; empty if nothing."""
+        """Say which value is missing before the law can stand in a port; empty if none is."""
         return ""
 
     def remark(self, values: Mapping[str, Any]) -> str:
-        """Say how the law at its fitted values differs from what its sentence says; empty if it does not."""
+        """Say how the law at its fitted values differs from its sentence; empty if it does not."""
         return ""
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """Tell whether the law at its fitted values hardly does what its sentence says."""
+        """Tell whether the law degenerates at its fitted values, so that its sentence is hardly true."""
         return False
 
     def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
-        """Start values at which it equals a plainer law fitted to `own`; empty where it does not refine that law."""
+        """Start values at which it equals a plainer law with the values `own`; empty if it does not refine that law."""
         more = [name for name in self.units if name not in plain.units]
         refines = plain.strength and plain.units.items() <= self.units.items() and set(more) <= set(self.strength)
         return {**dict.fromkeys(more, 0.0), **own} if more and refines else {}
 
     @classmethod
     def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:
-        """Start values of this form for a law that was found in another form; of strengths that vary, the mean."""
+        """Start values of this form for a law found in another form, with the means of strengths that vary."""
         own = {name: value for name, value in found.values.items() if name in cls.units}
         for name in own:
             ends = [found.values[f"{name}{end}"] for end in ("", "_mid", "_high") if f"{name}{end}" in found.values]
@@ -394,7 +394,7 @@ def _are_numbers(given: Any, count: int) -> bool:
         return False
 
 
-def _tried(entry: Tried, local: Local) -> Any:
+def _evaluate(entry: Grid, local: Local) -> Any:
     """Values of an entry of `starts` or `ranges`."""
     if callable(entry):
         return entry(local)
@@ -413,15 +413,15 @@ def display_name(law: str, form: str = "") -> str:
 
 
 def short_name(law: str, form: str = "") -> str:
-    """Write the id of a law as words, with its form if the id says little, or what varies the strength."""
-    told = [part for part in form.split(", ") if law in GENERAL or part.startswith(("scheduled", "scaled"))]
-    return display_name(law, ", ".join(told))
+    """Write the id of a law as words, with its form if the id says little, or the signal that varies its strength."""
+    shown = [part for part in form.split(", ") if law in GENERAL or part.startswith(("scheduled", "scaled"))]
+    return display_name(law, ", ".join(shown))
 
 
 def readable_unit(unit: str, w: str, z: str, signals: Mapping[str, str] | None = None) -> str:
-    """Put the port's own units into a unit in w, z and s: ("w/z^3", "N", "m") -> "N/m^3".
+    """Insert the port's units into a unit in w, z and s: ("w/z^3", "N", "m") -> "N/m^3".
 
-    `signals` has the units of signals by name, such as that of "[temperature]".
+    `signals` has the units of signals by name, for units such as "[temperature]".
     """
     if unit == "w/z" and w == z:
         return ""
@@ -437,7 +437,7 @@ def readable_unit(unit: str, w: str, z: str, signals: Mapping[str, str] | None =
 
 
 def contact_onset(z: Any, g: Any) -> Any:
-    """Rise from 0 to 1 where |z| passes a gap g, over a share of the gap, because a jump would have no slope in g."""
+    """Rise from 0 to 1 as |z| passes a gap g; smooth, because a jump would have no derivative by g."""
     return (1 + ca.tanh((ca.fabs(z) - g) / (ONSET_WIDTH * g))) / 2
 
 

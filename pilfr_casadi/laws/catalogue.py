@@ -15,13 +15,13 @@ FINER: dict[type[Law], tuple[Any, ...]] = {
     hysteresis.GeneralizedHysteresis: (hysteresis.FineGeneralized,),
 }
 
-# laws in the order in which they are tried: those of the files, in the order in which they are defined
+# laws in the order in which they are tried: file by file, in the order of their definitions
 CATALOGUE: tuple[type[Law], ...] = (
     *(
         law
         for file in (stiffness, friction, hysteresis, curves, dynamic, in_line, thermal, electrical)
         for law in vars(file).values()
-        if isinstance(law, type) and issubclass(law, Law) and hasattr(law, "id") and (law,) not in FINER.values()
+        if isinstance(law, type) and issubclass(law, Law) and hasattr(law, "equation") and (law,) not in FINER.values()
     ),
     behind_gap(friction.CoulombFriction),
 )

@@ -1,4 +1,4 @@
-"""Laws made of laws: scaled by a signal, varying with one, or acting behind a gap; and parameters that vary.
+"""Laws made of laws (scaled by a signal, varying with a signal, acting beyond a gap), and parameters that vary.
 
 Two laws in parallel in one port need no class of their own: call `Simulator.with_element` twice.
 """
@@ -58,7 +58,7 @@ def _lagrange(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(c, np.polyder(c)) for c in basis]
 
 
-def _through(share: Any, count: int) -> list[Any]:
+def _interpolation_weights(share: Any, count: int) -> list[Any]:
     """Weigh values at `count` equidistant nodes by the polynomial through them; outside along its tangents."""
     number = isinstance(share, (float, np.ndarray))
     inside = np.clip(share, 0, 1) if number else ca.fmin(ca.fmax(share, 0), 1)
@@ -75,7 +75,7 @@ PROFILES = {
         ("", "_mid", "_high"),
         " in a parabola",
         "a parabola in {by} through three values",
-        lambda share, values: _through(share, 3),
+        lambda share, values: _interpolation_weights(share, 3),
     ),
     "exponential": Profile(
         ("",),
@@ -83,7 +83,7 @@ PROFILES = {
         "times ratio^(({by} - low)/(high - low))",
         lambda share, values: [values["ratio"] ** share],
     ),
-    # of what is added to a parameter, which has its own value in the middle of the signal's range
+    # changes that are added to a parameter, which has its own value in the middle of the signal's range
     "tilt": Profile(
         ("",), "", "change = c (2 share - 1),  share = ({by} - low)/(high - low)", lambda share, values: [2 * share - 1]
     ),
@@ -91,17 +91,17 @@ PROFILES = {
         ("", "_high"),
         "",
         "change = (c (1 - share) - c_high share) (1 - 2 share),  share = ({by} - low)/(high - low)",
-        lambda share, values: _through(share, 3)[::2],
+        lambda share, values: _interpolation_weights(share, 3)[::2],
     ),
     "curve": Profile(
         ("", "_25", "_75", "_high"),
         "",
         "change = curve of fourth degree in {by} through c, c_25, 0, c_75, c_high, at even steps from low to high",
-        lambda share, values: [weight for i, weight in enumerate(_through(share, 5)) if i != 2],
+        lambda share, values: [weight for i, weight in enumerate(_interpolation_weights(share, 5)) if i != 2],
     ),
 }
 SCHEDULES = ("linear", "quadratic", "exponential")  # profiles of a law's strength
-NODES = {"": 0.0, "_25": 0.25, "_75": 0.75, "_high": 1.0}  # shares of the range at which a curve has its values
+CURVE_NODES = {"": 0.0, "_25": 0.25, "_75": 0.75, "_high": 1.0}  # shares of the range at which a curve has its values
 VARIATIONS = ("tilt", "bend", "curve")  # profiles of a parameter
 
 
@@ -120,14 +120,14 @@ def scaled(law: type[Law], by: str) -> type[Law]:
     InputError
         If it is not a law, or acts in series with a signal.
     """
-    return _scaled(_parallel(law), by)
+    return _scaled(_check_force(law), by)
 
 
 def scheduled(law: type[Law], by: str, profile: str = "linear") -> type[Law]:
     """Make a law whose strength varies with a signal, such as friction that grows with a pressure.
 
-    A strength, such as `F_c`, has its value where the signal is lowest in the recordings (`low`), and another where it
-    is highest (`high`). A force that opposes motion does so at both.
+    A strength has one value, such as `F_c`, where the signal is lowest in the recordings (`low`), and another, such as
+    `F_c_high`, where it is highest (`high`). A force that opposes motion does so at both.
 
     Parameters
     ----------
@@ -144,11 +144,11 @@ def scheduled(law: type[Law], by: str, profile: str = "linear") -> type[Law]:
     InputError
         If it is not a law, or acts in series with a signal, or there is no such profile.
     """
-    return _scheduled(_parallel(law), by, _checked(profile, SCHEDULES))
+    return _scheduled(_check_force(law), by, _check_profile(profile, SCHEDULES))
 
 
 class VaryingParameter(Law):
-    """What is added to a parameter of the equations, at the port `parameter:<name>`; see `varying`."""
+    """A change that is added to a parameter of the equations, at the port `parameter:<name>`; see `varying`."""
 
     id = "varying_parameter"
     flexible = True
@@ -164,7 +164,7 @@ class VaryingParameter(Law):
     def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
         """Start values at which a curve equals another variation with the same signal, fitted to `own`."""
         ends = {name: own[name] for name in ("low", "high")}
-        shares = np.array([NODES[name.removeprefix("c")] for name in self.strength])
+        shares = np.array([CURVE_NODES[name.removeprefix("c")] for name in self.strength])
         levels = strengths_over(plain, own, ends["low"] + shares * (ends["high"] - ends["low"]))["c"]
         return ends | dict(zip(self.strength, levels.tolist(), strict=True))
 
@@ -182,21 +182,21 @@ def varying(by: str, profile: str = "tilt") -> type[Law]:
     profile : {"tilt", "bend", "curve"}
         How it varies: in a line that adds `c` at the upper end and takes it away at the lower one; in a parabola that
         adds `c` at the lower end and `c_high` at the upper one; or in a curve of fourth degree through four such
-        values. Outside the range it goes on along its tangents.
+        values. Outside the range it continues along its tangents.
 
     Raises
     ------
     InputError
         If there is no such profile.
     """
-    return _scheduled(VaryingParameter, by, _checked(profile, VARIATIONS))
+    return _scheduled(VaryingParameter, by, _check_profile(profile, VARIATIONS))
 
 
 def heated(by: str) -> type[Law]:
     """Make the law by which a parameter varies with a slow state that the square of a signal drives.
 
-    So a winding's resistance follows the heat of its current: `change = c q`, `dq/dt = (s^2 / s_2 - q) / T`, with the
-    mean square s_2 of the signal s in the recordings. It stands in the port `parameter:<name>`.
+    For example, a winding's resistance follows the heat of its current: `change = c q`, `dq/dt = (s^2 / s_2 - q) / T`,
+    with the mean square s_2 of the signal s in the recordings. The law stands in the port `parameter:<name>`.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def heated(by: str) -> type[Law]:
     return _heated(by)
 
 
-def _checked(profile: str, known: Sequence[str]) -> str:
+def _check_profile(profile: str, known: Sequence[str]) -> str:
     """Check the name of a profile."""
     if profile not in known:
         raise InputError(f"profile = {profile!r} was given; give {', '.join(map(repr, known))}.")
@@ -221,7 +221,7 @@ def constant(law: type[Law]) -> type[Law]:
 def likely_profiles(law: type[Law]) -> tuple[str, ...]:
     """Return the profiles in which a strength may vary in a machine, the most general one first.
 
-    The operators of a layer vary together, by one ratio: each by itself, they could imitate any curve of position.
+    The operators of a layer vary together, by one ratio, because separately they could imitate any curve of position.
     """
     layer = any(law().parameters()[name].value.ndim for name in law.strength)
     return ("exponential",) if layer else ("quadratic", "linear", "exponential")
@@ -242,7 +242,7 @@ def behind_gap(law: type[Law]) -> type[Law]:
     InputError
         If it is not a law, acts in series with a signal, has states or a gap of its own, or reads other signals.
     """
-    base = _parallel(law)
+    base = _check_force(law)
     if base.order or "g" in base.units:
         raise InputError(f"The law {base.id!r} has {'states' if base.order else 'a gap'} of its own; take another.")
     if base.reads() - {"z", "dz"}:
@@ -250,7 +250,7 @@ def behind_gap(law: type[Law]) -> type[Law]:
     return _behind_gap(base)
 
 
-def _parallel(law: Any) -> Any:
+def _check_force(law: Any) -> Any:
     """Check that a law is a force."""
     if not (isinstance(law, type) and issubclass(law, Law)):
         raise InputError(f"A composed law is made of a class of laws, such as CoulombFriction; got {law!r}.")
@@ -259,7 +259,7 @@ def _parallel(law: Any) -> Any:
     return law
 
 
-def _not_there(by: str, local: Local) -> str:
+def _missing_signal(by: str, local: Local) -> str:
     """Say why a signal cannot vary a strength at a port; empty if it can."""
     if by not in local.inputs:
         return f"the port has no signal {by}"
@@ -267,7 +267,7 @@ def _not_there(by: str, local: Local) -> str:
 
 
 def strengths_over(law: Law, values: Mapping[str, Any], signal: np.ndarray) -> dict[str, np.ndarray]:
-    """Compute each strength (G,), or (G, n) of n operators, of a law that a signal (G,) varies; see `scheduled`."""
+    """Compute the strengths (G,), or (G, n) for n operators, of a law that a signal (G,) varies; see `scheduled`."""
     profile = PROFILES[law.profile]
     weights = profile.weights(signal, values)
     return {
@@ -306,7 +306,7 @@ def _seen_by(base: Any, output: str) -> Any:
         units = base.units
         seen_by = output
 
-    return _name(Seen, f"{base.__name__}SeenBy_{output}", f"{base.__doc__}\n\n    {output} alone reads its far side.")
+    return _rename(Seen, f"{base.__name__}SeenBy_{output}", f"{base.__doc__}\n\n    {output} alone reads its far side.")
 
 
 @functools.cache  # the same class for the same arguments
@@ -324,16 +324,16 @@ def _scaled(base: Any, by: str) -> Any:
 
         def why_not(self, local: Local) -> str:
             """Say why the data carries no information on this law; empty if it does."""
-            return super().why_not(local) or _not_there(by, local)
+            return super().why_not(local) or _missing_signal(by, local)
 
-    return _name(Scaled, f"{base.__name__}ScaledBy_{by}", f"{base.__doc__}\n\n    Its strength is scaled by {by}.")
+    return _rename(Scaled, f"{base.__name__}ScaledBy_{by}", f"{base.__doc__}\n\n    Its strength is scaled by {by}.")
 
 
 def _levels(found: Law, own: str, by: str, limits: Mapping[str, float]) -> np.ndarray:
     """Compute a strength at the low end, the middle and the high end of a signal that varies it, (3,) or (3, n).
 
-    A law that another signal varies has its mean strength. What a signal only scales may be negative; the simulator's
-    own spring or damper makes up for that, and here all is positive.
+    If another signal varies the law, its mean strength counts. A strength that a signal scales may be negative, which
+    the simulator's own spring or damper compensates; it is shifted, so that all levels here have one sign.
     """
     value = np.asarray(found.values[own], dtype=float)
     if found.scaled_by == by:
@@ -393,9 +393,9 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
         def why_not(self, local: Local) -> str:
             """Say why the data carries no information on this law; empty if it does."""
             unknown = not (local.readers or (local.from_zero and all(local.from_zero)))
-            if with_z and unknown:  # a level of each recording's own would pass for a variation with z
+            if with_z and unknown:  # an unknown level of each recording would look like a variation with z
                 return "no output reads the coordinate, and its start is unknown"
-            return super().why_not(local) or ("" if with_z else _not_there(by, local))
+            return super().why_not(local) or ("" if with_z else _missing_signal(by, local))
 
         def parameters(self) -> dict[str, Parameter]:
             """Parameters: the ends of the signal's range are fixed, and all values of a strength have one shape."""
@@ -428,7 +428,7 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
 
         @classmethod
         def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:
-            """Start as a law varies that varies already, or else as it does with every sense of variation."""
+            """Start as the found law varies, or else with every pattern of variation."""
             signal = cls().schedule(local)
             limits = {"low": float(signal.min()), "high": float(signal.max())}
             known = by in (found.scheduled_by, found.scaled_by)
@@ -456,7 +456,7 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
                 have = {"z": z, "dz": dz, "p": Named("parameter", strengths(p, u, z))}
                 return super().force(**{k: have[k] for k in read if k in have})
 
-    return _name(
+    return _rename(
         Scheduled,
         f"{base.__name__}ScheduledBy_{by}{name.capitalize() if varies.how else ''}",
         f"{base.__doc__}\n\n    Its strength varies{varies.how} with {words}.",
@@ -495,7 +495,7 @@ def _heated(by: str) -> Any:
             """Say why the data carries no information on this law; empty if it does."""
             return "" if np.ptp(local.z) > 0 else f"{by} is constant"
 
-    return _name(Heated, f"Heated_{by}", f"{VaryingParameter.__doc__}")
+    return _rename(Heated, f"Heated_{by}", f"{VaryingParameter.__doc__}")
 
 
 @functools.cache
@@ -534,10 +534,10 @@ def _behind_gap(base: Any) -> Any:
             def force(self, z: Any, dz: Any, p: Any) -> Any:
                 return super().force(**past(z, dz, p))
 
-    return _name(Behind, f"{base.__name__}BehindGap", f"{base.__doc__}\n\n    It acts beyond a gap.")
+    return _rename(Behind, f"{base.__name__}BehindGap", f"{base.__doc__}\n\n    It acts beyond a gap.")
 
 
-def _name(law: Any, name: str, doc: str) -> Any:
+def _rename(law: Any, name: str, doc: str) -> Any:
     law.__name__ = law.__qualname__ = name
     law.__doc__ = doc
     return law

@@ -72,7 +72,7 @@ class Magnitude(Polynomial):
 
 
 class Rectified(Polynomial):
-    """A sensor that does not see the sign of its signal, such as a pulse counter, with a power and a zero."""
+    """A sensor that does not measure the sign of its signal, such as a pulse counter, with a power and an offset."""
 
     form = "rectified"
     equation = "w = |z|^n + b - z"
@@ -104,7 +104,7 @@ class Power(Polynomial):
         return p.a * ca.sign(z) * size_to_power(z, p.n)
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """Tell whether the power is one, which makes it a gain, as from a wrong unit."""
+        """Tell whether the power is about one, so that it is a gain, as from a wrong unit."""
         return bool(abs(values["n"] - 1) < LINEAR_POWER)
 
 

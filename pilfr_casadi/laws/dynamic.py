@@ -14,7 +14,7 @@ from ..models import Parameter
 from .base import Law, Local
 
 LONGEST_SCREENED = 24  # memory of a delay in the screen, in steps; longer delays are not tried
-NO_PEAK = 0.707  # damping ratio above which a second-order response has no peak
+NO_PEAK = 0.5**0.5  # damping ratio above which a second-order response has no peak
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Delay(Law):
 
     @property
     def lacks(self) -> str:
-        """The missing start value or limit, without which the length of the memory is unknown."""
+        """Ask for a start value or a limit, if without it the length of the memory is unknown; else empty."""
         known = np.isfinite(self.limits.get("T", self._default_limits)[1])
         return "" if known else "give the time that it starts at, as in Delay().at({'T': 0.01}); it may come to double"
 
@@ -91,7 +91,7 @@ class Relaxation(Law):
         return (z - q) / p.T
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """Tell whether a time constant is at its longest: it hardly creeps, so it is a spring or a gain."""
+        """Tell whether a time constant is at its upper bound: then it hardly creeps, like a spring or a gain."""
         return any(values[name] >= p.bounds[1] for name, p in self.parameters().items() if p.unit == "s")
 
 
@@ -140,7 +140,7 @@ class Creep(Relaxation):
     strength: ClassVar[tuple[str, ...]] = ("c",)
     places = ("series",)
     dissipative = False
-    # negative parts would make a filter that comes back; creep goes on in the same direction
+    # with a negative strength the signal would come back; creep continues in the same direction
     ranges = {**Relaxation.ranges, "c": ("", 0.0, np.inf)}
 
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
@@ -221,7 +221,7 @@ class Mode(Resonance):
         return p.c_1 * q[0] + p.c_2 * q[1]
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """Tell whether it has no peak, like two lags that follow anything linear, or is too fast to be seen."""
+        """Tell whether it has no peak, like two lags that imitate anything linear, or is too fast to be visible."""
         return bool(values["D"] > NO_PEAK or values["W"] >= self.parameters()["W"].bounds[1])
 
 
@@ -258,7 +258,7 @@ class Attached(SprungMass, Resonance):
 
 
 class ElasticJoint(Attached):
-    """A mass behind a spring and a damper, whose motion the sensors see (a gear with a sensor at its output)."""
+    """A mass behind a spring and a damper, whose motion the sensors measure (a gear with a sensor at its output)."""
 
     form = "elastic joint"
     equation = f"{Attached.equation},  outputs read q in place of z"

@@ -12,24 +12,29 @@ SHARPEST_KNEE = 0.005  # smallest width of a knee that is tried, over the larges
 
 
 class _Electrical(Law):
-    """A law that is tried at electrical ports alone; its local coordinate is a current."""
+    """A law that is tried at electrical ports only; its local coordinate is a current."""
 
     domains = ("electrical",)
     special = True
     across = "A"
 
 
-class Diode(_Electrical):
-    """A junction that conducts in one direction, with its series resistance 1 / G (Shockley 1949)."""
+class _ElectricalCurve(_Electrical):
+    """A static curve, current over voltage or voltage over current, of a part that takes power."""
 
     id = "static_curve"
+    restoring = True
+
+
+class Diode(_ElectricalCurve):
+    """A junction that conducts in one direction, with its series resistance 1 / G (Shockley 1949)."""
+
     form = "diode"
     equation = "w = G V_T (s(z) - s(0)),  s(z) = ln(1 + exp((z - V_0) / V_T))"
     source = "Sze & Ng (2007), Physics of Semiconductor Devices, sec. 2.3; Enz et al. (1995)"
     sentence = "a diode: a current that grows exponentially with the voltage, from about V_0 on in proportion to it"
     units = {"G": "w/z", "V_0": "z", "V_T": "z"}
     across = "V"
-    restoring = True  # it takes power
     starts = {"V_0": ("reach", 0.1, 0.2, 0.35, 0.6, 0.9), "V_T": ("reach", 0.02, 0.08)}
     ranges = {"G": ("max_stiffness", -1.0, 1.0), "V_0": ("reach", 0.01, 1.5), "V_T": ("reach", SHARPEST_KNEE, 0.5)}
 
@@ -73,16 +78,14 @@ def _rise(x: Any) -> Any:
     return ca.fmax(x, 0) + ca.log1p(ca.exp(-ca.fabs(x)))
 
 
-class Overpotential(_Electrical):
-    """Voltage that a reaction at an electrode takes, or a junction: its inverse is the exponential (Butler-Volmer)."""
+class Overpotential(_ElectricalCurve):
+    """Voltage across a reaction at an electrode, or a junction: the inverse of the exponential (Butler-Volmer)."""
 
-    id = "static_curve"
     form = "overpotential"
     equation = "w = V_a asinh(z / I_0)"
     source = "Newman & Thomas-Alyea (2004), Electrochemical Systems, ch. 8"
     sentence = "an overpotential: a voltage that grows with the logarithm of a large current"
     units = {"V_a": "w", "I_0": "z"}
-    restoring = True
     starts = {"I_0": ("reach", 0.003, 0.02, 0.1, 0.4)}
     ranges = {"I_0": ("reach", 1e-4, 2.0)}
 
@@ -90,16 +93,14 @@ class Overpotential(_Electrical):
         return p.V_a * ca.asinh(z / p.I_0)
 
 
-class VoltageDrop(_Electrical):
-    """Voltage that a contact or a switch takes at any current: of brushes, or by the dead time of a bridge."""
+class VoltageDrop(_ElectricalCurve):
+    """Voltage across a contact or a switch at any current, as of brushes or by the dead time of a bridge."""
 
-    id = "static_curve"
     form = "voltage drop"
     equation = "w = V_d tanh(z / I_0)"
     source = "Choi & Sul (1996), IEEE Trans. Power Electron. 11(2)"
     sentence = "a voltage drop that opposes the current and hardly grows with it, as of brushes or a bridge's dead time"
     units = {"V_d": "w", "I_0": "z"}
-    restoring = True
     two_sided = True
     starts = {"I_0": ("reach", 0.01, 0.05, 0.2)}
     ranges = {"I_0": ("reach", 1e-4, 0.5)}

@@ -39,7 +39,7 @@ def unit_forces(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.
         signal = law.schedule(local)
         weights = np.array([PROFILES[kind.profile].weights(signal, shape) for shape in shapes])
         return np.concatenate([bare * of_value.T[:, :, None] for of_value in np.swapaxes(weights, 0, 1)], axis=2)
-    step = _all_lanes(kind, len(shapes), local.dt if law.shifts else 0.0)
+    step = _build_lanes(kind, len(shapes), local.dt if law.shifts else 0.0)
     p = law.at(shapes[0]).parameters()
     names = [name for name in p if name not in law.strength]
     table = [np.ravel(shape.get(n, p[n].value)) for shape in shapes for n in names]
@@ -62,9 +62,9 @@ def unit_forces(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.
 
 @one_at_a_time
 @functools.lru_cache(maxsize=256)
-def _all_lanes(kind: Any, lanes: int, h: float) -> ca.Function:
+def _build_lanes(kind: Any, lanes: int, h: float) -> ca.Function:
     """Build `(memory, [z, dz, t, z_next, dz_next], [shapes of all lanes, dt]) -> (next memory, forces)`."""
-    lane = _lane(kind, h)
+    lane = _build_lane(kind, h)
     n, sizes = lane.size1_in(0), lane.size1_in(2)
     memory, signals = ca.SX.sym("memory", n * lanes), ca.SX.sym("signals", 5)
     vector = ca.SX.sym("shapes", sizes * lanes + 1)
@@ -76,7 +76,7 @@ def _all_lanes(kind: Any, lanes: int, h: float) -> ca.Function:
 
 @one_at_a_time
 @functools.lru_cache(maxsize=256)
-def _lane(kind: Any, h: float) -> ca.Function:
+def _build_lane(kind: Any, h: float) -> ca.Function:
     """Build `(memory, [z, dz, t, z_next, dz_next], shape, dt) -> (next memory, forces)` for one shape."""
     law = kind()
     law = law.on_grid(h) if law.shifts else law

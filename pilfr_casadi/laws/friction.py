@@ -11,11 +11,11 @@ import numpy as np
 from ..models import play
 from .base import Law, Local
 
-KNEE = 0.15  # width of the reversal over the speed at which friction has fallen; above it the two cannot be told apart
+KNEE = 0.15  # width of the reversal over the speed at which friction has fallen; above it they are indistinguishable
 FALL = 0.05  # smallest excess of friction at rest over dry friction
 SPRINGY = 0.08  # threshold of presliding over half the travel; above it the element is a stop of a hysteresis
 MAX_THRESHOLD = 0.6  # largest threshold tried, over half the travel
-SHARP = 2e-3  # narrowest reversal that is tried in any case, over the speed
+SHARP = 2e-3  # narrowest reversal that is tried at any steps, over the speed
 SHARPEST_REVERSAL = 1e-4  # narrowest reversal that is tried where the steps resolve it, over the speed
 STABLE_STEP = 2.5  # |λ| h up to which a Runge-Kutta step is stable
 BROAD = 0.1  # width of the reversal over the largest speed from which an answer says that it is broad
@@ -44,7 +44,7 @@ class CoulombFriction(Law):
         return {"v_0": (_narrowest_reversal(self, local), self.widest * local.speed)}
 
     def remark(self, values: Mapping[str, Any]) -> str:
-        """Say that the reversal is broad, as a damper whose force saturates (a digressive one) has it."""
+        """Say that the reversal is broad, as of a damper whose force saturates (a digressive damper)."""
         share = self.widest * values["v_0"] / self.parameters()["v_0"].bounds[1]
         words = f"here it sets in over {share:.0%} of the largest speed, as in a damper whose force saturates"
         return words if BROAD < share < np.inf else ""
@@ -171,7 +171,7 @@ def _narrowest_reversal(law: Law, local: Local) -> float:
 
 
 def _hardly_falls(law: Law, values: Mapping[str, Any]) -> bool:
-    """Tell whether the fall is slight, goes on over all speeds, or ends at once: then it is dry friction."""
+    """Tell whether the fall is slight, spans all speeds, or ends at once: then it is dry friction."""
     (low, high), (dry, more) = law.parameters()["v_s"].bounds, (abs(float(values[k])) for k in law.strength[:2])
     return bool(not low < values["v_s"] < high or more < FALL * dry)
 

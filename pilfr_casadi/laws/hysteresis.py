@@ -26,8 +26,8 @@ PARTS = 4  # parts into which a step of a held signal is divided
 THIN_LOOPS = 0.1  # ratio of the loops' width to the bend beside them, below which a fit is a curve without memory
 DIRECT = 0.05  # ratio of the direct gain to the plays' total weight, below which they may be a mere backlash
 EQUAL_THRESHOLDS = 0.15  # ratio of the thresholds' spread to their mean, below which the plays are one
-NODES = 24  # stops that stand for the smooth density
-# edges of cells that hold equal shares of the curve of a = 1; each cell is one stop at its centre of gravity
+NODES = 24  # stops that represent the smooth density
+# edges of cells with equal shares of the curve of a = 1; each cell is one stop at its centre of gravity
 _LOW = -2 * np.log(1 - np.arange(NODES) / NODES)
 _MASS = np.append(-np.diff(np.exp(-_LOW)), np.exp(-_LOW[-1]))
 _MOMENT = np.append(-np.diff((_LOW + 1) * np.exp(-_LOW)), (_LOW[-1] + 1) * np.exp(-_LOW[-1]))
@@ -35,18 +35,23 @@ Q = _MOMENT / _MASS  # centres of the cells
 WIDTH = _MASS * np.exp(Q)  # widths of the cells, for the density exp(-q) at the centres
 
 
-class StopHysteresis(Law):
-    """Rate-independent hysteresis: a Prandtl-Ishlinskii layer of stops (Krikelis et al. 2024, Eq. 16)."""
+class _Hysteresis(Law):
+    """The common part of forces with rate-independent hysteresis."""
 
     id = "hysteresis"
     flexible = True
     contains = ("backlash", "coulomb_friction", "linear_stiffness")
+    sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
+    dissipative = True
+
+
+class StopHysteresis(_Hysteresis):
+    """Rate-independent hysteresis: a Prandtl-Ishlinskii layer of stops (Krikelis et al. 2024, Eq. 16)."""
+
     form = "prandtl_ishlinskii"
     equation = "w = sum_i w_i stop_{r_i}[z]"
     source = "Krikelis et al. (2024), Eq. 2 and 16"
-    sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
     units = {"w": "w/z", "r": "z"}
-    dissipative = True
     n = memory = 6
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
@@ -61,7 +66,7 @@ class StopHysteresis(Law):
         return super(StopHysteresis, whole).parameters()
 
     def size(self, values: Mapping[str, Any]) -> int:
-        """Number of weights that matter, of scalars, and two for the place and spread of the thresholds."""
+        """Number of weights that matter, plus scalars, plus two for the place and spread of the thresholds."""
         weights = np.abs(values["w"])
         scalars = sum(1 for p in self.parameters().values() if p.size == 1)
         return int(np.sum(weights > 0.01 * np.max(weights))) + 2 + scalars
@@ -109,8 +114,8 @@ class PlayHysteresis(StopHysteresis):
     def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:
         """Split each play but the first into two, a little apart."""
         w, r = np.asarray(found.values["w"]), np.asarray(found.values["r"])
-        apart = np.concatenate([r[:1], 0.8 * r[1:], 1.2 * r[1:]])
-        yield {**found.values, "w": np.concatenate([w[:1], w[1:] / 2, w[1:] / 2]), "r": apart}
+        thresholds = np.concatenate([r[:1], 0.8 * r[1:], 1.2 * r[1:]])
+        yield {**found.values, "w": np.concatenate([w[:1], w[1:] / 2, w[1:] / 2]), "r": thresholds}
 
 
 class FinePlays(PlayHysteresis):
@@ -154,18 +159,13 @@ class FineGeneralized(GeneralizedHysteresis):
     n = memory = 11
 
 
-class SmoothHysteresis(Law):
+class SmoothHysteresis(_Hysteresis):
     """Rate-independent hysteresis with rounded loops (Masing 1926; Iwan 1966; Segalman 2005)."""
 
-    id = "hysteresis"
-    flexible = True
-    contains = ("backlash", "coulomb_friction", "linear_stiffness")
     form = "prandtl_ishlinskii"
     equation = "w = k_h sum_i g_i stop_{R q_i}[z],  g_i ~ q_i^(a - 1) exp(-a q_i)"
     source = "Segalman (2005), J. Appl. Mech. 72(5); Krikelis et al. (2024), Eq. 26"
-    sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
     units = {"k_h": "w/z", "R": "z", "a": ""}
-    dissipative = True
     memory = NODES
     starts = {"R": ("half", 0.02, 0.06, 0.15, 0.4), "a": ("", 1.0)}
     ranges = {"R": ("half", 0.002, 2), "a": ("", 0.3, 12.0)}
@@ -184,18 +184,13 @@ class SmoothHysteresis(Law):
             yield {**shape, "k_h": float(np.sum(found.values["w"]))}
 
 
-class BoucWen(Law):
+class BoucWen(_Hysteresis):
     """Hysteresis by the Bouc-Wen equation (Bouc 1967; Wen 1976)."""
 
-    id = "hysteresis"
-    flexible = True
-    contains = ("backlash", "coulomb_friction", "linear_stiffness")
     form = "bouc_wen"
     equation = "w = k_h q,  dq/dt = dz/dt (1 - (1 - s + s sign(q dz/dt)) |q/q_0|^n)"
     source = "Wen (1976), J. Eng. Mech. 102(2); Ismail, Ikhouane & Rodellar (2009)"
-    sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
     units = {"k_h": "w/z", "q_0": "z", "s": "", "n": ""}
-    dissipative = True
     order = 1
     starts = {"q_0": ("half", 0.03, 0.1, 0.3, 0.8), "s": ("", 0.5, 0.8), "n": ("", 1.0)}
     ranges = {"q_0": ("half", 0.002, 5), "s": ("", 0.3, 1.5), "n": ("", 0.5, 4.0)}
@@ -252,7 +247,7 @@ OPERATORS = ("stop", "play", "generalized_play")  # kinds of layers
 def hysteresis_layer(kind: str, n: int, series: bool) -> type[StopHysteresis]:
     """Make the law of a Prandtl-Ishlinskii layer of n operators (Krikelis et al. 2024, Eq. 16).
 
-    All weights and thresholds are at least zero. Beside the operators there may be a linear term:
+    All weights and thresholds are at least zero. Some layers also have a linear term:
 
     | kind               | a force that opposes motion    | a signal that lags                                      |
     | ------------------ | ------------------------------ | ------------------------------------------------------- |
@@ -269,7 +264,7 @@ def hysteresis_layer(kind: str, n: int, series: bool) -> type[StopHysteresis]:
     n : int
         Operators, one or more.
     series : bool
-        Whether it acts at an actuator or a sensor, on a signal, and not as a force inside the dynamics.
+        Whether it acts on a signal, at an actuator or a sensor, rather than as a force inside the dynamics.
 
     Raises
     ------

@@ -1,11 +1,10 @@
 """Laws in line with a force that the equations have already: a gap, a compliance, a motor's rotor on a spring.
 
-Let F(z, dz/dt) be that force at a port, the port's `term`. In line with it stands an element that leaves F another
-coordinate q:
+Let F(z, dz/dt) be that force at a port, the port's `term`. An element in line with it changes the coordinate of F to q:
 
     w = F(q, dq/dt) - F(z, dz/dt),
 
-so that the equations hold F(q, dq/dt) in its place.
+so that F(q, dq/dt) takes the place of F(z, dz/dt) in the equations.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ class _InLine(Law):
         return super().why_not(local)
 
     def inner(self, local: Local, shape: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinate and rate (M,) that the term is left with along a port's signals."""
+        """Coordinate and rate (M,) of the term along a port's signals."""
         raise NotImplementedError
 
     def forces_along(self, local: Local, shapes: Sequence[Mapping[str, Any]]) -> np.ndarray:
@@ -104,7 +103,7 @@ class Compliance(_InLine):
         return (p.k * (z - q) - rest) / (term(q, 1) - rest)
 
     def inner(self, local: Local, shape: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Travel less that of the spring under the present load."""
+        """Travel minus the deflection of the spring under the present load."""
         assert local.term is not None
         inner = local.z - local.term(local.z, local.dz) / shape["k"]
         return inner, np.gradient(inner, local.dt)
@@ -164,7 +163,7 @@ class ElasticDriveSeenAtLoad(ElasticDrive):
 
 
 def _stiffness(local: Local) -> float:
-    """Size of the term over that of the coordinate."""
+    """Size of the term over the size of the coordinate."""
     if local.term is None:
         return 1.0
     return float(np.quantile(np.abs(local.term(local.z, local.dz)), 0.99)) / local.half or 1.0

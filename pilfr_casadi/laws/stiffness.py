@@ -1,7 +1,7 @@
 """Memoryless forces of the local coordinate: springs, contacts, gaps, and forces that repeat with position.
 
 The plain powers, contacts and gaps occur in all domains (a curve, an overflow, a threshold). The finer forms of springs
-are mechanical; those that follow powers also describe flows. Elsewhere there is `FreeCurve`.
+are mechanical, and the powers among them also describe flows. `FreeCurve` covers the other domains.
 """
 
 from __future__ import annotations
@@ -266,7 +266,7 @@ class PeriodicForce(Law):
         return {"L": (2 * local.half / 60, 2 * local.half / self.min_periods)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """Tell whether the motion holds fewer than two periods, which could be any other curve."""
+        """Tell whether the motion covers fewer than two periods; the force could then be any other curve."""
         return bool(values["L"] > self.min_periods / LEAST_PERIODS * self.parameters()["L"].bounds[1])
 
 
@@ -293,9 +293,10 @@ class Ripple(PeriodicForce):
     starts = {"L": lambda at: 2 * at.half / np.arange(3.0, 60.1, 1.0)}
 
 
-class _OnArm(Law):
-    """A force over the angle of a swinging arm, whose revolution L is known by the angle's unit."""
+class _Gravity(Law):
+    """Gravity over the angle of a swinging arm; the unit of the angle gives its revolution L."""
 
+    id = "gravity"
     source = "Siciliano et al. (2009), Robotics: Modelling, Planning and Control, sec. 7.3"
     domains = ("mechanical",)
     angular = True
@@ -312,10 +313,9 @@ class _OnArm(Law):
         return "" if known else "the motion is not a good part of one revolution"
 
 
-class Gravity(_OnArm):
-    """Gravity on a swinging arm, of whose sine the equations have the slope at zero alone."""
+class Gravity(_Gravity):
+    """Gravity on a swinging arm beyond small angles, where the equations have the sine's slope at zero only."""
 
-    id = "gravity"
     form = "beyond small angles"
     equation = "w = a (sin(q) - q),  q = 2 pi z / L,  L one revolution"
     sentence = "gravity on a swinging arm: a torque in proportion to the sine of the angle, not to the angle"
@@ -327,10 +327,9 @@ class Gravity(_OnArm):
         return p.a * (ca.sin(q) - q)
 
 
-class WholeGravity(_OnArm):
+class WholeGravity(_Gravity):
     """Gravity on an arm whose equations have none; the arm may hang at any angle."""
 
-    id = "gravity"
     equation = "w = a sin(q) + b cos(q),  q = 2 pi z / L,  L one revolution"
     sentence = "gravity on a swinging arm: a torque in proportion to the sine of its angle to the vertical"
     units = {"a": "w", "b": "w", "L": "z"}

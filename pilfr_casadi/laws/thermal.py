@@ -9,7 +9,7 @@ import casadi as ca
 from .base import Law, Local, size_to_power
 
 ROOM = 293.0  # temperature of the surroundings that is tried first, K
-COLDEST = 150.0  # K, below which a temperature is taken for a difference and not for an absolute one
+COLDEST = 150.0  # K, below which a temperature counts as a difference and not as absolute
 LINEAR_RANGE = 0.05  # range over the absolute temperature within which radiation is linear
 
 
@@ -50,7 +50,7 @@ class AbsoluteRadiation(Radiation):
 
 
 class Convection(Law):
-    """Heat that rises with the air which it has warmed: the flow grows faster than the temperature difference."""
+    """Heat that warm air carries upwards: the flow grows faster than the temperature difference."""
 
     id = "convection"
     form = "free"

@@ -6,7 +6,7 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
 from pilfr_casadi.diagnose.preparation import prepare
-from pilfr_casadi.diagnose.recording_faults import clipped_input, find_clipping
+from pilfr_casadi.diagnose.recording_faults import find_clipped_input, find_clipping
 
 DT = 0.02
 
@@ -88,14 +88,14 @@ def test_a_command_that_stops_at_its_limits_is_no_fault_beside_a_missing_law():
     u = np.clip(swinging(), -9, 9)
     bench, ready = _prepared(u, moved(np.sign(u) * np.abs(u) ** 0.6))
     assert [(c.channel, c.value) for c in find_clipping(bench.recordings, "u")] == [("drive", [-9.0, 9.0])]
-    assert clipped_input(bench, ready, 1.0) is None
+    assert find_clipped_input(bench, ready, 1.0) is None
 
 
 def test_what_lies_beyond_a_limit_is_told_from_what_is_felt():
     bench, ready = _prepared(np.clip(swinging(), -9, 9), moved(swinging()))
-    gate = clipped_input(bench, ready, 1.0)
+    gate = find_clipped_input(bench, ready, 1.0)
     assert gate is not None and gate.channel == "drive" and "explains 9" in gate.sentence
-    assert clipped_input(bench, ready, 0.001) is None  # a law leaves less
+    assert find_clipped_input(bench, ready, 0.001) is None  # a law leaves less
 
 
 def _prepared(u, y):

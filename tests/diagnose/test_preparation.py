@@ -8,7 +8,7 @@ from test_slips import DT, recorded, tanks
 from pilfr_casadi import Parameter, Recording, Simulator, multisine
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.gates import Checked
-from pilfr_casadi.diagnose.offsets import final_gates, find_offsets, offset_gates
+from pilfr_casadi.diagnose.offsets import find_offsets, list_offsets, update_offsets
 from pilfr_casadi.diagnose.preparation import prepare, refitted
 from pilfr_casadi.diagnose.proof import mean_nrmse
 from pilfr_casadi.laws import AsymmetricSaturation
@@ -55,11 +55,11 @@ def test_a_constant_of_a_sensor_is_found_and_kept():
     fitted, (gate,) = found.fitted, found.gates
     assert (gate.channel, gate.finding, gate.fault) == ("lower", "offset", True)
     assert gate.value == pytest.approx(0.3, rel=0.02)
-    (again,) = offset_gates(fitted.simulator.elements, fitted.values)
+    (again,) = list_offsets(fitted.simulator.elements, fitted.values)
     assert again.value == gate.value and "parameter of the corrected simulator" in again.sentence
-    (told,) = final_gates([gate], fitted, {gate.parameter: np.array(0.03)}, False, False)
+    (told,) = update_offsets([gate], fitted, {gate.parameter: np.array(0.03)}, False, False)
     assert "may be a part of that" in told.sentence
-    assert not final_gates([gate], fitted, {gate.parameter: np.array(0.3)}, False, False)  # it may be none
+    assert not update_offsets([gate], fitted, {gate.parameter: np.array(0.3)}, False, False)  # it may be none
 
 
 @pytest.mark.parametrize(("side", "channel"), [("u", "force"), ("y", "x2")])

@@ -130,7 +130,7 @@ def flexible_fit(on, port, kind):
     shape = next(iter(kind().shapes(local)))
     weights = np.append(-0.3 * (port != "ground"), np.full(5, 0.05))
     law = kind().at({**shape, "w": weights}, kind().bounds(local))
-    return Trials(on, 1).fitted(cart().with_element(port, law), [without.values], 1, states=without.begin), local
+    return Trials(on, 1).fit(cart().with_element(port, law), [without.values], 1, states=without.begin), local
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_simple_laws_whose_force_is_alike_are_put_up(port, hidden, flexible, sim
 
 def test_a_simple_law_stands_for_itself():
     on = bench("actuator:force", Saturation().at({"L": 8.0}))
-    best = Trials(on, 1).fitted(cart().with_element("actuator:force", Saturation().at({"L": 8.0})), [{}], 1)
+    best = Trials(on, 1).fit(cart().with_element("actuator:force", Saturation().at({"L": 8.0})), [{}], 1)
     local = port_signals(on, best.fitted, "actuator:force")
     np.testing.assert_allclose(local.z, on.recordings[0].u[:, 0])
     assert relatives(on, [best], [Scored("actuator:force", DeadZone(), 0.1, ({},), local)]) == []

@@ -156,7 +156,7 @@ def test_a_hypothesis_fitted_to_a_part_is_judged_on_everything(monkeypatch):
     monkeypatch.setitem(vars(sys.modules[Trials.__module__]), "COMPARED_SAMPLES", 300)
     search = searching(rubbing())
     placed = rig(OFF).with_element("ground-m1", FRICTION)
-    trial = search.fits.fitted(placed, [{}], 1)
+    trial = search.fits.fit(placed, [{}], 1)
     (whole,) = search.bench.recordings
     assert [len(e) for e in trial.fitted.residual] == [len(whole)]
     assert trial.mean_square == trial.fitted.cost != trial.part_mean_square

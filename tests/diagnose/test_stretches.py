@@ -201,8 +201,8 @@ def test_after_an_interrupt_everything_has_the_values_of_the_stretches():
     search = Search(bench, fitted, noise_floor(bench.recordings, fitted.residual), (), 1, Stages(lambda *_: None))
     search.keep(Trial((), fitted, fitted.cost, fitted.cost, True))
     search.interrupted = True
-    kept = Everything.of(search, stretches, ()).fitted(search, fitted)
+    kept = Everything.of(search, stretches, ()).fit(search, fitted)
     assert kept.values == fitted.values and [len(e) for e in kept.residual] == [3000]
     search.interrupted = False
-    moved = Everything.of(search, stretches, ()).fitted(search, fitted)
+    moved = Everything.of(search, stretches, ()).fit(search, fitted)
     assert moved.cost < kept.cost

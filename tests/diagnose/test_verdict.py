@@ -10,7 +10,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import Recording, multisine
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.correction import Correction
-from pilfr_casadi.diagnose.offsets import Offset, without_idle_offsets
+from pilfr_casadi.diagnose.offsets import Offset, fix_idle_offsets
 from pilfr_casadi.laws import CoulombFriction, CubicDamping, Power as StaticPower
 
 
@@ -63,7 +63,7 @@ def test_an_offset_that_earns_nothing_beside_a_law_is_held_at_nothing(offset):
     train = [r.with_(u=r.u - offset) for r in recordings(law.at({"F_c": 4.0, "v_0": 0.01}), count=1)]
     bench = Workbench.of(placed, train, "zero")
     fitted = bench.fit(placed.with_element("ground-m1", law), [{"actuator:force.w_0": 2.0}])
-    found = without_idle_offsets(bench, fitted)
+    found = fix_idle_offsets(bench, fitted)
     assert bool(np.all(found.simulator.parameters["actuator:force.w_0"].fixed)) is (offset == 0)
     assert found.values["actuator:force.w_0"] == pytest.approx(offset, abs=0.02 * offset)
     assert found.values["ground-m1.F_c"] == pytest.approx(4.0, rel=0.03)
