@@ -17,7 +17,6 @@ if TYPE_CHECKING:
         make_engine as make_engine,
         source_code as source_code,
     )
-    from .external import calls_external as calls_external
     from .sensitivities import Engine as Engine, VirtualMachine as VirtualMachine, linearize as linearize
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -39,7 +39,8 @@ from platformdirs import user_cache_path
 
 from .._base import InputError, one_at_a_time
 from ..models import Model
-from .external import bind, calls_external, entry_point, external_names, fill_gaps, without_remarks
+from ..simulators import calls_external
+from .external import bind, entry_point, external_names, fill_gaps, without_remarks
 from .sensitivities import BLOCKS, TARGETS, Engine, Linearization, VirtualMachine, linearize
 
 _SOURCES = {"x": 0, "s": 1, "z": 2, "w": 3}

@@ -45,11 +45,6 @@ class _External(ctypes.Structure):
     ]
 
 
-def calls_external(function: ca.Function) -> bool:
-    """Tell whether a function of SX expressions calls one that CasADi cannot look into."""
-    return any(function.instruction_id(k) == ca.OP_CALL for k in range(function.n_instructions()))
-
-
 @functools.cache
 def entry_point() -> int | None:
     """Find the address of CasADi's function that evaluates a buffer; None where it is not there."""

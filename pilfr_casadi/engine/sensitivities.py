@@ -26,7 +26,7 @@ import numpy as np
 
 from .._base import one_at_a_time
 from ..models import Model
-from .external import calls_external
+from ..simulators import calls_external
 
 TARGETS = {
     "z": ("x", "p"),

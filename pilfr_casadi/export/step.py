@@ -21,8 +21,8 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, numbers, path_text, write_atomically
-from ..engine import calls_external
 from ..models import ParameterSet
+from ..simulators import calls_external
 from .c_code import make_unique, write_c
 from .fmu import FmuContent, write_fmu
 from .smoothing import enclose, smooth_kinks

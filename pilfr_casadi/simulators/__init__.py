@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .equations import Named as Named
     from .external import (
         PythonFunction as PythonFunction,
+        calls_external as calls_external,
         leaves as leaves,
         units as units,
     )

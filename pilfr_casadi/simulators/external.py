@@ -98,6 +98,11 @@ def call_external(function: ca.Function, *arguments: Any) -> Any:
     return ca.vertcat(*function.call([ca.SX(a) for a in arguments], False, True))
 
 
+def calls_external(function: ca.Function) -> bool:
+    """Tell whether a function of SX expressions calls one that CasADi cannot look into."""
+    return any(function.instruction_id(k) == ca.OP_CALL for k in range(function.n_instructions()))
+
+
 def equal_state(values: np.ndarray, states: np.ndarray, names: Sequence[str]) -> str:
     """Return the name of the state that equals some values at all points, else ""; values (K,), states (K, n)."""
     same = np.all(np.abs(values[:, None] - states) <= ROUNDING * np.abs(states), axis=0) & np.any(states, axis=0)

@@ -25,7 +25,7 @@ import numpy as np
 from .._base import InputError, in_words, listed
 from ..models import Named, Parameter, ParameterSet
 from .black_box import BlackBox, Numeric, nominal_sizes
-from .equations import distinct_names, parameter_set
+from .equations import check_names, check_parameters
 from .simulator import Simulator
 from .symbols import NotFollowed, expression, symbols
 from .tracing import Trace, accept_symbols, follow
@@ -96,7 +96,7 @@ def from_function(
     >>> simulator.output_names
     ('pos',)
     """
-    own = distinct_names(states, "states"), distinct_names(inputs, "inputs"), parameter_set(parameters or {})
+    own = check_names(states, "states"), check_names(inputs, "inputs"), check_parameters(parameters or {})
     if not own[0]:
         raise InputError("No states were given; give their names, such as ('pos', 'vel').")
     names = _Names(*own)

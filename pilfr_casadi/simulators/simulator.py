@@ -183,7 +183,7 @@ class Simulator(Equations):
             {k: p if isinstance(p := parameters.get(k, q), Parameter) else replace(q, value=p) for k, q in own.items()}
         )
         alike = all(given[name].shape == own[name].shape for name in own)
-        return self._with(parameters=given) if alike else replace(self, parameters=given)
+        return self._copy_with(parameters=given) if alike else replace(self, parameters=given)
 
     def with_element(self, port: str, law: Any) -> Simulator:
         """Copy with a law in a port; see `close_loop`."""
@@ -208,7 +208,7 @@ class Simulator(Equations):
             raise InputError(f"The law {law.id!r} cannot be closed in at {port!r} yet: {lacks}.")
         placed = Placed(port, law, self._free_prefix(port))
         own = self.parameter_set | placed.named(law.parameters())
-        return self._with(parameters=own, elements=(*self.elements, placed))
+        return self._copy_with(parameters=own, elements=(*self.elements, placed))
 
     def _free_prefix(self, port: str) -> str:
         """Choose the prefix of a further law's parameters at a port; no other parameter's name begins with it."""
@@ -221,7 +221,7 @@ class Simulator(Equations):
         kept = list(self.elements)
         gone = kept.pop(index)
         own = {k: p for k, p in self.parameters.items() if not k.startswith(gone.prefix)}
-        return self._with(parameters=ParameterSet(own), elements=tuple(kept))
+        return self._copy_with(parameters=ParameterSet(own), elements=tuple(kept))
 
 
 def unit_notes(simulator: Simulator, recording: Recording) -> dict[str, str]:
