@@ -529,7 +529,7 @@ def _check_ports(given: Any) -> tuple[Port, ...]:
 
 
 def _as_tuple(given: Any, kind: type) -> tuple[Any, ...]:
-    """Return one object of a kind, or several, as a tuple; `(None,)` for what is neither."""
+    """Return one object of a kind, or several, as a tuple; `(None,)` for anything else."""
     try:
         return (given,) if isinstance(given, kind) else tuple(given)
     except TypeError:

@@ -1,6 +1,6 @@
 """A simulator as a discrete-time `Model`: classical Runge-Kutta of fourth order with a fixed sub-step.
 
-Within a sub-step of length h the inputs are held or follow their chord, and
+Within a sub-step of length h the inputs are constant or linear in time, and
 
     k₁ = f(x, u₀), k₂ = f(x + h k₁/2, u_½), k₃ = f(x + h k₂/2, u_½), k₄ = f(x + h k₃, u₁),
     x⁺ = x + h (k₁ + 2 k₂ + 2 k₃ + k₄) / 6.
@@ -34,7 +34,7 @@ from .ports import ACTUATOR, PARAMETER, SENSOR, Expression, Placed, Port, split_
 LARGEST_STEP = 0.25  # largest |λ| h: a phase error of (λh)⁴/120 = 3e-5 of the angle of a cycle
 MOST_SUBSTEPS = 200  # per sample
 VERY_FAST = 8 * LARGEST_STEP  # |λ| times the sampling interval above which the rates along a trial run decide
-INFINITE_RATE = 1e12  # rate that stands for an infinite one, rad/s
+INFINITE_RATE = 1e12  # replaces an infinite rate, rad/s
 DIVERGED = 1e100  # size of a state above which it has diverged
 TRIAL_SUBSTEPS = 20  # sub-steps per sample of the trial run
 # samples of the trial run, samples skipped at its beginning, and spacing of those that count
@@ -134,21 +134,7 @@ class ClosedEquations:
 
 
 class _LawsAtInstant:
-    """The laws of closed equations at one instant.
-
-    Attributes
-    ----------
-    x : Named
-        States of the simulator.
-    u : dict
-        Inputs by name, with the laws of their actuators once these are applied.
-    q, s : list
-        States and memory of each law.
-    flow, memory : list
-        Derivatives of q and next memory of each law, once it is applied.
-    signals : dict
-        (z, dz, w) by number of the law, once it is applied.
-    """
+    """The laws of closed equations at one instant; applied in turn, each adds to inputs, flow, memory and signals."""
 
     def __init__(self, equations: ClosedEquations, v: Instant) -> None:
         simulator = equations.simulator
@@ -193,23 +179,14 @@ def on_grid(simulator: E, h: float) -> E:
 
 
 def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: int = 1) -> Model:
-    """Discretise the simulator with its laws to a closed model.
+    """Discretise a simulator with its laws to a closed model for samples dt apart, s.
 
-    Parameters
-    ----------
-    simulator : Equations
-    dt : float
-        Sampling interval, s.
-    hold : {"zero", "linear"}
-        Whether inputs are held between samples or interpolated.
-    substeps : int
-        Runge-Kutta steps per sample (`choose_substeps`).
+    `hold` says whether inputs are constant between samples ("zero") or interpolated ("linear"); `substeps` is the
+    number of Runge-Kutta steps per sample (`choose_substeps`).
     """
     own = getattr(simulator.dynamics, "dt", None)  # of a program that steps by itself
     if own is not None and abs(own / dt - 1) > SAME_STEP:
-        raise InputError(
-            f"The simulator makes steps of {own:g} s, the recordings have steps of {dt:g} s; give both the same step."
-        )
+        raise InputError(f"The simulator has steps of {own:g} s, the recordings of {dt:g} s; give both the same step.")
     simulator = on_grid(simulator, dt / substeps)
     step = _SubStep(simulator, dt / substeps, hold)
     x, s, u0, u1, t, updated = step.x, step.s, step.u0, step.u1, step.t, step.updated
@@ -434,12 +411,8 @@ def choose_substeps(simulator: Equations, recordings: Sequence[Recording]) -> in
     """Choose the sub-steps per sample that keep |λ| h below `LARGEST_STEP` where the first recording begins.
 
     If an eigenvalue is very fast, the eigenvalues along a run decide (a square root is infinitely steep at zero). Laws
-    in ports may ask for more sub-steps (`least_substeps`).
-
-    Raises
-    ------
-    InputError
-        If more than `MOST_SUBSTEPS` are needed, or a derivative is not finite.
+    in ports may ask for more sub-steps (`least_substeps`). More than `MOST_SUBSTEPS`, or a derivative that is not
+    finite, raises InputError.
     """
     needed, rate = needed_substeps(simulator, recordings)
     if needed <= MOST_SUBSTEPS:

@@ -155,17 +155,7 @@ class _MeasuredStates:
 
 
 class _UserFunction:
-    """A user's function of t, x, u and p, evaluated at random points.
-
-    Attributes
-    ----------
-    called : str
-        Its name in messages.
-    rows : tuple of str
-        Names of its values.
-    values : list
-        Points and the values there.
-    """
+    """A user's function of t, x, u and p: the names of its values (`rows`), and the values at random points."""
 
     def __init__(self, function: Any, kind: str, names: _Names) -> None:
         self.function, self.kind, self.names = function, kind, names

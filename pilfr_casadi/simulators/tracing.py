@@ -122,7 +122,7 @@ def _wrap_creator(function: Rule) -> Rule:
 
 
 def _wrap_scalar_function(function: Rule, ufunc: Any) -> Rule:
-    """Let a function of `math` accept symbols, for which the ufunc stands."""
+    """Let a function of `math` accept symbols, to which the ufunc is applied."""
 
     def apply(*values: Any) -> Any:
         if not has_symbol(values):
@@ -145,7 +145,7 @@ REPLACED |= {getattr(math, name): _wrap_scalar_function(getattr(math, name), ufu
 
 
 class _SymbolicProxy:
-    """A stand-in for a module or an object: its functions accept symbols, and attributes set on it stay here."""
+    """A proxy of a module or an object: its functions accept symbols, and attributes are set on the proxy only."""
 
     def __init__(self, owner: Any, done: dict[int, Any]) -> None:
         self._owner, self._done = owner, done

@@ -1,4 +1,4 @@
-"""NumPy functions as simulators: their equations are those of the function, or one sentence says why not."""
+"""NumPy functions as simulators: the equations agree with the function, or one sentence says why not."""
 
 import math
 from math import copysign
