@@ -140,10 +140,12 @@ class _Equations:
 
     traced: ca.Function
     rows: tuple[str, ...]
+    parameters: tuple[str, ...]
     note: str
 
     def __call__(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
-        return dict(zip(self.rows, ca.vertsplit(self.traced(t, stack(x), stack(u), stack(p))), strict=True))
+        own = Named("parameter", {n: p[n] for n in self.parameters})  # p holds the parameters of laws as well
+        return dict(zip(self.rows, ca.vertsplit(self.traced(t, stack(x), stack(u), stack(own))), strict=True))
 
 
 @dataclass(frozen=True)
@@ -289,7 +291,7 @@ def _trace(own: _UserFunction) -> _Equations:
     traced = ca.Function(kind, [t, x, u, p], [equations], [*ARGUMENTS], [kind])
     own.compare(traced)
     times = f"{calls + COMPARED_POINTS} times ({calls} for its branches, {COMPARED_POINTS} as a check)"
-    return _Equations(traced, own.rows, f"{kind}: equations of {own.called}; called {times}")
+    return _Equations(traced, own.rows, tuple(names.parameters), f"{kind}: equations of {own.called}; called {times}")
 
 
 def _make_black_box(own: _UserFunction, numeric: Numeric) -> BlackBox:
