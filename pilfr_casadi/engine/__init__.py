@@ -1,8 +1,8 @@
 """Engines that run a model: sensitivities by a matrix recursion, as generated C or in CasADi's virtual machine.
 
-`sensitivities` holds the recursion and the virtual machine, `compiled` the generated C, its compiler and its cache,
-`external` the calls from there of programs that CasADi cannot look into.
-Both engines sum in the same order. So simulations, derivatives and fits agree bit for bit on x86-64.
+`sensitivities` holds the recursion and the virtual machine, `compiled` the generated C, its compiler and its cache.
+`external` lets generated C call programs that CasADi cannot look into. Both engines sum in the same order, so
+simulations, derivatives and fits agree bit for bit on x86-64.
 """
 
 from typing import TYPE_CHECKING
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
         cache_directory as cache_directory,
         compiler as compiler,
         make_engine as make_engine,
+        run_compiler as run_compiler,
         source_code as source_code,
     )
-    from .external import calls_external as calls_external
     from .sensitivities import Engine as Engine, VirtualMachine as VirtualMachine, linearize as linearize
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

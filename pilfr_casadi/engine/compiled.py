@@ -1,16 +1,15 @@
 """The engine that runs generated C: a model's step, called from the time loops of `_kernel.c`.
 
 Most partial derivatives of a state-space model are parameters, signals or constants themselves. The loops look these
-up; only the others become code, and expressions of parameters alone are evaluated once per run. Slopes of models with
-many operators are looked up in tables, whose zeros cost nothing. Slopes of a step of several stages are hardly ever
-zero and are written out term by term.
+up. Only the others become code, and expressions of parameters alone are evaluated once per run. The slopes of models
+with many operators are sparse, so the loops read them from tables. The slopes of a step of several stages are hardly
+ever zero and are written out term by term.
 
-The loops are built once, a model's library once per structure. Both are kept in a private per-user cache, keyed by
+The loops are built once, a model's library once per structure. Both are stored in a private per-user cache, keyed by
 source, compiler, processor and CasADi version, in folders by the key's first letters, so that listings stay short. A
 file name holds a digest of its content, so a damaged library is built again. A cache directory that others can write
-to is not used. Without a working C compiler `make_engine` falls back to the virtual
-machine of `sensitivities`, which gives the same numbers: bit by bit on x86-64, where neither engine fuses products
-and sums.
+to is not used. Without a working C compiler `make_engine` falls back to the virtual machine of `sensitivities`. It
+gives the same numbers, bit by bit on x86-64, because neither engine fuses products and sums there.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ import stat
 import subprocess
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,14 +38,14 @@ from platformdirs import user_cache_path
 
 from .._base import InputError, one_at_a_time
 from ..models import Model
-from .external import bind, calls_external, entry_point, external_names, fill_gaps, without_remarks
+from ..simulators import calls_external
+from .external import bind, entry_point, external_names, fill_gaps, suppress_gap_warnings
 from .sensitivities import BLOCKS, TARGETS, Engine, Linearization, VirtualMachine, linearize
 
 _SOURCES = {"x": 0, "s": 1, "z": 2, "w": 3}
 _VALUES = ("constant", "p", "fixed", "u", "x", "s", "z", "w", "c", "computed")
 
-
-# what generated code tells the outside, and how it tests for absent arguments and results
+# in generated code: the heads of exported functions, and the tests for absent arguments and results
 ENTRY = re.compile(r"CASADI_SYMBOL_EXPORT int pilfr_\w+\(const casadi_real\*\* arg")
 ABSENT_ARGUMENT = re.compile(r"arg\[(\d+)\]\? arg\[\1\]\[(\d+)\] : 0")
 ABSENT_RESULT = re.compile(r"if \(res\[\d+\]!=0\) ")
@@ -54,12 +53,12 @@ ABSENT_RESULT = re.compile(r"if \(res\[\d+\]!=0\) ")
 
 @dataclass(frozen=True, eq=False)
 class _Code:
-    """Code of a step, and the place of the nonzeros of each block in the kernel's stack of values.
+    """Code of a step, and the places of the nonzeros of each block in the kernel's stack of values.
 
-    The functions are `fixed` (p -> f), expressions of parameters alone, evaluated once per run; `step`; and `computed`,
-    the nonzeros that are neither constants nor parameters nor signals, each once. `at` gives the start of each of
-    `_VALUES` in the stack, and the stack's end. `entries` gives the place in the stack of each nonzero, in the order of
-    the block's pattern.
+    The functions are `fixed` (p -> f), the expressions of parameters alone, evaluated once per run; `step`; and
+    `computed`, the nonzeros that are neither constants nor parameters nor signals, without repetition. `at` holds the
+    start of each of `_VALUES` in the stack, and the stack's end. `entries` holds the place in the stack of each
+    nonzero, in the order of the block's pattern.
     """
 
     functions: dict[str, ca.Function]
@@ -69,7 +68,7 @@ class _Code:
 
     @classmethod
     def of(cls, linear: Linearization) -> _Code:
-        """Sort the nonzeros by their source."""
+        """Sort the nonzeros of a linearization by their source."""
         symbol = linear.symbols()
         stepped = linear.step(*(symbol[k] for k in linear.step.name_in()))
         blocks = linear.blocks(symbol)
@@ -115,7 +114,7 @@ def source_code(linear: Linearization) -> str:
     at, sizes = code.at, linear.sizes
     options = {"with_header": False, "main": False, "indent": 0, "casadi_int": "long long"}
     generator = ca.CodeGenerator("generated", options)
-    with without_remarks() if calls_external(linear.step) else contextlib.nullcontext():
+    with suppress_gap_warnings() if calls_external(linear.step) else contextlib.nullcontext():
         for function in code.functions.values():
             generator.add(function)
         generated = generator.dump()
@@ -125,13 +124,13 @@ def source_code(linear: Linearization) -> str:
         n = sizes[target]
         terms: list[list[str]] = [[] for _ in range(n)]
         directly: list[list[str]] = [[] for _ in range(n)]
-        for source, i, j, value in _entries(linear, code, target):
+        for source, i, j, value in _list_entries(linear, code, target):
             if source == "p":
                 directly[i].append(f"{{{j},{value}}}")
             else:
                 terms[i].append(f"{{{_SOURCES[source]},{j},{value}}}")
-        lines += [*_table(f"term_{target}", "term_t", f"row_{target}", terms)]
-        lines += [*_table(f"direct_{target}", "direct_t", f"direct_row_{target}", directly)]
+        lines += [*_write_table(f"term_{target}", "term_t", f"row_{target}", terms)]
+        lines += [*_write_table(f"direct_{target}", "direct_t", f"direct_row_{target}", directly)]
         most = max(most, sum(map(len, terms)))
     entries = {f: f"pilfr_{f}" for f in code.functions} | {"constants": "constants"}
     if staged:
@@ -148,15 +147,15 @@ def source_code(linear: Linearization) -> str:
     # a diagonal s_s lets the memory's slopes be advanced in place
     entries["keeps"] = str(int(linear.partial.sparsity_out(BLOCKS.index(("s", "s"))).is_diag()))
     model = ", ".join(f".{name} = {value}" for name, value in entries.items())
-    lines = [_text("_kernel.h"), *lines, f"const model_t pilfr_model = {{{model}}};\n"]
-    generated = _without_descriptions(generated)
+    lines = [_read_source("_kernel.h"), *lines, f"const model_t pilfr_model = {{{model}}};\n"]
+    generated = _drop_uncalled(generated)
     if not calls_external(linear.step):
-        return "\n".join([_with_all_arguments(generated), *lines])
-    return "\n".join([_text("_external.h"), fill_gaps(generated), *lines])
+        return "\n".join([_drop_absence_tests(generated), *lines])
+    return "\n".join([_read_source("_external.h"), fill_gaps(generated), *lines])
 
 
-def _without_descriptions(generated: str) -> str:
-    """Drop what nobody calls, such as CasADi's description of each function: a third of the compiler's work."""
+def _drop_uncalled(generated: str) -> str:
+    """Drop functions that nobody calls, such as CasADi's descriptions: a third of the compiler's work."""
     kept, depth = list[str](), 0  # braces that are open in a dropped definition
     for line in generated.splitlines():
         if depth or (line.startswith("CASADI_SYMBOL_EXPORT ") and not ENTRY.match(line)):
@@ -166,12 +165,12 @@ def _without_descriptions(generated: str) -> str:
     return "\n".join(kept)
 
 
-def _with_all_arguments(generated: str) -> str:
-    """Drop the tests for absent arguments and results: the loops give all of them."""
+def _drop_absence_tests(generated: str) -> str:
+    """Drop the tests for absent arguments and results, because the loops pass all of them."""
     return ABSENT_RESULT.sub("", ABSENT_ARGUMENT.sub(r"arg[\1][\2]", generated))
 
 
-def _entries(linear: Linearization, code: _Code, target: str) -> Iterator[tuple[str, int, int, int]]:
+def _list_entries(linear: Linearization, code: _Code, target: str) -> Iterator[tuple[str, int, int, int]]:
     """Yield (source, row, column, place of the value) of the slopes of a target."""
     for source in TARGETS[target]:
         pattern = linear.partial.sparsity_out(BLOCKS.index((target, source)))
@@ -182,15 +181,15 @@ def _entries(linear: Linearization, code: _Code, target: str) -> Iterator[tuple[
 def _write_slopes(linear: Linearization, code: _Code) -> tuple[list[str], list[str], int]:
     """Write C code of the slopes of all rows; return it, its direct entries {row, parameter, value}, and their rows.
 
-    The code works on a few columns at a time. Direct derivatives by a parameter are entered into separate rows, in the
-    same place at every step.
+    The code works on a few columns at a time. Direct derivatives by a parameter have rows of their own, at the same
+    places in every step.
     """
     sizes = linear.sizes
     rows = {target: [list[str]() for _ in range(sizes[target])] for target in TARGETS}
     own: dict[tuple[str, int], int] = {}
     direct = list[str]()
     for target in TARGETS:
-        for source, i, j, value in _entries(linear, code, target):
+        for source, i, j, value in _list_entries(linear, code, target):
             if source != "p":
                 factor = repr(code.constants[value]) if value < code.at["p"] else f"v[{value}]"
                 rows[target][i].append(f"{source}{j}" if factor == "1.0" else f"{factor} * {source}{j}")
@@ -210,11 +209,11 @@ def _write_slopes(linear: Linearization, code: _Code) -> tuple[list[str], list[s
     return [head, *lines, *stores, "} }"], direct, len(own)
 
 
-def _text(name: str) -> str:
+def _read_source(name: str) -> str:
     return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
-def _table(name: str, kind: str, starts: str, rows: list[list[str]]) -> tuple[str, str]:
+def _write_table(name: str, kind: str, starts: str, rows: list[list[str]]) -> tuple[str, str]:
     """Write C tables of the entries of all rows, one after the other, and of the start of each row."""
     first = np.cumsum([0, *map(len, rows)]).tolist()
     flat = ",".join(entry for row in rows for entry in row) or "{0}"
@@ -222,15 +221,15 @@ def _table(name: str, kind: str, starts: str, rows: list[list[str]]) -> tuple[st
     return f"static const {kind} {name}[] = {{{flat}}};", f"static const int {starts}[] = {{{begins}}};"
 
 
-# without fused multiply-adds the generated step gives the bits of the virtual machine, so the same operators slip
+# without fused multiply-adds the generated step equals the virtual machine's bit by bit, so the same operators slip
 COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
 COMPILER_FLAGS = (("-march=native", *COMMON), COMMON)  # the second if the compiler refuses the first
 # optimising long straight-line code takes seconds and gains nothing, unlike the loops; code that calls other programs
-# tests every output for being wanted, and GCC needs minutes to thread thousands of such jumps
+# tests for every output whether it is wanted, and GCC needs minutes to thread thousands of such jumps
 PLAIN, LOOPS = ("-O1", "-fno-thread-jumps"), ("-O2",)
-KEPT_LIBRARIES = 40  # libraries in each of the cache's 256 folders: some hundred megabytes
-COMPILATION_SECONDS = 600.0  # seconds for one compilation
-_failures: dict[str, str] = {}  # sources that did not compile; this process does not try them again
+KEPT_LIBRARIES = 40  # libraries in each of the cache's 256 folders: some hundred megabytes in all
+COMPILATION_SECONDS = 600.0  # longest time for one compilation
+_failures: dict[str, str] = {}  # errors of sources that did not compile; this process does not try them again
 
 
 @functools.cache
@@ -245,7 +244,7 @@ def compiler() -> str | None:
 
 
 @functools.cache
-def _machine(cc: str) -> str:
+def _describe_machine(cc: str) -> str:
     """Describe the compiler and processor that a library depends on besides its source."""
     try:
         version = subprocess.run([cc, "--version"], capture_output=True, text=True, check=False).stdout
@@ -295,27 +294,37 @@ def _digest(library: Path) -> str:
     return hashlib.sha256(library.read_bytes()).hexdigest()[:16]
 
 
-def _shelf(key: str) -> Path:
+def _cache_folder(key: str) -> Path:
     """Return the cache folder of a library."""
     return cache_directory() / key[:2]
 
 
 def _compile(cc: str, source: str, key: str, level: tuple[str, ...]) -> Path:
     """Compile to a temporary file and rename it, so that a library is never incomplete."""
+    choices = [(*some, *flags) for some, flags in zip((level, level[:1]), COMPILER_FLAGS, strict=True)]
     with tempfile.TemporaryDirectory(dir=cache_directory()) as folder:
-        c_file, partial = Path(folder) / "model.c", Path(folder) / "model.so"
-        c_file.write_text(source, encoding="utf-8")
-        for some, flags in zip((level, level[:1]), COMPILER_FLAGS, strict=True):
-            command = [cc, *some, *flags, str(c_file), "-o", str(partial), "-lm"]
-            done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=COMPILATION_SECONDS)
-            if not done.returncode and partial.exists():
-                library = _shelf(key) / f"{key}-{_digest(partial)}.so"
-                library.parent.mkdir(mode=0o700, exist_ok=True)
-                os.replace(partial, library)
-                with contextlib.suppress(OSError):  # keep the folder's most recently used; loaded ones need no file
-                    for old in sorted(library.parent.glob("*.so"), key=lambda p: p.stat().st_mtime)[:-KEPT_LIBRARIES]:
-                        old.unlink()
-                return library
+        partial = run_compiler(cc, source, Path(folder), *choices)
+        library = _cache_folder(key) / f"{key}-{_digest(partial)}.so"
+        library.parent.mkdir(mode=0o700, exist_ok=True)
+        os.replace(partial, library)
+    with contextlib.suppress(OSError):  # keep the folder's most recently used; loaded ones need no file
+        for old in sorted(library.parent.glob("*.so"), key=lambda p: p.stat().st_mtime)[:-KEPT_LIBRARIES]:
+            old.unlink()
+    return library
+
+
+def run_compiler(cc: str, source: str, folder: Path, *choices: Sequence[str]) -> Path:
+    """Compile C source to a library in a folder with the first choice of options that works; else raise OSError."""
+    (folder / "model.c").write_text(source, encoding="utf-8")
+    library = folder / "model.so"
+    for options in choices:
+        command = [os.path.abspath(cc), *options, "model.c", "-o", library.name, "-lm"]
+        try:
+            done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=COMPILATION_SECONDS)
+        except subprocess.TimeoutExpired as error:
+            raise OSError(str(error)) from error
+        if not done.returncode and library.exists():
+            return library
     raise OSError((done.stderr.strip().splitlines() or ["it wrote no library"])[0][:300])
 
 
@@ -324,8 +333,8 @@ def build(source: str, level: tuple[str, ...] = PLAIN) -> Path:
     cc = compiler()
     if cc is None:
         raise InputError("No C compiler was found; install one (cc, gcc or clang) or use engine='vm'.")
-    key = hashlib.sha256("\n".join((source, *level, _machine(cc))).encode()).hexdigest()[:32]
-    for library in _shelf(key).glob(f"{key}-*.so"):
+    key = hashlib.sha256("\n".join((source, *level, _describe_machine(cc))).encode()).hexdigest()[:32]
+    for library in _cache_folder(key).glob(f"{key}-*.so"):
         if library.stem == f"{key}-{_digest(library)}":
             with contextlib.suppress(OSError):
                 os.utime(library)  # used now
@@ -334,7 +343,7 @@ def build(source: str, level: tuple[str, ...] = PLAIN) -> Path:
     if key not in _failures:
         try:
             return _compile(cc, source, key, level)
-        except (OSError, subprocess.TimeoutExpired) as error:
+        except OSError as error:
             _failures[key] = str(error)
     raise InputError(
         f"The C compiler {cc} could not build the model ({_failures[key]}); "
@@ -354,17 +363,17 @@ def _load(library: Path) -> ctypes.CDLL:
 
 
 @functools.cache
-def _loops(_cache: Path) -> ctypes.CDLL:
+def _load_loops(_cache: Path) -> ctypes.CDLL:
     """Load the time loops, once per cache directory."""
-    return _load(build("\n".join((_text("_kernel.h"), _text("_kernel.c"))), LOOPS))
+    return _load(build("\n".join((_read_source("_kernel.h"), _read_source("_kernel.c"))), LOOPS))
 
 
 class Compiled:
-    """Generated C behind the `Engine` protocol; it keeps nothing between calls, so threads may share it."""
+    """Generated C behind the `Engine` protocol; it has no state between calls, so threads may share it."""
 
     def __init__(self, model: Model) -> None:
         self.linear = linearize(model)
-        self.loops = _loops(cache_directory())
+        self.loops = _load_loops(cache_directory())
         source = source_code(self.linear)
         self.library = _load(build(source))
         self.programs = external_names(source)

@@ -1,8 +1,8 @@
-"""Generated C that calls other programs: `simulators.leaves` in place of the code that CasADi cannot write.
+"""Generated C that calls other programs (`simulators.leaves`), for which CasADi cannot write code.
 
-CasADi leaves a gap where a function is a program of its own. `fill_gaps` lets that code call the function's buffer
-(`casadi.FunctionBuffer`), and `bind` gives the buffers of a thread to a library. Without CasADi's entry point for
-buffers the virtual machine has to be used.
+CasADi leaves a gap where a function is a program of its own. `fill_gaps` fills it with a call of the function's buffer
+(`casadi.FunctionBuffer`), and `bind` passes the buffers of a thread to a library. Without CasADi's entry point for
+buffers, only the virtual machine can run the model.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ ENTRY = "_ZN6casadi21_function_buffer_evalEPv"  # casadi::_function_buffer_eval(
 HEAD = r"(/\* (?P<name>\w+):\([^\n]*\n[^\n]*\{\n)"  # comment and first line of a generated function
 GAP = re.compile(HEAD + r" *#error Code generation not supported[^\n]*\n *return 0;")
 CALL = re.compile(HEAD + r" *return call_external\(")
-REMARK = "cannot be code generated"
+GAP_WARNING = "cannot be code generated"
 
 
 class _External(ctypes.Structure):
-    """`external_t` of `_external.h`."""
+    """`external_t` of `_fill_structure.h`."""
 
     _fields_ = [
         ("evaluate", ctypes.c_void_p),
@@ -45,14 +45,9 @@ class _External(ctypes.Structure):
     ]
 
 
-def calls_external(function: ca.Function) -> bool:
-    """Tell whether a function of SX expressions calls one that CasADi cannot look into."""
-    return any(function.instruction_id(k) == ca.OP_CALL for k in range(function.n_instructions()))
-
-
 @functools.cache
 def entry_point() -> int | None:
-    """Find the address of CasADi's function that evaluates a buffer; None where it is not there."""
+    """Find the address of CasADi's function that evaluates a buffer; None if there is none."""
     for suffix in (".so", ".dylib"):
         with contextlib.suppress(OSError, AttributeError):
             library = ctypes.CDLL(str(Path(ca.__file__).with_name(f"libcasadi{suffix}")))
@@ -74,31 +69,31 @@ def external_names(code: str) -> tuple[str, ...]:
 
 
 @contextlib.contextmanager
-def without_remarks() -> Iterator[None]:
-    """Keep CasADi's remarks about these gaps from the screen."""
-    screen, kept = sys.stderr, io.StringIO()
-    with contextlib.redirect_stderr(kept):
+def suppress_gap_warnings() -> Iterator[None]:
+    """Suppress CasADi's warnings about these gaps; print all other messages afterwards."""
+    screen, messages = sys.stderr, io.StringIO()
+    with contextlib.redirect_stderr(messages):
         yield
-    for line in kept.getvalue().splitlines():
-        if REMARK not in line:
+    for line in messages.getvalue().splitlines():
+        if GAP_WARNING not in line:
             print(line, file=screen)
 
 
 def bind(library: ctypes.CDLL, names: tuple[str, ...], build: Callable[[str], Path]) -> None:
-    """Give this thread's buffers of programs to a library's `pilfr_bind`; all libraries that it calls share them.
+    """Pass this thread's buffers of programs to a library's `pilfr_bind`; all libraries of a thread share them.
 
-    `names` are those of `leaves` in their order; `build` compiles C source and returns the path of the library.
+    `names` are keys of `leaves` in the order of the calls; `build` compiles C source and returns the library's path.
     """
     table = (_External * len(names))(*(_buffer(name, build) for name in names))
     library.pilfr_bind(table)
-    _of_this_thread.table = table  # the library reads it until the next call
+    _thread.table = table  # the library reads it until the next call
 
 
-_of_this_thread = threading.local()
+_thread = threading.local()
 
 
 def _buffer(name: str, build: Callable[[str], Path]) -> _External:
-    buffers = _of_this_thread.__dict__.setdefault("buffers", {})
+    buffers = _thread.__dict__.setdefault("buffers", {})
     if name not in buffers:
         buffers[name] = _make_buffer(name, build)
     found: _External = buffers[name][0]
@@ -112,10 +107,10 @@ def _make_buffer(name: str, build: Callable[[str], Path]) -> tuple[_External, li
         n_arg, n_res = ([size(i) for i in range(n)] for n, size in _shapes(function))
         unit = lease.unit
         address = ctypes.addressof(unit.structure)
-        made, tables = _external(_unit_caller(build), address, (unit.arguments, n_arg), (unit.results, n_res))
+        made, tables = _fill_structure(_unit_caller(build), address, (unit.arguments, n_arg), (unit.results, n_res))
         return made, [lease, tables]
     if isinstance(function, PythonFunction):
-        return _call_python(function)
+        return _make_python_buffer(function)
     buffer, _ = function.buffer()
     memory = []
     for (count, size), put in zip(_shapes(function), (buffer.set_arg, buffer.set_res), strict=True):
@@ -126,12 +121,12 @@ def _make_buffer(name: str, build: Callable[[str], Path]) -> tuple[_External, li
         memory.append((arrays, sizes))
     get = ctypes.pythonapi.PyCapsule_GetPointer
     get.restype, get.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
-    made, tables = _external(entry_point(), get(buffer._self(), None), *memory)
+    made, tables = _fill_structure(entry_point(), get(buffer._self(), None), *memory)
     return made, [buffer, memory, tables]
 
 
 class _Lease:
-    """An instance of a unit for one thread; after the thread's end it serves another one."""
+    """An instance of a unit for one thread; after the thread's end another thread takes it."""
 
     free: ClassVar[dict[str, list[FmuInstance]]] = {}
 
@@ -140,7 +135,7 @@ class _Lease:
 
     @classmethod
     def take(cls, name: str) -> _Lease | None:
-        """Return an instance that is free, or a new one; None if the unit refuses."""
+        """Take a free instance, or a new one; None if the unit refuses."""
         try:
             return cls(name, cls.free.setdefault(name, []).pop())
         except IndexError:
@@ -151,8 +146,8 @@ class _Lease:
         self.free[self.name].append(self.unit)
 
 
-def _call_python(function: PythonFunction) -> tuple[_External, list[object]]:
-    """Let generated C call a Python function without a detour by CasADi."""
+def _make_python_buffer(function: PythonFunction) -> tuple[_External, list[object]]:
+    """Make a buffer by which generated C calls a Python function directly."""
     arguments = [np.zeros(n) for n in function.sizes]
     result = np.zeros(function.size)
 
@@ -161,7 +156,7 @@ def _call_python(function: PythonFunction) -> tuple[_External, list[object]]:
 
     callback = ctypes.CFUNCTYPE(None, ctypes.c_void_p)(evaluate)
     address = ctypes.cast(callback, ctypes.c_void_p).value
-    made, tables = _external(address, 0, (arguments, list(function.sizes)), ([result], [function.size]))
+    made, tables = _fill_structure(address, 0, (arguments, list(function.sizes)), ([result], [function.size]))
     return made, [callback, arguments, result, tables]
 
 
@@ -169,7 +164,7 @@ def _shapes(function: ca.Function) -> tuple[tuple[int, Callable[[int], int]], tu
     return (function.n_in(), function.nnz_in), (function.n_out(), function.nnz_out)
 
 
-def _external(
+def _fill_structure(
     evaluate: int | None,
     buffer: int,
     arguments: tuple[list[np.ndarray], list[int]],

@@ -6,13 +6,13 @@ the estimated parameters and the initial state:
     Z  = h_x X + h_p,          W = e_z Z + e_s S + e_p,      S⁺ = g_z Z + g_s S + g_p,
     X⁺ = f_x X + f_w W + f_p,  Y = y_x X + y_w W + y_p.
 
-A step of several stages has sparse derivatives by way of its intermediate values c: `c = k(x, u, w, c, p)`, where each
-entry depends on earlier ones only, and `x⁺ = f(x, u, w, c, p)`. Then `C = k_x X + k_w W + k_c C + k_p` is carried too,
-row by row.
+A step of several stages has sparse derivatives if they are written with its intermediate values c:
+`c = k(x, u, w, c, p)`, where each entry depends on earlier ones only, and `x⁺ = f(x, u, w, c, p)`. Then the recursion
+also carries `C = k_x X + k_w W + k_c C + k_p`, row by row.
 
 `Linearization` holds the step and its partial derivatives; both engines run on it: `VirtualMachine` here (CasADi only,
-a few samples unrolled at a time) and the generated C of `compiled.py`. The record is never differentiated as a whole:
-time and memory are linear in its length.
+a few samples unrolled at a time) and the generated C of `compiled.py`. The record is never differentiated as a whole,
+so time and memory are linear in its length.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy as np
 
 from .._base import one_at_a_time
 from ..models import Model
-from .external import calls_external
+from ..simulators import calls_external
 
 TARGETS = {
     "z": ("x", "p"),
@@ -36,7 +36,7 @@ TARGETS = {
     "x": ("x", "w", "c", "p"),
     "y": ("x", "w", "p"),
 }
-# states with memory up to which slopes by way of intermediate values fit the processor's fastest cache
+# largest number of states and memory for which the slopes of the intermediate values fit the processor's fastest cache
 MOST_STAGED = 64
 BLOCKS = tuple((target, source) for target, sources in TARGETS.items() for source in sources)
 
@@ -62,7 +62,7 @@ class Linearization:
 
 @one_at_a_time
 def linearize(model: Model) -> Linearization:
-    """Differentiate one step of a closed model symbolically, by way of its intermediate values if it has any."""
+    """Differentiate one step of a closed model symbolically, with its intermediate values if it has any."""
     x, s, u, p = model.symbols()
     z_now = model.port(x, u, p)
     w_now, s_now = model.memory(z_now, s, p)
@@ -79,7 +79,7 @@ def linearize(model: Model) -> Linearization:
     by_c, x_next = stages(x, u, w, p, c)[1:] if stages else (c, x_next)
     value = {"z": model.port(x, u, p), "w": w_out, "s": s_next, "c": by_c, "x": x_next, "y": y}
     symbol = {"x": x, "s": s, "z": z, "w": w, "c": c, "u": u, "p": p}
-    # calls of other programs are differentiated along directions alone
+    # calls of other programs have derivatives along directions only
     options = {"helper_options": {"ad_weight": 0.0}} if calls_external(step) else {}
     blocks = [ca.jacobian(value[target], symbol[source], options) for target, source in BLOCKS]
     names = [f"{target}_{source}" for target, source in BLOCKS]
@@ -112,19 +112,19 @@ class Engine(Protocol):
 
 
 def _advance(slope: dict[str, Any], block: dict[tuple[str, str], Any], target: str) -> Any:
-    """Return the transposed slopes of a target, summed in the order of the generated C so that all bits agree."""
+    """Compute the transposed slopes of a target, summed in the order of the generated C so that all bits agree."""
     direct = block[target, "p"]
     total = ca.MX.zeros(*direct.shape)
     for source in TARGETS[target][:-1]:
         if (target, source) != ("c", "c") and block[target, source].nnz():
             total = ca.mac(slope[source], block[target, source], total)
     if target == "c":
-        return _stages(total, block["c", "c"], direct)
+        return _complete_stages(total, block["c", "c"], direct)
     return total + ca.densify(direct) if direct.nnz() else total
 
 
-def _stages(total: Any, by_stages: Any, direct: Any) -> Any:
-    """Complete the transposed slopes of the intermediate values one after the other: each needs the earlier ones."""
+def _complete_stages(total: Any, by_stages: Any, direct: Any) -> Any:
+    """Complete the transposed slopes of the intermediate values in turn, because each needs the earlier ones."""
     columns = ca.horzsplit(total) if total.shape[1] else []
     for i in range(len(columns)):
         before = by_stages[:, i]

@@ -1,4 +1,4 @@
-/* The functions of FMI 3.0; those of other interfaces and types than co-simulation of doubles return an error. */
+/* The functions of FMI 3.0; functions of other interfaces and types than co-simulation of doubles return an error. */
 typedef void *fmi3Instance;
 typedef void *fmi3InstanceEnvironment;
 typedef uint32_t fmi3ValueReference;

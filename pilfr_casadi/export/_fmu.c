@@ -46,7 +46,7 @@ typedef struct {
   char name[256];
 } model_t;
 
-/* y at these states and inputs, and the states of the next sample where x_next is no null pointer */
+/* y at these states and inputs, and the states of the next sample unless x_next is a null pointer */
 static void evaluate(const double *x, const double *u, const double *p, double *x_next, double *y) {
   const casadi_real *arg[{{ [1, function.sz_arg()] | max }}];
   casadi_real *res[{{ [1, function.sz_res()] | max }}];

@@ -1,4 +1,4 @@
-"""From a fit, a simulator, a model or a diagnosis to its exported step: values put in, states named, a start state."""
+"""Build the exported step of a fit, a simulator, a model or a diagnosis, with named states and a start state."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from .c_code import check_name, make_unique
 from .smoothing import smooth_kinks
 from .step import Exported
 
-DT_TOLERANCE = 1e-4  # relative difference of two steps that are taken as equal, from rounding in files
-REST_SAMPLES = 400  # samples of a resting recording from which a simulator's sub-steps are chosen
+DT_TOLERANCE = 1e-4  # relative difference of two equal steps that rounding in files may cause
+REST_SAMPLES = 400  # samples of a recording at rest, for the choice of a simulator's sub-steps
 TIME, NEXT = "time", "_next"
 
 
@@ -97,7 +97,7 @@ def exported(
         dt = _check_dt(dt)
         closed = _discretise_over_sample(model, dt, hold, substeps)
         step = _build_step(closed, dt, model)
-        rhs = _right_hand_side(model, f"{name.rstrip('_')}_rhs")
+        rhs = _make_right_hand_side(model, f"{name.rstrip('_')}_rhs")
     else:
         if hold is not None or substeps is not None:
             raise InputError("The model has its own steps; `hold` and `substeps` are for simulators, leave them out.")
@@ -109,7 +109,7 @@ def exported(
         step,
         name=name,
         smooth=float(smooth),
-        start=_start_state(model, closed, step, start),
+        start=_find_start_state(model, closed, step, start),
         units={k: v for k, v in getattr(model, "units", {}).items() if v},
         rhs=smooth_kinks(rhs, smooth) if rhs is not None and smooth else rhs,
     )
@@ -168,7 +168,7 @@ def _choose_substeps_at_rest(simulator: Simulator, dt: float) -> int:
     return choose_substeps(driven, [Recording(u, y, dt)])
 
 
-def _start_state(model: Any, closed: Model, step: Exported, start: Any) -> np.ndarray | None:
+def _find_start_state(model: Any, closed: Model, step: Exported, start: Any) -> np.ndarray | None:
     """Find the start state, (n_x,), from a recording, an array or nothing."""
     n, size = closed.n_state, len(step.states)
     if start is None:
@@ -201,7 +201,7 @@ def _check_recording(model: Model, step: Exported, recording: Recording) -> None
 
 
 def _build_step(model: Model, dt: float, simulator: Simulator | None = None) -> Exported:
-    """Put a closed model's values into its sub-steps and name its states; `simulator` names the states of its laws."""
+    """Build the step of a closed model and name its states; `simulator` gives the names of its laws' states."""
     if model.n_w and model.element is None and not model.n_s:
         raise InputError("The model has an open port; close it with close_loop first.")
     if "y" in model.reads:
@@ -232,11 +232,11 @@ def _build_step(model: Model, dt: float, simulator: Simulator | None = None) -> 
     )
 
 
-def _right_hand_side(simulator: Simulator, name: str) -> ca.Function | None:
-    """Return `(x, u) -> (xdot, y)`, or `(x, u, t)` where the equations read the time.
+def _make_right_hand_side(simulator: Simulator, name: str) -> ca.Function | None:
+    """Make `(x, u) -> (xdot, y)`, or `(x, u, t) -> (xdot, y)` if the equations read the time.
 
-    x holds the states of the simulator, then of its laws; inputs are held. The result is None for a simulator in
-    discrete time, or with a law whose memory moves from sample to sample.
+    x holds the states of the simulator, then of its laws; inputs are constant. The result is None for a simulator in
+    discrete time or with laws that have discrete memory.
     """
     if simulator.discrete:
         return None
@@ -254,7 +254,7 @@ def _right_hand_side(simulator: Simulator, name: str) -> ca.Function | None:
 def _name_element_states(model: Model) -> tuple[list[str], dict[str, float], list[str]]:
     """Name linear states, then the element's memory; `memory[0,3]` belongs to the threshold r[0,3].
 
-    Returns all names, the threshold by name of memory where there is one, and the names of the memory.
+    Returns all names, the thresholds by name of their memory, and the names of the memory.
     """
     states = [*model.states, *(f"state{k + 1}" for k in range(len(model.states), model.n_x))]
     if not isinstance(model.element, PrandtlIshlinskii):

@@ -3,8 +3,8 @@
     rig_x0(x);                          the start state
     rig_step(x, u, x_next, y);          arrays of RIG_NX, RIG_NU, RIG_NX, RIG_NY doubles; x_next may be x itself
 
-Names and units of signals come from files. In comments, characters that could end the comment are replaced; in
-constants, everything but letters, digits and underscores.
+Names and units of signals come from files. So comments replace all characters that could end them, and constants
+replace everything but letters, digits and underscores.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import casadi as ca
 
 from .._base import InputError, make_folder, write_atomically
 
-LONGEST_NAME = 50  # letters: C tells names apart by their first 63, and the longest ending is "_casadi_release"
+LONGEST_NAME = 50  # letters: C distinguishes names by their first 63, and the longest ending is "_casadi_release"
 C_KEYWORDS = frozenset(  # of C and C++
     (  # noqa: SIM905
         "alignas alignof and asm auto bool break case catch char class compl const constexpr continue decltype default "
@@ -60,11 +60,11 @@ def write_c(
     target, name, big = make_folder(folder), names["name"], names["name"].upper()
     inner = f"{name.rstrip('_')}_casadi"
     x, u = (ca.MX.sym(key, step.size1_in(key)) for key in ("x", "u"))
-    # long ones hold a loop and stay as they are, called from a function of the right name
+    # a long step holds a loop and is not expanded, only called from a function of the right name
     function = step.expand(inner) if step.is_a("SXFunction") else ca.Function(inner, [x, u], step.call([x, u]))
     entries = {}
     for letter, role in (("X", "states"), ("U", "inputs"), ("Y", "outputs")):
-        constants = _constant_names(f"{big}_{letter}_", list(names[role]))
+        constants = _make_constant_names(f"{big}_{letter}_", list(names[role]))
         comments = [_clean_comment(_describe_entry(names, entry)) for entry in names[role]]
         entries[letter] = list(zip(constants, comments, strict=True))
     values = {**names, "big": big, "entries": entries, "interpolated": interpolated, "function": function}
@@ -95,7 +95,7 @@ def fill_template(template: str, values: Mapping[str, Any]) -> str:
 
 
 def _use_all_parameters(code: str) -> str:
-    """Mark the parameters of CasADi's functions as used; -Wextra warns about the ones that a function ignores."""
+    """Mark the parameters of CasADi's functions as used, because -Wextra warns about unused ones."""
 
     def mark_used(match: re.Match[str]) -> str:
         names = [parameter.split()[-1] for parameter in match[1].split(",")]
@@ -121,14 +121,14 @@ def _describe_entry(names: Mapping[str, Any], name: str) -> str:
 
 
 def _clean_comment(text: str) -> str:
-    """Replace everything in a text that could end, open or continue a comment."""
+    """Replace all characters of a text that could end, open or continue a comment."""
     kept = "".join(c if c.isprintable() and c not in "\\?" else "_" for c in text[:200])
     while "*/" in kept or "/*" in kept:
         kept = kept.replace("*/", "* ").replace("/*", " *")
     return kept.strip("/")
 
 
-def _constant_names(prefix: str, names: Sequence[str]) -> list[str]:
+def _make_constant_names(prefix: str, names: Sequence[str]) -> list[str]:
     """Make a distinct constant of each name, of letters, digits and underscores."""
     out: list[str] = []
     for name in names:

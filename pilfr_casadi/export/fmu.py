@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import os
-import subprocess
 import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -23,15 +22,14 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, __version__, digest, path_text, write_atomically
-from ..engine import compiler
+from ..engine import compiler, run_compiler
 from ..models import ParameterSet
 from ..simulators import binary_path
 from .c_code import fill_template, generate_code, make_unique
 
 VERSIONS = ("2.0", "3.0")
-# -O1: see `engine.compiled`; no fused products, so that the numbers are those of `simulate`
-OPTIONS = "-O1 -fno-thread-jumps -fPIC -shared -std=c99 -ffp-contract=off -fvisibility=hidden"
-COMPILATION_SECONDS = 600.0  # seconds for the compilation
+# -O1: see `engine.compiled`; without fused products, so that its numbers equal the result of `simulate`
+OPTIONS = ("-O1", "-fno-thread-jumps", "-fPIC", "-shared", "-std=c99", "-ffp-contract=off", "-fvisibility=hidden")
 EPOCH = (1980, 1, 1, 0, 0, 0)  # time of all files in the archive, so that the same model gives the same bytes
 UNUSED_TYPES = (  # of FMI 3.0
     *((f"Int{n}", f"int{n}_t") for n in (8, 16, 32, 64)),
@@ -57,7 +55,7 @@ class _Variable:
 
 @dataclass(frozen=True, eq=False)
 class FmuContent:
-    """A step with everything that the FMU says about it.
+    """A step and its description in the FMU.
 
     Attributes
     ----------
@@ -88,13 +86,13 @@ class FmuContent:
     @cached_property
     def variables(self) -> list[_Variable]:
         """All variables in the order of the array; inputs, outputs and parameters keep their names."""
-        found = list(self._variables())
+        found = list(self._list_variables())
         by_rank = sorted(range(len(found)), key=lambda i: found[i].causality == "local")
         unique = make_unique(_clean(found[i].name) for i in by_rank)
         names = dict(zip(by_rank, unique, strict=True))
         return [_Variable(names[i], *list(vars(v).values())[1:]) for i, v in enumerate(found)]
 
-    def _variables(self) -> Iterator[_Variable]:
+    def _list_variables(self) -> Iterator[_Variable]:
         units, thresholds = self.names["units"], self.names["thresholds"]
         yield _Variable("time", "independent", "continuous", 0.0, "s", description="Time")
         own = self.parameters
@@ -126,15 +124,15 @@ def write_fmu(path: str | os.PathLike[str], content: FmuContent, fmi: str) -> Pa
         raise InputError(f"{path} was given for the FMU; give a name that ends in .fmu.")
     name = content.names["name"]
     code = generate_code(content.step)
-    token = digest({"code": code, "description": _describe(content, fmi, "")})
-    source = _source(content, fmi, token, code)
+    token = digest({"code": code, "description": _write_description(content, fmi, "")})
+    source = _write_source(content, fmi, token, code)
     files: dict[str, str | bytes] = {
-        "modelDescription.xml": _describe(content, fmi, token),
-        binary_path(name, fmi[0]): _compile(source),
+        "modelDescription.xml": _write_description(content, fmi, token),
+        binary_path(name, fmi[0]): _compile_library(source),
         f"sources/{name}.c": source,
     }
     if fmi == "3.0":
-        files["sources/buildDescription.xml"] = _build_description(name)
+        files["sources/buildDescription.xml"] = _write_build_description(name)
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w") as out:
         for inside, data in files.items():
@@ -142,7 +140,7 @@ def write_fmu(path: str | os.PathLike[str], content: FmuContent, fmi: str) -> Pa
     return write_atomically(path, archive.getvalue())
 
 
-def _source(content: FmuContent, fmi: str, token: str, code: str) -> str:
+def _write_source(content: FmuContent, fmi: str, token: str, code: str) -> str:
     variables = content.variables
     return fill_template(
         "_fmu.c",
@@ -164,27 +162,21 @@ def _source(content: FmuContent, fmi: str, token: str, code: str) -> str:
     )
 
 
-def _compile(source: str) -> bytes:
+def _compile_library(source: str) -> bytes:
     """Compile the source to a library of this platform; return its bytes."""
     cc = compiler()
     if cc is None:
         raise InputError("An FMU holds a compiled program, and no C compiler was found; install cc, gcc or clang.")
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "fmu.c").write_text(source, encoding="utf-8")
-        command = [cc, *OPTIONS.split(), "fmu.c", "-o", "fmu.lib", "-lm"]
         try:
-            done = subprocess.run(
-                command, cwd=folder, capture_output=True, text=True, check=False, timeout=COMPILATION_SECONDS
-            )
-            if done.returncode == 0:
-                return (Path(folder) / "fmu.lib").read_bytes()
-            said = " ".join(done.stderr.split())[:200]
-        except (OSError, subprocess.TimeoutExpired) as error:
-            said = str(error)
-    raise InputError(f"The C compiler {cc} could not build the FMU ({said}); repair it, or name another in CC.")
+            return run_compiler(cc, source, Path(folder), OPTIONS).read_bytes()
+        except OSError as error:
+            raise InputError(
+                f"The C compiler {cc} could not build the FMU ({error}); repair it, or name another in CC."
+            ) from None
 
 
-def _describe(content: FmuContent, fmi: str, token: str) -> str:
+def _write_description(content: FmuContent, fmi: str, token: str) -> str:
     """Write modelDescription.xml."""
     two, name = fmi == "2.0", content.names["name"]
     root = ET.Element(
@@ -225,11 +217,11 @@ def _describe(content: FmuContent, fmi: str, token: str) -> str:
     for kind in () if two else ("Output", "InitialUnknown"):
         for i in outputs:
             ET.SubElement(structure, kind, valueReference=str(i))
-    return _text(root)
+    return _to_text(root)
 
 
 def _add_variable(parent: ET.Element, variable: _Variable, reference: int, two: bool) -> None:
-    """Add a variable; FMI 2.0 keeps the numbers in an element of their own."""
+    """Add a variable; in FMI 2.0 its numbers are in an element of their own."""
     v = variable
     about = {"name": v.name, "valueReference": str(reference), "causality": v.causality, "variability": v.variability}
     if v.description:
@@ -246,19 +238,19 @@ def _add_variable(parent: ET.Element, variable: _Variable, reference: int, two: 
         ET.SubElement(parent, "Float64", about | numbers)
 
 
-def _build_description(name: str) -> str:
+def _write_build_description(name: str) -> str:
     root = ET.Element("fmiBuildDescription", fmiVersion="3.0")
     build = ET.SubElement(root, "BuildConfiguration", modelIdentifier=name)
     sources = ET.SubElement(build, "SourceFileSet", language="C99")
     ET.SubElement(sources, "SourceFile", name=f"{name}.c")
-    return _text(root)
+    return _to_text(root)
 
 
-def _text(root: ET.Element) -> str:
+def _to_text(root: ET.Element) -> str:
     ET.indent(root)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
 
 
 def _clean(text: str) -> str:
-    """Replace characters that XML or the standard does not allow in a name."""
+    """Replace the characters that XML or the standard forbids in a name."""
     return "".join(c if c.isprintable() else "_" for c in text)

@@ -1,14 +1,13 @@
-"""Models on disk: a fit's values as JSON, out and in.
+"""Models on disk: write and read the values of a fit as JSON.
 
 A model file is standard JSON: format and version, structure, parameter values by name with units and standard errors,
 sampling, names, and a summary of the training. Its SHA-256 reveals numbers that were changed afterwards. The file holds
-no code, and every number comes back to the last digit. A PI-LFR (Krikelis et al. 2024, Eq. 15-17) can be rebuilt from
+no code, and every number is restored to the last digit. A PI-LFR (Krikelis et al. 2024, Eq. 15-17) can be rebuilt from
 its file; for a model of the user's own equations the file holds only the values.
 
 Nothing in a file is trusted or executed. Sizes are compared with the numbers in the file before anything is built, so a
-few bytes cannot ask for a model of a billion operators. Every value is checked for its
-shape, for being finite, and against the bounds and fixed values of the structure (by default `w >= 0` and `r >= 0` as
-in Eq. 16).
+few bytes cannot ask for a model of a billion operators. Every value must be finite and have the right shape, and must
+agree with the bounds and fixed values of the structure (by default `w >= 0` and `r >= 0` as in Eq. 16).
 """
 
 from __future__ import annotations
@@ -58,22 +57,22 @@ if TYPE_CHECKING:
 
 FORMAT = "pilfr_casadi model"
 VERSION = 2
-VERSION_WITHOUT_DIGEST = 1  # still read, with a warning
+VERSION_WITHOUT_DIGEST = 1  # read with a warning
 LARGEST_FILE = 200_000_000  # bytes; a model with 500 states takes 20 million
-MOST_PARTS = 100  # combined elements and degrees of products; more would only exhaust the memory
+MOST_PARTS = 100  # combined elements, and largest degree of products; more would only exhaust the memory
 HISTORY = ("number", "cost", "seconds", "step", "damping")  # columns of a solver's history
-WRITTEN = {Envelope: ("channels",), Products: ("channels", "degrees"), StaticNetwork: ("hidden", "channels")}
+ELEMENT_FIELDS = {Envelope: ("channels",), Products: ("channels", "degrees"), StaticNetwork: ("hidden", "channels")}
 LIMIT_NUMBERS = ("value", "lower", "upper", "multiplier")
-DEEPEST = 3  # nested lists of an array: no parameter has more dimensions than two
+DEEPEST = 3  # levels of nested lists in an array: no parameter has more than two dimensions
 
 
 @dataclass(frozen=True, eq=False)
 class FitContent:
     """The values of a fit that a model file holds.
 
-    Fields are named as in `Fit`; `structure` is None for a model of the user's own equations. `initial` and `weights`
-    are keyed by the recordings' fingerprints. `noise` is the noise level that priors are weighed against. `limits` is
-    None in files of the first releases, which did not keep them.
+    Fields are named as in `Fit`; `structure` is None for a model of the user's own equations. The keys of `initial` and
+    `weights` are the recordings' fingerprints. `noise` is the noise level that weights the data against priors.
+    `limits` is None for files of the first releases, which did not store them.
     """
 
     model: Model
@@ -96,21 +95,21 @@ class FitContent:
 
 
 class _Unusable(Exception):
-    """A file is intact but cannot be used; the message ends the sentence about the file."""
+    """A file cannot be used as it is; the message completes the sentence "The file ..."."""
 
 
 def write_model_file(path: str | os.PathLike[str], content: FitContent) -> None:
-    """Write a fit as JSON, atomically; for a model of the user's own equations only the values are kept."""
+    """Write a fit as JSON, atomically; for a model of the user's own equations only its values."""
     write_atomically(path, model_text(content))
 
 
 def model_text(content: FitContent) -> str:
     """Return the text of a model file."""
-    tables = _tables_of_fit(content)
-    return _layout({**tables, "sha256": ordered_digest(tables)}) + "\n"
+    tables = _make_tables(content)
+    return _format_json({**tables, "sha256": ordered_digest(tables)}) + "\n"
 
 
-def _tables_of_fit(fit: FitContent) -> dict[str, Any]:
+def _make_tables(fit: FitContent) -> dict[str, Any]:
     model, solution = fit.model, fit.solution
     limited = len(solution.theta) + sum(limit.kind == "constraint" for limit in fit.limits or ())
     return {
@@ -124,7 +123,7 @@ def _tables_of_fit(fit: FitContent) -> dict[str, Any]:
             "states": model.states,
             "memory": model.n_s,
         },
-        "structure": None if fit.structure is None else _structure_table(fit.structure),
+        "structure": None if fit.structure is None else _make_structure_table(fit.structure),
         "parameters": {
             name: {"value": _to_json(p.value), "std": _to_json(fit.errors.get(name), "inf"), "unit": p.unit}
             for name, p in model.parameters.items()
@@ -145,7 +144,7 @@ def _tables_of_fit(fit: FitContent) -> dict[str, Any]:
                 {key: _to_json(v, "inf") if key in LIMIT_NUMBERS else v for key, v in asdict(limit).items()}
                 for limit in fit.limits or ()
             ],
-            "solve": _solve_table(solution),
+            "solve": _make_solve_table(solution),
             "variables": dict(zip(fit.labels, _to_json(solution.theta), strict=True)),
             "multipliers": _to_json(solution.multipliers if len(solution.multipliers) == limited else ()),
             "history": {key: _to_json([getattr(h, key) for h in solution.history]) for key in HISTORY},
@@ -156,7 +155,7 @@ def _tables_of_fit(fit: FitContent) -> dict[str, Any]:
                     "status": c.solution.status.name,
                     "note": c.note,
                     "drawn": c.drawn,
-                    **_solve_table(c.solution),
+                    **_make_solve_table(c.solution),
                 }
                 for c in fit.candidates
             ],
@@ -164,33 +163,33 @@ def _tables_of_fit(fit: FitContent) -> dict[str, Any]:
     }
 
 
-def _solve_table(solution: Solution) -> dict[str, Any]:
+def _make_solve_table(solution: Solution) -> dict[str, Any]:
     numbers = {key: _to_json(getattr(solution, key)) for key in ("cost", "violation", "seconds")}
     return {"iterations": int(solution.iterations), **numbers}
 
 
-def _structure_table(structure: PILFR) -> dict[str, Any]:
+def _make_structure_table(structure: PILFR) -> dict[str, Any]:
     pairs = {"bounds": structure.bounds, "priors": structure.priors}
     return {
         "nx": int(structure.nx),
         "offset": bool(structure.offset),
-        "element": None if structure.element is None else _element_table(structure.element),
+        "element": None if structure.element is None else _make_element_table(structure.element),
         "fixed": {name: _to_json(value) for name, value in structure.fixed.items()},
         **{key: {name: [_to_json(v) for v in pair] for name, pair in table.items()} for key, table in pairs.items()},
     }
 
 
-def _element_table(element: Any) -> dict[str, Any]:
+def _make_element_table(element: Any) -> dict[str, Any]:
     if isinstance(element, Combined):
         parts = [
-            {"name": p.name, "element": _element_table(p.element), "reads": p.reads, "writes": p.writes}
+            {"name": p.name, "element": _make_element_table(p.element), "reads": p.reads, "writes": p.writes}
             for p in element.parts
         ]
         return {"kind": element.kind, "channels": element.channels, "parts": parts}
     if not isinstance(element, PrandtlIshlinskii):
-        if type(element) not in WRITTEN:
+        if type(element) not in ELEMENT_FIELDS:
             return {"kind": type(element).__name__}
-        return {"kind": element.kind, **{name: getattr(element, name) for name in WRITTEN[type(element)]}}
+        return {"kind": element.kind, **{name: getattr(element, name) for name in ELEMENT_FIELDS[type(element)]}}
     operator = element.operator
     out = {"kind": element.kind, "operator": operator.name, "n": element.n, "channels": element.channels}
     out["rounded"] = element.rounded
@@ -205,11 +204,11 @@ def _to_json(value: Any, infinite: str | None = None) -> Any:
     return to_json(np.asarray(value, dtype=float), infinite)
 
 
-def _layout(value: Any, depth: int = 0) -> str:
-    """Lay out JSON with one line for each entry of the outer tables, so that people can read and compare files."""
+def _format_json(value: Any, depth: int = 0) -> str:
+    """Format JSON with one line for each entry of the outer tables, so that people can read and compare files."""
     if isinstance(value, dict) and value and depth < 2:
         pad = " " * (depth + 1)
-        rows = [f"{pad}{json.dumps(key)}: {_layout(item, depth + 1)}" for key, item in value.items()]
+        rows = [f"{pad}{json.dumps(key)}: {_format_json(item, depth + 1)}" for key, item in value.items()]
         return "{\n" + ",\n".join(rows) + "\n" + " " * depth + "}"
     return json.dumps(value, allow_nan=False)
 
@@ -231,7 +230,7 @@ def read_model_file(path: str | os.PathLike[str], model: Model | PILFR | None = 
                 "so changes made to it after it was written cannot be noticed; save the model again to give it one.",
                 stacklevel=3,
             )
-        return _fit_content(read_tables(content), model)
+        return _build_content(read_tables(content), model)
     except _Unusable as error:
         fault = str(error)
     except ValueError as error:  # includes objects that refuse the file's entries
@@ -308,24 +307,24 @@ def _check_content(content: Any) -> dict[str, Any]:
     return content
 
 
-def _fit_content(tables: schema.ModelTables, given: Model | PILFR | None) -> FitContent:
-    """Build the model and read everything about its training."""
+def _build_content(tables: schema.ModelTables, given: Model | PILFR | None) -> FitContent:
+    """Build the model and the results of its training."""
     training = tables.training
-    structure, start = _equations(tables, given)
-    model = _with_values(tables, start, structure)
+    structure, start = _build_model(tables, given)
+    model = _restore_values(tables, start, structure)
     limits = None if training.limits is None else tuple(Limit(**dict(row)) for row in training.limits)
     return FitContent(
         model=model,
         structure=structure,
         dt=tables.model.dt,
-        solution=_solution_of_training(training, limits),
+        solution=_build_trained_solution(training, limits),
         labels=tuple(training.variables),
         errors={
             name: _array(tables.parameters[name].std, p.value.shape, f"the standard error of {name!r}", np.nan)
             for name, p in model.parameters.items()
             if tables.parameters[name].std is not None
         },
-        linear=_linear(tables, structure),
+        linear=_build_linear(tables, structure),
         initial={
             recording: _array(state, (model.n_state,), "an initial state")
             for recording, state in tables.initial_states.items()
@@ -339,32 +338,32 @@ def _fit_content(tables: schema.ModelTables, given: Model | PILFR | None) -> Fit
         noise=training.noise,
         weights=training.weights,
         candidates=tuple(
-            Candidate(s.seed, model, np.zeros(0), s.error, _solution(s, s.status), s.note, s.drawn)
+            Candidate(s.seed, model, np.zeros(0), s.error, _build_solution(s, s.status), s.note, s.drawn)
             for s in training.starts
         ),
     )
 
 
-def _equations(tables: schema.ModelTables, given: Model | PILFR | None) -> tuple[PILFR | None, Model]:
+def _build_model(tables: schema.ModelTables, given: Model | PILFR | None) -> tuple[PILFR | None, Model]:
     """Build the structure (None for the user's own equations) and the closed model, without the file's values."""
     n_u, n_y = len(tables.model.inputs), len(tables.model.outputs)
     if isinstance(given, Model):
         if (given.n_u, given.n_y) != (n_u, n_y):
             raise InputError(f"it has {given.n_u} inputs and {given.n_y} outputs, the file {n_u} and {n_y}")
         return None, given
-    structure = given or _structure(tables, n_u, n_y)
-    return structure, _model_of(structure, tables.model)
+    structure = given or _build_structure(tables, n_u, n_y)
+    return structure, _build_closed_model(structure, tables.model)
 
 
-def _structure(tables: schema.ModelTables, n_u: int, n_y: int) -> PILFR:
+def _build_structure(tables: schema.ModelTables, n_u: int, n_y: int) -> PILFR:
     table = tables.structure
     if table is None:
         raise _Unusable(
             "holds the values of a model of your own equations, not the equations; give the model as `model=`"
         )
-    element = None if table.element is None else _element(table.element, tables)
+    element = None if table.element is None else _make_element(table.element, tables)
     for name, shape in block_shapes(table.nx, n_u, n_y, 0 if element is None else element.channels).items():
-        _parameter(tables, name, shape)
+        _read_parameter(tables, name, shape)
 
     def pairs(kind: str, low: float | None, high: float | None) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         return {
@@ -376,19 +375,20 @@ def _structure(tables: schema.ModelTables, n_u: int, n_y: int) -> PILFR:
     return PILFR(table.nx, element, fixed, pairs("bounds", -np.inf, np.inf), pairs("priors", None, None), table.offset)
 
 
-def _element(table: schema.ElementTable, tables: schema.ModelTables, prefix: str = "") -> Element:
+def _make_element(table: schema.ElementTable, tables: schema.ModelTables, prefix: str = "") -> Element:
     """Build an element after checking its parameters in the file, called `prefix + name`."""
 
     def check(names: tuple[str, ...], *shape: int) -> None:
         for name in names:
-            _parameter(tables, prefix + name, shape)
+            _read_parameter(tables, prefix + name, shape)
 
     channels = table.channels
     if not prefix and table.kind == "combined":
         rows = getattr(table, "parts", ())
         if len(rows) > MOST_PARTS:
             raise InputError(f"it combines {len(rows)} elements")
-        parts = (Part(row.name, _element(row.element, tables, f"{row.name}_"), row.reads, row.writes) for row in rows)
+        elements = (_make_element(row.element, tables, f"{row.name}_") for row in rows)
+        parts = (Part(row.name, own, row.reads, row.writes) for row, own in zip(rows, elements, strict=True))
         return Combined(tuple(parts), channels)
     if table.kind == "prandtl_ishlinskii":
         if table.operator not in OPERATORS:
@@ -416,9 +416,9 @@ def _element(table: schema.ElementTable, tables: schema.ModelTables, prefix: str
     raise _Unusable(f"has the element {table.kind[:40]!r}, which a file cannot hold; give the model as `model=`")
 
 
-def _with_values(tables: schema.ModelTables, model: Model, structure: PILFR | None) -> Model:
-    """Put the file's values into the model; refuse unknown names, and values out of bounds or unlike fixed ones."""
-    values = {name: _parameter(tables, name, p.value.shape) for name, p in model.parameters.items()}
+def _restore_values(tables: schema.ModelTables, model: Model, structure: PILFR | None) -> Model:
+    """Set the file's values; refuse unknown names, values out of bounds, and values that differ from fixed ones."""
+    values = {name: _read_parameter(tables, name, p.value.shape) for name, p in model.parameters.items()}
     unknown = sorted(set(tables.parameters) - set(values))
     if unknown:
         raise _Unusable(f"has the parameter {unknown[0]!r}, which its model lacks; give the model it was saved from")
@@ -433,32 +433,32 @@ def _with_values(tables: schema.ModelTables, model: Model, structure: PILFR | No
             raise InputError(f"a value of parameter {name!r} lies outside its bounds")
         if structure is not None and name in structure.fixed and np.any((values[name] != p.value)[p.fixed]):
             raise InputError(f"parameter {name!r} differs from the value that the structure fixes")
-    return _at_values(model, values)
+    return _set_values(model, values)
 
 
-def _linear(tables: schema.ModelTables, structure: PILFR | None) -> Model | None:
-    """Build the linear model that the fit began with, where the file has it."""
+def _build_linear(tables: schema.ModelTables, structure: PILFR | None) -> Model | None:
+    """Build the linear model that the fit started from, if the file has it."""
     if tables.linear is None or structure is None:
         return None
-    model = _model_of(structure.linear(), tables.model)
+    model = _build_closed_model(structure.linear(), tables.model)
     values = {
         name: _array(tables.linear.get(name), p.value.shape, f"the linear model's {name!r}")
         for name, p in model.parameters.items()
     }
-    return _at_values(model, values)
+    return _set_values(model, values)
 
 
-def _model_of(structure: PILFR, signals: schema.Signals) -> Model:
+def _build_closed_model(structure: PILFR, signals: schema.Signals) -> Model:
     inputs, outputs = signals.names
     return structure.model(len(inputs), len(outputs), inputs=inputs, outputs=outputs)
 
 
-def _at_values(model: Model, values: Mapping[str, np.ndarray]) -> Model:
+def _set_values(model: Model, values: Mapping[str, np.ndarray]) -> Model:
     return model.with_parameters(model.parameters.change(**{name: {"value": v} for name, v in values.items()}))
 
 
-def _solution_of_training(training: schema.Training, limits: tuple[Limit, ...] | None) -> Solution:
-    """Build the solution with its history, and a multiplier for each variable and constraint, or none."""
+def _build_trained_solution(training: schema.Training, limits: tuple[Limit, ...] | None) -> Solution:
+    """Build the solution with its history and multipliers: one for each variable and constraint, or none."""
     theta, multipliers = (np.array(list(v), float) for v in (training.variables.values(), training.multipliers))
     n = len(theta) + sum(limit.kind == "constraint" for limit in limits or ())
     # the first files did not name the constraints
@@ -466,16 +466,16 @@ def _solution_of_training(training: schema.Training, limits: tuple[Limit, ...] |
         raise InputError(f"it has {multipliers.size} multipliers of {n} variables and constraints")
     columns = [getattr(training.history, key) for key in HISTORY]
     history = tuple(Iteration(int(number), *row) for number, *row in zip(*columns, strict=True))
-    solution = _solution(training.solve, training.status)
+    solution = _build_solution(training.solve, training.status)
     return replace(solution, theta=theta, multipliers=multipliers, history=history, message=training.message)
 
 
-def _solution(solve: schema.Solve, status: str) -> Solution:
+def _build_solution(solve: schema.Solve, status: str) -> Solution:
     numbers = solve.cost, Status[status], solve.iterations, solve.seconds
     return Solution(np.zeros(0), *numbers, violation=solve.violation)
 
 
-def _parameter(tables: schema.ModelTables, name: str, shape: tuple[int, ...]) -> np.ndarray:
+def _read_parameter(tables: schema.ModelTables, name: str, shape: tuple[int, ...]) -> np.ndarray:
     """Read the value of a parameter; refuse another shape."""
     if name not in tables.parameters:
         raise InputError(f"{name!r} is missing")

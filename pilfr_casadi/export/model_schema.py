@@ -1,6 +1,6 @@
-"""The schema of a model file: its tables, keys and kinds of entries, and the sentence about the first violation.
+"""The schema of a model file: its tables, keys and types of entries, and a sentence about the first violation.
 
-Only this file imports pydantic, and `read_model_file` imports this file only when a model is read.
+Only this file imports pydantic in this folder, and `read_model_file` imports it only to read a model.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from .._base import InputError
 from ..optimise import Status
 
-SHOWN = 40  # letters of a key or a value in a message
+SHOWN = 40  # characters of a key or a value in a message
 KINDS = {
     "string_type": "a text",
     "int_type": "a whole number",
@@ -55,7 +55,7 @@ Pairs = dict[str, Annotated[list[Any], Field(min_length=2, max_length=2)]]
 
 
 class Table(BaseModel):
-    """A table with these keys and no others; numbers stay numbers and texts stay texts."""
+    """A table with these keys and no others; numbers and texts are not converted."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -188,7 +188,7 @@ class History(Table):
 
 
 class Training(Table):
-    """Results of the training; the first files had no limits, noise, weights and errors of the linear model."""
+    """Results of the training; files of the first releases have no limits, noise, weights and linear errors."""
 
     status: Ending
     sentence: str = ""
@@ -208,7 +208,7 @@ class Training(Table):
 
 
 class ModelTables(Table):
-    """All tables of a model file, less its digest."""
+    """All tables of a model file, without its digest."""
 
     format: str
     version: int
@@ -222,7 +222,7 @@ class ModelTables(Table):
 
 
 def read_tables(content: Any) -> ModelTables:
-    """Validate the content of a file; refuse it with a sentence about its first violation."""
+    """Validate the content of a file; raise a sentence about its first violation."""
     try:
         return ModelTables.model_validate(content)
     except ValidationError as error:

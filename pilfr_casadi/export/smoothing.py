@@ -12,9 +12,9 @@ al. 2024, Eq. 15-16) with plays or stops an output is off by at most `|D_yw| Σ_
 with its rounded twin, and each rounding widens the interval by eps/2 (Moore, Kearfott & Cloud 2009, ch. 2).
 
 The bound holds for one step from the same x and u. Over many steps a rounded play creeps towards its signal, by about
-eps²/4d per sample at the distance d from its edges, and so forgets; use it over the horizon of a controller, not for
-a long simulation. (`models.fmax` rounds within a narrow band instead: it keeps the memory of long records, as a fit
-needs, but its second derivative jumps, which Newton-type solvers do not take.)
+eps²/4d per sample at the distance d from its edges, and so loses its memory: use it over the horizon of a controller,
+not for a long simulation. (`models.fmax` rounds within a narrow band instead. It keeps the memory of long records, as a
+fit needs, but its second derivative jumps, which Newton-type solvers cannot handle.)
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def smooth_kinks(function: ca.Function, eps: float) -> ca.Function:
             return a / ca.sqrt(a**2 + eps**2 / 4)
         return ca.SX.unary(code, a) if b is None else ca.SX.binary(code, a, b)
 
-    results = [ca.vertcat(ca.SX(0, 1), *row) for row in _walk(function, entries, apply, ca.SX)]
+    results = [ca.vertcat(ca.SX(0, 1), *row) for row in _evaluate(function, entries, apply, ca.SX)]
     return ca.Function(function.name(), arguments, results, function.name_in(), function.name_out())
 
 
@@ -77,18 +77,20 @@ def enclose(function: ca.Function, eps: float, *arguments: Sequence[Interval]) -
     def apply(op: str, code: int, a: Interval, b: Interval | None = None) -> Interval:
         with np.errstate(all="ignore"):
             try:
-                low, high = _unary(op, a, eps) if b is None else _binary(op, a, b, eps)
+                low, high = _enclose_unary(op, a, eps) if b is None else _enclose_binary(op, a, b, eps)
             except OverflowError:
                 return EVERYTHING
         return EVERYTHING if math.isnan(low) or math.isnan(high) else (float(low), float(high))
 
-    return _walk(function, list(arguments), apply, lambda value: (float(value), float(value)))
+    return _evaluate(function, list(arguments), apply, lambda value: (float(value), float(value)))
 
 
-def _walk(function: ca.Function, arguments: list[Any], apply: Callable[..., Any], constant: Callable[..., Any]) -> Any:
+def _evaluate(
+    function: ca.Function, arguments: list[Any], apply: Callable[..., Any], constant: Callable[..., Any]
+) -> Any:
     """Run a function's instructions on other values; treat `a > b ? a : b` as a max, its opposite as a min.
 
-    CasADi writes such a choice as a sum of two terms. Numbering equal expressions alike makes the choice visible.
+    CasADi writes such a choice as a sum of two terms, which is recognised because equal expressions get equal numbers.
     """
     numbers: dict[Any, int] = {}  # (operation, numbers of its arguments) -> number
     nodes: list[Any] = []
@@ -120,15 +122,15 @@ def _walk(function: ca.Function, arguments: list[Any], apply: Callable[..., Any]
             )
         else:
             node: Any = (op, *(registers[r] for r in read))
-            node = _choice(nodes, node) or node
+            node = _recognise_choice(nodes, node) or node
             parts = (values[i] for i in node[1:])
             found = number_node(node, partial(apply, node[0], getattr(ca, f"OP_{node[0]}"), *parts))
         registers[written[0]] = found
     return results
 
 
-def _choice(nodes: list[Any], node: Any) -> Any:
-    """Return (FMAX or FMIN, a, b) where the node is one of these, written as a choice; else None."""
+def _recognise_choice(nodes: list[Any], node: Any) -> Any:
+    """Return (FMAX or FMIN, a, b) if the node is such a choice; else None."""
     if node[0] == "ADD":
         one, two = (_split_choice(nodes, nodes[part]) for part in node[1:])
         if one is None or two is None or one[0] != two[0] or one[1] == two[1]:
@@ -147,7 +149,7 @@ def _choice(nodes: list[Any], node: Any) -> Any:
 
 
 def _split_choice(nodes: list[Any], node: Any) -> tuple[int, bool, int] | None:
-    """Split `comparison ? value : 0` into (comparison, whether it must hold, value)."""
+    """Split `comparison ? value : 0` into (comparison, whether it must be true, value)."""
     if node[0] != "IF_ELSE_ZERO":
         return None
     condition, yes = node[1], True
@@ -156,7 +158,7 @@ def _split_choice(nodes: list[Any], node: Any) -> tuple[int, bool, int] | None:
     return (condition, yes, node[2]) if nodes[condition][0] in ("LT", "LE") else None
 
 
-def _unary(op: str, a: Interval, eps: float) -> Interval:
+def _enclose_unary(op: str, a: Interval, eps: float) -> Interval:
     low, high = a
     if op in _RISING:
         return _RISING[op](low), _RISING[op](high)
@@ -179,13 +181,13 @@ def _unary(op: str, a: Interval, eps: float) -> Interval:
     if op == "ACOS":
         return np.arccos(high), np.arccos(low)
     if op == "INV":
-        return _binary("DIV", (1.0, 1.0), a, eps)
+        return _enclose_binary("DIV", (1.0, 1.0), a, eps)
     if op == "NOT":
         return float(low == high == 0), float(low == 0)
     raise InputError(f"No error bound is known behind the operation {op.lower()!r}; leave it out.")
 
 
-def _binary(op: str, a: Interval, b: Interval, eps: float) -> Interval:
+def _enclose_binary(op: str, a: Interval, b: Interval, eps: float) -> Interval:
     if op == "ADD":
         return a[0] + b[0], a[1] + b[1]
     if op == "SUB":
@@ -205,11 +207,11 @@ def _binary(op: str, a: Interval, b: Interval, eps: float) -> Interval:
         return (float(same), float(not apart)) if op == "EQ" else (float(apart), float(not same))
     if op in ("AND", "OR"):
         join = min if op == "AND" else max
-        return join(_truth(a)[0], _truth(b)[0]), join(_truth(a)[1], _truth(b)[1])
+        return join(_enclose_truth(a)[0], _enclose_truth(b)[0]), join(_enclose_truth(a)[1], _enclose_truth(b)[1])
     if op == "DIV" and b[0] <= 0 <= b[1]:
         return EVERYTHING
     if op in ("POW", "CONSTPOW") and a[0] < 0:
-        return _power(a, b)
+        return _enclose_power(a, b)
     known: dict[str, Callable[[Any, Any], Any]] = {
         "MUL": lambda x, y: x * y if x and y else 0.0,
         "DIV": np.divide,
@@ -222,7 +224,7 @@ def _binary(op: str, a: Interval, b: Interval, eps: float) -> Interval:
     return (math.nan, math.nan) if np.any(np.isnan(corners)) else (min(corners), max(corners))
 
 
-def _power(a: Interval, b: Interval) -> Interval:
+def _enclose_power(a: Interval, b: Interval) -> Interval:
     """Enclose a power of a base that may be negative: known for whole exponents."""
     n = b[0]
     if b[0] != b[1] or n != round(n) or (n < 0 and a[0] <= 0 <= a[1]):
@@ -231,5 +233,5 @@ def _power(a: Interval, b: Interval) -> Interval:
     return (0.0 if a[0] <= 0 <= a[1] and n % 2 == 0 else min(ends)), max(ends)
 
 
-def _truth(a: Interval) -> Interval:
+def _enclose_truth(a: Interval) -> Interval:
     return float(a[0] > 0 or a[1] < 0), float(a != (0.0, 0.0))

@@ -1,9 +1,9 @@
 """An exported model: one step over a whole sample, `(x, u) -> (x_next, y)`, with names, units and start state.
 
-A model steps from sub-step to sub-step and may read the input at the sub-step's end and the time (`Model.reads`). Here
-the sub-steps of a sample run one after the other, and y is the output at the first. The arguments stay plain: `u` is
-the input held over the sample; where the input is interpolated, the next sample's input follows it; where the equations
-read the time, it is the last entry of x and advances by itself.
+A model advances by sub-steps and may read the input at the sub-step's end and the time (`Model.reads`). Here the
+sub-steps of a sample run in turn, and y is the output at the first. `u` is the input, constant over the sample; if
+inputs are interpolated, it also holds the next sample's input. If the equations read the time, the time is the last
+entry of x and advances by itself.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, numbers, path_text, write_atomically
-from ..engine import calls_external
 from ..models import ParameterSet
+from ..simulators import calls_external
 from .c_code import make_unique, write_c
 from .fmu import FmuContent, write_fmu
 from .smoothing import enclose, smooth_kinks
@@ -35,8 +35,8 @@ INLINE = 4  # sub-steps written out one after the other; more become a loop, whi
 class CheckedStep(ca.Function):
     """`(x, u) -> (x_next, y)`, called with numbers or symbols of exactly these sizes, or with several columns of them.
 
-    A plain `casadi.Function` spreads one number over a whole state and takes a missing argument as zero, so a loop that
-    lost its state would go on unnoticed.
+    A plain `casadi.Function` broadcasts one number to a whole state and replaces a missing argument by zero, which
+    hides a loop that has lost its state.
 
     Raises
     ------
@@ -45,7 +45,7 @@ class CheckedStep(ca.Function):
     """
 
     def __call__(self, *given: Any, **named: Any) -> Any:
-        """Return the function's values, after the check."""
+        """Check the arguments and return the function's values."""
         arguments = dict(zip(("x", "u"), given, strict=False)) | named
         if len(given) + len(named) != 2 or set(arguments) != {"x", "u"}:
             raise InputError(f"A step of {self.name()} needs x and u; give both, as in step(x, u).")
@@ -59,7 +59,7 @@ class CheckedStep(ca.Function):
 
 
 def _shape(value: Any) -> tuple[int, ...] | None:
-    """Shape of an array of numbers or symbols; None for anything else."""
+    """Return the shape of an array of numbers or symbols; None for anything else."""
     if isinstance(value, ca.DM | ca.SX | ca.MX):
         return tuple(value.shape)
     try:
@@ -83,34 +83,34 @@ class Exported:
     Attributes
     ----------
     step : casadi.Function
-        x (n_x,) and u (n_u,) to x_next (n_x,) and y (n_y,); y belongs to the sample at which x and u are given. Called
-        from Python it refuses other sizes (`CheckedStep`).
+        x (n_x,) and u (n_u,) to x_next (n_x,) and y (n_y,); y belongs to the same sample as x and u. Called from Python
+        it refuses other sizes (`CheckedStep`).
     name : str
         The function's name.
     states : dict
         Name of each entry of x -> its index: linear states, then the operators' memory `memory[i,j]` of channel i and
-        threshold r[i,j]; of a simulator its states, then the laws' own, `<port>.q1`, and their memory,
-        `<port>.memory1`; `time`, in s, comes last where the equations read it.
+        threshold r[i,j]. For a simulator: its states, then the laws' states, `<port>.q1`, and their memory,
+        `<port>.memory1`. `time`, in s, comes last if the equations read it.
     thresholds : dict
-        Name of a memory -> half-width of its play or stop, in units of the signal that drives it.
+        Name of a memory -> half-width of its play or stop, in units of its driving signal.
     inputs, outputs : tuple of str
-        Names of the entries of u and y. Where inputs are interpolated, u also holds the next inputs, `<input>_next`.
+        Names of the entries of u and y. If inputs are interpolated, u also holds the next inputs, `<input>_next`.
     units : dict
-        Unit by name, where it is known.
+        Known units by name.
     dt : float
         Duration of a step, s.
     smooth : float
-        eps of the rounding (`smoothing`), 0 where min and max are exact.
+        eps of the rounding (`smoothing`); 0 for exact min and max.
     rhs : casadi.Function or None
-        `(x, u) -> (xdot, y)`, or `(x, u, t)`, where the model has equations in continuous time.
+        `(x, u) -> (xdot, y)`, or `(x, u, t) -> (xdot, y)`, if the model has equations in continuous time.
     start : array, (n_x,), or None
         State that `x0()` returns; None for zero.
     reads : tuple of str
-        Signals that `row` holds, in this order: "u" the inputs, "next" the inputs at the sub-step's end, "t" the time.
+        Signals in `row`, in this order: "u" the inputs, "next" the inputs at the sub-step's end, "t" the time.
     substeps : int
         Number of sub-steps in a step.
     memory_names : tuple of str
-        States that are memory of operators. The shift register of a delay is not among them: it moves at every step.
+        States that are memory of operators, without the shift registers of delays, which move at every step.
     parametric : casadi.Function
         An exact sub-step of scalar expressions, `(x, row, p) -> (x_next, y)`.
     parameters : ParameterSet
@@ -182,11 +182,11 @@ class Exported:
         return "next" in self.reads
 
     def x0(self) -> np.ndarray:
-        """Return the start state, (n_x,): `start` where it was given, else zero."""
+        """Return the start state, (n_x,): `start` if it was given, else zero."""
         return np.zeros(len(self.states)) if self.start is None else self.start.copy()
 
     def bound(self, x: Any, u: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Bound the difference of one smoothed step from x and u to the exact one: arrays (n_x,) and (n_y,).
+        """Bound the error of one smoothed step from x and u, in x_next (n_x,) and in y (n_y,).
 
         With plays or stops in a PI-LFR, y is off by at most `|D_yw| Σ_j w_j eps/2`, the linear states by at most
         `|B_w| Σ_j w_j eps/2`, and the memory of a play by at most eps/2. See `smoothing`.
@@ -203,17 +203,15 @@ class Exported:
         one, own = self.one, len(x) - self.timed
         rows = self._rows(u, x[own] if self.timed else 0.0, lambda *columns: np.hstack([np.zeros(0), *columns]))
         exact, enclosure = x[:own], [(v, v) for v in x[:own]]
-        output_error = np.zeros(0)
-        for i, row in enumerate(rows):
-            found = enclose(one, self.smooth, enclosure, [(v, v) for v in row])
-            true = [np.asarray(part).ravel() for part in one(exact, row)]
-            if i == 0:
-                output_error = _largest_error(found[1], true[1])
-            enclosure, exact = found[0], true[0]
-        return np.append(_largest_error(enclosure, exact), np.zeros(int(self.timed))), output_error
+        output_errors = []
+        for row in rows:
+            enclosure, y_enclosure = enclose(one, self.smooth, enclosure, [(v, v) for v in row])
+            exact, y_exact = (np.asarray(part).ravel() for part in one(exact, row))
+            output_errors.append(_largest_error(y_enclosure, y_exact))
+        return np.append(_largest_error(enclosure, exact), np.zeros(int(self.timed))), output_errors[0]
 
     def _rows(self, u: Any, t: Any, stack: Any) -> list[Any]:
-        """List the signals that each sub-step reads, for inputs u and time t; `stack` joins columns."""
+        """List the rows that the sub-steps read, for inputs u and time t; `stack` joins signals."""
         n, count = self.substeps, len(self.inputs) // 2 if self.interpolated else len(self.inputs)
         now, after = u[:count], u[count:]
         out = []
@@ -234,7 +232,7 @@ class Exported:
             )
 
     def names(self) -> dict[str, Any]:
-        """Return everything but the function as plain JSON."""
+        """Return names, units, step and start state as plain JSON."""
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -251,9 +249,9 @@ class Exported:
         }
 
     def serialize(self, path: str | os.PathLike[str]) -> Path:
-        """Write the function for `casadi.Function.load`, and names, units, dt and start state as JSON beside it.
+        """Write the function for `casadi.Function.load`, and names, units, dt and start state to `<path>.names.json`.
 
-        Both can be read without this package. The second file is called `<path>.names.json`.
+        Both files can be read without this package.
 
         Raises
         ------
@@ -289,10 +287,10 @@ class Exported:
     def to_fmu(self, path: str | os.PathLike[str], fmi: str = "2.0") -> Path:
         """Write a co-simulation FMU for this platform, with its C source inside.
 
-        A communication step is one sample of `dt` seconds or several. Parameters that were held are `fixed` in the FMU,
-        the others `tunable` within their bounds. States are the variables `state.<name>`, whose start values can be set
-        before the initialisation; the memory of hysteresis is among them, and saved with the FMU's state. Where inputs
-        are interpolated, `der(<input>)` is the slope of an input from this sample to the next one; in FMI 2.0
+        A communication step is one sample of `dt` seconds, or several. Fixed parameters of the model are `fixed` in the
+        FMU; the others are `tunable` within their bounds. States, with the memory of hysteresis, are the variables
+        `state.<name>`: their start values can be set before the initialisation, and the FMU's state saves them. If
+        inputs are interpolated, `der(<input>)` is the slope of an input from this sample to the next one; in FMI 2.0
         `fmi2SetRealInputDerivatives` sets it too.
 
         Parameters
@@ -354,6 +352,6 @@ class Exported:
 
 
 def _largest_error(enclosure: list[tuple[float, float]], exact: np.ndarray) -> np.ndarray:
-    """Largest distance of an enclosure's ends from the exact values."""
+    """Compute the largest distance of an enclosure's ends from the exact values."""
     ends = np.array(enclosure, dtype=float).reshape(-1, 2)
     return np.maximum(np.maximum(ends[:, 1] - exact, exact - ends[:, 0]), 0.0)

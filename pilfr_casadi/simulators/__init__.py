@@ -1,12 +1,12 @@
 """The user's equations with ports for missing physics.
 
-`ports` are the places where laws may stand. `equations` evaluates the equations with the laws in their ports, and
-`integration` discretises them to a `Model`. `simulator` holds the class `Simulator` and the state in which its laws
-begin at rest. `domains` infers a port's physical domain. `adapters` accept a Python file (`user_file`), a state space
-or a fitted model in its place. `fmu` wraps a functional mock-up unit as a simulator (`fmu_description`,
-`fmu_instance`), and `mujoco` writes the equations of a MuJoCo model. `numpy_function` makes a simulator from a NumPy
-function: `tracing` calls the function with `symbols` to obtain its equations. A function that cannot be traced is
-called with numbers (`black_box`). `external` lets equations call such a program.
+`ports` are the places where laws may stand. `equations` evaluates the equations and their ports, and `integration`
+closes them with laws and discretises them to a `Model`. `simulator` holds the class `Simulator`. `domains` infers a
+port's physical domain. `adapters` convert a Python file (`user_file`), a state space or a fitted model to a simulator.
+`fmu` wraps a functional mock-up unit as a simulator (`fmu_description`, `fmu_instance`, for co-simulation
+`fmu_cosimulation`), and `mujoco` writes the equations of a MuJoCo model. `numpy_function` makes a simulator from a
+NumPy function: `tracing` calls the function with `symbols` to obtain its equations. A function that cannot be traced
+is called with numbers (`black_box`). `external` lets equations call such a program.
 """
 
 from typing import TYPE_CHECKING
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     )
     from .black_box import Numeric as Numeric
     from .domains import (
-        DOMAINS as DOMAINS,
         MECHANICAL as MECHANICAL,
         UNKNOWN as UNKNOWN,
         infer_domain as infer_domain,
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from .equations import Named as Named
     from .external import (
         PythonFunction as PythonFunction,
+        calls_external as calls_external,
         leaves as leaves,
         units as units,
     )

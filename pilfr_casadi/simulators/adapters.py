@@ -1,9 +1,9 @@
 """Simulators from other sources: a user's Python file, a `control.StateSpace`, and a fitted PI-LFR.
 
 A state space becomes equations whose matrix entries are parameters: entries that are exactly 0, 1 or -1 are structure
-and stay fixed, the others may move within a factor of two. A fitted model runs in discrete time as it is, with its
-memory among the states and its parameters fixed, because it has been fitted already; only a gain near one and an offset
-of each output are free.
+and stay constant; the others may change within a factor of two. A fitted model runs in discrete time, with its memory
+among the states and its parameters fixed, because it has been fitted already; only a gain near one and an offset of
+each output are free.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from .equations import Named
 from .simulator import Simulator
 from .user_file import user_variable
 
-FACTOR = 2.0  # by which an entry of a state space may move
-GAIN = (0.7, 1.3)  # bounds of the gain of a fitted model's output
-STATED_STEP = 1e-3  # relative difference up to which a model's stated step is that of a recording: three digits of it
+FACTOR = 2.0  # by which an entry of a state space may change
+GAIN_BOUNDS = (0.7, 1.3)  # of the gain of a fitted model's output
+STEP_TOLERANCE = 1e-3  # relative difference of two equal steps: models state three digits
 VARIABLE = "simulator"  # name of the variable that a simulator file sets
 
 
 def as_simulator(thing: Any, recordings: Sequence[Recording] = ()) -> Simulator:
-    """Make a simulator from an object that can stand for one.
+    """Convert a simulator, a linear system or a fitted model to a simulator.
 
     Parameters
     ----------
     thing : Simulator, control.StateSpace, control.TransferFunction, Fit or Model
-        Signals without names get those of the recordings.
+        Unnamed signals get the names of the recordings' signals.
     recordings : sequence of Recording
-        Their step is compared with the step of a discrete-time system.
+        Recordings whose step a discrete-time system must have.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def as_simulator(thing: Any, recordings: Sequence[Recording] = ()) -> Simulator:
 
 def _check_step(dt: float, recordings: Sequence[Recording]) -> None:
     for r in recordings:
-        if abs(r.dt / dt - 1) > STATED_STEP:
+        if abs(r.dt / dt - 1) > STEP_TOLERANCE:
             raise InputError(f"The model's step is {dt:g} s, that of {r.label} {r.dt:g} s; resample the recording.")
 
 
@@ -77,9 +77,9 @@ def _from_model(
         raise InputError("The model was made from a simulator; give the simulator itself.")
     own, parameters = model.parameters, {k: Parameter(p.value, p.unit, fixed=True) for k, p in model.parameters.items()}
     for name in model.outputs:
-        seen = [np.std(r.y[:, r.outputs.index(name)]) for r in recordings if name in r.outputs]
-        reach = float(max(seen, default=np.inf))
-        parameters[f"gain_{name}"] = Parameter(1.0, bounds=GAIN)
+        deviations = [np.std(r.y[:, r.outputs.index(name)]) for r in recordings if name in r.outputs]
+        reach = float(max(deviations, default=np.inf))
+        parameters[f"gain_{name}"] = Parameter(1.0, bounds=GAIN_BOUNDS)
         parameters[f"offset_{name}"] = Parameter(0.0, bounds=(-reach, reach))
     states = tuple(model.states)
     states += tuple(f"memory{i + 1}" for i in range(model.n_state - len(states)))
@@ -116,9 +116,9 @@ def _from_system(system: Any, recordings: Sequence[Recording]) -> Simulator:
     if discrete and system.dt is not True:
         _check_step(float(system.dt), recordings)
     first = recordings[0] if recordings else None
-    inputs = _names(system.input_labels, "u", first.inputs if first else ())
-    outputs = _names(system.output_labels, "y", first.outputs if first else ())
-    states = _names(system.state_labels, "x", ())
+    inputs = _choose_names(system.input_labels, "u", first.inputs if first else ())
+    outputs = _choose_names(system.output_labels, "y", first.outputs if first else ())
+    states = _choose_names(system.state_labels, "x", ())
     return linear_simulator(matrices, states, inputs, outputs, discrete)
 
 
@@ -131,18 +131,14 @@ def linear_simulator(
 ) -> Simulator:
     """Make `ẋ = A x + B u, y = C x + D u` (or `x⁺`) with a parameter for every entry that is not 0, 1 or -1."""
     parameters: dict[str, Parameter] = {}
-    entries: dict[str, list[list[Any]]] = {}
+    entries: dict[str, np.ndarray] = {}  # numbers, or names of parameters
     for letter, matrix in matrices.items():
-        entries[letter] = []
-        for i, row in enumerate(np.asarray(matrix, dtype=float)):
-            entries[letter].append([])
-            for j, value in enumerate(row):
-                if value in (0.0, 1.0, -1.0):
-                    entries[letter][i].append(float(value))
-                    continue
+        entries[letter] = np.array(matrix, dtype=object)
+        for (i, j), value in np.ndenumerate(np.asarray(matrix, dtype=float)):
+            if value not in (0.0, 1.0, -1.0):
                 name = f"{letter}{i + 1}{j + 1}" if max(matrix.shape) < 10 else f"{letter}{i + 1}_{j + 1}"
-                parameters[name] = Parameter(value, bounds=_bounds_around(float(value), letter == "A" and discrete))
-                entries[letter][i].append(name)
+                parameters[name] = Parameter(value, bounds=_bound_entry(value, letter == "A" and discrete))
+                entries[letter][i, j] = name
 
     def product(letter: str, i: int, symbols: list[Any], p: Named) -> Any:
         total: Any = 0
@@ -162,8 +158,8 @@ def linear_simulator(
     return Simulator(dynamics, outputs_of, states, inputs, parameters, discrete=discrete, hold=hold)
 
 
-def _bounds_around(value: float, pole: bool) -> tuple[float, float]:
-    """Bound an entry by a factor of two; an entry of a discrete A also by half its distance to one."""
+def _bound_entry(value: float, pole: bool) -> tuple[float, float]:
+    """Bound an entry by a factor of two; bound an entry of a discrete A also by half its distance to one."""
     if pole and abs(value) < 1:
         reach = min(abs(value) * (FACTOR - 1), max(0.5 * (1 - abs(value)), 1e-3))
         return value - reach, value + reach
@@ -171,8 +167,8 @@ def _bounds_around(value: float, pole: bool) -> tuple[float, float]:
     return min(ends), max(ends)
 
 
-def _names(labels: Sequence[str], letter: str, recorded: tuple[str, ...]) -> tuple[str, ...]:
-    """Give the system's own names; instead of u[0], u[1], ... those of the recordings, else u or u1, u2, ..."""
+def _choose_names(labels: Sequence[str], letter: str, recorded: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the system's own names; replace u[0], u[1], ... by the recordings' names, or by u or u1, u2, ..."""
     own = tuple(str(label) for label in labels)
     if own != tuple(f"{letter}[{i}]" for i in range(len(own))):
         return own
@@ -188,7 +184,7 @@ def load_simulator(path: str | os.PathLike[str]) -> Simulator:
     ----------
     path : path
         A Python file that sets the variable `simulator` to a `Simulator` (or to what `as_simulator` accepts). It may
-        import modules that lie beside it.
+        import modules of the same folder.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Python functions without symbols as equations: they are called with numbers in every evaluation (`external`)."""
+"""Python functions as equations without symbols: every evaluation calls them with numbers (`external`)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .._base import InputError
 from ..models import Named
 from .external import NOMINAL, PythonFunction, call_external, equal_state, external
 
-KEPT_DERIVATIVES = 16  # matrices of derivatives that are kept: those of the stages of a step, for all directions
+KEPT_JACOBIANS = 16  # Jacobians in the cache: all directions of a step's stages reuse them
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,10 @@ class Numeric:
     ----------
     jacobian : callable, optional
         `jacobian(t, x, u, p)` returns the derivatives of the function's values, one row each, by x, by u, and by the
-        entries of p in the order of the parameters. By default they are differences.
+        entries of p in the order of the parameters. By default differences replace it.
     nominal : mapping, optional
-        Size of a state, an input or a parameter by name, by which differences are scaled where its value is smaller;
-        by default 0.001.
+        Size of a state, an input or a parameter by name, which scales its differences if its value is smaller; by
+        default 0.001.
     """
 
     jacobian: Callable[..., Any] | None = None
@@ -35,14 +35,14 @@ class Numeric:
 
 
 class BlackBox:
-    """The dynamics or outputs of a simulator that are a function of `z = (t, x, u, p)`.
+    """The dynamics or outputs of a simulator as a function of `z = (t, x, u, p)` that is called with numbers.
 
     Parameters
     ----------
     function : callable
         From z (n,) to the values, (m,).
     called : str
-        What messages call it.
+        Its name in messages.
     rows : tuple of str
         Names of its values.
     names : sequence of tuples of str
@@ -50,7 +50,7 @@ class BlackBox:
     jacobian : callable, optional
         From z to the derivatives by x, u and p, shape (m, n - 1).
     nominal : array, (n,)
-        Sizes of z, by which differences are scaled where it is smaller.
+        Sizes of z, which scale the differences if z is smaller.
     """
 
     def __init__(
@@ -62,21 +62,21 @@ class BlackBox:
         jacobian: Callable[[np.ndarray], np.ndarray] | None,
         nominal: np.ndarray,
     ) -> None:
-        self._made_from = function, called, rows, names, jacobian, nominal
+        self._arguments = function, called, rows, names, jacobian, nominal
         self.called, self.rows, self.names = called, rows, names
         self.leaf = PythonFunction(function, (len(nominal),), len(rows))
-        self.slope = None if jacobian is None else _slope(jacobian, len(nominal), len(rows))
+        self.slope = None if jacobian is None else _make_slope(jacobian, len(nominal), len(rows))
         by_slope = None if self.slope is None else (lambda z, s: call_external(self.slope, z, s))
         self.function = external(lambda z: call_external(self.leaf, z), nominal, len(rows), by_slope)
         self.points: list[tuple[np.ndarray, np.ndarray]] = []  # z and the values there
         self.equal: dict[str, str] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Make it again in another process, where nothing has been called yet."""
-        return BlackBox, self._made_from, {"points": self.points, "equal": self.equal}
+        """Rebuild it in another process, where nothing has been called yet."""
+        return BlackBox, self._arguments, {"points": self.points, "equal": self.equal}
 
     def find_equal_states(self) -> None:
-        """Note the values that equal a state at all `points`; they are not asked for any more."""
+        """Note the values that equal a state at all `points`; the equations then use the state instead."""
         z, found = (np.array(part) for part in zip(*self.points, strict=True))
         states = z[:, 1 : 1 + len(self.names[0])]
         for row, values in zip(self.rows, found.T, strict=True):
@@ -85,9 +85,9 @@ class BlackBox:
 
     @property
     def note(self) -> str:
-        """How often the function has been called, and its first failure."""
-        by = "differences" if self.slope is None else f"its Jacobian, called {self.slope.calls} times"
-        text = f"{self.called}: called {self.leaf.calls} times; derivatives by {by}"
+        """Number of calls and first failure, in words."""
+        source = "differences" if self.slope is None else f"its Jacobian, called {self.slope.calls} times"
+        text = f"{self.called}: called {self.leaf.calls} times; derivatives by {source}"
         return text if self.leaf.failure is None else f"{text}; it failed first with {self.leaf.failure!r}"
 
     def __call__(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
@@ -97,26 +97,26 @@ class BlackBox:
         return {n: x[self.equal[n]] if n in self.equal else found[i] for i, n in enumerate(self.rows)}
 
 
-def _slope(jacobian: Callable[[np.ndarray], np.ndarray], n: int, m: int) -> PythonFunction:
-    """Make `(z, s) -> J(z) s`; the derivative by time is left out."""
-    kept: dict[bytes, np.ndarray] = {}
+def _make_slope(jacobian: Callable[[np.ndarray], np.ndarray], n: int, m: int) -> PythonFunction:
+    """Make `(z, s) -> J(z) s` without the derivative by time; recent Jacobians are cached."""
+    cache: dict[bytes, np.ndarray] = {}
 
     def along(z: np.ndarray, s: np.ndarray) -> np.ndarray:
         key = z.tobytes()
-        if key not in kept:
+        if key not in cache:
             found = np.asarray(jacobian(z), dtype=float)
             if found.shape != (m, n - 1):
                 raise InputError(f"The Jacobian has the shape {found.shape}; give {(m, n - 1)}: columns of x, u and p.")
-            while len(kept) >= KEPT_DERIVATIVES:
-                kept.pop(next(iter(kept)), None)
-            kept[key] = found
-        return kept[key] @ s[1:]
+            while len(cache) >= KEPT_JACOBIANS:
+                cache.pop(next(iter(cache)), None)
+            cache[key] = found
+        return cache[key] @ s[1:]
 
     return PythonFunction(along, (n, n), m)
 
 
 def nominal_sizes(given: Mapping[str, float], names: Sequence[str], sizes: Sequence[int]) -> np.ndarray:
-    """Make the sizes of z from sizes by name; `sizes` are the numbers of entries of all names."""
+    """Stack the sizes of z from sizes by name; `sizes` are the numbers of entries of all names."""
     for name, value in given.items():
         if name not in names or not isinstance(value, int | float) or not 0 < value < np.inf:
             raise InputError(

@@ -1,11 +1,11 @@
 """The physical domain of a port: mechanical, thermal, electrical or fluid, inferred from its units.
 
-The unit of the hidden force and that of the local coordinate each allow some domains; the port belongs to the one
+The units of the hidden force and of the local coordinate each allow some domains; the port belongs to the one
 domain that both allow. Dimensions decide, not spelling (Karnopp, Margolis & Rosenberg 2012, System Dynamics):
 a temperature is thermal, a unit with amperes is electrical, a volume or mass flow is fluid, a force or a torque is
 mechanical. A pressure or a length may be fluid or mechanical, and a number, a power or a unit that is not known may be
-anything: N over m is mechanical, m^3/s over m is fluid, W over K is thermal, V over the state of charge is electrical.
-Without units, or if they contradict each other, the domain is unknown.
+anything. So N over m is mechanical, m^3/s over m is fluid, W over K is thermal, V over the state of charge is
+electrical. Without units, or if they contradict each other, the domain is unknown.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MECHANICAL = "mechanical"
 DOMAINS = (MECHANICAL, "thermal", "electrical", "fluid")
 UNKNOWN = "unknown"
 
-_TURNING = {"rad", "deg", "rpm"}  # units that occur in mechanics alone
+_ROTATION_UNITS = {"rad", "deg", "rpm"}  # occur in mechanics alone
 
 # domains of the dimensions that are neither thermal nor electrical; others may be anything
 _DOMAINS_OF: dict[tuple[int, ...], tuple[str, ...]] = {
@@ -50,7 +50,7 @@ def infer_domain(*units: str) -> str:
 
 
 def may_convert(unit: str, other: str) -> bool:
-    """Tell whether a unit may be converted to another: of the same dimension, or not known.
+    """Tell whether a unit may be converted to another: both have the same dimension, or one is unknown.
 
     >>> may_convert("mV", "V"), may_convert("A", "V"), may_convert("", "V")
     (True, False, True)
@@ -60,7 +60,7 @@ def may_convert(unit: str, other: str) -> bool:
 
 
 def may_be_speed(unit: str) -> bool:
-    """Tell whether a unit may be that of a speed: of a length, an angle or a count per time, or not given.
+    """Tell whether a unit may belong to a speed: a length, an angle or a count per time, or not given.
 
     >>> may_be_speed("rad/s"), may_be_speed("counts/s"), may_be_speed(""), may_be_speed("mm"), may_be_speed("level")
     (True, True, True, False, False)
@@ -79,21 +79,21 @@ def is_motion(unit: str) -> bool:
     if size is None:
         return False
     plain = size[0] == size[3] == size[4] == 0 and size[2] in (0, -1, -2)
-    return plain and (size[1] == 1 or (size[1] == 0 and bool(_TURNING & set(symbols(unit)))))
+    return plain and (size[1] == 1 or (size[1] == 0 and bool(_ROTATION_UNITS & set(symbols(unit)))))
 
 
 def common_domain(domains: Iterable[str]) -> str:
-    """Return the domain of all whose domain is known; unknown if there is none, or more than one."""
+    """Return the one known domain among several; unknown if there is none, or more than one."""
     found = set(domains) - {UNKNOWN}
     return found.pop() if len(found) == 1 else UNKNOWN
 
 
 def _allowed_domains(unit: str) -> tuple[str, ...]:
-    """Domains in which a quantity of a unit may occur."""
+    """List the domains in which a quantity with a unit may occur."""
     size = dimension(unit)
     if size is None:
         return DOMAINS
-    if _TURNING & set(symbols(unit)):
+    if _ROTATION_UNITS & set(symbols(unit)):
         return ("mechanical",)
     if size[4]:
         return ("thermal",)

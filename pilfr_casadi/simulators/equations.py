@@ -21,6 +21,7 @@ import numpy as np
 from .._base import InputError, listed, whole
 from ..models import Named, Parameter, ParameterSet
 from .domains import MECHANICAL, UNKNOWN, common_domain, is_motion, may_be_speed
+from .external import calls_external
 from .ports import (
     ACTUATOR,
     BUILT_IN,
@@ -35,12 +36,12 @@ from .ports import (
     split_port,
 )
 
-EQUAL_DEPTH = 5  # to which two expressions are compared
+EQUAL_DEPTH = 5  # levels of two expressions that are compared
 COMPARED_POINTS = 3  # random points at which expressions are compared
 
 
 def call(function: Expression, name: str, **available: Any) -> Any:
-    """Call a user's function, called `name` in messages, with those of the available symbols that it names."""
+    """Call a user's function with the available symbols that its arguments name; messages call it `name`."""
     try:
         arguments = inspect.signature(function).parameters.items()
     except (TypeError, ValueError):
@@ -86,26 +87,25 @@ class Equations:
             if not callable(getattr(self, kind)):
                 raise InputError(f"The simulator's {kind} are {getattr(self, kind)!r}; give a function of x, u and p.")
         for kind in ("states", "inputs"):
-            object.__setattr__(self, kind, distinct_names(getattr(self, kind), kind))
+            object.__setattr__(self, kind, check_names(getattr(self, kind), kind))
         if self.hold not in (None, "zero", "linear"):
             raise InputError(f"hold = {self.hold!r} was given; use 'zero', 'linear' or None.")
         object.__setattr__(self, "substeps", whole(self.substeps, "substeps", 1))
         if not isinstance(self.units, Mapping):
             raise InputError(f"The simulator's units are {self.units!r}; give {{name: unit}}.")
-        object.__setattr__(self, "parameters", parameter_set(self.parameters))
-        object.__setattr__(self, "ports", _checked_ports(self.ports))
+        object.__setattr__(self, "parameters", check_parameters(self.parameters))
+        object.__setattr__(self, "ports", _check_ports(self.ports))
         x, u, p, t = self.symbols()
-        derivatives = ca.vertsplit(self.derivatives(x, u, p, t)) if self.states else ()
-        found = {**dict(zip(self.states, derivatives, strict=True)), **self.measured(x, u, p, t)}
-        _check_expressions(found, [*x._values.values(), *u._values.values(), *p._values.values(), t])
+        found = self.by_state(self.derivatives(x, u, p, t)) | self.measured(x, u, p, t)
+        _check_expressions(found, ca.vertcat(stack(x, u, p), t))
         for port in self.ports:
             self.into(port, x, u, p, t)
             self.across(port, x, u, p, t)
             self._check_term(port, x, u, p, t)
         if self.observer is not None:
-            object.__setattr__(self, "observer", self._checked_gain(self.observer))
+            object.__setattr__(self, "observer", self._check_gain(self.observer))
 
-    def _checked_gain(self, given: Any) -> np.ndarray:
+    def _check_gain(self, given: Any) -> np.ndarray:
         wanted = len(self.states), len(self.output_names)
         try:
             gain = np.asarray(given, dtype=float)
@@ -118,18 +118,18 @@ class Equations:
             )
         return gain
 
-    def _with(self, **changes: Any) -> Self:
-        """Copy with other elements or values of parameters, which leave the equations as they were checked."""
+    def _copy_with(self, **changes: Any) -> Self:
+        """Copy without new checks, for changes of elements or values that keep the equations."""
         copy = object.__new__(type(self))
         copy.__dict__.update(self.__dict__, **changes)
         return copy
 
     def with_elements(self, elements: tuple[Placed, ...]) -> Self:
-        """Copy with other laws in place of its own; they have the same parameters."""
-        return self._with(elements=elements)
+        """Copy with other laws of the same parameters in place of its own."""
+        return self._copy_with(elements=elements)
 
     def with_ports(self, ports: tuple[Port, ...]) -> Self:
-        """Copy with other inner ports, such as those of `undeclared`."""
+        """Copy with other inner ports, such as `undeclared`; its cached properties are evaluated anew."""
         copy = object.__new__(type(self))
         copy.__dict__.update({f.name: getattr(self, f.name) for f in fields(self)}, ports=ports)
         return copy
@@ -153,18 +153,31 @@ class Equations:
         found = call(self.dynamics, "simulator's dynamics", x=x, u=u, p=p, t=t)
         if not isinstance(found, Mapping):
             raise InputError(f"The simulator's dynamics returned {type(found).__name__}; return {{state: derivative}}.")
-        return ca.vertcat(*_row(found, self.states, "dynamics", "derivative"))
+        for name in self.states:
+            if name not in found:
+                raise InputError(f"The simulator's dynamics give no derivative for the state {name!r}; add it.")
+        for name in found:
+            if name not in self.states:
+                raise InputError(
+                    f"The simulator's dynamics give {name!r}, which is not a state; there are {', '.join(self.states)}."
+                )
+        checked = _as_scalars(found, "dynamics", "derivative")
+        return ca.vertcat(*(checked[name] for name in self.states))
+
+    def by_state(self, vector: Any) -> dict[str, Any]:
+        """Split a vector (n_x, 1) by state."""
+        return dict(zip(self.states, ca.vertsplit(vector), strict=True))
 
     def measured(self, x: Named, u: Named, p: Named, t: Any, dx: Any = None) -> dict[str, Any]:
-        """Evaluate the outputs by name, without laws; `dx` are the states' derivatives, by default without laws."""
+        """Evaluate the outputs by name, without laws; `dx` (n_x, 1) replaces the derivatives without laws."""
         more = {}
         if self._reads_rates:
             dx = self.derivatives(x, u, p, t) if dx is None else dx
-            more["dx"] = Named("derivative", dict(zip(self.states, ca.vertsplit(dx), strict=True)))
+            more["dx"] = Named("derivative", self.by_state(dx))
         found = call(self.outputs, "simulator's outputs", x=x, u=u, p=p, t=t, **more)
         if not isinstance(found, Mapping) or not found:
             raise InputError("The simulator's outputs must be a dict {output: expression} with at least one entry.")
-        return dict(zip(found, _row(found, tuple(found), "outputs", "expression"), strict=True))
+        return _as_scalars(found, "outputs", "expression")
 
     @cached_property
     def output_names(self) -> tuple[str, ...]:
@@ -181,10 +194,10 @@ class Equations:
         except (TypeError, ValueError):
             return False
 
-    def _rates_in_outputs(self, x: Named, u: Named, p: Named, t: Any) -> Any:
-        """Evaluate what each output reads of each state's derivative, (n_y, n_x)."""
+    def _derivative_feedthrough(self, x: Named, u: Named, p: Named, t: Any) -> Any:
+        """Evaluate the factor of each state's derivative in each output, (n_y, n_x)."""
         if not self._reads_rates:
-            return ca.sparsify(ca.SX(self._derivatives_measured))
+            return ca.sparsify(ca.SX(self._accelerometer_gains))
         dx = ca.SX.sym("dx", len(self.states))
         outputs = ca.vertcat(*self.measured(x, u, p, t, dx).values())
         factors = ca.jacobian(outputs, dx)
@@ -193,26 +206,25 @@ class Equations:
         return factors
 
     @cached_property
-    def _derivatives_measured(self) -> np.ndarray:
-        """Find outputs that are a positive multiple of a state's derivative, as accelerometers measure; (n_y, n_x).
+    def _accelerometer_gains(self) -> np.ndarray:
+        """Positive factors by which outputs are multiples of states' derivatives, (n_y, n_x); zero for no multiple.
 
-        They are compared at random points. A derivative that depends on a single state or input is left out: its
-        multiple may be that state itself.
+        Random points decide. A derivative that depends on a single state or input is left out, because its multiple
+        may be that state itself.
         """
         n_x, n_y = len(self.states), len(self.output_names)
         out = np.zeros((n_y, n_x))
         if self.discrete or not n_x:
             return out
         x, u, p, t = self.symbols()
-        moving = ca.vertcat(*x._values.values(), *u._values.values())
-        known = ca.vertcat(*(ca.vec(v) for v in (moving, *p._values.values())), t)
+        moving = stack(x, u)
         f, y = self.derivatives(x, u, p, t), ca.vertcat(*self.measured(x, u, p, t).values())
-        both = ca.Function("both", [known], [f, y])
-        if any(both.instruction_id(k) == ca.OP_CALL for k in range(both.n_instructions())):
-            return out  # the user's program, which may fail at random points
-        rates, shown = _at_random_points(both)
+        both = ca.Function("both", [ca.vertcat(moving, stack(p), t)], [f, y])
+        if calls_external(both):
+            return out  # the user's program may fail at random points
+        rates, outputs = _evaluate_at_random_points(both)
         with np.errstate(all="ignore"):
-            ratios = shown[:, :, None] / rates[:, None, :]
+            ratios = outputs[:, :, None] / rates[:, None, :]
         same = np.all(np.isclose(ratios, ratios[0], rtol=1e-9, atol=0.0), axis=0) & (ratios[0] > 0)
         rich = np.array([ca.jacobian(f[i], moving).nnz() > 1 for i in range(n_x)])
         for i, j in zip(*np.nonzero(same & rich), strict=True):
@@ -226,7 +238,7 @@ class Equations:
             what = f"signal {name!r} of port {port.name!r}"
             if name in self.inputs:
                 raise InputError(f"The {what} has the name of an input; give it another one.")
-            found[name] = _scalar(call(signal, what, x=x, u=u, p=p, t=t), what)
+            found[name] = _as_scalar(call(signal, what, x=x, u=u, p=p, t=t), what)
         return found
 
     def into(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
@@ -239,53 +251,54 @@ class Equations:
         for target in found:
             if target not in known:
                 raise InputError(f"Port {port.name!r} goes into {target!r}; there are {', '.join(known)}.")
-        given = dict(zip(found, _row(found, tuple(found), f"port {port.name!r}", "factor"), strict=True))
-        moved = ca.vertcat(*(given.get(state, 0.0) for state in self.states))
-        shown = ca.vertsplit(ca.mtimes(self._rates_in_outputs(x, u, p, t), moved)) if self.states else []
-        rates = dict(zip(self.output_names, shown, strict=bool(shown)))
-        return given | {k: v for k, v in rates.items() if k not in given and not ca.SX(v).is_zero()}
+        given = _as_scalars(found, f"port {port.name!r}", "factor")
+        through = ca.mtimes(self._derivative_feedthrough(x, u, p, t), self.state_factors(given))
+        rates = dict(zip(self.output_names, ca.vertsplit(through), strict=True))
+        return given | {k: v for k, v in rates.items() if k not in given and not v.is_zero()}
+
+    def state_factors(self, factors: Mapping[str, Any]) -> Any:
+        """Select the factors of w in the derivatives, a vector (n_x, 1); zero for states that w does not enter."""
+        return ca.vertcat(ca.SX(0, 1), *(factors.get(state, 0.0) for state in self.states))
 
     def across(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Any:
         """Evaluate the local coordinate z."""
         name = f"`across` of port {port.name!r}"
-        return _scalar(call(port.across, name, x=x, u=u, p=p, t=t), name)
+        return _as_scalar(call(port.across, name, x=x, u=u, p=p, t=t), name)
 
     def term(self, port: Port, z: Any, dz: Any, x: Named, u: Named, p: Named) -> Any:
         """Evaluate a port's term at another coordinate and rate."""
         assert port.term is not None
         name = f"`term` of port {port.name!r}"
-        return _scalar(call(port.term, name, z=ca.SX(z), dz=ca.SX(dz), x=x, u=u, p=p), name)
+        return _as_scalar(call(port.term, name, z=ca.SX(z), dz=ca.SX(dz), x=x, u=u, p=p), name)
 
     def term_parameters(self, name: str) -> tuple[str, ...]:
-        """List the parameters that the term of a port reads."""
+        """List the parameters that a port's term depends on."""
         x, u, p, _ = self.symbols()
         term = self.term(self.port(name), ca.SX.sym("z"), ca.SX.sym("dz"), x, u, p)
         return tuple(name for name in self.parameters if ca.depends_on(term, ca.vec(ca.SX(p[name]))))
 
     def rate(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Any:
-        """Evaluate the rate dz/dt of a port inside the equations, inputs held."""
+        """Evaluate the rate dz/dt of a port inside the equations, with constant inputs."""
         if port.rate is not None:
-            return _scalar(call(port.rate, f"`rate` of port {port.name!r}", x=x, u=u, p=p, t=t), "rate")
-        states = ca.vertcat(*(x[name] for name in self.states))
-        return ca.jtimes(self.across(port, x, u, p, t), states, self.derivatives(x, u, p, t))
+            return _as_scalar(call(port.rate, f"`rate` of port {port.name!r}", x=x, u=u, p=p, t=t), "rate")
+        return ca.jtimes(self.across(port, x, u, p, t), stack(x), self.derivatives(x, u, p, t))
 
     def _check_term(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> None:
-        """Refuse a term that the equations hold with the other sign: its symbols change them the other way."""
+        """Refuse a term with the opposite sign in the equations: its slopes by all symbols are then opposite too."""
         if port.term is None:
             return
-        known = ca.vertcat(*(ca.vec(v) for names in (x, u, p) for v in names._values.values()), t)
+        known = ca.vertcat(stack(x, u, p), t)
         term = self.term(port, self.across(port, x, u, p, t), self.rate(port, x, u, p, t), x, u, p)
         name, factor = next(iter(self.into(port, x, u, p, t).items()))
-        held = dict(zip(self.states, ca.vertsplit(self.derivatives(x, u, p, t)), strict=True)) if self.states else {}
-        entire = held[name] if name in held else self.measured(x, u, p, t)[name]
+        entire = (self.measured(x, u, p, t) | self.by_state(self.derivatives(x, u, p, t)))[name]
         slopes = ca.Function("slopes", [known], [ca.jacobian(v, known) for v in (entire, factor * term, factor)])
-        all_of, own, scale = _at_random_points(slopes)
+        total, own, scale = _evaluate_at_random_points(slopes)
         moving = np.any(own != 0, axis=0) & ~np.any(scale != 0, axis=0)
-        same, opposite = (np.any(np.all(np.isclose(all_of, sign * own, atol=0.0), axis=0) & moving) for sign in (1, -1))
+        same, opposite = (np.any(np.all(np.isclose(total, sign * own, atol=0.0), axis=0) & moving) for sign in (1, -1))
         if opposite and not same:
             raise InputError(
                 f"The equations hold the term of port {port.name!r} with the other sign; give it so that `into` times "
-                "the term stands in them."
+                "the term is part of them."
             )
 
     def shown_states(self, port: Port) -> tuple[str, str] | None:
@@ -313,7 +326,7 @@ class Equations:
     def port(self, name: str) -> Port:
         """Find a port by name: declared, `actuator:<input>`, `sensor:<output>`, `equation:<state>`, `parameter:<name>`.
 
-        Parameters are not among `all_ports`: a law there adds to a number of the equations, and no signal passes it.
+        Parameters are not among `all_ports`: a law there changes a parameter's value, not a signal.
         """
         for port in self.all_ports():
             if port.name == name:
@@ -331,20 +344,19 @@ class Equations:
 
     @cached_property
     def _every_port(self) -> tuple[Port, ...]:
-        inner = self.ports or (() if self.discrete else tuple(map(self._equation, self.states)))
-        domain = common_domain(port.domain for port in inner)
+        inner = self.ports or (() if self.discrete else tuple(map(self._equation_port, self.states)))
+        domain = common_domain(port.domain for port in inner)  # also of actuators: a voltage is a signal in all domains
         if not self.ports:
             inner = tuple(replace(port, domain=domain) if port.domain == UNKNOWN else port for port in inner)
-        inner = self._with_drives(tuple(map(self._with_speed, inner)))
-        # a voltage is a signal in all domains
-        actuators = (_series(ACTUATOR, n, lambda u, n=n: u[n], self.units, domain) for n in self.inputs)
-        sensors = (_series(SENSOR, n, lambda: 0, self.units, domain) for n in self.output_names)
+        inner = self._add_drives(tuple(map(self._mark_speed, inner)))
+        actuators = (_series_port(ACTUATOR, n, lambda u, n=n: u[n], self.units, domain) for n in self.inputs)
+        sensors = (_series_port(SENSOR, n, lambda: 0, self.units, domain) for n in self.output_names)
         return (*inner, *actuators, *sensors)
 
-    def _equation(self, state: str) -> Port:
-        """Make the port of a state's equation: w is subtracted from its derivative.
+    def _equation_port(self, state: str) -> Port:
+        """Make the port of a state's equation, where w is subtracted from its derivative.
 
-        Where the state is the derivative of another state (a velocity), the local coordinate is that other state. The
+        If the state is the derivative of another state (a velocity), that other state is the local coordinate. The
         port has units if an output is the coordinate itself.
         """
         integral = next((n for n, rate in self._integrals.items() if rate == state), state)
@@ -353,8 +365,8 @@ class Equations:
         rate = None if integral == state else lambda x: x[state]
         return Port(port_name(EQUATION, state), {state: -1.0}, lambda x: x[integral], rate, own if unit else "", unit)
 
-    def _with_speed(self, port: Port) -> Port:
-        """Mark a port whose z is a speed: a force changes it at once, and units do not deny it."""
+    def _mark_speed(self, port: Port) -> Port:
+        """Set `rate` to `across` if z is a speed: a force changes its derivative, and its unit may be a speed's."""
         if self.discrete or not self.states:
             return port
         x, u, p, t = self.symbols()
@@ -362,14 +374,12 @@ class Equations:
         if port.rate is not None:
             speed = ca.is_equal(ca.SX(self.rate(port, x, u, p, t)), ca.SX(z), EQUAL_DEPTH)
         else:
-            factors = self.into(port, x, u, p, t)
-            force = ca.vertcat(*(factors.get(name, 0) for name in self.states))
-            at_once = ca.jtimes(z, ca.vertcat(*(x[name] for name in self.states)), force)
-            speed = not at_once.is_zero() and port.domain in (MECHANICAL, UNKNOWN) and may_be_speed(port.across_unit)
+            lift = ca.jtimes(z, stack(x), self.state_factors(self.into(port, x, u, p, t)))
+            speed = not lift.is_zero() and port.domain in (MECHANICAL, UNKNOWN) and may_be_speed(port.across_unit)
             speed = speed and not (z.is_symbolic() and z.name() in self.kinematic)  # which are positions
         return replace(port, rate=port.across) if speed else port
 
-    def _with_drives(self, ports: tuple[Port, ...]) -> tuple[Port, ...]:
+    def _add_drives(self, ports: tuple[Port, ...]) -> tuple[Port, ...]:
         """Find the force of a drive in the equations, as `term` of the first port at each driven motion without one.
 
         A drive may be elastic wherever a force acts on a position, whether its user has thought of that or not.
@@ -381,54 +391,54 @@ class Equations:
         taken = {target for port, target in zip(ports, targets, strict=True) if port.term is not None}
         out = []
         for port, target in zip(ports, targets, strict=True):
-            if target not in taken and (drive := self._drive(port, *at)) is not None:
+            if target not in taken and (drive := self._find_drive(port, *at)) is not None:
                 taken.add(target)
                 port = replace(port, term=drive, implied=True)
             out.append(port)
         return tuple(out)
 
-    def _drive(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Expression | None:
+    def _find_drive(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Expression | None:
         """Return the force of a drive at a port, with the sign of w; None if none acts on a position there.
 
         A drive acts by inputs, and by states that only inputs move, such as the lagged torque of an actuator.
         """
         into, z = self.into(port, x, u, p, t), self.across(port, x, u, p, t)
         speed = next(iter(into))
-        driven = len(into) == 1 and z.is_symbolic() and self._integrals.get(z.name()) == speed
-        if not driven or port.domain not in (MECHANICAL, UNKNOWN):
+        moves = len(into) == 1 and z.is_symbolic() and self._integrals.get(z.name()) == speed
+        if not moves or port.domain not in (MECHANICAL, UNKNOWN):
             return None
         rates = dict(zip(self.states, ca.vertsplit(self.derivatives(x, u, p, t)), strict=True))
-        free = set(self.states) - {z.name(), speed}
-        while moved := {n for n in free if any(ca.depends_on(rates[n], x[m]) for m in set(self.states) - free)}:
-            free -= moved
+        actuators = set(self.states) - {z.name(), speed}
+        mechanism = [x[n] for n in self.states if n not in actuators]
+        while coupled := {n for n in actuators if ca.depends_on(rates[n], ca.vertcat(*mechanism))}:
+            actuators -= coupled
+            mechanism += [x[n] for n in coupled]
         forces = [n for n in self.inputs if not is_motion(self.units.get(n, ""))]
-        actuators = sorted(free)
-        acting = ca.vertcat(*(u[n] for n in forces), *(x[n] for n in actuators))
-        slope = ca.jacobian(rates[speed], acting) / into[speed]
-        if not slope.nnz() or ca.depends_on(slope, ca.vertcat(*u._values.values(), *(x[n] for n in actuators), t)):
+        own = sorted(actuators)
+        slope = ca.jacobian(rates[speed], ca.vertcat(*(u[n] for n in forces), *(x[n] for n in own))) / into[speed]
+        if not slope.nnz() or ca.depends_on(slope, ca.vertcat(stack(u), *(x[n] for n in own), t)):
             return None
-        positions, parameters = ca.vertcat(*(x[n] for n in self.states)), ca.vertcat(*map(ca.vec, p._values.values()))
-        of = ca.Function("slope", [positions, parameters], [slope])
+        of = ca.Function("slope", [stack(x), stack(p)], [slope])
 
         def drive(x: Named, u: Named, p: Named) -> Any:
             states = ca.vertcat(*(x[n] for n in self.states))
-            own = ca.vertcat(*(ca.vec(ca.SX(p[n])) for n in self.parameters))
-            return ca.mtimes(of(states, own), ca.vertcat(*(u[n] for n in forces), *(x[n] for n in actuators)))
+            values = ca.vertcat(*(ca.vec(ca.SX(p[n])) for n in self.parameters))
+            return ca.mtimes(of(states, values), ca.vertcat(*(u[n] for n in forces), *(x[n] for n in own)))
 
         return drive
 
     @cached_property
     def state_units(self) -> dict[str, str]:
-        """Units of the states that are an output, or else the coordinate of a declared port."""
+        """Units of states: of the outputs that equal them, or else of the declared ports' coordinates."""
         at = self.symbols()
-        shown = [(self.across(port, *at), port.across_unit) for port in self.ports]
-        shown += [(y, self.units.get(name, "")) for name, y in self.measured(*at).items()]
-        return {z.name(): unit for z, unit in shown if unit and z.is_symbolic() and z.name() in self.states}
+        known = [(self.across(port, *at), port.across_unit) for port in self.ports]
+        known += [(y, self.units.get(name, "")) for name, y in self.measured(*at).items()]
+        return {z.name(): unit for z, unit in known if unit and z.is_symbolic() and z.name() in self.states}
 
     def signal_units(self, port: str, recorded: Mapping[str, str] | None = None) -> dict[str, str]:
-        """Units by name of the signals with which a law at a port may vary, with those that a recording states.
+        """Return the units, by name, of the signals that may scale a law at a port; a recording's units come first.
 
-        A parameter varies with states as well; an output may have the name of one, in another unit.
+        A parameter varies with states as well. An output may have the name of a state and another unit.
         """
         own = {name: self.state_units.get(name, "") for name in self.states if kind_of(port) == PARAMETER}
         return {**self.units, **(recorded or {}), **own}
@@ -436,18 +446,18 @@ class Equations:
     @cached_property
     def _integrals(self) -> dict[str, str]:
         """States whose derivative is a single symbol, with its name."""
-        derivatives = ca.vertsplit(self.derivatives(*self.symbols())) if self.states else []
-        return {n: d.name() for n, d in zip(self.states, derivatives, strict=True) if d.is_symbolic()}
+        derivatives = self.by_state(self.derivatives(*self.symbols()))
+        return {name: rate.name() for name, rate in derivatives.items() if rate.is_symbolic()}
 
     @cached_property
     def kinematic(self) -> frozenset[str]:
-        """States that are the integral of another state: their equations are definitions and lack nothing."""
+        """States that are the integral of another state: their equations are definitions and cannot miss physics."""
         own = {} if self.discrete else self._integrals
         return frozenset(n for n, rate in own.items() if rate in self.states and rate != n)
 
     @cached_property
     def unreached(self) -> frozenset[str]:
-        """States whose equations lack a declared port, though they are no definitions."""
+        """States whose equations are no definitions and have no declared port."""
         at = self.symbols()
         reached = {target for port in self.ports for target in self.into(port, *at)}
         return frozenset(self.states) - self.kinematic - reached
@@ -456,7 +466,7 @@ class Equations:
     def undeclared(self) -> tuple[Port, ...]:
         """Ports of states' equations that differ from all declared ports; empty if none is declared.
 
-        A declared port that enters one equation, at the same coordinate, is that of the equation.
+        A declared port is the port of an equation if it enters that equation alone and has the same coordinate.
         """
         at = self.symbols()
         declared = [
@@ -465,50 +475,54 @@ class Equations:
         ]
         found = []
         for state in self.states if self.ports and not self.discrete else ():
-            port = self._equation(state)
+            port = self._equation_port(state)
             z = self.across(port, *at)
             same = any(reached == [state] and ca.is_equal(z, other, EQUAL_DEPTH) for reached, other in declared)
             if state not in self.kinematic and not same:
-                found.append(self._with_speed(port))
+                found.append(self._mark_speed(port))
         return tuple(found)
 
     @cached_property
     def coefficients(self) -> tuple[str, ...]:
         """Scalar parameters whose effect on the equations depends on states or inputs.
 
-        What varies in any other one, such as an offset, is a force or a curve at a port.
+        A variation of any other parameter, such as an offset, is a force or a curve at a port.
         """
         x, u, p, t = self.symbols()
         equations = ca.vertcat(self.derivatives(x, u, p, t), *self.measured(x, u, p, t).values())
-        moving = ca.vertcat(*x._values.values(), *u._values.values())
         scalars = [name for name, own in self.parameters.items() if not own.value.ndim]
-        return tuple(name for name in scalars if ca.depends_on(ca.jacobian(equations, p[name]), moving))
+        return tuple(name for name in scalars if ca.depends_on(ca.jacobian(equations, p[name]), stack(x, u)))
 
     @cached_property
     def idle_inputs(self) -> tuple[str, ...]:
-        """Inputs that no equation reads: they may scale the missing physics."""
+        """Inputs that no equation depends on; they may scale the missing physics."""
         x, u, p, t = self.symbols()
         read = ca.vertcat(self.derivatives(x, u, p, t), *self.measured(x, u, p, t).values())
         return tuple(name for name in self.inputs if not ca.depends_on(read, u[name]))
 
 
-def _series(kind: str, name: str, across: Expression, units: Mapping[str, str], domain: str) -> Port:
+def _series_port(kind: str, name: str, across: Expression, units: Mapping[str, str], domain: str) -> Port:
     unit = units.get(name, "")
     return Port(port_name(kind, name), {}, across, None, unit, unit, series=True, domain=domain)
 
 
-def _at_random_points(function: ca.Function) -> list[np.ndarray]:
-    """Evaluate a function of one vector at random points; an array (points, entries) for each of its results."""
+def stack(*named: Named) -> Any:
+    """Stack the values of several sets of symbols in one column."""
+    return ca.vertcat(ca.SX(0, 1), *(ca.vec(value) for names in named for value in names._values.values()))
+
+
+def _evaluate_at_random_points(function: ca.Function) -> list[np.ndarray]:
+    """Evaluate a function of one vector at random points; return an array (points, entries) per result."""
     points = np.random.default_rng(0).uniform(0.5, 1.5, (COMPARED_POINTS, function.numel_in(0)))
     with np.errstate(all="ignore"):
         results = zip(*(function.call([point]) for point in points), strict=True)
         return [np.array([value.full().ravel() for value in column]) for column in results]
 
 
-def _check_expressions(found: Mapping[str, Any], known: list[Any]) -> None:
+def _check_expressions(found: Mapping[str, Any], known: Any) -> None:
     """Refuse foreign symbols, and the NaN that `math.sin(symbol)` gives without an error."""
     names, expressions = list(found), list(found.values())
-    f = ca.Function("equations", known, expressions, {"allow_free": True})
+    f = ca.Function("equations", [known], expressions, {"allow_free": True})
     if f.has_free():
         raise InputError(f"The simulator's equations hold a symbol {f.get_free()[0]!r}; use x, u, p and t alone.")
     k = range(f.n_instructions())
@@ -521,7 +535,7 @@ def _check_expressions(found: Mapping[str, Any], known: list[Any]) -> None:
         )
 
 
-def _scalar(value: Any, name: str) -> Any:
+def _as_scalar(value: Any, name: str) -> Any:
     try:
         value = ca.SX(value)
     except Exception:
@@ -531,20 +545,12 @@ def _scalar(value: Any, name: str) -> Any:
     return value
 
 
-def _row(found: Mapping[str, Any], names: tuple[str, ...], where: str, kind: str) -> list[Any]:
-    for name in names:
-        if name not in found:
-            raise InputError(f"The simulator's {where} give no {kind} for the state {name!r}; add it.")
-    for name in found:
-        if name not in names:
-            raise InputError(
-                f"The simulator's {where} give {name!r}, which is not a state; there are {', '.join(names)}."
-            )
-    return [_scalar(found[name], f"{kind} of {name!r} in the {where}") for name in names]
+def _as_scalars(found: Mapping[str, Any], where: str, kind: str) -> dict[str, Any]:
+    return {name: _as_scalar(value, f"{kind} of {name!r} in the {where}") for name, value in found.items()}
 
 
-def parameter_set(given: Any) -> ParameterSet:
-    """Check that parameters by name are given, and lay them out."""
+def check_parameters(given: Any) -> ParameterSet:
+    """Check a mapping of parameters by name and lay out their vector."""
     if not isinstance(given, Mapping):
         raise InputError(f"The simulator's parameters are {given!r}; give {{name: Parameter(value, ...)}}.")
     for name, value in given.items():
@@ -553,12 +559,9 @@ def parameter_set(given: Any) -> ParameterSet:
     return ParameterSet(dict(given))
 
 
-def distinct_names(given: Any, kind: str) -> tuple[str, ...]:
-    """Return one name or several as a tuple; refuse what are no names, and a name given twice."""
-    try:
-        names = (given,) if isinstance(given, str) else tuple(given)
-    except TypeError:
-        names = (None,)
+def check_names(given: Any, kind: str) -> tuple[str, ...]:
+    """Return one name or several as a tuple; refuse anything else, and repeated names."""
+    names = _as_tuple(given, str)
     if not all(isinstance(name, str) and name for name in names):
         raise InputError(f"The simulator's {kind} are {given!r}; give their names, such as ('pos', 'vel').")
     if len(set(names)) != len(names):
@@ -566,11 +569,8 @@ def distinct_names(given: Any, kind: str) -> tuple[str, ...]:
     return names
 
 
-def _checked_ports(given: Any) -> tuple[Port, ...]:
-    try:
-        ports = (given,) if isinstance(given, Port) else tuple(given)
-    except TypeError:
-        ports = (None,)
+def _check_ports(given: Any) -> tuple[Port, ...]:
+    ports = _as_tuple(given, Port)
     if not all(isinstance(port, Port) for port in ports):
         raise InputError(f"The simulator's ports are {given!r}; give Port(name, into, across) or a tuple of several.")
     names = [port.name for port in ports]
@@ -583,3 +583,11 @@ def _checked_ports(given: Any) -> tuple[Port, ...]:
                 f"({', '.join(f'{kind}:' for kind in BUILT_IN)}), which need no declaration; call it something else."
             )
     return ports
+
+
+def _as_tuple(given: Any, kind: type) -> tuple[Any, ...]:
+    """Return one object of a kind, or several, as a tuple; `(None,)` for anything else."""
+    try:
+        return (given,) if isinstance(given, kind) else tuple(given)
+    except TypeError:
+        return (None,)

@@ -1,16 +1,16 @@
-"""Functions that CasADi cannot look into, in equations: a call by numbers, with derivatives along directions.
+"""Calls of functions that CasADi cannot look into: evaluated with numbers, differentiated along directions.
 
-The equations hold a call of `r = f(z)`. Their derivatives call it too: along a direction s, by the function's own
-derivative `J(z) s` where it has one, else by a difference
+The equations hold a call of `r = f(z)`, and their derivatives call f too. Along a direction s they use the function's
+own derivative `J(z) s` if it has one, else a difference
 
     (f(z + h s) - r) / h,   h = ε / Σ_j |s_j| / max(|z_j|, nominal_j),   ε = square root of the rounding.
 
-So a sensitivity costs one call for each state and free parameter at each stage of the integration. Every result is
-taken to depend on every argument. Second derivatives are left out: they matter where the rate of a port is not given
-and its coordinate is a curved function of the states.
+So a sensitivity costs one call for each state and free parameter at each stage of the integration. Every result counts
+as dependent on every argument. Second derivatives are zero: they matter only if a port has no given rate and its
+coordinate is a nonlinear function of the states.
 
-A leaf is a function that is a program of its own: a Python function or a functional mock-up unit. Generated C cannot
-hold it and calls it by its name in `leaves`.
+A leaf is a program of its own: a Python function or a functional mock-up unit. Generated C cannot hold it and calls it
+by its name in `leaves`.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ import numpy as np
 
 from .fmu_instance import FmuFile
 
-RELATIVE_STEP = float(np.sqrt(np.finfo(float).eps))  # at which rounding and curvature disturb a difference alike
-NOMINAL = 1e-3  # size of an argument that is zero: small beside values in SI units, far above rounding
+RELATIVE_STEP = float(np.sqrt(np.finfo(float).eps))  # at this step rounding and curvature disturb a difference equally
+NOMINAL = 1e-3  # size of an argument that is zero: small compared with values in SI units, far above rounding
 ROUNDING = 1e-9  # relative difference that rounding may cause
 TINY = 1e-100  # against division by zero along a direction of zeros
 leaves: dict[str, ca.Function] = {}  # by name; CasADi itself does not keep callbacks alive
@@ -32,7 +32,7 @@ units: dict[str, FmuFile] = {}  # of leaves that are functional mock-up units
 
 
 def keep_leaf(function: ca.Function, unit: FmuFile | None = None) -> ca.Function:
-    """Enter a function into `leaves`; its name must be unique, and for a program the same in any process."""
+    """Enter a function into `leaves`; its name must be unique, and the same in every process for an FMU."""
     leaves[function.name()] = function
     if unit is not None:
         units[function.name()] = unit
@@ -43,14 +43,14 @@ Expression = Callable[..., Any]
 
 
 def external(evaluate: Expression, nominal: np.ndarray, results: int, slope: Expression | None = None) -> ca.Function:
-    """Make a function that is called as it is when symbols are given to it.
+    """Make a function that stays a call when symbols are given to it.
 
     Parameters
     ----------
     evaluate : callable
         From symbols z (n,) to the expression r (m,) that calls a program (`call_external`).
     nominal : array, (n,)
-        Sizes of the arguments, by which differences are scaled where z is smaller.
+        Sizes of the arguments, which scale the differences if z is smaller.
     results : int
         m.
     slope : callable, optional
@@ -70,12 +70,12 @@ def external(evaluate: Expression, nominal: np.ndarray, results: int, slope: Exp
         h = RELATIVE_STEP / (ca.dot(ca.fabs(s), r[m:]) + TINY)
         return (evaluate(z + h * s) - r[:m]) * (1 / h)
 
-    def across(row: Any) -> Any:  # along each argument in turn: CasADi asks for it only where results are few
+    def across(row: Any) -> Any:  # along each argument in turn: CasADi asks for it only if there are few results
         columns = [along(ca.SX(ca.DM(np.eye(n)[:, j]))) for j in range(n)]
         return ca.horzcat(*columns).T @ row[:m]
 
     none = ca.SX.zeros(n)
-    # a slope changes with its direction; how it changes with z is left out
+    # a slope changes with its direction; its change with z is neglected
     turned, slopes = ca.SX.sym("turned", n), ca.SX.sym("slopes", m + n)
     changes = [z, r, s, slopes, ca.SX.sym("dz", n), ca.SX.sym("dr", m + n), turned]
     cache = {
@@ -86,7 +86,7 @@ def external(evaluate: Expression, nominal: np.ndarray, results: int, slope: Exp
     }
     forward = ca.Function("fwd1_external", [z, r, s], [ca.vertcat(along(s), none)], {"cache": cache})
     reverse = ca.Function("adj1_external", [z, r, row], [across(row)])
-    # zero, and a dependence of all results on all arguments: some programs state too few, and lose derivatives
+    # zero, but makes all results depend on all arguments: a program that states too few would lose derivatives
     dependence = ca.fmin(ca.fabs(ca.sum1(z)), 0.0)
     found = ca.vertcat(evaluate(z) + dependence, 1 / ca.fmax(ca.fabs(z), nominal))
     options = {"never_inline": True, "cache": {"fwd1_external": forward, "adj1_external": reverse}}
@@ -94,8 +94,13 @@ def external(evaluate: Expression, nominal: np.ndarray, results: int, slope: Exp
 
 
 def call_external(function: ca.Function, *arguments: Any) -> Any:
-    """Call a function within SX expressions, where CasADi would otherwise write out its formulas; stack its results."""
+    """Call a function within SX expressions without writing out its formulas; stack its results."""
     return ca.vertcat(*function.call([ca.SX(a) for a in arguments], False, True))
+
+
+def calls_external(function: ca.Function) -> bool:
+    """Tell whether a function of SX expressions calls one that CasADi cannot look into."""
+    return any(function.instruction_id(k) == ca.OP_CALL for k in range(function.n_instructions()))
 
 
 def equal_state(values: np.ndarray, states: np.ndarray, names: Sequence[str]) -> str:
@@ -105,7 +110,7 @@ def equal_state(values: np.ndarray, states: np.ndarray, names: Sequence[str]) ->
 
 
 class PythonFunction(ca.Callback):
-    """A Python function of one array as a `casadi.Function`; where it fails, its results are not numbers.
+    """A Python function of arrays as a `casadi.Function`; if it fails, its results are NaN.
 
     Attributes
     ----------
@@ -124,19 +129,15 @@ class PythonFunction(ca.Callback):
         keep_leaf(self)
 
     def get_n_in(self) -> int:
-        """Number of arguments."""
+        """Return the number of arguments, for CasADi; there is one result."""
         return len(self.sizes)
 
-    def get_n_out(self) -> int:
-        """Number of results."""
-        return 1
-
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Shape of an argument."""
+        """Return the shape of an argument."""
         return ca.Sparsity.dense(self.sizes[i], 1)
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Shape of the result."""
+        """Return the shape of the result."""
         return ca.Sparsity.dense(self.size, 1)
 
     def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:

@@ -1,16 +1,16 @@
 """Simulators from functional mock-up units (https://fmi-standard.org), FMI 2.0 and 3.0, for model exchange.
 
-Those for co-simulation alone are stepped (`fmu_cosimulation`).
+Units for co-simulation alone are stepped (`fmu_cosimulation`).
 
-CasADi loads the unit and evaluates its derivatives and outputs; differences along directions give their derivatives
-(`external`), because CasADi takes both not to depend on parameters. Where a derivative or an output equals a state at
-every point of a trial, the equations say so instead of calling the unit.
+CasADi loads the unit and evaluates its derivatives and outputs. Differences along directions give the Jacobians
+(`external`), because CasADi assumes that neither depends on parameters. If a derivative or an output equals a state at
+every trial point, the equations use the state instead of calling the unit.
 
-A force in a port enters an input of the unit, to which it adds. States are counted from their start values. Events are
-not looked for: a step of the integration runs over them.
+A force in a port is added to an input of the unit. States are deviations from their start values. Events are not
+located: the integration steps over them.
 
-A unit is a program and runs with the rights of the user. It is loaded in a process of its own first, so that one that
-ends its process ends that one.
+A unit is a program and runs with the rights of the user. A worker process loads it first, so that a unit that crashes
+ends only that process.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, check_known, listed, run_in_worker
+from .._base import InputError, check_known, run_in_worker
 from ..models import Named, Parameter, parameter_within, within_a_factor
 from .external import NOMINAL, ROUNDING, call_external, equal_state, external, keep_leaf
-from .fmu_cosimulation import CoSimulation, SteppedEquations, SteppedUnit
+from .fmu_cosimulation import CoSimulation, SteppedEquations, SteppedUnit, check_force, unknown_signal
 from .fmu_description import Variable, check_file, describe, tidy
 from .fmu_instance import FmuFile, unpack
 from .ports import Port
 from .simulator import Simulator
 
-COMPARED_POINTS = 8  # at which a trial compares derivatives and outputs with states, and looks at what ports do
-TIMES = (0.0, 0.7, 13.0, 400.0)  # s, at which a trial looks for a dependence on time
+COMPARED_POINTS = 8  # trial points at which derivatives and outputs are compared with states and with forces in ports
+TIMES = (0.0, 0.7, 13.0, 400.0)  # s, at which a dependence on time is looked for
 LOADING_SECONDS = 60.0  # seconds that loading may take
 
 
@@ -56,7 +56,7 @@ class _Unit:
 
     @classmethod
     def load(cls, path: Path, outputs: Sequence[str] | None = None) -> _Unit:
-        """Load a unit whose file has been checked, with some of its outputs."""
+        """Load a unit whose file has been checked, with all or some of its outputs."""
         folder, key = unpack(path)
         builder = ca.DaeBuilder("unit", str(folder), {"enable_ls_serialization": False})
         if outputs is not None:
@@ -68,7 +68,7 @@ class _Unit:
         variables = described.variables
         roles = zip("xupy", names, strict=True)
         references = {role: [variables[n].reference for n in found] for role, found in roles}
-        direct = described.states == names[0]  # else its order of the states is another one
+        direct = described.states == names[0]  # else the file orders the states in another way
         file = FmuFile(folder, int(described.version), described.token, described.binary, references)
         return cls(path, variables, keep_leaf(leaf, file if direct else None), *names)
 
@@ -77,7 +77,7 @@ class _Unit:
         return _Unit.load, (self.path, self.outputs)
 
     def starts(self, names: Sequence[str]) -> np.ndarray:
-        """Start values, zero where there is none."""
+        """Start values of variables, zero if the file gives none."""
         return np.nan_to_num(np.array([self.variables[n].start for n in names]))
 
     @property
@@ -112,7 +112,7 @@ def from_fmu(
     hold: str | None = None,
     cosimulation: CoSimulation | None = None,
 ) -> Simulator:
-    """Make a simulator from a functional mock-up unit, for model exchange where it can be used so.
+    """Make a simulator from a functional mock-up unit, for model exchange if the unit supports it.
 
     Parameters
     ----------
@@ -126,13 +126,14 @@ def from_fmu(
     parameters : names, or mapping from names to Parameter, optional
         Tunable parameters that a fit may change; by default all. The others keep the unit's values.
     bounds : mapping, optional
-        `(lower, upper)` by parameter; by default those of the unit, else a factor of ten either way.
+        `(lower, upper)` by parameter; by default the unit's bounds, else a factor of ten either way.
     inputs, outputs : tuple of str, optional
-        Inputs and outputs that are recorded; by default all that no port uses. Other inputs keep their start values.
+        Recorded inputs and outputs; by default all outputs, and all inputs that no port uses. Other inputs keep their
+        start values.
     hold : {"zero", "linear"}, optional
         As of `Simulator`.
     cosimulation : CoSimulation, optional
-        Step size and states of a unit that is for co-simulation alone.
+        Step size and states of a unit for co-simulation alone.
 
     Returns
     -------
@@ -145,7 +146,7 @@ def from_fmu(
         If the file is no unit for this platform, a name is not one of its variables, or a unit for co-simulation has
         no states that can be set.
     """
-    path, given = Path(path), dict(ports or {})
+    path, given, bounds = Path(path), dict(ports or {}), bounds or {}
     described = check_file(path)
     unit: _Unit | SteppedUnit
     if described.identifier:
@@ -154,26 +155,24 @@ def from_fmu(
     else:
         unit = SteppedUnit.load(path, described, cosimulation or CoSimulation())
     for name, port in given.items():
-        if not isinstance(port, Mapping):
-            raise InputError(f"The port {name!r} is {port!r}; give dict(into=INPUT, across=VARIABLE, rate=VARIABLE).")
+        _check_port(name, port)
     used = [name for port in given.values() for name in _factors(port.get("into"))]
     own = parameters if parameters is not None else unit.parameters
     for names, there, kind in (
         (used, unit.inputs, "inputs"),
         (inputs or (), unit.inputs, "inputs"),
         (outputs or (), unit.outputs, "outputs"),
-        ((*own, *(bounds or {})), unit.parameters, "tunable parameters"),
+        ((*own, *bounds), unit.parameters, "tunable parameters"),
     ):
         check_known(names, there, kind, path)
-    free = tuple(own)
     drives = tuple(inputs) if inputs is not None else tuple(n for n in unit.inputs if n not in used)
     measured = tuple(outputs) if outputs is not None else unit.outputs
     read = {port.get(key) for port in given.values() for key in ("across", "rate")}
     needed = tuple(n for n in unit.outputs if n in measured or n in read)
-    made = own if isinstance(own, Mapping) else {n: _parameter(unit.variables[n], (bounds or {}).get(n)) for n in own}
+    made = own if isinstance(own, Mapping) else {n: _make_parameter(unit.variables[n], bounds.get(n)) for n in own}
     equations: _Equations | SteppedEquations
     if isinstance(unit, _Unit):
-        equations = _Equations(_Unit.load(path, needed), drives, free, measured)
+        equations = _Equations(_Unit.load(path, needed), drives, tuple(own), measured)
     else:
         symbols = tuple(n for n in unit.inputs if n in drives or n in used)
         equations = SteppedEquations(unit, symbols, made, needed, measured)
@@ -183,7 +182,7 @@ def from_fmu(
         equations.states,
         drives,
         made,
-        tuple(_port(equations, name, port) for name, port in given.items()),
+        tuple(_make_port(equations, name, port) for name, port in given.items()),
         hold,
         equations.discrete,
         units={n: unit.variables[n].unit for n in (*drives, *measured)},
@@ -215,15 +214,9 @@ class _Equations:
         equal = [equal_state(row, states, unit.states) for row in found.T]
         self.equal = {row: same for row, same in zip(rows, equal, strict=True) if same}
         self.unit = _Unit.load(unit.path, [n for n in unit.outputs if n not in self.equal])
-        if self.timed:
-            self.dynamics: Callable[..., dict[str, Any]] = lambda x, u, p, t: self._derivatives(x, u, p, t)
-            self.measured: Callable[..., dict[str, Any]] = lambda x, u, p, t: self._outputs(x, u, p, t)
-        else:
-            self.dynamics = lambda x, u, p: self._derivatives(x, u, p, 0.0)
-            self.measured = lambda x, u, p: self._outputs(x, u, p, 0.0)
 
     def _points(self) -> Any:
-        """Draw times, states, inputs and parameters near the start values; the first are these."""
+        """Draw times, states, inputs and parameters near the start values; the first point holds the start values."""
         unit, rng = self.unit, np.random.default_rng(0)
         x, u, p = (unit.starts(names) for names in (unit.states, unit.inputs, unit.parameters))
         yield 0.0, x, u, p
@@ -249,26 +242,29 @@ class _Equations:
         found: Any = call_external(self.unit.function, self._stack(x, u, p, t)) if calls else None
         return [x[self.equal[n]] if n in self.equal else found[rows.index(n)] for n in names]
 
-    def _derivatives(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
-        states = self.unit.states
-        return dict(zip(states, self._rows([_rate(n) for n in states], x, u, p, t), strict=True))
+    def dynamics(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
+        """Evaluate the derivatives by state."""
+        rows = self._rows([_rate(n) for n in self.states], x, u, p, t if self.timed else 0.0)
+        return dict(zip(self.states, rows, strict=True))
 
-    def _outputs(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
-        return dict(zip(self.outputs, self._rows(self.outputs, x, u, p, t), strict=True))
+    def measured(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
+        """Evaluate the outputs by name."""
+        return dict(zip(self.outputs, self._rows(self.outputs, x, u, p, t if self.timed else 0.0), strict=True))
 
     def signal(self, port: str, key: str, name: str) -> Callable[..., Any]:
+        """Make the local coordinate of a port, or its rate, from the name of a variable."""
         unit = self.unit
         if name in unit.states:
             return lambda x: x[name]
         if name not in (*unit.outputs, *self.equal):
-            known = listed([*unit.outputs, *(n for n in self.equal if not n.startswith("der(")), *unit.states])
-            raise InputError(f"`{key}` of port {port!r} is {name!r}; give an output or a state of the unit: {known}.")
+            known = [*unit.outputs, *(n for n in self.equal if not n.startswith("der(")), *unit.states]
+            raise unknown_signal(port, key, name, known)
         if same := self.equal.get(name):
             return lambda x: x[same]
         return lambda x, u, p: self._rows([name], x, u, p, 0.0)[0]
 
     def into(self, port: str, factors: Mapping[str, float]) -> Any:
-        """Find how a unit force changes derivatives and outputs: constants, or differences of two calls."""
+        """Make the effect of a unit force on derivatives and outputs: constants, or differences of two calls."""
         unit, step = self.unit, np.array([factors.get(n, 0.0) for n in self.unit.inputs])
         names = (*unit.states, *unit.outputs)
         rows = [i for i, n in enumerate(names) if i < len(unit.states) or n in self.outputs]
@@ -278,14 +274,9 @@ class _Equations:
         )
         once, twice = once - none, twice - none
         size = np.max(np.abs(once)) + ROUNDING * np.max(np.abs(none))
-        if np.any(np.abs(twice - 2 * once) > np.sqrt(ROUNDING) * size):
-            raise InputError(
-                f"The force of port {port!r} does not add up in {listed(list(factors))}: twice the input has not twice "
-                "the effect; name an input that is a force."
-            )
         moved = {k: i for k, i in enumerate(rows) if np.any(np.abs(once[:, k]) > ROUNDING * size)}
-        if not moved:
-            raise InputError(f"The input {listed(list(factors))} of port {port!r} changes nothing; name another one.")
+        linear = not np.any(np.abs(twice - 2 * once) > np.sqrt(ROUNDING) * size)
+        check_force(port, factors, linear, bool(moved))
         if np.all(np.abs(once - once[0]) <= np.sqrt(ROUNDING) * size):
             return {names[i]: float(once[0, k]) for k, i in moved.items()}
 
@@ -298,15 +289,19 @@ class _Equations:
         return into
 
 
-def _port(equations: _Equations | SteppedEquations, name: str, given: Mapping[str, Any]) -> Port:
-    """Make a port from the names of the unit's variables."""
-    factors, across, rate = _factors(given.get("into")), given.get("across"), given.get("rate")
-    unknown = [key for key in given if key not in ("into", "across", "rate")]
-    if unknown or not factors or not isinstance(across, str) or not isinstance(rate, str | None):
+def _check_port(name: str, given: Any) -> None:
+    """Refuse a port that does not give the names of the unit's variables."""
+    usable = isinstance(given, Mapping) and set(given) <= {"into", "across", "rate"} and _factors(given.get("into"))
+    if not usable or not isinstance(given.get("across"), str) or not isinstance(given.get("rate"), str | None):
         raise InputError(
-            f"The port {name!r} is {dict(given)!r}; give dict(into=INPUT, across=VARIABLE, rate=VARIABLE) with "
+            f"The port {name!r} is {given!r}; give dict(into=INPUT, across=VARIABLE, rate=VARIABLE) with "
             "names of the unit's variables."
         )
+
+
+def _make_port(equations: _Equations | SteppedEquations, name: str, given: Mapping[str, Any]) -> Port:
+    """Make a port from the names of the unit's variables."""
+    factors, across, rate = _factors(given["into"]), given["across"], given.get("rate")
     z = equations.signal(name, "across", across)
     dz = None if rate is None else equations.signal(name, "rate", rate)
     force, coordinate = (equations.unit.variables[n] for n in (next(iter(factors)), across))
@@ -318,13 +313,13 @@ def _rate(state: str) -> str:
 
 
 def _factors(into: Any) -> dict[str, float]:
-    """Return the inputs that a port's force enters, with its factors; the name of one means the opposite sign."""
+    """Return the factors of a port's force by input; a single name has the factor -1."""
     if isinstance(into, str):
         return {into: -1.0}
     return dict(into) if isinstance(into, Mapping) else {}
 
 
-def _parameter(variable: Variable, bounds: tuple[float, float] | None) -> Parameter:
+def _make_parameter(variable: Variable, bounds: tuple[float, float] | None) -> Parameter:
     value = 0.0 if np.isnan(variable.start) else variable.start
     low, high = bounds if bounds is not None else (variable.low, variable.high)
     usual = within_a_factor(value) if value else (-np.inf, np.inf)
@@ -333,9 +328,9 @@ def _parameter(variable: Variable, bounds: tuple[float, float] | None) -> Parame
 
 
 def _check_program(path: Path) -> None:
-    """Refuse a unit whose program does not load and evaluate, in a process that it may end."""
+    """Refuse a unit whose program cannot be loaded and evaluated; a worker process tries it."""
     job = path.resolve(), unpack(path)[0]
-    reply = run_in_worker(pickle.dumps(_try), pickle.dumps(job), LOADING_SECONDS)
+    reply = run_in_worker(pickle.dumps(_try_unit), pickle.dumps(job), LOADING_SECONDS)
     if reply.timed_out or reply.lost:
         what = f"takes more than {LOADING_SECONDS:g} s to load" if reply.timed_out else "ends the process that loads it"
         raise InputError(f"The program inside {path} {what}; ask its maker for another one.")
@@ -343,8 +338,8 @@ def _check_program(path: Path) -> None:
         raise InputError(f"{path} cannot be evaluated ({reply.result}); check it with the tool that made it.")
 
 
-def _try(unpacked: tuple[Path, Path]) -> str:
-    """Load and evaluate a unit that is unpacked in a folder; return what went wrong."""
+def _try_unit(unpacked: tuple[Path, Path]) -> str:
+    """Load and evaluate a unit that is unpacked in a folder; return the error's message, empty without an error."""
     path, folder = unpacked
     try:
         unpack(path, folder)

@@ -1,13 +1,13 @@
 """Simulators from functional mock-up units for co-simulation, which only step: `x⁺ = Φ_h(x, u, p)`.
 
-A step sets states, inputs and parameters, goes on by h and reads states and outputs (`fmu_slave`). Variables are states
-where a value that was set changes a later step. Two steps must equal two steps with the states set in between, else the
-unit has memory that cannot be set, and no trial could be repeated.
+A step sets states, inputs and parameters, advances the unit by h and reads states and outputs (`fmu_slave`). A variable
+is a state if setting it changes a later step. Two steps must equal two steps with the states set in between; otherwise
+the unit has memory that cannot be set, and no simulation could be repeated.
 
-A diagnosis needs some ten million evaluations, an hour of a unit's steps. So its equations are looked for first: the
-derivatives `lim (Φ_h(x) - x) / h`, extrapolated from halved steps (Richardson), are fitted by polynomials
-(`polynomial_equations`). Where these agree with the unit, they are the simulator, in continuous time. Else the
-simulator is in discrete time and steps the unit at every sample, with differences as derivatives.
+A diagnosis needs some ten million evaluations, which take an hour of a unit's steps. So its equations are looked for
+first: polynomials (`polynomial_equations`) are fitted to the derivatives `lim (Φ_h(x) - x) / h`, extrapolated from
+halved steps (Richardson). If they agree with the unit, they are the simulator, in continuous time. Otherwise the
+simulator is in discrete time and steps the unit at every sample, with differences as Jacobians.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from .polynomial_equations import find_polynomials
 
 LEVELS = 5  # halvings of a step from which a derivative is extrapolated
 CONVERGED = 1e-5  # relative change by the last halving
-REPEATED = 1e-4  # relative difference that restarting the unit's solver may make
-DECADES = (-3.0, 1.0)  # powers of ten of sizes of states and inputs at which equations are checked
-PROBED = 4  # states from which a unit's memory is looked at
+REPEATED = 1e-4  # relative difference that a restart of the unit's solver may cause
+DECADES = (-3.0, 1.0)  # range of the powers of ten of states and inputs at which equations are checked
+PROBED_POINTS = 4  # points at which the memory of a unit and the forces in its ports are checked
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class CoSimulation:
     dt : float, optional
         Length of its steps, s: the sampling interval of the recordings. By default the step size that the file states.
     states : tuple of str, optional
-        Its state variables; by default all outputs and local variables that change a step when they are set.
+        State variables; by default all outputs and local variables whose values change a step.
     """
 
     dt: float | None = None
@@ -61,16 +61,16 @@ class SteppedUnit:
     slave: Slave
     dt: float
     variable_steps: bool
-    begin: Mapping[str, float]  # values of variables when the program has started
+    begin: Mapping[str, float]  # values of variables after the start of the program
     states: tuple[str, ...] = ()
 
     @classmethod
     def load(cls, path: Path, described: Description, options: CoSimulation) -> SteppedUnit:
-        """Load a unit, find its states and refuse one that has others."""
+        """Load a unit and find its states; refuse a unit with other memory."""
         dt = options.dt if options.dt is not None else described.step_size
         if np.isnan(dt):
             raise InputError(
-                f"{path} is for co-simulation and states no step size; give that of the recordings, as in "
+                f"{path} is for co-simulation and states no step size; give the recordings' step, as in "
                 "from_fmu(..., cosimulation=CoSimulation(dt=0.001))."
             )
         slave = Slave(path, described.version, described.token, described.slave)
@@ -119,16 +119,16 @@ class SteppedUnit:
 
     def steps(self, names: Sequence[str], values: np.ndarray, h: float, read: Sequence[str]) -> tuple[np.ndarray, str]:
         """Set variables by name and step; see `Slave.steps`."""
-        sets, reads = ([self.variables[n].reference for n in those] for those in (names, read))
+        sets, reads = ([self.variables[n].reference for n in each] for each in (names, read))
         return self.slave.steps(sets, values, np.full(len(values), h), reads)
 
     def _candidates(self, described: Description) -> tuple[str, ...]:
-        """List what may be a state: by the structure of the file, else outputs and local variables."""
+        """List the states that the file names, or else all outputs and local variables."""
         local = (v.name for v in self.variables.values() if v.causality == "local" and v.variability == "continuous")
         return described.states or (*self.outputs, *local)
 
     def _with_states(self, names: tuple[str, ...], given: bool) -> SteppedUnit | None:
-        """Copy with those of some variables as states that can be set and, if not `given`, change a step."""
+        """Copy with the states among some variables: they can be set and, if not `given`, change a step."""
         kept = tuple(n for n in names if not self.steps((n,), np.array([[self.begin[n]]]), self.dt, (n,))[1])
         unit = replace(self, states=kept)
         if not kept or (given and kept != names):
@@ -144,20 +144,20 @@ class SteppedUnit:
 
     @property
     def set_names(self) -> tuple[str, ...]:
-        """Names of what a step sets."""
+        """Names of the variables that a step sets."""
         return (*self.states, *self.inputs, *self.parameters)
 
     def points(self, count: int, seed: int = 0) -> np.ndarray:
-        """Draw values of `set_names` about the start values; parameters stay."""
+        """Draw values of `set_names` about the start values, with unchanged parameters."""
         rng, sizes = np.random.default_rng(seed), [self.variables[n].nominal for n in self.set_names]
         sizes = np.nan_to_num(np.array(sizes), nan=1.0) * 0.1
         sizes[len(self.states) + len(self.inputs) :] = 0.0
         return np.array([self.begin[n] for n in self.set_names]) + sizes * rng.standard_normal((count, len(sizes)))
 
     def _check_memory(self) -> None:
-        """Refuse a unit whose steps depend on more than what is set before them."""
+        """Refuse a unit whose steps depend on more than the variables that are set before them."""
         n, read = len(self.states), (*self.states, *self.outputs)
-        for z in self.points(PROBED, 1):
+        for z in self.points(PROBED_POINTS, 1):
             on = np.full((1, len(z)), np.nan)
             first, failure = self.steps(self.set_names, np.vstack([z, on]), self.dt, read)
             other = np.vstack([self.points(1, 2), z, np.append(first[0, :n], z[n:])])
@@ -175,8 +175,25 @@ class SteppedUnit:
                 )
 
 
+def unknown_signal(port: str, key: str, name: str, known: Sequence[str]) -> InputError:
+    """Make the error about a port's coordinate or rate that is no signal of the unit."""
+    return InputError(f"`{key}` of port {port!r} is {name!r}; give an output or a state of the unit: {listed(known)}.")
+
+
+def check_force(port: str, factors: Mapping[str, float], linear: bool, effective: bool) -> None:
+    """Refuse inputs of a port that are no forces: their effect is not linear, or they have none."""
+    inputs = listed(list(factors))
+    if not linear:
+        raise InputError(
+            f"The force of port {port!r} does not add up in {inputs}: twice the input has not twice the effect; name "
+            "an input that is a force."
+        )
+    if not effective:
+        raise InputError(f"The input {inputs} of port {port!r} changes nothing; name another one.")
+
+
 class SteppedEquations:
-    """The equations of a unit: found as polynomials (`polynomials`), else its steps.
+    """The equations of a unit: polynomials if these are found (`polynomials`), else its steps.
 
     Parameters
     ----------
@@ -186,7 +203,7 @@ class SteppedEquations:
     parameters : mapping
         Parameters that are symbols.
     needed, measured : tuple of str
-        Outputs that ports or recordings read, and those of recordings.
+        Outputs that ports or recordings read, and outputs that are recorded.
     """
 
     def __init__(
@@ -206,7 +223,7 @@ class SteppedEquations:
         inverse = [j for j, n in enumerate(self.names) if n in parameters and np.prod(self._range(n)) > 0]
         found = find_polynomials(self._derivatives, self._draw, inverse) if unit.variable_steps else None
         self.polynomials = found
-        # an output that is no state is read after a step: it belongs to the next sample, as a state does
+        # an output that is no state is read after a step, so it belongs to the next sample and is kept as a state
         self.states = unit.states if found is not None else self.rows
         self.discrete = found is None
         if found is None:
@@ -217,7 +234,7 @@ class SteppedEquations:
 
     @property
     def note(self) -> str:
-        """How the equations came about."""
+        """Origin of the equations, in words."""
         if self.discrete:
             return f"steps of {self.unit.dt:g} s; {self._box.note}"
         return (
@@ -227,11 +244,11 @@ class SteppedEquations:
 
     @property
     def dt(self) -> float | None:
-        """Interval of the steps, s; None if equations were found."""
+        """Length of the steps, s; None if equations were found."""
         return self.unit.dt if self.discrete else None
 
     def _range(self, name: str) -> tuple[float, float]:
-        """Give the values of a parameter at which equations are looked for."""
+        """Return the range of a parameter in which equations are looked for."""
         p = self.parameters[name]
         value, low, high = (float(v) for v in (p.value, *p.bounds))
         reach = 10 * abs(value) or 1.0
@@ -259,13 +276,13 @@ class SteppedEquations:
         given = dict(zip(self.names, values.T, strict=True))
         all_of = [given.get(name, np.full(len(z), start[name])) for name in self.unit.set_names]
         out = np.full((len(z), len(self.rows)), np.nan)
-        usable = np.all(np.isfinite(values), axis=1)  # a run that has failed does not call it again
+        usable = np.all(np.isfinite(values), axis=1)  # a diverged simulation does not call the unit
         if np.any(usable):
             out[usable] = self.unit.steps(self.unit.set_names, np.stack(all_of, axis=1)[usable], h, self.rows)[0]
         return out - np.append(self._start[:n], np.zeros(len(self.others)))
 
     def _derivatives(self, z: np.ndarray) -> np.ndarray:
-        """Extrapolate derivatives and outputs to steps of length zero; NaN where this does not converge."""
+        """Extrapolate derivatives and outputs to steps of length zero; NaN without convergence."""
         n, table = len(self.unit.states), list[np.ndarray]()
         for k in range(LEVELS):
             h = self.unit.dt / 2**k
@@ -285,19 +302,19 @@ class SteppedEquations:
         return self._results(self._reduced(z[None]), self.unit.dt)[0]
 
     def _slopes(self, z: np.ndarray) -> np.ndarray:
-        """Differences by x, u and p, in one call."""
+        """Compute the differences by x, u and p in one call."""
         h = RELATIVE_STEP * np.maximum(np.abs(z), self._nominal)[1:]
         points = np.vstack([z, z + np.hstack([np.zeros((len(h), 1)), np.diag(h)])])
         found = self._results(self._reduced(points), self.unit.dt)
         return np.asarray((found[1:] - found[0]).T / h)
 
     def _reduced(self, z: np.ndarray) -> np.ndarray:
-        """Leave out time, and outputs that are kept as states."""
+        """Drop time, and outputs that are kept as states."""
         n = 1 + len(self.unit.states)
         return np.delete(z, [0, *range(n, n + len(self.others))], axis=1)
 
     def _evaluate(self, x: Any, u: Mapping[str, Any], p: Any) -> dict[str, Any]:
-        """Derivatives, or next values, of states, and other outputs, by name."""
+        """Evaluate the derivatives or the next values of states, and the other outputs, by name."""
         if self.polynomials is not None:
             return self._by_name(self.polynomials(self._stack(x, u, p)), self.rows)
         return self._box(x, Named("input", {n: u.get(n, self.unit.begin[n]) for n in self.inputs}), p, 0.0)
@@ -326,37 +343,31 @@ class SteppedEquations:
         return {n: x[n] + self._start_of(n) if n in self.states else found[n] for n in self.outputs}
 
     def _start_of(self, state: str) -> float:
-        """Start value from which a state counts; an output that is kept as a state counts from zero."""
+        """Return the start value of a state, its zero; an output that is kept as a state has none."""
         return self.unit.begin[state] if state in self.unit.states else 0.0
 
     def signal(self, port: str, key: str, name: str) -> Callable[..., Any]:
-        """Make a local signal of a port."""
+        """Make the local coordinate of a port, or its rate, from the name of a variable."""
         if name in self.states:
             start = self._start_of(name)
             return lambda x: x[name] + start
         if name in self.others:
             return lambda x, u, p: self._evaluate(x, u._values, p)[name]
-        known = listed([*self.unit.outputs, *(n for n in self.unit.states if n not in self.unit.outputs)])
-        raise InputError(f"`{key}` of port {port!r} is {name!r}; give an output or a state of the unit: {known}.")
+        known = [*self.unit.outputs, *(n for n in self.unit.states if n not in self.unit.outputs)]
+        raise unknown_signal(port, key, name, known)
 
     def into(self, port: str, factors: Mapping[str, float]) -> Any:
-        """Make the effect of a unit force on states and outputs: that on the unit at rest."""
-        z = self._draw(PROBED, True)
+        """Make the effect of a unit force on states and outputs, evaluated at rest if the unit is stepped."""
+        z = self._draw(PROBED_POINTS, True)
         step = np.array([factors.get(n, 0.0) for n in self.names])
         evaluate = self._derivatives if self.polynomials is not None else (lambda z: self._results(z, self.unit.dt))
         none, once, twice = (evaluate(z + k * step) for k in (0, 1, 2))
         once, twice = once - none, twice - none
         size = np.max(np.abs(once), axis=0) + NOMINAL * np.max(np.abs(none), axis=0)
-        if np.any(np.abs(twice - 2 * once) > NOMINAL * size):
-            raise InputError(
-                f"The force of port {port!r} does not add up in {listed(list(factors))}: twice the input has not twice "
-                "the effect; name an input that is a force."
-            )
         moved = [n for n, change in zip(self.rows, once.T, strict=True) if np.any(np.abs(change) > RELATIVE_STEP)]
         moved = [n for n in moved if n in self.states or n in self.outputs]
-        if not moved:
-            raise InputError(f"The input {listed(list(factors))} of port {port!r} changes nothing; name another one.")
-
+        linear = not np.any(np.abs(twice - 2 * once) > NOMINAL * size)
+        check_force(port, factors, linear, bool(moved))
         if self.polynomials is not None:
             z = ca.SX.sym("z", len(step))
             slopes = ca.jtimes(self.polynomials(z), z, ca.SX(ca.DM(step)))

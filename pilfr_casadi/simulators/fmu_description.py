@@ -15,7 +15,7 @@ import numpy as np
 
 from .._base import InputError, existing_file, listed
 
-SYSTEMS = {  # folders of programs in FMI 2.0 and 3.0, and how programs end
+SYSTEMS = {  # folders of programs in FMI 2.0 and 3.0, and their suffix
     "linux": ("linux", "linux", ".so"),
     "darwin": ("darwin", "darwin", ".dylib"),
     "win32": ("win", "windows", ".dll"),
@@ -24,7 +24,7 @@ SYSTEMS = {  # folders of programs in FMI 2.0 and 3.0, and how programs end
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable of modelDescription.xml; numbers are NaN where it states none."""
+    """A variable of modelDescription.xml; missing numbers are NaN."""
 
     name: str
     causality: str
@@ -41,8 +41,8 @@ class Variable:
 class Description:
     """The content of modelDescription.xml.
 
-    `identifier` is empty where the unit is not for model exchange, `slave` where it is not for co-simulation;
-    `step_size` is NaN where none is stated.
+    `identifier` is empty for a unit without model exchange, `slave` for a unit without co-simulation; `step_size` is
+    NaN if the file states none.
     """
 
     version: str
@@ -64,14 +64,14 @@ def describe(path: Path) -> Description:
     except (zipfile.BadZipFile, KeyError, ET.ParseError, OSError, EOFError, ValueError) as error:
         raise InputError(f"{path} is not a functional mock-up unit ({tidy(error)}); export it again.") from None
     entries = list(root.iterfind("ModelVariables/*"))
-    variables = {v.name: v for entry in entries if (v := _variable(entry)) is not None}
+    variables = {v.name: v for entry in entries if (v := _read_variable(entry)) is not None}
     version = root.get("fmiVersion", "").partition(".")[0]
     token = root.get("guid" if version == "2" else "instantiationToken", "")
     kinds = [root.find(kind) for kind in ("ModelExchange", "CoSimulation")]
     identifier, slave = ("" if kind is None else kind.get("modelIdentifier", "") for kind in kinds)
     varies = kinds[1] is not None and kinds[1].get("canHandleVariableCommunicationStepSize") in ("true", "1")
     experiment = root.find("DefaultExperiment")
-    step_size = _number(None if experiment is None else experiment.get("stepSize"))
+    step_size = _read_number(None if experiment is None else experiment.get("stepSize"))
     try:
         states = tuple(_state_names(root, entries, version))
     except (ValueError, IndexError, KeyError, StopIteration):
@@ -81,7 +81,7 @@ def describe(path: Path) -> Description:
 
 
 def binary_path(identifier: str, version: str) -> str:
-    """Give the path inside a unit, of FMI "2" or "3", of its program for this platform."""
+    """Return the path of this platform's program inside a unit of FMI "2" or "3"."""
     system, system3, suffix = SYSTEMS.get(sys.platform, SYSTEMS["linux"])
     machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower(), platform.machine().lower())
     folder = f"{system}64" if version == "2" else f"{machine}-{system3}"
@@ -89,7 +89,7 @@ def binary_path(identifier: str, version: str) -> str:
 
 
 def _state_names(root: ET.Element, entries: list[ET.Element], version: str) -> Iterator[str]:
-    """List the states in the order of the unit's vector, by the derivatives of its structure."""
+    """List the states in the order of the unit's vector, found by the derivatives in its structure."""
     if version == "2":
         for unknown in root.iterfind("ModelStructure/Derivatives/Unknown"):
             real = entries[int(unknown.get("index", 0)) - 1].find("Real")
@@ -102,27 +102,20 @@ def _state_names(root: ET.Element, entries: list[ET.Element], version: str) -> I
         yield by_reference[state].get("name", "")
 
 
-def _variable(entry: ET.Element) -> Variable | None:
+def _read_variable(entry: ET.Element) -> Variable | None:
     """Read a real variable; None for one of another type."""
     real = entry.find("Real")
     if real is None and entry.tag != "Float64":
         return None
     numbers = entry if real is None else real
-    low, high, nominal, start = (_number(numbers.get(key)) for key in ("min", "max", "nominal", "start"))
-    return Variable(
-        entry.get("name", ""),
-        entry.get("causality", "local"),
-        entry.get("variability", "continuous"),
-        numbers.get("unit", ""),
-        low,
-        high,
-        nominal,
-        start,
-        int(entry.get("valueReference", 0)),
-    )
+    low, high, nominal, start = (_read_number(numbers.get(key)) for key in ("min", "max", "nominal", "start"))
+    name, causality, variability = entry.get("name", ""), entry.get("causality", "local"), entry.get("variability")
+    reference = int(entry.get("valueReference", 0))
+    unit = numbers.get("unit", "")
+    return Variable(name, causality, variability or "continuous", unit, low, high, nominal, start, reference)
 
 
-def _number(text: str | None) -> float:
+def _read_number(text: str | None) -> float:
     try:
         return float(text) if text is not None else np.nan
     except ValueError:
@@ -130,7 +123,7 @@ def _number(text: str | None) -> float:
 
 
 def check_file(path: Path) -> Description:
-    """Refuse what is no unit with a program for this platform; return its description."""
+    """Refuse a file that is no unit with a program for this platform; return its description."""
     unit = describe(path)
     if unit.version not in ("2", "3"):
         raise InputError(f"{path} is a unit of FMI {unit.version or '(none stated)'}; give one of FMI 2.0 or 3.0.")

@@ -1,6 +1,6 @@
 """An instance of a functional mock-up unit for model exchange, in its continuous-time mode, for calls from generated C.
 
-CasADi's own instances need half a microsecond for an evaluation, ten times what a small unit takes.
+CasADi's own instances need half a microsecond for an evaluation, ten times as long as a small unit.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-OK = 1  # largest status of a call that was done, with or without a warning
-NAMES = {  # of the functions that an evaluation calls
+OK = 1  # largest status of a successful call, with or without a warning
+FUNCTIONS = {  # of the functions that an evaluation calls
     2: ("fmi2SetTime", "fmi2SetContinuousStates", "fmi2GetDerivatives", "fmi2SetReal", "fmi2GetReal"),
     3: (
         "fmi3SetTime",
@@ -63,7 +63,7 @@ class _Fmu(ctypes.Structure):
 
 @dataclass(frozen=True, eq=False)
 class FmuFile:
-    """An unpacked unit: the names of its description, and the value references by role, to make instances from."""
+    """An unpacked unit with the facts that an instance needs: version, token, program, value references by role."""
 
     folder: Path
     version: int
@@ -73,9 +73,9 @@ class FmuFile:
 
     def instantiate(self) -> FmuInstance | None:
         """Make an instance in continuous-time mode; None if the unit refuses."""
-        library = _library(self.folder / self.binary)
-        start = _start_2 if self.version == 2 else _start_3
-        instance = start(library, self)
+        library = _load_library(self.folder / self.binary)
+        instantiate = _instantiate_2 if self.version == 2 else _instantiate_3
+        instance = instantiate(library, self)
         return None if instance is None else FmuInstance(library, instance, self)
 
 
@@ -88,7 +88,7 @@ class FmuInstance:
         self.results = [np.zeros(max(n, 1)) for n in (sizes["x"], sizes["y"])]
         self._last = np.full(max(sizes["p"], 1), np.nan)
         self._references = [np.array([*file.references[k], 0], dtype=np.uint32) for k in ("u", "p", "y")]
-        addresses = [ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in NAMES[file.version]]
+        addresses = [ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in FUNCTIONS[file.version]]
         arrays: list[np.ndarray] = [*self._references, *self.arguments, *self.results, self._last]
         memory = [a.ctypes.data for a in arrays]
         counts = [sizes[k] for k in ("x", "u", "p", "y")]
@@ -96,9 +96,9 @@ class FmuInstance:
 
 
 def unpack(path: Path, folder: Path | None = None) -> tuple[Path, str]:
-    """Unpack a file into a private folder, once for this process; return the folder and a digest of the file.
+    """Unpack a file into a private folder, once in this process; return the folder and a digest of the file.
 
-    `folder` is one where another process has unpacked it.
+    `folder` names a folder into which another process has unpacked it.
     """
     content = path.read_bytes()
     key = hashlib.sha256(content).hexdigest()
@@ -114,11 +114,11 @@ def unpack(path: Path, folder: Path | None = None) -> tuple[Path, str]:
 
 
 @functools.cache
-def _library(path: Path) -> ctypes.CDLL:
+def _load_library(path: Path) -> ctypes.CDLL:
     return ctypes.CDLL(str(path))
 
 
-def _resources(library: ctypes.CDLL) -> Path:
+def _resource_folder(library: ctypes.CDLL) -> Path:
     return Path(library._name).parents[2] / "resources"
 
 
@@ -128,14 +128,14 @@ def _call(library: ctypes.CDLL, name: str, *arguments: Any) -> bool:
     return bool(function(*arguments) <= OK)
 
 
-def _start_2(library: ctypes.CDLL, file: FmuFile) -> int | None:
+def _instantiate_2(library: ctypes.CDLL, file: FmuFile) -> int | None:
     libc = ctypes.CDLL(None)
     addresses = (ctypes.cast(f, ctypes.c_void_p) for f in (libc.calloc, libc.free))
     callbacks = _Callbacks(_log, *addresses, None, None)
-    _kept.append(callbacks)
+    _callbacks.append(callbacks)
     make = library.fmi2Instantiate
     make.restype = ctypes.c_void_p
-    where = _resources(library).as_uri().encode()
+    where = _resource_folder(library).as_uri().encode()
     instance = make(b"unit", 0, file.token.encode(), where, ctypes.byref(callbacks), 0, 0)
     if not instance:
         return None
@@ -151,11 +151,11 @@ def _start_2(library: ctypes.CDLL, file: FmuFile) -> int | None:
     return int(instance) if done else None
 
 
-def _start_3(library: ctypes.CDLL, file: FmuFile) -> int | None:
+def _instantiate_3(library: ctypes.CDLL, file: FmuFile) -> int | None:
     make = library.fmi3InstantiateModelExchange
     make.restype = ctypes.c_void_p
     no, zero = ctypes.c_bool(False), ctypes.c_double(0.0)
-    where = str(_resources(library)).encode()
+    where = str(_resource_folder(library)).encode()
     instance = make(b"unit", file.token.encode(), where, no, no, None, _log)
     if not instance:
         return None
@@ -171,4 +171,4 @@ def _start_3(library: ctypes.CDLL, file: FmuFile) -> int | None:
 
 
 _folders: dict[str, Path] = {}  # by digest
-_kept: list[Any] = []  # instances read their callbacks as long as they live
+_callbacks: list[Any] = []  # kept alive for the instances that call them

@@ -1,8 +1,8 @@
 """Steps of a functional mock-up unit for co-simulation, by FMPy in a process of its own.
 
-Such units crash, hang and keep hidden memory, and two that are written in Python would share modules of one name. A
-step that fails gives NaN, and one that ends or blocks the process gives NaN and a new process. One call takes many
-points there.
+Such units crash, hang and keep hidden memory, and two units that are written in Python would share modules of one name.
+A step that fails gives NaN; a step that ends or blocks the process gives NaN and a new process. One call sends many
+points to the process.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from .._base import InputError, run_in_worker
 from .fmu_description import tidy
 from .fmu_instance import unpack
 
-CALL_SECONDS = 60.0  # that a call may take, with a start of the unit
-STEP_SECONDS = 0.1  # more, for each of its steps
+CALL_SECONDS = 60.0  # seconds that a call may take, with a start of the unit
+STEP_SECONDS = 0.1  # further seconds for each of its steps
 
 
 @dataclass(frozen=True)
 class Slave:
-    """A unit for co-simulation. With `fresh` each step starts the unit anew, so that its states can be set."""
+    """A unit for co-simulation; with `fresh` each step restarts the unit, so that its states can be set."""
 
     path: Path
     version: str
@@ -56,7 +56,7 @@ class Slave:
         references : sequence of int
             Variables that are set.
         values : array, (K, len(references))
-            Their values. A row that is not finite sets nothing: the unit goes on from where it is.
+            Their values. A row that is not finite sets nothing: the unit continues from its present state.
         h : array, (K,)
             Length of the steps, s.
         read : sequence of int
@@ -122,7 +122,7 @@ class _Instance:
 
 
 def _serve(job: tuple[Any, ...]) -> tuple[np.ndarray, str]:
-    """Do the steps of a job, in the child process; an instance whose step fails is replaced."""
+    """Do the steps of a job in the child process; replace an instance whose step fails."""
     slave, folder, references, values, h, read = job
     out, failure = np.full((len(h), len(read)), np.nan), ""
     for k in range(len(h)):

@@ -4,10 +4,10 @@ MuJoCo reads the file. The equations of motion
 
     M(q) dv/dt + c(q, v) = τ_actuators - D v - K (q - q_spring) + w
 
-(Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 2) are then written for CasADi. So they are compiled, they have
-exact derivatives by states and by any of the model's numbers, and w may enter at every joint. They are compared with
-MuJoCo's own accelerations at several points. Contacts and joint limits are left out; everything else that the equations
-do not hold is refused.
+(Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 2) are then written for CasADi. So they can be compiled, have
+exact derivatives by states and by all numbers of the model, and accept a force w at every joint. They are compared with
+MuJoCo's own accelerations at several points. Contacts and joint limits are ignored. A model with any other feature that
+the equations lack is refused.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from ..models import Named, Parameter, parameter_within, within_a_factor
 from .ports import Port
 from .simulator import Simulator
 
-POINTS = 8  # at which the equations are compared with MuJoCo
-SAME = 1e-8  # relative difference of accelerations that rounding may cause
+COMPARED_POINTS = 8  # at which the equations are compared with MuJoCo
+AGREE = 1e-8  # relative difference of accelerations that rounding may cause
 AXES = ("x", "y", "z")
 
 
@@ -43,9 +43,9 @@ def from_mujoco(
 ) -> Simulator:
     """Make a simulator from a MuJoCo model (extra `pilfr-casadi[mujoco]`).
 
-    Every joint is a port, with its torque or force, position and speed. The states are the joints' positions, by their
-    names, and their speeds, as `elbow.speed`. The size of the force that actuators put on a joint is a signal of its
-    port, `load`, with which friction may grow.
+    Every joint is a port, with its torque or force, position and speed. The states are the joints' positions, with the
+    names of the joints, and their speeds, such as `elbow.speed`. The absolute force of the actuators on a joint is the
+    signal `load` of its port, with which friction may grow.
 
     Parameters
     ----------
@@ -59,31 +59,31 @@ def from_mujoco(
         `(lower, upper)` by parameter; by default a factor of ten either way; dampings, armatures, stiffnesses and
         values of zero are bounded by zero below.
     inputs : tuple of str, optional
-        Actuators that are recorded; by default all. The others are at zero.
+        Recorded actuators; by default all. The others are at zero.
     outputs : tuple of str, optional
-        Sensors of joint positions and speeds, or joints, that are recorded; by default all such sensors, and the joints
-        where there is none.
+        Recorded sensors of joint positions and speeds, or joints; by default all such sensors, or all joints if there
+        is none.
     hold : {"zero", "linear"}, optional
         As of `Simulator`.
 
     Raises
     ------
     InputError
-        If MuJoCo is not installed or cannot read the file, a name is unknown, or the model holds what the equations do
-        not follow, such as free bodies, tendons, equality constraints, muscles or dry friction.
+        If MuJoCo is not installed or cannot read the file, a name is unknown, or the model has features that the
+        equations lack, such as free bodies, tendons, equality constraints, muscles or dry friction.
     """
-    tree = _Tree.load(Path(path))
-    own = parameters if parameters is not None else tree.usual_parameters
+    tree, bounds = _Tree.load(Path(path)), bounds or {}
+    own = parameters if parameters is not None else tree.default_parameters
     for names, there, kind in (
-        ((*own, *(bounds or {})), tuple(tree.numbers), "parameters"),
+        ((*own, *bounds), tuple(tree.numbers), "parameters"),
         (inputs or (), tree.actuators, "actuators"),
         (outputs or (), tuple(tree.sensors), "joints, and sensors of joints"),
     ):
         check_known(names, there, kind, path)
-    ends = {n: (bounds or {}).get(n) or _usual_bounds(n, tree.numbers[n]) for n in own}
+    ends = {n: bounds.get(n) or _default_bounds(n, tree.numbers[n]) for n in own}
     made = own if isinstance(own, Mapping) else {n: parameter_within(n, tree.numbers[n], ends[n]) for n in own}
     drives = tuple(tree.actuators if inputs is None else inputs)
-    measured = tuple(tree.usual_outputs if outputs is None else outputs)
+    measured = tuple(tree.default_outputs if outputs is None else outputs)
     equations = _Equations(tree, tuple(made), drives, measured)
     equations.check()
     return Simulator(
@@ -108,7 +108,7 @@ class _Tree:
 
     @classmethod
     def load(cls, path: Path) -> _Tree:
-        """Read a file, and refuse what the equations do not hold."""
+        """Read a file; refuse a model with features that the equations lack."""
         try:
             import mujoco
         except ImportError:
@@ -120,7 +120,7 @@ class _Tree:
             reason = " ".join(str(error).split())
             raise InputError(f"MuJoCo cannot read {path} ({reason}); correct the file.") from None
         tree = cls(path, mujoco, model)
-        if lacks := tree._left_out():
+        if lacks := tree._unsupported_feature():
             raise InputError(
                 f"{path} has {lacks}, which the equations of a tree of rigid bodies do not hold; remove it."
             )
@@ -130,8 +130,8 @@ class _Tree:
         """Read the file again in another process."""
         return _Tree.load, (self.path,)
 
-    def _left_out(self) -> str:
-        """Say what the equations do not hold; empty if nothing."""
+    def _unsupported_feature(self) -> str:
+        """Name a feature of the model that the equations lack; empty if there is none."""
         m, mj = self.model, self.mujoco
         one_axis = (int(mj.mjtJoint.mjJNT_HINGE), int(mj.mjtJoint.mjJNT_SLIDE))
         cases = {
@@ -175,7 +175,7 @@ class _Tree:
 
     @cached_property
     def sensors(self) -> dict[str, tuple[int, bool]]:
-        """Joint, and whether its speed is meant, by name of a sensor of a joint or of a joint."""
+        """(joint, whether the sensor measures its speed) by name of a joint's sensor or of a joint."""
         kinds = {int(self.mujoco.mjtSensor.mjSENS_JOINTPOS): False, int(self.mujoco.mjtSensor.mjSENS_JOINTVEL): True}
         found = {
             name: (int(self.model.sensor_objid[i]), kinds[int(self.model.sensor_type[i])])
@@ -185,12 +185,12 @@ class _Tree:
         return {**{name: (i, False) for i, name in enumerate(self.joints)}, **found}
 
     @property
-    def usual_outputs(self) -> tuple[str, ...]:
-        """The sensors of joints, or the joints where there is none."""
+    def default_outputs(self) -> tuple[str, ...]:
+        """The sensors of joints, or the joints if there is none."""
         return tuple(n for n in self.sensors if n not in self.joints) or self.joints
 
-    def _moving(self) -> list[int]:
-        """Bodies that a joint moves and that have a mass."""
+    def _list_moving_bodies(self) -> list[int]:
+        """List the bodies with a mass that a joint moves."""
         m, moves = self.model, [False] * self.model.nbody
         for i in range(1, m.nbody):
             moves[i] = bool(m.body_jntnum[i]) or moves[m.body_parentid[i]]
@@ -200,7 +200,7 @@ class _Tree:
     def numbers(self) -> dict[str, float]:
         """Every number that may be a parameter, by name."""
         m, out = self.model, {"gravity": float(np.linalg.norm(self.model.opt.gravity))}
-        for i in self._moving():
+        for i in self._list_moving_bodies():
             out |= {f"{self.bodies[i]}.mass": float(m.body_mass[i]), f"{self.bodies[i]}.inertia": 1.0}
             out |= {f"{self.bodies[i]}.com_{axis}": float(v) for axis, v in zip(AXES, m.body_ipos[i], strict=True)}
         for i, name in enumerate(self.joints):
@@ -210,12 +210,12 @@ class _Tree:
         return out | {f"{name}.gain": 1.0 for name in self.actuators}
 
     @property
-    def usual_parameters(self) -> tuple[str, ...]:
+    def default_parameters(self) -> tuple[str, ...]:
         """Masses and dampings."""
         return tuple(n for n in self.numbers if n.endswith((".mass", ".damping")))
 
     def hinge(self, joint: int) -> bool:
-        """Tell whether a joint turns."""
+        """Tell whether a joint is a hinge."""
         return bool(self.model.jnt_type[joint] == int(self.mujoco.mjtJoint.mjJNT_HINGE))
 
     def units(self, measured: Sequence[str]) -> dict[str, str]:
@@ -245,8 +245,8 @@ class _Equations:
         q, v, u, p = (ca.SX.sym(name, size) for name, size in zip("qvup", (n, n, len(inputs), len(free)), strict=True))
         controls = {name: u[i] for i, name in enumerate(inputs)}
         numbers = {**tree.numbers, **{name: p[i] for i, name in enumerate(free)}}
-        driven = self._driven(q, v, controls, numbers)
-        mass, rest = self._motion(q, v, driven, numbers)
+        driven = self._actuator_forces(q, v, controls, numbers)
+        mass, rest = self._motion_terms(q, v, driven, numbers)
         # M, the rest of the equations M dv/dt = rest, and the actuators' forces on the joints
         self.motion = ca.Function("motion", [q, v, u, p], [mass, rest, driven])
 
@@ -259,62 +259,62 @@ class _Equations:
         tree, rng, n = self.tree, np.random.default_rng(0), len(self.tree.joints)
         drives = [tree.actuators.index(name) for name in self.inputs]
         values = [tree.numbers[name] for name in self.free]
-        for _ in range(POINTS):
+        for _ in range(COMPARED_POINTS):
             q, v, u = rng.uniform(-0.7, 0.7, n), rng.normal(0, 1, n), np.zeros(len(tree.actuators))
             u[drives] = rng.uniform(-0.5, 0.5, len(drives))
             mass, rest, _ = self.motion(q, v, u[drives], values)
             wanted, found = tree.acceleration(q, v, u), np.linalg.solve(mass.full(), rest.full().ravel())
-            if not np.max(np.abs(found - wanted)) <= SAME * max(np.max(np.abs(wanted)), 1.0):
+            if not np.max(np.abs(found - wanted)) <= AGREE * max(np.max(np.abs(wanted)), 1.0):
                 raise InputError(
                     f"{tree.path} moves otherwise than a tree of rigid bodies with linear springs, dampers and "
-                    "actuators; remove what else it has, such as a fluid, curved damping, or gravity compensation."
+                    "actuators; remove its other features, such as a fluid, curved damping, or gravity compensation."
                 )
 
-    def _bodies(self, q: Any, numbers: Mapping[str, Any]) -> tuple[list[tuple[Any, Any, int]], list[Any]]:
+    def _pose_bodies(self, q: Any, numbers: Mapping[str, Any]) -> tuple[list[tuple[Any, Any, int]], list[Any]]:
         """Return centre of mass, axes of the inertia (3, 3) and index of each moving body, and the joints' axes.
 
-        All are in the world's frame. A slide turns nothing, and its axis is zero.
+        All are in the world's frame. A slide has the axis zero, because it turns nothing.
         """
         m, out = self.tree.model, []
         poses: list[tuple[Any, Any]] = [(ca.SX.zeros(3), ca.SX.eye(3))]
         turning = [ca.SX.zeros(3) for _ in self.tree.joints]
         for i in range(1, m.nbody):
             p, r = poses[m.body_parentid[i]]
-            p, r = p + r @ ca.SX(ca.DM(m.body_pos[i])), r @ _rotation(m.body_quat[i])
+            p, r = p + r @ ca.SX(ca.DM(m.body_pos[i])), r @ _rotate_by(m.body_quat[i])
             for j in range(m.body_jntadr[i], m.body_jntadr[i] + m.body_jntnum[i]):
                 moved, axis = q[j] - m.qpos0[m.jnt_qposadr[j]], ca.DM(m.jnt_axis[j])
                 along = r @ ca.SX(axis)
                 if self.tree.hinge(j):
                     turning[j] = along
                     anchor = ca.SX(ca.DM(m.jnt_pos[j]))
-                    turned = r @ _turn(axis, moved)
+                    turned = r @ _rotate_about(axis, moved)
                     p, r = p + r @ anchor - turned @ anchor, turned
                 else:
                     p = p + along * moved
             poses.append((p, r))
-        for i in self.tree._moving():
+        for i in self.tree._list_moving_bodies():
             p, r = poses[i]
             centre = ca.vertcat(*(numbers[f"{self.tree.bodies[i]}.com_{axis}"] for axis in AXES))
-            out.append((p + r @ centre, r @ _rotation(m.body_iquat[i]), i))
+            out.append((p + r @ centre, r @ _rotate_by(m.body_iquat[i]), i))
         return out, turning
 
-    def _above(self, body: int) -> set[int]:
-        """Joints that move a body."""
+    def _joints_above(self, body: int) -> set[int]:
+        """List the joints that move a body."""
         m, out = self.tree.model, set[int]()
         while body:
             out |= set(range(m.body_jntadr[body], m.body_jntadr[body] + m.body_jntnum[body]))
             body = int(m.body_parentid[body])
         return out
 
-    def _motion(self, q: Any, v: Any, driven: Any, numbers: Mapping[str, Any]) -> tuple[Any, Any]:
+    def _motion_terms(self, q: Any, v: Any, driven: Any, numbers: Mapping[str, Any]) -> tuple[Any, Any]:
         """Return M(q), (n, n), and the rest of the equations M dv/dt = rest, (n,), with the actuators' forces."""
         m, n, tree = self.tree.model, len(self.tree.joints), self.tree
         down = m.opt.gravity / (np.linalg.norm(m.opt.gravity) or 1.0)
         fall = numbers["gravity"] * ca.SX(ca.DM(down))
         mass, rest = ca.SX.zeros(n, n), 1 * driven
-        bodies, hinges = self._bodies(q, numbers)
+        bodies, hinges = self._pose_bodies(q, numbers)
         for centre, axes, i in bodies:
-            above, name = self._above(i), tree.bodies[i]
+            above, name = self._joints_above(i), tree.bodies[i]
             turning = ca.horzcat(*(axis if j in above else ca.SX.zeros(3) for j, axis in enumerate(hinges)))
             moving, weight = ca.jacobian(centre, q), numbers[f"{name}.mass"]
             share = numbers[f"{name}.inertia"] * weight / float(m.body_mass[i])
@@ -330,7 +330,7 @@ class _Equations:
             rest[j] -= numbers[f"{name}.stiffness"] * (q[j] - numbers[f"{name}.spring"])
         return mass, rest
 
-    def _driven(self, q: Any, v: Any, controls: Mapping[str, Any], numbers: Mapping[str, Any]) -> Any:
+    def _actuator_forces(self, q: Any, v: Any, controls: Mapping[str, Any], numbers: Mapping[str, Any]) -> Any:
         """Return the force or torque of the actuators on every joint, (n,)."""
         m, out = self.tree.model, ca.SX.zeros(len(self.tree.joints))
         for i, name in enumerate(self.tree.actuators):
@@ -346,7 +346,7 @@ class _Equations:
             out[j] += gear * force
         return out
 
-    def _at(self, x: Named, u: Named, p: Named) -> Any:
+    def _evaluate(self, x: Named, u: Named, p: Named) -> Any:
         """Evaluate `motion` for the simulator's symbols."""
         names, none = self.tree.joints, ca.SX(0, 1)
         return self.motion(
@@ -357,14 +357,14 @@ class _Equations:
         )
 
     def dynamics(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
-        """Derivatives by state."""
+        """Evaluate the derivatives by state."""
         names = self.tree.joints
-        mass, rest, _ = self._at(x, u, p)
+        mass, rest, _ = self._evaluate(x, u, p)
         faster = ca.vertsplit(ca.solve(mass, rest))
         return {n: x[f"{n}.speed"] for n in names} | {f"{n}.speed": a for n, a in zip(names, faster, strict=True)}
 
     def outputs(self, x: Named) -> dict[str, Any]:
-        """Outputs by name."""
+        """Evaluate the outputs by name."""
         kinds = {n: self.tree.sensors[n] for n in self.measured}
         return {n: x[self.tree.joints[i] + (".speed" if speed else "")] for n, (i, speed) in kinds.items()}
 
@@ -373,19 +373,19 @@ class _Equations:
         names, name = self.tree.joints, self.tree.joints[joint]
 
         def into(x: Named, u: Named, p: Named) -> dict[str, Any]:
-            mass = self._at(x, u, p)[0]
+            mass = self._evaluate(x, u, p)[0]
             unit = ca.SX.zeros(len(names))
             unit[joint] = -1.0
             return {f"{n}.speed": a for n, a in zip(names, ca.vertsplit(ca.solve(mass, unit)), strict=True)}
 
         def load(x: Named, u: Named, p: Named) -> Any:
-            return ca.fabs(self._at(x, u, p)[2][joint])
+            return ca.fabs(self._evaluate(x, u, p)[2][joint])
 
         def motor(dz: Any, x: Named, u: Named, p: Named) -> Any:
-            # the damping of a geared joint is mostly its motor's
+            # the motor causes most of the damping of a geared joint
             loss = f"{name}.damping"
             damping = p[loss] if loss in self.free else self.tree.numbers[loss]
-            return damping * dz - self._at(x, u, p)[2][joint]
+            return damping * dz - self._evaluate(x, u, p)[2][joint]
 
         unit = ("N m", "rad") if self.tree.hinge(joint) else ("N", "m")
         driven = any(int(j) == joint for j in self.tree.model.actuator_trnid[:, 0])
@@ -394,21 +394,21 @@ class _Equations:
         return Port(name, into, across, rate, *unit, **own)
 
 
-def _turn(axis: ca.DM, angle: Any) -> Any:
-    """Rotation (3, 3) about a unit axis (Rodrigues)."""
+def _rotate_about(axis: ca.DM, angle: Any) -> Any:
+    """Make the rotation (3, 3) about a unit axis (Rodrigues)."""
     k = ca.SX(ca.skew(axis))
     return ca.SX.eye(3) + ca.sin(angle) * k + (1 - ca.cos(angle)) * (k @ k)
 
 
-def _rotation(quaternion: np.ndarray) -> Any:
-    """Rotation (3, 3) of a unit quaternion w, x, y, z."""
+def _rotate_by(quaternion: np.ndarray) -> Any:
+    """Make the rotation (3, 3) of a unit quaternion w, x, y, z."""
     w, v = float(quaternion[0]), ca.DM(quaternion[1:])
     k = ca.skew(v)
     return ca.SX(ca.DM.eye(3) + 2 * w * k + 2 * k @ k)
 
 
-def _usual_bounds(name: str, value: float) -> tuple[float, float]:
-    """Return the bounds of a number of the model for which none are given."""
+def _default_bounds(name: str, value: float) -> tuple[float, float]:
+    """Return the default bounds of a number of the model."""
     if ".com_" in name or name.endswith(".spring"):
         return -np.inf, np.inf
     if name.endswith((".damping", ".armature", ".stiffness")):  # a joint need not have any

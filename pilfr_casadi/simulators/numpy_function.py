@@ -1,8 +1,8 @@
 """Simulators from NumPy functions, such as the right-hand side that is given to `scipy.integrate.solve_ivp`.
 
 The function is called with symbols (`tracing`), which gives its equations. They are compared with the function itself
-at random points. From then on the simulator has equations like any other, with exact derivatives and compiled code, and
-the function is not called any more. A function that cannot be followed stays as it is with `symbolic=False`
+at random points. The simulator then has equations like any other, with exact derivatives and compiled code, and no
+longer calls the function. With `numeric=Numeric()`, a function that cannot be traced is called with numbers instead
 (`black_box`).
 """
 
@@ -25,15 +25,15 @@ import numpy as np
 from .._base import InputError, in_words, listed
 from ..models import Named, Parameter, ParameterSet
 from .black_box import BlackBox, Numeric, nominal_sizes
-from .equations import distinct_names, parameter_set
+from .equations import check_names, check_parameters, stack
 from .simulator import Simulator
-from .symbols import NotFollowed, expression, symbols
-from .tracing import Trace, accept_symbols, follow
+from .symbols import NotTraceable, expression, symbols
+from .tracing import Trace, accept_symbols, explore_paths
 
 COMPARED_POINTS = 40  # at which the equations are compared with the function
-SIZE_DECADES = (-3.0, 2.0)  # powers of ten between which the sizes of states and inputs are drawn, in their own units
+SIZE_DECADES = (-3.0, 2.0)  # range of the powers of ten of states and inputs at these points, in their own units
 PARAMETER_CHANGE = 0.1  # relative change of parameters between these points
-AGREE = 1e-9  # relative difference that rounding may cause; the order of operations can differ
+AGREE = 1e-9  # relative difference that rounding may cause, because the order of operations can differ
 ARGUMENTS = ("t", "x", "u", "p")
 
 
@@ -96,15 +96,17 @@ def from_function(
     >>> simulator.output_names
     ('pos',)
     """
-    own = distinct_names(states, "states"), distinct_names(inputs, "inputs"), parameter_set(parameters or {})
+    own = check_names(states, "states"), check_names(inputs, "inputs"), check_parameters(parameters or {})
     if not own[0]:
         raise InputError("No states were given; give their names, such as ('pos', 'vel').")
     names = _Names(*own)
-    dynamics = _made(function, "derivatives", names, names.states, numeric)
+    dynamics = _make_equations(_UserFunction(function, "derivatives", names), numeric)
     if not callable(outputs):
-        measured: Any = _MeasuredStates(_measured(outputs, names.states))
+        measured: Any = _MeasuredStates(_check_measured_states(outputs, names.states))
     else:
-        measured = _made(outputs, "outputs", names, None, numeric and replace(numeric, jacobian=None))
+        measured = _make_equations(
+            _UserFunction(outputs, "outputs", names), numeric and replace(numeric, jacobian=None)
+        )
     for made in (dynamics, measured):
         if isinstance(made, BlackBox) and not (discrete and made is dynamics):
             made.find_equal_states()
@@ -118,9 +120,9 @@ class _Names:
     parameters: ParameterSet
 
     def points(self) -> list[tuple[float, np.ndarray, np.ndarray, np.ndarray]]:
-        """Draw times, states, inputs and vectors of parameters within their bounds; the first is rest.
+        """Draw times, states, inputs and vectors of parameters within their bounds; the first point is rest.
 
-        Every second one has positive states and inputs, as levels and temperatures have.
+        Every second point has positive states and inputs, such as levels and temperatures.
         """
         own, rng = self.parameters, np.random.default_rng(0)
         sizes, drawn = (len(self.states), len(self.inputs)), []
@@ -137,16 +139,13 @@ class _Equations:
     """The equations of a function, called as the dynamics or outputs of a `Simulator`."""
 
     traced: ca.Function
-    found: tuple[str, ...]
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
+    rows: tuple[str, ...]
     parameters: tuple[str, ...]
     note: str
 
     def __call__(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
-        values = [x[n] for n in self.states], [u[n] for n in self.inputs], [ca.vec(p[n]) for n in self.parameters]
-        stack = (ca.vertcat(ca.SX(0, 1), *each) for each in values)
-        return dict(zip(self.found, ca.vertsplit(self.traced(t, *stack)), strict=True))
+        own = Named("parameter", {n: p[n] for n in self.parameters})  # p holds the parameters of laws as well
+        return dict(zip(self.rows, ca.vertsplit(self.traced(t, stack(x), stack(u), stack(own))), strict=True))
 
 
 @dataclass(frozen=True)
@@ -157,25 +156,156 @@ class _MeasuredStates:
         return {n: x[n] for n in self.states}
 
 
-def _made(
-    function: Any, kind: str, names: _Names, found: tuple[str, ...] | None, numeric: Numeric | None
-) -> _Equations | BlackBox:
-    """Find the equations of a function, or make one that is called with numbers."""
-    if numeric is None:
-        return _equations(function, kind, names, found)
-    called = getattr(function, "__name__", type(function).__name__)
-    _check_arguments(function, called, kind)
-    rows, values = _evaluate(function, called, kind, names, found)
+class _UserFunction:
+    """A user's function of t, x, u and p: the names of its values (`rows`), and the values at random points."""
+
+    def __init__(self, function: Any, kind: str, names: _Names) -> None:
+        self.function, self.kind, self.names = function, kind, names
+        self.called = getattr(function, "__name__", type(function).__name__)
+        self.rows = names.states if kind == "derivatives" else ()
+        self._check_arguments()
+        self.values = self._evaluate_at_points()
+
+    def _check_arguments(self) -> None:
+        function, called = self.function, self.called
+        if not callable(function):
+            raise InputError(f"{function!r} was given for the {self.kind}; give a function of t, x, u and p.")
+        try:
+            inspect.signature(getattr(function, "py_func", function)).bind(*ARGUMENTS)
+        except (TypeError, ValueError):
+            raise InputError(
+                f"{called} cannot be called as {called}(t, x, u, p); give a function of these four."
+            ) from None
+
+    def _evaluate_at_points(self) -> list[tuple[Any, np.ndarray]]:
+        """Call the function with numbers; a function may fail at points outside its domain."""
+        values, failed = [], None
+        for point in self.names.points():
+            try:
+                with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore"):
+                    row = self.check_result(self.function(*_read_only(point, self.names.parameters)))
+                values.append((point, np.array(row, dtype=float)))
+            except InputError:
+                raise
+            except Exception as error:
+                failed = failed or error
+        if failed is not None and (not values or _writes_into_arguments(failed)):
+            raise InputError(self.describe_failure(failed)) from failed
+        if not any(np.all(np.isfinite(row)) for _, row in values):
+            raise InputError(
+                f"{self.called} gives no finite numbers at any of {COMPARED_POINTS} points around zero; check its "
+                "formulas."
+            )
+        return values
+
+    def check_result(self, result: Any) -> list[Any]:
+        """Return the values of a result in the order of `rows`; the first result of outputs gives their names."""
+        called = self.called
+        if self.kind == "outputs":
+            if not isinstance(result, Mapping) or not result or not all(isinstance(n, str) for n in result):
+                raise InputError(
+                    f"{called} returned {_describe(result)}; the outputs are {{name: value}}, such as "
+                    "{'position': x[0]}."
+                )
+            self.rows = self.rows or tuple(result)
+            if set(self.rows) != set(result):
+                raise InputError(
+                    f"{called} returned the outputs {listed(list(result))}, and before {listed(self.rows)}."
+                )
+            result = [result[n] for n in self.rows]
+        array = np.asarray(result, dtype=object)
+        values = array.ravel().tolist()
+        if len(values) != len(self.rows) or (array.ndim > 1 and max(array.shape) != array.size):
+            count = f"{len(values)} value{'s' * (len(values) != 1)}" if array.ndim < 2 else _describe(array)
+            raise InputError(
+                f"{called} returned {count}; return one number for each of the {self.kind} {listed(self.rows)}."
+            )
+        values = [v.ravel()[0] if isinstance(v, np.ndarray) and v.size == 1 else v for v in values]
+        for name, value in zip(self.rows, values, strict=True):
+            if value is None or isinstance(value, str | complex | np.complexfloating | Mapping | Sequence | np.ndarray):
+                raise InputError(f"{called} returned {_describe(value)} for {name!r}; return a number.")
+        return values
+
+    def compare(self, traced: ca.Function) -> None:
+        """Refuse equations that differ from the function at a point where the function is finite."""
+        for point, row in self.values:
+            own = traced(*point).full().ravel()
+            largest = np.max(np.abs(row[np.isfinite(row)]), initial=0.0)
+            same = np.isclose(own, row, rtol=AGREE, atol=AGREE * 1e-2 * largest) | ~np.isfinite(row)
+            if not np.all(same):
+                i = int(np.argmin(same))
+                t, x, u, _ = point
+                raise InputError(
+                    f"{self.called} gives {row[i]:.8g} for {self.rows[i]!r} and its equations {own[i]:.8g} (t = "
+                    f"{t:.4g}, x = {_format(x)}, u = {_format(u)}); a function with memory, random numbers or a test "
+                    "of types cannot be followed: write the equations in CasADi as a Simulator."
+                )
+
+    def describe_failure(self, error: BaseException, symbolic: bool = False) -> str:
+        """Describe an error of the function with its line; `symbolic` says that symbols were given to it."""
+        place = f"{self.called} ({_find_user_line(error)})"
+        if isinstance(error, NotTraceable):
+            return f"{place} {error}, or write the equations in CasADi as a Simulator."
+        if _writes_into_arguments(error):
+            return f"{place} writes into its arguments; make a new array, as in y = np.array([...])."
+        parameters = self.names.parameters
+        if isinstance(error, KeyError) and error.args and error.args[0] not in parameters:
+            known = listed(list(parameters)) or "none"
+            return f"{place} asks for the parameter {error.args[0]!r}; there are {known}."
+        said = f"{type(error).__name__}: {' '.join(str(error).split())[:160]}".rstrip(".: ")
+        if symbolic:
+            return (
+                f"{place} fails with symbols in place of numbers, for which every branch is entered ({said}); use "
+                "arithmetic and functions of NumPy (np.interp for tables), leave out checks, or write the equations in "
+                "CasADi as a Simulator."
+            )
+        return f"{place} fails with numbers ({said}); it is called as {self.called}(t, x, u, p) with p[name]."
+
+
+def _make_equations(own: _UserFunction, numeric: Numeric | None) -> _Equations | BlackBox:
+    """Find the equations of a function, or make equations that call it with numbers."""
+    return _trace(own) if numeric is None else _make_black_box(own, numeric)
+
+
+def _trace(own: _UserFunction) -> _Equations:
+    """Find the equations of a function, check them, and note how often it was called."""
+    names, kind = own.names, own.kind
+    t, x, u = ca.SX.sym("t"), ca.SX.sym("x", len(names.states)), ca.SX.sym("u", len(names.inputs))
+    p = ca.SX.sym("p", names.parameters.size)
+    accepting = accept_symbols(own.function)
+
+    def call(trace: Trace) -> Any:
+        parameters = {
+            n: symbols(v, names.parameters[n].value.shape, trace) for n, v in names.parameters.symbols(p).items()
+        }
+        arrays = symbols(x, x.shape[:1], trace), symbols(u, u.shape[:1], trace)
+        result = accepting(symbols(t, (), trace), *arrays, types.MappingProxyType(parameters))
+        return ca.vertcat(ca.SX(0, 1), *map(expression, own.check_result(result)))
+
+    try:
+        equations, calls = explore_paths(call, ca.vertcat(t, x, u))
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(own.describe_failure(error, symbolic=True)) from error
+    traced = ca.Function(kind, [t, x, u, p], [equations], [*ARGUMENTS], [kind])
+    own.compare(traced)
+    times = f"{calls + COMPARED_POINTS} times ({calls} for its branches, {COMPARED_POINTS} as a check)"
+    return _Equations(traced, own.rows, tuple(names.parameters), f"{kind}: equations of {own.called}; called {times}")
+
+
+def _make_black_box(own: _UserFunction, numeric: Numeric) -> BlackBox:
+    """Make equations that call a function with numbers."""
+    function, kind, names, rows, jacobian = own.function, own.kind, own.names, own.rows, numeric.jacobian
     every = (*names.states, *names.inputs, *names.parameters)
     counts = [*(1 for _ in (*names.states, *names.inputs)), *(p.size for p in names.parameters.values())]
     sizes = nominal_sizes(numeric.nominal, every, counts)
     at = np.cumsum([1, len(names.states), len(names.inputs)])
-
     latest: list[Any] = [b"", None]  # parameters change once in a run
 
     def arguments(z: np.ndarray) -> tuple[Any, ...]:
         if (key := z[at[2] :].tobytes()) != latest[0] or latest[1] is None:
-            latest[:] = key, _numbers((0.0, z[:0], z[:0], z[at[2] :]), names.parameters)[3]
+            latest[:] = key, _read_only((0.0, z[:0], z[:0], z[at[2] :]), names.parameters)[3]
         return float(z[0]), z[1 : at[1]].copy(), z[at[1] : at[2]].copy(), latest[1]
 
     def evaluate(z: np.ndarray) -> np.ndarray:
@@ -183,150 +313,38 @@ def _made(
         result = [result[n] for n in rows] if kind == "outputs" else result
         return np.array(result, dtype=float).reshape(len(rows))
 
-    by, own = numeric.jacobian, (names.states, names.inputs, tuple(names.parameters))
-    made = BlackBox(evaluate, called, rows, own, None if by is None else (lambda z: by(*arguments(z))), sizes)
-    made.points = [(np.hstack(point), row) for point, row in values if np.all(np.isfinite(row))]
+    slope = None if jacobian is None else (lambda z: jacobian(*arguments(z)))
+    made = BlackBox(evaluate, own.called, rows, (names.states, names.inputs, tuple(names.parameters)), slope, sizes)
+    made.points = [(np.hstack(point), row) for point, row in own.values if np.all(np.isfinite(row))]
     return made
 
 
-def _equations(function: Any, kind: str, names: _Names, found: tuple[str, ...] | None) -> _Equations:
-    """Find the equations of a function, check them, and say how often it was called."""
-    called = getattr(function, "__name__", type(function).__name__)
-    _check_arguments(function, called, kind)
-    found, values = _evaluate(function, called, kind, names, found)
-    t, x, u = ca.SX.sym("t"), ca.SX.sym("x", len(names.states)), ca.SX.sym("u", len(names.inputs))
-    p = ca.SX.sym("p", names.parameters.size)
-    accepting = accept_symbols(function)
-
-    def call(trace: Trace) -> Any:
-        own = {n: symbols(v, names.parameters[n].value.shape, trace) for n, v in names.parameters.symbols(p).items()}
-        arrays = symbols(x, x.shape[:1], trace), symbols(u, u.shape[:1], trace)
-        result = accepting(symbols(t, (), trace), *arrays, types.MappingProxyType(own))
-        return ca.vertcat(ca.SX(0, 1), *map(expression, _row(result, found, called, kind)[1]))
-
-    try:
-        equations, calls = follow(call, ca.vertcat(t, x, u))
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(_failure(called, error, names, followed=True)) from error
-    traced = ca.Function(kind, [t, x, u, p], [equations], [*ARGUMENTS], [kind])
-    for point, row in values:
-        _compare(traced, point, row, found, called)
-    times = f"{calls + COMPARED_POINTS} times ({calls} for its branches, {COMPARED_POINTS} as a check)"
-    note = f"{kind}: equations of {called}; called {times}"
-    return _Equations(traced, found, names.states, names.inputs, tuple(names.parameters), note)
-
-
-def _evaluate(
-    function: Any, called: str, kind: str, names: _Names, found: tuple[str, ...] | None
-) -> tuple[tuple[str, ...], list[tuple[Any, np.ndarray]]]:
-    """Call the function with numbers; return the names of its values, and the points with the values there."""
-    values, failed = [], None
-    for point in names.points():  # outside of its domain a function may fail
-        try:
-            with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore"):
-                found, row = _row(function(*_numbers(point, names.parameters)), found, called, kind)
-            values.append((point, np.array(row, dtype=float)))
-        except InputError:
-            raise
-        except Exception as error:
-            failed = failed or error
-    if failed is not None and (not values or _writes(failed)):
-        raise InputError(_failure(called, failed, names)) from failed
-    if found is None or not any(np.all(np.isfinite(row)) for _, row in values):
-        raise InputError(
-            f"{called} gives no finite numbers at any of {COMPARED_POINTS} points around zero; check its formulas."
-        )
-    return found, values
-
-
-def _numbers(point: tuple[float, np.ndarray, np.ndarray, np.ndarray], parameters: ParameterSet) -> tuple[Any, ...]:
+def _read_only(point: tuple[float, np.ndarray, np.ndarray, np.ndarray], parameters: ParameterSet) -> tuple[Any, ...]:
+    """Make the arguments t, x, u and p of a function, which it cannot write into."""
     t, x, u, p = point
     x, u = x.copy(), u.copy()
-    own: dict[str, Any] = {}
-    for name, value in parameters.unpack(p).items():
-        value.flags.writeable = False
-        own[name] = value if value.ndim else float(value)
-    for array in (x, u):
+    values = parameters.unpack(p)
+    for array in (x, u, *values.values()):
         array.flags.writeable = False
+    own = {name: value if value.ndim else float(value) for name, value in values.items()}
     return t, x, u, types.MappingProxyType(own)
 
 
-def _row(result: Any, found: tuple[str, ...] | None, called: str, kind: str) -> tuple[tuple[str, ...], list[Any]]:
-    """Return the names and values of a result."""
-    if kind == "outputs":
-        if not isinstance(result, Mapping) or not result or not all(isinstance(n, str) for n in result):
-            raise InputError(
-                f"{called} returned {_what(result)}; the outputs are {{name: value}}, such as {{'position': x[0]}}."
-            )
-        if found is not None and set(found) != set(result):
-            raise InputError(f"{called} returned the outputs {listed(list(result))}, and before {listed(found)}.")
-        found = found or tuple(result)
-        result = [result[n] for n in found]
-    assert found is not None
-    array = np.asarray(result, dtype=object)
-    values = array.ravel().tolist()
-    if len(values) != len(found) or (array.ndim > 1 and max(array.shape) != array.size):
-        count = f"{len(values)} value{'s' * (len(values) != 1)}" if array.ndim < 2 else _what(array)
-        raise InputError(f"{called} returned {count}; return one number for each of the {kind} {listed(found)}.")
-    for name, value in zip(found, values, strict=True):
-        if isinstance(value, np.ndarray) and value.size == 1:
-            value = value.ravel()[0]
-        if value is None or isinstance(value, str | complex | np.complexfloating | Mapping | Sequence | np.ndarray):
-            raise InputError(f"{called} returned {_what(value)} for {name!r}; return a number.")
-    return found, [v.ravel()[0] if isinstance(v, np.ndarray) else v for v in values]
-
-
-def _what(value: Any) -> str:
+def _describe(value: Any) -> str:
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape}"
     return "None" if value is None else f"a {type(value).__name__}"
 
 
-def _compare(traced: ca.Function, point: Any, row: np.ndarray, found: tuple[str, ...], called: str) -> None:
-    own = traced(*point).full().ravel()
-    largest = np.max(np.abs(row[np.isfinite(row)]), initial=0.0)
-    for name, value, other in zip(found, row, own, strict=True):
-        same = np.isclose(other, value, rtol=AGREE, atol=AGREE * 1e-2 * largest, equal_nan=True)
-        if not same and np.isfinite(value):  # where it is not, the function is outside of its domain
-            raise InputError(
-                f"{called} gives {value:.8g} for {name!r} and its equations {other:.8g} (t = {point[0]:.4g}, "
-                f"x = {_short(point[1])}, u = {_short(point[2])}); a function with memory, random numbers or a test of "
-                "types cannot be followed: write the equations in CasADi as a Simulator."
-            )
-
-
-def _short(values: np.ndarray) -> str:
+def _format(values: np.ndarray) -> str:
     return np.array2string(values, precision=4, threshold=6, separator=", ").replace("\n", "")
 
 
-def _writes(error: BaseException) -> bool:
+def _writes_into_arguments(error: BaseException) -> bool:
     return "read-only" in str(error) or "does not support item assignment" in str(error)
 
 
-def _failure(called: str, error: BaseException | None, names: _Names, followed: bool = False) -> str:
-    """Describe an error of the user's function with its line."""
-    assert error is not None
-    place = f"{called} ({_place(error)})"
-    if isinstance(error, NotFollowed):
-        return f"{place} {error}, or write the equations in CasADi as a Simulator."
-    if _writes(error):
-        return f"{place} writes into its arguments; make a new array, as in y = np.array([...])."
-    if isinstance(error, KeyError) and error.args and error.args[0] not in names.parameters:
-        known = listed(list(names.parameters)) or "none"
-        return f"{place} asks for the parameter {error.args[0]!r}; there are {known}."
-    said = f"{type(error).__name__}: {' '.join(str(error).split())[:160]}".rstrip(".: ")
-    if followed:
-        return (
-            f"{place} fails with symbols in place of numbers, for which every branch is entered ({said}); use "
-            "arithmetic and functions of NumPy (np.interp for tables), leave out checks, or write the equations in "
-            "CasADi as a Simulator."
-        )
-    return f"{place} fails with numbers ({said}); it is called as {called}(t, x, u, p) with p[name]."
-
-
-def _place(error: BaseException) -> str:
+def _find_user_line(error: BaseException) -> str:
     """Return the deepest line of the user's code in the traceback of an error."""
     ours = (str(Path(__file__).resolve().parents[1]), sysconfig.get_path("purelib"), sysconfig.get_path("stdlib"))
     steps = [(f.f_code.co_filename, n) for f, n in traceback.walk_tb(error.__traceback__)]
@@ -338,16 +356,7 @@ def _place(error: BaseException) -> str:
     return f"{Path(file).name}, line {line}" + (f": `{source[:80]}`" if source else "")
 
 
-def _check_arguments(function: Any, called: str, kind: str) -> None:
-    if not callable(function):
-        raise InputError(f"{function!r} was given for the {kind}; give a function of t, x, u and p.")
-    try:
-        inspect.signature(getattr(function, "py_func", function)).bind(*ARGUMENTS)
-    except (TypeError, ValueError):
-        raise InputError(f"{called} cannot be called as {called}(t, x, u, p); give a function of these four.") from None
-
-
-def _measured(given: Any, states: tuple[str, ...]) -> tuple[str, ...]:
+def _check_measured_states(given: Any, states: tuple[str, ...]) -> tuple[str, ...]:
     names = (given,) if isinstance(given, str) else given
     if not isinstance(names, list | tuple) or not names or not all(n in states for n in names):
         raise InputError(

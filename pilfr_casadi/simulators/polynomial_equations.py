@@ -1,8 +1,8 @@
-"""Find the equations of a program that is called with numbers, where they are polynomials.
+"""Find polynomial equations of a program that is called with numbers.
 
-The candidates are all products of at most `HIGHEST` arguments, and of reciprocals of those that are never zero (masses,
-time constants). Least squares at random points give their coefficients; terms that matter nowhere are left out, as in
-sparse identification (Brunton, Proctor & Kutz 2016, PNAS 113), but without noise: at other points, whose sizes span
+The candidates are all products of at most `HIGHEST_DEGREE` arguments and reciprocals of arguments that are never zero
+(masses, time constants). Least squares at random points give their coefficients, and negligible terms are dropped, as
+in sparse identification (Brunton, Proctor & Kutz 2016, PNAS 113). There is no noise: at other points, whose sizes span
 decades, the equations must agree with the program to six digits.
 """
 
@@ -15,13 +15,13 @@ from collections.abc import Callable, Sequence
 import casadi as ca
 import numpy as np
 
-HIGHEST = 4  # degree: a cubic spring times its stiffness
+HIGHEST_DEGREE = 4  # a cubic spring times its stiffness
 MOST_TERMS = 1500  # candidates, for which a fit takes seconds
-SPARE = 2  # points for each candidate
+POINTS_PER_TERM = 2  # random points for each candidate
 CHECKED_POINTS = 200
-NEGLIGIBLE = 1e-7  # share of the largest term of a row below which a term is left out
-AGREE = 1e-6  # relative difference from the program that is allowed at the checked points
-DIGITS = 8  # of coefficients, so that a state whose derivative is another state is seen to be that
+NEGLIGIBLE = 1e-7  # share of the largest term of a row below which a term is dropped
+AGREE = 1e-6  # allowed relative difference from the program at the checked points
+COEFFICIENT_DIGITS = 8  # so that the derivative of a position is exactly the speed
 
 
 def find_polynomials(
@@ -29,7 +29,7 @@ def find_polynomials(
     draw: Callable[[int, bool], np.ndarray],
     reciprocals: Sequence[int],
 ) -> ca.Function | None:
-    """Find `z -> r` from numbers.
+    """Find the equations `z -> r` from evaluations.
 
     Parameters
     ----------
@@ -43,43 +43,43 @@ def find_polynomials(
     Returns
     -------
     casadi.Function
-        `z -> r`; None where the program has no such equations.
+        `z -> r`; None if the program has no such equations.
     """
     checked = draw(CHECKED_POINTS, True)
     wanted = evaluate(checked)
     if not np.all(np.isfinite(wanted)):
         return None
     n, inverse = checked.shape[1], list(reciprocals)
-    for degree in range(1, HIGHEST + 1):
+    for degree in range(1, HIGHEST_DEGREE + 1):
         if math.comb(n + len(inverse) + degree, degree) > MOST_TERMS:
             return None
-        terms = _terms(n, inverse, degree)
-        z = draw(SPARE * len(terms) + n, False)
-        rows = _fit(_columns(z, inverse, terms), evaluate(z))
+        terms = _list_terms(n, inverse, degree)
+        z = draw(POINTS_PER_TERM * len(terms) + n, False)
+        rows = _fit_coefficients(_evaluate_terms(z, inverse, terms), evaluate(z))
         if rows is None:
             return None
-        values = _columns(checked, inverse, terms)
+        values = _evaluate_terms(checked, inverse, terms)
         sizes = np.abs(values) @ np.abs(rows)
         if np.all(np.abs(values @ rows - wanted) <= AGREE * sizes):
-            return _function(n, inverse, terms, rows)
+            return _make_function(n, inverse, terms, rows)
     return None
 
 
-def _terms(n: int, inverse: Sequence[int], degree: int) -> list[tuple[int, ...]]:
-    """List products as tuples of variables; n + k is the reciprocal of `inverse[k]`, never beside it."""
+def _list_terms(n: int, inverse: Sequence[int], degree: int) -> list[tuple[int, ...]]:
+    """List products as tuples of variables; n + k is the reciprocal of `inverse[k]`, never multiplied by it."""
     all_of = range(n + len(inverse))
     products = (c for d in range(degree + 1) for c in itertools.combinations_with_replacement(all_of, d))
     pairs = [(j, n + k) for k, j in enumerate(inverse)]
     return [c for c in products if not any(a in c and b in c for a, b in pairs)]
 
 
-def _columns(z: np.ndarray, inverse: Sequence[int], terms: Sequence[tuple[int, ...]]) -> np.ndarray:
+def _evaluate_terms(z: np.ndarray, inverse: Sequence[int], terms: Sequence[tuple[int, ...]]) -> np.ndarray:
     variables = np.hstack([z, 1 / z[:, inverse]])
     return np.stack([np.prod(variables[:, list(term)], axis=1) for term in terms], axis=1)
 
 
-def _fit(columns: np.ndarray, values: np.ndarray) -> np.ndarray | None:
-    """Fit the coefficients of few terms, (n_terms, m); None where a value is not finite."""
+def _fit_coefficients(columns: np.ndarray, values: np.ndarray) -> np.ndarray | None:
+    """Fit the coefficients of few terms, (n_terms, m); None if a value is not finite."""
     if not np.all(np.isfinite(values)):
         return None
     size = np.max(np.abs(columns), axis=0)
@@ -90,11 +90,11 @@ def _fit(columns: np.ndarray, values: np.ndarray) -> np.ndarray | None:
         kept = np.abs(row) > NEGLIGIBLE * np.max(np.abs(row))
         if np.any(kept):
             found = np.linalg.lstsq(columns[:, kept] / size[kept], values[:, i], rcond=None)[0] / size[kept]
-            out[kept, i] = [float(f"{c:.{DIGITS}g}") for c in found]
+            out[kept, i] = [float(f"{c:.{COEFFICIENT_DIGITS}g}") for c in found]
     return out
 
 
-def _function(n: int, inverse: Sequence[int], terms: Sequence[tuple[int, ...]], rows: np.ndarray) -> ca.Function:
+def _make_function(n: int, inverse: Sequence[int], terms: Sequence[tuple[int, ...]], rows: np.ndarray) -> ca.Function:
     z = ca.SX.sym("z", n)
     variables = [*ca.vertsplit(z), *(1 / z[j] for j in inverse)]
     found = []

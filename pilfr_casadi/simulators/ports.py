@@ -1,7 +1,7 @@
 """Ports: the places where physics may be missing, and laws placed there.
 
-A port that the user declares has a name of its own. Built-in ports need no declaration. They are named by their kind
-and by what they belong to: `actuator:<input>`, `sensor:<output>`, `equation:<state>`, `parameter:<name>`.
+A port that the user declares has a name of its own. Built-in ports need no declaration; their names give their kind
+and their owner: `actuator:<input>`, `sensor:<output>`, `equation:<state>`, `parameter:<name>`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def port_name(kind: str, of: str) -> str:
 
 
 def split_port(port: str) -> tuple[str, str]:
-    """Split a port's name into its kind and what it belongs to; the kind of a declared port is empty.
+    """Split a port's name into its kind and its owner; the kind of a declared port is empty.
 
     Examples
     --------
@@ -39,7 +39,7 @@ def split_port(port: str) -> tuple[str, str]:
 
 
 def kind_of(port: str) -> str:
-    """Tell the kind of a port by its name: ACTUATOR, SENSOR, EQUATION, PARAMETER, or "" if it is declared."""
+    """Return the kind of a port by its name: ACTUATOR, SENSOR, EQUATION, PARAMETER, or "" for a declared port."""
     return split_port(port)[0]
 
 
@@ -51,7 +51,7 @@ def in_series(port: str) -> bool:
 def name_at(port: str, law: str, form: str = "", brief: bool = False) -> str:
     """Name a law in a port by its id and form: "backlash at gear", or "variation of R with temperature".
 
-    A `brief` name has the form only where it says what the law is.
+    A `brief` name omits the form unless it identifies the law.
     """
     kind, of = split_port(port)
     if kind == PARAMETER:
@@ -70,8 +70,8 @@ class Port:
         Name in results.
     into : callable or mapping
         Where an internal force w enters: `{state: factor}` (added to the state's derivative) or `{output: factor}`; a
-        callable takes any of x, u, p by name. An output that is a state's derivative, such as that of an accelerometer,
-        or that reads one by `dx`, feels the force as well, without an entry of its own.
+        callable takes any of x, u, p by name. An output that is a state's derivative, such as an acceleration, or that
+        reads `dx`, changes with the force as well, without an entry of its own.
     across : callable
         Local coordinate z, from any of x, u, p.
     rate : callable, optional
@@ -81,24 +81,24 @@ class Port:
     unit, across_unit : str
         Units of w and of z.
     signals : mapping of str to callable, optional
-        Further quantities with which the strength of a law here may vary, besides the inputs and z: a load that the
-        contact transmits, a temperature, `{"load": lambda x, u: ca.fabs(u.torque)}`; from any of x, u, p.
+        Further quantities, besides the inputs and z, with which the strength of a law here may vary, such as the load
+        of a contact or a temperature: `{"load": lambda x, u: ca.fabs(u.torque)}`; from any of x, u, p.
     term : callable, optional
-        Force that the equations have here already, with the sign of w, so that they hold `into * term`: the force of a
-        spring, `lambda z, p: p.k * z`, or minus the torque of a motor, `lambda u: -u.torque`. It takes any of z, dz, x,
-        u, p by name, where z and dz are the local coordinate and its rate. Laws in line with it (a gap, a compliance, a
-        rotor on a spring) are then tried: they give it another z and dz. Where no term is given, that of a drive is
-        found in the equations.
+        Force that the equations have here already, with the sign of w, so that `into * term` is part of them: the force
+        of a spring, `lambda z, p: p.k * z`, or minus the torque of a motor, `lambda u: -u.torque`. It takes any of z,
+        dz, x, u, p by name, where z and dz are the local coordinate and its rate. Laws in line with it (a gap, a
+        compliance, a rotor on a spring) are then tried: they change its z and dz.
+        If no term is given, the force of a drive is found in the equations.
     implied : bool
         The simulator has found `term` in its equations.
     domain : {"mechanical", "thermal", "electrical", "fluid", "unknown"}, optional
-        Physical domain, which decides what laws are tried; by default inferred from the units.
+        Physical domain, which decides the laws that are tried; by default inferred from the units.
 
     Raises
     ------
     InputError
-        If an argument has the wrong type, or the domain is not one of these. A simulator refuses a term that its
-        equations hold with the other sign.
+        If an argument has the wrong type, or the domain is not one of these. A simulator refuses a term that has the
+        other sign in its equations.
 
     Examples
     --------
@@ -146,7 +146,7 @@ class Port:
 
     @property
     def kinds(self) -> set[str]:
-        """Kinds of places of a law that it offers: "parallel", "parameter", or "series" and at a sensor "sensor"."""
+        """Places that it offers to laws: "parallel", "parameter", or "series", at a sensor also "sensor"."""
         kind = kind_of(self.name)
         if kind == PARAMETER:
             return {"parameter"}
@@ -156,12 +156,12 @@ class Port:
 
     @property
     def is_speed(self) -> bool:
-        """Whether z is a speed, so that there is no position."""
+        """Whether z is a speed; the port then has no position."""
         return self.rate is not None and self.rate is self.across
 
     @property
     def position_unit(self) -> str:
-        """Unit of the position at the port, in which laws are written: that of z, or if z is a speed that of z s."""
+        """Unit of the position at the port, in which laws are written: the unit of z; for a speed, times s."""
         if not (self.is_speed and self.across_unit):
             return self.across_unit
         before, per_second, after = self.across_unit.rpartition("/s")
@@ -174,8 +174,8 @@ class Port:
     def admits(self, law: Any) -> bool:
         """Tell whether a law (or its class) may be missing here: by its places, physical domains and coordinate.
 
-        A port of unknown domain admits the laws of all domains, except special ones. Where z is a speed, a law of the
-        position cannot be told; if the domain is unknown, z may be something else, and a law of z alone is admitted.
+        A port of unknown domain admits the laws of all domains, except special ones. If z is a speed, laws of the
+        position are excluded; in an unknown domain z may be another quantity, so laws of z alone are admitted.
         """
         if self.is_speed and "z" in law.reads() and (self.domain == MECHANICAL or "dz" in law.reads()):
             return False
@@ -190,20 +190,20 @@ class Port:
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A law in a port, and the prefix of its parameters' names."""
+    """A law in a port, with the prefix of its parameters' names."""
 
     port: str
     law: Any
     prefix: str
 
     def own(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Extract the law's values by its own names from values by full name."""
+        """Select the law's values, by its own names, from values by full name."""
         return {name: values[f"{self.prefix}{name}"] for name in self.law.parameters()}
 
     def of(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Extract the law's values by full name from all values."""
+        """Select the law's values, by full name, from values by full name."""
         return self.named(self.own(values))
 
     def named(self, own: Mapping[str, Any]) -> dict[str, Any]:
-        """Give values of the law their full names."""
+        """Rename values of the law to full names."""
         return {f"{self.prefix}{name}": value for name, value in own.items()}

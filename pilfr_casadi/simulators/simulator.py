@@ -32,8 +32,8 @@ class Simulator(Equations):
         From any of x, u, p (and t, time in s) by name to `{state: derivative}`; x.<state>, u.<input>, p.<parameter> are
         CasADi symbols.
     outputs : callable
-        From the same to `{output: expression}`; it may also ask for `dx`, the states' derivatives, for sensors of
-        acceleration or force: `lambda x, dx: {"acceleration": dx.vel}`. Outputs are linear in `dx`.
+        From the same to `{output: expression}`. It may also read `dx`, the states' derivatives, for sensors of
+        acceleration or force: `lambda x, dx: {"acceleration": dx.vel}`. Outputs must be linear in `dx`.
     states, inputs : tuple of str
         Names; `states=()` is a static device.
     parameters : mapping
@@ -41,7 +41,7 @@ class Simulator(Equations):
     ports : Port or tuple of Port
         Declared ports; by default each state's equation is a port.
     hold : {"zero", "linear"}, optional
-        Inputs between samples, where a recording does not say.
+        Inputs between samples, for recordings that do not state it.
     discrete : bool
         `dynamics` gives the next sample's states instead of derivatives.
     elements : tuple of Placed
@@ -49,11 +49,11 @@ class Simulator(Equations):
     units : mapping
         Units of inputs and outputs by name.
     observer : array, shape (n_x, n_y), optional
-        Gain of a one-step predictor (Ljung 1999, System Identification, sec. 4.3): after each sample, it times the
+        Gain K of a one-step predictor (Ljung 1999, System Identification, sec. 4.3): after each sample, K times the
         measured minus the simulated output is added to the states. Outputs are then predictions one sample ahead.
     substeps : int
-        Least number of integration steps per sample. More are taken where the equations are fast at the beginning of a
-        recording; say how many, if they become fast later.
+        Least number of integration steps per sample. If the equations are fast at the beginning of a recording, more
+        steps are taken; if they become fast later, give the number of steps here.
 
     Raises
     ------
@@ -79,8 +79,8 @@ class Simulator(Equations):
     def simulate(self, recording: Recording) -> np.ndarray:
         """Simulate the outputs for a recording's inputs, shape (M, n_y), at the parameters' values.
 
-        A run starts from the recording's `initial` where it gives numbers, else from zero. To estimate it, `fit` the
-        simulator and simulate the fit.
+        The simulation starts from the recording's `initial` if it holds numbers, else from zero. To estimate the
+        initial state, `fit` the simulator and simulate the fit.
 
         Raises
         ------
@@ -99,7 +99,7 @@ class Simulator(Equations):
         own = recording.with_(u=recording.u[:, columns] * factors, inputs=self.inputs, units={})
         if self.observer is not None:
             factors = [unit_factor(self, recording, name) for name in self.output_names]
-            own = own.with_(y=self._measured(own) * factors, outputs=self.output_names)
+            own = own.with_(y=self._select_outputs(own) * factors, outputs=self.output_names)
         substeps = choose_substeps(self, [own])
         model = discretise(self, own.dt, own.hold or self.hold or "zero", substeps)
         drive, start = model.drive(own), np.zeros(model.n_state)
@@ -111,8 +111,7 @@ class Simulator(Equations):
     def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
         """Compute the NRMSE (Krikelis et al. 2024, Eq. 27) of a simulation, averaged over outputs and recordings.
 
-        As `Fit.nrmse` does, it fits an initial state that a recording does not give to the first samples, which are
-        then not scored.
+        As in `Fit.nrmse`, an unknown initial state is fitted to the first samples, which are then not scored.
 
         Raises
         ------
@@ -122,10 +121,9 @@ class Simulator(Equations):
         return later("simulator_nrmse")(self, recordings)
 
     def plot(self, recording: Recording) -> Any:
-        """Draw the simulator beside a recording: a row for each output, the largest swing and all residuals.
+        """Draw simulated and recorded outputs: a row for each output, the largest swing and all residuals.
 
-        An initial state that the recording does not give is fitted to the first samples; see `compare`, whose figure
-        this is.
+        An unknown initial state is fitted to the first samples; `compare` draws the same figure.
 
         Returns
         -------
@@ -145,15 +143,15 @@ class Simulator(Equations):
         ]
         for name, p in self.parameters.items():
             value = f"{float(p.value):.5g}" if p.value.ndim == 0 else np.array2string(p.value, precision=5, threshold=8)
-            lines.append(f"  {name} = {value} {self._unit(name)}{' (fixed)' if np.all(p.fixed) else ''}".rstrip())
+            lines.append(f"  {name} = {value} {self._find_unit(name)}{' (fixed)' if np.all(p.fixed) else ''}".rstrip())
         return "\n".join(lines)
 
     def readable_parameters(self) -> ParameterSet:
-        """Copy of the parameters with those of a law in the units of its port."""
-        return ParameterSet({name: replace(p, unit=self._unit(name)) for name, p in self.parameters.items()})
+        """Copy the parameters, with the parameters of laws in the units of their ports."""
+        return ParameterSet({name: replace(p, unit=self._find_unit(name)) for name, p in self.parameters.items()})
 
-    def _unit(self, name: str) -> str:
-        """Unit of a parameter, that of a law in the units of its port."""
+    def _find_unit(self, name: str) -> str:
+        """Return the unit of a parameter; for a parameter of a law, in the units of its port."""
         unit = self.parameters[name].unit
         for e in self.elements:
             if name.startswith(e.prefix):
@@ -161,14 +159,14 @@ class Simulator(Equations):
                 return readable_unit(unit, port.unit, port.position_unit, self.signal_units(e.port))
         return unit
 
-    def _measured(self, recording: Recording) -> np.ndarray:
+    def _select_outputs(self, recording: Recording) -> np.ndarray:
         for name in self.output_names:
             if name not in recording.outputs:
                 raise InputError(f"{recording.label} has no output {name!r}; it has {', '.join(recording.outputs)}.")
         return recording.y[:, [recording.outputs.index(name) for name in self.output_names]]
 
     def with_parameters(self, parameters: Mapping[str, Any]) -> Simulator:
-        """Copy with some parameters replaced; a number, or an array, replaces the value alone.
+        """Copy with some parameters replaced; a number or an array replaces only the value.
 
         Raises
         ------
@@ -183,7 +181,7 @@ class Simulator(Equations):
             {k: p if isinstance(p := parameters.get(k, q), Parameter) else replace(q, value=p) for k, q in own.items()}
         )
         alike = all(given[name].shape == own[name].shape for name in own)
-        return self._with(parameters=given) if alike else replace(self, parameters=given)
+        return self._copy_with(parameters=given) if alike else replace(self, parameters=given)
 
     def with_element(self, port: str, law: Any) -> Simulator:
         """Copy with a law in a port; see `close_loop`."""
@@ -199,18 +197,18 @@ class Simulator(Equations):
             )
         if getattr(law, "sensed", False) and not self.shown_states(place):
             raise InputError(
-                f"The law {law.id!r} ({law.form}) changes what outputs read of {port!r}, but none reads its coordinate "
-                "as a state, or that state's rate; choose another port or law."
+                f"The law {law.id!r} ({law.form}) changes what outputs show of {port!r}, but no output reads its "
+                "coordinate as a state, or that state's rate; choose another port or law."
             )
         if getattr(law, "channels", 1) != 1:
             raise InputError(f"The element has {law.channels} channels, the port {port!r} has one; give as many.")
         if lacks := getattr(law, "lacks", ""):
             raise InputError(f"The law {law.id!r} cannot be closed in at {port!r} yet: {lacks}.")
-        placed = Placed(port, law, self._free_prefix(port))
+        placed = Placed(port, law, self._choose_prefix(port))
         own = self.parameter_set | placed.named(law.parameters())
-        return self._with(parameters=own, elements=(*self.elements, placed))
+        return self._copy_with(parameters=own, elements=(*self.elements, placed))
 
-    def _free_prefix(self, port: str) -> str:
+    def _choose_prefix(self, port: str) -> str:
         """Choose the prefix of a further law's parameters at a port; no other parameter's name begins with it."""
         taken = (*self.parameters, *(e.prefix for e in self.elements))
         prefixes = itertools.chain([f"{port}."], (f"{port}#{k}." for k in itertools.count(2)))
@@ -218,14 +216,14 @@ class Simulator(Equations):
 
     def without_element(self, index: int = -1) -> Simulator:
         """Copy without one of the `elements`, by default the last."""
-        kept = list(self.elements)
-        gone = kept.pop(index)
-        own = {k: p for k, p in self.parameters.items() if not k.startswith(gone.prefix)}
-        return self._with(parameters=ParameterSet(own), elements=tuple(kept))
+        others = list(self.elements)
+        removed = others.pop(index)
+        own = {k: p for k, p in self.parameters.items() if not k.startswith(removed.prefix)}
+        return self._copy_with(parameters=ParameterSet(own), elements=tuple(others))
 
 
 def unit_notes(simulator: Simulator, recording: Recording) -> dict[str, str]:
-    """Say by channel which values of a recording are converted to the simulator's units."""
+    """Describe, by channel, the conversions of a recording's values to the simulator's units."""
     out = {}
     for name in (n for n in (*simulator.inputs, *simulator.output_names) if n in recording.units):
         factor = unit_factor(simulator, recording, name)
@@ -238,7 +236,7 @@ def unit_notes(simulator: Simulator, recording: Recording) -> dict[str, str]:
 
 
 def unit_factor(simulator: Simulator, recording: Recording, name: str) -> float:
-    """Return the factor from a channel's unit in a recording to the simulator's; 1 where one of them is not known.
+    """Return the factor from a channel's unit in a recording to the simulator's unit; 1 if one of them is unknown.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """Symbols that NumPy's functions accept: expressions of CasADi that behave like numbers and arrays of numbers.
 
-NumPy hands its functions over to their arguments (NEP 13, `__array_ufunc__`, and NEP 18, `__array_function__`). `RULES`
-gives the expression of each ufunc, and `FUNCTIONS` that of functions which need more than ufuncs. All others run as
-they are, on arrays of objects.
+NumPy lets arguments override its functions (NEP 13, `__array_ufunc__`, and NEP 18, `__array_function__`). `RULES` gives
+the expression of each ufunc, and `FUNCTIONS` gives the expressions of functions that are not built from ufuncs. All
+other functions run unchanged on arrays of objects.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ import numpy as np
 Rule = Callable[..., Any]
 
 
-class NotFollowed(Exception):
-    """An operation has no symbolic counterpart: what the function does, and what to write instead."""
+class NotTraceable(Exception):
+    """An operation has no symbolic counterpart; the message says what the function does and what to write instead."""
 
     def __init__(self, does: str, instead: str) -> None:
         super().__init__(f"{does}; {instead}")
 
 
 class Decides(Protocol):
-    """Answers conditions that are symbols."""
+    """Decide conditions that are symbols."""
 
     def decide(self, condition: Any) -> bool:
         """Return the answer to a condition."""
 
     def guard(self, argument: Any, harmless: float) -> Any:
-        """Return the argument of a function that is singular, or a harmless one where the answers are others."""
+        """Return the argument of a singular function, or a harmless one on the other paths."""
 
 
 class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
@@ -63,7 +63,7 @@ class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
     def _number(self, does: str) -> float:
         if self.sx.is_constant():
             return float(self.sx)
-        raise NotFollowed(
+        raise NotTraceable(
             f"{does} from a value that is a symbol here",
             "leave out int(), use functions of NumPy in place of other modules (np.interp for tables), and collect "
             "results by np.array([...])",
@@ -85,7 +85,7 @@ class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
         return complex(self._number("makes a complex number"))
 
     def item(self) -> Symbol:
-        """Return itself, as the scalars of NumPy return their number."""
+        """Return the symbol itself, as NumPy's scalars return their number."""
         return self
 
 
@@ -99,20 +99,20 @@ class Symbols(np.ndarray):
         return _apply_function(function, args, kwargs)
 
     def __getitem__(self, key: Any) -> Any:
-        return super().__getitem__(_decided(key))
+        return super().__getitem__(_decide_index(key))
 
     def __setitem__(self, key: Any, value: Any) -> None:
-        super().__setitem__(_decided(key), value)
+        super().__setitem__(_decide_index(key), value)
 
     def astype(self, dtype: Any, *args: Any, **options: Any) -> Any:
-        """Return a copy for any type of floats, which symbols stand for."""
+        """Return a copy for any type of float, because symbols stand for floats."""
         dtype = float if dtype is Float else dtype
         if np.dtype(dtype).kind == "f" and has_symbol(self):
             return self.copy()
         return super().astype(dtype, *args, **options)
 
 
-class _KindOfFloat(type):
+class _FloatType(type):
     def __call__(cls, value: Any = 0.0) -> Any:
         return value if isinstance(value, Symbol) else float(value)
 
@@ -120,12 +120,12 @@ class _KindOfFloat(type):
         return isinstance(value, float | Symbol)
 
 
-class Float(metaclass=_KindOfFloat):
-    """The type `float`, of which a symbol is an instance too, as NumPy's scalars are."""
+class Float(metaclass=_FloatType):
+    """The type `float`, extended so that symbols are instances too, as NumPy's scalars are."""
 
 
 def symbols(expression: Any, shape: tuple[int, ...], trace: Decides) -> Any:
-    """Make a read-only array of a shape from a matrix of expressions; of the shape (), one symbol."""
+    """Make a read-only array of symbols from a matrix of expressions; one symbol for the shape ()."""
     if not shape:
         return Symbol(expression, trace)
     out = np.empty(shape, dtype=object)
@@ -140,10 +140,10 @@ def expression(value: Any) -> Any:
     return value.sx if isinstance(value, Symbol) else ca.SX(float(value))
 
 
-def _decided(key: Any) -> Any:
+def _decide_index(key: Any) -> Any:
     """Decide the conditions of a boolean index."""
     if isinstance(key, tuple):
-        return tuple(map(_decided, key))
+        return tuple(map(_decide_index, key))
     if isinstance(key, Symbols):
         return np.array([bool(c) for c in key.ravel()], dtype=bool).reshape(key.shape)
     return key
@@ -158,7 +158,7 @@ def has_symbol(value: Any) -> bool:
     return isinstance(value, list | tuple) and any(map(has_symbol, value))
 
 
-def _trace(values: Sequence[Any]) -> Decides:
+def _find_trace(values: Sequence[Any]) -> Decides:
     return next(v.trace for v in values if isinstance(v, Symbol))
 
 
@@ -172,49 +172,53 @@ def objects(value: Any) -> np.ndarray:
 
 
 def array_of(array: np.ndarray) -> Any:
-    """Make an array of objects one of symbols, or its only element."""
+    """View an array of objects as one of symbols; return the element of an array without dimensions."""
     return array.view(Symbols) if array.ndim else array[()]
 
 
+def _map(rule: Rule, *values: Any) -> Any:
+    """Apply a rule to each element of some values, broadcast together."""
+    found = np.frompyfunc(rule, len(values), 1)(*map(objects, values))
+    return found.view(Symbols) if isinstance(found, np.ndarray) else found
+
+
 def to_numbers(value: Any) -> Any:
-    """Make arrays of objects without a symbol arrays of numbers again."""
+    """Convert arrays of objects without a symbol to arrays of numbers."""
     if isinstance(value, Symbols):
         return np.array(value.tolist())
     return type(value)(map(to_numbers, value)) if type(value) in (list, tuple) else value
 
 
-def _arrays(value: Any) -> Any:
-    """Make scalars arrays, which NumPy's own functions work on."""
+def _wrap_scalars(value: Any) -> Any:
+    """Convert single symbols to arrays, which NumPy's own functions work on."""
     if isinstance(value, Symbol):
         return objects(value).view(Symbols)
-    return type(value)(map(_arrays, value)) if type(value) in (list, tuple) else value
+    return type(value)(map(_wrap_scalars, value)) if type(value) in (list, tuple) else value
 
 
 def _elementwise(ufunc: Any, *inputs: Any) -> Any:
-    """Apply a rule, or a ufunc to elements that are all numbers."""
+    """Apply a rule, or the ufunc itself to elements that are all numbers."""
     rule = RULES.get(ufunc)
-    arrays = np.broadcast_arrays(*map(objects, inputs))
-    out = np.empty(arrays[0].shape, dtype=object)
-    for i in np.ndindex(out.shape):
-        values: list[Any] = [a[i] for a in arrays]
+    singular, harmless = SINGULAR.get(ufunc, (None, 0.0))
+
+    def apply(*values: Any) -> Any:
         if not has_symbol(values):
-            out[i] = ufunc(*values)
-        elif rule is None:
-            raise NotFollowed(f"uses np.{ufunc.__name__}, which has no symbolic counterpart", INSTEAD)
-        else:
-            own = [v.sx if isinstance(v, Symbol) else float(v) for v in values]
-            trace = _trace(values)
-            k, harmless = SINGULAR.get(ufunc, (0, None))
-            if harmless is not None and isinstance(values[k], Symbol):
-                own[k] = trace.guard(own[k], harmless)
-            out[i] = Symbol(rule(*own), trace)
-    return array_of(out)
+            return ufunc(*values)
+        if rule is None:
+            raise NotTraceable(f"uses np.{ufunc.__name__}, which has no symbolic counterpart", INSTEAD)
+        own = [v.sx if isinstance(v, Symbol) else float(v) for v in values]
+        trace = _find_trace(values)
+        if singular is not None and isinstance(values[singular], Symbol):
+            own[singular] = trace.guard(own[singular], harmless)
+        return Symbol(rule(*own), trace)
+
+    return _map(apply, *inputs)
 
 
 def _apply_ufunc(ufunc: Any, method: str, inputs: Sequence[Any], options: dict[str, Any]) -> Any:
     into = options.pop("out", (None,))[0]
     if options.pop("where", True) is not True:
-        raise NotFollowed(f"uses the option where= of np.{ufunc.__name__}", "write np.where(condition, a, b)")
+        raise NotTraceable(f"uses the option where= of np.{ufunc.__name__}", "write np.where(condition, a, b)")
     if method == "__call__" and ufunc.signature is None:
         result = _elementwise(ufunc, *inputs)
     elif method == "reduce" and ufunc in RULES:
@@ -224,7 +228,7 @@ def _apply_ufunc(ufunc: Any, method: str, inputs: Sequence[Any], options: dict[s
     if into is None or isinstance(into, Symbol):
         return result
     if into.dtype != object:
-        raise NotFollowed("writes symbols into an array of numbers", "write y = y + ... in place of y += ...")
+        raise NotTraceable("writes symbols into an array of numbers", "write y = y + ... in place of y += ...")
     into[...] = result
     return into
 
@@ -246,27 +250,25 @@ def _apply_function(function: Any, inputs: Sequence[Any], options: dict[str, Any
         return writable(result)
     if function in FUNCTIONS:
         return FUNCTIONS[function](*inputs, **options)
-    inputs, options = _arrays(tuple(inputs)), {k: _arrays(v) for k, v in options.items()}
+    inputs, options = _wrap_scalars(tuple(inputs)), {k: _wrap_scalars(v) for k, v in options.items()}
     result = np.ndarray.__array_function__(objects([]).view(Symbols), function, (Symbols,), inputs, options)
     return array_of(objects(result)) if isinstance(result, np.ndarray) and result.dtype == object else result
 
 
 def _if_else(condition: Any, a: Any, b: Any) -> Any:
     """Choose elements as np.where does."""
-    arrays: Any = np.broadcast_arrays(*map(objects, (condition, a, b)))
-    out = np.empty(arrays[0].shape, dtype=object)
-    for i in np.ndindex(out.shape):
-        c, *ab = (array[i] for array in arrays)
+
+    def choose(c: Any, yes: Any, no: Any) -> Any:
         if isinstance(c, Symbol):
-            out[i] = Symbol(ca.if_else(c.sx, *map(expression, ab)), c.trace)
-        else:
-            out[i] = ab[0] if c else ab[1]
-    return array_of(out)
+            return Symbol(ca.if_else(c.sx, expression(yes), expression(no)), c.trace)
+        return yes if c else no
+
+    return _map(choose, condition, a, b)
 
 
 def _where(condition: Any, *choices: Any) -> Any:
     if len(choices) != 2:
-        raise NotFollowed("uses np.where with one argument", "write np.where(condition, a, b)")
+        raise NotTraceable("uses np.where with one argument", "write np.where(condition, a, b)")
     return _if_else(condition, *choices)
 
 
@@ -284,29 +286,26 @@ def _select(conditions: Any, choices: Any, default: Any = 0) -> Any:
 def _interp(x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None, period: Any = None) -> Any:
     """Interpolate linearly in a table of numbers, with the end values beyond its ends."""
     if has_symbol([xp, fp]) or not (left is right is period is None):
-        raise NotFollowed("uses np.interp with more than x and a table of numbers", "write np.interp(x, xp, fp)")
+        raise NotTraceable("uses np.interp with more than x and a table of numbers", "write np.interp(x, xp, fp)")
     at, values = (np.asarray(to_numbers(v), dtype=float).ravel() for v in (xp, fp))
     if len(at) < 2 or len(at) != len(values) or np.any(np.diff(at) <= 0):
-        raise NotFollowed("uses np.interp with a table whose x does not increase", "give one that increases")
+        raise NotTraceable("uses np.interp with a table whose x does not increase", "give one that increases")
     return _each(x, lambda e: _piecewise(ca.fmin(ca.fmax(e, at[0]), at[-1]), at, _chords(at, values)))
 
 
 def _each(x: Any, rule: Rule) -> Any:
-    """Apply a rule to each element of an array that holds a symbol."""
-    elements = objects(x)
-    out = np.empty(elements.shape, dtype=object)
-    for i in np.ndindex(out.shape):
-        out[i] = Symbol(rule(expression(elements[i])), _trace(elements.ravel().tolist()))
-    return array_of(out)
+    """Apply a rule for expressions to each element of an array that holds a symbol."""
+    trace = _find_trace(objects(x).ravel().tolist())
+    return _map(lambda element: Symbol(rule(expression(element)), trace), x)
 
 
 def _chords(at: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the coefficients of a polygon for `_piecewise`."""
+    """Compute the coefficients of a piecewise linear function for `_piecewise`."""
     return np.array([np.diff(values) / np.diff(at), values[:-1]])
 
 
 def _piecewise(x: Any, at: np.ndarray, coefficients: np.ndarray) -> Any:
-    """Evaluate polynomials of x - at[j], highest power first, shape (order, pieces), the outer ones beyond the ends."""
+    """Evaluate piecewise polynomials of x - at[j], highest power first, shape (order, pieces); the outer ones go on."""
     found = None
     for start, end, row in reversed(list(zip(at[:-1], at[1:], coefficients.T, strict=True))):
         value = functools.reduce(lambda total, c, start=start: total * (x - start) + c, row, ca.SX(0))  # type: ignore[misc]
@@ -315,13 +314,13 @@ def _piecewise(x: Any, at: np.ndarray, coefficients: np.ndarray) -> Any:
 
 
 def as_table(value: Any) -> Rule | None:
-    """Make an interpolator of SciPy in one variable, linear or a spline, accept symbols; None of anything else."""
+    """Wrap a SciPy interpolator in one variable, linear or a spline, to accept symbols; None for anything else."""
     if not type(value).__module__.startswith("scipy.interpolate"):
         return None
     from scipy.interpolate import BSpline, PPoly, interp1d
 
     own: Any = value
-    beyond: Any  # what holds beyond the ends: True the outer pieces, numbers, or "periodic"
+    beyond: Any  # rule beyond the ends: True for the outer pieces, numbers, or "periodic"
     if isinstance(value, BSpline) and own.c.ndim == 1:
         pieces = PPoly.from_spline(own)
         keep = np.diff(pieces.x) > 0  # a spline's knots are repeated at its ends
@@ -338,7 +337,7 @@ def as_table(value: Any) -> Rule | None:
         if not has_symbol(x):
             return value(x, *order, **options)
         if order or options:
-            raise NotFollowed("asks a table for more than its value", "make a table of the derivative")
+            raise NotTraceable("asks a table for more than its value", "make a table of the derivative")
         return _each(x, at_one)
 
     def at_one(x: Any) -> Any:
@@ -354,20 +353,20 @@ def as_table(value: Any) -> Rule | None:
 
 
 def _like(function: Rule) -> Rule:
-    """Make np.zeros of a shape np.zeros_like of an array."""
+    """Convert a function of a shape, as np.zeros, to a function of an array, as np.zeros_like."""
     return lambda a, *values, **_: array_of(objects(function(np.shape(a), *values[: function is np.full])))
 
 
 def _matrix(rule: Rule) -> Rule:
-    """Make a function of matrices of expressions one of arrays of symbols."""
+    """Convert a function of matrices of expressions to a function of arrays of symbols."""
 
     def apply(*arrays: Any) -> Any:
         own = [objects(a) for a in arrays]
         dense = [ca.vertcat(*(ca.horzcat(*map(expression, row)) for row in a.reshape(len(a), -1))) for a in own]
         found = ca.densify(rule(*map(ca.sparsify, dense)))  # zeros spare most of the work
-        out = np.empty(found.shape, dtype=object)
+        trace, out = _find_trace([e for a in own for e in a.flat]), np.empty(found.shape, dtype=object)
         for i in np.ndindex(out.shape):
-            out[i] = Symbol(found[i], _trace([e for a in own for e in a.flat]))
+            out[i] = Symbol(found[i], trace)
         return out[0, 0] if rule is ca.det else array_of(out.reshape(own[-1].shape))
 
     return apply
@@ -391,8 +390,7 @@ RULES: dict[Any, Rule] = {
     np.divide: lambda a, b: a / b,
     np.floor_divide: lambda a, b: ca.floor(a / b),
     np.remainder: _floored_remainder,
-    np.power: lambda a, b: a**b,
-    np.float_power: lambda a, b: a**b,
+    **dict.fromkeys((np.power, np.float_power), lambda a, b: a**b),
     np.negative: lambda a: -a,
     np.positive: lambda a: a,
     np.absolute: ca.fabs,
@@ -406,27 +404,22 @@ RULES: dict[Any, Rule] = {
     np.maximum: ca.fmax,
     np.minimum: ca.fmin,
     np.trunc: lambda a: ca.sign(a) * ca.floor(ca.fabs(a)),
-    np.deg2rad: lambda a: a * (math.pi / 180),
-    np.radians: lambda a: a * (math.pi / 180),
-    np.rad2deg: lambda a: a * (180 / math.pi),
-    np.degrees: lambda a: a * (180 / math.pi),
+    **dict.fromkeys((np.deg2rad, np.radians), lambda a: a * (math.pi / 180)),
+    **dict.fromkeys((np.rad2deg, np.degrees), lambda a: a * (180 / math.pi)),
     np.less: lambda a, b: a < b,
     np.less_equal: lambda a, b: a <= b,
     np.greater: lambda a, b: a > b,
     np.greater_equal: lambda a, b: a >= b,
     np.equal: lambda a, b: a == b,
     np.not_equal: lambda a, b: a != b,
-    np.logical_and: ca.logic_and,
-    np.logical_or: ca.logic_or,
-    np.logical_not: ca.logic_not,
-    np.bitwise_and: ca.logic_and,  # `&`, `|` and `~` of conditions
-    np.bitwise_or: ca.logic_or,
-    np.invert: ca.logic_not,
-    np.isfinite: lambda a: ca.SX(1),  # a guard that equations do not need
+    **dict.fromkeys((np.logical_and, np.bitwise_and), ca.logic_and),  # bitwise: `&`, `|` and `~` of conditions
+    **dict.fromkeys((np.logical_or, np.bitwise_or), ca.logic_or),
+    **dict.fromkeys((np.logical_not, np.invert), ca.logic_not),
+    np.isfinite: lambda a: ca.SX(1),  # equations need no such guard
     np.isnan: lambda a: ca.SX(0),
     np.isinf: lambda a: ca.SX(0),
 }
-# functions that are singular or undefined for some values of an argument: which one, and a value where they are not
+# functions that are singular or undefined somewhere: the number of the argument, and a harmless value of it
 SINGULAR: dict[Any, tuple[int, float]] = {
     np.divide: (1, 1.0),
     **dict.fromkeys((np.reciprocal, np.power, np.float_power, np.sqrt, np.cbrt), (0, 1.0)),
@@ -451,5 +444,5 @@ for _name in ("zeros", "ones", "empty", "full"):
 
 
 def writable(made: Any) -> Any:
-    """Make an array of floats one that can hold symbols."""
+    """Convert an array of floats to one that can hold symbols."""
     return array_of(made.astype(object)) if isinstance(made, np.ndarray) and made.dtype.kind == "f" else made

@@ -1,7 +1,7 @@
-"""Running a user's Python file, such as a simulator file or a run file.
+"""Run a user's Python file, such as a simulator file or a run file.
 
-The file is the user's own program and runs as such, in a namespace of its own. It leaves neither bytecode files nor
-modules of its folder in `sys.modules`, and its errors become one sentence with the line.
+The file is the user's own program and runs in a namespace of its own. It leaves no bytecode files and no modules of its
+folder in `sys.modules`, and its errors become one sentence with the line.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 
 from .._base import InputError, existing_file, listed
 
-LONGEST = 240  # characters shown of another program's message
+LONGEST_MESSAGE = 240  # characters shown of another program's message
 
 
 def user_variable(
@@ -32,11 +32,11 @@ def user_variable(
     code = _compile(path, _read(path, what), what)
     module = types.ModuleType(f"_{name}_{''.join(c if c.isalnum() else '_' for c in path.stem)}")
     module.__file__ = str(path)
-    with _own_imports(path.resolve().parent, module):
+    with _isolate_imports(path.resolve().parent, module):
         try:
             exec(code, module.__dict__)
         except (Exception, SystemExit) as error:
-            raise InputError(_sentence(path, error, what)) from error
+            raise InputError(_describe_error(path, error, what)) from error
         if check is not None:
             check(path, module)
         if name not in vars(module):
@@ -61,20 +61,20 @@ def _compile(path: Path, source: bytes, what: str) -> Any:
     except SyntaxError as error:
         place = f"{path}, line {error.lineno}" if error.lineno else str(path)
         shown = f" in `{error.text.strip()}`" if error.text and error.text.strip() else ""
-        raise InputError(f"{place}: {_tidy(error.msg)}{shown}; correct it.") from None
+        raise InputError(f"{place}: {_shorten(error.msg)}{shown}; correct it.") from None
     except (ValueError, RecursionError, MemoryError) as error:  # null bytes, too deep
-        raise InputError(f"{path} is not a Python file ({_tidy(str(error))}); give {what}'s.") from None
+        raise InputError(f"{path} is not a Python file ({_shorten(str(error))}); give {what}'s.") from None
 
 
 @contextmanager
-def _own_imports(folder: Path, module: types.ModuleType) -> Iterator[None]:
+def _isolate_imports(folder: Path, module: types.ModuleType) -> Iterator[None]:
     """Allow imports from the file's folder, and remove its modules afterwards."""
     before, wrote, where = set(sys.modules), sys.dont_write_bytecode, str(folder)
     sys.dont_write_bytecode = True
     sys.path.insert(0, where)
     sys.modules[module.__name__] = module
     try:
-        with warnings.catch_warnings():  # np.sin(symbol) works; casadi's remark would confuse the user
+        with warnings.catch_warnings():  # np.sin(symbol) works; casadi's warning would confuse the user
             warnings.filterwarnings("ignore", category=FutureWarning, module="casadi")
             yield
     finally:
@@ -83,31 +83,31 @@ def _own_imports(folder: Path, module: types.ModuleType) -> Iterator[None]:
             sys.path.remove(where)
         for name in set(sys.modules) - before:
             origin = getattr(sys.modules[name], "__file__", None)
-            if origin and Path(origin).resolve().is_relative_to(folder) and not _installed(Path(origin)):
+            if origin and Path(origin).resolve().is_relative_to(folder) and not _is_installed(Path(origin)):
                 del sys.modules[name]
 
 
-def _installed(path: Path) -> bool:
+def _is_installed(path: Path) -> bool:
     """Tell whether a module belongs to an environment below the file's folder, or to this package."""
     package = Path(__file__).resolve().parents[1]
     return "site-packages" in path.parts or path.resolve().is_relative_to(package)
 
 
-def _sentence(path: Path, error: BaseException, what: str) -> str:
+def _describe_error(path: Path, error: BaseException, what: str) -> str:
     """Describe the error with the deepest line of the user's file."""
-    line = _line(path, error)
+    line = _find_line(path, error)
     place = f"{path}, line {line}" if line else str(path)
     if isinstance(error, InputError):
-        return f"{place}: {_tidy(str(error))}"
+        return f"{place}: {_shorten(str(error))}"
     if isinstance(error, SystemExit):
         return f"{place}: the file ends the program; let it only define {what}."
     if isinstance(error, SyntaxError):  # in a module that the file imports
-        return f"{place}: {Path(error.filename or '').name}, line {error.lineno}: {_tidy(error.msg)}; correct it."
-    said = _tidy(str(error)).rstrip(".")
+        return f"{place}: {Path(error.filename or '').name}, line {error.lineno}: {_shorten(error.msg)}; correct it."
+    said = _shorten(str(error)).rstrip(".")
     return f"{place}: {type(error).__name__}{f': {said}' if said else ''}; correct the file."
 
 
-def _line(path: Path, error: BaseException | None) -> int | None:
+def _find_line(path: Path, error: BaseException | None) -> int | None:
     """Find the deepest line of the file in the traceback of an error, or of its first cause."""
     found, seen = None, set[int]()
     while error is not None and id(error) not in seen:
@@ -119,7 +119,7 @@ def _line(path: Path, error: BaseException | None) -> int | None:
     return found
 
 
-def _tidy(text: str) -> str:
-    """Shorten a message to one line of at most `LONGEST` characters."""
+def _shorten(text: str) -> str:
+    """Shorten a message to one line of at most `LONGEST_MESSAGE` characters."""
     text = " ".join(text.split())
-    return text if len(text) <= LONGEST else listed([text[:LONGEST].rsplit(" ", 1)[0]]) + " ..."
+    return text if len(text) <= LONGEST_MESSAGE else listed([text[:LONGEST_MESSAGE].rsplit(" ", 1)[0]]) + " ..."

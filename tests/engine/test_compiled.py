@@ -1,4 +1,4 @@
-"""Ratios of time and memory, loose enough for a busy machine; compiler and cache, which the fast engine rests on."""
+"""The compiled engine: ratios of time and memory, with limits for a busy machine; compiler and cache."""
 
 import os
 import threading
@@ -37,7 +37,7 @@ def seconds(case, way, samples):
 
 
 def largest_ratio(slow, fast, enough):
-    """The largest of a few measured ratios; the first that is enough ends it."""
+    """Measure a ratio a few times, until it is large enough; return the largest."""
     found = []
     for _ in range(AGAIN):
         found.append(slow() / fast())
@@ -104,10 +104,10 @@ def model():
 
 @pytest.fixture
 def fresh(tmp_path, monkeypatch):
-    """An empty cache, and everything remembered about compilers forgotten, before and after."""
+    """Use an empty cache, and clear all facts about compilers before and after."""
 
     def forget():
-        for function in (compiled.compiler, compiled._machine, compiled.cache_directory):
+        for function in (compiled.compiler, compiled._describe_machine, compiled.cache_directory):
             function.cache_clear()
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -183,7 +183,7 @@ def test_damaged_library_is_built_anew(model, fresh, harm):
 @needs_compiler
 def test_the_cache_does_not_grow_without_end(fresh, monkeypatch):
     monkeypatch.setattr(compiled, "KEPT_LIBRARIES", 2)
-    monkeypatch.setattr(compiled, "_shelf", lambda key: cache_directory() / "00")
+    monkeypatch.setattr(compiled, "_cache_folder", lambda key: cache_directory() / "00")
     sources = [f"int number(void) {{ return {k}; }}" for k in range(4)]
     first = compiled.build(sources[0])
     for k, source in enumerate(sources[1:], 1):

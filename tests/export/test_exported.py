@@ -1,4 +1,4 @@
-"""What comes with an exported step: names, start state, files that need no package, continuous time, plain refusals."""
+"""Exported steps: names, start state, files that need no package, continuous time, error messages."""
 
 import ast
 import ctypes
@@ -174,7 +174,7 @@ def test_files_that_cannot_be_written(tmp_path):
 @needs_compiler
 @pytest.mark.parametrize("flags", [("-O2", "-Wextra", "-pedantic"), ("-O0",)])
 def test_hostile_names_stay_names(tmp_path, flags):
-    """Names come from files: nothing in them reaches the compiler as code."""
+    """Names come from files, and nothing in them may reach the compiler as code."""
     names = ('a" */ #error\n"', "b\\", "*/ int evil(void) { return 1; } /*", "a b", "a-b", "??/", "µ*//*", "\u202e", "")
     structure = PILFR(1, PrandtlIshlinskii(Play, 2))
     values = {"A": 0.5, "B_u": np.ones((1, len(names) - 1)), "C_z": 1.0, "D_yw": 1.0}
@@ -196,7 +196,7 @@ def test_hostile_names_stay_names(tmp_path, flags):
 
 @needs_compiler
 def test_c_for_a_program(tmp_path):
-    """What the header promises, used as a C programmer would: constants by name, and the state stepped in place."""
+    """Use the header as a C programmer would: constants by name, and the state stepped in place."""
     found = exported(lfr(Play, 2, 3), name="rig", start=np.arange(5) / 7)
     found.to_c(tmp_path)
     (tmp_path / "main.c").write_text(
@@ -324,7 +324,7 @@ TALKS_TO_ITS_CHILD = ("workers.py",)
 
 
 def test_the_package_runs_no_text_but_the_users_own_program():
-    """`eval`, `exec`, unpickling: nowhere but where a simulator's file is run, which is a program and called one."""
+    """`eval`, `exec` and unpickling occur only where a simulator's file, a program of the user, is run."""
     package = Path(exported.__code__.co_filename).parents[1]
     for path in package.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

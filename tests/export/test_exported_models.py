@@ -1,4 +1,4 @@
-"""One step, four ways: the exported function, generated C, python-control and the simulation agree on every model."""
+"""The exported function, generated C, python-control and the simulation agree on every model."""
 
 import ctypes
 import subprocess
@@ -66,7 +66,7 @@ def random_fit(structure, n_io, seed=7):
 
 
 def other_structures():
-    """Name -> fit of the structures beside the PI-LFR: modal coordinates, elements combined, networks."""
+    """Name -> fit of further structures: modal coordinates, combined elements, networks."""
     networks = {f"network {name}": random_fit(*given) for name, given in NETWORKS.items()}
     return {
         "modal coordinates": lfr(Play, 5, 4, fixed={"A": modal(5)}),
@@ -182,7 +182,7 @@ def library(models, tmp_path_factory):
 
 
 def inputs_of(model, data):
-    """Rows of u as the exported step wants them: with those of the next sample where it interpolates."""
+    """Rows of u for the exported step, with the next sample's inputs if it interpolates."""
     after = np.vstack([data.u[1:], data.u[-1:]])
     return np.hstack([data.u, after]) if len(model.inputs) == 2 * data.n_u else data.u
 

@@ -1,4 +1,4 @@
-"""Exported FMUs: what FMPy's validator says of them, and the same numbers as `simulate` when FMPy runs them."""
+"""Exported FMUs pass FMPy's validator and give the numbers of `simulate` when FMPy runs them."""
 
 import ctypes
 import shutil
@@ -200,7 +200,7 @@ def test_bounds_and_held_parameters_are_described():
 
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_the_memory_of_hysteresis_is_in_the_state_of_the_fmu(fmi):
-    """Saved, serialized and put back, the FMU runs on as it did."""
+    """A restored FMU continues as before, from its state or its serialized state."""
     from fmpy import extract, read_model_description
     from fmpy.fmi2 import FMU2Slave
     from fmpy.fmi3 import FMU3Slave

@@ -1,4 +1,4 @@
-"""Models on disk come back to the last digit or not at all, and later changes to a file are noticed."""
+"""Model files restore a model to the last digit or fail, and later changes to a file are noticed."""
 
 import json
 import os
@@ -46,17 +46,9 @@ def test_a_saved_model_simulates_to_the_last_digit(case, tmp_path):
     assert np.array_equal(after.simulate(data), before.simulate(data))
     assert after.nrmse(data) == before.nrmse(data)
     assert after.structure.fixed.keys() == before.structure.fixed.keys()
-    assert (after.dt, after.units, after.labels, after.active) == (
-        before.dt,
-        before.units,
-        before.labels,
-        before.active,
-    )
-    assert (after.train_nrmse, after.seconds, after.model.states) == (
-        before.train_nrmse,
-        before.seconds,
-        before.model.states,
-    )
+    for name in ("dt", "units", "labels", "active", "train_nrmse", "seconds"):
+        assert getattr(after, name) == getattr(before, name)
+    assert after.model.states == before.model.states
     assert np.array_equal(after.solution.theta, before.solution.theta)
     assert np.array_equal(after.solution.multipliers, before.solution.multipliers)
     assert (after.solution.history, after.status, after.solution.message) == (
@@ -121,7 +113,7 @@ def test_the_file_is_standard_json_with_everything_asked_for(tmp_path):
 
 
 class Interruption(Exception):
-    """Whatever may interrupt a write."""
+    """Errors that may interrupt a write."""
 
 
 @pytest.mark.parametrize("name", ["replace", "fsync", "fdopen"])
@@ -497,7 +489,7 @@ def test_entries_of_the_wrong_kind_or_length_are_refused(path, tmp_path):
 
 
 def refused(tmp_path, path, value, words):
-    """A change that came with its own digest."""
+    """Change the content and its digest."""
     save(some_fit(), tmp_path / "model.json")
     content = signed(changed(json.loads((tmp_path / "model.json").read_text()), path, value))
     (tmp_path / "model.json").write_text(json.dumps(content))

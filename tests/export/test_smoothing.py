@@ -1,4 +1,4 @@
-"""Rounded steps are smooth, and off by no more than is said."""
+"""Rounded steps are smooth, and their error is within the bound."""
 
 import casadi as ca
 import numpy as np
@@ -133,7 +133,7 @@ def test_what_nothing_is_known_of():
 
 @given(number, number, eps)
 def test_other_operations_are_enclosed(a, b, eps):
-    """Whatever the equations do with a rounded value, both it and the exact one lie inside."""
+    """For any operation on a rounded value, the enclosure holds the rounded and the exact result."""
     c = ca.fmax(z, q)
     expressions = [
         ca.sin(c), ca.cos(c), ca.exp(c), ca.tanh(c), c**2, c**3, c**-1, 1 / (5 + c), c * z - q * c, ca.sqrt(c + 4),

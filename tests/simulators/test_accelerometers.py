@@ -1,4 +1,4 @@
-"""Outputs that measure a state's derivative, such as accelerations: a force at a port is in them as well."""
+"""Outputs that measure a state's derivative, such as accelerations, include the force at a port."""
 
 import casadi as ca
 import numpy as np
@@ -35,7 +35,7 @@ def rig(outputs, ports=(MOUNT,), k=8000.0):
 
 
 def factors(simulator):
-    """What a unit force at the first port adds to each state's derivative and output."""
+    """Effect of a unit force at the first port on each state's derivative and output."""
     x, u, p, t = simulator.symbols()
     found = simulator.into(simulator.all_ports()[0], x, u, p, t)
     vector = ca.vertcat(*p._values.values())
@@ -97,7 +97,7 @@ def test_other_outputs_do_not(outputs):
 
 
 def test_a_decay_is_no_multiple_of_its_state():
-    """dT/dt = -T: an output T or -T is that of the state."""
+    """dT/dt = -T: an output T or -T measures the state, not its derivative."""
     for sign in (1, -1):
         cooling = Simulator(
             lambda x: {"T": -x.T},

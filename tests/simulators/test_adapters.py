@@ -1,4 +1,4 @@
-"""A user's simulator file: what it may do, what it leaves behind, and one sentence for every error in it."""
+"""A user's simulator file: its rights, no traces after it has run, and one sentence for every error in it."""
 
 import sys
 

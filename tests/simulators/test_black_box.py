@@ -1,4 +1,4 @@
-"""Functions that are called with numbers: values and derivatives are those of their equations, failures are trials."""
+"""Functions that are called with numbers: values and derivatives equal their equations; a failure fails one trial."""
 
 import re
 

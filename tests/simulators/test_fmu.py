@@ -1,4 +1,4 @@
-"""Simulators from functional mock-up units: the same numbers as from equations, ports, parameters, plain refusals."""
+"""Simulators from functional mock-up units: the numbers of their equations, ports, parameters, error messages."""
 
 import pickle
 import subprocess

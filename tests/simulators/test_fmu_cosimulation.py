@@ -1,4 +1,4 @@
-"""Units for co-simulation: equations found from their steps, steps where there are none, failures, plain refusals."""
+"""Units for co-simulation: equations found from their steps, else their steps; failures and error messages."""
 
 import sys
 import textwrap
@@ -117,7 +117,7 @@ def test_a_unit_without_such_equations_is_stepped(built):
     assert np.abs(rubbed - swing(given.u[:, 0], friction=1.0)).max() <= 1e-9
     again = cloudpickle.loads(cloudpickle.dumps(unit))
     assert np.array_equal(again.simulate(given), unit.simulate(given))
-    with pytest.raises(InputError, match=r"steps of 0\.01 s, the recordings in 0\.02 s"):
+    with pytest.raises(InputError, match=r"steps of 0\.01 s, the recordings of 0\.02 s"):
         unit.simulate(given.with_(dt=2 * DT))
 
 

@@ -1,4 +1,4 @@
-"""Simulators from MuJoCo models: the same motion as MuJoCo's own, numbers as parameters, plain refusals."""
+"""Simulators from MuJoCo models: the same motion as in MuJoCo, numbers as parameters, error messages."""
 
 import pickle
 

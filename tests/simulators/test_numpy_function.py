@@ -1,4 +1,4 @@
-"""NumPy functions as simulators: their equations are those of the function, or one sentence says why not."""
+"""NumPy functions as simulators: the equations agree with the function, or one sentence says why not."""
 
 import math
 from math import copysign
@@ -178,6 +178,15 @@ def test_it_simulates_as_the_symbolic_simulator_does_and_is_not_called_any_more(
     record = pilfr.Recording(u, u, 5e-3, inputs=("force",), outputs=("pos",), initial="zero", hold="zero")
     one, other = made.simulate(record), symbolic().simulate(record)
     assert np.max(np.abs(one - other)) <= 1e-12 * np.max(np.abs(other)) and calls == 41
+
+
+def test_a_law_in_a_port_adds_its_parameters():
+    law = pilfr.laws.CoulombFriction().at({"F_c": 12.0, "v_0": 0.003})
+    force = 12 * np.sin(np.arange(200.0) / 9)[:, None]
+    record = pilfr.Recording(force, force, 5e-3, inputs=("force",), outputs=("pos",), initial="zero", hold="zero")
+    simulators = from_function(rhs, "pos", ports=GROUND, **NAMES), symbolic()
+    made, other = (s.with_element("ground", law) for s in simulators)
+    np.testing.assert_allclose(made.simulate(record), other.simulate(record), rtol=1e-9, atol=1e-12)
 
 
 def test_missing_friction_is_found_as_with_the_symbolic_simulator():
