@@ -22,7 +22,7 @@ import numpy as np
 from .._base import InputError, one_blas_thread
 from ..data import Recording, as_recordings, group_by_input, mean_period, repeats_itself
 from ..engine import Engine, make_engine
-from ..models import NARX, PILFR, Lagged, Model, lagged_start, reading_output
+from ..models import NARX, PILFR, Lagged, Model, lagged_start, read_measured_output
 from ..optimise import Candidate, GaussNewton, Ipopt, Problem, Progress, Solution, Status, estimate_initial_state
 from .context import FitContext, check_recordings, report_iterations
 from .multistart import EXPLORE, judge, run_tasks
@@ -117,7 +117,7 @@ def explore_lagged(search: LaggedSearch, seed: int, sequence: np.random.SeedSequ
     solution, engine = None, None
     shares = OUTPUT_SHARES[:1] if isinstance(search.wanted, NARX) else OUTPUT_SHARES
     for share in shares:
-        trained = reading_output(model, share) if share else model
+        trained = read_measured_output(model, share) if share else model
         problem = search.problem(trained, engine if share else None)
         engine = problem.engine
         begin = problem.start if solution is None else solution.theta
@@ -177,7 +177,7 @@ def one_step(fit: Any, recording: Recording) -> np.ndarray:
     InputError
         If the fit is of another model, or the recording does not fit it.
     """
-    model = reading_output(fit.model)
+    model = read_measured_output(fit.model)
     state = fit.initial_state(recording)
     return make_engine(model, fit.engine).simulate(model.drive(recording), model.parameters.start, state)[0]
 

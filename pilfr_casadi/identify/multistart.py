@@ -37,7 +37,7 @@ from ..models import (
     PrandtlIshlinskii,
     StaticNetwork,
     direction_fixed,
-    fixed_whole,
+    fixed_blocks,
     places,
     weight_density,
 )
@@ -125,7 +125,7 @@ def is_drawn(structure: Any, start: str, seed: int) -> bool:
     element = structure.element
     if start != "grid" or isinstance(element, StaticNetwork):
         return True
-    several = "r" not in fixed_whole(structure) and getattr(element, "n", 1) > 1
+    several = "r" not in fixed_blocks(structure) and getattr(element, "n", 1) > 1
     return seed >= len(places(structure)) and (several or not direction_fixed(structure))
 
 

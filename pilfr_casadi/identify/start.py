@@ -54,12 +54,12 @@ from ..models import (
     PrandtlIshlinskii,
     StaticNetwork,
     direction_fixed,
-    driven_through,
-    fixed_whole,
+    fixed_blocks,
+    is_hammerstein,
+    is_wiener,
     is_zero,
     neurons_over,
     or_one,
-    read_through,
 )
 from ..optimise import Constraint, GaussNewton, Problem, Solution, Status, stability_limits
 from .context import FitContext, report_iterations
@@ -347,14 +347,14 @@ def _place_element(
 ) -> tuple[Blocks, Array]:
     """Return the linear blocks with the element at its place (see `grid_start`), and the signal z (M, channels)."""
     blocks = _directions(element, linear, rng)
-    fixed, n_u = fixed_whole(structure), linear["B_u"].shape[1]
+    fixed, n_u = fixed_blocks(structure), linear["B_u"].shape[1]
     blocks["D_zu"] = blocks["D_zu"] / or_one(np.std(np.concatenate(inputs), axis=0))
     at_output, at_input = (np.arange(element.channels) % n for n in (len(linear["C_y"]), n_u))
     if place == "output":
         blocks["C_z"], blocks["D_zu"] = linear["C_y"][at_output], linear["D_yu"][at_output]
     elif place == "input" and not is_zero(structure, "D_zu"):
         blocks["C_z"], blocks["D_zu"] = np.zeros_like(blocks["C_z"]), np.eye(n_u)[at_input]
-    if driven_through(structure):
+    if is_hammerstein(structure):
         blocks["B_w"], blocks["D_yw"] = linear["B_u"], linear["D_yu"]
     blocks |= _fixed_blocks(structure, linear, blocks)
     z = _signal(inputs, states, blocks)
@@ -373,8 +373,8 @@ def _signal(inputs: Signals, states: Signals, blocks: Values) -> Array:
 
 def _fixed_blocks(structure: PILFR, linear: Values, blocks: Blocks) -> Blocks:
     """Return the blocks that the structure fixes, and for a Wiener model z = the linear model's output."""
-    out = {"C_z": linear["C_y"], "D_zu": linear["D_yu"]} if read_through(structure) else {}
-    fixed = {k: np.asarray(structure.fixed[k], dtype=float) for k in fixed_whole(structure) if k in blocks}
+    out = {"C_z": linear["C_y"], "D_zu": linear["D_yu"]} if is_wiener(structure) else {}
+    fixed = {k: np.asarray(structure.fixed[k], dtype=float) for k in fixed_blocks(structure) if k in blocks}
     return out | {k: np.broadcast_to(v, blocks[k].shape) for k, v in fixed.items()}
 
 

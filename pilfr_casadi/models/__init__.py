@@ -59,12 +59,12 @@ if TYPE_CHECKING:
         PILFR as PILFR,
         block_shapes as block_shapes,
         direction_fixed as direction_fixed,
-        driven_through as driven_through,
-        fixed_whole as fixed_whole,
+        fixed_blocks as fixed_blocks,
         hammerstein as hammerstein,
+        is_hammerstein as is_hammerstein,
+        is_wiener as is_wiener,
         is_zero as is_zero,
         places as places,
-        read_through as read_through,
         wiener as wiener,
         with_port_gain as with_port_gain,
     )
@@ -82,7 +82,7 @@ if TYPE_CHECKING:
         named_structure as named_structure,
         network_lfr as network_lfr,
         neurons_over as neurons_over,
-        reading_output as reading_output,
+        read_measured_output as read_measured_output,
         ssnn as ssnn,
     )
 else:

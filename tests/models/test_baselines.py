@@ -11,7 +11,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError, ordered_digest
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.identify import gauge_tangents, solve_with_early_stopping, split_validation
-from pilfr_casadi.models import reading_output
+from pilfr_casadi.models import read_measured_output
 from pilfr_casadi.optimise import Problem
 
 NOISE = 0.01
@@ -128,7 +128,7 @@ def test_derivatives(name, share):
     model = truth(name)
     train = recordings(model, length=60)[0].with_(initial="estimate")
     if share is not None:
-        model = reading_output(model, share)
+        model = read_measured_output(model, share)
     engines = [Problem(model, train, engine=engine) for engine in ("vm", "auto")]
     theta = engines[0].start + 0.05 * np.random.default_rng(1).normal(size=engines[0].size)
     jac, again = (p.jacobian(theta) for p in engines)
@@ -150,10 +150,10 @@ def test_reading_the_output_is_a_regression():
     z = states @ known["C_z"].T + train.u @ known["D_zu"].T
     following = states @ known["A"].T + train.u @ known["B_u"].T
     following += np.tanh(z + known["bias"].ravel()) @ known["B_w"].T
-    read = reading_output(model)
+    read = read_measured_output(model)
     y = make_engine(read, "vm").simulate(read.drive(train), read.parameters.start, np.zeros(read.n_x))[0]
     np.testing.assert_allclose(y[1:], following[:-1, :2] + known["y_0"], atol=1e-12)
-    free = reading_output(model, 0.0)
+    free = read_measured_output(model, 0.0)
     one, two = (
         make_engine(m, "vm").simulate(m.drive(train), m.parameters.start, np.zeros(m.n_x))[0] for m in (model, free)
     )
