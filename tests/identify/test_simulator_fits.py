@@ -44,7 +44,7 @@ def test_the_parameters_are_found(record, fitted):
     assert np.isfinite(fitted.errors["k"]) and np.isnan(fitted.errors["m"])
 
 
-def test_a_law_gets_the_substeps_that_it_asks_for_in_a_fit_as_in_a_simulation(record):
+def test_a_fit_and_a_simulation_use_the_substeps_of_a_law(record):
     late = simulator().with_element("actuator:force", Delay({"T": 0.025}))
     found = pilfr.fit(late, record, engine="vm")
     assert found.model.substeps == Delay.substeps > 1
