@@ -223,7 +223,7 @@ def run_free(
     array, shape (M, n_y)
         Simulated outputs; not finite where the simulation diverges.
     int
-        First scored sample: the part that the state is fitted to is left out, unless that is the whole recording.
+        First scored sample, after the part to which the state is fitted unless that is the whole recording.
     """
     estimated = recording.begins == "estimate" and model.n_state > 0
     used = samples_to_start(model, engine, recording) if estimated else 0

@@ -160,7 +160,7 @@ class FitContext:
     def _result(
         self, model: Model, structure: PILFR | None, problem: Problem, solution: Solution, note: str, fields: Any
     ) -> Fit:
-        """Build the `Fit`, with a note on what the recordings do not determine.
+        """Build the `Fit`, with a note on quantities that the recordings do not determine.
 
         Priors that the search added to weights and thresholds (`DENSITY_PRIOR`) are removed from the model and its
         standard errors here.
@@ -310,23 +310,28 @@ def describe_reached_gain(problem: Problem, theta: Array) -> str:
             moved = find_slipping(problem, theta, values)
         low, high = problem.g_lower[rows], problem.g_upper[rows]
         room = APART * float(np.max(np.abs(np.concatenate([low, high])), initial=0.0))
-
-        def far(gain: Array, low: Array = low, high: Array = high, room: float = room) -> bool:
-            return bool(np.any(~((low - room <= gain) & (gain <= high + room))))
-
+        limits = low - room, high + room
         whole, within, odd = channel_weights(problem.model.element, values, c.expression.slope, moved)
-        if far(gain_over(values, whole, None)):
+        if _is_outside(gain_over(values, whole, None), *limits):
             continue  # the limits report a gain that is not met at all
         reached = gain_over(values, within, samples)
-        if not far(reached):
+        if not _is_outside(reached, *limits):
             continue
-        by_range, by_time = far(gain_over(values, within, None)), far(gain_over(values, whole, samples))
-        both = not by_range and not by_time
-        why = [odd] if (by_range or both) and odd else []
-        why += [f"the response takes more than the {samples} recorded samples to settle"] if by_time or both else []
+        by_range = _is_outside(gain_over(values, within, None), *limits)
+        by_time = _is_outside(gain_over(values, whole, samples), *limits)
+        why = []
+        if odd and (by_range or not by_time):
+            why.append(odd)
+        if by_time or not by_range:
+            why.append(f"the response takes more than the {samples} recorded samples to settle")
         shown = ", ".join(f"{g:.3g}" for g in reached)
         found.append(f"{c.name} holds only beyond the recordings: {' and '.join(why)}; within them it is {shown}")
     return "; ".join(found)
+
+
+def _is_outside(gain: Array, low: Array, high: Array) -> bool:
+    """Tell whether an entry of a gain lies outside its limits, or is nan."""
+    return bool(np.any(~((low <= gain) & (gain <= high))))
 
 
 def find_slipping(problem: Problem, theta: Array, values: Mapping[str, Array]) -> Array:
@@ -357,12 +362,12 @@ def channel_weights(
     if slope not in (0.0, 1.0):
         return whole, whole, ""
     if (slope == 1.0) != stops:  # large motions
-        odd, what = ~moved, "never slip in them"
+        odd, reason = ~moved, "never slip in them"
     else:
-        odd, what = values["r"] <= 0, "have no threshold below which they stick"
+        odd, reason = values["r"] <= 0, "have no threshold below which they stick"
     odd = odd & (w > 0)
     active = odd if slope == 0.0 else ~odd
-    return whole, (w * active).sum(axis=1), f"{int(odd.sum())} of {w.size} operators {what}" if np.any(odd) else ""
+    return whole, (w * active).sum(axis=1), f"{int(odd.sum())} of {w.size} operators {reason}" if np.any(odd) else ""
 
 
 def gain_over(values: Mapping[str, Array], weight: Array, samples: int | None) -> Array:

@@ -96,9 +96,9 @@ def fit(
         Solver of the final problem, by default `GaussNewton(tolerance=1e-4)`. At an exact bound on a spectral radius
         the last solve is always by Gauss-Newton.
     starts, seed : int
-        Number of starts (`start` says how they are chosen), and the seed of all of them. With `start="grid"` the first
-        two have the element at the output and at the input (Hammerstein and Wiener models have one such start); further
-        ones are drawn. More starts with the same seed include those of fewer.
+        Number of starts (see `start`), and the seed of all of them. With `start="grid"` the first two have the element
+        at the output and at the input (Hammerstein and Wiener models have one such start); further starts are drawn.
+        With the same seed, more starts include all of fewer starts.
     start : {"grid", "paper", "plain"} or mapping
         How start values are chosen (`starts` is their number). "grid" (default) places thresholds on a grid, explores
         every start and polishes the best. "paper" solves from every start of the paper (Eq. 22-24) and then places its
@@ -165,7 +165,7 @@ def fit(
         raise InputError("Weights are for a fit from values; give a Model, a Fit, or start={name: value}.")
     own_pool = executor is None and workers > 1
     if own_pool and getattr(multiprocessing.current_process(), "_inheriting", False):
-        raise SystemExit(1)  # a spawned worker runs the script again; the first process says what to do
+        raise SystemExit(1)  # a spawned worker runs the script again; the first process reports the error
     if l1 is not None and not isinstance(l1, dict):
         raise InputError(f'l1 = {l1!r} was given; give weights by name, like {{"w": 1e-4}}.')
     options = model.options if isinstance(model, Fit) else FitOptions()

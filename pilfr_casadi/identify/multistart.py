@@ -75,7 +75,7 @@ class StartSearch:
         return self.context.problem(model, noise or self.level, constraints=constraints, **engines)
 
     def solve(self, problem: Problem, start: np.ndarray | None, solver: Any, at_bound: bool = False) -> Solution:
-        """Solve inside exact bounds on spectral radii; `at_bound` says that one of them is active at the start."""
+        """Solve inside exact bounds on spectral radii; set `at_bound` if one of them is active at the start."""
         return solve_within_bounds(problem, start, solver, "steps", self.context.progress, at_bound=at_bound)
 
     def model(self, values: dict[str, Any]) -> Model:

@@ -2,7 +2,7 @@ r"""L1 penalty on an element's weights, with all scales fixed that could offset 
 
     minimise  1/2 mean(e²) + l1 Σ w_ij
 
-(Tibshirani 1996; the simulation error is that of Krikelis et al. 2024, Eq. 20). The outputs of a PI-LFR do not change
+(Tibshirani 1996; simulation error of Krikelis et al. 2024, Eq. 20). The outputs of a PI-LFR do not change
 under `w_i -> w_i / μ, (B_w, D_yw)_i -> μ (...)`, nor under a scaling of z with its thresholds and of the states, in
 every combination (`generators`). With all blocks free, a rescaling alone would drive the penalty to zero. Fixing an
 invariant product such as `C_z B_w` is not enough: it is the first sample of the response from w to z, which is tiny in
@@ -143,7 +143,7 @@ def restore_variables(solution: Solution, fixed_problem: Problem, problem: Probl
 
 
 def penalty_sentence(model: Model, l1: dict[str, float]) -> str:
-    """Say how many entries the penalty has set to zero."""
+    """Report how many entries the penalty has set to zero."""
     counts = [f"{np.sum(model.parameters[k].value == 0)} of {model.parameters[k].size} entries of {k}" for k in l1]
     return f"L1 penalty: {', '.join(counts)} are exactly zero; the linear blocks were fixed during this solve"
 

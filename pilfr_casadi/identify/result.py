@@ -66,7 +66,7 @@ class FitOptions:
         weights: Any = None,
         train: Any = (),
     ) -> FitOptions:
-        """Return the options with some replaced; None keeps the present value. `weights` are those of `train`."""
+        """Return the options with some replaced; None keeps the present value. `weights` belong to `train`."""
         if noise is not None and noise != "estimate" and not (is_number(noise) and 0 < noise < np.inf):
             raise InputError(f"noise = {noise!r} was given; give a number above zero, or 'estimate'.")
         if constraints is None and self.lost:
@@ -369,7 +369,7 @@ class Fit:
             )
 
     def content(self) -> FitContent:
-        """Collect what a model file stores of this fit."""
+        """Collect the content of this fit's model file."""
         shared = {f.name: getattr(self, f.name) for f in fields(FitContent) if hasattr(self, f.name)}
         return FitContent(**shared, noise=self.options.noise, weights=self.options.weights)
 
@@ -467,8 +467,8 @@ def save(fit: Fit, path: str | os.PathLike[str]) -> None:
 def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fit:
     """Read a fit that `save` wrote; simulations are the same to the last digit.
 
-    Parameters, errors and warnings are those of `export.read_model_file`. Each candidate has its seed, error and
-    status, an empty `theta` and the fitted model.
+    See `export.read_model_file` for parameters, errors and warnings. Each candidate has its seed, error and status, an
+    empty `theta` and the fitted model.
     """
     content = read_model_file(path, model)
     shared = {f.name: getattr(content, f.name) for f in fields(content) if f.name in Fit.__dataclass_fields__}

@@ -93,13 +93,13 @@ def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> F
     train : Recording or sequence of Recording
         Training data of the fit.
     options
-        As for `fit`: `solver`, `engine`, `stable`, `constraints`, `noise`, `weights`; the last four are those of the
-        fit by default.
+        As for `fit`: `solver`, `engine`, `stable`, `constraints`, `noise`, `weights`; the last four default to the
+        options of the fit.
 
     Returns
     -------
     Fit
-        Each channel has as many operators as the fullest channel needs, at least one.
+        Each channel has as many operators as the channel with the most nonzero weights, at least one.
 
     Raises
     ------

@@ -288,8 +288,8 @@ def grid_start(
 
     - "random": a random direction in states and inputs, each in units of its deviation; `B_w = D_yw = 0`; if the
       structure fixes the direction, random thresholds in place of the grid;
-    - "output": z is the linear model's output, half of which is read through the element;
-    - "input": z is the input, half of which reaches the linear model through the element.
+    - "output": z is the linear model's output, half of which passes through the element;
+    - "input": z is the input, half of which passes through the element to the linear model.
 
     For Hammerstein and Wiener structures the linear blocks move to the other side of the element. With other fixed
     blocks, "output" and "input" give the direction of z alone.
@@ -403,8 +403,8 @@ def envelope_start(
 ) -> Blocks:
     """Choose envelopes, thresholds and weights of a generalized play from the loops of z and its answer.
 
-    `values` (from `grid_start`) define z. They are returned unchanged if the structure fixes other blocks than those of
-    a Hammerstein or Wiener model. At `place` "random" the output is read through the element, as at "output".
+    `values` (from `grid_start`) define z. They are returned unchanged if the structure fixes blocks that a Hammerstein
+    or Wiener model leaves free. At `place` "random" the output is read through the element, as at "output".
     """
     element = _pi_element(structure)
     fixed = set(structure.fixed) - {"y_0", "A"}

@@ -91,8 +91,8 @@ def surrogate_warning(error: float) -> str:
     if error <= POOR_SURROGATE:
         return ""
     return (
-        "The linear model is poor: the simulation is not linear there, and what the model misses may show up as "
-        "missing physics. Give the simulator itself where it can be had."
+        "The linear model is poor: the simulation is not linear there, and the error of the model may show up as "
+        "missing physics. Give the simulator itself if you have it."
     )
 
 

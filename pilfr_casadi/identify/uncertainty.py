@@ -238,6 +238,7 @@ def standard_errors(problem: Problem, theta: Array, structure: PILFR | None = No
 
 
 def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tuple[Array, Array]:
+    """Compute the covariance of θ, and the mask (size,) of variables at an active bound; see `covariance`."""
     theta = np.array(theta, dtype=float)
     _, _, hessian = problem.normal(theta)
     if not np.all(np.isfinite(hessian)):
@@ -262,18 +263,18 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     basis = _complement(removed[:, length > 0] / length[length > 0])
     values, vectors = np.linalg.eigh(basis.T @ (hessian[square] / unit / unit[:, None]) @ basis)
     least = 1e-14 * len(used) * values.max(initial=0.0)
-    seen, directions = values > least, basis @ vectors
+    determined, directions = values > least, basis @ vectors
     # coordinates in which the Hessian is the identity
-    weights = np.zeros((problem.size, int(seen.sum())))
-    weights[used] = directions[:, seen] / np.sqrt(values[seen]) / unit[:, None]
+    weights = np.zeros((problem.size, int(determined.sum())))
+    weights[used] = directions[:, determined] / np.sqrt(values[determined]) / unit[:, None]
     out = weights @ gradient_covariance(problem, theta, weights) @ weights.T
     # a direction without effect is treated as one whose effect is just too small to count
-    inverse = np.sum(directions[:, seen] ** 2 / values[seen], axis=1)
-    hidden = used[np.sum(directions[:, ~seen] ** 2, axis=1) > least * inverse]
-    if problem.residuals <= seen.sum():
-        hidden = used
-    blind = np.flatnonzero(~at_bound & (sensitivity == 0))
-    out[hidden, hidden] = out[blind, blind] = np.inf
+    inverse = np.sum(directions[:, determined] ** 2 / values[determined], axis=1)
+    undetermined = used[np.sum(directions[:, ~determined] ** 2, axis=1) > least * inverse]
+    if problem.residuals <= determined.sum():
+        undetermined = used
+    without_effect = np.flatnonzero(~at_bound & (sensitivity == 0))
+    out[undetermined, undetermined] = out[without_effect, without_effect] = np.inf
     return out, at_bound
 
 

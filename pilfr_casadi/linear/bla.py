@@ -370,8 +370,8 @@ def _warn_if_useless(G: Array, var: Array, inflation: Array, record: Recording) 
     typical, hidden = np.median(share, axis=0), np.median(inflation, axis=0)
     if np.max(hidden) > INFLATED:
         warnings.warn(
-            f"The spectrum of the input {record.inputs[int(np.argmax(hidden))]!r} cannot be told from leakage at most "
-            f"frequencies, so its best linear approximation is not to be trusted; {REMEDY}",
+            f"The spectrum of the input {record.inputs[int(np.argmax(hidden))]!r} is mostly leakage at most "
+            f"frequencies, so its best linear approximation is not reliable; {REMEDY}",
             RuntimeWarning,
             stacklevel=3,
         )

@@ -69,14 +69,14 @@ if TYPE_CHECKING:
         with_port_gain as with_port_gain,
     )
     from .structures import (
-        ANY as ANY,
-        HYSTERETIC as HYSTERETIC,
+        ALL_OPTIONS as ALL_OPTIONS,
+        HYSTERETIC_OPTIONS as HYSTERETIC_OPTIONS,
         LAGGED as LAGGED,
         NARX as NARX,
         NOE as NOE,
         OPERATORS as OPERATORS,
+        STRUCTURE_OPTIONS as STRUCTURE_OPTIONS,
         STRUCTURES as STRUCTURES,
-        TAKES as TAKES,
         Lagged as Lagged,
         lagged_start as lagged_start,
         named_structure as named_structure,

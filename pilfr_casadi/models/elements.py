@@ -270,8 +270,8 @@ class Envelope:
     """A gain on each channel that its own slow amplitude schedules.
 
     The amplitude `a` is the root mean square of z over the last 1/κ samples. Through `B_w` and `C_z` of a PI-LFR it
-    makes a stiffness fall (or rise) with the amplitude of vibration and leaves the damping nearly as it is, as in
-    structures whose resonances move with the level (slow dynamics, amplitude-dependent modulus). Play and stop
+    makes a stiffness fall (or rise) with the amplitude of vibration and hardly changes the damping, as in structures
+    whose resonances move with the level (slow dynamics, amplitude-dependent modulus). Play and stop
     operators do the same within a period, but then dissipate in proportion.
 
     `ρ` (`reach`) and `c = ρ / 3` limit w. Start values from data lie beyond the visited range of z, so that the limits

@@ -59,7 +59,7 @@ class Model:
         Steps within a sample; outputs are taken at the first of them.
     stages : casadi.Function, optional
         `(x, u, w, p, c) -> (values of c, c by c, x_next by c)`: the step by way of intermediate values c (n_c,), where
-        each depends only on earlier ones. Its derivatives are sparse where those of `step` are dense.
+        each depends only on earlier ones. Its derivatives are sparse, the derivatives of `step` are dense.
     resting : casadi.Function, optional
         `(x, u, p) -> state`: the whole state from the states in `states` alone, as if their signals had stood still
         before; without it, the rest is zero.
@@ -309,7 +309,7 @@ def inject_outputs(model: Model, gain: np.ndarray, strength: Mapping[str, Parame
     gain : array, shape (k, n_y)
         K; it acts on the first k states, never on memory.
     strength : mapping of one Parameter, optional
-        γ and its name. Without it γ is 1 in the sub-steps at which a sample is taken and 0 in those after it.
+        γ and its name. Without it γ is 1 in the sub-step at which a sample is taken and 0 in the sub-steps after it.
     """
     x, s, u, p = model.symbols()
     sizes = (("z", model.n_w), ("w", model.n_w), ("measured", model.n_y), ("gamma", 1))

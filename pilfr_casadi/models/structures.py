@@ -244,24 +244,24 @@ def read_measured_output(model: Model, share: float = 1.0) -> Model:
 
 
 OPERATORS: dict[str, Any] = {"play": Play, "stop": Stop, "generalized_play": GeneralizedPlay}
-HYSTERETIC = ("nx", "operators", "operator", "channels", "neurons", "offset", "fix", "bounds", "priors")
+HYSTERETIC_OPTIONS = ("nx", "operators", "operator", "channels", "neurons", "offset", "fix", "bounds", "priors")
 LAGGED = {"narx": NARX, "noe": NOE}
 # options of each structure
-TAKES: dict[str, tuple[str, ...]] = {
-    "lfr": HYSTERETIC,
-    "hammerstein": HYSTERETIC,
-    "wiener": HYSTERETIC,
+STRUCTURE_OPTIONS: dict[str, tuple[str, ...]] = {
+    "lfr": HYSTERETIC_OPTIONS,
+    "hammerstein": HYSTERETIC_OPTIONS,
+    "wiener": HYSTERETIC_OPTIONS,
     "ssnn": ("nx", "hidden", "offset", "fix", "bounds", "priors"),
     "network_lfr": ("nx", "hidden", "channels", "offset", "fix", "bounds", "priors"),
     "narx": ("lags", "hidden", "input_lags"),
     "noe": ("lags", "hidden", "input_lags"),
 }
-STRUCTURES = tuple(TAKES)
-ANY = frozenset(name for takes in TAKES.values() for name in takes)
+STRUCTURES = tuple(STRUCTURE_OPTIONS)
+ALL_OPTIONS = frozenset(name for takes in STRUCTURE_OPTIONS.values() for name in takes)
 
 
 def named_structure(structure: str = "lfr", **given: Any) -> PILFR | Lagged:
-    """Build a structure of `STRUCTURES` with the options of `TAKES`, at least `nx` or `lags`.
+    """Build a structure of `STRUCTURES` with the options of `STRUCTURE_OPTIONS`, at least `nx` or `lags`.
 
     Omitted options have the structure's defaults. `operators` is 20 by default, and 0 makes a linear model; `neurons`
     selects the generalized play.
@@ -270,7 +270,7 @@ def named_structure(structure: str = "lfr", **given: Any) -> PILFR | Lagged:
         return LAGGED[structure](**given)
     element: dict[str, Any] = {k: given[k] for k in ("hidden", "channels") if k in given}
     form = {k: given[k] for k in ("bounds", "priors", "offset") if k in given}
-    if "hidden" in TAKES[structure]:
+    if "hidden" in STRUCTURE_OPTIONS[structure]:
         base = ssnn(given["nx"], **element) if structure == "ssnn" else network_lfr(given["nx"], **element)
     else:
         base = _hysteretic(structure, given)

@@ -355,7 +355,7 @@ def _tightening_path(problem: Problem, theta: Array) -> list[tuple[Constraint, .
 
 
 def _scale_inside(problem: Problem, theta: Array) -> Array:
-    """Scale A and B_w so that every radius is inside; return θ as it is where they may not be scaled."""
+    """Scale A and B_w so that every radius is inside; return θ unchanged if fixed entries forbid it."""
     parameters = problem.model.parameters
     names = [name for name in ("A", "B_w") if name in parameters and parameters[name].size]
     values = parameters.unpack(problem.parameters(theta))
@@ -390,7 +390,7 @@ def _is_better(problem: Problem, theta: Array, found: Solution) -> bool:
 
 
 def _with_time_left(ends: float, solver: GaussNewton) -> GaussNewton:
-    """Return the solver with the time that is left."""
+    """Return the solver with the remaining time as its limit."""
     return replace(solver, time_limit=ends - time.perf_counter())
 
 

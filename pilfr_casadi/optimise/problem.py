@@ -202,7 +202,7 @@ class Problem:
     weights : sequence of float, optional
         One per recording, which multiplies its residuals (see `periods.noise_weights`). The mean still divides by R.
     scored : sequence of bool array (M,), optional
-        One per recording: the samples whose errors count, among those after `skip`. All are simulated.
+        One per recording: the samples after `skip` whose errors count. All samples are simulated.
 
     Attributes
     ----------
@@ -212,7 +212,7 @@ class Problem:
     Raises
     ------
     InputError
-        If model and recordings do not fit each other, or nothing is left to estimate.
+        If model and recordings do not fit each other, or the problem has no variable.
     """
 
     def __init__(

@@ -73,7 +73,7 @@ class Solution:
     violation : float
         Largest violation of the general constraints (0 where they hold).
     multipliers : numpy.ndarray
-        Multipliers of bounds (n,) followed by those of the general constraints (n_g,); positive at an upper limit.
+        Multipliers of the bounds (n,), then of the general constraints (n_g,); positive at an upper limit.
     """
 
     theta: np.ndarray

@@ -254,7 +254,7 @@ def test_plain_bla_warns_of_a_tone_with_leakage(noise):
     """Beside its line a tone is leakage. The residual does not show it: without noise it is almost zero."""
     u = np.sin(2 * np.pi * 7.77 * DT * np.arange(2000))[:, None]
     y = simulate_lti(system(), u) + noise * np.random.default_rng(0).standard_normal(u.shape)
-    with pytest.warns(RuntimeWarning, match=r"the input 'u' cannot be told from leakage .* `period` set\.$") as found:
+    with pytest.warns(RuntimeWarning, match=r"the input 'u' is mostly leakage .* `period` set\.$") as found:
         bla = plain_bla(Recording(u, y, DT))
     assert len(found) == 1 and found[0].filename == __file__
     true = frequency_response(system(), bla.frequency)

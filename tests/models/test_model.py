@@ -222,7 +222,7 @@ def test_rounded_operators_convert_exactly():
 
 @pytest.mark.parametrize("element", [None, PrandtlIshlinskii(GeneralizedPlay, 2)])
 def test_only_plays_and_stops_have_a_complement(element):
-    with pytest.raises(InputError, match="complement"):
+    with pytest.raises(InputError, match="give a Prandtl-Ishlinskii element of plays or stops"):
         to_stops(PILFR(1, element), {})
 
 
