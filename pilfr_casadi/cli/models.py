@@ -39,7 +39,7 @@ from ..engine import VirtualMachine, compiler, make_engine
 from ..export import NAMES, exported
 from ..identify import Fit, check_recordings, fit, load, run_simulator
 from ..linear import select_order
-from ..models import ANY, PILFR, TAKES, Lagged, named_structure
+from ..models import ALL_OPTIONS, PILFR, STRUCTURE_OPTIONS, Lagged, named_structure
 from ..optimise import GaussNewton, Ipopt, Status
 from ..simulators import load_simulator, unit_notes
 from ..studies import LARGEST_SIZE
@@ -160,9 +160,9 @@ def _check(options: FitOptions) -> Path:
     structure = options.structure or "lfr"
     for name in options.search:
         own = STRUCTURE_NAMES.get(name, name)
-        if own in ANY and own not in TAKES[structure]:
+        if own in ALL_OPTIONS and own not in STRUCTURE_OPTIONS[structure]:
             raise InputError(f"--{name} is not for --structure {structure}; leave it out.")
-    if "lags" in TAKES[structure] and options.lags is None:
+    if "lags" in STRUCTURE_OPTIONS[structure] and options.lags is None:
         raise InputError(f"--structure {structure} needs --lags, the number of past outputs; give it.")
     return new_file(options.out, "model.json", options.overwrite)
 
@@ -187,7 +187,7 @@ def _identify(
 def _structure(options: FitOptions, train: Sequence[Recording], progress: Progress) -> PILFR | Lagged:
     structure = options.structure or "lfr"
     given: dict[str, Any] = {k: getattr(options, k) for k in ("operators", "operator", "channels", "hidden", "lags")}
-    if "nx" in TAKES[structure]:
+    if "nx" in STRUCTURE_OPTIONS[structure]:
         nx, how = options.nx, "as given"
         if nx is None:
             choice = select_order(train, range(1, 9), offset=True, progress=progress)

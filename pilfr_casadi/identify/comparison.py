@@ -1,13 +1,12 @@
 """Models of any kind beside one recording, all treated alike: `compare`.
 
-An error depends on where a simulation begins; from zero and from a fitted state one rig has 0.63 and 0.0055. `compare`
-gives every model the same start, by the recording's `initial`:
+An error depends on where a simulation begins: one rig has 0.63 from zero and 0.0055 from a fitted state. `compare`
+starts every model in the same way, by the recording's `initial`:
 
-- `"estimate"`: each model's state is fitted to the first samples alone, as many as it needs for its states, at the
-  model's parameters; a state that a fit has found from the whole recording is not used. These samples, as many as the
-  largest model needs, are scored for none. States of a black box have no scale of their own and get the weak prior
-  around rest that `Fit.nrmse` gives them.
-- `"zero"`, `"periodic"` or numbers: each begins there.
+- `"estimate"`: each model's state is fitted to the first samples alone, at the model's parameters; a state that a fit
+  estimated from the whole recording is not used. These samples, as many as the largest model needs, are scored for
+  none. States of a black box have no scale of their own and get the weak prior around rest of `Fit.nrmse`.
+- `"zero"`, `"periodic"` or numbers: each model begins there.
 """
 
 from __future__ import annotations
@@ -23,10 +22,10 @@ from ..data import Recording, as_recordings, rmse_per_output
 from ..engine import Engine, make_engine
 from ..models import Model
 from ..optimise import estimate_initial_state, samples_to_start
-from ..simulators import Simulator, as_simulator, choose_substeps, discretise
+from ..simulators import Simulator, as_simulator, discretise_for
 from .result import Fit, match_channels
 
-RUN_AWAY = 1e4  # error from which its size says nothing
+RUN_AWAY = 1e4  # error from which a simulation counts as diverging
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,10 +53,10 @@ class Comparison:
 
     @property
     def rows(self) -> list[list[str]]:
-        """A row of text for each model: its name, its error of each output, and, of several outputs, their mean."""
+        """A row of text for each model: its name, its error of each output, and their mean if there are several."""
         many = self.recording.n_y > 1
         return [
-            [name, *(_shown(e) for e in error), *([_shown(float(np.mean(error)))] if many else [])]
+            [name, *(_format_error(e) for e in error), *([_format_error(float(np.mean(error)))] if many else [])]
             for name, error in self.errors.items()
         ]
 
@@ -98,7 +97,9 @@ class Comparison:
         if kind != "signals":
             raise InputError(f"kind={kind!r} was given to plot; give signals or residuals.")
         error = self.nrmse
-        return plot_comparison(self.recording, [(f"{k} ({_shown(error[k])})", y) for k, y in self.simulated.items()])
+        return plot_comparison(
+            self.recording, [(f"{k} ({_format_error(error[k])})", y) for k, y in self.simulated.items()]
+        )
 
     def __repr__(self) -> str:
         cells = [self.columns, *self.rows]
@@ -113,23 +114,23 @@ class Comparison:
         return str(later("comparison_card")(self))
 
 
-def _shown(error: float) -> str:
+def _format_error(error: float) -> str:
     return f"{error:.4f}" if error < RUN_AWAY else "diverges"
 
 
 def compare(recording: Recording, models: Mapping[str, Any] | Any) -> Comparison:
     """Simulate several models along one recording and tabulate their errors.
 
-    All begin alike: at the recording's `initial`, which for `"estimate"` is a state fitted to the first samples at
-    each model's own parameters; these samples are not scored. Nothing else is fitted.
+    All begin at the recording's `initial`. For `"estimate"` this is a state fitted to the first samples at each model's
+    own parameters; these samples are not scored. Nothing else is fitted.
 
     Parameters
     ----------
     recording : Recording
-        With the inputs and outputs of the models; a model takes its own by name where it has names.
+        Recording with the inputs and outputs of the models; a model with names takes its own by name.
     models : mapping of str to model, or one model
         Each a `Simulator`, a `Fit`, a `Diagnosis` (its corrected simulator), a closed `Model`, or a
-        `control.StateSpace`, by the name that the table and the figure give it.
+        `control.StateSpace`, by its name in the table and the figure.
 
     Returns
     -------
@@ -139,7 +140,7 @@ def compare(recording: Recording, models: Mapping[str, Any] | Any) -> Comparison
     Raises
     ------
     InputError
-        If it is not a recording, has no outputs, or does not fit a model.
+        If the recording is none, has no outputs, or does not fit a model.
     """
     if not isinstance(recording, Recording):
         raise InputError(f"A {type(recording).__name__} was given to compare; give a Recording first, then the models.")
@@ -167,7 +168,7 @@ def compare(recording: Recording, models: Mapping[str, Any] | Any) -> Comparison
 
 
 def simulator_nrmse(simulator: Simulator, recordings: Recording | Sequence[Recording]) -> float:
-    """Compute `Simulator.nrmse`: the mean over recordings of the error in `compare`, of its outputs alone."""
+    """Compute `Simulator.nrmse`: the mean over recordings of the error in `compare`, over the simulator's outputs."""
     given = [match_channels(simulator, r) for r in as_recordings(recordings)]
     return float(np.mean([compare(r, simulator).nrmse["simulated"] for r in given]))
 
@@ -175,15 +176,15 @@ def simulator_nrmse(simulator: Simulator, recordings: Recording | Sequence[Recor
 def _residual(model: Any, recording: Recording) -> tuple[np.ndarray, int]:
     """Return simulated minus measured outputs (M, n_y), in the recording's order, and the first sample to score.
 
-    A diagnosis compares with the recording as it has corrected it (sign, unit, shift); the residual is then scaled
-    back, so that its share of the output's deviation stays.
+    A diagnosis is compared with the recording that it has corrected (sign, unit, shift). Its residual is scaled back,
+    so that the residual's share of the output's deviation stays the same.
     """
     if isinstance(model, Fit) and model.simulator is not None:
         seen = model.matched(recording)
         y, first = run_free(model.model, make_engine(model.model, model.engine), seen)
     elif hasattr(model, "run"):
         if isinstance(model, Fit):
-            model = replace(model, initial={})  # as for the others: no state from the whole recording
+            model = replace(model, initial={})  # no model uses a state from the whole recording
         seen, y, first = model.run(recording)
     elif isinstance(model, Model):
         seen = recording
@@ -200,14 +201,13 @@ def _residual(model: Any, recording: Recording) -> tuple[np.ndarray, int]:
 
 
 def run_simulator(simulator: Simulator, recording: Recording) -> tuple[Recording, np.ndarray, int]:
-    """Simulate along a recording: it as the simulator takes it, the outputs (M, n_y), the first sample to score.
+    """Simulate along a recording, from an estimated state where `Simulator.simulate` begins at zero (`run_free`).
 
-    An initial state that the recording does not give is fitted to its first samples; see `run_free`.
+    Returns the recording with the simulator's channels, the outputs (M, n_y), and the first scored sample.
     """
-    seen = match_channels(simulator, recording)
-    hold = seen.hold or simulator.hold or "zero"
-    model = discretise(simulator, seen.dt, hold, choose_substeps(simulator, [seen]))
-    return seen, *run_free(model, make_engine(model), seen)
+    matched = match_channels(simulator, recording)
+    model = discretise_for(simulator, [matched])
+    return matched, *run_free(model, make_engine(model), matched)
 
 
 def run_free(
@@ -223,7 +223,7 @@ def run_free(
     array, shape (M, n_y)
         Simulated outputs; not finite where the simulation diverges.
     int
-        First scored sample: the part that the state is fitted to is left out, unless that is the whole recording.
+        First scored sample, after the part to which the state is fitted unless that is the whole recording.
     """
     estimated = recording.begins == "estimate" and model.n_state > 0
     used = samples_to_start(model, engine, recording) if estimated else 0

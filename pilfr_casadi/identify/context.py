@@ -1,19 +1,18 @@
 """`FitContext`: the recordings, solver and options of one fit, its solves, and its result with a note.
 
-**A search begins at rest.** With a free initial state a search improves the fit by initial memories that the machine
-never had. A prior does not prevent this, because the units of states and memories are free too. So a search begins at
-rest unless the recordings contradict it, that is, unless freeing the state lowers the cost by more than the Bayesian
+**A search begins at rest.** With a free initial state a search would improve the fit by initial memories that the
+machine never had. A prior does not prevent this, because the units of states and memories are free too. So a search
+begins at rest unless the recordings contradict it: unless freeing the state lowers the cost by more than the Bayesian
 information criterion charges for the new variables (`FitContext.agrees_with_rest`).
 
 **The note of a result** names two things that the recordings do not determine. First, an operator that never slips in a
-periodic steady state keeps any memory: its row of the state's slope over a period is that of the identity, every value
-in an interval is a steady state, and the outputs differ by a constant. The fit uses the memory that is reached from
-rest.
+periodic steady state keeps any memory: its row of the state's slope over a period is a row of the identity, every value
+in an interval is a steady state, and the outputs differ by a constant. The fit uses the memory reached from rest.
 
 Second, the gain of a `dc_gain` constraint applies after an infinite time, to motions so large that every play slips
 (`slope` 1) or so small that every play sticks (0). A fit may meet it outside the data, by operators whose thresholds
-lie beyond all motions, or by a slow pole. So the gain is computed a second time, over the samples of the longest
-recording and without the operators that never slip (for small motions: with the operators that have no threshold),
+exceed all motions, or by a slow pole. So the gain is computed a second time, over the samples of the longest recording
+and without the operators that never slip (for small motions: with the operators that have no threshold),
 
     gain_M = C' (Σ_{k<M} A'^k) B' + D',   with the blocks of the constraint at S = diag(Σ_j w_ij), j slipping.
 """
@@ -21,7 +20,7 @@ recording and without the operators that never slip (for small motions: with the
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -37,7 +36,7 @@ from ..optimise import (
     Gain,
     GaussNewton,
     Ipopt,
-    Iteration,
+    IterationCallback,
     Problem,
     Solution,
     Status,
@@ -63,7 +62,7 @@ class FitContext:
     """The recordings, solver and options that every kind of fit shares.
 
     `constraints` include the bounds on spectral radii; `threads` is the number of recordings run at a time; `began` is
-    the value of `time.perf_counter` when the work began.
+    the `time.perf_counter` at which the work began.
     """
 
     recordings: tuple[Recording, ...]
@@ -97,21 +96,19 @@ class FitContext:
         bound_solver = self.solver if isinstance(self.solver, GaussNewton) else BOUND_SOLVER
         return solve_within_bounds(problem, start, self.solver, stage, self.progress, bound_solver)
 
-    def iterate_noise(
-        self, problem: Problem, solution: Solution, stage: str, **others: Any
-    ) -> tuple[Problem, Solution]:
-        """Solve again with the noise set to the error reached, until the two agree; only if there are priors."""
+    def iterate_noise(self, problem: Problem, solution: Solution) -> tuple[Problem, Solution]:
+        """If there are priors, solve again with the noise set to the error reached, until the two agree."""
         priors = any(p.prior is not None and not np.all(p.fixed) for p in problem.model.parameters.values())
         for _ in range(NOISE_ROUNDS if priors and self.options.noise is None else 0):
             error = rms_error(problem, solution.theta)
             if abs(error / problem.noise - 1) < NOISE_AGREES or error == 0 or solution.status is Status.INTERRUPTED:
                 break
-            problem = self.problem(problem.model, error, **{**others, "engine": problem.engine})
-            solution = self.solve(problem, stage, solution.theta)
+            problem = self.problem(problem.model, error, l1=problem.l1, engine=problem.engine)
+            solution = self.solve(problem, "solve", solution.theta)
         return problem, solution
 
     def at_rest(self) -> FitContext:
-        """Return the context with recordings from rest in place of those with an initial state to be estimated."""
+        """Return the context in which recordings with an estimated initial state begin at rest."""
         if not any(r.begins == "estimate" for r in self.recordings):
             return self
         recordings = [r.with_(initial="zero") if r.begins == "estimate" else r for r in self.recordings]
@@ -121,7 +118,7 @@ class FitContext:
         """Tell whether the recordings agree with a beginning at rest, given the solution θ of the problem from rest.
 
         A linearised step in the initial states alone predicts the largest decrease of the cost. `correlated` residuals
-        count as one, because a model's errors change slowly. True also if θ has initial states already.
+        count as one, because a model's errors change slowly. True also if θ already contains initial states.
         """
         if problem.size > problem.n_free or not any(r.begins == "estimate" for r in self.recordings):
             return True
@@ -142,7 +139,7 @@ class FitContext:
     def result(
         self, model: Model, structure: PILFR | None, problem: Problem, solution: Solution, note: str = "", **fields: Any
     ) -> Fit:
-        """Build the `Fit` of a solution; Ctrl-C takes effect when it is complete and appears in its status.
+        """Build the `Fit` of a solution; Ctrl-C waits until it is complete and shows in its status.
 
         `fields` are further fields of the `Fit`; `errors={}` skips the standard errors.
         """
@@ -163,16 +160,14 @@ class FitContext:
     def _result(
         self, model: Model, structure: PILFR | None, problem: Problem, solution: Solution, note: str, fields: Any
     ) -> Fit:
-        """Build the `Fit`, with a note on what the recordings do not determine.
+        """Build the `Fit`, with a note on quantities that the recordings do not determine.
 
         Priors that the search added to weights and thresholds (`DENSITY_PRIOR`) are removed from the model and its
         standard errors here.
         """
         fitted, judged, theta = with_solution(model, problem, solution), problem, solution.theta
         if note == DENSITY_PRIOR:
-            priors = structure.priors if structure else {}
-            own = {name: {"prior": priors.get(name)} for name in LAYER}
-            fitted = fitted.with_parameters(fitted.parameters.change(**own))
+            fitted = without_density_prior(fitted, structure)
             names = ("engine", "constraints", "noise", "scale", "weights")
             options: dict[str, Any] = {name: getattr(problem, name) for name in names}
             judged = Problem(fitted, problem.recordings, **options)
@@ -214,6 +209,12 @@ class FitContext:
         )
 
 
+def without_density_prior(model: Model, structure: PILFR | None) -> Model:
+    """Replace the priors that a search put on weights and thresholds by the structure's own, if it has any."""
+    priors = structure.priors if structure else {}
+    return model.with_parameters(model.parameters.change(**{name: {"prior": priors.get(name)} for name in LAYER}))
+
+
 def solve_within_bounds(
     problem: Problem,
     start: np.ndarray | None,
@@ -225,7 +226,7 @@ def solve_within_bounds(
 ) -> Solution:
     """Solve a problem inside exact bounds on spectral radii with any solver (`solve_within_radii`).
 
-    Solvers of the package report their steps under the name `stage`; `bound_solver` gets their limit on time.
+    The package's solvers report their steps under the name `stage` and pass their time limit on to `bound_solver`.
     """
     start = problem.start if start is None else start
     if not isinstance(solver, GaussNewton | Ipopt):
@@ -235,10 +236,10 @@ def solve_within_bounds(
     return solve_within_radii(problem, start, lambda p, s: solver.solve(p, s, report), bound_solver, at_bound, report)
 
 
-def report_iterations(progress: Progress | None, stage: str, most: int) -> Callable[[Iteration], None] | None:
-    """Turn a progress function into one of a solver's iterations.
+def report_iterations(progress: Progress | None, stage: str, most: int) -> IterationCallback | None:
+    """Turn a progress function into a callback for a solver's iterations.
 
-    A cost includes priors and weights of recordings and does not tell the NRMSE, so the error reported is nan.
+    A cost includes priors and weights of recordings, so it is no NRMSE, and the error reported is nan.
     """
     if progress is None:
         return None
@@ -248,7 +249,7 @@ def report_iterations(progress: Progress | None, stage: str, most: int) -> Calla
 def context_of_fit(
     fit: Fit, train: Recording | Sequence[Recording], *, solver: Any, engine: str = "auto", **others: Any
 ) -> FitContext:
-    """Make the context of a fit that continues an earlier one; `others` replace its options, see `FitOptions`."""
+    """Make the context of a fit that continues an earlier one; `others` replace its `FitOptions`."""
     recordings = as_recordings(train)
     options = fit.options.updated(**others, train=recordings)
     return FitContext(recordings, solver, options.all_constraints(fit.structure), engine=engine, options=options)
@@ -279,11 +280,10 @@ def rms_error(problem: Problem, theta: Array) -> float:
 
 
 def describe_open_memory(problem: Problem, theta: Array) -> str:
-    """Name the recordings that do not determine some memories; empty where there are none."""
+    """Name the recordings that do not determine some memories; empty if there are none."""
     counts = {}
     for k, (r, state) in enumerate(zip(problem.recordings, problem.first_states(theta), strict=True)):
-        periodic = r.begins == "periodic"
-        if periodic and problem.model.n_s and np.all(np.isfinite(state)):
+        if r.begins == "periodic" and problem.model.n_s and np.all(np.isfinite(state)):
             period = problem.model.drive(r)[: (r.period or 1) * problem.model.substeps]
             open_memory = undetermined_memory(
                 problem.engine, period, problem.parameters(theta), state, problem.model.n_x, problem.scale
@@ -299,35 +299,39 @@ def describe_open_memory(problem: Problem, theta: Array) -> str:
 
 
 def describe_reached_gain(problem: Problem, theta: Array) -> str:
-    """Name the gains that hold only beyond the recordings, and why; empty where there are none."""
-    found, at = [], 0
+    """Name the gains that hold only beyond the recordings, and why; empty if there are none."""
+    found = []
     values, moved = problem.model.parameters.unpack(problem.parameters(theta)), None
     samples = max(len(r) for r in problem.recordings)
-    for c, size in zip(problem.constraints, problem.g_sizes, strict=True):
-        rows, at = slice(at, at + size), at + size
+    for c, rows in zip(problem.constraints, problem.g_slices, strict=True):
         if not isinstance(c.expression, Gain):
             continue
         if moved is None:
             moved = find_slipping(problem, theta, values)
         low, high = problem.g_lower[rows], problem.g_upper[rows]
         room = APART * float(np.max(np.abs(np.concatenate([low, high])), initial=0.0))
-
-        def far(gain: Array, low: Array = low, high: Array = high, room: float = room) -> bool:
-            return bool(np.any(~((low - room <= gain) & (gain <= high + room))))
-
+        limits = low - room, high + room
         whole, within, odd = channel_weights(problem.model.element, values, c.expression.slope, moved)
-        if far(gain_over(values, whole, None)):
-            continue  # not met at all, which the limits report
+        if _is_outside(gain_over(values, whole, None), *limits):
+            continue  # the limits report a gain that is not met at all
         reached = gain_over(values, within, samples)
-        if not far(reached):
+        if not _is_outside(reached, *limits):
             continue
-        by_range, by_time = far(gain_over(values, within, None)), far(gain_over(values, whole, samples))
-        both = not by_range and not by_time
-        why = [odd] if (by_range or both) and odd else []
-        why += [f"the response takes more than the {samples} recorded samples to settle"] if by_time or both else []
+        by_range = _is_outside(gain_over(values, within, None), *limits)
+        by_time = _is_outside(gain_over(values, whole, samples), *limits)
+        why = []
+        if odd and (by_range or not by_time):
+            why.append(odd)
+        if by_time or not by_range:
+            why.append(f"the response takes more than the {samples} recorded samples to settle")
         shown = ", ".join(f"{g:.3g}" for g in reached)
         found.append(f"{c.name} holds only beyond the recordings: {' and '.join(why)}; within them it is {shown}")
     return "; ".join(found)
+
+
+def _is_outside(gain: Array, low: Array, high: Array) -> bool:
+    """Tell whether an entry of a gain lies outside its limits, or is nan."""
+    return bool(np.any(~((low <= gain) & (gain <= high))))
 
 
 def find_slipping(problem: Problem, theta: Array, values: Mapping[str, Array]) -> Array:
@@ -350,7 +354,7 @@ def find_slipping(problem: Problem, theta: Array, values: Mapping[str, Array]) -
 def channel_weights(
     element: object, values: Mapping[str, Array], slope: float, moved: Array
 ) -> tuple[Array, Array, str]:
-    """Sum each channel's weights (n_w,), in all and of the operators at work in the recordings; describe the others."""
+    """Sum each channel's weights (n_w,), of all operators and of those active in the recordings; describe the rest."""
     if not isinstance(element, PrandtlIshlinskii):
         return np.zeros(0), np.zeros(0), ""
     w, stops = values["w"], isinstance(element.operator, Stop)
@@ -358,16 +362,16 @@ def channel_weights(
     if slope not in (0.0, 1.0):
         return whole, whole, ""
     if (slope == 1.0) != stops:  # large motions
-        odd, what = ~moved, "never slip in them"
+        odd, reason = ~moved, "never slip in them"
     else:
-        odd, what = values["r"] <= 0, "have no threshold below which they stick"
+        odd, reason = values["r"] <= 0, "have no threshold below which they stick"
     odd = odd & (w > 0)
     active = odd if slope == 0.0 else ~odd
-    return whole, (w * active).sum(axis=1), f"{int(odd.sum())} of {w.size} operators {what}" if np.any(odd) else ""
+    return whole, (w * active).sum(axis=1), f"{int(odd.sum())} of {w.size} operators {reason}" if np.any(odd) else ""
 
 
 def gain_over(values: Mapping[str, Array], weight: Array, samples: int | None) -> Array:
-    """Compute the gain (n_y n_u,), row by row, for Σw of each channel, after `samples` or, with None, in the limit."""
+    """Compute the gain (n_y n_u,), row by row, for Σw of each channel, after `samples`, or in the limit if None."""
     a, b, c, d = (values[k] for k in ("A", "B_u", "C_y", "D_yu"))
     if len(weight):
         a, b, c, d = with_port_gain(values, np.diag(weight))

@@ -27,15 +27,15 @@ from ..optimise import (
     Solution,
     Status,
     check_gain,
-    check_room,
+    check_radius_bounds,
     loosen_radii,
     stability_limits,
     violated_exact,
 )
-from ..simulators import Simulator, choose_substeps, discretise
-from .context import FitContext, Stage, check_recordings, mark_interrupted, rms_error
+from ..simulators import Simulator, discretise_for
+from .context import FitContext, Stage, check_recordings, mark_interrupted, rms_error, without_density_prior
 from .lagged import check_lagged_options, fit_lagged
-from .multistart import DEFAULT_SOLVER, KEEP, START_KINDS, StartSearch, search_starts
+from .multistart import DEFAULT_SOLVER, MOST_POLISHED, START_KINDS, StartSearch, search_starts
 from .penalty import check_penalty, solve_with_penalty
 from .result import Fit, FitOptions, match_channels, with_solution
 from .start import known_entries, linear_model, transform_to_known_basis
@@ -54,7 +54,7 @@ CORRELATED_SAMPLES = 10
 
 @dataclass(frozen=True, eq=False)
 class StartOptions:
-    """The starts that `fit` tries: `kind` is its option `start`, `count` its option `starts`; and where they run."""
+    """Options of the starts that `fit` tries: `kind` is its option `start`, `count` its option `starts`."""
 
     count: int
     seed: int
@@ -87,25 +87,25 @@ def fit(
     Parameters
     ----------
     model : PILFR, NARX, NOE, Model, Simulator or Fit
-        A structure, for which start values are computed, or a closed model, a simulator or an earlier fit, whose
-        values are the start. A simulator is integrated on the recordings' grid, with the `hold` of the
-        recordings or else its own.
+        A structure, for which start values are computed, or a closed model, a simulator or an earlier fit, which
+        starts at its own values. A simulator is integrated on the recordings' grid, with the `hold` of the recordings
+        or else its own.
     train : Recording or sequence of Recording
         Training data.
     solver : GaussNewton or Ipopt
         Solver of the final problem, by default `GaussNewton(tolerance=1e-4)`. At an exact bound on a spectral radius
         the last solve is always by Gauss-Newton.
     starts, seed : int
-        Number of starts (`start` says how they are chosen), and the seed of all of them. With `start="grid"` the first
-        two have the element at the output and at the input (Hammerstein and Wiener models have one such start); further
-        ones are drawn. More starts with the same seed include those of fewer.
+        Number of starts (see `start`), and the seed of all of them. With `start="grid"` the first two have the element
+        at the output and at the input (Hammerstein and Wiener models have one such start); further starts are drawn.
+        With the same seed, more starts include all of fewer starts.
     start : {"grid", "paper", "plain"} or mapping
         How start values are chosen (`starts` is their number). "grid" (default) places thresholds on a grid, explores
-        every start and polishes the best. "paper" solves every start of the paper (Eq. 22-24) and places its thresholds
-        anew, which the paper does not; "plain" only solves, which with the best linear approximation for `linear` is
-        the paper's protocol. A mapping of values by parameter name is the one start of a PI-LFR with any element.
+        every start and polishes the best. "paper" solves from every start of the paper (Eq. 22-24) and then places its
+        thresholds anew, an addition to the paper. "plain" only solves; with `linear="bla"` this is the paper's
+        protocol. A mapping of values by parameter name is the only start, for a PI-LFR with any element.
     linear : control.StateSpace or "bla", optional
-        Linear model that the search for a PI-LFR begins with; "bla" estimates the best linear approximation from
+        Linear model from which the search for a PI-LFR begins; "bla" estimates the best linear approximation from
         periodic training recordings, as in the paper. By default subspace identification refined by output error.
     stable : bool or float, default True
         Upper bound on the spectral radius of a fitted PI-LFR, checked on the eigenvalues of the result. `True` allows
@@ -123,8 +123,8 @@ def fit(
     l1 : dict
         Weight of an L1 penalty by name, `{"w": 1e-4}`: unneeded operators get exactly zero. For a PI-LFR the problem
         is first solved without; then the weights of each channel are scaled to a sum of one and the penalty acts on the
-        element alone, all linear blocks fixed, so that no change of scale evades it (see `penalty`). For a closed model
-        of your own see `Problem`.
+        element alone, with all linear blocks fixed, so that no change of scale evades it (see `penalty`). For your own
+        closed model see `Problem`.
     weights : sequence of float, optional
         Weight of each recording, see `Problem` and `noise_weights`; for fits from values (a `Model`, a `Simulator`, a
         `Fit`, or `start` a mapping). Refitting a `Fit` keeps its weights unless you pass others.
@@ -151,7 +151,8 @@ def fit(
     Raises
     ------
     InputError
-        If recordings and model do not match, hold too little, the start is not usable, or an option is invalid.
+        If recordings and model do not match, the recordings are too short, the start is not usable, or an option is
+        invalid.
     """
     solver = solver or DEFAULT_SOLVER
     _check_arguments(model, solver, starts, seed, workers)
@@ -164,7 +165,7 @@ def fit(
         raise InputError("Weights are for a fit from values; give a Model, a Fit, or start={name: value}.")
     own_pool = executor is None and workers > 1
     if own_pool and getattr(multiprocessing.current_process(), "_inheriting", False):
-        raise SystemExit(1)  # a spawned worker runs the script again; the first process says what to do
+        raise SystemExit(1)  # a spawned worker runs the script again; the first process reports the error
     if l1 is not None and not isinstance(l1, dict):
         raise InputError(f'l1 = {l1!r} was given; give weights by name, like {{"w": 1e-4}}.')
     options = model.options if isinstance(model, Fit) else FitOptions()
@@ -220,7 +221,7 @@ def _fit(
     closed = _closed_model(model, recordings, starts.kind)
     check_gain(options.constraints, closed.element)
     context = replace(context, constraints=options.all_constraints(structure))
-    check_room(closed.parameters, context.constraints)
+    check_radius_bounds(closed.parameters, context.constraints)
     context = replace(context, recordings=check_recordings(closed, recordings))
     found = fit_from_values(closed, structure, context, model if isinstance(model, Fit) else None)
     return found if simulator is None else found.with_simulator(simulator)
@@ -232,12 +233,7 @@ def _closed_model(model: PILFR | Model | Simulator | Fit, recordings: Sequence[R
         return model_at_values(model, recordings[0], values)
     if not isinstance(model, Simulator):
         return model.model if isinstance(model, Fit) else model
-    holds = {r.hold or model.hold or "zero" for r in recordings}
-    if len(holds) > 1:
-        raise InputError(
-            "The recordings differ in `hold`, and a simulator is integrated with one of them; fit them one by one."
-        )
-    return discretise(model, recordings[0].dt, holds.pop(), choose_substeps(model, recordings))
+    return discretise_for(model, recordings)
 
 
 def _fit_structure(
@@ -252,7 +248,7 @@ def _fit_structure(
     first = as_recordings(train)[0]
     shape = structure.model(first.n_u, first.n_y).parameters
     context = replace(context, recordings=check_recordings(structure, train))
-    check_room(shape, context.constraints)
+    check_radius_bounds(shape, context.constraints)
     if context.l1:
         check_penalty(context.l1, shape, structure.element is None)
     rest = context.at_rest() if structure.element is not None else context
@@ -303,8 +299,7 @@ def fit_from_values(model: Model, structure: PILFR | None, context: FitContext, 
     """Fit a closed model, or an earlier fit again, from its values and initial states."""
     if context.l1:
         check_penalty(context.l1, model.parameters, structure is not None and structure.element is None)
-    options: dict[str, Any] = {"l1": {} if structure else context.l1}
-    problem = context.problem(model, **options)
+    problem = context.problem(model, l1={} if structure else context.l1)
     if not np.isfinite(problem.cost(problem.start)):
         raise InputError("The simulation diverges at the start values; start from a stable model.")
     start = problem.start
@@ -312,9 +307,16 @@ def fit_from_values(model: Model, structure: PILFR | None, context: FitContext, 
         estimated = [r for r in context.recordings if r.begins == "estimate"]
         begin = np.concatenate([start[: problem.n_free], *(earlier.initial_state(r) for r in estimated)])
         start = begin if problem.cost(begin) < problem.cost(start) else start
+    return _solve_and_refine(model, structure, problem, start, context)
+
+
+def _solve_and_refine(
+    model: Model, structure: PILFR | None, problem: Problem, start: np.ndarray, context: FitContext
+) -> Fit:
+    """Solve the problem of a closed model, with the noise estimated and the L1 penalty of a structure."""
     latest = model, problem, context.solve(problem, "solve", start), ""
     try:
-        problem, solution = context.iterate_noise(problem, latest[2], "solve", **options)
+        problem, solution = context.iterate_noise(problem, latest[2])
         latest = model, problem, solution, ""
         if context.l1 and structure:
             latest = solve_with_penalty(model, problem, solution, context)
@@ -325,17 +327,12 @@ def fit_from_values(model: Model, structure: PILFR | None, context: FitContext, 
 
 
 def _fit_linear(structure: PILFR, fitted: Model, context: FitContext) -> Fit:
-    """Fit a linear model with the structure's bounds and fixed blocks, from the one without."""
+    """Fit a linear model with the structure's bounds and fixed blocks, starting from the model without them."""
     values = {k: p.value for k, p in fitted.parameters.items()}
     first = context.recordings[0]
     model = structure.model(first.n_u, first.n_y, values, inputs=fitted.inputs, outputs=fitted.outputs)
     problem = context.problem(model)
-    latest = problem, context.solve(problem, "solve")
-    try:
-        latest = context.iterate_noise(*latest, "solve")
-    except KeyboardInterrupt:
-        latest = problem, replace(latest[1], status=Status.INTERRUPTED)
-    return context.result(model, structure, *latest)
+    return _solve_and_refine(model, structure, problem, problem.start, context)
 
 
 def _fit_from_starts(
@@ -346,7 +343,7 @@ def _fit_from_starts(
     original: FitContext,
     starts: StartOptions,
 ) -> Fit | None:
-    """Fit a PI-LFR from many starts, given the linear model with its problem and solution; None as for `_search`."""
+    """Fit a PI-LFR from many starts, given the solved linear model; None if the recordings contradict rest."""
     problem, solution = solved
     progress, least = context.progress, np.inf
 
@@ -387,11 +384,10 @@ def _finish(
     context: FitContext,
     polished: bool,
 ) -> Stage:
-    """Solve the winner to the end: with the user's solver, the noise estimated, and the L1 penalty."""
+    """Solve from the best candidate to the end: with the user's solver, the noise estimated, and the L1 penalty."""
     model, note, l1 = best.model, best.note, context.l1 and not stopped
     if l1:  # the penalty and a prior towards a smooth density contradict each other
-        own = {name: {"prior": structure.priors.get(name)} for name in ("w", "r")}
-        model, note = model.with_parameters(model.parameters.change(**own)), ""
+        model, note = without_density_prior(model, structure), ""
     problem = context.problem(model, best.error)
     latest: Stage = model, problem, best.solution, note
     try:
@@ -401,7 +397,7 @@ def _finish(
             latest = model, problem, context.solve(problem, "solve", best.theta), note
         model, problem, result, note = latest = _meet_constraints(latest, candidates, context)
         if structure.priors and not stopped:
-            problem, result = context.iterate_noise(problem, result, "solve")
+            problem, result = context.iterate_noise(problem, result)
             latest = model, problem, result, note
         if l1:
             latest = solve_with_penalty(model, problem, latest[2], context)
@@ -413,7 +409,7 @@ def _finish(
 def _meet_constraints(latest: Stage, candidates: Sequence[Candidate], context: FitContext) -> Stage:
     """Return the stage or, if its last solve misses the constraints, a solve from the best start that met them."""
     usable = [c for c in candidates if c.solution.status is not Status.INFEASIBLE and np.isfinite(c.error)]
-    for other in sorted(usable, key=lambda c: c.error)[:KEEP]:
+    for other in sorted(usable, key=lambda c: c.error)[:MOST_POLISHED]:
         if latest[2].status is not Status.INFEASIBLE:
             break
         problem = context.problem(other.model, other.error)

@@ -1,13 +1,13 @@
 """Fit NARX and NOE models, which are trained by one-step prediction and used in simulation.
 
-A NARX is trained to predict one step from the measured outputs. A NOE starts like this and then reads a decreasing
-share of the measured outputs, down to none: the simulation error over a long record has many minima, and a model guided
-by the data avoids most of them. Both are judged and chosen by the simulation error over the training data.
+A NARX is trained to predict one step from the measured outputs. A NOE starts like this and then reads a share of the
+measured outputs that falls to zero: the simulation error over a long record has many minima, and a model guided by the
+data avoids most of them. The simulation error over the training data selects the best start of both.
 
-With early stopping a part of the training data is held back for validation, and the point with the smallest error on it
-is returned. One recording is cut in time: its end is held back, and simulated from the beginning of the recording. Of
-several recordings the last ones are held back, with all that have the same inputs. The end of a periodic recording has
-the same input as its beginning, so its mean period is cut in time.
+With early stopping a part of the training data is held back for validation, and the fit returns the point with the
+smallest error on it. A single recording is cut in time: its end is held back, and simulated from the beginning of the
+recording. Of several recordings the last ones are held back, with all that have the same inputs. The end of a periodic
+recording has the same input as its beginning, so its mean period is cut in time.
 """
 
 from __future__ import annotations
@@ -22,8 +22,17 @@ import numpy as np
 from .._base import InputError, one_blas_thread
 from ..data import Recording, as_recordings, group_by_input, mean_period, repeats_itself
 from ..engine import Engine, make_engine
-from ..models import NARX, PILFR, Lagged, Model, lagged_start, reading_output
-from ..optimise import Candidate, GaussNewton, Ipopt, Problem, Progress, Solution, Status, estimate_initial_state
+from ..models import NARX, PILFR, Lagged, Model, lagged_start, read_measured_output
+from ..optimise import (
+    Candidate,
+    GaussNewton,
+    Ipopt,
+    IterationCallback,
+    Problem,
+    Solution,
+    Status,
+    estimate_initial_state,
+)
 from .context import FitContext, check_recordings, report_iterations
 from .multistart import EXPLORE, judge, run_tasks
 from .result import Fit, with_solution
@@ -44,7 +53,7 @@ SAME_INPUT_NOTE = (
 class LaggedSearch:
     """The model, options and data that all starts of one fit share."""
 
-    wanted: Lagged
+    lagged: Lagged
     structure: PILFR
     context: FitContext
     training: tuple[Recording, ...]
@@ -55,9 +64,9 @@ class LaggedSearch:
         return replace(self.context, recordings=self.training).problem(model, engine=engine or self.context.engine)
 
 
-def check_lagged_options(wanted: Lagged, stable: bool | float, start: Any) -> None:
-    """Refuse options that a NARX or NOE would ignore: a bound on a spectral radius, a start of another kind."""
-    kind = type(wanted).__name__
+def check_lagged_options(lagged: Lagged, stable: bool | float, start: Any) -> None:
+    """Refuse options that a NARX or NOE would ignore: a bound on a spectral radius, or another kind of start."""
+    kind = type(lagged).__name__
     if not isinstance(stable, bool):
         raise InputError(
             f"stable = {stable!r} was given for a {kind}, whose state holds past signals and has no spectral radius to "
@@ -68,7 +77,7 @@ def check_lagged_options(wanted: Lagged, stable: bool | float, start: Any) -> No
 
 
 def fit_lagged(
-    wanted: Lagged,
+    lagged: Lagged,
     train: Recording | Sequence[Recording],
     context: FitContext,
     starts: int,
@@ -78,15 +87,17 @@ def fit_lagged(
     """Fit a NARX or NOE: solve from every start and return the smallest simulation error over the training data."""
     if context.l1:
         raise InputError("An L1 penalty is for the weights of an element; leave l1 out, or give a PILFR.")
-    if not isinstance(context.solver, GaussNewton) and wanted.validation:
+    if not isinstance(context.solver, GaussNewton) and lagged.validation:
         raise InputError("Early stopping needs the solver GaussNewton(); give that, or validation=0.")
     first = as_recordings(train)[0]
-    context = replace(context, recordings=check_recordings(wanted, train))
-    structure = wanted.structure(first.n_u, first.n_y)
-    whole = context.recordings, (), ""
-    training, validation, note = split_validation(context.recordings, wanted.validation) if wanted.validation else whole
+    context = replace(context, recordings=check_recordings(lagged, train))
+    structure = lagged.structure(first.n_u, first.n_y)
+    validation: tuple[Recording, ...] = ()
+    training, note = context.recordings, ""
+    if lagged.validation:
+        training, validation, note = split_validation(context.recordings, lagged.validation)
     shared = context if executor is None else replace(context, progress=None)  # a callable stays in its process
-    search = LaggedSearch(wanted, structure, shared, training, validation)
+    search = LaggedSearch(lagged, structure, shared, training, validation)
 
     def report(candidates: list[Candidate], total: int) -> None:
         if context.progress:
@@ -111,13 +122,13 @@ def fit_lagged(
 def explore_lagged(search: LaggedSearch, seed: int, sequence: np.random.SeedSequence) -> Candidate:
     """Run one start to its end."""
     first = search.training[0]
-    values = lagged_start(search.wanted, search.structure, search.training, np.random.default_rng(sequence))
+    values = lagged_start(search.lagged, search.structure, search.training, np.random.default_rng(sequence))
     names = {"inputs": first.inputs, "outputs": first.outputs}
     model = search.structure.model(first.n_u, first.n_y, values, **names)
     solution, engine = None, None
-    shares = OUTPUT_SHARES[:1] if isinstance(search.wanted, NARX) else OUTPUT_SHARES
+    shares = OUTPUT_SHARES[:1] if isinstance(search.lagged, NARX) else OUTPUT_SHARES
     for share in shares:
-        trained = reading_output(model, share) if share else model
+        trained = read_measured_output(model, share) if share else model
         problem = search.problem(trained, engine if share else None)
         engine = problem.engine
         begin = problem.start if solution is None else solution.theta
@@ -144,7 +155,7 @@ def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution
     problem = Problem(model, search.context.recordings, engine=engine)
     theta = solution.theta
     pairs = zip(search.training, search.context.recordings, strict=False)
-    # the given recordings that begin with the data trained on
+    # the original recordings that begin with the training data
     known = [r for k, r in pairs if k.begins == r.begins and np.array_equal(k.y, r.y[: len(k)])]
     known = known if len(known) == len(search.training) else []
     if problem.size > len(theta) or not known:  # add the initial states of recordings held back or cut
@@ -159,7 +170,7 @@ def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution
 
 
 def one_step(fit: Any, recording: Recording) -> np.ndarray:
-    """Predict with a fitted NARX or NOE one step ahead, from the measured outputs up to the sample before.
+    """Predict one step ahead with a fitted NARX or NOE, from the measured outputs up to the previous sample.
 
     Parameters
     ----------
@@ -177,7 +188,7 @@ def one_step(fit: Any, recording: Recording) -> np.ndarray:
     InputError
         If the fit is of another model, or the recording does not fit it.
     """
-    model = reading_output(fit.model)
+    model = read_measured_output(fit.model)
     state = fit.initial_state(recording)
     return make_engine(model, fit.engine).simulate(model.drive(recording), model.parameters.start, state)[0]
 
@@ -185,7 +196,7 @@ def one_step(fit: Any, recording: Recording) -> np.ndarray:
 def split_validation(
     recordings: Sequence[Recording], share: float
 ) -> tuple[tuple[Recording, ...], tuple[Recording, ...], str]:
-    """Split training data; return the part to train on, the part for validation (scored there alone), and a note."""
+    """Split training data; return the part to train on, the part for validation with its scored samples, and a note."""
     groups = group_by_input(recordings)
     if len(groups) > 1:
         wanted, last = max(1, round(share * len(recordings))), set(groups[-1])
@@ -207,14 +218,14 @@ def _cut_in_time(r: Recording, share: float) -> tuple[Recording, Recording]:
         mean = mean_period(r.slice(r.skip, r.skip + whole))
         cut = min(max(round((1 - share) * len(mean)), 2), len(mean) - 1)
         twice = mean.with_(u=np.tile(mean.u, (2, 1)), y=np.tile(mean.y, (2, 1)), initial="zero")
-        # a period from rest before the part that is scored
+        # a period from rest precedes the scored part
         return mean.slice(0, cut), _score_from(twice, len(mean) + cut)
     cut = min(max(r.skip + round((1 - share) * (len(r) - r.skip)), r.skip + 2), len(r) - 1)
     return r.slice(0, cut), _score_from(r, cut)
 
 
 def _begin_at_rest(recording: Recording) -> Recording:
-    """Begin at zero in place of an initial state to be estimated, and do not score the first fifth."""
+    """Begin at zero instead of an estimated initial state, and do not score the first fifth."""
     if recording.begins != "estimate":
         return recording
     return _score_from(recording.with_(initial="zero"), max(recording.skip, len(recording) // 5))
@@ -226,15 +237,15 @@ def _score_from(recording: Recording, skip: int) -> Recording:
     return recording.with_(skip=skip, period=training)
 
 
-class Watch:
-    """Remember the point of a solve with the smallest error on the data held back."""
+class EarlyStopping:
+    """Remember the point of a solve with the smallest error on the validation data."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.best, self.theta, self.failed = np.inf, np.zeros(0), 0
 
     def __call__(self, theta: np.ndarray) -> bool:
-        """Tell whether to stop, after the point θ of the solve."""
+        """Record a point θ of the solve; tell whether to stop there."""
         cost = self.problem.cost(theta[: self.problem.size])
         if cost < self.best or not self.theta.size:
             self.best, self.theta, self.failed = cost, theta.copy(), 0
@@ -244,14 +255,18 @@ class Watch:
 
 
 def solve_with_early_stopping(
-    solver: GaussNewton, problem: Problem, validation: Problem, start: np.ndarray, progress: Progress | None = None
+    solver: GaussNewton,
+    problem: Problem,
+    validation: Problem,
+    start: np.ndarray,
+    progress: IterationCallback | None = None,
 ) -> Solution:
     """Solve, and return the point with the smallest error on `validation`."""
-    watch = Watch(validation)
-    solution = solver.solve(problem, start, progress, watch)
-    if not watch.theta.size or solution.status is Status.INTERRUPTED:
+    stopping = EarlyStopping(validation)
+    solution = solver.solve(problem, start, progress, stopping)
+    if not stopping.theta.size or solution.status is Status.INTERRUPTED:
         return solution
-    if watch(solution.theta) or watch.failed:
-        cost = problem.cost(watch.theta)
-        return replace(solution, theta=watch.theta, cost=cost, status=Status.STOPPED_EARLY)
+    if stopping(solution.theta) or stopping.failed:
+        cost = problem.cost(stopping.theta)
+        return replace(solution, theta=stopping.theta, cost=cost, status=Status.STOPPED_EARLY)
     return solution

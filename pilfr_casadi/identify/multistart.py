@@ -1,19 +1,19 @@
 """From a linear model to a PI-LFR: many starts, and a careful polish of the best.
 
 1. Exploration (`explore`): a short Gauss-Newton run from each start; about forty steps show how good a start is. The
-   first two starts have the element at the output and at the input, the others anywhere (`grid_start`). Where the
-   structure fixes the place, the thresholds are a grid in the first start and drawn in the others.
-2. Polish (`polish`): the thresholds of the best few are spread anew along the smoothed density of the fitted weights
-   (`regrid`), because some have clustered or never slip, and the solver runs again. This is done twice. The second time
-   thresholds reach beyond the visited range, and a weak prior keeps the weights near the smoothed density where the
-   data do not determine them. A last run without the prior shows its cost: the fit with the prior wins if its error is
-   within 10 % of the one without.
+   first two starts have the element at the output and at the input, the others anywhere (`grid_start`). If the
+   structure fixes the place, the first start has its thresholds on a grid, and the others draw them.
+2. Polish (`polish`): some thresholds of the best few have clustered or never slip. So they are spread anew along the
+   smoothed density of the fitted weights (`regrid`), and the solver runs again, twice. The second time thresholds reach
+   beyond the visited range, and a weak prior keeps the weights near the smoothed density where the data do not
+   determine them. A last run without the prior shows the prior's cost: the fit with the prior wins if its error is at
+   most 10 % larger.
 
 With `start="paper"` every start is solved to the end in 1 and polished in 2, so that each result stands for one start.
-With "plain" it is solved in 1 alone. This is the paper's protocol if the linear model is the best linear approximation,
-as in the paper. The refined linear model is at the minimum of the output error, where more starts get stuck. Elements
-without memory have their own start values (`network_start`) and no thresholds to spread; each of their starts is solved
-to the end too unless the start is "grid".
+With "plain" it is only solved in 1. This is the paper's protocol if the linear model is the best linear approximation.
+The refined linear model is at the minimum of the output error, where more starts get stuck. Elements without memory
+have their own start values (`network_start`) and no thresholds to spread; their starts, too, are solved to the end
+unless the start is "grid".
 
 Every task depends on its own seed alone, so the numbers are the same for any executor and any number of workers.
 """
@@ -37,7 +37,7 @@ from ..models import (
     PrandtlIshlinskii,
     StaticNetwork,
     direction_fixed,
-    fixed_whole,
+    fixed_blocks,
     places,
     weight_density,
 )
@@ -49,14 +49,14 @@ from .start import Blocks, envelope_start, grid_start, has_networks, network_sta
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
 DEFAULT_SOLVER: GaussNewton = GaussNewton(max_iterations=200, tolerance=1e-4)  # of `fit`, and of every polish
 START_KINDS: tuple[str, ...] = ("grid", "paper", "plain")
-KEEP = 4  # candidates that are polished
+MOST_POLISHED = 4  # candidates that are polished
 KERNEL_WIDTH = 1 / 12  # of the smoothed density of weights, over the visited range
-PRIOR_MARGIN = 1.1  # on the smallest error, up to which the fit with the density prior wins
+PRIOR_MARGIN = 1.1  # multiple of the smallest error up to which the fit with the density prior wins
 
 
 @dataclass(frozen=True, eq=False)
 class StartSearch:
-    """The options that all starts of one fit share; `level` is the error that the linear model reaches."""
+    """The options that all starts of one fit share; `level` is the error of the linear model."""
 
     context: FitContext
     structure: PILFR
@@ -66,16 +66,16 @@ class StartSearch:
     coordinates: bool = True  # whether the states' coordinates are free to choose
 
     def problem(self, model: Model, engine: Engine | None = None, noise: float | None = None) -> Problem:
-        """Make the simulation-error problem of a model, its bounds on spectral radii loosened.
+        """Make the simulation-error problem of a model, with looser bounds on spectral radii.
 
-        Priors are weighed against the noise that the user gave, else the error `noise` that was reached, else `level`.
+        Priors are weighed against the user's noise, else the error `noise` reached so far, else `level`.
         """
         constraints = loosen_radii(self.context.constraints, least=1.0)
         engines = {} if engine is None else {"engine": engine}
         return self.context.problem(model, noise or self.level, constraints=constraints, **engines)
 
     def solve(self, problem: Problem, start: np.ndarray | None, solver: Any, at_bound: bool = False) -> Solution:
-        """Solve inside exact bounds on spectral radii; `at_bound` says that one of them is active at the start."""
+        """Solve inside exact bounds on spectral radii; set `at_bound` if one of them is active at the start."""
         return solve_within_bounds(problem, start, solver, "steps", self.context.progress, at_bound=at_bound)
 
     def model(self, values: dict[str, Any]) -> Model:
@@ -86,7 +86,7 @@ class StartSearch:
 
 @one_blas_thread
 def explore(search: StartSearch, seed: int, sequence: np.random.SeedSequence) -> Candidate:
-    """Run one start: briefly with the grid, else to the end, with the paper's start including the polish.
+    """Run one start: briefly for "grid", else to the end, and for "paper" polish it too.
 
     The paper's start draws thresholds far smaller than z, which end in clusters and beyond the visited range. A solver
     alone does not bring them back.
@@ -100,7 +100,7 @@ def explore(search: StartSearch, seed: int, sequence: np.random.SeedSequence) ->
     polished = polish(search, candidate)
     if solver == DEFAULT_SOLVER or polished is candidate:
         return polished
-    # the last solve is the user's solver's
+    # the user's solver makes the last solve
     problem = search.problem(polished.model, problem.engine, noise=polished.error)
     solution = search.solve(problem, polished.theta, solver)
     return judge(seed, polished.model, problem, solution, polished.note)
@@ -121,11 +121,11 @@ def start_values(search: StartSearch, seed: int, sequence: np.random.SeedSequenc
 
 
 def is_drawn(structure: Any, start: str, seed: int) -> bool:
-    """Tell whether a start depends on the seed; a grid start does if it draws a direction of z or thresholds."""
+    """Tell whether a start depends on the seed, as a grid start that draws a direction of z or thresholds does."""
     element = structure.element
     if start != "grid" or isinstance(element, StaticNetwork):
         return True
-    several = "r" not in fixed_whole(structure) and getattr(element, "n", 1) > 1
+    several = "r" not in fixed_blocks(structure) and getattr(element, "n", 1) > 1
     return seed >= len(places(structure)) and (several or not direction_fixed(structure))
 
 
@@ -215,7 +215,7 @@ def regrid(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Place the thresholds and weights (N,) of one channel anew along their smoothed density.
 
-    Each new threshold represents an equal share of `density^spacing`. The default 0.4 gives the knots of a good
+    Each new threshold represents an equal share of `density^spacing`. With 0.4 the thresholds are the knots of a good
     piecewise-linear approximation of the loading curve. Beyond the visited range the density is extrapolated.
 
     Parameters
@@ -225,7 +225,7 @@ def regrid(
     reach : float
         Largest |z| visited.
     extent : float
-        Largest threshold, in units of `reach`; the tail is extrapolated log-linearly and never rises.
+        Largest threshold, in units of `reach`; the log-linear extrapolation of the tail never rises.
     count : int, optional
         Number of new thresholds, N by default.
     spacing : float
@@ -263,8 +263,8 @@ def regrid_channels(
 def threshold_range(structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, channel: int) -> float:
     """Return the smallest threshold for which an operator of a channel never moves over z (M,).
 
-    For plays and stops it is max |z|. A generalized play rests if its lower curve `γ_l - r` lies below its upper one
-    `γ_r + r` at every two values of z, so it is half of `max γ_l - min γ_r`.
+    For plays and stops it is max |z|. A generalized play rests if its lower curve `γ_l - r` at any z lies below its
+    upper curve `γ_r + r` at any other z, so the threshold is half of `max γ_l - min γ_r`.
     """
     if not has_networks(structure):
         return float(np.max(np.abs(z)))
@@ -298,11 +298,13 @@ def search_starts(
         )
     if search.start != "grid" or stopped:
         return found, usable[0], stopped
-    chosen = usable[:KEEP]
+    chosen = usable[:MOST_POLISHED]
     if any(at_active_radius(search.problem(c.model), c.theta, c.solution) for c in usable):
-        # At a bound the errors after exploration rank candidates poorly. Polish every candidate that was among the best
-        # so far when it was explored, so that more starts are never worse than fewer.
-        chosen = [c for i, c in enumerate(found) if c in sorted(found[: i + 1], key=_merit)[:KEEP] and c in usable]
+        # At a bound the errors after exploration rank candidates poorly. So polish each candidate that was among the
+        # best when it was explored; then more starts are never worse than fewer.
+        chosen = [
+            c for i, c in enumerate(found) if c in sorted(found[: i + 1], key=_merit)[:MOST_POLISHED] and c in usable
+        ]
     polished, stopped = run_tasks(polish, [(search, c) for c in chosen], executor, partial(report, "polish"))
     return found, min(polished or usable[:1], key=_merit), stopped
 

@@ -2,7 +2,7 @@ r"""L1 penalty on an element's weights, with all scales fixed that could offset 
 
     minimise  1/2 mean(e²) + l1 Σ w_ij
 
-(Tibshirani 1996; the simulation error is that of Krikelis et al. 2024, Eq. 20). The outputs of a PI-LFR do not change
+(Tibshirani 1996; simulation error of Krikelis et al. 2024, Eq. 20). The outputs of a PI-LFR do not change
 under `w_i -> w_i / μ, (B_w, D_yw)_i -> μ (...)`, nor under a scaling of z with its thresholds and of the states, in
 every combination (`generators`). With all blocks free, a rescaling alone would drive the penalty to zero. Fixing an
 invariant product such as `C_z B_w` is not enough: it is the first sample of the response from w to z, which is tiny in
@@ -10,7 +10,7 @@ a mechanical system and can be restored at almost no cost. Therefore
 
 1. the problem is solved without the penalty;
 2. the weights of each channel are scaled to a sum of one, with `B_w` and `D_yw` scaled inversely, unless an entry is
-   fixed, bounded or has a prior: `l1` then is in units of the cost, for the sum of a channel's weights;
+   fixed, bounded or has a prior; `l1` then is the cost of a channel's whole sum of weights;
 3. plays or stops of a channel with nearly the same threshold are merged as long as the objective grows by at most the
    share `OBJECTIVE_GROWTH` in all, because the penalty does not distinguish one large weight from two halves of it;
 4. the problem is solved with the penalty from there. Weights, thresholds, `y_0` and the initial states are free; the
@@ -40,7 +40,9 @@ OBJECTIVE_GROWTH = 0.02  # relative growth of the objective that merging operato
 def check_penalty(l1: dict[str, float], parameters: ParameterSet, linear: bool) -> None:
     """Refuse a penalty on a linear model, an unknown name or a parameter that may be negative, before any long work."""
     if linear:
-        raise InputError("An L1 penalty was asked for on a linear model; it acts on an element's weights, give one.")
+        raise InputError(
+            "l1 was given for a linear model, but the penalty acts on an element's weights; give an element."
+        )
     for name, weight in l1.items():
         lower = parameters.lower[parameters.position(name)]
         if not is_number(weight) or not 0 <= weight < np.inf:
@@ -72,7 +74,7 @@ def _may_be_scaled(p: Parameter, part: Any, low: float) -> bool:
 
 
 def hold_all_but_element(model: Model, names: Iterable[str]) -> Model:
-    """Fix all parameters but `y_0`, the penalised names and, if weights or thresholds are among them, both of these."""
+    """Fix all parameters but `y_0` and the penalised ones; weights and thresholds are free if either is penalised."""
     loose = {"y_0", *names} | (set(LAYER) if set(LAYER) & set(names) else set())
     changes = {name: {"fixed": True, "prior": None} for name in model.parameters if name not in loose}
     return model.with_parameters(model.parameters.change(**changes))
@@ -141,21 +143,20 @@ def restore_variables(solution: Solution, fixed_problem: Problem, problem: Probl
 
 
 def penalty_sentence(model: Model, l1: dict[str, float]) -> str:
-    """Say how many entries the penalty has set to zero."""
+    """Report how many entries the penalty has set to zero."""
     counts = [f"{np.sum(model.parameters[k].value == 0)} of {model.parameters[k].size} entries of {k}" for k in l1]
     return f"L1 penalty: {', '.join(counts)} are exactly zero; the linear blocks were fixed during this solve"
 
 
 def solve_with_penalty(model: Model, problem: Problem, solution: Solution, context: FitContext) -> Stage:
-    """Solve with the L1 penalty from the solution without; return model, problem, solution and a note."""
+    """Solve with the L1 penalty, starting from the solution without it; return model, problem, solution and a note."""
     if solution.status is Status.INTERRUPTED:
         return model, problem, solution, "interrupted before the L1 penalty was applied"
     found = normalise_weights(with_solution(model, problem, solution))
     states = solution.theta[problem.n_free :]
     options: dict[str, Any] = {"engine": problem.engine, "l1": context.l1}
-    whole, fixed_problem = (
-        context.problem(m, problem.noise, **options) for m in (found, hold_all_but_element(found, context.l1))
-    )
+    full_problem = context.problem(found, problem.noise, **options)
+    fixed_problem = context.problem(hold_all_but_element(found, context.l1), problem.noise, **options)
     begin = merge_operators(fixed_problem, np.concatenate([fixed_problem.start[: fixed_problem.n_free], states]))
     states = begin[fixed_problem.n_free :]
     last = fix_idle_operators(
@@ -164,5 +165,5 @@ def solve_with_penalty(model: Model, problem: Problem, solution: Solution, conte
     if np.any(last.parameters.free):
         fixed_problem = context.problem(last, problem.noise, **options)
     begin = np.concatenate([fixed_problem.start[: fixed_problem.n_free], states])
-    result = restore_variables(context.solve(fixed_problem, "L1 penalty", begin), fixed_problem, whole)
-    return found, whole, result, penalty_sentence(with_solution(found, whole, result), context.l1)
+    result = restore_variables(context.solve(fixed_problem, "L1 penalty", begin), fixed_problem, full_problem)
+    return found, full_problem, result, penalty_sentence(with_solution(found, full_problem, result), context.l1)

@@ -1,9 +1,9 @@
 """`Fit`, the result of `fit`, with its verbs: simulate, nrmse, plot, save, export and report.
 
 `FitOptions` are the options of `fit` that also apply to fits made from its result: the bound on spectral radii, the
-constraints, the noise that priors are weighed against, and the weights of recordings. A model file holds no code and so
-no constraints, only their names and the bound on spectral radii. A constraint known only by name must be supplied
-again or dropped explicitly.
+constraints, the noise against which priors are weighed, and the weights of recordings. A model file contains no code.
+So it stores the bound on spectral radii but only the names of other constraints, which must be supplied again or
+dropped explicitly.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ RADIUS = "spectral radius"  # how the names of bounds on spectral radii begin
 class FitOptions:
     """Options that a fit passes on to fits made from it, as for `fit`.
 
-    `lost` names constraints that the fit had before it was written to a file; `noise` is None where it is to be
-    estimated; `weights` go by the `fingerprint` of each recording, None for equal weights.
+    `lost` names constraints that a model file could not store; `noise` is None if it is estimated; `weights` maps the
+    `fingerprint` of each recording to its weight, None for equal weights.
     """
 
     stable: bool | float = True
@@ -66,7 +66,7 @@ class FitOptions:
         weights: Any = None,
         train: Any = (),
     ) -> FitOptions:
-        """Return the options with some replaced; None keeps the present value. `weights` are those of `train`."""
+        """Return the options with some replaced; None keeps the present value. `weights` belong to `train`."""
         if noise is not None and noise != "estimate" and not (is_number(noise) and 0 < noise < np.inf):
             raise InputError(f"noise = {noise!r} was given; give a number above zero, or 'estimate'.")
         if constraints is None and self.lost:
@@ -108,7 +108,7 @@ def _weights_by_recording(weights: Any, train: Any) -> dict[str, float]:
 
 
 def options_from_limits(limits: Sequence[Limit], structure: PILFR | None, **more: Any) -> FitOptions:
-    """Recover the options from the limits in a model file; `more` are options that the file states."""
+    """Recover the options from the limits in a model file; `more` are options that the file contains."""
     names = dict.fromkeys(limit.name.partition("[")[0] for limit in limits if limit.kind == "constraint")
     radii = [limit.upper for limit in limits if limit.name.startswith(f"{RADIUS} <= ")]
     lost = tuple(name for name in names if not name.startswith(RADIUS))
@@ -201,9 +201,9 @@ class Fit:
     def initial_state(self, recording: Recording, samples: int | None = None) -> np.ndarray:
         """Find the state with memory at a recording's first sample, as its `initial` says.
 
-        A state that is to be estimated is that of the fit for a training recording. For any other recording it is
-        fitted to the first `samples` samples (default: ten per state, at least 50) at the model's parameters. Later
-        samples are not used, and `nrmse` does not score the first ones.
+        An estimated state of a training recording comes from the fit. For any other recording it is fitted to the first
+        `samples` samples (default: ten per state, at least 50) at the model's parameters. Later samples are not used,
+        and `nrmse` does not score the first ones.
         """
         recording = self.matched(recording)
         known = self.initial.get(fingerprint(recording))
@@ -217,7 +217,7 @@ class Fit:
         Raises
         ------
         InputError
-            If it is not a recording, or does not fit the model.
+            If it is not a recording, or the recording does not fit the model.
         """
         return self.signals(recording)["y"]
 
@@ -229,12 +229,12 @@ class Fit:
         return {"y": y, "z": z, "w": w}
 
     def run(self, recording: Recording) -> tuple[Recording, np.ndarray, int]:
-        """Simulate along a recording: it as the model takes it, its outputs (M, n_y), the first scored sample."""
+        """Return a recording with the model's channels, its simulated outputs (M, n_y), and its first scored sample."""
         recording = self.matched(recording)
         return recording, self.simulate(recording), self.scored_from(recording)
 
     def scored_from(self, recording: Recording) -> int:
-        """Find the first sample that is scored: after `skip`, and after those that an initial state is fitted to."""
+        """Find the first scored sample: after `skip`, and after the samples to which an initial state is fitted."""
         recording = self.matched(recording)
         estimated = recording.begins == "estimate"
         if not estimated or fingerprint(recording) in self.initial or not self.model.n_state:
@@ -250,9 +250,8 @@ class Fit:
     def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
         """Compute the NRMSE (Eq. 27) over outputs, averaged over recordings, in free-run simulation.
 
-        Where the initial state of a recording other than the training's is estimated, the samples that it is fitted to
-        are not scored (`scored_from`). An output that rests in one of several recordings is scaled by its deviation
-        over all of them.
+        The samples to which the initial state of a test recording is fitted are not scored (`scored_from`). An output
+        that rests in one of several recordings is scaled by its deviation over all of them.
 
         Raises
         ------
@@ -353,8 +352,8 @@ class Fit:
         Parameters
         ----------
         path : path
-            The file, usually `*.json`. For your own model or simulator it holds the values alone (a warning says so for
-            a simulator); give the model to `load`.
+            The file, usually `*.json`. For your own model or simulator it holds only the values (for a simulator with a
+            warning); give the model to `load`.
 
         Raises
         ------
@@ -370,7 +369,7 @@ class Fit:
             )
 
     def content(self) -> FitContent:
-        """Collect what a model file stores of this fit."""
+        """Collect the content of this fit's model file."""
         shared = {f.name: getattr(self, f.name) for f in fields(FitContent) if hasattr(self, f.name)}
         return FitContent(**shared, noise=self.options.noise, weights=self.options.weights)
 
@@ -383,7 +382,7 @@ class Fit:
         return exported(self, **options)
 
     def __str__(self) -> str:
-        errors = ", ".join(map(_shown, self.train_nrmse))
+        errors = ", ".join(map(_format_error, self.train_nrmse))
         count = len(self.candidates)
         starts = f"{count} start{'s' if count > 1 else ''}"
         spent = f"{self.seconds:.1f} s{f' for {starts}' if count else ''}; " if self.seconds else ""
@@ -398,8 +397,8 @@ class Fit:
             lines.insert(1, NOTHING_SENTENCE)
         if self.candidates:
             reached = sorted(c.error for c in self.candidates)
-            several = f"the starts reached NRMSE {_shown(reached[0])} ... {_shown(reached[-1])}"
-            lines.append(several if count > 1 else f"the start reached NRMSE {_shown(reached[0])}")
+            several = f"the starts reached NRMSE {_format_error(reached[0])} ... {_format_error(reached[-1])}"
+            lines.append(several if count > 1 else f"the start reached NRMSE {_format_error(reached[0])}")
             if not any(c.drawn for c in self.candidates):
                 lines.append("no start is drawn at random, so the seed has no effect")
         if self.linear_nrmse:
@@ -429,7 +428,7 @@ class Fit:
 
 
 def match_channels(simulator: Simulator, recording: Recording) -> Recording:
-    """Return a recording with its columns in a simulator's order and units, others left out.
+    """Return a recording with only a simulator's columns, in its order and units.
 
     Raises
     ------
@@ -468,8 +467,8 @@ def save(fit: Fit, path: str | os.PathLike[str]) -> None:
 def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fit:
     """Read a fit that `save` wrote; simulations are the same to the last digit.
 
-    Parameters, errors and warnings are those of `export.read_model_file`. Each candidate has its seed, error and
-    status, an empty `theta` and the fitted model.
+    See `export.read_model_file` for parameters, errors and warnings. Each candidate has its seed, error and status, an
+    empty `theta` and the fitted model.
     """
     content = read_model_file(path, model)
     shared = {f.name: getattr(content, f.name) for f in fields(content) if f.name in Fit.__dataclass_fields__}
@@ -479,7 +478,7 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
     return Fit(**{**shared, "limits": content.limits or ()}, options=options)
 
 
-def _shown(error: float) -> str:
+def _format_error(error: float) -> str:
     return f"{error:.4f}" if error < 1e4 else f"{error:.3g}"
 
 

@@ -5,11 +5,11 @@ Along the path the objective of Krikelis et al. (2024), Eq. 20, has
     l1 Σ_j w_ij        (unneeded operators get zero weight and are removed; the rest is fitted again), or
     s ((θ - m) / σ)²   (a prior of mean m and standard deviation σ, s times as strong).
 
-Every fit is judged by its free-run simulation of a validation recording that none of them was fitted to. The strongest
-regularization whose validation error is within a margin of the smallest is recommended; no test recording is used.
-Penalised estimates are biased towards zero, hence the second fit (relaxed lasso, Meinshausen 2007). It is made with the
-remaining operators, and also with the same number of operators spread in several ways over the density of the first
-fit, with a prior on their weights; validation chooses between these too.
+Every fit is judged by its free-run simulation of a validation recording, to which none of them was fitted. The
+strongest regularization whose validation error is within a margin of the smallest is recommended; no test recording is
+used. Penalised estimates are biased towards zero, hence the second fit (relaxed lasso, Meinshausen 2007). It uses the
+remaining operators, or the same number of operators spread over the density of the first fit's weights, at several
+spacings and with a prior on their weights. Validation chooses between these too.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from .result import DENSITY_PRIOR, Fit
 
 FACTORS = (0.01, 0.1, 1.0, 10.0, 100.0)  # on the strength of priors
 STRENGTHS = (1.0, 10.0, 30.0, 100.0, 300.0, 1000.0)  # of the L1 penalty, in units of the objective without it
-# (extent, spacing) of `regrid`, for each way of spreading operators
+# (extent, spacing) of `regrid` with which operators are spread
 SPREADINGS = tuple((extent, spacing) for extent in (1.0, 1.15, 1.3) for spacing in (0.25, 0.4))
-SPREAD = 0.02  # relative deviation of the prior on weights that are spread over a density
+SPREAD = 0.02  # relative deviation of the prior on the weights of spread operators
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -93,13 +93,13 @@ def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> F
     train : Recording or sequence of Recording
         Training data of the fit.
     options
-        As for `fit`: `solver`, `engine`, `stable`, `constraints`, `noise`, `weights`; the last four are those of the
-        fit by default.
+        As for `fit`: `solver`, `engine`, `stable`, `constraints`, `noise`, `weights`; the last four default to the
+        options of the fit.
 
     Returns
     -------
     Fit
-        Each channel has as many operators as the fullest channel needs, at least one.
+        Each channel has as many operators as the channel with the most nonzero weights, at least one.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> F
 
 
 def polish_fit(fit: Fit, train: Recording | Sequence[Recording], *, solver: Any = None, **options: Any) -> Fit:
-    """Polish a fit as the search does with its best starts (`polish`); return the fit itself if that is worse."""
+    """Polish a fit as a search polishes its best starts (`polish`); return the fit itself if the result is worse."""
     structure, context = fit.structure, context_of_fit(fit, train, solver=solver or DEFAULT_SOLVER, **options)
     assert structure is not None
     search = StartSearch(context, structure, {}, level=float(np.mean(fit.train_nrmse)))
@@ -193,8 +193,8 @@ def regularization_path(
     Raises
     ------
     InputError
-        If the fit is not one of a PI-LFR, a strength or the margin is invalid, or a validation recording is a training
-        recording.
+        If the fit is not a fit of a PI-LFR, a strength or the margin is invalid, or a validation recording is a
+        training recording.
     """
     structure, training, unseen = _check_path(fit, train, validation, priors is None)
     ascending = _sort_strengths(fit.solution.cost if priors is None else None, strengths, margin)
@@ -245,16 +245,16 @@ def _check_path(
 
 
 def _sort_strengths(unit: float | None, strengths: Any, margin: Any) -> list[float]:
-    """Sort the given or default strengths; default penalties are in units of the objective `unit`, None for priors."""
-    usual = FACTORS if unit is None else [unit * s for s in STRENGTHS]
-    asked: Any = usual if strengths is None else strengths
-    listed = isinstance(asked, Sequence | np.ndarray) and all(is_number(s) and 0 < s < np.inf for s in asked)
-    if not (listed and len(asked) and is_number(margin) and 0 <= margin < np.inf):
+    """Check and sort strengths; default penalties are in units of the objective `unit`, which is None for priors."""
+    if strengths is None:
+        strengths = FACTORS if unit is None else [unit * s for s in STRENGTHS]
+    valid = isinstance(strengths, Sequence | np.ndarray) and all(is_number(s) and 0 < s < np.inf for s in strengths)
+    if not (valid and len(strengths) and is_number(margin) and 0 <= margin < np.inf):
         raise InputError(
-            f"strengths = {asked!r} and margin = {margin!r} were given; give one strength or more, all above zero, and "
-            "a margin of zero or more."
+            f"strengths = {strengths!r} and margin = {margin!r} were given; give one strength or more, all above zero, "
+            "and a margin of zero or more."
         )
-    return sorted({float(s) for s in asked})
+    return sorted({float(s) for s in strengths})
 
 
 def _fit_sparser(
@@ -265,7 +265,10 @@ def _fit_sparser(
     thin: dict[int, tuple[Fit, ...]],
     options: Mapping[str, Any],
 ) -> Fit:
-    """Return the better fit on validation: the operators that a penalty leaves, or as many spread anew (see `thin`)."""
+    """Return the best fit on validation, with the operators that a penalty leaves or as many spread ones.
+
+    `thin` stores the fits with spread operators by their number.
+    """
     pruned = _raise_if_interrupted(
         prune(_raise_if_interrupted(identify(fit, training, l1={"w": strength}, **options)), training, **options)
     )
@@ -285,7 +288,7 @@ def _raise_if_interrupted(fit: Fit) -> Fit:
 def thin_operators(
     fit: Fit, train: Recording | Sequence[Recording], n: int, *, solver: Any = None, **options: Any
 ) -> tuple[Fit, ...]:
-    """Fit with n operators per channel, spread in several ways over the density of a fit's weights.
+    """Fit with n operators per channel, spread over the density of a fit's weights at several spacings.
 
     The options of the fit apply unless others are given. Returns no fits if weights or thresholds are fixed, bounded or
     have a prior.

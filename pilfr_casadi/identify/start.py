@@ -1,30 +1,30 @@
 r"""Start values of a PI-LFR: a linear model first, then the element in it.
 
 **Linear model** (`linear_model`; Krikelis et al. 2024, Sec. 5.3): subspace identification refined by output error,
-least squares as in Eq. 20 without an element. A solve without the bound on the spectral radius comes first: an
-integrator lies on the bound, and a solver that has to stay inside all the way reaches it badly.
+least squares as in Eq. 20 without an element. A solve without the bound on the spectral radius comes first, because an
+integrator lies on the bound, which a solver hardly reaches from inside.
 
-Identification finds the linear blocks up to a change of the states' basis, `x = T x'`. Where a structure fixes entries
-of `A`, `B_u` or `C_y` (physical sub-matrices), `find_nearest_basis` chooses the basis in which these entries come
-nearest to the known values,
+Identification finds the linear blocks up to a change of the states' basis, `x = T x'`. If a structure fixes entries of
+`A`, `B_u` or `C_y` (physical sub-matrices), `find_nearest_basis` chooses the basis in which these entries come nearest
+to the known values,
 
     minimise over T   Σ_known (T⁻¹ A T - A_k)² + (T⁻¹ B_u - B_k)² + (C_y T - C_k)²     (each over its block's size),
 
-from several start bases, and the linear model is fitted again with the entries at their values.
+from several start bases, and the linear model is fitted again with these entries fixed.
 
 **Element.** `paper_start` is Krikelis et al. (2024), Eq. 22-24. `grid_start` spreads the thresholds over the range of z
 instead of drawing them from `U(0, R)`, because idle or identical thresholds hardly separate again; z is a random
 direction, or the linear model's output or input. `network_start` is for elements without memory. `envelope_start` is
-for generalized plays. Between its envelopes such a play keeps its value (Eq. 7), so the values `v` seen at one `z` fill
-the interval from the lower to the upper envelope: the outline of the cloud `(z, v)` estimates both. The answer `v` is
-the output where the output is read through the element. Where the input passes the element, `v` is the input with which
-the linear model would have given the measured output,
+for generalized plays. Between its envelopes such a play keeps its value (Eq. 7), so the values `v` at one `z` fill the
+interval from the lower to the upper envelope: the outline of the cloud `(z, v)` estimates both. If the element is at
+the output, its answer `v` is the measured output. If it is at the input, `v` is the input with which the linear model
+would have given the measured output,
 
     V = U + G^H (G G^H + λ I)⁻¹ (Y - G U),
 
 with the linear model's response G at each frequency; λ damps frequencies that G hardly passes. The networks of Eq. 14
 are then fitted to the outline by non-negative least squares, with the neurons spread over the range of z. Envelopes
-that begin as straight lines (or, as in Sec. 5.3, at random) rarely bend to those of a saturating loop.
+that start as straight lines (or, as in Sec. 5.3, at random) rarely bend to the envelopes of a saturating loop.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from ..linear import (
     FrequencyProblem,
     in_modal_coordinates,
     is_modal,
-    propagate,
     resolvent,
     robust_bla,
+    states_from_rest,
     subspace_matrices,
 )
 from ..models import (
@@ -54,12 +54,12 @@ from ..models import (
     PrandtlIshlinskii,
     StaticNetwork,
     direction_fixed,
-    driven_through,
-    fixed_whole,
+    fixed_blocks,
+    is_hammerstein,
+    is_wiener,
     is_zero,
     neurons_over,
     or_one,
-    read_through,
 )
 from ..optimise import Constraint, GaussNewton, Problem, Solution, Status, stability_limits
 from .context import FitContext, report_iterations
@@ -69,7 +69,7 @@ Array = np.ndarray
 Blocks = dict[str, np.ndarray]
 Values = Mapping[str, np.ndarray]
 Signals = list[np.ndarray]  # one array (M, channels) for each recording
-BLA_OPTION = "bla"  # value of `linear` that asks for the best linear approximation
+BLA_OPTION = "bla"  # value of `linear` for the best linear approximation
 LINEAR = ("A", "B_u", "C_y", "D_yu", "y_0")
 COORDINATES = ("A", "B_u", "C_y")  # blocks that depend on the basis of the states
 PAPER_RANGE = 0.1  # R of Eq. 24
@@ -80,7 +80,7 @@ START_DEVIATION = 0.1
 OUTLINE_BINS = 40  # bins of z for the outline of a loop
 OUTLYING_SHARE = 0.03  # share of the samples at one z that lie outside each envelope
 DAMPING = 0.05  # damping of the inverse of the linear model, in units of its largest gain
-LEAST_SHARE = 0.01  # least height of each neuron, as a share of the curve's height, so that every neuron has a slope
+LEAST_SHARE = 0.01  # least total height of the neurons, as a share of the curve's, so that every neuron has a slope
 
 
 def linear_model(
@@ -95,8 +95,8 @@ def linear_model(
     """Fit a linear state-space model: subspace identification refined by output error, or the model `given`.
 
     The structure gives the order, whether there is an offset, and whether `A` is in modal coordinates; its element and
-    its other fixed blocks are ignored. A model `given` for the search of an element is not refined: at the
-    minimum of the linear error the slope of half of the parameters vanishes, and starts get stuck.
+    its other fixed blocks are ignored. A model `given` for a search with an element is not refined: at the minimum of
+    the linear error the slope of half of the parameters vanishes, and starts get stuck.
     """
     model = _linear_start(recordings, structure, given, progress)
     problem = Problem(model, recordings, engine=engine, constraints=constraints)
@@ -154,8 +154,7 @@ def best_linear_matrices(recordings: Sequence[Recording], nx: int) -> tuple[Arra
             )
     if nx == 0:
         return subspace_matrices(recordings, nx, offset=True)
-    model = FrequencyProblem(robust_bla(recordings), True).solve([nx], None)[0]
-    return model.A, model.B, model.C, model.D
+    return FrequencyProblem(robust_bla(recordings), True).identify(nx)
 
 
 def state_space_matrices(given: Any, nx: int, recording: Recording) -> tuple[Array, Array, Array, Array]:
@@ -180,18 +179,17 @@ def _offset(recordings: Sequence[Recording], a: Array, b: Array, c: Array, d: Ar
     """Compute the mean output error (n_y,) of a linear model from rest."""
     errors = []
     for r in recordings:
-        states = propagate(a.T, (r.u @ b.T)[None], np.zeros((1, len(a))))[0][0] if len(a) else np.zeros((len(r), 0))
-        errors.append((r.y - states @ c.T - r.u @ d.T)[r.skip :])
+        errors.append((r.y - states_from_rest(a, b, r.u) @ c.T - r.u @ d.T)[r.skip :])
     return np.asarray(np.mean(np.concatenate(errors), axis=0))
 
 
 def known_entries(structure: PILFR) -> Blocks:
-    """Return the fixed blocks that depend on the basis of the states (nan: free), without those fixed at zero."""
+    """Return the fixed blocks that depend on the basis of the states (nan: free); blocks fixed at zero do not."""
     return {k: np.asarray(v) for k, v in structure.fixed.items() if k in COORDINATES and np.any(np.asarray(v) != 0)}
 
 
 def transform_to_known_basis(structure: PILFR, linear: Model, context: FitContext) -> Model:
-    """Fit the linear model again in the basis of the structure's known entries; without any, return it as it is."""
+    """Fit the linear model again in the basis of the structure's known entries; without any, return it unchanged."""
     known = known_entries(structure)
     if not known or not structure.nx or (set(known) == {"A"} and is_modal(known, structure.nx)):
         return linear  # already in modal coordinates
@@ -266,9 +264,9 @@ def unit_states(blocks: Values, inputs: Signals, free: bool = True) -> tuple[Blo
 def paper_start(structure: PILFR, linear: Values, inputs: Signals, states: Signals, rng: np.random.Generator) -> Blocks:
     """Draw the start of Eq. 22-24: `C_z, D_zu ~ U(-1, 1)`, `w ~ U(0, 1/N)`, `r ~ U(0, R)`, `B_w = D_yw = 0`.
 
-    R is 0.1. Where the structure leaves no direction of z to draw, thresholds are in units of z's deviation: z
-    then has the units of an input or output, in which all of them could lie beyond it. For a Wiener model z is the
-    linear model's output: with any other z the non-negative weights fall to zero, where no other parameter has a slope.
+    R is 0.1. If the structure fixes the direction of z, thresholds are in units of z's deviation: z then has the units
+    of an input or output, and thresholds of other units could all exceed it. For a Wiener model z is the linear model's
+    output: with any other z the non-negative weights fall to zero, where no other parameter has a slope.
     """
     element = _pi_element(structure)
     shape = (element.channels, element.n)
@@ -285,13 +283,13 @@ def grid_start(
 ) -> Blocks:
     """Choose a direction of z of unit deviation, thresholds on a grid over its range, and equal weights.
 
-    Places of the element; the last two stand for the commonest structures, backlash or friction in the actuator or in
-    the sensor of a linear system:
+    Places of the element; the last two stand for the commonest structures, backlash or friction in the sensor or the
+    actuator of a linear system:
 
-    - "random": a random direction in states and inputs, each in units of its deviation; `B_w = D_yw = 0`; where the
-      structure leaves no direction to draw, random thresholds in place of the grid;
-    - "output": z is the linear model's output, half of which is read through the element;
-    - "input": z is the input, half of which reaches the linear model through the element.
+    - "random": a random direction in states and inputs, each in units of its deviation; `B_w = D_yw = 0`; if the
+      structure fixes the direction, random thresholds in place of the grid;
+    - "output": z is the linear model's output, half of which passes through the element;
+    - "input": z is the input, half of which passes through the element to the linear model.
 
     For Hammerstein and Wiener structures the linear blocks move to the other side of the element. With other fixed
     blocks, "output" and "input" give the direction of z alone.
@@ -312,8 +310,8 @@ def network_start(
 ) -> Blocks:
     """Draw directions of z of unit deviation and neurons that bend in its range; `B_w = D_yw = 0`.
 
-    As in Schoukens (2021), the network has no effect at first: the model starts as the linear one. Where slopes are
-    fixed at one, z has the deviation `START_DEVIATION`: neurons that start nearly linear reach better minima.
+    As in Schoukens (2021), the network has no effect at first: the model starts as the linear one. If slopes are fixed
+    at one, z has the deviation `START_DEVIATION`: neurons that start nearly linear reach better minima.
     """
     element = structure.element
     assert isinstance(element, StaticNetwork)
@@ -347,14 +345,14 @@ def _place_element(
 ) -> tuple[Blocks, Array]:
     """Return the linear blocks with the element at its place (see `grid_start`), and the signal z (M, channels)."""
     blocks = _directions(element, linear, rng)
-    fixed, n_u = fixed_whole(structure), linear["B_u"].shape[1]
+    fixed, n_u = fixed_blocks(structure), linear["B_u"].shape[1]
     blocks["D_zu"] = blocks["D_zu"] / or_one(np.std(np.concatenate(inputs), axis=0))
     at_output, at_input = (np.arange(element.channels) % n for n in (len(linear["C_y"]), n_u))
     if place == "output":
         blocks["C_z"], blocks["D_zu"] = linear["C_y"][at_output], linear["D_yu"][at_output]
     elif place == "input" and not is_zero(structure, "D_zu"):
         blocks["C_z"], blocks["D_zu"] = np.zeros_like(blocks["C_z"]), np.eye(n_u)[at_input]
-    if driven_through(structure):
+    if is_hammerstein(structure):
         blocks["B_w"], blocks["D_yw"] = linear["B_u"], linear["D_yu"]
     blocks |= _fixed_blocks(structure, linear, blocks)
     z = _signal(inputs, states, blocks)
@@ -373,13 +371,13 @@ def _signal(inputs: Signals, states: Signals, blocks: Values) -> Array:
 
 def _fixed_blocks(structure: PILFR, linear: Values, blocks: Blocks) -> Blocks:
     """Return the blocks that the structure fixes, and for a Wiener model z = the linear model's output."""
-    out = {"C_z": linear["C_y"], "D_zu": linear["D_yu"]} if read_through(structure) else {}
-    fixed = {k: np.asarray(structure.fixed[k], dtype=float) for k in fixed_whole(structure) if k in blocks}
+    out = {"C_z": linear["C_y"], "D_zu": linear["D_yu"]} if is_wiener(structure) else {}
+    fixed = {k: np.asarray(structure.fixed[k], dtype=float) for k in fixed_blocks(structure) if k in blocks}
     return out | {k: np.broadcast_to(v, blocks[k].shape) for k, v in fixed.items()}
 
 
 def _split_path(linear: Values, size: Array, at: Array, output: bool) -> Blocks:
-    """Split the path of output or input `at[i]`: half stays direct, half passes through channel i of the element."""
+    """Split the path of output or input `at[i]`: half stays direct, half passes through the element's channel i."""
     through = np.zeros((len(at), len(linear["C_y"]) if output else linear["B_u"].shape[1]))
     through[np.arange(len(at)), at] = size
     carried = np.count_nonzero(through, axis=0)
@@ -388,7 +386,7 @@ def _split_path(linear: Values, size: Array, at: Array, output: bool) -> Blocks:
 
 
 def _route(linear: Values, through: Array, direct: Array, before: bool) -> Blocks:
-    """Route inputs (`before`) or outputs by `through` (n, channels) to the element; the share `direct` passes by."""
+    """Route inputs (`before`) or outputs by `through` (n, channels) to the element; the share `direct` bypasses it."""
     b, c, d = linear["B_u"], linear["C_y"], linear["D_yu"]
     if before:
         return {"B_w": b @ through, "D_yw": d @ through, "B_u": b * direct, "D_yu": d * direct}
@@ -405,8 +403,8 @@ def envelope_start(
 ) -> Blocks:
     """Choose envelopes, thresholds and weights of a generalized play from the loops of z and its answer.
 
-    `values` (from `grid_start`) define z. They are returned unchanged if the structure fixes other blocks than those of
-    a Hammerstein or Wiener model. At `place` "random" the output is read through the element, as at "output".
+    `values` (from `grid_start`) define z. They are returned unchanged if the structure fixes blocks that a Hammerstein
+    or Wiener model leaves free. At `place` "random" the output is read through the element, as at "output".
     """
     element = _pi_element(structure)
     fixed = set(structure.fixed) - {"y_0", "A"}
@@ -444,7 +442,7 @@ def envelope_start(
 
 
 def _gain(linear: Values) -> Array:
-    """Compute the static gain (n_y, n_u), 0 for an integrator."""
+    """Compute the static gain (n_y, n_u); 0 for an integrator."""
     a = linear["A"]
     if len(a) and np.max(np.abs(np.linalg.eigvals(a))) > 0.9999:
         return np.zeros_like(linear["D_yu"])
@@ -452,7 +450,7 @@ def _gain(linear: Values) -> Array:
 
 
 def deconvolve_inputs(linear: Values, recording: Recording, states: Array) -> Array:
-    """Compute the inputs (M, n_u) for which the linear model gives the measured outputs, by the formula above for V."""
+    """Compute the inputs (M, n_u) for which the linear model gives the measured outputs: V of the module docstring."""
     u, y = recording.u, recording.y
     error = np.fft.rfft(y - states @ linear["C_y"].T - u @ linear["D_yu"].T - linear["y_0"], axis=0)
     z = np.exp(2j * np.pi * np.arange(len(error)) / len(u))
@@ -465,7 +463,7 @@ def deconvolve_inputs(linear: Values, recording: Recording, states: Array) -> Ar
 
 
 def channel_start(element: PrandtlIshlinskii, z: Array, v: Array) -> Blocks:
-    """Choose one channel's envelopes, thresholds and weights by name from its signal z (M,) and answer v (M,)."""
+    """Choose the envelopes, thresholds and weights of a channel by name from its signal z (M,) and answer v (M,)."""
     centres, low, high = loop_outline(z, v)
     n, operator = element.n, element.operator
     widest = float(np.max(high - low)) / 2
@@ -480,7 +478,7 @@ def channel_start(element: PrandtlIshlinskii, z: Array, v: Array) -> Blocks:
 def loop_outline(z: Array, v: Array) -> tuple[Array, Array, Array]:
     """Outline the cloud (z, v), both (M,): return centres of bins, and a rising lower and upper curve (bins,).
 
-    A play lags behind z. Loops that run the other way round, ahead of z, get no width.
+    A play lags behind z. Loops in the other direction, ahead of z, get no width.
     """
     edges = np.linspace(np.quantile(z, 0.002), np.quantile(z, 0.998), OUTLINE_BINS + 1)
     centres, bins = (edges[1:] + edges[:-1]) / 2, np.clip(np.searchsorted(edges, z) - 1, 0, OUTLINE_BINS - 1)

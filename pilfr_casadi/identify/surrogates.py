@@ -1,4 +1,4 @@
-r"""A linear surrogate, in named modes, for a simulation that is known only by its inputs and outputs.
+r"""A linear surrogate in named modes for a simulation known only by its inputs and outputs.
 
 A discrete model is identified from the simulation's record, converted to continuous time,
 
@@ -17,7 +17,7 @@ and a real eigenvalue `-r` the equation `q' = -r q + b u`. Frequencies, dampings
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -31,15 +31,16 @@ from ..simulators import Named, Port, Simulator
 from .fitting import fit
 
 POOR_SURROGATE = 0.02  # NRMSE above which a simulation is too nonlinear for a surrogate
-FREE = 0.3  # range of the parameters, as a share of their values
+RANGE = 0.3  # how far parameters may move, as a share of their values
 EXACT_ERROR = 1e-3  # NRMSE below which no higher order is tried
 HIGHEST = 8  # highest order that is tried
 NEGLIGIBLE_SHARE = 1e-3  # share of an output below which a coefficient is fixed
-FAST = 0.9  # over the Nyquist frequency; a faster eigenvalue has no reliable continuous counterpart
-POOR = 1e5  # condition number above which a pair's eigenvectors are not reliable
-# names of the inputs' gains on a mode's displacement and rate, and of these in the outputs
-GAINS, SEEN = ("gain on the displacement of", "gain of"), ("seen in", "rate seen in")
+FASTEST = 0.9  # share of the Nyquist frequency above which an eigenvalue has no reliable continuous counterpart
+ILL_CONDITIONED = 1e5  # condition number above which a pair's eigenvectors are not reliable
+# names of the gains of inputs on a mode's displacement and rate, and of displacement and rate in the outputs
+INPUT_GAINS, OUTPUT_GAINS = ("gain on the displacement of", "gain of"), ("seen in", "rate seen in")
 Array = np.ndarray
+Equation = Callable[[Named, Named, Named], dict[str, Any]]
 
 
 def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = None) -> tuple[Simulator, float]:
@@ -55,7 +56,7 @@ def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = N
     Returns
     -------
     Simulator
-        The simulator in modes, with the ports `mode:<frequency> Hz`; its parameters may move by 30 %.
+        The simulator in modes, with ports `mode:<frequency> Hz`; its parameters may move by 30 %.
     float
         Its NRMSE on the recordings, in free-run simulation from the fitted initial state.
 
@@ -70,8 +71,9 @@ def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = N
     records = tuple(r if r.period else r.with_(initial="estimate") for r in records)
     found: list[tuple[float, Simulator]] = []
     for n in range(HIGHEST + 1) if nx is None else (nx,):  # a simulation has no noise, so its order is evident
-        one = _identify(records, n, hold)
-        found += [one] if one is not None else []
+        identified = _identify(records, n, hold)
+        if identified is not None:
+            found.append(identified)
         if found and found[-1][0] < EXACT_ERROR:
             break
     if not found:
@@ -85,16 +87,17 @@ def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = N
 
 
 def surrogate_warning(error: float) -> str:
-    """Warn of a surrogate whose NRMSE `error` shows that the simulation is not linear; empty if it is small enough."""
+    """Return a warning if the NRMSE `error` of a surrogate shows that the simulation is not linear, else ""."""
     if error <= POOR_SURROGATE:
         return ""
     return (
-        "The linear model is poor: the simulation is not linear there, and what the model misses may show up as "
-        "missing physics. Give the simulator itself where it can be had."
+        "The linear model is poor: the simulation is not linear there, and the error of the model may show up as "
+        "missing physics. Give the simulator itself if you have it."
     )
 
 
 def _identify(records: Sequence[Recording], n: int, hold: str | None) -> tuple[float, Simulator] | None:
+    """Identify a simulator of order n; return its NRMSE and the simulator, or None if there is no such model."""
     try:
         found = fit(PILFR(n), records)
     except InputError:
@@ -119,14 +122,14 @@ def _identify(records: Sequence[Recording], n: int, hold: str | None) -> tuple[f
 
 
 def _as_mass(mode: Mode, slow: float) -> Mode:
-    """Turn a mode that is too slow to oscillate in a recording into a mass with almost no spring."""
+    """Turn a second-order mode too slow to oscillate in a recording into a mass with almost no spring."""
     if not mode.second_order or mode.spring or abs(mode.value) > slow:
         return mode
     return replace(mode, spring=(abs(mode.value) ** 2, -2 * mode.value.real))
 
 
-def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, like: Recording) -> Simulator:
-    """Make a simulator in modes, with the names of a recording.
+def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, recording: Recording) -> Simulator:
+    """Make a simulator in modes, with the names and units of a recording.
 
     Parameters
     ----------
@@ -135,85 +138,109 @@ def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, 
     offset : array, shape (n_y,)
         Constants of the outputs.
     """
-    slow = 0.05 / (len(like) * like.dt)
-    found = [_as_mass(mode, slow) for mode in modes(*matrices[:3])]
-    names = _distinct([mode.label(slow) for mode in found])
+    slowest = 0.05 / (len(recording) * recording.dt)
+    found = [_as_mass(mode, slowest) for mode in modes(*matrices[:3])]
+    names = _number_equal_names([mode.label(slowest) for mode in found])
+    named = dict(zip(names, found, strict=True))
     parameters: dict[str, Parameter] = {}
+    for name, mode in named.items():
+        parameters |= _mode_parameters(name, mode, recording)
+    parameters |= _output_parameters(matrices[3], offset, recording)
+    dynamics, read_outputs = _modal_equations(named, recording.inputs, recording.outputs)
     states: list[str] = []
-    inputs, outputs = like.inputs, like.outputs
+    for i, mode in enumerate(found, 1):
+        states += [f"q{i}", f"v{i}"] if mode.second_order else [f"q{i}"]
+    ports = tuple(_port(f"mode:{name}", i, mode) for i, (name, mode) in enumerate(named.items(), 1))
+    units = dict(recording.units)
+    return Simulator(dynamics, read_outputs, tuple(states), recording.inputs, parameters, ports, units=units)
 
-    def free(name: str, value: float, unit: str = "", size: float = 0.0) -> None:
-        reach = FREE * max(abs(value), 0.1 * size)
-        held = abs(value) <= NEGLIGIBLE_SHARE * size
-        parameters[name] = Parameter(value, unit=unit, bounds=(value - reach, value + reach), fixed=held)
 
-    for i, (name, mode) in enumerate(zip(names, found, strict=True), 1):
-        of = f"mode {name}: "
-        # typical ratios of q and v to q
-        speed = np.array([1.0, max(abs(mode.value), 1 / (len(like) * like.dt))])[: len(mode.into)]
-        entering = float(np.max(np.abs(mode.into) * (speed[::-1])[:, None]))
-        leaving = float(np.max(np.abs(mode.out) * speed))
-        if mode.spring:
-            rate = max(abs(mode.value), 1 / (len(like) * like.dt))
-            free(f"{of}stiffness", mode.spring[0], "1/s^2", rate**2)
-            free(f"{of}drag", mode.spring[1], "1/s", rate)
-            states += [f"q{i}", f"v{i}"]
-        elif mode.second_order:
-            w = abs(mode.value)
-            free(f"{of}frequency", w / (2 * np.pi), "Hz")
-            free(f"{of}damping", -mode.value.real / w)
-            states += [f"q{i}", f"v{i}"]
-        else:
-            free(f"{of}rate", -mode.value.real, "1/s")
-            states.append(f"q{i}")
-        for row, kind, faster in zip(mode.into, GAINS[-len(speed) :], speed[::-1], strict=True):
-            for other, value in zip(inputs, row, strict=True):
-                if value == 1.0:  # the strongest input has gain one; the gains in the outputs hold the size of the mode
-                    parameters[f"{of}{kind} {other}"] = Parameter(1.0, fixed=True)
-                else:
-                    free(f"{of}{kind} {other}", float(value), size=entering / faster)
-        for column, kind, faster in zip(mode.out.T, SEEN, speed, strict=False):
-            for other, value in zip(outputs, column, strict=True):
-                free(f"{of}{kind} {other}", float(value), like.units.get(other, ""), leaving / faster)
-    spreads, moved = np.std(like.y[like.skip :], axis=0), np.std(like.u, axis=0)
-    for name, row, spread in zip(outputs, matrices[3], spreads, strict=True):
-        for other, value, push in zip(inputs, row, moved, strict=True):
-            free(f"direct: {other} in {name}", float(value), size=float(spread / max(push, 1e-300)))
-    for name, value, spread in zip(outputs, offset, spreads, strict=True):
-        parameters[f"offset: {name}"] = Parameter(value, bounds=(value - spread, value + spread))
+def _parameter(value: float, unit: str = "", size: float = 0.0) -> Parameter:
+    """Make a parameter that may move by `RANGE`, fixed if it is negligible next to the typical `size`."""
+    reach = RANGE * max(abs(value), 0.1 * size)
+    negligible = abs(value) <= NEGLIGIBLE_SHARE * size
+    return Parameter(value, unit=unit, bounds=(value - reach, value + reach), fixed=negligible)
 
-    def driven(u: Named, p: Named, of: str, kind: str) -> Any:
-        return sum((p[f"{of}{kind} {n}"] * u[n] for n in inputs), start=ca.SX(0))
+
+def _mode_parameters(name: str, mode: Mode, recording: Recording) -> dict[str, Parameter]:
+    """Make the parameters of a mode: its frequency and damping, and its gains from the inputs and in the outputs."""
+    prefix = f"mode {name}: "
+    rate = max(abs(mode.value), 1 / (len(recording) * recording.dt))
+    out: dict[str, Parameter] = {}
+    if mode.spring:
+        out[f"{prefix}stiffness"] = _parameter(mode.spring[0], "1/s^2", rate**2)
+        out[f"{prefix}drag"] = _parameter(mode.spring[1], "1/s", rate)
+    elif mode.second_order:
+        w = abs(mode.value)
+        out[f"{prefix}frequency"] = _parameter(w / (2 * np.pi), "Hz")
+        out[f"{prefix}damping"] = _parameter(-mode.value.real / w)
+    else:
+        out[f"{prefix}rate"] = _parameter(-mode.value.real, "1/s")
+    ratios = np.array([1.0, rate])[: len(mode.into)]  # typical ratios of q and v to q
+    largest_in = float(np.max(np.abs(mode.into) * (ratios[::-1])[:, None]))
+    largest_out = float(np.max(np.abs(mode.out) * ratios))
+    for row, kind, ratio in zip(mode.into, INPUT_GAINS[-len(ratios) :], ratios[::-1], strict=True):
+        for other, value in zip(recording.inputs, row, strict=True):
+            # the strongest input has gain one; the gains in the outputs hold the size of the mode
+            strongest = value == 1.0
+            gain = Parameter(1.0, fixed=True) if strongest else _parameter(float(value), size=largest_in / ratio)
+            out[f"{prefix}{kind} {other}"] = gain
+    for column, kind, ratio in zip(mode.out.T, OUTPUT_GAINS, ratios, strict=False):
+        for other, value in zip(recording.outputs, column, strict=True):
+            unit = recording.units.get(other, "")
+            out[f"{prefix}{kind} {other}"] = _parameter(float(value), unit, largest_out / ratio)
+    return out
+
+
+def _output_parameters(direct: Array, offset: Array, recording: Recording) -> dict[str, Parameter]:
+    """Make the direct gains (n_y, n_u) from inputs to outputs, and the outputs' offsets (n_y,)."""
+    spreads, moved = np.std(recording.y[recording.skip :], axis=0), np.std(recording.u, axis=0)
+    out: dict[str, Parameter] = {}
+    for name, row, spread in zip(recording.outputs, direct, spreads, strict=True):
+        for other, value, push in zip(recording.inputs, row, moved, strict=True):
+            size = float(spread / max(push, 1e-300))
+            out[f"direct: {other} in {name}"] = _parameter(float(value), size=size)
+    for name, value, spread in zip(recording.outputs, offset, spreads, strict=True):
+        out[f"offset: {name}"] = Parameter(value, bounds=(value - spread, value + spread))
+    return out
+
+
+def _modal_equations(
+    found: Mapping[str, Mode], inputs: Sequence[str], outputs: Sequence[str]
+) -> tuple[Equation, Equation]:
+    """Make the state equations and the output equations of modes by name, as functions of named x, u and p."""
+
+    def force(u: Named, p: Named, prefix: str, kind: str) -> Any:
+        return sum((p[f"{prefix}{kind} {n}"] * u[n] for n in inputs), start=ca.SX(0))
 
     def dynamics(x: Named, u: Named, p: Named) -> dict[str, Any]:
         out: dict[str, Any] = {}
-        for i, (name, mode) in enumerate(zip(names, found, strict=True), 1):
-            of = f"mode {name}: "
+        for i, (name, mode) in enumerate(found.items(), 1):
+            prefix = f"mode {name}: "
             if mode.second_order:
                 q, v = x[f"q{i}"], x[f"v{i}"]
                 if mode.spring:
-                    pull = p[f"{of}stiffness"] * q + p[f"{of}drag"] * v
+                    pull = p[f"{prefix}stiffness"] * q + p[f"{prefix}drag"] * v
                 else:
-                    w = 2 * np.pi * p[f"{of}frequency"]
-                    pull = w**2 * q + 2 * p[f"{of}damping"] * w * v
-                out[f"q{i}"] = v + driven(u, p, of, GAINS[0])
-                out[f"v{i}"] = driven(u, p, of, GAINS[1]) - pull
+                    w = 2 * np.pi * p[f"{prefix}frequency"]
+                    pull = w**2 * q + 2 * p[f"{prefix}damping"] * w * v
+                out[f"q{i}"] = v + force(u, p, prefix, INPUT_GAINS[0])
+                out[f"v{i}"] = force(u, p, prefix, INPUT_GAINS[1]) - pull
             else:
-                out[f"q{i}"] = -p[f"{of}rate"] * x[f"q{i}"] + driven(u, p, of, GAINS[1])
+                out[f"q{i}"] = -p[f"{prefix}rate"] * x[f"q{i}"] + force(u, p, prefix, INPUT_GAINS[1])
         return out
 
-    def seen(x: Named, u: Named, p: Named) -> dict[str, Any]:
+    def read_outputs(x: Named, u: Named, p: Named) -> dict[str, Any]:
         out: dict[str, Any] = {}
         for name in outputs:
             y = p[f"offset: {name}"] + sum((p[f"direct: {n} in {name}"] * u[n] for n in inputs), start=ca.SX(0))
-            for i, (label, mode) in enumerate(zip(names, found, strict=True), 1):
-                for state, kind in zip("qv", SEEN[: len(mode.into)], strict=False):
+            for i, (label, mode) in enumerate(found.items(), 1):
+                for state, kind in zip("qv", OUTPUT_GAINS[: len(mode.into)], strict=False):
                     y = y + p[f"mode {label}: {kind} {name}"] * x[f"{state}{i}"]
             out[name] = y
         return out
 
-    ports = tuple(_port(f"mode:{name}", i, mode) for i, (name, mode) in enumerate(zip(names, found, strict=True), 1))
-    return Simulator(dynamics, seen, tuple(states), inputs, parameters, ports, units=dict(like.units))
+    return dynamics, read_outputs
 
 
 def _port(name: str, i: int, mode: Mode) -> Port:
@@ -222,8 +249,8 @@ def _port(name: str, i: int, mode: Mode) -> Port:
     return Port(name, {f"v{i}": -1.0}, lambda x: x[f"q{i}"], lambda x: x[f"v{i}"])
 
 
-def _distinct(names: list[str]) -> list[str]:
-    """Number equal names."""
+def _number_equal_names(names: list[str]) -> list[str]:
+    """Append numbers to names that occur several times."""
     return [n if names.count(n) == 1 else f"{n} ({names[:k].count(n) + 1})" for k, n in enumerate(names)]
 
 
@@ -282,9 +309,9 @@ def to_continuous(a: Array, b: Array, c: Array, d: Array, dt: float, hold: str) 
         return a, b, c, d
     values = np.linalg.eigvals(a)
     angle = np.abs(np.angle(values))
-    if np.any(angle > FAST * np.pi) or np.any(np.abs(values) < 1e-4):
+    if np.any(angle > FASTEST * np.pi) or np.any(np.abs(values) < 1e-4):
         raise InputError("The model has a mode too fast for its step; simulate at a shorter step.")
-    with warnings.catch_warnings():  # of an error of 1e-11
+    with warnings.catch_warnings():  # logm warns of errors of 1e-11
         warnings.simplefilter("ignore", RuntimeWarning)
         a_c = np.real(logm(a)) / dt
     # ∫ e^{A s} ds and ∫ e^{A (Δ - s)} s ds / Δ in one exponential (Van Loan, 1978)
@@ -315,7 +342,7 @@ def modes(a: Array, b: Array, c: Array) -> list[Mode]:
         pair = [k, int(np.argmin(np.abs(values - np.conj(value))))]
         others = np.setdiff1d(np.arange(len(values)), pair)
         # a nearly double eigenvalue has no reliable eigenvectors; its part is the complement of the others
-        poor = np.linalg.cond(right[:, pair]) > POOR
+        poor = np.linalg.cond(right[:, pair]) > ILL_CONDITIONED
         part = np.eye(len(a)) - right[:, others] @ left[others] if poor else right[:, pair] @ left[pair]
         out.append(_pair(np.real(part), complex(value), a, b, c))
     return sorted(_combine_real_modes(out), key=lambda mode: abs(mode.value))
@@ -324,7 +351,8 @@ def modes(a: Array, b: Array, c: Array) -> list[Mode]:
 def _pair(part: Array, value: complex, a: Array, b: Array, c: Array) -> Mode:
     """Write a pair as displacement and rate, `q' = v`, `v' = -|value|² q + 2 Re(value) v + u`, in its part of states.
 
-    The strongest input enters v alone: v belongs to `b`, and q to `A b - 2 Re(value) b`, each projected on the part.
+    The strongest input enters v alone: v is the coordinate along `b`, and q along `A b - 2 Re(value) b`, both projected
+    on the part.
     """
     force = part @ b
     size = np.linalg.norm(force, axis=0)

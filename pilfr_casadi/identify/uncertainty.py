@@ -11,9 +11,9 @@ The outputs of a PI-LFR do not change under
 - for generalized plays, a shift of all `r_i` against the two envelopes, and a shift of the output that `y_0`, the
   envelopes and the initial state compensate.
 
-Each comes with an affine change of the initial states; `generators` gives their tangents. `covariance` works on the
-orthogonal complement of these directions, spanned by Q, in the metric `D = diag(H)`, that is, with each variable in
-units of its own sensitivity. This gauge stays nearest to the fit.
+Each comes with an affine change of the initial states; `generators` yields their tangents. `covariance` works on the
+orthogonal complement of these directions, spanned by Q, in the metric `D = diag(H)`: each variable is in units of its
+own sensitivity. This gauge stays nearest to the fit.
 
     cov = D^-1/2 Q (Q'H~Q)^-1 Q'M~Q (Q'H~Q)^-1 Q' D^-1/2,    H~ = D^-1/2 H D^-1/2,    M~ = D^-1/2 M D^-1/2
 
@@ -21,8 +21,8 @@ units of its own sensitivity. This gauge stays nearest to the fit.
 share) with the covariance Ω of the noise (`gradient_covariance`). For white noise this is the classical `σ²/R H^-1`;
 for coloured noise it is the covariance of the least-squares estimate (Ljung 1999, Chapter 9).
 
-The errors describe how estimates vary from record to record with the noise. They do not cover bias, from a model that
-is too simple or another minimum. A gauge-invariant function f (an eigenvalue, a static gain) has the variance
+The errors describe how estimates vary from record to record with the noise. They do not cover the bias of a model that
+is too simple, or another minimum. A gauge-invariant function f (an eigenvalue, a static gain) has the variance
 `∇f' cov ∇f`.
 """
 
@@ -227,7 +227,7 @@ def standard_errors(problem: Problem, theta: Array, structure: PILFR | None = No
     -------
     dict
         One array of the parameter's shape by name: nan where an entry is fixed or at an active bound, inf where the
-        data say nothing about it.
+        data do not determine it.
     """
     parameters = problem.model.parameters
     matrix, at_bound = _covariance(problem, theta, structure)
@@ -238,6 +238,7 @@ def standard_errors(problem: Problem, theta: Array, structure: PILFR | None = No
 
 
 def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tuple[Array, Array]:
+    """Compute the covariance of θ, and the mask (size,) of variables at an active bound; see `covariance`."""
     theta = np.array(theta, dtype=float)
     _, _, hessian = problem.normal(theta)
     if not np.all(np.isfinite(hessian)):
@@ -247,12 +248,12 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     if np.any(theta != given):  # a threshold on its bound may slip where it stuck
         _, _, hessian = problem.normal(theta)
     sensitivity = np.sqrt(np.diag(hessian))
-    # drop entries that only a transient affects that has long faded: their derivative is rounding
+    # drop entries that act only through a transient that has long faded: their derivative is rounding
     sensitivity = np.where(sensitivity > FADED * Neighbours(problem.labels).largest(sensitivity), sensitivity, 0.0)
     tangents = np.zeros((problem.size, 0)) if structure is None else gauge_tangents(problem, theta, structure, at_bound)
     slopes = problem.constraint_jacobian(theta)[problem.active_constraints(theta)]
-    # a gauge direction that an active constraint excludes is no freedom; constraints on a spectral radius or a gain
-    # exclude none, apart from rounding
+    # an active constraint may exclude a gauge direction; constraints on a spectral radius or a gain exclude none, apart
+    # from rounding
     forbidden, size = slopes @ tangents, np.abs(slopes) @ np.abs(tangents)
     tangents = tangents @ null_space(np.where(np.abs(forbidden) > 1e-4 * size, forbidden, 0.0))
     used = np.flatnonzero(~at_bound & (sensitivity > 0))
@@ -262,26 +263,26 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     basis = _complement(removed[:, length > 0] / length[length > 0])
     values, vectors = np.linalg.eigh(basis.T @ (hessian[square] / unit / unit[:, None]) @ basis)
     least = 1e-14 * len(used) * values.max(initial=0.0)
-    seen, directions = values > least, basis @ vectors
+    determined, directions = values > least, basis @ vectors
     # coordinates in which the Hessian is the identity
-    weights = np.zeros((problem.size, int(seen.sum())))
-    weights[used] = directions[:, seen] / np.sqrt(values[seen]) / unit[:, None]
+    weights = np.zeros((problem.size, int(determined.sum())))
+    weights[used] = directions[:, determined] / np.sqrt(values[determined]) / unit[:, None]
     out = weights @ gradient_covariance(problem, theta, weights) @ weights.T
     # a direction without effect is treated as one whose effect is just too small to count
-    inverse = np.sum(directions[:, seen] ** 2 / values[seen], axis=1)
-    hidden = used[np.sum(directions[:, ~seen] ** 2, axis=1) > least * inverse]
-    if problem.residuals <= seen.sum():
-        hidden = used
-    blind = np.flatnonzero(~at_bound & (sensitivity == 0))
-    out[hidden, hidden] = out[blind, blind] = np.inf
+    inverse = np.sum(directions[:, determined] ** 2 / values[determined], axis=1)
+    undetermined = used[np.sum(directions[:, ~determined] ** 2, axis=1) > least * inverse]
+    if problem.residuals <= determined.sum():
+        undetermined = used
+    without_effect = np.flatnonzero(~at_bound & (sensitivity == 0))
+    out[undetermined, undetermined] = out[without_effect, without_effect] = np.inf
     return out, at_bound
 
 
 def snap_to_bounds(problem: Problem, theta: Array, sensitivity: Array) -> Array:
-    """Move variables within rounding of a bound onto it, in place; return which are at a bound (size,), bool.
+    """Move variables within rounding of a bound onto it, in place; return the mask (size,) of variables at a bound.
 
-    Within rounding means that the move changes the normalised outputs by less than `AT_BOUND`, by the sensitivity at
-    both ends: a variable without effect here, such as the slope of a saturated neuron, may have one at the bound.
+    A variable is within rounding if the move changes the normalised outputs by less than `AT_BOUND`, by the sensitivity
+    at both ends: a variable without effect here, such as the slope of a saturated neuron, may have one at the bound.
     """
     given, at_bound = theta.copy(), np.zeros(problem.size, dtype=bool)
     for bound in (problem.lower, problem.upper):

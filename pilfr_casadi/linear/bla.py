@@ -37,7 +37,7 @@ Array = np.ndarray
 
 EXCITED_SHARE = 1e-3  # share of the largest input amplitude below which a line counts as not excited
 EXCITED_OVER_NOISE = 20  # power of a line over the input's own noise power above which the line counts as excited
-SINGULAR = 1e4  # condition number of the input matrix above which a line is left out
+SINGULAR = 1e4  # condition number of the input matrix above which a line is skipped
 UNCERTAIN = 0.5  # relative standard deviation above which an estimate is useless
 INFLATED = 1e6  # variance over that without leakage; broadband inputs have less than 10, a tone beside its line 1e13
 REMEDY = "give an input that excites many frequencies by itself, or whole periods with `period` set."
@@ -147,9 +147,9 @@ def robust_bla(
         ``n_u`` inputs each ``n_u`` recordings in the order given make one realization, and their inputs must be
         linearly independent at every line, best orthogonal multisines.
     period : int, optional
-        Samples per period; left out, the recordings' own.
+        Samples per period; by default the recordings' own.
     lines : array of int, optional
-        Excited harmonics, 1 being one cycle per period. Left out, they are found: every input exceeds 0.1 % of its
+        Excited harmonics, 1 being one cycle per period. By default the lines at which every input exceeds 0.1 % of its
         largest amplitude and, with several periods, 20 times the power of its variation between periods.
 
     Returns
@@ -182,7 +182,7 @@ def robust_bla(
 def output_spectra(recordings: Recording | Iterable[Recording]) -> OutputSpectra:
     """Estimate the spectra of the outputs, of their noise, and of noise and nonlinear distortion together.
 
-    Takes periodic recordings, as :func:`robust_bla`. The distortion is the scatter of ``Y - G U`` over the
+    The recordings are periodic, as for :func:`robust_bla`. The distortion is the scatter of ``Y - G U`` over the
     realizations, `G` being the BLA.
     """
     spectra = _periodic_spectra(recordings, None, None)
@@ -210,13 +210,13 @@ def plain_bla(
     Parameters
     ----------
     recordings : Recording or iterable of Recording
-        Of any length and with any input; samples up to `skip` are left out. Periodic ones that hold a whole number of
-        periods are averaged over them first.
+        Recordings of any length with any input; samples up to `skip` are left out. A periodic recording of whole
+        periods is averaged over them first.
     order : int
         Order of the local polynomials of the response and the transient.
     window : int, optional
-        Excited lines in a window, in the shortest recording (more in proportion in longer ones); by default as many as
-        the polynomials need with at least 10 degrees of freedom, and at least the distance of the frequencies returned.
+        Excited lines in a window of the shortest recording (proportionally more in longer ones). By default it leaves
+        at least 10 degrees of freedom and spans at least the distance of the frequencies returned.
     n_frequencies : int
         Largest number of frequencies returned, spread over the excited lines of the shortest recording.
     floor : float
@@ -225,8 +225,8 @@ def plain_bla(
     Returns
     -------
     BLA
-        `var_total` is from the residual of the local fits: noise, nonlinear distortion and the misfit of the
-        polynomials. Neighbours share data, so their errors are correlated. `var_noise` is ``None``.
+        `var_total` comes from the residual of the local fits: noise, nonlinear distortion and the misfit of the
+        polynomials. Neighbouring frequencies share data, so their errors are correlated. `var_noise` is ``None``.
 
     Raises
     ------
@@ -237,7 +237,7 @@ def plain_bla(
     -----
     RuntimeWarning
         If at half of the frequencies or more the standard deviation exceeds 50 % of the response, or the input cannot
-        be distinguished from leakage, as a tone between two lines.
+        be distinguished from leakage (a tone between two lines).
 
     References
     ----------
@@ -370,8 +370,8 @@ def _warn_if_useless(G: Array, var: Array, inflation: Array, record: Recording) 
     typical, hidden = np.median(share, axis=0), np.median(inflation, axis=0)
     if np.max(hidden) > INFLATED:
         warnings.warn(
-            f"The spectrum of the input {record.inputs[int(np.argmax(hidden))]!r} cannot be told from leakage at most "
-            f"frequencies, so its best linear approximation is not to be trusted; {REMEDY}",
+            f"The spectrum of the input {record.inputs[int(np.argmax(hidden))]!r} is mostly leakage at most "
+            f"frequencies, so its best linear approximation is not reliable; {REMEDY}",
             RuntimeWarning,
             stacklevel=3,
         )
@@ -441,7 +441,7 @@ def _local_polynomials(
 
 
 def any_bla(recordings: Sequence[Recording]) -> BLA | None:
-    """Estimate the BLA by the method that recordings allow, robust for periodic ones; None where none does."""
+    """Estimate the BLA, for periodic recordings by the robust method; None if the recordings do not allow it."""
     try:
         return robust_bla(recordings) if all(r.period for r in recordings) else plain_bla(recordings)
     except InputError:

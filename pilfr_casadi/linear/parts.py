@@ -1,13 +1,13 @@
-"""The linear models hidden in a closed model: in small and in large motions, or about a working point.
+"""The linear models in a closed model: in small and in large motions, or about a working point.
 
-In motions that are too small to cross a gap, plays stand still; where all operators move, they are a gain
-`w = diag(Σ w) z`. Stops are the other way round. An operator with the threshold zero has no gap: as a play it always
-moves, as a stop it is zero. With the gain K of the operators that move,
+Plays stand still in motions too small to cross a gap; in large motions they are the gain `w = diag(Σ w) z`. Stops are
+this gain in small motions and none in large ones. An operator with the threshold zero has no gap: as a play it always
+moves, as a stop it is zero. With the gain K of the operators,
 
     A + B_w K C_z,   B_u + B_w K D_zu,   C_y + D_yw K C_z,   D_yu + D_yw K D_zu.
 
-A simulator is linearised about a state and an input, with the memory of its laws at rest, over a whole sample with the
-inputs held.
+A simulator is linearised about a state and an input over a whole sample, with the inputs held and the memory of its
+laws at rest.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ..models import Model, Play, Stop, with_port_gain
 from .statespace import resolvent
 
 Array = np.ndarray
-INFINITE_ZERO = 1e6  # zeros beyond are those at infinity, to rounding
+INFINITE_ZERO = 1e6  # larger zeros are zeros at infinity, up to rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,33 +69,32 @@ def linear_parts(
         `small motions` and `large motions` of a PI-LFR with plays or stops; its `linear part` with any other element;
         `linearised` of any other model.
     dt : float
-        Time of a sample, in s.
+        Sampling interval, s.
     state, drive : array, optional
         Working point of a model that has to be linearised, (n_state,) and (n_u,); zero by default.
 
     Raises
     ------
     InputError
-        If the model reads measured outputs, as one with an observer.
+        If the model reads measured outputs, as a model with an observer does.
     """
     names = ("A", "B_u", "C_y", "D_yu")
     if not set(names) <= set(model.parameters):
-        return {"linearised": _about(model, dt, state, drive)}
+        return {"linearised": _linearise(model, dt, state, drive)}
     operator = getattr(model.element, "operator", None)
     if not isinstance(operator, Play | Stop):
         a, b, c, d = (model.parameters[name].value for name in names)
         return {"linear part": LinearPart(a, b, c, d, dt)}
     w, r = (model.parameters[name].value for name in ("w", "r"))
-    waiting, every = (w * (r > 0)).sum(axis=1), w.sum(axis=1)
-    gains = (every - waiting, every) if isinstance(operator, Play) else (waiting, 0 * every)
-    motions = ("small motions", "large motions")
+    with_gap, total = (w * (r > 0)).sum(axis=1), w.sum(axis=1)
+    small, large = (total - with_gap, total) if isinstance(operator, Play) else (with_gap, 0 * total)
     p = {name: parameter.value for name, parameter in model.parameters.items()}
-    closed = [LinearPart(*with_port_gain(p, np.diag(gain)), dt) for gain in gains]
-    return dict(zip(motions, closed, strict=True))
+    gains = {"small motions": small, "large motions": large}
+    return {name: LinearPart(*with_port_gain(p, np.diag(gain)), dt) for name, gain in gains.items()}
 
 
 @one_at_a_time
-def _about(model: Model, dt: float, state: Array | None, drive: Array | None) -> LinearPart:
+def _linearise(model: Model, dt: float, state: Array | None, drive: Array | None) -> LinearPart:
     """Linearise a sample of a model about a working point, its memory held."""
     if "y" in model.reads:
         raise InputError("The model reads its measured outputs; leave out its observer, then it has a linear part.")

@@ -2,8 +2,8 @@ r"""Linear state-space models: resolvent, states over time, modal coordinates, a
 
 .. math:: x(k+1) = A x(k) + B u(k), \qquad y(k) = C x(k) + D u(k), \qquad G(z) = C (z I - A)^{-1} B + D
 
-The resolvent takes one complex Schur form of `A` for all frequencies; the states are computed in pieces of the record,
-all pieces at once, joined by powers of `A`. Both are plain NumPy, for any number of samples and frequencies.
+The resolvent uses one complex Schur form of `A` for all frequencies. States are computed in pieces of the record, all
+pieces at once, joined by powers of `A`.
 
 **Modal coordinates** serve linear parts of high order. A full state matrix has n_x² entries, but a change of basis
 x = T x' leaves only 2 n_x of them free. Every diagonalizable A is similar to a matrix of blocks with a pair of poles
@@ -18,8 +18,8 @@ the linear model (Sec. 5.3).
     S = C P C' + R,   K = A P C' S⁻¹,   P̂ = (I - K C) P (I - K C)' + K R K'   (A = I).
 
 `A = I` gives the gain of a filter, which corrects the present state; any other A the gain of a one-step predictor. The
-extended Kalman filter (`control.kalman_filter`) and the smoother of an unknown force (`diagnose`) call the update in
-every sample. With the steady-state gain the predictor is a model itself,
+extended Kalman filter (`control.kalman_filter`) and the smoother of an unknown force (`diagnose`) call the update at
+every sample. With the steady-state gain the predictor is itself a model,
 
     x⁺ = f(x, u, p) + γ K (y_measured - y),
 
@@ -43,7 +43,7 @@ Array = np.ndarray
 DEFECTIVE = 1e10  # condition number of the eigenvectors above which A counts as defective to rounding
 REAL = 1e-12  # imaginary part, next to the largest eigenvalue, below which an eigenvalue is real
 INJECTION = "observer"  # name of the parameter γ
-# factor on A that makes an integrator no output sees detectable; 1e-4 per sample is far below any fit
+# factor on A that makes an unobservable integrator detectable; 1e-4 per sample is far below any fit
 FADING = 1 - 1e-4
 
 
@@ -87,7 +87,7 @@ def propagate(At: Array, v: Array, x0: Array) -> tuple[Array, Array]:
     length = int(np.ceil(np.sqrt(M)))
     pieces = -(-M // length)
     V = np.zeros((runs, pieces, length, nx))
-    V.reshape(runs, -1, nx)[:, :M] = v
+    V.reshape(runs, pieces * length, nx)[:, :M] = v
     gained = np.zeros((runs, pieces, nx))
     for i in range(length):
         gained = gained @ At + V[:, :, i]
@@ -102,8 +102,13 @@ def propagate(At: Array, v: Array, x0: Array) -> tuple[Array, Array]:
     for i in range(length):
         X[:, :, i] = x
         x = x @ At + V[:, :, i]
-    X = X.reshape(runs, -1, nx)[:, :M]
+    X = X.reshape(runs, pieces * length, nx)[:, :M]
     return X, X[:, -1] @ At + v[:, -1]
+
+
+def states_from_rest(a: Array, b: Array, u: Array) -> Array:
+    """Return the states (M, nx) of ``x(k+1) = a x(k) + b u(k)`` from zero, for inputs u (M, n_u)."""
+    return propagate(a.T, (u @ b.T)[None], np.zeros((1, len(a))))[0][0]
 
 
 def modal(nx: int) -> Array:
@@ -129,7 +134,7 @@ def modal(nx: int) -> Array:
 
 
 def is_modal(fixed: Mapping[str, Any], nx: int) -> bool:
-    """Tell whether the fixed entries of a structure put `A` in modal coordinates."""
+    """Tell whether the fixed entries of a structure give `A` the pattern of modal coordinates."""
     given = np.asarray(fixed.get("A", 0.0), dtype=float)
     return nx > 0 and given.shape == (nx, nx) and np.array_equal(given, modal(nx), equal_nan=True)
 
@@ -156,7 +161,7 @@ def in_modal_coordinates(blocks: Mapping[str, Array], recordings: tuple[Recordin
     back = np.linalg.inv(t)
     a, b = back @ blocks["A"] @ t, back @ blocks["B_u"]
     a = np.where(np.isnan(modal(len(a))), a, 0.0)
-    states = [propagate(a.T, (r.u @ b.T)[None], np.zeros((1, len(a))))[0][0] for r in recordings]
+    states = [states_from_rest(a, b, r.u) for r in recordings]
     spread = or_one(np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0)))
     return {**blocks, "A": a * spread / spread[:, None], "B_u": b / spread[:, None], "C_y": blocks["C_y"] @ t * spread}
 

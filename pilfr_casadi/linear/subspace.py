@@ -6,9 +6,10 @@ With `O` the extended observability matrix, of `r` block rows, from the leading 
 
 .. math:: O = [C; C A; \dots; C A^{r-1}], \qquad O_{1:r-1} A = O_{2:r}, \qquad C = O_1,
 
-`A` is found by least squares and its eigenvalues outside the unit circle are reflected into it; `B` and `D`, in which
-response and output are linear, follow by least squares. This is done for a few `r`, and the model that explains the
-data best is kept. These are the start values of Krikelis et al. (2024), Sec. 5.3, which a fit refines by output error.
+`A` is found by least squares, and its eigenvalues outside the unit circle are reflected into it. `B` and `D` follow by
+least squares, because response and output are linear in them. This is done for a few `r`, and the model that explains
+the data best is kept. These are the start values of Krikelis et al. (2024), Sec. 5.3; a fit refines them by output
+error.
 
 :class:`FrequencyProblem` follows McKelvey, Akçay & Ljung (1996), Subspace-based multivariable system identification
 from frequency response data, IEEE Trans. Automatic Control 41(7), 960-979, algorithm 2 (any frequency grid, noise
@@ -58,7 +59,7 @@ Array = np.ndarray
 ROUNDING = 1e-8  # smaller relative errors are rounding errors
 DIVERGED = 1e150  # entry of a triangular factor above which its square overflows
 LADDER = tuple(round(4 * 1.5**k) for k in range(12))  # numbers of block rows to try: 4, 6, 9, 14, 20, 30, ...
-TRIALS = 4  # numbers of block rows tried for each order, besides the least
+TRIALS = 4  # numbers of block rows tried for each order, besides the first
 BUDGET = 4e9  # multiplications (samples times rows squared) above which larger numbers of block rows are not tried
 SWEEPS = 2  # alternations between solving for C, D and for B, D
 CHUNK = 8192  # rows of a sequential QR that are handled at once, for memory
@@ -78,8 +79,7 @@ def frequency_subspace(bla: BLA, nx: int, weight: bool = True, block_rows: int |
         minimises the error relative to the uncertainty. Without weights the largest part of the response counts most,
         which usually gives the smaller simulation error.
     block_rows : int, optional
-        Block rows of the extended observability matrix; by default a few are tried and the model that fits the
-        response best is kept.
+        Block rows of the extended observability matrix; by default the best of a few numbers.
 
     Returns
     -------
@@ -95,8 +95,7 @@ def frequency_subspace(bla: BLA, nx: int, weight: bool = True, block_rows: int |
     ----------
     McKelvey, Akçay & Ljung (1996), algorithm 2.
     """
-    problem = FrequencyProblem(bla, weight)
-    return problem.solve([whole(nx, "the order nx", 1)], block_rows)[0].system(problem.dt)
+    return FrequencyProblem(bla, weight).identify(nx, block_rows).system(bla.dt)
 
 
 def time_subspace(
@@ -111,11 +110,10 @@ def time_subspace(
     nx : int
         Order of the model.
     offset : bool
-        Estimate a constant offset of each output in each recording and leave it out of the model, for signals that
-        are measured from an operating point.
+        Estimate a constant offset of each output in each recording, which is not part of the model. For signals around
+        an operating point.
     block_rows : int, optional
-        Samples of the past and of the future in the data matrices; by default a few are tried and the model that
-        simulates the recordings best is kept.
+        Samples of the past and of the future in the data matrices; by default the best of a few numbers.
 
     Returns
     -------
@@ -132,7 +130,7 @@ def time_subspace(
     Verhaegen (1994), PO-MOESP.
     """
     problem = TimeProblem(recordings, offset)
-    return problem.solve([whole(nx, "the order nx", 1)], block_rows)[0].system(problem.dt)
+    return problem.identify(nx, block_rows).system(problem.dt)
 
 
 def subspace_matrices(
@@ -140,19 +138,17 @@ def subspace_matrices(
     nx: int,
     offset: bool = False,
     progress: Progress | None = None,
-) -> tuple[Array, Array, Array, Array]:
-    """Return the matrices A, B, C, D of :func:`time_subspace`, without importing the control package.
+) -> Matrices:
+    """Return the matrices of :func:`time_subspace`, without importing the control package.
 
     Order 0, a static gain, is allowed here. `progress` is called with ("subspace", done, total, smallest error so far).
     """
     if nx == 0:
         return _static_gain(as_recordings(recordings), offset)
-    model = TimeProblem(recordings, offset).solve([whole(nx, "the order nx", 1)], None, progress)[0]
-    return model.A, model.B, model.C, model.D
+    return TimeProblem(recordings, offset).identify(nx, progress=progress)
 
 
-@dataclass(frozen=True, eq=False)
-class Matrices:
+class Matrices(NamedTuple):
     """A linear model `A`, `B`, `C`, `D` in the units of the data."""
 
     A: Array
@@ -171,8 +167,8 @@ class RangeSpace(NamedTuple):
     """Range of an extended observability matrix, with as many columns as singular values."""
 
     rows: Array  # without the last block row
-    shifted: Array  # the same shifted by one step, weighted alike
-    C: Array  # the first block row, in outputs divided by `y_scale`
+    shifted: Array  # the same shifted by one step, with the same weights
+    C: Array  # the first block row, for outputs divided by `y_scale`
     values: Array  # singular values
 
 
@@ -203,7 +199,7 @@ class SubspaceProblem:
         return -(-nx // len(self.y_scale)) + 1
 
     def ladder(self, nx: int, block_rows: int | None) -> list[int]:
-        """Return the numbers of block rows to try for an order: steps of one ladder, so that orders share them."""
+        """Return the numbers of block rows to try for an order, from one ladder, so that orders share them."""
         least = self.least_rows(nx)
         if least > self.most_rows:
             raise InputError(f"{self.too_few} for order {nx}; record more or choose a lower order.")
@@ -217,24 +213,18 @@ class SubspaceProblem:
         steps = [r for r in LADDER if first < r <= self.most_rows][:TRIALS]
         return [first, *steps[:1], *(r for r in steps[1:] if r <= self.affordable_rows)]
 
-    def solve(self, orders: list[int], block_rows: int | None, progress: Progress | None = None) -> list[Matrices]:
-        """Return the best model of each order; report block rows tried for one order, or orders done for several."""
-        spaces: dict[int, RangeSpace] = {}
-        if len(orders) == 1:
-            return [self._solve_order(orders[0], block_rows, spaces, progress)]
-        models: list[Matrices] = []
-        for nx in orders:
-            if progress:
-                progress("choosing the order", len(models), len(orders), np.nan)
-            models.append(self._solve_order(nx, block_rows, spaces))
-        if progress:
-            progress("choosing the order", len(orders), len(orders), np.nan)
-        return models
-
-    def _solve_order(
-        self, nx: int, block_rows: int | None, spaces: dict[int, RangeSpace], progress: Progress | None = None
+    def identify(
+        self,
+        nx: int,
+        block_rows: int | None = None,
+        progress: Progress | None = None,
+        spaces: dict[int, RangeSpace] | None = None,
     ) -> Matrices:
-        """Return the best model of one order over the numbers of block rows; `spaces` keeps their range spaces."""
+        """Return the best model of one order over the numbers of block rows.
+
+        `spaces` stores range spaces by their number of block rows, so that several orders can share them.
+        """
+        nx, spaces = whole(nx, "the order nx", 1), {} if spaces is None else spaces
         trials: list[tuple[Matrices, float]] = []
         steps = self.ladder(nx, block_rows)
         for k, r in enumerate(steps):
@@ -419,14 +409,15 @@ class TimeProblem(SubspaceProblem):
         return [total]
 
 
-def _static_gain(recordings: tuple[Recording, ...], offset: bool) -> tuple[Array, Array, Array, Array]:
-    """Fit a static gain by least squares; with `offset`, to signals without their means in each recording."""
+def _static_gain(recordings: tuple[Recording, ...], offset: bool) -> Matrices:
+    """Fit a static gain by least squares; with `offset`, to each recording's signals minus their means."""
     parts = [(r.u[r.skip :], r.y[r.skip :]) for r in recordings]
     if offset:
         parts = [(u - np.mean(u, axis=0), y - np.mean(y, axis=0)) for u, y in parts]
     u, y = (np.concatenate(signals) for signals in zip(*parts, strict=True))
     n_u, n_y = u.shape[1], y.shape[1]
-    return np.zeros((0, 0)), np.zeros((0, n_u)), np.zeros((n_y, 0)), np.linalg.lstsq(u, y, rcond=None)[0].T
+    gain = np.linalg.lstsq(u, y, rcond=None)[0].T
+    return Matrices(np.zeros((0, 0)), np.zeros((0, n_u)), np.zeros((n_y, 0)), gain)
 
 
 def _triangle(rows: Array) -> Array:
@@ -544,10 +535,10 @@ def select_order(
     Parameters
     ----------
     data : BLA, Recording or iterable of Recording
-        Held out are every second frequency of a BLA, the last 30 % of the samples of a single recording, or the last
-        30 % of several recordings, at least one.
+        The held-out part is every second frequency of a BLA, the last 30 % of the samples of a single recording, or the
+        last 30 % of several recordings, at least one.
     orders : iterable of int
-        Orders to try; orders too high for the data are left out, unless all are.
+        Orders to try; orders too high for the data are skipped, unless all are too high.
     margin : float
         The recommended order is the smallest whose validation error is at most ``1 + margin`` times the best.
     offset : bool
@@ -580,7 +571,14 @@ def select_order(
         n_train = max(1, min(len(records) - 1, round(0.7 * len(records))))
         train, validation = TimeProblem(records[:n_train], offset), TimeProblem(records[n_train:], offset)
     tried = [n for n in tried if train.least_rows(n) <= train.most_rows] or tried[:1]
-    models = train.solve(tried, None, progress)
+    models: list[Matrices] = []
+    spaces: dict[int, RangeSpace] = {}
+    for nx in tried:
+        if progress:
+            progress("choosing the order", len(models), len(tried), np.nan)
+        models.append(train.identify(nx, spaces=spaces))
+    if progress:
+        progress("choosing the order", len(tried), len(tried), np.nan)
     train_error, error = (np.array([part.error(m) for m in models]) for part in (train, validation))
     good_enough = max((1 + margin) * np.min(error), ROUNDING)
     recommended = next(n for n, e in zip(tried, error, strict=True) if e <= good_enough)

@@ -73,7 +73,9 @@ def to_plays(structure: PILFR, values: Mapping[str, Any]) -> tuple[PILFR, dict[s
 def _convert(structure: PILFR, values: Mapping[str, Any], operator: Play | Stop) -> tuple[PILFR, dict[str, Array]]:
     element = structure.element
     if not isinstance(element, PrandtlIshlinskii) or not isinstance(element.operator, Play | Stop):
-        raise InputError("Only a Prandtl-Ishlinskii element of plays or stops has a complement; convert one of those.")
+        raise InputError(
+            f"The element {element!r} was given to convert; give a Prandtl-Ishlinskii element of plays or stops."
+        )
     if type(element.operator) is type(operator):
         return structure, {name: np.array(value, dtype=float) for name, value in values.items()}
     touched = {block for block, factors in SLOPES.items() if not any(is_zero(structure, f) for f in factors)}

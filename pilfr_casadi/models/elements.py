@@ -1,4 +1,4 @@
-r"""Elements: laws with memory from a local signal z to an internal signal w.
+r"""Elements: maps with memory from a local signal z to an internal signal w.
 
 An element is anything with `channels`, `memory`, `parameters()` and `step(z, s, p) -> (w, s_next)`; `close_loop` puts
 it into a model's port (Krikelis et al. 2024, Eq. 15-17, with `n_z = n_w = channels`):
@@ -10,7 +10,7 @@ it into a model's port (Krikelis et al. 2024, Eq. 15-17, with `n_z = n_w = chann
   `w = a / (a + b) clip(z, ±ρ)`;
 - `Combined`, several of these in one port: `w[writes_k] += element_k(z[reads_k])`.
 
-An element may also tell how it grows: `slopes(p)` in large motions, and `bound(p, size)`, its largest output.
+An element may also have `slopes(p)`, its slopes in large motions, and `bound(p, size)`, its largest output.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from .parameters import Parameter, ParameterSet, check_size
 
 LAYER = ("w", "r")  # parameters of a Prandtl-Ishlinskii layer that have an entry for each operator
 CREST = 3.0  # ratio of the largest z to the largest amplitude of an envelope
-SMALL = 1e-6  # square of an envelope's amplitude at rest over the knee's square: gives the root a slope there
+SMALL = 1e-6  # share of the knee's square added to an envelope's mean square, so that its root has a slope at rest
 
 
 class Element(Protocol):
@@ -45,14 +45,14 @@ class Element(Protocol):
         """Number of memory states."""
 
     def parameters(self) -> ParameterSet:
-        """The element's parameters with start values and bounds."""
+        """Make the element's parameters with start values and bounds."""
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
-        """Symbolic step: z (channels, 1), s (memory, 1), p by name -> w (channels, 1), next s."""
+        """Compute one symbolic step: z (channels, 1), s (memory, 1), p by name -> w (channels, 1), next s."""
 
 
 def is_element(thing: Any) -> bool:
-    """Tell whether something, other than a class, has the attributes of an `Element`."""
+    """Tell whether an object has the attributes of an `Element`; a class is no element."""
     needed = ("channels", "memory", "parameters", "step")
     return not isinstance(thing, type) and all(hasattr(thing, name) for name in needed)
 
@@ -104,7 +104,7 @@ class PrandtlIshlinskii:
         return self.n * self.channels
 
     def parameters(self) -> ParameterSet:
-        """`w`, `r` (channels, N), both bounded by `≥ 0`, and the operator's own."""
+        """Make `w` and `r` (channels, N), both `≥ 0`, and the operator's own parameters."""
         shape = (self.channels, self.n)
         grid = np.tile((np.arange(self.n) + 0.5) / self.n, (self.channels, 1))
         own = ParameterSet(
@@ -118,24 +118,24 @@ class PrandtlIshlinskii:
         return own | self.operator.parameters(self.channels)
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
-        """One step; the memory is stacked channel by channel."""
+        """Compute one step; the memory is stacked channel by channel."""
         eps = p["eps"] if self.rounded else 0.0
-        w_out, s_out = [], []
+        w, s_next = [], []
         for i in range(self.channels):
+            more = {"channel": i} if isinstance(self.operator, GeneralizedPlay) else {}
+            weighted = []
             for j in range(self.n):
-                q = s[i * self.n + j]
-                more = {"channel": i} if isinstance(self.operator, GeneralizedPlay) else {}
-                v, q_next = self.operator.step(z[i], q, p["r"][i, j], p, eps, **more)
-                w_out.append(p["w"][i, j] * v)
-                s_out.append(q_next)
-        w = [sum(w_out[i * self.n + 1 : (i + 1) * self.n], w_out[i * self.n]) for i in range(self.channels)]
-        return ca.vertcat(*w), ca.vertcat(*s_out)
+                v, q_next = self.operator.step(z[i], s[i * self.n + j], p["r"][i, j], p, eps, **more)
+                weighted.append(p["w"][i, j] * v)
+                s_next.append(q_next)
+            w.append(sum(weighted[1:], weighted[0]))
+        return ca.vertcat(*w), ca.vertcat(*s_next)
 
     def slopes(self, p: Mapping[str, Any]) -> dict[str, Any]:
-        """Slopes of w over z (channels, channels) in large motions (of stops: in small ones), by name.
+        """Compute the slopes of w over z (channels, channels) in large motions (for stops in small ones), by name.
 
         The slope is `Σ w`: in large motions all plays slip, in small ones all stops stick. For generalized plays it is
-        multiplied by the slope of each envelope network far out; for user-defined envelopes no slope is known.
+        multiplied by the slope of each envelope network far out; the slope of user-defined envelopes is unknown.
         """
         full, operator = ca.sum2(p["w"]), self.operator
         if not isinstance(operator, GeneralizedPlay):
@@ -144,9 +144,9 @@ class PrandtlIshlinskii:
         return {f"{name} envelope far out": ca.diag(full * operator.far_slope(s, p)) for name, s in sides.items()}
 
     def bound(self, p: Mapping[str, Any], size: np.ndarray) -> np.ndarray:
-        """Largest |w| of each channel where |z| is at most `size` (channels,), from memory zero.
+        """Compute the largest |w| of each channel where |z| is at most `size` (channels,), from memory zero.
 
-        A stop stays within its threshold for any z; a play follows z. For a generalized play no bound is known.
+        A stop stays within its threshold for any z; a play follows z. The bound of a generalized play is unknown.
         """
         w, r, z = np.asarray(p["w"], dtype=float), np.asarray(p["r"], dtype=float), np.asarray(size, dtype=float)
         if isinstance(self.operator, GeneralizedPlay):
@@ -187,7 +187,7 @@ class StaticNetwork:
         _check_counts("A static network", hidden=self.hidden, channels=self.channels)
 
     def parameters(self) -> ParameterSet:
-        """`gain`, `slope`, `bias`, each (channels, hidden)."""
+        """Make `gain`, `slope` and `bias`, each (channels, hidden)."""
         shape = (self.channels, self.hidden)
         bias = np.tile(np.linspace(-1.0, 1.0, self.hidden) if self.hidden > 1 else np.zeros(1), (self.channels, 1))
         return ParameterSet(
@@ -195,12 +195,12 @@ class StaticNetwork:
         )
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
-        """One step; s is empty."""
+        """Compute one step; s is empty."""
         neurons = ca.tanh(p["slope"] * ca.repmat(z, 1, self.hidden) + p["bias"])
         return ca.sum2(p["gain"] * neurons), s
 
     def bound(self, p: Mapping[str, Any], size: np.ndarray) -> np.ndarray:
-        """Largest |w| of each channel for any z, (channels,)."""
+        """Compute the largest |w| of each channel for any z, (channels,)."""
         return np.asarray(np.sum(np.abs(np.asarray(p["gain"], dtype=float)), axis=1))
 
 
@@ -208,7 +208,7 @@ class StaticNetwork:
 class Products:
     """All products of the channels of the given degrees, mixed into as many channels by `gain`.
 
-    Squares and cubes are included. With the linear part outside this is the polynomial feedback of a nonlinear LFR.
+    Squares and cubes are included. In the port of a linear model they are the polynomial feedback of a nonlinear LFR.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ class Products:
         return tuple(t for d in self.degrees for t in combinations_with_replacement(range(self.channels), d))
 
     def parameters(self) -> ParameterSet:
-        """`gain` (channels, terms), zero, and `reach` (channels,)."""
+        """Make `gain` (channels, terms), zero at first, and `reach` (channels,)."""
         return ParameterSet(
             {
                 "gain": Parameter(np.zeros((self.channels, len(self.terms)))),
@@ -252,14 +252,14 @@ class Products:
         )
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
-        """One step: w (channels, 1), and no memory."""
+        """Compute one step: w (channels, 1), and no memory."""
         inside = [fmax(fmin(z[i], p["reach"][i]), -p["reach"][i]) for i in range(self.channels)]
         products = [prod(inside[i] for i in term) for term in self.terms]
         w = [sum(p["gain"][i, m] * value for m, value in enumerate(products)) for i in range(self.channels)]
         return ca.vertcat(*w), s
 
     def bound(self, p: Mapping[str, Any], size: np.ndarray) -> np.ndarray:
-        """Largest |w| of each channel where |z| is at most `size`, (channels,); finite for any z."""
+        """Compute the largest |w| of each channel where |z| is at most `size`, (channels,); finite for any z."""
         reach = np.minimum(np.asarray(p["reach"], dtype=float), size)
         largest = np.array([prod(reach[i] for i in term) for term in self.terms])
         return np.asarray(np.abs(np.asarray(p["gain"], dtype=float)) @ largest)
@@ -270,11 +270,11 @@ class Envelope:
     """A gain on each channel that its own slow amplitude schedules.
 
     The amplitude `a` is the root mean square of z over the last 1/κ samples. Through `B_w` and `C_z` of a PI-LFR it
-    makes a stiffness fall (or rise) with the amplitude of vibration and leaves the damping nearly as it is, as in
-    structures whose resonances move with the level (slow dynamics, amplitude-dependent modulus). Play and stop
+    makes a stiffness fall (or rise) with the amplitude of vibration and hardly changes the damping, as in structures
+    whose resonances move with the level (slow dynamics, amplitude-dependent modulus). Play and stop
     operators do the same within a period, but then dissipate in proportion.
 
-    `ρ` (`reach`) and `c = ρ / 3` limit w. Start values from data put them beyond the visited range of z, so that they
+    `ρ` (`reach`) and `c = ρ / 3` limit w. Start values from data lie beyond the visited range of z, so that the limits
     matter only to a bound on the response.
 
     Parameters
@@ -301,7 +301,7 @@ class Envelope:
         return self.channels
 
     def parameters(self) -> ParameterSet:
-        """`rate`, `knee` and `reach`, each (channels,)."""
+        """Make `rate`, `knee` and `reach`, each (channels,)."""
         one = np.ones(self.channels)
         return ParameterSet(
             {
@@ -312,7 +312,7 @@ class Envelope:
         )
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
-        """One step: w (channels, 1) and the next mean squares."""
+        """Compute one step: w (channels, 1) and the next mean squares."""
         w, s_next = [], []
         for i in range(self.channels):
             rate, knee, reach = p["rate"][i], p["knee"][i], p["reach"][i]
@@ -323,7 +323,7 @@ class Envelope:
         return ca.vertcat(*w), ca.vertcat(*s_next)
 
     def bound(self, p: Mapping[str, Any], size: np.ndarray) -> np.ndarray:
-        """Largest |w| of each channel where |z| is at most `size`, (channels,); finite for any z."""
+        """Compute the largest |w| of each channel where |z| is at most `size`, (channels,); finite for any z."""
         reach, knee = (np.asarray(p[name], dtype=float) for name in ("reach", "knee"))
         a = np.sqrt(np.minimum(reach / CREST, size) ** 2 + SMALL * knee**2)
         return np.asarray(np.minimum(reach, size) * a / (a + knee))
@@ -420,13 +420,13 @@ class Combined:
         return sum(part.element.memory for part in self.parts)
 
     def parameters(self) -> ParameterSet:
-        """Parameters of all parts, under `name_parameter`."""
+        """Make the parameters of all parts, under `name_parameter`."""
         return ParameterSet(
             {f"{part.name}_{k}": p for part in self.parts for k, p in part.element.parameters().items()}
         )
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
-        """One step: the sum of the parts' outputs, and their next memory."""
+        """Compute one step: the sum of the parts' outputs, and their next memory."""
         w: list[Any] = [0] * self.channels
         s_next, begin = [], 0
         for part in self.parts:
@@ -439,7 +439,7 @@ class Combined:
         return ca.vertcat(*w), ca.vertcat(*s_next)
 
     def slopes(self, p: Mapping[str, Any]) -> dict[str, Any]:
-        """Slopes of w over z (channels, channels) of all parts together; bounded parts add none."""
+        """Add up the slopes of w over z (channels, channels) of all parts; bounded parts have none."""
         known = [(part, element_slopes(part.element, _PartValues(p, part))) for part in self.parts]
         names = max((tuple(slopes) for _, slopes in known), key=len)
         out = {}
@@ -453,11 +453,11 @@ class Combined:
         return out
 
     def _selector(self, channels: tuple[int, ...]) -> ca.DM:
-        """Matrix (channels, k) of zeros and ones that puts k signals into their channels."""
+        """Make the matrix (channels, k) of zeros and ones that puts k signals into their channels."""
         return ca.DM(np.eye(self.channels)[:, list(channels)])
 
     def bound(self, p: Mapping[str, Any], size: np.ndarray) -> np.ndarray:
-        """Largest |w| of each channel where |z| is at most `size`, (channels,); infinite where a part is unbounded."""
+        """Bound |w| of each channel where |z| is at most `size`, (channels,); infinite where a part is unbounded."""
         out = np.zeros(self.channels)
         for part in self.parts:
             own = _PartValues(p, part)
@@ -494,13 +494,13 @@ def element_bound(element: Element, p: Mapping[str, Any], size: np.ndarray) -> n
 
 
 def element_slopes(element: Element, p: Mapping[str, Any]) -> dict[str, Any]:
-    """Give the slopes of an element by name, (channels, channels) each; empty where none is known."""
+    """Return the slopes of an element by name, (channels, channels) each; empty where none is known."""
     slopes = getattr(element, "slopes", None)
     return {} if slopes is None else dict(slopes(p))
 
 
 def unknown_slope(element: Element, p: Mapping[str, Any]) -> bool:
-    """Tell whether an element with values p may grow with its signals at a rate that is not known."""
+    """Tell whether an element with values p may grow with its signals, and its slope is unknown."""
     if isinstance(element, Combined):
         return any(unknown_slope(part.element, _PartValues(p, part)) for part in element.parts)
     bounded = bool(np.all(np.isfinite(element_bound(element, p, np.full(element.channels, np.inf)))))
@@ -508,6 +508,6 @@ def unknown_slope(element: Element, p: Mapping[str, Any]) -> bool:
 
 
 def _check_counts(owner: str, **counts: Any) -> None:
-    check_size(
-        owner, prod(whole(count, f"{name} of {owner[0].lower()}{owner[1:]}", 1) for name, count in counts.items())
-    )
+    """Refuse counts that are not whole numbers above zero, or whose product is too large for a fit."""
+    owned = f"{owner[0].lower()}{owner[1:]}"
+    check_size(owner, prod(whole(count, f"{name} of {owned}", 1) for name, count in counts.items()))

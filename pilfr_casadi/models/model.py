@@ -59,7 +59,7 @@ class Model:
         Steps within a sample; outputs are taken at the first of them.
     stages : casadi.Function, optional
         `(x, u, w, p, c) -> (values of c, c by c, x_next by c)`: the step by way of intermediate values c (n_c,), where
-        each depends only on earlier ones. Its derivatives are sparse where those of `step` are dense.
+        each depends only on earlier ones. Its derivatives are sparse, the derivatives of `step` are dense.
     resting : casadi.Function, optional
         `(x, u, p) -> state`: the whole state from the states in `states` alone, as if their signals had stood still
         before; without it, the rest is zero.
@@ -79,7 +79,7 @@ class Model:
     resting: ca.Function | None = None
 
     def drive(self, recording: Recording) -> np.ndarray:
-        """Make the signals that the step reads along a recording, shape (M * substeps, n_u), in the order of `reads`.
+        """Collect the signals that the step reads along a recording, (M * substeps, n_u), in the order of `reads`.
 
         `u` is the input at the start of a sub-step and `next` at its end (both interpolated between samples; `u` alone
         is held over the sample), `t` the time in s since the recording's first sample, `y` the measured output, and
@@ -104,9 +104,9 @@ class Model:
         return np.ascontiguousarray(np.hstack(columns)) if len(columns) != 1 else columns[0]
 
     def rest_at(self, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Compute the whole state (n_state,) from the entries x known of it; see `resting`.
+        """Compute the whole state (n_state,) from its first entries x; see `resting`.
 
-        u (n_u,) are the first inputs; p are the parameters, with further ones behind them where the caller has some.
+        u (n_u,) are the first inputs; p are the model's parameters, which further ones may follow.
         """
         whole = np.zeros(self.n_state)
         if self.resting is not None and len(x) < self.n_state:
@@ -119,7 +119,7 @@ class Model:
         Raises
         ------
         InputError
-            If it gives neither the states nor the states with memory.
+            If the number of values given fits neither the states nor the states with memory.
         """
         if isinstance(recording.initial, str):
             return np.zeros(self.n_state)
@@ -186,9 +186,10 @@ class Model:
 def model_functions(
     x: Any, u: Any, w: Any, p: Any, step: Sequence[Any], z: Any, element: Sequence[Any]
 ) -> dict[str, ca.Function]:
-    """Make the functions of a `Model` of symbols x, u, w, p: of `step` (x_next, y) and of the port's signal z.
+    """Make the functions of a `Model` from its symbols x, u, w, p and expressions of them.
 
-    `element` holds symbols (z, s) and expressions (w, s_next) of them and p.
+    `step` holds the expressions (x_next, y) and `z` the signal of the port; `element` holds the symbols (z, s) and the
+    expressions (w, s_next) of them and p.
     """
     return {
         "step": ca.Function("step", [x, u, w, p], step, ["x", "u", "w", "p"], ["x_next", "y"]),
@@ -308,7 +309,7 @@ def inject_outputs(model: Model, gain: np.ndarray, strength: Mapping[str, Parame
     gain : array, shape (k, n_y)
         K; it acts on the first k states, never on memory.
     strength : mapping of one Parameter, optional
-        γ and its name. Without it γ is 1 in the sub-steps at which a sample is taken and 0 in those after it.
+        γ and its name. Without it γ is 1 in the sub-step at which a sample is taken and 0 in the sub-steps after it.
     """
     x, s, u, p = model.symbols()
     sizes = (("z", model.n_w), ("w", model.n_w), ("measured", model.n_y), ("gamma", 1))
@@ -350,18 +351,17 @@ def map_points(function: ca.Function, *arguments: np.ndarray) -> list[np.ndarray
     arrays = [np.ascontiguousarray(np.broadcast_to(a, (count, np.shape(a)[-1])), dtype=float) for a in arguments]
     results = [np.empty((count, function.size2_out(i), function.size1_out(i))) for i in range(function.n_out())]
     whole = count - count % BLOCK
-    run = _mapped(function) if whole else None
     for begin in range(0, whole, BLOCK):
         block = slice(begin, begin + BLOCK)
-        _call(run, [a[block] for a in arrays], [out[block] for out in results])
-    for k in range(whole, count):  # a map of another length would take longer to make, if the function is large
+        _call(_map_block(function), [a[block] for a in arrays], [out[block] for out in results])
+    for k in range(whole, count):  # for a large function a map of another length would take longer to make
         _call(function, [a[k] for a in arrays], [out[k] for out in results])
     return [out.transpose(0, 2, 1) for out in results]
 
 
 @functools.lru_cache(maxsize=16)
-def _mapped(function: ca.Function) -> ca.Function:
-    """Map a function over a block of points; that takes long for hundreds of states."""
+def _map_block(function: ca.Function) -> ca.Function:
+    """Map a function over a block of points; this takes long for hundreds of states."""
     return function.map(BLOCK)
 
 
@@ -374,12 +374,12 @@ def accumulate_steps(function: ca.Function, state: np.ndarray, *arguments: np.nd
         Arguments after the state, one row for each step.
     """
     count, state = len(arguments[0]), np.array(state, dtype=float)
-    blocks = -(-count // BLOCK)  # the last one is filled up: single steps cost far more each
+    blocks = -(-count // BLOCK)  # the last one is filled up, because single steps cost far more
     more = blocks * BLOCK - count
     filled = (np.concatenate([a, np.repeat(a[-1:], more, axis=0)], dtype=float) for a in arguments)
     arrays = list(map(np.ascontiguousarray, filled))
     results = [np.zeros((blocks * BLOCK, function.size1_out(i))) for i in range(function.n_out())]
-    run = _accumulated(function)
+    run = _accumulate_block(function)
     for begin in range(0, blocks * BLOCK, BLOCK):
         block = slice(begin, begin + BLOCK)
         _call(run, [state, *(a[block] for a in arrays)], [out[block] for out in results])
@@ -388,36 +388,36 @@ def accumulate_steps(function: ca.Function, state: np.ndarray, *arguments: np.nd
 
 
 @functools.lru_cache(maxsize=256)
-def _accumulated(function: ca.Function) -> ca.Function:
+def _accumulate_block(function: ca.Function) -> ca.Function:
     """Chain the steps of a block."""
     return function.mapaccum("accumulated", BLOCK)
 
 
 def _call(function: ca.Function, arrays: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
     buffer, evaluate = function.buffer()
+    _connect(buffer, arrays, results)
+    evaluate()
+
+
+def _connect(buffer: Any, arrays: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
+    """Make a function's buffer read its arguments from arrays and write its results into others."""
     for i, a in enumerate(arrays):
         if a.size:
             buffer.set_arg(i, a.data)
     for i, out in enumerate(results):
         if out.size:
             buffer.set_res(i, out.data)
-    evaluate()
 
 
 class Buffered:
-    """A function of dense arguments and results that is called many times on the same memory."""
+    """A function of dense arguments and results, to be called many times on the same memory."""
 
     def __init__(self, function: ca.Function) -> None:
         self.function = function
         self._buffer, self._evaluate = function.buffer()
         self._arguments = [np.zeros((function.size2_in(i), function.size1_in(i))) for i in range(function.n_in())]
         self._results = [np.zeros((function.size2_out(i), function.size1_out(i))) for i in range(function.n_out())]
-        for i, a in enumerate(self._arguments):
-            if a.size:
-                self._buffer.set_arg(i, a.data)
-        for i, out in enumerate(self._results):
-            if out.size:
-                self._buffer.set_res(i, out.data)
+        _connect(self._buffer, self._arguments, self._results)
 
     def __call__(self, *arguments: np.ndarray) -> list[np.ndarray]:
         """Evaluate; a result of one column is a vector, else a matrix (rows, columns). Omitted arguments are zero."""
@@ -428,5 +428,5 @@ class Buffered:
 
     @property
     def status(self) -> str:
-        """Return CasADi's word for how the last call of a solver ended."""
+        """CasADi's return status of the last call of a solver."""
         return str(self._buffer.stats()["return_status"])

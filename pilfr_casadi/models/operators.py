@@ -10,11 +10,11 @@ Each operator has one memory state `q`, the play state, and maps `(z, q, r)` to 
 The generalized play is a play only where `γ_l(z) - r <= γ_r(z) + r`. This is met by construction: the upper curve is
 `hi = max(gr + r, gl - r)`, which is `γ_r + r` wherever the condition holds; elsewhere the loop has no width.
 
-All work on numbers, NumPy arrays and CasADi symbols alike. The derivative at a kink is the one of the sticking side.
-`eps > 0` rounds min and max over a band of half-width eps (compact support: outside the band nothing changes, so no
-memory leaks; softplus would lose memory at every step). One rounded min, max or step of an operator is off by at most
-eps/4. In the band a rounded play creeps, sample by sample, so over a record it is off by at most eps, and rate
-independence holds outside the band only.
+All operators take numbers, NumPy arrays and CasADi symbols. The derivative at a kink is the one of the sticking side.
+`eps > 0` rounds min and max over a band of half-width eps. The rounding has compact support: nothing changes outside
+the band, so no memory leaks, whereas softplus would lose memory at every step. One rounded min, max or step of an
+operator is off by at most eps/4. In the band a rounded play creeps sample by sample. So over a record it is off by at
+most eps, and it is rate independent only outside the band.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _SYMBOLIC = (ca.SX, ca.MX, ca.DM)
 def fmax(a: Any, b: Any, eps: Any = 0.0) -> Any:
     """Compute max(a, b), rounded over |a - b| < eps by `(eps - |a - b|)₊² / 4 eps`; numbers, arrays or symbols.
 
-    In the exact form the derivative at a tie is that of `b`.
+    Without rounding the derivative at a tie is the derivative of `b`.
     """
     symbolic = isinstance(a, _SYMBOLIC) or isinstance(b, _SYMBOLIC)
     # casadi's own fmax halves the derivative at a tie, which is wrong for a threshold resting on its bound r = 0
@@ -50,7 +50,7 @@ def fmax(a: Any, b: Any, eps: Any = 0.0) -> Any:
 
 
 def fmin(a: Any, b: Any, eps: Any = 0.0) -> Any:
-    """Compute min(a, b), the mirror of `fmax`; in the exact form the derivative at a tie is that of `b`."""
+    """Compute min(a, b), rounded as in `fmax`; without rounding the derivative at a tie is the derivative of `b`."""
     return -fmax(-a, -b, eps)
 
 
@@ -90,7 +90,7 @@ class Play(_Plain):
     name = "play"
 
     def step(self, z: Any, q: Any, r: Any, p: Any, eps: Any = 0.0) -> tuple[Any, Any]:
-        """One step: (output, next memory); z scalar or like q and r."""
+        """Compute one step: (output, next memory); z is a scalar or has the shape of q and r."""
         v = play(z, q, r, eps)
         return v, v
 
@@ -102,7 +102,7 @@ class Stop(_Plain):
     name = "stop"
 
     def step(self, z: Any, q: Any, r: Any, p: Any, eps: Any = 0.0) -> tuple[Any, Any]:
-        """One step: (output, next memory)."""
+        """Compute one step: (output, next memory)."""
         v = stop(z, q, r, eps)
         return v, z - v
 
@@ -144,7 +144,7 @@ class GeneralizedPlay:
         return self.gamma_l is None and self.gamma_r is None
 
     def parameters(self, channels: int) -> ParameterSet:
-        """Envelope parameters, one row for each channel; they start near the identity, with small neurons."""
+        """Make the envelope parameters, one row per channel; envelopes start near the identity, with small neurons."""
         entries: dict[str, Parameter] = dict(self.extra or {})
         for side, own in (("l", self.gamma_l), ("r", self.gamma_r)):
             if own is not None:
@@ -170,7 +170,7 @@ class GeneralizedPlay:
         return out
 
     def far_slope(self, side: str, p: Any) -> Any:
-        """Give the slope of the network γ_l or γ_r with saturated neurons, `a_0` of each channel: (channels, 1)."""
+        """Return the slope of γ_l or γ_r where its neurons saturate, `a_0` of each channel: (channels, 1)."""
         return p[f"gamma_{side}_a0"]
 
     def steepest(self, side: str, p: Any) -> np.ndarray:
@@ -186,7 +186,7 @@ class GeneralizedPlay:
         return np.array(out)
 
     def step(self, z: Any, q: Any, r: Any, p: Any, eps: Any = 0.0, channel: int = 0) -> tuple[Any, Any]:
-        """One step: (output, next memory)."""
+        """Compute one step: (output, next memory)."""
         low, high = (partial(self.envelope, side, p=p, channel=channel) for side in "lr")
         v = generalized_play(z, q, r, low, high, eps)
         return v, v

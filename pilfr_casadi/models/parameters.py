@@ -1,4 +1,4 @@
-"""Named, bounded, shaped parameters and the one way they become a vector.
+"""Named parameters with shapes and bounds, and their layout as a vector.
 
 A model carries a `ParameterSet`: an ordered, immutable mapping from names to `Parameter`. Arrays are stacked column by
 column (CasADi's `vec`) in the order of the names, so numbers and symbols share one layout. Bounds go to the solver as
@@ -17,12 +17,11 @@ import numpy as np
 from .._base import InputError, filled, listed
 
 Array = np.ndarray
-# parameters: the Gauss-Newton Hessian then takes 3.2 GB, and its factorisation a minute per step
-LARGEST_MODEL = 20_000
+LARGEST_MODEL = 20_000  # parameters, whose Gauss-Newton Hessian takes 3.2 GB, and its factorisation a minute per step
 
 
 def parameter_within(name: str, value: float, bounds: tuple[float, float], unit: str = "") -> Parameter:
-    """Make a parameter of somebody else's model; refuse a value outside of the bounds with its name."""
+    """Make a parameter of an imported model; an error about its bounds contains its name."""
     low, high = bounds
     if not low <= value <= high:
         raise InputError(f"The parameter {name!r} is {value:g}, outside of its bounds {low:g} to {high:g}; widen them.")
@@ -30,7 +29,7 @@ def parameter_within(name: str, value: float, bounds: tuple[float, float], unit:
 
 
 def check_size(owner: str, count: int) -> None:
-    """Refuse a model whose number of parameters no fit could handle, before anything of that size is allocated."""
+    """Refuse a model with too many parameters for a fit, before arrays of that size are allocated."""
     if count > LARGEST_MODEL:
         raise InputError(
             f"{owner} of this size has at least {float(count):.3g} parameters, and the matrix that a fit solves for "
@@ -39,7 +38,7 @@ def check_size(owner: str, count: int) -> None:
 
 
 def within_a_factor(value: float) -> tuple[float, float]:
-    """Return usual bounds of a value of which nothing is known but its size: a factor of ten either way."""
+    """Return default bounds of a parameter known only by its size: a factor of ten either way."""
     low, high = sorted((value / 10, value * 10))
     return low, high
 
@@ -92,15 +91,15 @@ class Parameter:
             raise InputError("A parameter's value is not finite; give a number.")
         if not isinstance(self.unit, str):
             raise InputError(f"A parameter's unit is {self.unit!r}; give plain text, such as 'N/m'.")
-        lower, upper = (_filled(bound, value.shape, "A bound") for bound in _pair(self.bounds, "bounds (lower, upper)"))
-        fixed = _filled(self.fixed, value.shape, "A fixed flag").astype(bool)
+        lower, upper = (_fill(bound, value.shape, "A bound") for bound in _pair(self.bounds, "bounds (lower, upper)"))
+        fixed = _fill(self.fixed, value.shape, "A fixed flag").astype(bool)
         between = f"({self.bounds[0]}, {self.bounds[1]})"
         if not np.all(lower <= upper):
             raise InputError(f"The bounds {between} are infeasible: the lower one must not exceed the upper one.")
         if np.any((value < lower) | (value > upper)):
             raise InputError(f"The value {self.value} lies outside its bounds {between}; move it inside or widen them.")
         if self.prior is not None:
-            mean, std = (_filled(part, value.shape, "The prior") for part in _pair(self.prior, "prior (mean, std)"))
+            mean, std = (_fill(part, value.shape, "The prior") for part in _pair(self.prior, "prior (mean, std)"))
             if not (np.all(np.isfinite(mean)) and np.all(std > 0)):
                 raise InputError(f"The prior {self.prior} needs a finite mean and a positive standard deviation.")
         for array in (value, lower, upper, fixed):
@@ -122,7 +121,7 @@ class Parameter:
 
     @classmethod
     def trusted(cls, value: Any, unit: str, lower: Any, upper: Any) -> Parameter:
-        """Make a free scalar from numbers that have been checked: finite, with `lower <= value <= upper`."""
+        """Make a free scalar without checks; the numbers must be finite, with `lower <= value <= upper`."""
         made = object.__new__(cls)
         value, lower, upper, fixed = np.array(value), np.array(lower), np.array(upper), np.array(False)
         for array in (value, lower, upper, fixed):
@@ -130,8 +129,8 @@ class Parameter:
         made.__dict__.update(value=value, unit=unit, bounds=(lower, upper), fixed=fixed, prior=None)
         return made
 
-    def _moved_to(self, value: Array) -> Parameter:
-        """Copy with another value, which is trusted: finite, inside the bounds, of the same shape, nobody else's."""
+    def _with_value(self, value: Array) -> Parameter:
+        """Copy with another value, which must be finite, in bounds, of the same shape and not shared; not checked."""
         copy = object.__new__(type(self))
         copy.__dict__.update(self.__dict__)
         value.setflags(write=False)
@@ -147,7 +146,7 @@ def _pair(given: Any, name: str) -> tuple[Any, Any]:
     return first, second
 
 
-def _filled(given: Any, shape: tuple[int, ...], name: str) -> Array:
+def _fill(given: Any, shape: tuple[int, ...], name: str) -> Array:
     """Copy numbers into a parameter's shape."""
     return np.array(filled(given, f"{name} of a parameter", shape, nan=True, infinite=True))
 
@@ -238,7 +237,7 @@ class ParameterSet(Mapping[str, Parameter]):
                 raise InputError(f"There is no parameter {name!r}; there are {listed(list(self))}.")
 
     def pack(self, values: Mapping[str, Any]) -> Array:
-        """Make a vector from values by name; parameters that are not named keep their start value."""
+        """Make a vector from values by name; all other parameters keep their start value."""
         self._require(values)
         full = {}
         for n, p in self.items():
@@ -260,11 +259,11 @@ class ParameterSet(Mapping[str, Parameter]):
         return {n: ca.reshape(vector[entries], *p.shape) for n, p, entries in self._slices()}
 
     def at(self, vector: Array) -> ParameterSet:
-        """Copy with start values from a vector, which must be finite, clipped to the bounds."""
+        """Copy with the start values of a finite vector, clipped to the bounds."""
         values = self.unpack(np.clip(vector, self.lower, self.upper))
         if not all(np.all(np.isfinite(value)) for value in values.values()):
             raise InputError("A parameter's value is not finite; give a number.")
-        return ParameterSet({n: p._moved_to(values[n]) for n, p in self.items()})
+        return ParameterSet({n: p._with_value(values[n]) for n, p in self.items()})
 
     def change(self, **changes: Mapping[str, Any]) -> ParameterSet:
         """Copy with fields of some parameters replaced: `change(A={"fixed": True}, w={"bounds": (0, 1)})`."""
@@ -299,8 +298,8 @@ class Named:
 class Neighbours:
     """Judge the size of an entry by the other entries of its row, its column and its matrix.
 
-    An entry that is zero has no size of its own. `sqrt(largest of its row × largest of its column)` is never less than
-    the entry itself, and has its unit wherever the entries of a row or of a column share a unit.
+    An entry of zero has no size of its own. `sqrt(largest of its row × largest of its column)` is never less than the
+    entry itself, and has its unit wherever the entries of a row or of a column share a unit.
 
     Parameters
     ----------
@@ -316,12 +315,12 @@ class Neighbours:
         )
 
     def sizes(self, values: Array) -> Array:
-        """Size of each entry by its row and column, shape (n,)."""
+        """Compute the size of each entry from its row and column, shape (n,)."""
         values = np.abs(values)
         return np.sqrt(_largest(values, self._row)) * np.sqrt(_largest(values, self._column))
 
     def largest(self, values: Array) -> Array:
-        """Largest value of the matrix that each entry belongs to, shape (n,)."""
+        """Find the largest value of the matrix that each entry belongs to, shape (n,)."""
         return _largest(values, self._matrix)
 
 

@@ -25,7 +25,7 @@ BLOCKS = ("A", "B_u", "B_w", "C_y", "D_yu", "D_yw", "C_z", "D_zu", "y_0")
 
 
 def block_shapes(nx: int, n_u: Any, n_y: Any, n_w: int) -> dict[str, tuple[Any, ...]]:
-    """Give the shapes of the linear blocks; strings in place of unknown n_u and n_y are passed through."""
+    """Return the shapes of the linear blocks; unknown n_u and n_y may be strings, which appear in the shapes."""
     return {
         "A": (nx, nx),
         "B_u": (nx, n_u),
@@ -41,7 +41,7 @@ def block_shapes(nx: int, n_u: Any, n_y: Any, n_w: int) -> dict[str, tuple[Any, 
 
 @dataclass(frozen=True)
 class PILFR:
-    """A PI-LFR model structure, before data says how many inputs and outputs there are.
+    """A PI-LFR model structure, whose numbers of inputs and outputs come from data.
 
     Parameters
     ----------
@@ -91,7 +91,8 @@ class PILFR:
             given = getattr(self, option)
             if not isinstance(given, Mapping):
                 raise InputError(f"{option} = {given!r} was given; give values by parameter name, a mapping.")
-        known = (*BLOCKS, *(self.element.parameters() if self.element else ()))
+        elements = self.element.parameters() if self.element else {}
+        known = (*BLOCKS, *elements)
         for name in (*self.fixed, *self.bounds, *self.priors):
             if name not in known:
                 raise InputError(f"There is no parameter {name!r} to fix or bound; there are {', '.join(known)}.")
@@ -99,7 +100,6 @@ class PILFR:
             _check_pair(f"bounds of {name!r}", pair, "(lower, upper), with -numpy.inf or numpy.inf for none")
         for name, pair in self.priors.items():
             _check_pair(f"prior of {name!r}", pair, "(mean, std)")
-        elements = self.element.parameters() if self.element else {}
         shapes = {**block_shapes(self.nx, "n_u", "n_y", self.n_w), **{k: p.value.shape for k, p in elements.items()}}
         for name, shape in shapes.items():
             given = self._given(name, shape)
@@ -112,7 +112,7 @@ class PILFR:
         return 0 if self.element is None else self.element.channels
 
     def _given(self, name: str, shape: tuple[Any, ...]) -> dict[str, Any]:
-        """Collect the given ones of `fixed`, `bounds` and `prior` of a parameter, filled to its shape."""
+        """Collect the options `fixed`, `bounds` and `prior` of a parameter, filled to its shape."""
         out: dict[str, Any] = {}
         if name in self.fixed:
             value = self.fixed[name]
@@ -273,24 +273,24 @@ def _is_identity(structure: PILFR, name: str) -> bool:
     return np.shape(given) in ((), eye.shape) and np.array_equal(np.broadcast_to(given, eye.shape), eye)
 
 
-def fixed_whole(structure: PILFR) -> list[str]:
-    """List the blocks that have no free entry."""
+def fixed_blocks(structure: PILFR) -> list[str]:
+    """List the blocks that are fixed entirely."""
     return [k for k, v in structure.fixed.items() if not np.any(np.isnan(np.asarray(v, dtype=float)))]
 
 
-def read_through(structure: PILFR) -> bool:
+def is_wiener(structure: PILFR) -> bool:
     """Tell whether the output is read through the element alone (Wiener)."""
     return is_zero(structure, "C_y") and _is_identity(structure, "D_yw")
 
 
-def driven_through(structure: PILFR) -> bool:
+def is_hammerstein(structure: PILFR) -> bool:
     """Tell whether the input reaches the dynamics through the element alone (Hammerstein)."""
     return is_zero(structure, "B_u") and _is_identity(structure, "D_zu")
 
 
 def direction_fixed(structure: PILFR) -> bool:
-    """Tell whether z has no free direction: `C_z` and `D_zu` are fixed, or z is that of the output (Wiener)."""
-    return {"C_z", "D_zu"} <= set(fixed_whole(structure)) or read_through(structure)
+    """Tell whether z has no free direction: `C_z` and `D_zu` are fixed, or z is the linear output (Wiener)."""
+    return {"C_z", "D_zu"} <= set(fixed_blocks(structure)) or is_wiener(structure)
 
 
 def places(structure: PILFR) -> tuple[str, ...]:

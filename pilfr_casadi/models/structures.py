@@ -1,4 +1,4 @@
-"""Structures beside the PI-LFR: black-box models to compare with, and every structure by its name.
+"""Black-box models to compare a PI-LFR with, and every structure by its name.
 
 Each baseline is a linear model closed by a `StaticNetwork` (a `PILFR`) with some blocks fixed:
 
@@ -8,7 +8,7 @@ Each baseline is a linear model closed by a `StaticNetwork` (a `PILFR`) with som
 - `network_lfr`: one network in the port of a linear model, `w = Σ gain_j tanh(slope_j z + bias_j)`;
 - `NARX`, `NOE`: `y(k+1) = f(y(k), …, y(k-n_a+1), u(k), …, u(k-n_b+1))`, with `f` a linear part and one hidden layer.
   The state holds the past of y and u, so `A` is a shift except in its first rows. For one-step training the model reads
-  the measured output (`reading_output`); in use, and in the training of a NOE, it reads its own output.
+  the measured output (`read_measured_output`); in use, and in the training of a NOE, it reads its own output.
 """
 
 from __future__ import annotations
@@ -131,8 +131,8 @@ class NARX(Lagged):
     input_lags : int, optional
         Past inputs, n_b; as many as `lags` by default. The input acts from the next sample on.
     validation : float
-        Share of the training data that is held back; training stops when the one-step error on it no longer falls. 0
-        uses all data for training.
+        Share of the training data held back for validation; training stops when the one-step error on it no longer
+        falls. 0 uses all data for training.
     linear : bool
         Whether a linear part stands beside the neurons.
 
@@ -154,8 +154,8 @@ class NOE(Lagged):
     lags, hidden, input_lags, linear
         As for `NARX`.
     validation : float
-        Share of the training data that is held back; training stops when the simulation error on it no longer falls,
-        and the point of the lowest error is returned. 0 uses all data for training.
+        Share of the training data held back for validation; training stops when the simulation error on it no longer
+        falls, and the point of the lowest error is returned. 0 uses all data for training.
 
     Raises
     ------
@@ -167,7 +167,7 @@ class NOE(Lagged):
 
 
 def _lagged_states(model: Lagged, recording: Recording, level: Array) -> Array:
-    """Collect the states (M, nx) along a recording, from outputs less their level (n_y,); zero before its start."""
+    """Collect the states (M, nx) along a recording, from outputs minus their mean (n_y,); zero before its start."""
     m, past = len(recording), [(recording.y - level, k) for k in range(model.lags)]
     past += [(recording.u, k) for k in range(1, model.input_lags or model.lags)]
     return np.hstack([np.vstack([np.zeros((min(k, m), x.shape[1])), x[: max(m - k, 0)]]) for x, k in past])
@@ -185,11 +185,11 @@ def lagged_start(
     states = [_lagged_states(model, r, level) for r in recordings]
     n_y, n_u = recordings[0].n_y, recordings[0].n_u
     rows = np.concatenate([np.hstack([x, r.u])[r.skip : -1] for x, r in zip(states, recordings, strict=True)])
-    following = np.concatenate([(r.y - level)[r.skip + 1 :] for r in recordings])
+    targets = np.concatenate([(r.y - level)[r.skip + 1 :] for r in recordings])
     size = or_one(np.std(rows, axis=0))
     a, b = np.zeros((structure.nx, structure.nx)), np.zeros((structure.nx, n_u))
     if model.linear:
-        predictor = (np.linalg.lstsq(rows / size, following, rcond=1e-8)[0] / size[:, None]).T
+        predictor = (np.linalg.lstsq(rows / size, targets, rcond=1e-8)[0] / size[:, None]).T
         a[:n_y], b[:n_y] = predictor[:, : structure.nx], predictor[:, structure.nx :]
     element = structure.element
     assert isinstance(element, StaticNetwork)
@@ -211,10 +211,10 @@ def neurons_over(structure: PILFR, element: StaticNetwork, z: np.ndarray, rng: n
     return {"gain": rng.uniform(-1, 1, shape), "slope": slope, "bias": -slope * middle}
 
 
-def reading_output(model: Model, share: float = 1.0) -> Model:
-    """Make the model read the measured output y.
+def read_measured_output(model: Model, share: float = 1.0) -> Model:
+    """Make a NARX or NOE model read the measured output y.
 
-    Its first states, the outputs less `y_0`, become `x + share (y - ŷ)` before each step. A share of one predicts one
+    Its first states, the outputs minus `y_0`, become `x + share (y - ŷ)` before each step. A share of one predicts one
     step ahead, a share of zero simulates; the share is a fixed parameter.
 
     Raises
@@ -244,33 +244,33 @@ def reading_output(model: Model, share: float = 1.0) -> Model:
 
 
 OPERATORS: dict[str, Any] = {"play": Play, "stop": Stop, "generalized_play": GeneralizedPlay}
-HYSTERETIC = ("nx", "operators", "operator", "channels", "neurons", "offset", "fix", "bounds", "priors")
+HYSTERETIC_OPTIONS = ("nx", "operators", "operator", "channels", "neurons", "offset", "fix", "bounds", "priors")
 LAGGED = {"narx": NARX, "noe": NOE}
 # options of each structure
-TAKES: dict[str, tuple[str, ...]] = {
-    "lfr": HYSTERETIC,
-    "hammerstein": HYSTERETIC,
-    "wiener": HYSTERETIC,
+STRUCTURE_OPTIONS: dict[str, tuple[str, ...]] = {
+    "lfr": HYSTERETIC_OPTIONS,
+    "hammerstein": HYSTERETIC_OPTIONS,
+    "wiener": HYSTERETIC_OPTIONS,
     "ssnn": ("nx", "hidden", "offset", "fix", "bounds", "priors"),
     "network_lfr": ("nx", "hidden", "channels", "offset", "fix", "bounds", "priors"),
     "narx": ("lags", "hidden", "input_lags"),
     "noe": ("lags", "hidden", "input_lags"),
 }
-STRUCTURES = tuple(TAKES)
-ANY = frozenset(name for takes in TAKES.values() for name in takes)
+STRUCTURES = tuple(STRUCTURE_OPTIONS)
+ALL_OPTIONS = frozenset(name for takes in STRUCTURE_OPTIONS.values() for name in takes)
 
 
 def named_structure(structure: str = "lfr", **given: Any) -> PILFR | Lagged:
-    """Build a structure of `STRUCTURES` with the options of `TAKES`, at least `nx` or `lags`.
+    """Build a structure of `STRUCTURES` with the options of `STRUCTURE_OPTIONS`, at least `nx` or `lags`.
 
-    Omitted options have the structure's defaults; `operators` is 20 by default and 0 for a linear model; `neurons`
-    belong to a generalized play.
+    Omitted options have the structure's defaults. `operators` is 20 by default, and 0 makes a linear model; `neurons`
+    selects the generalized play.
     """
     if structure in LAGGED:
         return LAGGED[structure](**given)
     element: dict[str, Any] = {k: given[k] for k in ("hidden", "channels") if k in given}
     form = {k: given[k] for k in ("bounds", "priors", "offset") if k in given}
-    if "hidden" in TAKES[structure]:
+    if "hidden" in STRUCTURE_OPTIONS[structure]:
         base = ssnn(given["nx"], **element) if structure == "ssnn" else network_lfr(given["nx"], **element)
     else:
         base = _hysteretic(structure, given)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
         Constraint as Constraint,
         Gain as Gain,
         check_gain as check_gain,
-        check_room as check_room,
+        check_radius_bounds as check_radius_bounds,
         dc_gain as dc_gain,
         describe_unbounded as describe_unbounded,
         loosen_radii as loosen_radii,
@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from .solution import (
         Candidate as Candidate,
         Iteration as Iteration,
+        IterationCallback as IterationCallback,
         Limit as Limit,
-        Progress as Progress,
         Solution as Solution,
         Status as Status,
         describe_unknown_multipliers as describe_unknown_multipliers,

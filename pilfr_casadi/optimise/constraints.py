@@ -1,25 +1,26 @@
-"""Constraints on a model's named parameters, as CasADi expressions that every solver takes the same way.
+"""Constraints on a model's named parameters: CasADi expressions with limits, the same for every solver.
 
 `stable` bounds the spectral radius. For every matrix norm and every m, `ρ(A) <= ‖A^m‖^(1/m)`, with equality as m grows,
 so
 
     (1/m) log ‖A^m‖_F <= log ρ_max,   m = 2^squarings,
 
-is one smooth inequality that guarantees the bound, at any point where it holds. Repeated squaring with the norm taken
-out after each step keeps the numbers in range. Where eigenvalues coincide (a double integrator) the powers grow as
+is one smooth inequality that guarantees the bound wherever it holds. Repeated squaring, with a division by the norm
+after each step, keeps the numbers in range. Where eigenvalues coincide (a double integrator) the powers grow as
 m^(n-1) and the left-hand side exceeds `log ρ(A)` by up to `(n - 1) log(m) / m`, 1.3e-5 (n - 1) here, with slopes of the
 size of m. `stable` therefore has a slack, and a violation as small as that slack is no failure of a solver.
 `stability_limits` names the matrices of a PI-LFR that a fit bounds: `A`, and `A` with the element moving along its
 slope.
 
-Asked for as `exact`, a constraint has no slack and no tolerance: it is checked on the numbers of the result, the
-spectral radius by its eigenvalues. `exact_limits` solves with such constraints.
+An `exact` constraint has neither slack nor tolerance: it is checked on the numbers of the result, a spectral radius by
+its eigenvalues. `exact_limits` solves with such constraints.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import casadi as ca
@@ -38,7 +39,7 @@ from ..models import (
     with_port_gain,
 )
 
-TOLERATED = 1e-6  # violation, in units of a constraint, up to which it counts as met
+FEASIBILITY_TOLERANCE = 1e-6  # violation, in units of a constraint, up to which the constraint counts as met
 LARGEST_UNIT, SMALLEST_UNIT = 100.0, 1e-6  # a unit is at most 100 limits, at least this share of the change
 LOG_RADIUS_UNIT = 100.0  # unit of log ρ: a violation of 1e-4 is tolerated
 SLACK = 1e-4  # share by which `stable` lets the radius exceed its limit
@@ -58,13 +59,13 @@ class Constraint:
     name : str
         Name of the constraint in results.
     unit : float, optional
-        Change of the expression that violations are measured in. By default the largest change that one variable
-        causes when it changes by its own size, so that physical units do not matter, but at most a hundred times the
-        limit, so that a small limit is met to 1e-4 of itself.
+        Unit of violations. By default the largest change of the expression that one variable causes when it changes by
+        its own size, so that physical units do not matter, but at most a hundred times the limit, so that a small limit
+        is met to 1e-4 of itself.
     exact : bool
         Whether the limits hold on the numbers of the result, not up to a solver's tolerance; for inequalities.
     check : callable, optional
-        For an exact constraint: how far named numbers violate the limit in another measure than the expression's (0 or
+        For an exact constraint: how far named numbers violate the limit, in another measure than the expression (0 or
         less: not at all). `stable` uses the eigenvalues.
     """
 
@@ -78,7 +79,7 @@ class Constraint:
 
 
 def log_norm_of_power(matrix: Any, squarings: int = 20) -> Any:
-    """`(1/m) log ‖A^m‖_F` with `m = 2^squarings`: an upper bound of `log ρ(A)`, smooth in A."""
+    """Compute `(1/m) log ‖A^m‖_F` with `m = 2^squarings`: an upper bound of `log ρ(A)`, smooth in A."""
     log_scale, power = 0.0, matrix
     for k in range(squarings + 1):
         if k:
@@ -107,7 +108,7 @@ class LogRadius:
 
 
 @dataclass(frozen=True)
-class BeyondRadius:
+class RadiusExcess:
     """Excess of the largest eigenvalue of a square matrix of named numbers over a radius."""
 
     radius: float
@@ -126,81 +127,67 @@ def stable(
     slack: float = SLACK,
     exact: bool = False,
 ) -> Constraint:
-    """Spectral radius of `A` (or of another square expression of the parameters) at most `radius`.
+    """Bound the spectral radius of `A` (or of another square expression of the parameters) by `radius`.
 
-    The bound that holds is `radius (1 + slack)`, and with `exact` the radius itself, checked on the eigenvalues of the
-    result, which may stop up to three digits inside. Without slack no solver could meet a limit of 1 at a double
-    integrator.
+    The bound is `radius (1 + slack)`: without slack no solver could meet a limit of 1 at a double integrator. With
+    `exact` it is the radius itself, checked on the eigenvalues of the result, which may stop up to three digits inside.
 
     Raises
     ------
     InputError
         If the radius is not positive, or the slack negative.
     """
-    if not (radius > 0 and slack >= 0):
-        raise InputError(
-            f"A bound of {radius} on the spectral radius was given; give a number above zero."
-            if slack >= 0
-            else f"The bound on the spectral radius has a slack of {slack}; give zero or more."
-        )
+    if not slack >= 0:
+        raise InputError(f"The bound on the spectral radius has a slack of {slack}; give zero or more.")
+    if not radius > 0:
+        raise InputError(f"A bound of {radius} on the spectral radius was given; give a number above zero.")
     limit = float(np.log(radius) + (-LOG_RADIUS_MARGIN if exact else np.log1p(slack)))
-    check = BeyondRadius(radius, matrix) if exact else None
+    check = RadiusExcess(radius, matrix) if exact else None
     return Constraint(
         LogRadius(matrix), upper=limit, name=f"{name} <= {radius:.12g}", unit=LOG_RADIUS_UNIT, exact=exact, check=check
     )
 
 
 def loosen_radii(constraints: Sequence[Constraint], least: float = 0.0) -> tuple[Constraint, ...]:
-    """Replace each exact bound on a spectral radius from `least` on by one of at least 1, with a slack."""
+    """Replace each exact bound on a spectral radius of `least` or more by a bound of at least 1 with a slack."""
     return tuple(
         stable(max(c.check.radius, 1.0), c.check.matrix, c.name.partition(" <=")[0])
-        if c.exact and isinstance(c.check, BeyondRadius) and c.check.radius >= least
+        if c.exact and isinstance(c.check, RadiusExcess) and c.check.radius >= least
         else c
         for c in constraints
     )
 
 
-@dataclass(frozen=True)
-class WithElement:
-    """`A + B_w S C_z` with one of an element's slopes S; a class, because it has to be pickled."""
-
-    element: Any
-    slope: str
-
-    def __call__(self, p: Mapping[str, Any]) -> Any:
-        """Return the expression for named parameters p."""
-        return p["A"] + p["B_w"] @ element_slopes(self.element, p)[self.slope] @ p["C_z"]
+def closed_loop_matrix(element: Any, slope: str, p: Mapping[str, Any]) -> Any:
+    """Return `A + B_w S C_z` for one of an element's slopes S by its name."""
+    return p["A"] + p["B_w"] @ element_slopes(element, p)[slope] @ p["C_z"]
 
 
-def stability(structure: PILFR, radius: float = 1.0, exact: bool = False) -> tuple[Constraint, ...]:
-    """Bound the spectral radius of A, and of `A + B_w S C_z` for each slope S that the element can have.
+def stability_limits(structure: PILFR, bound: bool | float) -> tuple[Constraint, ...]:
+    """Bound the spectral radius of A, and of `A + B_w S C_z` for each slope S of the element, as `fit(stable=bound)`.
 
     For plays the two cases are that no operator slips, or all do (for stops: all stick).
     """
+    if bound is False:
+        return ()
+    if not isinstance(bound, bool | int | float | np.number) or not np.isfinite(bound):
+        raise InputError(f"stable = {bound!r} was given; give True, False or the largest spectral radius, above zero.")
     if structure.nx == 0:
         return ()
-    limits: tuple[Constraint, ...] = (stable(radius, exact=exact),)
+    limits = [stable(float(bound), exact=True)]
     element = structure.element
     if element is not None:
         symbols = {name: ca.MX.sym(name, *p.shape) for name, p in element.parameters().items()}
         for slope in element_slopes(element, symbols):
             name = f"spectral radius with the element's {slope}"
-            limits += (stable(radius, WithElement(element, slope), name, exact=exact),)
-    return limits
-
-
-def stability_limits(structure: PILFR, bound: bool | float) -> tuple[Constraint, ...]:
-    """Return the constraints that `stable=bound` of a fit stands for."""
-    if bound is False:
-        return ()
-    if not isinstance(bound, bool | int | float | np.number) or not np.isfinite(bound):
-        raise InputError(f"stable = {bound!r} was given; give True, False or the largest spectral radius, above zero.")
-    return stability(structure, float(bound), exact=True)
+            matrix = partial(closed_loop_matrix, element, slope)  # unlike a lambda it can be pickled
+            limits.append(stable(float(bound), matrix, name, exact=True))
+    return tuple(limits)
 
 
 def describe_unbounded(structure: PILFR | None, constraints: Iterable[Constraint], p: Mapping[str, Any]) -> str:
-    """Say which motions of an element in feedback the bounds on radii do not cover at the values p; else empty."""
-    radii = [c.check.radius for c in constraints if isinstance(c.check, BeyondRadius)]
+    """Describe the motions of an element in feedback that the bounds on radii do not cover at the values p, if any."""
+    radii = [c.check.radius for c in constraints if isinstance(c.check, RadiusExcess)]
     element = structure.element if structure else None
     if element is None or not radii or not np.any(np.sum(np.abs(p["C_z"]), axis=1) * np.sum(np.abs(p["B_w"]), axis=0)):
         return ""
@@ -223,9 +210,9 @@ def describe_unbounded(structure: PILFR | None, constraints: Iterable[Constraint
     )
 
 
-def check_room(parameters: ParameterSet, limits: Iterable[Constraint]) -> None:
-    """Refuse bounds on the entries of A that no A with the required spectral radius satisfies."""
-    radii = [c.check.radius for c in limits if isinstance(c.check, BeyondRadius) and c.check.matrix is linear_part]
+def check_radius_bounds(parameters: ParameterSet, limits: Iterable[Constraint]) -> None:
+    """Refuse bounds on the entries of A between which no A has the required spectral radius."""
+    radii = [c.check.radius for c in limits if isinstance(c.check, RadiusExcess) and c.check.matrix is linear_part]
     if not radii or "A" not in parameters or np.all(parameters["A"].fixed):
         return
     a = parameters["A"]
@@ -253,8 +240,8 @@ def least_radius(low: np.ndarray, high: np.ndarray) -> float:
     return least
 
 
-def _numbers_or_nan(function: ca.Function, *arguments: Any) -> np.ndarray:
-    """Evaluate the first output of a function; nan where CasADi raises because a matrix is singular."""
+def _evaluate(function: ca.Function, *arguments: Any) -> np.ndarray:
+    """Evaluate the first output of a function; nan if CasADi raises because a matrix is singular."""
     try:
         return np.asarray(function.call(arguments)[0])
     except RuntimeError:
@@ -264,8 +251,8 @@ def _numbers_or_nan(function: ca.Function, *arguments: Any) -> np.ndarray:
 class Rows:
     """The constraints of a problem as one Function `p -> g` of the full parameter vector p, shape (n_p,).
 
-    `lower`, `upper` and `units` (as given, nan where not) have shape (n_g,), `labels` one name per entry, `sizes` the
-    number of entries of each constraint.
+    `lower`, `upper` and `units` (nan where none was given) have shape (n_g,). `labels` has one name per entry, `sizes`
+    the number of entries of each constraint.
     """
 
     def __init__(self, constraints: tuple[Constraint, ...], parameters: ParameterSet) -> None:
@@ -291,7 +278,7 @@ class Rows:
     def _check_start(self, p: np.ndarray, free: np.ndarray, satisfied: np.ndarray, logs: np.ndarray) -> None:
         """Refuse a constraint that is not finite at the start, or is violated there and depends on no free parameter.
 
-        `satisfied` marks entries whose own check says that they hold, `logs` entries that are logarithms.
+        `satisfied` marks entries that pass their own check, `logs` entries that are logarithms.
         """
         value, slope = self.values(p), self.slope(p)[:, free]
         for i in np.flatnonzero(~np.isfinite(value) | ~np.all(np.isfinite(slope), axis=1)):
@@ -301,7 +288,7 @@ class Rows:
                 f"{shown}); give an expression that is finite there, or other start values."
             )
         reach = np.asarray(ca.DM(self.function.jac_sparsity(0, 0), 1).full(), dtype=bool)[:, free]
-        room = TOLERATED * np.maximum(np.abs(value), 1.0)
+        room = FEASIBILITY_TOLERANCE * np.maximum(np.abs(value), 1.0)
         missed = (value < self.lower - room) | (value > self.upper + room)
         for i in np.flatnonzero(missed & ~np.any(reach, axis=1) & ~satisfied):
             found, low, high = (np.exp(v) if logs[i] else v for v in (value[i], self.lower[i], self.upper[i]))
@@ -311,23 +298,23 @@ class Rows:
             )
 
     def units_from(self, change: np.ndarray) -> np.ndarray:
-        """Units as given, or from the largest change of each entry (n_g,), no larger than its limits warrant."""
+        """Return the given units, else the largest change of each entry (n_g,), at most in proportion to its limits."""
         limits = np.abs([np.where(np.isfinite(b), b, 0.0) for b in (self.lower, self.upper)])
         largest = LARGEST_UNIT * np.max(limits, axis=0, initial=0.0)
         own = np.where(largest > 0, np.clip(largest, SMALLEST_UNIT * change, change), change)
         return np.where(np.isnan(self.units), own, self.units)
 
     def values(self, p: np.ndarray) -> np.ndarray:
-        """Shape (n_g,); nan where they cannot be computed, such as a gain where a pole is 1 to the last digit."""
-        return _numbers_or_nan(self.function, p).ravel()
+        """Compute the constraints, (n_g,); nan where that fails, such as for a gain where a pole is exactly 1."""
+        return _evaluate(self.function, p).ravel()
 
     def slope(self, p: np.ndarray) -> np.ndarray:
-        """Shape (n_g, n_p)."""
-        return _numbers_or_nan(self._slope, p).reshape(len(self.labels), len(p))
+        """Compute the Jacobian of the constraints, (n_g, n_p)."""
+        return _evaluate(self._slope, p).reshape(len(self.labels), len(p))
 
 
 def _limits(c: Constraint, size: int) -> np.ndarray:
-    """Check the limits and the unit (nan where none is given) of a constraint's entries: (3, size)."""
+    """Check a constraint's limits and unit; return them for each entry, (3, size), the unit nan if none is given."""
     try:
         low, high = (np.broadcast_to(np.asarray(b, dtype=float).ravel(), (size,)) for b in (c.lower, c.upper))
     except ValueError:
@@ -394,16 +381,10 @@ class Gain:
         return (c @ ca.solve(ca.DM.eye(a.shape[0]) - a, b) + d if a.shape[0] else d).T
 
 
-@dataclass(frozen=True)
-class Differences:
-    """Differences of neighbouring entries along each row of a parameter."""
-
-    name: str = "r"
-
-    def __call__(self, p: Mapping[str, Any]) -> Any:
-        """Return the expression for named parameters p."""
-        rows = p[self.name] if p[self.name].shape[1] > 1 else p[self.name].T
-        return ca.vec((rows[:, 1:] - rows[:, :-1]).T)
+def row_differences(name: str, p: Mapping[str, Any]) -> Any:
+    """Return the differences of neighbouring entries along each row of a parameter, or along a vector."""
+    rows = p[name] if p[name].shape[1] > 1 else p[name].T
+    return ca.vec((rows[:, 1:] - rows[:, :-1]).T)
 
 
 def dc_gain(value: Any, *, within: Any = 0.0, slope: float = 1.0) -> Constraint:
@@ -414,12 +395,12 @@ def dc_gain(value: Any, *, within: Any = 0.0, slope: float = 1.0) -> Constraint:
     Parameters
     ----------
     value : float or array, (n_y, n_u)
-        The gain, in units of the outputs over those of the inputs; a plain list will do for one output or one input.
+        The gain, in output units per input unit; a plain list is enough for one output or one input.
     within : float or array, as the value
         Largest deviation from it; 0 for an equation.
     slope : float
-        How much of the element's slope Σw counts: 1 for large motions of plays (all slip) and small ones of stops, 0
-        for the other way round.
+        Share of the element's slope Σw that counts: 1 for large motions of plays (all slip) and small ones of stops, 0
+        for small motions of plays and large ones of stops.
 
     Raises
     ------
@@ -454,7 +435,7 @@ def check_gain(constraints: Iterable[Constraint], element: Any) -> None:
 
 
 def ordered(name: str = "r", gap: float = 0.0) -> Constraint:
-    """Make the entries of a parameter (by default the thresholds) ascend along each row, by at least `gap`.
+    """Constrain the entries of a parameter (by default the thresholds) to ascend along each row by at least `gap`.
 
     Raises
     ------
@@ -464,4 +445,4 @@ def ordered(name: str = "r", gap: float = 0.0) -> Constraint:
     gap = float(filled(gap, f"The gap between the entries of {name!r}", (), infinite=True))
     if not 0 <= gap < np.inf:
         raise InputError(f"A gap of {gap} between the entries of {name!r} was given; give a number of 0 or more.")
-    return Constraint(Differences(name), lower=float(gap), name=f"{name} ascending", exact=True)
+    return Constraint(partial(row_differences, name), lower=float(gap), name=f"{name} ascending", exact=True)

@@ -13,22 +13,22 @@ eigenvalues meet. At a tight bound several eigenvalues lie on the circle at once
 starts outside ends in poor points. `solve_within_radii` therefore
 
 1. solves without the bound (or with a bound of 1 and a small slack, `loosen_radii`) and stops if the result is inside;
-2. otherwise tightens the bound in steps (`tighten_radii`) that at most double `-log ρ`. Before each step `A` and `B_w`
-   are scaled by one factor, which scales every bounded matrix of a PI-LFR (Krikelis et al. 2024, Eq. 15), so that the
+2. otherwise tightens the bound in steps (`tighten_radii`) that at most double `-log ρ`. Before each step it scales `A`
+   and `B_w` by one factor, and with them every bounded matrix of a PI-LFR (Krikelis et al. 2024, Eq. 15), so that the
    start is inside;
 3. solves at the bound, with a new Schur form each time, until the cost stops falling.
 
-Radii stop a share of `MARGINS` inside, so that the eigenvalues of the result, computed in floating point, never exceed
-the bound: three digits of it are used. The result is a local minimum.
+Radii stay inside by one of the shares `MARGINS`, so that the eigenvalues of the result, computed in floating point,
+never exceed the bound. The result is a local minimum.
 
-A solver meets other constraints up to a tolerance. Where an exact one fails on the numbers of the result,
-`move_inside_exact` moves the point by the smallest step, in the metric of the outputs, that meets it and keeps all
-others to first order:
+A solver meets other constraints up to a tolerance. If an exact one fails on the numbers of the result,
+`move_inside_exact` makes the smallest step, in the metric of the outputs, that meets it and keeps all others to first
+order:
 
     minimise  1/2 d'(H + λ D)d   subject to  lower <= θ + d <= upper,  lower_g + m <= g(θ) + ∇g d <= upper_g - m
 
 with `H` the Gauss-Newton Hessian of the simulation error (Eq. 20 there) and a margin m on the exact ones that doubles
-until every check holds in floating point. What is fixed stays fixed.
+until every check holds in floating point. Fixed parameters stay fixed.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ import casadi as ca
 import numpy as np
 
 from ..models import Neighbours
-from .constraints import TOLERATED, BeyondRadius, Constraint, loosen_radii
+from .constraints import FEASIBILITY_TOLERANCE, Constraint, RadiusExcess, loosen_radii
 from .gauss_newton import GaussNewton, QuadraticProgram, replace_rounding
 from .problem import Problem
-from .solution import ACTIVE_MULTIPLIER, Progress, Solution, Status
+from .solution import ACTIVE_MULTIPLIER, IterationCallback, Solution, Status
 
 Array = np.ndarray
 Solve = Callable[[Problem, "Array | None"], Solution]
@@ -63,9 +63,15 @@ FIRST_MARGIN = 1e-9  # margin of the first of these steps, in units of a constra
 MOVE_DAMPING = 1e-6  # λ of these steps, only large enough that their Hessian is positive definite
 
 
-def radius_limits(problem: Problem) -> dict[Constraint, BeyondRadius]:
+def radius_limits(problem: Problem) -> dict[Constraint, RadiusExcess]:
     """Return the exact bounds on spectral radii of a problem with their checks."""
-    return {c: c.check for c in problem.constraints if c.exact and isinstance(c.check, BeyondRadius)}
+    return {c: c.check for c in problem.constraints if c.exact and isinstance(c.check, RadiusExcess)}
+
+
+def radius_rows(problem: Problem) -> Array:
+    """Return the mask (n_g,) of the constraints that are exact bounds on spectral radii."""
+    limits = radius_limits(problem)
+    return np.repeat([c in limits for c in problem.constraints], problem.g_sizes).astype(bool)
 
 
 def below_blocks(n: int) -> Array:
@@ -78,7 +84,7 @@ def below_blocks(n: int) -> Array:
 def jury_rows(n: int) -> ca.Function:
     """Build `(M, X) -> (jury, low)`: Jury's rows of the diagonal blocks of F, and F below them.
 
-    M (n, n) is over its bound; X holds the entries of `below_blocks` column by column.
+    M (n, n) is divided by its bound; X holds the entries of `below_blocks` column by column.
     """
     low = [(int(i), int(j)) for j, i in zip(*np.nonzero(below_blocks(n).T), strict=True)]
     m, x = ca.SX.sym("M", n, n), ca.SX.sym("X", len(low))
@@ -104,7 +110,7 @@ def jury_rows(n: int) -> ca.Function:
 def schur_basis(matrix: Array) -> Array:
     """Return an orthogonal Q (n, n) with `Q' M Q` block upper triangular.
 
-    Blocks hold complex pairs, and those real eigenvalues that are nearest to each other: only these may become a pair.
+    A block holds a complex pair, or two real eigenvalues near each other, because only such two can become a pair.
     """
     from scipy.linalg import lapack, schur
 
@@ -128,7 +134,7 @@ def _first_pair(t: Array) -> tuple[int, int]:
     value = np.diag(t)[order]
     if len(order) % 2 == 0:
         return int(order[0]), int(order[1])
-    # an odd number leaves one alone: the one whose removal leaves the smallest gaps
+    # an odd number leaves one over: choose the one whose removal leaves the smallest gaps
     gaps = [np.sum(np.diff(np.delete(value, k))[::2]) for k in range(0, len(order), 2)]
     paired = np.delete(order, 2 * int(np.argmin(gaps)))
     return int(paired[0]), int(paired[1])
@@ -137,7 +143,7 @@ def _first_pair(t: Array) -> tuple[int, int]:
 class _Bound:
     """One bounded matrix: M over its radius as a Function of p, the Schur basis Q, and Jury's rows with slopes."""
 
-    def __init__(self, problem: Problem, limit: Constraint, check: BeyondRadius, theta: Array, margin: float) -> None:
+    def __init__(self, problem: Problem, limit: Constraint, check: RadiusExcess, theta: Array, margin: float) -> None:
         parameters = problem.model.parameters
         p = ca.MX.sym("p", parameters.size)
         scaled = ca.densify(check.matrix(parameters.symbols(p))) / (check.radius * (1.0 - margin))
@@ -167,23 +173,21 @@ class _Bound:
 class SchurProblem:
     """Problem whose exact bounds on spectral radii are Jury's rows in extra unknowns X; see `Minimisation`.
 
-    The Schur forms are taken at θ. Radii stay a share `margin` below their bounds, and other exact constraints as far
-    inside in their units.
+    The Schur forms are taken at θ. Radii stay a share `margin` below their bounds, and other exact constraints stay
+    inside by `margin` of their units.
     """
 
     def __init__(self, problem: Problem, theta: Array, margin: float) -> None:
         self.problem = problem
-        limits = radius_limits(problem)
-        self.kept = np.flatnonzero(np.repeat([c not in limits for c in problem.constraints], problem.g_sizes))
-        self.bounds = [_Bound(problem, c, check, theta, margin) for c, check in limits.items()]
+        self.kept = np.flatnonzero(~radius_rows(problem))
+        self.bounds = [_Bound(problem, c, check, theta, margin) for c, check in radius_limits(problem).items()]
         extra = [b.unknowns for b in self.bounds]
         self.places = [slice(a, b) for a, b in pairwise(problem.size + np.cumsum([0, *extra]))]
         self.labels = (*problem.labels, *(f"X{k}[{i},0]" for k, m in enumerate(extra) for i in range(m)))
         free = np.full(sum(extra), np.inf)
         self.lower, self.upper = np.concatenate([problem.lower, -free]), np.concatenate([problem.upper, free])
         self.start = np.concatenate([theta, np.zeros(sum(extra))])
-        exact = np.repeat([c.exact for c in problem.constraints], problem.g_sizes).astype(bool)
-        room = np.where(exact, margin * problem.constraint_units(theta), 0.0)
+        room = np.where(problem.g_exact, margin * problem.constraint_units(theta), 0.0)
         room = np.minimum(room, 0.25 * (problem.g_upper - problem.g_lower))[self.kept]
         top = [b.upper for b in self.bounds]
         self.g_lower = np.concatenate([problem.g_lower[self.kept] + room, np.zeros(sum(map(len, top)))])
@@ -237,15 +241,15 @@ class SchurProblem:
         return np.concatenate([units[self.kept], np.full(len(self.g_lower) - len(self.kept), ROW_UNIT)])
 
     def multipliers(self, x: Array, found: Array) -> Array:
-        """Return multipliers of the problem's own limits; of a radius with respect to its logarithm."""
+        """Return the multipliers of the problem's own limits; a multiplier of a radius belongs to its logarithm."""
         problem, n = self.problem, self.problem.size
         out, rows = np.zeros(n + len(problem.g_lower)), found[self.size :]
         out[:n], out[n + self.kept] = found[:n], rows[: len(self.kept)]
-        p, row, first = problem.parameters(self.theta(x)), len(self.kept), np.cumsum([0, *problem.g_sizes])
+        p, row = problem.parameters(self.theta(x)), len(self.kept)
         for bound, at in zip(self.bounds, self.places, strict=True):
             by_m = bound.slopes(p, x[at])[0]
             force = float(rows[row : row + len(by_m)] @ by_m @ bound.rotated(p).ravel(order="F"))
-            out[n + first[problem.constraints.index(bound.limit)]] = max(force, 0.0)
+            out[n + problem.g_slices[problem.constraints.index(bound.limit)].start] = max(force, 0.0)
             row += len(by_m)
         return out
 
@@ -256,13 +260,13 @@ def solve_within_radii(
     solve: Solve,
     bound_solver: GaussNewton = BOUND_STEP_SOLVER,
     at_bound: bool = False,
-    progress: Progress | None = None,
+    progress: IterationCallback | None = None,
 ) -> Solution:
     """Solve a problem that may have exact bounds on spectral radii.
 
-    `solve` is any solver's function of a problem and a start. `bound_solver` makes the solves at the bounds, and
-    `progress` receives their iterations. `at_bound` says that the solution is known to lie at a bound, so the solve
-    without the bounds is left out.
+    `solve` is any solver's function of a problem and a start. `bound_solver` solves at the bounds, and `progress`
+    receives its iterations. With `at_bound`, for a solution known to lie at a bound, the solve without the bounds is
+    skipped.
     """
     if not radius_limits(problem):
         return solve(problem, start)
@@ -286,16 +290,14 @@ def near_radius(problem: Problem, theta: Array) -> bool:
 
 def at_active_radius(problem: Problem, theta: Array, solution: Solution) -> bool:
     """Tell whether a bound on a radius is active at a point, by the solution's multipliers if it has any."""
-    limits, force = radius_limits(problem), np.abs(solution.multipliers[problem.size :])
-    rows = np.repeat([c in limits for c in problem.constraints], problem.g_sizes).astype(bool)
-    idle = len(force) == len(rows) and bool(
-        np.max(force[rows], initial=0.0) <= ACTIVE_MULTIPLIER * solution.cost
-    )  # nan is unknown
-    return not idle and near_radius(problem, theta)
+    rows, force = radius_rows(problem), np.abs(solution.multipliers[problem.size :])
+    if len(force) == len(rows) and np.max(force[rows], initial=0.0) <= ACTIVE_MULTIPLIER * solution.cost:
+        return False  # a multiplier of nan is unknown and does not count
+    return near_radius(problem, theta)
 
 
 def tighten_radii(
-    problem: Problem, theta: Array, bound_solver: GaussNewton, progress: Progress | None = None
+    problem: Problem, theta: Array, bound_solver: GaussNewton, progress: IterationCallback | None = None
 ) -> Solution:
     """Tighten the bounds step by step from the radii at θ to the wanted ones; return the best solution inside."""
     if not np.isfinite(problem.cost(theta)):
@@ -333,7 +335,7 @@ def tighten_radii(
 
 
 def point_as_solution(problem: Problem, theta: Array, status: Status) -> Solution:
-    """Return a point that no solver has reached as a solution without multipliers."""
+    """Make a solution without multipliers from a point that no solver has reached."""
     return Solution(theta, problem.cost(theta), status, 0, 0.0)
 
 
@@ -353,7 +355,7 @@ def _tightening_path(problem: Problem, theta: Array) -> list[tuple[Constraint, .
 
 
 def _scale_inside(problem: Problem, theta: Array) -> Array:
-    """Scale A and B_w so that every radius is inside; return θ as it is where they may not be scaled."""
+    """Scale A and B_w so that every radius is inside; return θ unchanged if fixed entries forbid it."""
     parameters = problem.model.parameters
     names = [name for name in ("A", "B_w") if name in parameters and parameters[name].size]
     values = parameters.unpack(problem.parameters(theta))
@@ -375,10 +377,9 @@ def _log_room(problem: Problem, theta: Array) -> float:
 
 def _meets_all(problem: Problem, theta: Array) -> bool:
     """Tell whether θ meets every constraint."""
-    g, unit = problem.constraint(theta), problem.constraint_units(theta)
-    over = np.maximum(problem.g_lower - g, g - problem.g_upper) - TOLERATED * np.where(unit > 0, unit, 1.0)
-    exact = np.repeat([c.exact for c in problem.constraints], problem.g_sizes)  # judged by `violated_exact`
-    return not violated_exact(problem, theta) and bool(np.all((over <= 0) | exact))
+    unit = problem.constraint_units(theta)
+    over = problem.excess(theta) - FEASIBILITY_TOLERANCE * np.where(unit > 0, unit, 1.0)
+    return not violated_exact(problem, theta) and bool(np.all((over <= 0) | problem.g_exact))
 
 
 def _is_better(problem: Problem, theta: Array, found: Solution) -> bool:
@@ -389,12 +390,12 @@ def _is_better(problem: Problem, theta: Array, found: Solution) -> bool:
 
 
 def _with_time_left(ends: float, solver: GaussNewton) -> GaussNewton:
-    """Return the solver with the time that is left."""
+    """Return the solver with the remaining time as its limit."""
     return replace(solver, time_limit=ends - time.perf_counter())
 
 
 def _solve_inside(
-    problem: Problem, theta: Array, solver: GaussNewton, ends: float, progress: Progress | None
+    problem: Problem, theta: Array, solver: GaussNewton, ends: float, progress: IterationCallback | None
 ) -> Solution:
     """Solve at the bounds with the smallest margin for which the eigenvalues of the result are inside."""
     found = point_as_solution(problem, theta, Status.INFEASIBLE)
@@ -410,7 +411,7 @@ def _solve_inside(
 
 
 def _solve_jury_rows(
-    problem: Problem, theta: Array, solver: GaussNewton, margin: float, progress: Progress | None
+    problem: Problem, theta: Array, solver: GaussNewton, margin: float, progress: IterationCallback | None
 ) -> Solution:
     """Solve once, with the bounds on radii written as Jury's rows."""
     schur = SchurProblem(problem, theta, margin)
@@ -423,13 +424,12 @@ def violated_exact(problem: Problem, theta: Array) -> list[str]:
     """List the names of the exact constraints that θ violates."""
     if not any(c.exact for c in problem.constraints):
         return []
-    g, first = problem.constraint(theta), np.cumsum([0, *problem.g_sizes])
-    satisfied = (g >= problem.g_lower) & (g <= problem.g_upper)
+    satisfied = problem.excess(theta) <= 0
     values = problem.model.parameters.unpack(problem.parameters(theta))
     return [
         c.name
-        for c, (a, b) in zip(problem.constraints, pairwise(first), strict=True)
-        if c.exact and not (np.all(satisfied[a:b]) if c.check is None else c.check(values) <= 0)
+        for c, rows in zip(problem.constraints, problem.g_slices, strict=True)
+        if c.exact and not (np.all(satisfied[rows]) if c.check is None else c.check(values) <= 0)
     ]
 
 
@@ -438,7 +438,6 @@ def move_inside_exact(problem: Problem, solution: Solution) -> Solution:
     theta = solution.theta
     if solution.status is Status.INFEASIBLE or not np.isfinite(solution.cost) or not violated_exact(problem, theta):
         return solution
-    exact = np.repeat([c.exact for c in problem.constraints], problem.g_sizes)
     hessian = problem.normal(theta)[2]
     floor = replace_rounding(np.diag(hessian), theta, Neighbours(problem.labels))
     unit = problem.constraint_units(theta, floor)
@@ -446,14 +445,9 @@ def move_inside_exact(problem: Problem, solution: Solution) -> Solution:
     damped = hessian + MOVE_DAMPING * np.diag(floor)
     damped += np.diag(np.where(np.diag(damped) > 0, 0.0, 1.0))
     qp, margin = QuadraticProgram(problem.size, len(unit), "daqp"), FIRST_MARGIN
-
-    def excess(point: Array) -> Array:
-        g = problem.constraint(point)
-        return np.maximum(problem.g_lower - g, g - problem.g_upper)
-
     for _ in range(MOST_MOVES):
         g = problem.constraint(theta)
-        room = np.where(exact, np.minimum(margin * unit, 0.25 * (problem.g_upper - problem.g_lower)), 0.0)
+        room = np.where(problem.g_exact, np.minimum(margin * unit, 0.25 * (problem.g_upper - problem.g_lower)), 0.0)
         d, _, good = qp(
             damped,
             np.zeros(problem.size),
@@ -464,14 +458,13 @@ def move_inside_exact(problem: Problem, solution: Solution) -> Solution:
             problem.g_upper - room - g,
         )
         trial = np.clip(theta + d, problem.lower, problem.upper)
-        if not good or not np.all(excess(trial) <= unit):  # the linearisation no longer holds
+        if not good or not np.all(problem.excess(trial) <= unit):  # the linearisation no longer holds
             break
         theta = trial
         if not violated_exact(problem, theta):
             break
         margin *= 2.0
-    cost, over = problem.cost(theta), np.maximum(excess(theta), 0.0)
-    if violated_exact(problem, theta) or not np.isfinite(cost) or np.any(over > TOLERATED * unit):
-        failed = Status.INFEASIBLE if solution.status.converged else solution.status
-        return replace(solution, status=failed)
+    cost, over = problem.cost(theta), np.maximum(problem.excess(theta), 0.0)
+    if violated_exact(problem, theta) or not np.isfinite(cost) or np.any(over > FEASIBILITY_TOLERANCE * unit):
+        return replace(solution, status=Status.INFEASIBLE) if solution.status.converged else solution
     return replace(solution, theta=theta, cost=cost, violation=float(np.max(over, initial=0.0)))

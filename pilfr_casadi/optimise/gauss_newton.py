@@ -21,20 +21,20 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import casadi as ca
 import numpy as np
 
 from .._base import InputError, handled_interrupt, unwrapped_interrupt
 from ..models import Neighbours
-from .constraints import TOLERATED
-from .solution import Iteration, Progress, Solution, Status, check_solver_options
+from .constraints import FEASIBILITY_TOLERANCE
+from .solution import Iteration, IterationCallback, Solution, Status, check_solver_options
 
 FEASIBLE_VIOLATION = 1e-9  # violation, in units of the constraints, up to which a point is feasible
 ROUNDING_VIOLATION = 1e-12  # violation that rounding alone can cause
-MOST_RETURNS = 4  # returns of a run that has strayed to its best feasible point, at most
-ENDED = (Status.CONVERGED, Status.SMALL_STEP, Status.SOLVER_FAILED)  # the run got as far as it can
+MOST_RETURNS = 4  # how often a run that has strayed may return to its best feasible point
+ENDED = (Status.CONVERGED, Status.SMALL_STEP, Status.SOLVER_FAILED)  # the run cannot improve its point
 KINK_SHARE = 1e-3  # predicted but unreachable improvement, as a share of the cost, that reveals a kink
 ZERO_COST = 1e-24  # cost that counts as zero: outputs are off by 1e-12 of their size
 ZERO_COLUMN = 1e-20  # squared column norm, relative to the largest of its matrix, that counts as zero
@@ -75,7 +75,7 @@ class Minimisation(Protocol):
         """Return the general constraints (n_g,)."""
 
     def constraint_jacobian(self, theta: np.ndarray, /) -> np.ndarray:
-        """Return their Jacobian (n_g, n)."""
+        """Return the Jacobian of the general constraints (n_g, n)."""
 
     def constraint_units(self, theta: np.ndarray, squares: np.ndarray | None = None, /) -> np.ndarray:
         """Return the unit of each general constraint (n_g,), see `Problem.constraint_units`."""
@@ -113,6 +113,14 @@ def replace_rounding(squares: np.ndarray, theta: np.ndarray, neighbours: Neighbo
     return np.asarray(np.where(idle, 1.0 / np.where(size > ZERO_SIZE, size, 1.0) ** 2, squares))
 
 
+class Step(NamedTuple):
+    """A quadratic program's step (n,), its multipliers (n + n_g,), and whether it was found."""
+
+    d: np.ndarray
+    multipliers: np.ndarray
+    good: bool
+
+
 class QuadraticProgram:
     """Dense quadratic program for a step inside limits.
 
@@ -139,8 +147,8 @@ class QuadraticProgram:
         a: np.ndarray,
         lba: np.ndarray,
         uba: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Minimise `1/2 d'h d + g'd` over `lbx <= d <= ubx, lba <= a d <= uba`; return d, multipliers and success.
+    ) -> Step:
+        """Minimise `1/2 d'h d + g'd` over `lbx <= d <= ubx, lba <= a d <= uba`.
 
         h has a positive diagonal. Solvers have absolute tolerances, so the diagonal and the rows are scaled to one,
         and the step to the steepest slope or, if all slopes are zero, to the violation of the rows at d = 0.
@@ -153,26 +161,25 @@ class QuadraticProgram:
         size = float(np.max(np.abs(g))) or float(np.max(np.maximum(low, -high), initial=0.0))
         size = max(size, SMALLEST_DIVISOR)
         rows = a / row[:, None], low / size, high / size
-        d, multipliers, good = self._solve(
-            h * unit * unit[:, None], g / size, lbx / unit / size, ubx / unit / size, *rows
-        )
-        return d * size * unit, size * multipliers / np.concatenate([unit, row]), good
+        bounds = lbx / unit / size, ubx / unit / size
+        d, multipliers, good = self._solve(h * unit * unit[:, None], g / size, *bounds, *rows)
+        return Step(d * size * unit, size * multipliers / np.concatenate([unit, row]), good)
 
-    def _solve(self, h: np.ndarray, g: np.ndarray, *limits: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+    def _solve(self, h: np.ndarray, g: np.ndarray, *limits: np.ndarray) -> Step:
         """Solve the scaled program."""
         lbx, ubx, a, lba, uba = limits
         d = unconstrained_step(h, g)
         if d is not None and np.all((lbx <= d) & (d <= ubx)):
             slack = a @ d
             if np.all((lba <= slack) & (slack <= uba)):
-                return d, np.zeros(len(d) + len(slack)), True
+                return Step(d, np.zeros(len(d) + len(slack)), True)
         low, high = np.concatenate([lbx, lba]), np.concatenate([ubx, uba])
         if not np.all((low < np.inf) & (high > -np.inf)):  # an overflow or NaN, at which a plugin raises
-            return np.zeros(len(g)), np.zeros(len(g) + len(a)), False
+            return Step(np.zeros(len(g)), np.zeros(len(g) + len(a)), False)
         out = self._solver(h=h, g=g, lbx=lbx, ubx=ubx, a=a, lba=lba, uba=uba)
         d = np.asarray(out["x"]).ravel()
         multipliers = np.concatenate([np.asarray(out["lam_x"]).ravel(), np.asarray(out["lam_a"]).ravel()])
-        return d, multipliers, bool(self._solver.stats()["success"]) and bool(np.all(np.isfinite(d)))
+        return Step(d, multipliers, bool(self._solver.stats()["success"]) and bool(np.all(np.isfinite(d))))
 
 
 def unconstrained_step(h: np.ndarray, g: np.ndarray) -> np.ndarray | None:
@@ -189,10 +196,10 @@ def unconstrained_step(h: np.ndarray, g: np.ndarray) -> np.ndarray | None:
 class ExactPenalty:
     """General constraints in their units, and the exact penalty `μ Σ violation` by which steps are judged.
 
-    The weight μ follows the multipliers by Powell's rule (1978): 1.5 times the largest, or half-way down to that from
-    its last value, but not below `least`. A weight that only grew would stay as large as multipliers far from the
-    solution demanded and make the solver crawl. The units (n_g,) are fixed at the first point where a constraint has a
-    slope (`Problem.constraint_units`).
+    The weight μ follows the multipliers by Powell's rule (1978): it is 1.5 times the largest multiplier, or half-way
+    down to that from its last value, but not below `least`. A weight that only grew would stay as large as the
+    multipliers far from the solution and make the solver crawl. The units (n_g,) are fixed at the first point where a
+    constraint has a slope (`Problem.constraint_units`).
     """
 
     def __init__(self, problem: Minimisation) -> None:
@@ -208,7 +215,7 @@ class ExactPenalty:
             self.unit[first], self._known[first] = unit[first], True
 
     def shrink_units(self, theta: np.ndarray) -> bool:
-        """Adopt units at θ that are far smaller than before; tell whether a violation shows in the new units alone.
+        """Adopt the units at θ that are far smaller than before; tell whether only they reveal a violation.
 
         The first unit of a constraint near a pole, such as a gain beside an integrator, may be immense.
         """
@@ -217,14 +224,14 @@ class ExactPenalty:
         unit, before = self.problem.constraint_units(theta), self.violations(theta)
         smaller = self._known & (unit > 0) & (unit < SHRUNKEN_UNIT * self.unit)
         self.unit = np.where(smaller, unit, self.unit)
-        return bool(np.any((before <= TOLERATED) & (self.violations(theta) > TOLERATED)))
+        return bool(np.any((before <= FEASIBILITY_TOLERANCE) & (self.violations(theta) > FEASIBILITY_TOLERANCE)))
 
     def values(self, theta: np.ndarray) -> np.ndarray:
         """Return the constraints in their units, shape (n_g,)."""
         return self.problem.constraint(theta) / self.unit if len(self.unit) else np.zeros(0)
 
     def slope(self, theta: np.ndarray) -> np.ndarray:
-        """Return their Jacobian, shape (n_g, n)."""
+        """Return the Jacobian of `values`, shape (n_g, n)."""
         return self.problem.constraint_jacobian(theta) / self.unit[:, None]
 
     def room(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -268,7 +275,7 @@ class BestFeasible:
 
     def update(self, cost: float, violation: float, theta: np.ndarray, multipliers: np.ndarray) -> None:
         """Update the best point, or the weight needed, with a point and its summed violation."""
-        if violation > TOLERATED:
+        if violation > FEASIBILITY_TOLERANCE:
             self.weight_needed = max(
                 self.weight_needed, (self.cost - cost) / violation if np.isfinite(self.cost) else 0.0
             )
@@ -277,7 +284,8 @@ class BestFeasible:
 
     def beats(self, cost: float, violation: float) -> bool:
         """Tell whether the best feasible point beats one of this cost and violation."""
-        return bool(np.isfinite(self.cost)) and (violation > TOLERATED or cost > self.cost * (1.0 + self.tolerance))
+        worse = violation > FEASIBILITY_TOLERANCE or cost > self.cost * (1.0 + self.tolerance)
+        return bool(np.isfinite(self.cost)) and worse
 
 
 @dataclass(frozen=True)
@@ -323,26 +331,17 @@ class GaussNewton:
         self,
         problem: Minimisation,
         start: np.ndarray | None = None,
-        progress: Progress | None = None,
+        progress: IterationCallback | None = None,
         watch: Watch | None = None,
         unfinished: bool = False,
     ) -> Solution:
         """Minimise from `start` (n,), by default the problem's own.
 
-        `watch` receives every accepted point and ends the run by returning True. A run that stops at the limit of
-        iterations or time returns its best feasible point. With `unfinished` it returns its last point, feasible or
-        not, so that another run can continue from there.
+        `watch` receives every accepted point and ends the run by returning True. A run that reaches its limit of
+        iterations or time returns its best feasible point; with `unfinished` it returns its last point, feasible or
+        not, from which another run can continue.
         """
         return _Run(self, problem, problem.start if start is None else start, progress, watch).run(unfinished)
-
-
-@dataclass(frozen=True, eq=False)
-class _Step:
-    """A quadratic program's step (n,), its multipliers (n + n_g,), and whether it was found."""
-
-    d: np.ndarray
-    multipliers: np.ndarray
-    good: bool
 
 
 class _Run:
@@ -353,8 +352,8 @@ class _Run:
         options: GaussNewton,
         problem: Minimisation,
         start: np.ndarray,
-        progress: Progress | None,
-        watch: Watch | None = None,
+        progress: IterationCallback | None,
+        watch: Watch | None,
     ) -> None:
         self.options, self.problem, self.progress, self.watch = options, problem, progress, watch
         self.theta = np.clip(np.asarray(start, dtype=float), problem.lower, problem.upper)
@@ -388,12 +387,12 @@ class _Run:
                     status = self._iterate()
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
-        goes_on = unfinished and status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT)
-        if not goes_on and self.best.beats(self.cost, self.penalty.violation(self.theta)):
+        continues = unfinished and status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT)
+        if not continues and self.best.beats(self.cost, self.penalty.violation(self.theta)):
             status = Status.SOLVER_FAILED if self._has_strayed(status) else status
             self._go_back()
         self.penalty.shrink_units(self.theta)
-        if status in ENDED and np.any(self.penalty.violations(self.theta) > TOLERATED):
+        if status in ENDED and np.any(self.penalty.violations(self.theta) > FEASIBILITY_TOLERANCE):
             status = Status.INFEASIBLE
         return self._finish(status)
 
@@ -463,7 +462,7 @@ class _Run:
             self.damping = self.damping.after_failure()
             if self.damping.value > MOST_DAMPING:
                 stalled = self._judge_stalled(hessian, floor, gradient, slope)
-                return Status.INFEASIBLE if violation > TOLERATED else stalled
+                return Status.INFEASIBLE if violation > FEASIBILITY_TOLERANCE else stalled
         return Status.MAX_ITERATIONS
 
     def _has_converged(self, recent: list[tuple[float, float]]) -> bool:
@@ -474,7 +473,7 @@ class _Run:
         if len(recent) <= options.patience:
             return False
         (cost, violation), (now, left) = recent[-1 - options.patience], recent[-1]
-        if left > TOLERATED:
+        if left > FEASIBILITY_TOLERANCE:
             mu = self.penalty.weight
             merits = cost + mu * violation, now + mu * left
             return violation - left < options.tolerance * left and merits[0] - merits[1] < options.tolerance * merits[1]
@@ -493,12 +492,12 @@ class _Run:
 
     def _step(
         self, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray, correction: np.ndarray | None = None
-    ) -> _Step:
+    ) -> Step:
         """Solve the quadratic program, removing less of the violation where it is infeasible."""
         problem = self.problem
         low, high = self.penalty.room(self.penalty.values(self.theta) if correction is None else correction)
         for share in VIOLATION_SHARES if self.n_g else VIOLATION_SHARES[:1]:
-            d, multipliers, good = self.qp(
+            step = self.qp(
                 damped,
                 gradient,
                 problem.lower - self.theta,
@@ -507,12 +506,12 @@ class _Run:
                 np.minimum(low, share * np.maximum(low, 0.0)),
                 np.maximum(high, share * np.minimum(high, 0.0)),
             )
-            if good:
+            if step.good:
                 break
-        return _Step(d, multipliers, good)
+        return step
 
     def _judge(
-        self, step: _Step, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray
+        self, step: Step, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray
     ) -> tuple[np.ndarray, float, float]:
         """Return the trial point, its cost and its improvement of the penalised cost."""
         if not step.good:
@@ -529,7 +528,7 @@ class _Run:
         cost = problem.cost(trial)
         return trial, cost, self.cost - cost + self.penalty.weight * (here - there)
 
-    def _end_of_step(self, step: _Step) -> np.ndarray:
+    def _end_of_step(self, step: Step) -> np.ndarray:
         """Return the end of a step: exactly on its active bounds, and inside the others."""
         problem, force, theta = self.problem, step.multipliers[: self.problem.size], self.theta + step.d
         theta = np.where((force < 0) & np.isfinite(problem.lower), problem.lower, theta)

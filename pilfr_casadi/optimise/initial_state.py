@@ -1,4 +1,4 @@
-"""The initial state of a recording, at parameters that are known: given, at rest, in steady state, or estimated.
+"""The initial state of a recording at known parameters: given, at rest, in steady state, or estimated.
 
 In a fit, initial states that are to be estimated are variables of the problem (`place_recordings` in `problem`), with
 the same prior (`state_precision` there).
@@ -18,8 +18,8 @@ from .gauss_newton import GaussNewton
 from .problem import STATE_NOISE, Penalties, Problem, state_precision
 from .steady_state import steady_state
 
-STATE_ROUNDS = 20  # solves for a first state, at most, each with a wider prior
-SAMPLES_PER_STATE = 10  # an estimate from so many adds a tenth of the noise's mean square to the run
+STATE_ROUNDS = 20  # most solves for a first state, each with a wider prior
+SAMPLES_PER_STATE = 10  # an estimate from so many samples adds a tenth of the noise's mean square to the run
 LEAST_INFORMATION = 1e-9  # singular value, over the largest, below which a direction of the state moves no output
 LARGEST_STATE = 1.1  # mean square of a first state, in units of its prior, above which the prior is widened
 
@@ -32,9 +32,9 @@ def samples_for_state(model: Model) -> int:
 def samples_to_start(model: Model, engine: Engine, recording: Recording) -> int:
     """Choose how many leading samples an unknown initial state is fitted to, up to a third of the recording.
 
-    Ten samples per state are enough where all inform alike: the estimate's error then adds a tenth of the noise's mean
-    square to the rest of the run. A slow or lightly damped mode is hardly seen in few samples, and its error rings on.
-    With `H` and `H'` the information of the head and of the rest (n' residuals) on the state, the error adds
+    Ten samples per state are enough if all are equally informative: the estimate's error then adds a tenth of the
+    noise's mean square to the rest of the run. A few samples hardly show a slow or lightly damped mode, and its error
+    rings on. With the information `H` of the head and `H'` of the rest (n' residuals) on the state, the error adds
     `tr(H^-1 H') / n'` of the noise; the head is doubled until that is at most a tenth.
     """
     least, most = samples_for_state(model), len(recording) // 3
@@ -56,15 +56,15 @@ def samples_to_start(model: Model, engine: Engine, recording: Recording) -> int:
 
 
 def _state_problem(model: Model, engine: Engine, recording: Recording) -> Problem:
-    """Make the problem whose only variables are the initial state; the outputs are over their deviations."""
+    """Make the problem whose only variables are the initial state; outputs are scaled by their deviations."""
     fixed = model.parameters.change(**{k: {"fixed": True, "prior": None} for k in model.parameters})
     spread = np.std(recording.y, axis=0)
-    scale = np.where(spread > 0, spread, np.max(spread) or 1.0)  # that of another output where one is constant
+    scale = np.where(spread > 0, spread, np.max(spread) or 1.0)  # a constant output gets the largest deviation
     return Problem(model.with_parameters(fixed), recording, engine=engine, scale=scale)
 
 
 def _slope_by_state(model: Model, engine: Engine, recording: Recording) -> np.ndarray:
-    """Compute the slope of the outputs, over their deviations, by the initial state in a run from rest, (M n_y, n)."""
+    """Compute the slope of the scaled outputs by the initial state in a run from rest, (M n_y, n)."""
     problem = _state_problem(model, engine, recording.with_(skip=0, initial="estimate", period=None))
     try:
         with np.errstate(all="ignore"):
@@ -84,9 +84,9 @@ def estimate_initial_state(
 ) -> np.ndarray:
     """Find the state with memory at a recording's first sample, as its `initial` says, at the model's parameters.
 
-    A state that is to be estimated is fitted to the first `samples` outputs alone, from rest and from each of `starts`.
-    With `state_prior` it has a prior around rest, on the scale of the states in a run over all inputs
-    (`state_precision`), and is fitted from rest alone.
+    An estimated state is fitted to the first `samples` outputs alone, from rest and from each of `starts`. With
+    `state_prior` it has a prior around rest on the scale of the states in a run over all inputs (`state_precision`),
+    and is fitted from rest alone.
     """
     n, values, state = model.n_state, model.parameters.start, model.first_state(recording)
     if recording.begins == "periodic":

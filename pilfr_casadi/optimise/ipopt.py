@@ -1,14 +1,14 @@
 """The simulation-error problem through IPOPT, by single shooting with the package's own derivatives.
 
-IPOPT is given the problem in the units of `Scaled`, with bounds and constraints as they are, and the damped
-Gauss-Newton Hessian of `DampedHessian`: an interior-point iteration turned Levenberg-Marquardt method, with a barrier
-for bounds and a filter for constraints (Wächter & Biegler 2006). With an undamped or the exact Hessian trials diverged.
-Only while IPOPT restores feasibility, ignoring the cost, the curvature of the constraints is used instead.
+IPOPT solves the problem in the units of `Scaled`, with unchanged bounds and constraints and the damped Gauss-Newton
+Hessian of `DampedHessian`. This makes the interior-point iteration a Levenberg-Marquardt method with a barrier for
+bounds and a filter for constraints (Wächter & Biegler 2006). With an undamped or the exact Hessian trials diverged.
+Only while IPOPT restores feasibility, ignoring the cost, the Hessian is the curvature of the constraints.
 
-An interior-point method pushes away from bounds, and thresholds start on theirs (r = 0): push and barrier are kept
-small next to the first cost, which is 1. Bounds are never relaxed. At the end, variables whose multiplier exceeds
-their distance to a bound are set to it if that does not raise the cost. A diverging simulation is an evaluation error,
-from which the line search backs off.
+An interior-point method pushes variables away from bounds, and thresholds start on theirs (r = 0). So push and barrier
+are small compared with the first cost, which is 1. Bounds are never relaxed. At the end, variables whose multiplier
+exceeds their distance to a bound are set to it if that does not raise the cost. A diverging simulation is an evaluation
+error, from which the line search backs off.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 from .._base import InputError, handled_interrupt
 from .gauss_newton import ACCEPTED_RATIO, LEAST_DAMPING, MOST_DAMPING, SMALLEST_DIVISOR, ZERO_COLUMN, Damping
 from .problem import Problem
-from .solution import Iteration, Progress, Solution, Status, check_solver_options
+from .solution import Iteration, IterationCallback, Solution, Status, check_solver_options
 
 SETTINGS = {
     "print_level": 0,
@@ -53,7 +53,7 @@ Sparsities = dict[str, ca.Sparsity]
 FEASIBLE_VIOLATION = 1e-8  # up to which a point is feasible, in units of the change that one scaled variable causes
 INFEASIBLE_FROM = 1e-6  # the same, above which the end of a run is infeasible
 MOST_SOLVES = 4  # when IPOPT's line search fails, the next solve starts from the best point with more damping
-MORE_DAMPING, LEAST_RAISED = 100.0, 1e-2  # factor on λ for the next solve, and the λ that is raised at least
+MORE_DAMPING, LEAST_RAISED = 100.0, 1e-2  # factor on λ for the next solve, and the least λ that it multiplies
 RAISED, MOST_RAISED = 4.0, 100.0  # factor on λ for each shortening by the line search, and the largest factor in all
 MOST_FIRST_STEPS = 20  # most trials of the first step, from which column norms of the Jacobian are computed
 MOST_CORRECTIONS = 3  # Newton steps back onto the constraints after variables were set to their bounds
@@ -63,9 +63,8 @@ QUASI_NEWTON_PATIENCE = 4  # factor on the patience with a quasi-Newton Hessian,
 class _Callback(ca.Callback):
     """CasADi Function around a Python function, with its inputs and outputs by name.
 
-    The function takes one flat array per input and returns one value per output. An exception must not cross a
-    solver's C++ frames: CasADi would turn it into a failed evaluation and forget it. It is passed to `failed` instead,
-    and the solver receives NaN.
+    The function takes one flat array per input and returns one value per output. CasADi would turn an exception into a
+    failed evaluation and forget it. So the exception is passed to `failed`, and the solver receives NaN.
     """
 
     def __init__(
@@ -199,11 +198,11 @@ class Scaled:
         return np.asarray(np.clip(x / self.s, self.problem.lower, self.problem.upper))
 
     def constraints(self, theta: np.ndarray) -> np.ndarray:
-        """Scaled constraints G, shape (n_g,)."""
-        return self.problem.constraint(theta) / self.g_unit if len(self.g_unit) else np.zeros(0)
+        """Compute the scaled constraints G, shape (n_g,)."""
+        return self.problem.constraint(theta) / self.g_unit
 
     def slope(self, x: np.ndarray) -> np.ndarray:
-        """Jacobian of G, shape (n_g, n)."""
+        """Compute the Jacobian of G, shape (n_g, n)."""
         return self.problem.constraint_jacobian(self.theta(x)) / self.s / self.g_unit[:, None]
 
     def excess(self, g: np.ndarray) -> np.ndarray:
@@ -226,7 +225,7 @@ class Scaled:
         return ca.Function("curvature", [p, lam], [ca.densify(h)], ["p", "lam"], ["hessian"]) if h.nnz() else None
 
     def curvature(self, x: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-        """Hessian of the constraints weighted by their multipliers (n_g,), shape (n, n)."""
+        """Compute the Hessian of the constraints weighted by their multipliers (n_g,), shape (n, n)."""
         h, free = np.zeros((len(x), len(x))), np.flatnonzero(self.problem.free)
         if self._weighted_curvature is not None:
             dense = np.asarray(
@@ -237,12 +236,12 @@ class Scaled:
         return h
 
     def multipliers(self, lam_x: np.ndarray, lam_g: np.ndarray) -> np.ndarray:
-        """Multipliers of the bounds and constraints of the problem itself, shape (n + n_g,)."""
+        """Return the multipliers of the bounds and constraints of the problem itself, shape (n + n_g,)."""
         return self.unit * np.concatenate([lam_x * self.s, lam_g / self.g_unit])
 
 
 def _fill_zero_columns(squares: np.ndarray, labels: tuple[str, ...], start: np.ndarray, unit: float) -> np.ndarray:
-    """Give columns that vanish at both points the median norm of their parameter, else one that fits their value."""
+    """Give columns that vanish at both points the median norm of their parameter, else a norm from the start value."""
     names, out = np.array([label.split("[")[0] for label in labels]), squares.copy()
     for name in set(names[~(squares > 0)]):
         alike = names == name
@@ -302,7 +301,9 @@ class Ipopt:
                     f"IPOPT rejects the option {name!r} with the value {value!r}; see its list of options."
                 ) from None
 
-    def solve(self, problem: Problem, start: np.ndarray | None = None, progress: Progress | None = None) -> Solution:
+    def solve(
+        self, problem: Problem, start: np.ndarray | None = None, progress: IterationCallback | None = None
+    ) -> Solution:
         """Minimise from `start` (n,), by default the problem's own."""
         return _Run(self, problem, problem.start if start is None else start, progress).run()
 
@@ -310,7 +311,7 @@ class Ipopt:
 class _Run:
     """One solve: the last point evaluated and the best one."""
 
-    def __init__(self, options: Ipopt, problem: Problem, start: np.ndarray, progress: Progress | None) -> None:
+    def __init__(self, options: Ipopt, problem: Problem, start: np.ndarray, progress: IterationCallback | None) -> None:
         self.options, self.problem, self.progress = options, problem, progress
         self.theta = np.clip(np.asarray(start, dtype=float), problem.lower, problem.upper)
         self.cost, self.violation = np.inf, np.inf
@@ -456,9 +457,9 @@ class _Run:
         barrier = float(np.sum(np.abs(multipliers * np.where(np.isfinite(gap), gap, 0.0)))) * scaled.unit
         span = options.patience * (1 if options.hessian == "gauss-newton" else QUASI_NEWTON_PATIENCE)
         recent = [entry.cost for entry in self.history[-1 - span :]]
-        calm = len(recent) > span and max(recent) - min(recent) < options.tolerance * cost
+        settled = len(recent) > span and max(recent) - min(recent) < options.tolerance * cost
         feasible = np.max(np.abs(scaled.excess(g)), initial=0.0) <= FEASIBLE_VIOLATION
-        if calm and feasible and barrier < 10 * options.tolerance * cost:
+        if settled and feasible and barrier < 10 * options.tolerance * cost:
             self.stopped = self.stopped or Status.CONVERGED
         return [int(self.stopped is not None)]
 
@@ -483,15 +484,13 @@ class _Run:
         self.multipliers[: problem.size][inside] = 0.0  # the barrier leaves small values there
 
     def _solution(self, status: Status, message: str) -> Solution:
-        g = self.problem.constraint(self.theta) if len(self.problem.g_lower) else np.zeros(0)
-        violation = np.maximum(self.problem.g_lower - g, g - self.problem.g_upper)
         return Solution(
             theta=self.theta,
             cost=self.cost,
             status=status,
             iterations=max(len(self.history) - 1, 0),
             seconds=time.perf_counter() - self.began,
-            violation=float(np.max(violation, initial=0.0)),
+            violation=float(np.max(self.problem.excess(self.theta), initial=0.0)),
             multipliers=self.multipliers,
             history=tuple(self.history),
             message=message,

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import casadi as ca
@@ -33,7 +34,7 @@ T = TypeVar("T")
 # slowly, so samples are not independent; calibrated on fits of the rig (problems.initial_state)
 STATE_NOISE = 0.2
 STATE_SAMPLES = 256  # states of a run from which second moments are computed
-STILL_STATE = 1e-3  # least deviation of a state, relative to the largest of its kind
+STILL_STATE = 1e-3  # least deviation of a state (or memory), relative to the largest deviation of a state (memory)
 LEAST_CORRELATION_VARIANCE = 1e-6  # added to the diagonal of the correlation matrix
 MOST_WRITTEN_PERIODS = 50  # most periods that `to_nlp` writes out before a recording in steady state
 AT_LIMIT = 1e-7  # distance from a limit, in units of a constraint, up to which the constraint is active
@@ -44,9 +45,9 @@ STRETCH_ENTRIES = 2_000_000  # entries of the Jacobian kept in memory at a time 
 class PlacedRecording:
     """Recording with its place in the problem.
 
-    `first` is the first of its variables, where its initial state is estimated; `state` (n_state,) its first state;
-    `drive` its inputs; `scale` (n_y,) the divisors of its residuals. `steady` says whether it begins at the fixed point
-    of its period, of `period` rows of the drive.
+    `first` is the index of its first variable, or None unless its initial state is estimated; `state` (n_state,) its
+    first state; `drive` its inputs; `scale` (n_y,) the divisors of its residuals; `scored` the mask of the samples that
+    count, None for all. `steady` tells whether it begins in the steady state of its period, of `period` drive rows.
     """
 
     recording: Recording
@@ -65,7 +66,7 @@ class PlacedRecording:
         return len(self.recording) - skip if self.scored is None else int(np.sum(self.scored[skip:]))
 
     def rows(self, a: int, b: int) -> slice | Array:
-        """Select the scored ones of the samples from a to b, counted from a."""
+        """Select the scored samples among those from a to b; indices count from a."""
         cut = min(max(self.recording.skip - a, 0), b - a)
         return slice(cut, b - a) if self.scored is None else cut + np.flatnonzero(self.scored[a + cut : b])
 
@@ -156,9 +157,9 @@ class Penalties:
 def state_precision(engine: Engine, drive: Array, p: Array, n_x: int, n_s: int) -> Array | None:
     """Compute the prior precision (n_state, n_state) of an initial state with memory, in units of the outputs.
 
-    The prior is `N(0, S)`. S holds the second moments of the states that a run from rest on the same inputs passes
-    through, so an operator that this run does not move begins at rest, and states and memories are correlated as they
-    are in motion. The prior is weighed against errors of `STATE_NOISE` per sample. None if the run diverges.
+    The prior is `N(0, S)`. S holds the second moments of the states in a run from rest on the same inputs. So an
+    operator that this run does not move begins at rest, and states and memories are correlated as they are in motion.
+    The prior is weighed against errors of `STATE_NOISE` per sample. None if the run diverges.
     """
     state, found = np.zeros(n_x + n_s), []
     with np.errstate(over="ignore", invalid="ignore"):
@@ -201,7 +202,7 @@ class Problem:
     weights : sequence of float, optional
         One per recording, which multiplies its residuals (see `periods.noise_weights`). The mean still divides by R.
     scored : sequence of bool array (M,), optional
-        One per recording: the samples whose errors count, among those after `skip`. All are simulated.
+        One per recording: the samples after `skip` whose errors count. All samples are simulated.
 
     Attributes
     ----------
@@ -211,7 +212,7 @@ class Problem:
     Raises
     ------
     InputError
-        If model and recordings do not fit each other, or nothing is left to estimate.
+        If model and recordings do not fit each other, or the problem has no variable.
     """
 
     def __init__(
@@ -264,10 +265,13 @@ class Problem:
         self._constrain(tuple(constraints))
 
     def _constrain(self, constraints: tuple[Constraint, ...]) -> None:
+        """Set the constraints, with the names, limits and entries of their rows in g."""
         self.constraints = constraints
         self.rows = Rows(constraints, self.model.parameters)
         self.g_lower, self.g_upper, self.g_labels = self.rows.lower, self.rows.upper, self.rows.labels
         self.g_sizes = self.rows.sizes
+        self.g_slices = [slice(a, b) for a, b in pairwise(np.cumsum([0, *self.g_sizes]))]
+        self.g_exact = np.repeat([c.exact for c in constraints], self.g_sizes).astype(bool)
 
     def with_constraints(self, constraints: Sequence[Constraint]) -> Problem:
         """Return the same problem under other constraints."""
@@ -331,8 +335,8 @@ class Problem:
 
     def _first_slope(self, part: PlacedRecording) -> Array:
         """Return the slope of a recording's first state by the free parameters and, if it is unknown, by itself."""
-        n_state, wide = self.model.n_state, part.first is not None or part.steady
-        return np.hstack([np.zeros((n_state, self.n_free)), np.eye(n_state)[:, : n_state * wide]])
+        n_state, unknown = self.model.n_state, part.first is not None or part.steady
+        return np.hstack([np.zeros((n_state, self.n_free)), np.eye(n_state)[:, : n_state * unknown]])
 
     def _run(
         self, part: PlacedRecording, theta: Array, state: Array, slope: Array
@@ -364,7 +368,7 @@ class Problem:
             slope = self._first_slope(part)
             if part.steady:
                 run = self._run(part, theta, state, slope)
-                slope = steady_slope(next(behind for *_, behind in run if behind is not None), self.n_free)
+                slope = steady_slope(next(after for *_, after in run if after is not None), self.n_free)
             for e, jac, _ in self._run(part, theta, state, slope):
                 yield e, jac, self._variables(part)
 
@@ -382,11 +386,11 @@ class Problem:
         n_c, after = slope.shape[1], slope
         value, gradient, hessian = 0.0, np.zeros(n_c), np.zeros((n_c, n_c))
         with np.errstate(over="ignore", invalid="ignore"):  # a diverging simulation gives an infinite value
-            for e, jac, behind in self._run(part, theta, state, slope):
+            for e, jac, slope_after in self._run(part, theta, state, slope):
                 value += float(e @ e)
                 gradient += e @ jac
                 hessian += jac.T @ jac
-                after = after if behind is None else behind
+                after = after if slope_after is None else slope_after
             if not part.steady:
                 return value, gradient, hessian
             if not np.all(np.isfinite(after)):
@@ -412,6 +416,11 @@ class Problem:
         """Return the values g(θ) of the general constraints."""
         return self.rows.values(self.parameters(theta))
 
+    def excess(self, theta: Array) -> Array:
+        """Return how far each general constraint lies outside its limits, (n_g,); negative inside."""
+        g = self.constraint(theta)
+        return np.asarray(np.maximum(self.g_lower - g, g - self.g_upper))
+
     def constraint_jacobian(self, theta: Array) -> Array:
         """Compute the Jacobian of `constraint`, shape (n_g, size)."""
         jac = np.zeros((len(self.g_lower), self.size))
@@ -420,11 +429,11 @@ class Problem:
         return jac
 
     def constraint_units(self, theta: Array, squares: Array | None = None) -> Array:
-        """Return the unit of each general constraint, in which its violation is judged, shape (n_g,).
+        """Return the unit in which the violation of each general constraint is judged, shape (n_g,).
 
-        A unit that was not given is the largest change that one variable causes when it moves by its size
-        (`Neighbours`). A variable of size zero moves by what changes the outputs by their own size, according to
-        `squares` (size,), the diagonal of the Gauss-Newton Hessian. The unit is zero if the constraint has no slope.
+        By default it is the largest change that one variable causes when it moves by its size (`Neighbours`). A
+        variable of size zero moves by the step that changes the outputs by their own size, according to `squares`
+        (size,), the diagonal of the Gauss-Newton Hessian. The unit is zero if the constraint has no slope.
         """
         size = Neighbours(self.labels).sizes(theta)
         still = np.ones(self.size) if squares is None else 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0))
@@ -446,7 +455,7 @@ class Problem:
         return [nrmse(r.y, y, r.skip, self.scale) for r, y in pairs]
 
     def to_nlp(self, periods: int | None = None) -> Horizon:
-        """Write the problem as CasADi expressions over the whole horizon, to which you can add costs and constraints.
+        """Write the problem as CasADi expressions over the whole horizon; you can add costs and constraints to them.
 
         Parameters
         ----------
@@ -495,7 +504,7 @@ class Problem:
         )
 
     def _periods_before(self, part: PlacedRecording, periods: int | None) -> int:
-        """Return the periods before a recording in steady state: as given, else those until the start model settles."""
+        """Return the number of periods before a recording in steady state, by default until the start model settles."""
         if not part.steady or periods is not None:
             return (periods or 0) * part.steady
         p, state = self.model.parameters.start, part.state

@@ -11,7 +11,7 @@ import numpy as np
 
 from .._base import InputError, is_number, positive, whole
 from ..models import Model
-from .constraints import TOLERATED, BeyondRadius
+from .constraints import FEASIBILITY_TOLERANCE, RadiusExcess
 from .problem import Problem
 
 
@@ -73,7 +73,7 @@ class Solution:
     violation : float
         Largest violation of the general constraints (0 where they hold).
     multipliers : numpy.ndarray
-        Multipliers of bounds (n,) followed by those of the general constraints (n_g,); positive at an upper limit.
+        Multipliers of the bounds (n,), then of the general constraints (n_g,); positive at an upper limit.
     """
 
     theta: np.ndarray
@@ -89,7 +89,7 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """The result of one start; `drawn` tells whether the start depends on the seed, `nrmse` averages the recordings."""
+    """The result of one start: `drawn` tells whether it depends on the seed, `nrmse` is the mean over recordings."""
 
     seed: int
     model: Model
@@ -101,7 +101,7 @@ class Candidate:
     nrmse: float = np.nan
 
 
-Progress = Callable[[Iteration], None]
+IterationCallback = Callable[[Iteration], None]
 
 
 AT_RADIUS = 1e-3  # share of a bound within which a radius counts as lying at it
@@ -122,8 +122,8 @@ class Limit:
         Value of the expression and its limits (infinite where there is none). For a bound on a spectral radius, the
         radius computed from the eigenvalues of the result, and its bound.
     multiplier : float
-        Decrease of the objective per unit by which the limit is moved outwards; 0 if the limit is not active, nan if
-        the solver gave none or ended at a kink of the error, where no such rate exists.
+        Decrease of the objective per unit by which the limit moves outwards; 0 if the limit is not active, nan if the
+        solver gave none or ended at a kink of the error, where no such rate exists.
     active : bool
         Whether the value is at a limit.
     met : bool
@@ -148,7 +148,7 @@ class Limit:
 
 
 def describe_unknown_multipliers(limits: Sequence[Limit], status: Status) -> str:
-    """Say why multipliers of active constraints are unknown; empty where they are known."""
+    """Explain why multipliers of active constraints are unknown; empty where they are known."""
     names = [
         limit.name for limit in limits if limit.kind == "constraint" and limit.active and np.isnan(limit.multiplier)
     ]
@@ -171,14 +171,14 @@ def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
     if len(problem.g_lower):
         g, low, high = problem.constraint(theta), problem.g_lower, problem.g_upper
         unit = np.maximum(problem.constraint_units(theta), 1e-300)
-        met = np.maximum(low - g, g - high) <= TOLERATED * unit
+        met = problem.excess(theta) <= FEASIBILITY_TOLERANCE * unit
         # a solver may stop a little short of an active limit
-        near = (size[n:] > 0) & (np.minimum(g - low, high - g) <= 10 * TOLERATED * unit)
+        near = (size[n:] > 0) & (np.minimum(g - low, high - g) <= 10 * FEASIBILITY_TOLERANCE * unit)
         active = problem.active_constraints(theta) | near
         checks = [c.check for c, k in zip(problem.constraints, problem.g_sizes, strict=True) for _ in range(k)]
         values = problem.model.parameters.unpack(problem.parameters(theta))
         for i, (name, check) in enumerate(zip(problem.g_labels, checks, strict=True)):
-            if isinstance(check, BeyondRadius):
+            if isinstance(check, RadiusExcess):
                 pushes = not known or bool(size[n + i] > ACTIVE_MULTIPLIER * solution.cost)
                 out.append(_radius_limit(name, check, values, float(size[n + i]), pushes))
                 continue
@@ -191,19 +191,19 @@ def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
     return tuple(out)
 
 
-def _radius_limit(name: str, check: BeyondRadius, values: Mapping[str, Any], force: float, pushes: bool) -> Limit:
+def _radius_limit(name: str, check: RadiusExcess, values: Mapping[str, Any], force: float, pushes: bool) -> Limit:
     """Describe a bound on a spectral radius; `force` is the multiplier of its logarithm, `pushes` whether it counts."""
     excess, bound = check(values), check.radius
-    active = -excess <= AT_RADIUS * bound and (pushes or -excess <= 10 * TOLERATED * bound)
+    active = -excess <= AT_RADIUS * bound and (pushes or -excess <= 10 * FEASIBILITY_TOLERANCE * bound)
     multiplier = force / bound if active else 0.0
     return Limit(name, "constraint", excess + bound, -np.inf, bound, multiplier, active, met=excess <= 0)
 
 
 def check_solver_options(solver: Any) -> None:
-    """Refuse limits of a solver that are no numbers, or below zero."""
+    """Refuse options of a solver that are no numbers, or below zero."""
     for name in ("max_iterations", "patience"):
         whole(getattr(solver, name), name, 0)
     for name in ("tolerance", "damping"):
         positive(getattr(solver, name), name, zero=True)
-    if not is_number(solver.time_limit) or np.isnan(solver.time_limit):  # below zero, no time is left
+    if not is_number(solver.time_limit) or np.isnan(solver.time_limit):  # it may be negative: then no time is left
         raise InputError(f"time_limit={solver.time_limit!r} was given; give a number of seconds.")

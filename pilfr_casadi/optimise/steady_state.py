@@ -1,7 +1,6 @@
-"""Steady states: the state at the beginning of a period that repeats itself.
+"""Periodic steady states: the fixed point `x = Φ(x)` of one period of the input.
 
-It is the fixed point `x = Φ(x)` of one period. A period does not determine the memory of operators that never
-slip in it.
+A period does not determine the memory of operators that never slip in it.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ Array = np.ndarray
 STEADY = 1e-10  # relative change of the state over a period that counts as none
 NEARLY_STEADY = 1e-6  # the same, accepted after the last period
 MOST_PERIODS, PERIODS_PER_NEWTON_STEP = 200, 10  # limit of periods; periods run between two Newton steps
-STILL_MEMORY = 1e-12  # distance of a memory's slope over a period from 1 up to which nothing moves it
+STILL_MEMORY = 1e-12  # deviation of a memory's slope over a period from 1 up to which the memory does not move
 CHUNK_SAMPLES = 512  # samples of a period whose slopes are kept in memory at a time
 
 
@@ -45,17 +44,17 @@ def _newton_step(engine: Engine, period: Array, p: Array, state: Array) -> Array
     if not np.all(np.isfinite(slope)):
         return after
     try:
-        there = state + steady_slope(np.hstack([(after - state)[:, None], slope]), 1)[:, 0]
+        trial = state + steady_slope(np.hstack([(after - state)[:, None], slope]), 1)[:, 0]
     except np.linalg.LinAlgError:
         return after
-    behind = engine.simulate(period, p, there)[1]
-    return there if np.max(np.abs(behind - there)) < np.max(np.abs(after - state)) else after
+    trial_after = engine.simulate(period, p, trial)[1]
+    return trial if np.max(np.abs(trial_after - trial)) < np.max(np.abs(after - state)) else after
 
 
 def steady_slope(after: Array, n: int) -> Array:
     """Compute `(I - Φ_x)^-1 Φ_θ`, (n_state, n), from the slope after one period, whose first n columns belong to θ.
 
-    Memory that nothing moves in a whole period has zero slope.
+    A memory that does not move in the whole period has zero slope.
     """
     size = len(after)
     matrix, right = np.eye(size) - after[:, n:], after[:, :n].copy()

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
         Instant as Instant,
         choose_substeps as choose_substeps,
         discretise as discretise,
+        discretise_for as discretise_for,
         fastest_rates as fastest_rates,
         growth_rate as growth_rate,
         least_substeps as least_substeps,

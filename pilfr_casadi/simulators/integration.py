@@ -429,6 +429,16 @@ def choose_substeps(simulator: Equations, recordings: Sequence[Recording]) -> in
     )
 
 
+def discretise_for(simulator: Equations, recordings: Sequence[Recording]) -> Model:
+    """Discretise on the recordings' grid, with their hold of the inputs (else the simulator's) and enough sub-steps."""
+    holds = {r.hold or simulator.hold or "zero" for r in recordings}
+    if len(holds) > 1:
+        raise InputError(
+            "The recordings differ in `hold`, and a simulator is integrated with one of them; fit them one by one."
+        )
+    return discretise(simulator, recordings[0].dt, holds.pop(), choose_substeps(simulator, recordings))
+
+
 def least_substeps(simulator: Equations) -> int:
     """Return the fewest sub-steps per sample that the simulator and its laws allow; 1 in discrete time."""
     if simulator.discrete:

@@ -18,7 +18,7 @@ from ..data import Recording, conversion
 from ..laws import readable_unit
 from ..models import Parameter, ParameterSet, accumulate_steps
 from .equations import Equations
-from .integration import choose_substeps, discretise
+from .integration import discretise_for
 from .ports import Placed
 
 
@@ -100,13 +100,12 @@ class Simulator(Equations):
         if self.observer is not None:
             factors = [unit_factor(self, recording, name) for name in self.output_names]
             own = own.with_(y=self._select_outputs(own) * factors, outputs=self.output_names)
-        substeps = choose_substeps(self, [own])
-        model = discretise(self, own.dt, own.hold or self.hold or "zero", substeps)
+        model = discretise_for(self, [own])
         drive, start = model.drive(own), np.zeros(model.n_state)
         if not isinstance(own.initial, str):
             start = model.rest_at(np.asarray(own.initial, dtype=float), own.u[0], self.parameter_set.start)
         values = np.broadcast_to(self.parameter_set.start, (len(drive), self.parameter_set.size))
-        return accumulate_steps(model.closed, start, drive, values)[1][::substeps]
+        return accumulate_steps(model.closed, start, drive, values)[1][:: model.substeps]
 
     def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
         """Compute the NRMSE (Krikelis et al. 2024, Eq. 27) of a simulation, averaged over outputs and recordings.

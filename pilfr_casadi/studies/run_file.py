@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from .._base import InputError, existing_file
-from ..models import ANY, HYSTERETIC, LAGGED, PILFR, TAKES, Lagged, Model
+from ..models import ALL_OPTIONS, HYSTERETIC_OPTIONS, LAGGED, PILFR, STRUCTURE_OPTIONS, Lagged, Model
 from ..optimise import Constraint
 from ..simulators import user_variable
 from .schema import (
@@ -230,15 +230,15 @@ def _cell(values: Mapping[str, Any], model: PILFR | Lagged | Model, tables: dict
 
 def _is_linear(model: Mapping[str, Any]) -> bool:
     """Tell whether a [model] table asks for a linear model: no operators."""
-    return TAKES.get(model.get("structure", "lfr")) == HYSTERETIC and model.get("operators") == 0
+    return STRUCTURE_OPTIONS.get(model.get("structure", "lfr")) == HYSTERETIC_OPTIONS and model.get("operators") == 0
 
 
 def _idle_keys(model: Mapping[str, Any], axes: Mapping[str, Sequence[Any]]) -> set[str]:
     """Return the keys that do not matter to a cell: keys of other structures, and keys without effect on its model."""
     structure, out = model.get("structure", "lfr"), set[str]()
-    if "structure" in axes and structure in TAKES:
-        others = {name for s in axes["structure"] for name in TAKES.get(s, ())}
-        out = {k for k in ANY.difference(TAKES[structure]) if k not in axes or k in others}
+    if "structure" in axes and structure in STRUCTURE_OPTIONS:
+        others = {name for s in axes["structure"] for name in STRUCTURE_OPTIONS.get(s, ())}
+        out = {k for k in ALL_OPTIONS.difference(STRUCTURE_OPTIONS[structure]) if k not in axes or k in others}
         if structure in LAGGED:
             of_lfr = ("start", "linear")  # not of a NARX or NOE
             out |= {k for k in of_lfr if k not in axes or not LAGGED.keys() >= set(axes["structure"])}

@@ -32,7 +32,7 @@ from pydantic import (
 
 from .._base import InputError
 from ..identify import BLA_OPTION, DEFAULT_SOLVER, START_KINDS
-from ..models import OPERATORS, PILFR, STRUCTURES, TAKES, Lagged, Model, named_structure
+from ..models import OPERATORS, PILFR, STRUCTURE_OPTIONS, STRUCTURES, Lagged, Model, named_structure
 from ..optimise import Constraint, GaussNewton, Ipopt, check_gain, dc_gain, ordered
 
 # keys of the grid: those of [model] and [solver] that a study varies
@@ -174,7 +174,7 @@ class ModelTable(Table):
     def build(self) -> PILFR | Lagged:
         """Build the model; refuse keys that its structure does not take."""
         given = {key: value for key, value in self if value is not None and key != "structure"}
-        takes = TAKES[self.structure]
+        takes = STRUCTURE_OPTIONS[self.structure]
         if takes[0] not in given:
             raise InputError(f"'{takes[0]}' in [model] is missing; give the number of {SIZE[takes[0]]}.")
         for key in given:

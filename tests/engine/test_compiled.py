@@ -18,7 +18,7 @@ from pilfr_casadi.engine import (
     make_engine,
     source_code,
 )
-from pilfr_casadi.models import NARX, PILFR, Play, PrandtlIshlinskii, reading_output
+from pilfr_casadi.models import NARX, PILFR, Play, PrandtlIshlinskii, read_measured_output
 from problems import speed
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
@@ -257,7 +257,7 @@ def test_many_lags_compile_in_proportion_to_their_code(tmp_path, monkeypatch):
     monkeypatch.setattr(compiled, "cache_directory", lambda: tmp_path)
     sources = []
     for lags in (10, 20):
-        model = reading_output(NARX(lags, 10).structure(1, 1).model(1, 1), 1.0)
+        model = read_measured_output(NARX(lags, 10).structure(1, 1).model(1, 1), 1.0)
         sources.append(source_code(linearize(model)))
     more = len(sources[1]) / len(sources[0])
 

@@ -28,13 +28,13 @@ def rig(k=4.0, **more):
 
 @pytest.fixture(scope="module")
 def moving():
-    """A machine that is moving when the recording begins."""
+    """A machine in motion at the beginning of the recording."""
     rng = np.random.default_rng(0)
     r = Recording(rng.normal(size=400), np.zeros((400, 2)), DT, "force", ("position", "speed"), initial=[2.0, -1.0])
     return r.with_(y=rig().simulate(r), initial="estimate", name="run 3")
 
 
-def test_the_start_is_estimated_for_a_simulator_as_for_a_fit(moving):
+def test_a_simulator_and_a_fit_get_the_same_estimated_start(moving):
     assert rig().nrmse(moving) < 1e-6
     found = pilfr.compare(moving, {"truth": rig(), "refitted": pilfr.fit(rig(5.0), moving), "stiff": rig(5.0)})
     assert found.nrmse["truth"] < 1e-6 and found.nrmse["refitted"] < 1e-4 and found.nrmse["stiff"] > 0.1
@@ -42,7 +42,7 @@ def test_the_start_is_estimated_for_a_simulator_as_for_a_fit(moving):
     np.testing.assert_array_equal(found.simulated["truth"].shape, moving.y.shape)
 
 
-def test_all_are_scored_on_the_samples_that_none_was_started_from(moving):
+def test_no_model_is_scored_on_samples_that_a_start_was_fitted_to(moving):
     big = pilfr.fit(PILFR(nx=6), moving, starts=1)
     alone = pilfr.compare(moving, {"truth": rig()})
     beside = pilfr.compare(moving, {"truth": rig(), "black box": big})
@@ -53,13 +53,13 @@ def test_all_are_scored_on_the_samples_that_none_was_started_from(moving):
     np.testing.assert_allclose(beside.errors["black box"], expected, rtol=1e-9)
 
 
-def test_a_fit_gets_no_state_from_the_whole_of_its_training_recording(moving):
+def test_a_fit_does_not_use_its_state_from_the_training_recording(moving):
     fitted = pilfr.fit(rig(5.0), moving)
     again = pilfr.compare(moving.with_(y=moving.y + 0), {"fit": fitted})
     assert again.nrmse == pilfr.compare(moving, {"fit": fitted}).nrmse
 
 
-def test_a_given_start_is_everybodys_start(moving):
+def test_every_model_begins_at_a_given_state(moving):
     r = moving.with_(initial="zero")
     found = pilfr.compare(r, {"truth": rig()})
     assert found.nrmse["truth"] == pytest.approx(rig().nrmse(r)) and found.recording.skip == 0
@@ -80,7 +80,7 @@ def test_models_of_every_kind_and_channels_in_any_order(moving):
     assert len(found.plot().axes) == 4
 
 
-def test_a_diagnosis_is_judged_on_the_recording_as_it_corrected_it():
+def test_a_diagnosis_is_compared_with_its_corrected_recording():
     d = example()
     r = d.train[0]
     found = pilfr.compare(r, {"as given": rig_of(d), "corrected": d})
@@ -91,7 +91,7 @@ def rig_of(diagnosis):
     return diagnosis.refitted
 
 
-def test_what_diverges_is_said(moving):
+def test_diverging_models_are_reported(moving):
     wild = Simulator(
         lambda x, u: dict(pos=x.vel, vel=u.force + 60.0 * x.pos),
         lambda x: dict(position=x.pos, speed=x.vel),
@@ -113,7 +113,7 @@ def test_what_diverges_is_said(moving):
         (lambda r: r.with_(y=np.column_stack([r.y[:, 0], np.ones(400)])), "the output 'speed' never changes"),
     ],
 )
-def test_what_cannot_be_compared(moving, change, said):
+def test_invalid_comparisons_are_refused(moving, change, said):
     with pytest.raises(InputError, match=said):
         pilfr.compare(change(moving), rig())
     with pytest.raises(InputError, match="No model was given"):

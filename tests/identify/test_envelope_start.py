@@ -1,4 +1,4 @@
-"""Generalized plays start from the envelopes that the recordings show, and reach what plays and stops cannot."""
+"""Generalized plays start from the envelopes in the recordings, and fit loops that plays and stops cannot."""
 
 import numpy as np
 import pytest
@@ -72,7 +72,7 @@ def test_the_outline_of_a_loop_is_its_envelopes():
     assert np.all(np.diff(low) >= 0) and np.all(np.diff(high) >= 0)
 
 
-def test_a_loop_that_runs_the_wrong_way_round_has_no_width():
+def test_a_loop_in_the_other_direction_has_no_width():
     z = drive()
     _, low, high = loop_outline(z[::-1], loop(z)[::-1])
     np.testing.assert_array_equal(low, high)
@@ -99,7 +99,7 @@ def test_the_input_behind_the_linear_model_is_found():
     assert np.sqrt(np.mean((found - want) ** 2)) < 0.02
 
 
-def test_signals_that_fall_with_the_answer_are_turned_over():
+def test_a_falling_signal_changes_its_sign():
     structure = PILFR(2, PrandtlIshlinskii(GeneralizedPlay(3), 4))
     u = drive()[:, None]
     blocks, states = unit_states(LINEAR, [u])

@@ -1,4 +1,4 @@
-"""What a fit says about itself: errors, limits, noise and priors, initial states, what is scored, and interrupts."""
+"""The result of a fit: errors, limits, noise and priors, initial states, scored samples, and interrupts."""
 
 import signal
 from dataclasses import dataclass, field, replace
@@ -20,7 +20,7 @@ SHORT = GaussNewton(max_iterations=3)
 
 @dataclass
 class Watching:
-    """Gauss-Newton that keeps what it was given: each problem, and the cost it started at."""
+    """Gauss-Newton that stores each problem and its cost at the start."""
 
     problems: list = field(default_factory=list)
     costs: list = field(default_factory=list)
@@ -67,7 +67,7 @@ def of_record(truth, record):
 # errors
 
 
-def test_the_searchs_own_prior_is_not_taken_for_knowledge(truth, record):
+def test_the_prior_of_the_search_does_not_shrink_standard_errors(truth, record):
     structure, values, model = truth
     tight = {k: {"prior": (values[k], 1e-4 * np.ones_like(values[k]))} for k in ("w", "r")}
     held = model.with_parameters(model.parameters.change(**tight))
@@ -81,7 +81,7 @@ def test_the_searchs_own_prior_is_not_taken_for_knowledge(truth, record):
         assert found.model.parameters[name].prior is None
 
 
-def test_what_nothing_is_known_about_is_said(of_record):
+def test_undetermined_parameters_are_reported(of_record):
     errors = {"r": np.array([[0.1, np.inf, np.inf]]), "w": np.ones((1, 3))}
     told = replace(of_record, errors=errors, linear_nrmse=(0.25,))
     assert "the data alone do not determine 2 of 3 entries of r" in str(told)
@@ -94,7 +94,7 @@ def test_what_nothing_is_known_about_is_said(of_record):
     assert "the linear model alone, to judge the element by: NRMSE 0.2500" in str(told)
 
 
-def test_the_linear_model_is_judged_as_well(record):
+def test_the_error_of_the_linear_model_is_reported(record):
     found = fit(PILFR(2, PrandtlIshlinskii(Play, 3)), record, starts=1)
     linear = fit(PILFR(2), record)
     assert found.linear_nrmse == pytest.approx(linear.train_nrmse, rel=0.01)
@@ -109,12 +109,12 @@ def test_limits_on_either_side_are_listed(truth, record, low, high, listed):
     _, values, model = truth
     total = float(values["r"][0, 0])
     limit = Constraint(lambda p: p["r"][0, 0], low * total, high * total, name="first threshold")
-    held = model.with_parameters(model.parameters.change(D_zu={"fixed": True}))  # which says what z is measured in
+    held = model.with_parameters(model.parameters.change(D_zu={"fixed": True}))  # which fixes the unit of z
     assert ("first threshold" in fit(held, record, constraints=[limit]).active) is listed
 
 
 @pytest.mark.parametrize("path", ["linear", "refit", "search"])
-def test_the_radius_is_limited_on_every_way(record, of_record, path):
+def test_every_path_of_fit_limits_the_radius(record, of_record, path):
     watching = Watching()
     task = {
         "linear": PILFR(2, fixed={"D_yu": 0.0}),
@@ -145,7 +145,7 @@ def test_a_recording_at_rest_among_others(truth, record):
 # noise and priors
 
 
-def test_a_prior_means_the_same_on_every_way(truth, record):
+def test_a_prior_has_the_same_effect_on_every_path_of_fit(truth, record):
     _, values, model = truth
     mean = values["D_yu"] + 0.1
     pulled = model.with_parameters(model.parameters.change(D_yu={"prior": (mean, 0.05)}))
@@ -160,14 +160,14 @@ def test_a_prior_means_the_same_on_every_way(truth, record):
 
 
 @pytest.mark.parametrize("element", [None, PrandtlIshlinskii(Play, 3)], ids=["linear", "pi-lfr"])
-def test_the_noise_is_what_was_reached(record, element):
+def test_the_noise_is_the_error_reached(record, element):
     watching = Watching()
     structure = PILFR(2, element, priors={"D_yu": (0.5, 0.1)})
     found = fit(structure, record, solver=watching, starts=1)
     last = watching.problems[-1].noise
     assert last == pytest.approx(found.train_nrmse[0], rel=0.1)
     if element:
-        assert watching.problems[0].noise < 0.2  # what the search has reached
+        assert watching.problems[0].noise < 0.2  # the error that the search reached
     fixed = Watching()
     fit(structure, record, solver=fixed, starts=1, noise=0.3)
     assert {p.noise for p in fixed.problems} == {0.3}
@@ -176,7 +176,7 @@ def test_the_noise_is_what_was_reached(record, element):
 # initial states
 
 
-def test_states_are_known_by_recording_and_kind(of_moving, moving, of_record, record):
+def test_states_are_stored_by_recording_and_kind_of_start(of_moving, moving, of_record, record):
     np.testing.assert_allclose(of_moving.initial_state(moving)[:2], X0[:2], rtol=0.2)
     assert not of_moving.initial_state(moving.with_(initial="zero")).any()
     steady = of_moving.initial_state(moving.with_(initial="periodic", period=len(moving)))
@@ -184,7 +184,7 @@ def test_states_are_known_by_recording_and_kind(of_moving, moving, of_record, re
     assert of_record.initial_state(record.with_(initial="estimate")).any()
 
 
-def test_a_fit_starts_again_where_it_ended(of_moving, moving):
+def test_a_refit_starts_where_the_fit_ended(of_moving, moving):
     watching = Watching()
     fit(of_moving, moving, solver=watching)
     assert watching.costs[0] == pytest.approx(of_moving.solution.cost, rel=1e-9)
@@ -193,7 +193,7 @@ def test_a_fit_starts_again_where_it_ended(of_moving, moving):
     assert watching.costs[1] < 1e-3  # from rest it would be more than 0.01
 
 
-def test_only_the_head_tells_the_initial_state(of_record):
+def test_the_initial_state_is_fitted_to_the_first_samples_alone(of_record):
     u, y = simulated(6, 400, X0)
     other = y.copy()
     other[60:] = 7.0
@@ -202,7 +202,7 @@ def test_only_the_head_tells_the_initial_state(of_record):
     assert np.any(one != of_record.initial_state(Recording(u, np.roll(y, 5, axis=0), 0.01)))
 
 
-def test_what_the_state_was_fitted_to_is_not_scored(of_record, of_moving, moving):
+def test_samples_of_the_initial_state_are_not_scored(of_record, of_moving, moving):
     u, y = simulated(6, 400, X0)
     test = Recording(u, y, 0.01)
     assert of_record.scored_from(test) == 60  # ten a state, operators included
@@ -271,12 +271,12 @@ def test_an_interrupt_between_two_solves(record, monkeypatch):
 
 def test_constraints_are_found_by_name(record, truth):
     limit = Constraint(lambda p: ca.sum1(ca.vec(p["w"])), upper=1.0, name="sum of the weights")
-    scales = {name: {"fixed": True} for name in ("D_zu", "D_yw")}  # which leave the weights' own to nothing else
+    scales = {name: {"fixed": True} for name in ("D_zu", "D_yw")}  # which leave the scale of the weights alone free
     model = truth[2].with_parameters(truth[2].parameters.change(**scales))
     assert "sum of the weights" in fit(model, record, constraints=limit).active
 
 
-def test_the_command_line_says_what_is_not_scored(of_record):
+def test_the_command_line_reports_unscored_samples(of_record):
     from pilfr_casadi.cli import describe_test_error
 
     u, y = simulated(6, 400, X0)

@@ -1,4 +1,4 @@
-"""Initial states and memories that are estimated: no worse than known ones where the machine began at rest."""
+"""Estimated initial states and memories: no worse than known ones if the machine began at rest."""
 
 import numpy as np
 import pytest

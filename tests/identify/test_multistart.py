@@ -1,4 +1,4 @@
-"""Multistart with the paper's start: every start is polished, none is lost, and the user's solver has the last word."""
+"""Multistart with the paper's start: every start is polished, and the user's solver makes the last solve."""
 
 from dataclasses import dataclass, field, replace
 
@@ -24,13 +24,12 @@ from pilfr_casadi.identify import (
     unit_states,
 )
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
-from pilfr_casadi.optimise import GaussNewton, Solution, Status
-from pilfr_casadi.optimise.constraints import stability
+from pilfr_casadi.optimise import GaussNewton, Solution, Status, stability_limits
 
 
 @dataclass
 class Counting:
-    """Gauss-Newton that keeps what it was asked and what it gave."""
+    """Gauss-Newton that stores its problems and its solutions."""
 
     solver: GaussNewton = field(default_factory=lambda: GaussNewton(max_iterations=200, tolerance=1e-4))
     given: list = field(default_factory=list)
@@ -48,7 +47,7 @@ def search():
     linear, problem, solution = linear_model(train, model)
     parameters = linear.parameters.at(problem.parameters(solution.theta))
     blocks = {k: p.value for k, p in parameters.items()}
-    return StartSearch(FitContext(train, DEFAULT_SOLVER, stability(model)), model, blocks, start="paper")
+    return StartSearch(FitContext(train, DEFAULT_SOLVER, stability_limits(model, True)), model, blocks, start="paper")
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (1, 2))])
@@ -69,7 +68,7 @@ def test_the_papers_start_is_polished(search, seed):
     np.testing.assert_array_equal(candidate.theta, again.theta)
 
 
-def test_the_users_solver_has_the_last_word(search):
+def test_the_users_solver_makes_the_last_solve(search):
     counting = Counting()
     candidate = explore(replace(search, context=replace(search.context, solver=counting)), 1, np.random.SeedSequence(1))
     assert len(counting.given) == 2
@@ -78,19 +77,19 @@ def test_the_users_solver_has_the_last_word(search):
     assert polish(search, candidate).error <= 1.1 * candidate.error
 
 
-def test_the_limit_with_the_elements_full_slope():
+def test_stability_limits_cover_the_elements_full_slope():
     structure, values = random_lfr(1, nx=3, n_w=2, n=3)
     model = structure.model(1, 1, values)
-    limits = stability(structure)
+    limits = stability_limits(structure, True)
     p = {name: ca.DM(parameter.value) for name, parameter in model.parameters.items()}
     slipping = values["A"] + values["B_w"] @ np.diag(values["w"].sum(axis=1)) @ values["C_z"]
     for limit, matrix in zip(limits, (values["A"], slipping), strict=True):
         radius = np.max(np.abs(np.linalg.eigvals(matrix)))
         assert float(limit.expression(p)) == pytest.approx(np.log(radius), abs=1e-4)
-    assert stability(PILFR(0, PrandtlIshlinskii(Play, 3))) == ()
+    assert stability_limits(PILFR(0, PrandtlIshlinskii(Play, 3)), True) == ()
 
 
-def test_the_users_priors_stay():
+def test_the_density_prior_keeps_the_users_priors():
     structure, values = random_lfr(1, nx=2, n=3)
     structure = replace(structure, priors={"w": (1.0, 0.5)})
     model = multistart.hold_near_density(structure.model(1, 1, values), values, 0.02)
@@ -120,7 +119,7 @@ def test_the_first_starts_place_the_element(search, monkeypatch):
 
     monkeypatch.setattr(multistart, "grid_start", kept)
     monkeypatch.setattr(multistart, "EXPLORE", GaussNewton(max_iterations=1))
-    monkeypatch.setattr(multistart, "KEEP", 0)
+    monkeypatch.setattr(multistart, "MOST_POLISHED", 0)
     search_starts(replace(search, start="grid"), 4, 0, None, lambda *_: None)
     assert places == ["output", "input", "random", "random"]
 
@@ -146,7 +145,7 @@ def test_an_interrupted_polish_ends_with_the_best(search, candidate, monkeypatch
     assert found.error == pytest.approx(min([candidate.error, *errors]), rel=1e-12)
 
 
-def test_priors_are_weighed_against_the_noise_that_is_known(search):
+def test_priors_are_weighed_against_the_known_noise(search):
     model = search.model({})
     assert search.problem(model).noise == 1.0 and replace(search, level=0.2).problem(model).noise == 0.2
     assert replace(search, level=0.2).problem(model, noise=0.1).noise == 0.1

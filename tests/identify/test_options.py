@@ -1,4 +1,4 @@
-"""What a fit was asked with holds for what is made from it: noise and weights of recordings here."""
+"""Fits made from a fit keep its options: here noise and weights of recordings."""
 
 import json
 
@@ -16,7 +16,7 @@ PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 5)
 
 
 class Watching:
-    """Gauss-Newton that keeps the problems it was given."""
+    """Gauss-Newton that stores its problems."""
 
     def __init__(self):
         self.problems = []
@@ -28,7 +28,7 @@ class Watching:
 
 @pytest.fixture(scope="module")
 def records():
-    """Two recordings that do not agree: the gain of the second is larger."""
+    """Two recordings that disagree: the gain of the second is larger."""
     first, second = three_plays(0, 400), three_plays(1, 400)
     return first, second.with_(y=1.1 * second.y, name="second")
 
@@ -43,7 +43,7 @@ def gain(fit, records):
     return float(np.std(fit.simulate(records[1])) / np.std(records[1].y))
 
 
-def test_a_second_fit_stays_where_the_weights_have_led(records, weighted):
+def test_a_refit_keeps_the_weights(records, weighted):
     again = pilfr.fit(weighted, records)
     even = pilfr.fit(weighted, records, weights=(1, 1))
     assert gain(again, records) == pytest.approx(gain(weighted, records), abs=2e-3)
@@ -51,7 +51,7 @@ def test_a_second_fit_stays_where_the_weights_have_led(records, weighted):
     assert again.options.weights == weighted.options.weights and set(even.options.weights.values()) == {1.0}
 
 
-def test_whatever_is_made_from_a_fit_has_its_weights_and_noise(records, weighted):
+def test_fits_made_from_a_fit_have_its_weights_and_noise(records, weighted):
     watching = Watching()
     judged = three_plays(2, 300)
     pilfr.fit(weighted, records, solver=watching)
@@ -65,7 +65,7 @@ def test_whatever_is_made_from_a_fit_has_its_weights_and_noise(records, weighted
         assert problem.noise == 0.2
 
 
-def test_weights_can_be_given_to_whatever_is_made_from_a_fit(records, weighted):
+def test_fits_made_from_a_fit_take_other_weights(records, weighted):
     watching = Watching()
     options = {"weights": (3.0, 1.0), "noise": 0.1, "solver": watching}
     pruned = pilfr.prune(weighted, records, **options)
@@ -74,7 +74,7 @@ def test_weights_can_be_given_to_whatever_is_made_from_a_fit(records, weighted):
     assert list(pruned.options.weights.values()) == [3.0, 1.0] and pruned.options.noise == 0.1
 
 
-def test_weights_belong_to_recordings_whatever_their_order(records, weighted):
+def test_weights_belong_to_recordings_in_any_order(records, weighted):
     watching = Watching()
     pilfr.fit(weighted, records[::-1], solver=watching)
     pilfr.fit(weighted, records[1], solver=watching)
@@ -98,7 +98,7 @@ def test_noise_can_be_estimated_again(records, weighted):
             pilfr.fit(weighted, records, noise=wrong)
 
 
-def test_a_file_keeps_them(records, weighted, tmp_path):
+def test_a_file_keeps_noise_and_weights(records, weighted, tmp_path):
     weighted.save(tmp_path / "m.json")
     loaded = pilfr.load(tmp_path / "m.json")
     assert loaded.options.noise == 0.2

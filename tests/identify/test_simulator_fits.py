@@ -7,6 +7,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Simulator
 from pilfr_casadi._base import InputError
 from pilfr_casadi.engine import make_engine
+from pilfr_casadi.identify import run_simulator
 from pilfr_casadi.laws import Delay
 from pilfr_casadi.simulators import discretise
 
@@ -44,12 +45,26 @@ def test_the_parameters_are_found(record, fitted):
     assert np.isfinite(fitted.errors["k"]) and np.isnan(fitted.errors["m"])
 
 
-def test_a_law_gets_the_substeps_that_it_asks_for_in_a_fit_as_in_a_simulation(record):
+def test_a_fit_and_a_simulation_use_the_substeps_of_a_law(record):
     late = simulator().with_element("actuator:force", Delay({"T": 0.025}))
     found = pilfr.fit(late, record, engine="vm")
     assert found.model.substeps == Delay.substeps > 1
     placed = found.simulator
     assert np.max(np.abs(placed.simulate(record)[:, 0] - found.simulate(record)[:, 0])) < 1e-9 * np.std(record.y)
+
+
+def test_recordings_with_different_holds_are_refused(record):
+    with pytest.raises(InputError, match="differ in `hold`"):
+        pilfr.fit(simulator(), [record, record.with_(hold="linear")], engine="vm")
+
+
+def test_run_simulator_equals_simulate_from_zero(record):
+    placed = simulator().with_element("actuator:force", Delay({"T": 0.025}))
+    for hold in ("zero", "linear"):
+        known = record.with_(hold=hold, initial="zero")
+        matched, y, first = run_simulator(placed, known)
+        np.testing.assert_allclose(y, placed.simulate(known), atol=1e-9 * np.std(record.y))
+        assert (matched.outputs, first) == (record.outputs, record.skip)
 
 
 def test_columns_are_matched_by_name(record, fitted):

@@ -1,4 +1,4 @@
-"""What stands for a simulator: a linear surrogate of a simulation, a control.StateSpace, a fitted PI-LFR."""
+"""Substitutes for a simulator: a linear surrogate of a simulation, a control.StateSpace, a fitted PI-LFR."""
 
 import importlib
 
@@ -77,7 +77,7 @@ def test_modes_are_the_system(seed):
         assert np.max(np.abs(total - expected)) < 1e-8 * np.max(np.abs(expected))
 
 
-def test_the_modal_simulator_answers_as_the_system(seed=3):
+def test_the_modal_simulator_has_the_response_of_the_system(seed=3):
     a, b, c, d = random_system(seed)
     rng = np.random.default_rng(1)
     record = Recording(rng.standard_normal((300, 2)), np.zeros((300, 2)), DT, ("f", "g"), ("x", "y"))
@@ -109,11 +109,11 @@ def simulation(seed=0, m=2000, cubic=0.0, lag=False, hold="zero"):
 
 
 @pytest.mark.parametrize("hold", ["zero", "linear"])
-def test_the_surrogate_finds_the_modes_of_a_simulation(hold):
+def test_a_surrogate_finds_the_modes_of_a_simulation(hold):
     record = simulation(hold=hold)
     simulator, error = surrogate(record)
     assert error < 1e-3
-    assert simulator.hold == hold  # a displacement has no direct feed-through: that tells
+    assert simulator.hold == hold  # a displacement has no direct feed-through, which reveals the hold
     k, m = np.array([[120, -60], [-120, 120.0]]), 2 * np.pi
     expected = np.sqrt(np.sort(np.linalg.eigvals(k))) / m
     found = sorted(float(p.value) for n, p in simulator.parameters.items() if n.endswith(": frequency"))
@@ -135,7 +135,7 @@ def test_a_lag_has_one_real_mode():
 
 @pytest.mark.parametrize("drag", [2.0, 0.1, 0.0])
 def test_a_mass_on_a_rail_is_one_mode(drag):
-    """Two real eigenvalues, one of them zero, are a displacement and its rate, so that friction has where to act."""
+    """Two real eigenvalues, one of them zero, are a displacement and its rate, on which friction can act."""
     a, b, c, d = np.array([[0, 1], [0, -drag]]), np.array([[0.0], [0.5]]), np.array([[1.0, 0.0]]), np.zeros((1, 1))
     sampled = cont2discrete((a, b, c, d), 0.01)[:4]
     u = multisine(2000, f_max=5.0, fs=100.0, rng=np.random.default_rng(0))
@@ -156,7 +156,7 @@ def test_a_simulation_that_is_not_linear_has_a_poor_surrogate():
     assert surrogate_warning(POOR_SURROGATE) == ""
 
 
-def test_the_diagnosis_offers_it_too():
+def test_diagnose_has_the_same_surrogate():
     assert importlib.import_module("pilfr_casadi.diagnose").surrogate is surrogate
 
 
@@ -203,7 +203,7 @@ def test_a_fitted_pilfr_runs_as_it_is():
         as_simulator(found, [record.with_(dt=0.05)])
 
 
-def test_other_things_are_refused():
+def test_other_objects_are_no_simulator():
     for thing in (3, "rig.py", pilfr.Simulator, None):
         with pytest.raises(InputError, match=r"Simulator, a control\.StateSpace"):
             as_simulator(thing)

@@ -40,7 +40,7 @@ def crossing(values, channel):
 
 
 def moved(values, operator, rng, mild=1.0):
-    """The same model in another random gauge, operators and channels in another order; and the change of the state."""
+    """Return the model in a random gauge, with operators and channels in another order, and the map of its state."""
     nx, (n_w, n) = len(values["A"]), values["w"].shape
     general = operator is GeneralizedPlay
     t, _ = np.linalg.qr(rng.normal(size=(nx, nx)))
@@ -136,9 +136,9 @@ def test_the_null_space_of_the_jacobian_is_the_gauge(operator, initial):
     if operator is Play:
         values["r"][0, 0] = 0.0
     u = random_input(5, 400)
-    u[:30] *= np.linspace(0.02, 1.0, 30)[:, None]  # so that memories are kept for a while, each for another
+    u[:30] *= np.linspace(0.02, 1.0, 30)[:, None]  # so that memories stay for a while, each for a different time
     state = np.array([0.05, -0.05, 0.0, 0.0])
-    z = (values["C_z"] @ state[:2] + values["D_zu"] @ u[0]).item()  # the memory lies where the first sample keeps it
+    z = (values["C_z"] @ state[:2] + values["D_zu"] @ u[0]).item()  # the first sample does not move this memory
     state[2:] = z if operator is not GeneralizedPlay else sum(envelope(values, s, 0, z) for s in ("l", "r")) / 2
     model, recording = recorded(structure, values, u, initial=state if initial == "given" else initial)
     problem = Problem(model, recording, engine="vm")
@@ -148,7 +148,7 @@ def test_the_null_space_of_the_jacobian_is_the_gauge(operator, initial):
     held = theta == problem.lower
     tangents = gauge_tangents(problem, theta, structure, held)
     expected = {Play: 4 + 2 + 1, Stop: 4 + 2, GeneralizedPlay: 4 + 5}[operator]
-    if initial == "given":  # a state that is not to move leaves the transformations that keep it
+    if initial == "given":  # a given state leaves only the transformations that keep it
         expected -= 2 + 1
     if initial == "zero" and operator is GeneralizedPlay:
         expected -= 1  # an offset needs another initial state
@@ -252,8 +252,8 @@ def test_monte_carlo_of_a_pi_lfr(colour):
     assert well_spread(pivots)
 
 
-def test_white_noise_is_not_taken_for_coloured():
-    """Forty parameters in a narrow band leave a notch in the residual, which is not a property of the noise."""
+def test_white_noise_is_not_mistaken_for_coloured():
+    """Forty parameters in a narrow band leave a notch in the residual that is not in the noise."""
     structure, values = random_lfr(18, nx=8, n=4)
     u = random_input(18, 600)
     u = np.cumsum(np.cumsum(u, axis=0), axis=0)
@@ -310,7 +310,7 @@ def test_errors_of_invariants_do_not_depend_on_the_gauge():
 
 
 def test_scale_invariance():
-    """In other units of one parameter its error is in those units; the metric knows the scales."""
+    """The error of a parameter follows its unit."""
     structure, values = random_lfr(13, nx=2, n=2)
     u = random_input(13, 300)
     model, recording = recorded(structure, values, u, noise=0.05, initial="zero")
@@ -337,8 +337,8 @@ def test_bounds_and_fixed_entries_have_no_error():
     assert np.all(covariance(problem, theta)[0] == 0)
 
 
-def test_what_hardly_counts_is_not_moved_to_a_bound_where_it_counts():
-    """The slope of a saturated neuron is nearly blind where it is, and not so at its bound."""
+def test_a_variable_that_matters_at_its_bound_is_not_moved_there():
+    """The slope of a saturated neuron has almost no effect at its value, but has one at its bound."""
     parameters = ParameterSet(
         {
             "gain": Parameter(1e-12, bounds=(0, 9)),
@@ -396,7 +396,7 @@ def test_a_constraint_that_only_fixes_the_gauge_changes_no_invariant():
     np.testing.assert_allclose(tied.constraint_jacobian(tied.start) @ matrix, 0.0, atol=1e-12)
 
 
-def test_what_the_data_leaves_open_is_infinite():
+def test_undetermined_parameters_have_infinite_errors():
     structure, values = random_lfr(14, nx=2, n=3)
     values["r"][0] = [0.2, 50.0, 0.7]  # the second play never moves
     values["r"][0, 2] = 0.7
@@ -410,7 +410,7 @@ def test_what_the_data_leaves_open_is_infinite():
     assert np.isfinite(errors["A"]).all()
 
 
-def test_two_equal_operators_are_not_told_apart():
+def test_two_equal_operators_have_infinite_errors():
     structure, values = random_lfr(15, nx=2, n=3)
     values["r"][0], values["w"][0] = [0.5, 0.5, 1.0], [0.3, 0.3, 0.4]
     u = random_input(15, 300)
@@ -423,7 +423,7 @@ def test_two_equal_operators_are_not_told_apart():
     assert np.isfinite(errors["C_y"]).all()
 
 
-def test_a_gauge_that_nobody_named_gives_infinite_errors():
+def test_a_gauge_without_generators_gives_infinite_errors():
     structure, values = random_lfr(16, nx=2, n=2)
     u = random_input(16, 300)
     model, recording = recorded(structure, values, u, noise=0.01, initial="zero")
@@ -435,13 +435,13 @@ def test_a_gauge_that_nobody_named_gives_infinite_errors():
     np.testing.assert_allclose(without["D_yu"], standard_errors(problem, problem.start, structure)["D_yu"], rtol=1e-6)
 
 
-def test_fewer_samples_than_parameters_is_not_a_crash():
+def test_fewer_samples_than_parameters_give_infinite_errors():
     problem = oscillator(2e-3, 0, length=3, initial="estimate", model=spring(m={"fixed": False}))
     errors = standard_errors(problem, problem.start)
     assert all(np.all(np.isnan(e) | np.isinf(e)) for e in errors.values())
 
 
-def test_a_prior_counts_as_the_problem_weighs_it():
+def test_a_prior_counts_with_its_weight_in_the_problem():
     plain, held = oscillator(2e-3, 0), oscillator(2e-3, 0, model=spring(k={"prior": (40.0, 1e-3)}))
     loose = Problem(
         held.model, held.recordings, engine=held.engine, noise=float(np.sqrt(np.mean(held.residual(held.start) ** 2)))
@@ -451,8 +451,8 @@ def test_a_prior_counts_as_the_problem_weighs_it():
     assert standard_errors(plain, plain.start)["k"] > 10 * errors["k"]
 
 
-def test_outputs_with_noises_of_their_own():
-    """Two outputs that share no parameter: each has the errors it would have alone."""
+def test_outputs_may_have_different_noise():
+    """Two outputs without common parameters have the same errors as each alone."""
     structure, values = random_lfr(17, nx=0, n_u=1, n_y=2, n_w=0)
     u = random_input(17, 500)
     model = structure.model(1, 2, values)

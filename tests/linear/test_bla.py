@@ -1,4 +1,4 @@
-"""BLA: exact on noise-free linear data, variances as Monte-Carlo finds them, several inputs, units, bad input."""
+"""BLA: exact on noise-free linear data, variances checked by Monte Carlo, several inputs, units, bad input."""
 
 import control
 import numpy as np
@@ -68,7 +68,7 @@ def test_robust_bla_is_exact_for_a_noise_free_linear_system(n_u):
     assert np.max(bla.var_total) < 1e-24
 
 
-def test_variances_that_cannot_be_told_are_none():
+def test_unknown_variances_are_none():
     rng, model = np.random.default_rng(0), system()
     u = [multisine(64, np.arange(1, 20), rng)[:, None] for _ in range(2)]
     one = robust_bla(periodic(u[0], steady(model, u[0]), 1))
@@ -182,7 +182,7 @@ def random_recordings(model, lengths, rng, noise=0.0):
 
 @pytest.mark.parametrize(("n_u", "lengths"), [(1, [2000]), (2, [2000]), (1, [1500, 1100, 700]), (3, [2000, 1200])])
 def test_plain_bla_removes_leakage(n_u, lengths):
-    """The bias of quadratics over some ten lines, and nothing of the leakage that a ratio of spectra would show."""
+    """Only the bias of quadratics over some ten lines remains, none of the leakage of a ratio of spectra."""
     rng, model = np.random.default_rng(4), system(n_u, 2)
     recordings = random_recordings(model, lengths, rng)
     bla = plain_bla(recordings)
@@ -219,7 +219,7 @@ def test_plain_bla_averages_periods_and_agrees_with_the_robust_one():
 
 
 def test_plain_bla_trusts_a_recording_by_its_periods():
-    """One noisy period and sixteen of them: 1/17 of the variance of one, where equal trust would leave a quarter."""
+    """One noisy period and sixteen of them have 1/17 of the variance of one; equal weights would leave a quarter."""
     rng, model, lines = np.random.default_rng(11), system(), np.arange(1, 1000)
     squares = []
     for _ in range(8):
@@ -231,7 +231,7 @@ def test_plain_bla_trusts_a_recording_by_its_periods():
     assert both < 0.1 * alone
 
 
-def test_plain_bla_returns_few_frequencies_and_leaves_out_what_is_not_excited():
+def test_plain_bla_returns_few_frequencies_and_only_excited_ones():
     rng, model = np.random.default_rng(9), system()
     u = np.fft.irfft(np.where(np.arange(1001) < 400, np.fft.rfft(rng.standard_normal(2000)), 0), 2000)[:, None]
     r = Recording(u, simulate_lti(model, u), DT)
@@ -251,10 +251,10 @@ def test_plain_bla_does_not_depend_on_units():
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_plain_bla_warns_of_a_tone_with_leakage(noise):
-    """Beside its line a tone is leakage, and the residual does not tell: without noise it is next to nothing."""
+    """Beside its line a tone is leakage. The residual does not show it: without noise it is almost zero."""
     u = np.sin(2 * np.pi * 7.77 * DT * np.arange(2000))[:, None]
     y = simulate_lti(system(), u) + noise * np.random.default_rng(0).standard_normal(u.shape)
-    with pytest.warns(RuntimeWarning, match=r"the input 'u' cannot be told from leakage .* `period` set\.$") as found:
+    with pytest.warns(RuntimeWarning, match=r"the input 'u' is mostly leakage .* `period` set\.$") as found:
         bla = plain_bla(Recording(u, y, DT))
     assert len(found) == 1 and found[0].filename == __file__
     true = frequency_response(system(), bla.frequency)
@@ -270,7 +270,7 @@ def test_plain_bla_warns_of_noise():
         plain_bla(drowned)
 
 
-def test_the_print_says_what_it_holds():
+def test_the_print_of_a_bla():
     rng = np.random.default_rng(0)
     text = repr(robust_bla([cubic(2, rng) for _ in range(3)]))
     assert "59 frequencies" in text

@@ -67,7 +67,7 @@ def test_the_pattern():
 
 
 @pytest.mark.parametrize("nx", [0, -1, 2.5, True, "3"])
-def test_orders_that_are_none(nx):
+def test_invalid_orders_are_refused(nx):
     with pytest.raises(InputError, match=r"the number of states nx is .*; give a whole number, 1 or more"):
         modal(nx)
 
@@ -94,7 +94,7 @@ def records():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("build", [lambda n: PILFR(n, PrandtlIshlinskii(Play, 3)), lambda n: PILFR(n), "hammerstein"])
-def test_fits_are_as_good_as_with_everything_free(build):
+def test_fits_are_as_good_as_with_a_free_matrix(build):
     full = hammerstein(3, PrandtlIshlinskii(Play, 3)) if build == "hammerstein" else build(3)
     train, test = records()
     one = fit(full, train, starts=1)

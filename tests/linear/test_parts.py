@@ -41,7 +41,7 @@ def linear_run(part, u):
 
 @pytest.mark.parametrize("threshold", [1.0, 0.0])
 @pytest.mark.parametrize("operator", [Play, Stop])
-def test_small_and_large_motions_are_what_the_model_does_there(operator, threshold):
+def test_small_and_large_motions_match_simulations(operator, threshold):
     model = PILFR(2, PrandtlIshlinskii(operator, 2)).model(1, 1, {**VALUES, "r": [[threshold, 2.0]]})
     parts = linear_parts(model, DT)
     u = np.random.default_rng(0).normal(size=60)

@@ -32,7 +32,7 @@ def random_system(nx, n_u, n_y, rng, radius=0.95):
 
 
 def response_error(model, true):
-    """Largest error of the response on a grid of its own, over the largest response."""
+    """Compute the largest error of the response on another grid, over the largest response."""
     reference = frequency_response(true, GRID)
     return np.max(np.abs(frequency_response(model, GRID) - reference)) / np.max(np.abs(reference))
 
@@ -81,7 +81,7 @@ def test_time_subspace_recovers_a_model_from_its_records(nx, n_u, n_y, seed):
 
 @pytest.mark.parametrize("band", [(0.0, 1.5), (1.0, 2.5)])
 def test_a_narrow_band_is_enough(band):
-    """Powers of z would be dependent to rounding there; orthonormal polynomials are not."""
+    """Powers of z would be dependent up to rounding there; orthonormal polynomials are not."""
     rng = np.random.default_rng(3)
     true = random_system(4, 1, 1, rng)
     bla = exact_bla(true, np.linspace(*band, 60))
@@ -123,7 +123,7 @@ def test_an_offset_of_each_recording_is_left_out():
     assert response_error(time_subspace(recordings, 3), true) > 1e-2
 
 
-def test_matrices_are_those_of_the_model():
+def test_subspace_matrices_equal_the_model():
     rng = np.random.default_rng(5)
     recordings = records(random_system(3, 2, 1, rng), [300], rng, noise=0.1)
     model = time_subspace(recordings, 3)
@@ -157,7 +157,7 @@ def test_reflection_keeps_the_gain_of_an_unstable_pole():
     np.testing.assert_allclose(model.A, [[0.8]], rtol=1e-9)
 
 
-def test_weights_use_the_frequencies_that_are_certain():
+def test_weights_favour_certain_frequencies():
     rng = np.random.default_rng(8)
     true = random_system(4, 2, 2, rng)
     frequency = np.linspace(0.01, 4.99, 300)
@@ -173,7 +173,7 @@ def test_weights_use_the_frequencies_that_are_certain():
 
 
 def test_a_noisy_output_does_not_spoil_a_clean_one():
-    """The clean output's response is known far better than by its single lines, whatever the other one's noise."""
+    """The noise of the other output hardly affects the response of the clean one."""
     rng = np.random.default_rng(17)
     true = random_system(4, 2, 2, rng)
     frequency = np.linspace(0.01, 4.99, 300)

@@ -1,4 +1,4 @@
-"""Black-box baselines: each recovers a system of its own class, and is a model like any other."""
+"""Black-box baselines: each recovers a system of its class, and works as any other model."""
 
 import json
 import subprocess
@@ -11,7 +11,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError, ordered_digest
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.identify import gauge_tangents, solve_with_early_stopping, split_validation
-from pilfr_casadi.models import reading_output
+from pilfr_casadi.models import read_measured_output
 from pilfr_casadi.optimise import Problem
 
 NOISE = 0.01
@@ -60,7 +60,7 @@ def recordings(model, noise=NOISE, length=1200, process=0.0):
 
 
 def disturbed(model, u, e):
-    """Outputs of a NARX, each with an error that the following ones see."""
+    """Simulate a NARX with an error in each output that enters the following ones."""
     x, p, y = np.zeros(model.n_x), model.parameters.start, np.empty_like(e)
     for k, u_k in enumerate(u):
         y[k] = np.asarray(model.closed(x, u_k, p)[1]).ravel() + e[k]
@@ -128,7 +128,7 @@ def test_derivatives(name, share):
     model = truth(name)
     train = recordings(model, length=60)[0].with_(initial="estimate")
     if share is not None:
-        model = reading_output(model, share)
+        model = read_measured_output(model, share)
     engines = [Problem(model, train, engine=engine) for engine in ("vm", "auto")]
     theta = engines[0].start + 0.05 * np.random.default_rng(1).normal(size=engines[0].size)
     jac, again = (p.jacobian(theta) for p in engines)
@@ -150,10 +150,10 @@ def test_reading_the_output_is_a_regression():
     z = states @ known["C_z"].T + train.u @ known["D_zu"].T
     following = states @ known["A"].T + train.u @ known["B_u"].T
     following += np.tanh(z + known["bias"].ravel()) @ known["B_w"].T
-    read = reading_output(model)
+    read = read_measured_output(model)
     y = make_engine(read, "vm").simulate(read.drive(train), read.parameters.start, np.zeros(read.n_x))[0]
     np.testing.assert_allclose(y[1:], following[:-1, :2] + known["y_0"], atol=1e-12)
-    free = reading_output(model, 0.0)
+    free = read_measured_output(model, 0.0)
     one, two = (
         make_engine(m, "vm").simulate(m.drive(train), m.parameters.start, np.zeros(m.n_x))[0] for m in (model, free)
     )
@@ -207,7 +207,7 @@ def test_a_damaged_network_is_refused(tmp_path):
             pilfr.load(tmp_path / "model.json")
 
 
-def test_the_seed_decides_and_workers_do_not():
+def test_the_seed_decides_the_result_and_workers_do_not():
     train = recordings(truth("NARX"), length=300)[0]
     one = pilfr.fit(pilfr.NARX(2, 3), train, starts=2, seed=3)
     two = pilfr.fit(pilfr.NARX(2, 3), train, starts=2, seed=3, workers=2)
@@ -240,7 +240,7 @@ def test_bad_input():
 # ---- early stopping ----
 
 
-def test_early_stopping_takes_the_best_point_on_what_is_held_back():
+def test_early_stopping_returns_the_best_point_on_validation_data():
     train, _ = recordings(truth("network_lfr"), noise=0.3, length=160)
     structure = pilfr.network_lfr(2, 6)
     model = pilfr.fit(structure, train, starts=1, start="plain", solver=pilfr.GaussNewton(max_iterations=1)).model
@@ -255,7 +255,7 @@ def test_early_stopping_takes_the_best_point_on_what_is_held_back():
     assert found.cost == pytest.approx(problem.cost(found.theta))
 
 
-def test_what_is_held_back():
+def test_split_of_training_and_validation_data():
     one = pilfr.Recording(np.arange(100.0), np.arange(100.0), 0.1, initial="zero", skip=20)
     (kept,), (held,), told = split_validation([one], 0.25)
     assert (len(kept), len(held), held.skip) == (80, 100, 80)
@@ -304,7 +304,7 @@ def test_a_noe_of_a_periodic_recording_whose_start_is_estimated():
 
 
 @pytest.mark.parametrize("wanted", [pilfr.NARX(2, 3), pilfr.NOE(2, 3, validation=0.0), pilfr.ssnn(2, 2)])
-def test_what_ends_at_a_limit_says_what_to_do(wanted):
+def test_a_fit_that_ends_at_a_limit_gives_advice(wanted):
     train = recordings(truth("NARX"), length=400)[0]
     fit = pilfr.fit(wanted, train, starts=1, solver=pilfr.GaussNewton(max_iterations=2))
     assert fit.status is pilfr.Status.MAX_ITERATIONS
@@ -326,7 +326,7 @@ def test_a_noe_of_several_recordings_has_a_state_for_each(tmp_path):
 @pytest.mark.parametrize(
     "options, says", [({"stable": 0.9}, "stable = 0.9"), ({"start": "paper"}, "'paper'"), ({"start": "plain"}, "plain")]
 )
-def test_what_a_lagged_model_would_not_hear_is_refused(kind, options, says):
+def test_options_that_a_lagged_model_ignores_are_refused(kind, options, says):
     train, _ = recordings(truth("NARX"))
     with pytest.raises(InputError, match=f"{says}.*was given for a {kind.__name__}"):
         pilfr.fit(kind(2, 3), train, **options)
@@ -349,7 +349,7 @@ def test_too_many_lags_are_refused_before_the_model_is_built(monkeypatch):
 @pytest.mark.parametrize(
     "wanted, stages", [(pilfr.NARX(2, 2), 1), (pilfr.NOE(2, 2), 4), (pilfr.NOE(2, 2, validation=0.0), 4)]
 )
-def test_every_step_of_a_start_is_told(wanted, stages):
+def test_every_step_of_a_start_is_reported(wanted, stages):
     model = truth("NARX")
     record = recordings(model, length=300)[0]
     seen, told = [], []
@@ -364,7 +364,7 @@ def test_every_step_of_a_start_is_told(wanted, stages):
 
 
 class Own:
-    """A solver of a user's own, which tells nothing."""
+    """A user-defined solver without progress reports."""
 
     def solve(self, problem, start=None):
         """As the package's own."""

@@ -84,7 +84,7 @@ def test_the_gain_of_an_envelope_grows_with_the_amplitude_and_is_in_phase():
 
 
 @given(st.integers(0, 1000))
-def test_what_elements_are_bounded_by_holds(seed):
+def test_bounds_of_elements_hold(seed):
     rng = np.random.default_rng(seed)
     values = some_values(EVERY, seed) | {"envelope_reach": [1.5, 0.7], "products_reach": [0.8, 1.1]}
     z = rng.normal(size=(60, 3)) * rng.uniform(0.1, 5.0)
@@ -110,7 +110,7 @@ def test_bounds_of_a_layer():
 # ---- products ----
 
 
-def test_products_are_the_polynomial_they_say():
+def test_products_are_a_polynomial():
     element = Products(2, (2, 3))
     assert element.terms == ((0, 0), (0, 1), (1, 1), (0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
     rng = np.random.default_rng(0)
@@ -125,7 +125,7 @@ def test_products_are_the_polynomial_they_say():
 # ---- combined ----
 
 
-def test_parts_read_and_write_the_channels_they_say():
+def test_parts_read_and_write_their_channels():
     values, rng = some_values(EVERY), np.random.default_rng(1)
     z = rng.normal(size=(40, 3))
     own = [{k.removeprefix(f"{p.name}_"): v for k, v in values.items() if k.startswith(p.name)} for p in EVERY.parts]
@@ -162,7 +162,7 @@ def test_derivatives_of_a_closed_loop():
         np.testing.assert_allclose(jac[:, :, i], slope, atol=1e-6)
 
 
-# ---- a machine whose resonance falls with the level, two inputs and outputs ----
+# ---- a machine whose resonance frequency falls with the level, with two inputs and outputs ----
 
 
 def machine():
@@ -222,7 +222,7 @@ def disturbed(structure, values, size=0.01):
     }
 
 
-def test_a_combined_machine_is_found_again_in_steady_state(tmp_path):
+def test_a_combined_machine_is_identified_in_steady_state(tmp_path):
     structure, values = machine()
     train = steady_records(structure, values)
     found = fit(structure, train, start=disturbed(structure, values), solver=GaussNewton(max_iterations=80), workers=2)
@@ -230,7 +230,7 @@ def test_a_combined_machine_is_found_again_in_steady_state(tmp_path):
     fresh = steady_records(structure, values, levels=(0.9,))
     assert found.nrmse(fresh) < 5e-3
     linear = fit(PILFR(4, offset=False), train)
-    assert max(linear.train_nrmse) > 0.05  # what the elements are there for
+    assert max(linear.train_nrmse) > 0.05  # the elements are needed
     found.save(tmp_path / "machine.json")
     again = load(tmp_path / "machine.json")
     assert again.structure.element == structure.element
@@ -317,6 +317,6 @@ def test_the_response_is_bounded_and_the_bound_holds():
         (lambda: fit(PILFR(1), steady_records(*machine()), start="near"), "'near' is unknown"),
     ],
 )
-def test_what_cannot_be_combined(make, words):
+def test_invalid_combinations_are_refused(make, words):
     with pytest.raises(InputError, match=words):
         make()

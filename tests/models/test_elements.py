@@ -56,7 +56,7 @@ def test_size_and_bounds(operator):
     np.testing.assert_allclose(p["w"].value.sum(axis=1), 1.0)
 
 
-def test_a_class_and_an_instance_say_the_same():
+def test_a_class_and_an_instance_are_equivalent():
     assert PrandtlIshlinskii(Play, 3) == PrandtlIshlinskii(Play(), 3)
     assert PrandtlIshlinskii(GeneralizedPlay(neurons=5), 3).parameters()["gamma_l_a"].value.shape == (1, 5)
 
@@ -71,7 +71,7 @@ def test_envelopes_start_close_to_the_identity_and_bounded_below():
             assert (p[f"gamma_{side}_{name}"].bounds[0] == 0).all()
 
 
-def test_own_envelopes_bring_their_parameters():
+def test_user_defined_envelopes_have_parameters():
     bent = GeneralizedPlay(
         gamma_l=lambda z, p: p["bend"] * z, gamma_r=lambda z, p: z, extra=ParameterSet({"bend": Parameter(1.5)})
     )
@@ -106,6 +106,6 @@ def test_rounding_is_a_parameter_that_is_fixed_at_zero(z, q, eps):
         (lambda: PrandtlIshlinskii(Play, 2.5), "whole number"),
     ],
 )
-def test_what_cannot_be_an_element(make, words):
+def test_invalid_elements_are_refused(make, words):
     with pytest.raises(InputError, match=words):
         make()

@@ -1,4 +1,4 @@
-"""Calls through buffers give what CasADi gives, over more points than a block and none."""
+"""Calls through buffers equal calls of CasADi, also for more points than a block and for none."""
 
 import casadi as ca
 import numpy as np

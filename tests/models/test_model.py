@@ -1,4 +1,4 @@
-"""Models: one step with a port, closing the loop, and what whole models must have in common."""
+"""Models: one step with a port, closing the loop, and properties of all models."""
 
 import casadi as ca
 import numpy as np
@@ -64,7 +64,7 @@ def test_sizes_and_names():
     assert model.closed.name_out() == ["x_next", "y"]
 
 
-def test_every_function_names_what_it_takes_and_gives():
+def test_functions_have_named_inputs_and_outputs():
     model = random_lfr(0)[0].model(1, 1)
     assert model.step.name_in() == ["x", "u", "w", "p"]
     assert model.port.name_out() == ["z"]
@@ -79,7 +79,7 @@ def test_no_states_at_all():
     np.testing.assert_allclose(run(model, u, state)[0], reference(Play, values, u, state)[0], atol=1e-13)
 
 
-def test_an_open_port_carries_nothing():
+def test_an_open_port_carries_zero():
     parameters = ParameterSet({"a": Parameter(0.5)})
     model = open_model(lambda x, u, w, p: (p["a"] * x + u + w, x), lambda x, u, p: x, parameters, n_x=1, n_u=1, n_w=1)
     y, _ = run(model, np.ones((4, 1)), [0.0])
@@ -100,7 +100,7 @@ def test_closing_a_loop_by_hand(operator, slips):
     assert y.ravel().tolist() == [0.0, 2.0 * (2.5 * slips + 0.5 * (1 - slips))]
 
 
-# ---- what goes wrong ----
+# ---- errors ----
 
 
 def simple(n_w=1, **options):
@@ -110,30 +110,30 @@ def simple(n_w=1, **options):
     )
 
 
-def test_a_port_is_closed_once():
+def test_a_port_cannot_be_closed_twice():
     closed = close_loop(simple(), PrandtlIshlinskii(Play, 2))
     with pytest.raises(InputError, match="closed already"):
         close_loop(closed, PrandtlIshlinskii(Play, 2))
 
 
-def test_an_element_fits_the_port():
+def test_an_element_needs_the_channels_of_the_port():
     with pytest.raises(InputError, match="2 channels, the model's port has 1"):
         close_loop(simple(), PrandtlIshlinskii(Play, 2, channels=2))
 
 
-def test_a_parameter_of_the_element_has_a_name_of_its_own():
+def test_parameters_of_element_and_model_need_different_names():
     parameters = ParameterSet({"w": Parameter(0.5)})
     model = open_model(lambda x, u, w, p: (p["w"] * x, x), lambda x, u, p: x, parameters, n_x=1, n_u=1, n_w=1)
     with pytest.raises(InputError, match="'w' is used twice"):
         close_loop(model, PrandtlIshlinskii(Play, 2))
 
 
-def test_names_are_as_many_as_signals():
+def test_every_signal_needs_a_name():
     with pytest.raises(InputError, match="2 names were given for 1 signals"):
         simple(inputs=("force", "current"))
 
 
-def test_expressions_have_the_sizes_they_say():
+def test_expressions_of_other_sizes_are_refused():
     nothing = ParameterSet()
     with pytest.raises(InputError, match=r"next state has the shape \(1, 1\); expected \(2, 1\)"):
         open_model(lambda x, u, w, p: (x[0], x), lambda x, u, p: x, nothing, n_x=2, n_u=1, n_w=0)
@@ -141,7 +141,7 @@ def test_expressions_have_the_sizes_they_say():
         open_model(lambda x, u, w, p: (x, x), lambda x, u, p: ca.vertcat(x, u), nothing, n_x=1, n_u=1, n_w=1)
 
 
-def test_parameters_are_exchanged_like_for_like():
+def test_other_parameters_are_refused():
     model = simple()
     with pytest.raises(InputError, match="do not match"):
         model.with_parameters(ParameterSet({"b": Parameter(1.0)}))
@@ -170,7 +170,7 @@ def test_plays_and_stops_are_the_same_model(operator, n_u, n_y, n_w, nx):
         np.testing.assert_allclose(value, values[name], atol=1e-14)
 
 
-def test_conversion_to_what_it_is_already_changes_nothing():
+def test_conversion_to_the_same_operator_changes_nothing():
     structure, values = random_lfr(0, operator=Stop)
     same, out = to_stops(structure, values)
     assert same is structure
@@ -195,7 +195,7 @@ def test_conversion_frees_the_blocks_that_take_up_the_slope(build, freed):
     )
 
 
-def test_a_converted_structure_keeps_what_it_can():
+def test_a_converted_structure_keeps_untouched_bounds_and_priors():
     structure, values = random_lfr(
         1, bounds={"B_w": (-1.0, 2.0), "A": (-5, 5), "w": (0, 3)}, priors={"D_yw": (0.5, 0.1)}, fixed={"y_0": 0.25}
     )
@@ -222,7 +222,7 @@ def test_rounded_operators_convert_exactly():
 
 @pytest.mark.parametrize("element", [None, PrandtlIshlinskii(GeneralizedPlay, 2)])
 def test_only_plays_and_stops_have_a_complement(element):
-    with pytest.raises(InputError, match="complement"):
+    with pytest.raises(InputError, match="give a Prandtl-Ishlinskii element of plays or stops"):
         to_stops(PILFR(1, element), {})
 
 

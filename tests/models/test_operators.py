@@ -1,4 +1,4 @@
-"""Stop, play and generalized play: what defines them, the paper's forms with its slips, and derivatives."""
+"""Stop, play and generalized play: defining properties, the paper's forms with its slips, and derivatives."""
 
 import functools
 import itertools
@@ -44,7 +44,7 @@ def run(operator, path, q, r):
 every_operator = pytest.mark.parametrize("operator", [Play, Stop, GeneralizedPlay])
 
 
-# ---- what makes them hysteresis operators ----
+# ---- properties of hysteresis operators ----
 
 
 @given(paths, numbers, thresholds)
@@ -56,7 +56,7 @@ def test_play_plus_stop_is_the_input(path, q, r):
 
 
 @given(paths, numbers, thresholds)
-def test_outputs_stay_where_they_belong(path, q, r):
+def test_outputs_stay_within_their_bounds(path, q, r):
     s, _ = run(Stop, path, q, r)
     v, _ = run(Play, path, q, r)
     assert np.max(np.abs(s)) <= r
@@ -111,7 +111,7 @@ def test_rate_independence(operator, path, q, r, more, repeats):
     inner=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=8),
 )
 def test_wiping_out(operator, path, q, r, a, b, inner):
-    """Madelung: back at the end of a branch, what happened inside it is forgotten."""
+    """Madelung: at the end of a branch, a loop inside it is forgotten."""
     excursion = [min(max(a + (b - a) * share, min(a, b)), max(a, b)) for share in inner]
     before = run(operator, [*path, a, b], q, r)
     after = run(operator, [*path, a, b, *excursion, b], q, r)
@@ -194,14 +194,14 @@ def test_networks_are_monotone_envelopes():
             assert np.all(np.diff(element.envelope(side, z, p, channel)) > 0)
 
 
-def test_own_envelopes_read_the_named_parameters():
+def test_user_defined_envelopes_read_named_parameters():
     element = GeneralizedPlay(gamma_l=lambda z, p: p["slope"] * z, gamma_r=lambda z, p: p["slope"] * z)
     v, q = element.step(2.0, 0.0, 0.5, {"slope": 3.0})
     assert v == q == 5.5
     assert not any(name.startswith("gamma") for name in element.parameters(1))
 
 
-def test_a_network_needs_neurons_in_whole_numbers():
+def test_a_network_needs_a_whole_number_of_neurons():
     for wrong in (-1, 2.5, np.inf, "3", None):
         with pytest.raises(InputError, match=f"An envelope has {wrong!r} neurons; give a whole number"):
             GeneralizedPlay(neurons=wrong)
@@ -347,8 +347,8 @@ def test_at_a_kink_the_operator_sticks(z, r):
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_at_zero_threshold_the_derivative_is_the_one_towards_positive_thresholds(side):
-    """r = 0 is a bound of every fit, reached exactly: the derivative there must be right, not halved."""
+def test_at_zero_threshold_the_derivative_is_one_sided(side):
+    """Fits reach the bound r = 0 exactly; the derivative there must be the one-sided one, not half of it."""
     z, q = 0.75, 0.75 + side * 0.5
     np.testing.assert_array_equal(derivative("play", (z, q, 0.0)), [1.0, 0.0, side])
     np.testing.assert_array_equal(derivative("stop", (z, q, 0.0)), [0.0, 0.0, -side])
@@ -403,7 +403,7 @@ def test_a_rounded_maximum(a, b, eps):
 
 @given(paths, numbers, thresholds, st.floats(1e-3, 2.0))
 def test_bounds_of_a_rounded_play(path, q, r, eps):
-    """One step is off by at most eps/4; a whole record, however long, by at most eps."""
+    """One step is off by at most eps/4, a record of any length by at most eps."""
     exact = rounded = q
     for z in path:
         assert abs(play(z, rounded, r, eps) - play(z, rounded, r)) <= eps / 4 + ULP
@@ -411,7 +411,7 @@ def test_bounds_of_a_rounded_play(path, q, r, eps):
         assert abs(rounded - exact) <= eps + ULP
 
 
-def test_the_bound_of_a_record_is_reached_and_that_of_a_step_is_not_enough():
+def test_a_rounded_play_reaches_the_bound_over_a_record():
     eps = q = 0.5
     for _ in range(2000):  # the same touch again and again: a rounded play creeps out of the band
         q = play(1.0 + 0.5, q, 1.0, eps)
@@ -433,6 +433,6 @@ def test_rounded_play_plus_rounded_stop(z, q, r, eps):
     assert abs(play(z, q, r, eps) + stop(z, q, r, eps) - z) <= ULP
 
 
-def test_the_module_names_what_it_offers():
+def test_names_and_parameters_of_operators():
     assert {k.name for k in (Play(), Stop(), GeneralizedPlay())} == {"play", "stop", "generalized_play"}
     assert op.Play().parameters(3).size == op.Stop().parameters(3).size == 0

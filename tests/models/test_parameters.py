@@ -1,4 +1,4 @@
-"""Parameters: what is checked at the door, and the one layout that numbers and symbols share."""
+"""Parameters: validation, and the layout shared by numbers and symbols."""
 
 import pickle
 
@@ -87,7 +87,7 @@ def test_joining_sets_keeps_the_order():
         a | a
 
 
-def test_names_left_out_keep_their_start():
+def test_other_names_keep_their_start():
     parameters = ParameterSet({"a": Parameter(1.0), "b": Parameter([2.0, 3.0])})
     assert parameters.pack({"b": [5.0, 6.0]}).tolist() == [1.0, 5.0, 6.0]
     assert parameters.pack({"b": [[5.0], [6.0]]}).tolist() == [1.0, 5.0, 6.0]
@@ -125,12 +125,12 @@ def test_sets_travel_between_processes():
         (lambda: Parameter([1.0, 2.0], prior=(np.zeros(3), 1.0)), "The prior of a parameter has the shape"),
     ],
 )
-def test_what_cannot_be_a_parameter(make, words):
+def test_invalid_parameters_are_refused(make, words):
     with pytest.raises(InputError, match=words):
         make()
 
 
-def test_what_a_set_does_not_take():
+def test_invalid_values_of_a_set_are_refused():
     parameters = ParameterSet({"A": Parameter(np.zeros((2, 3)))})
     for call, words in (
         (lambda: parameters.pack({"B": 1.0}), "no parameter 'B'; there are A"),
@@ -144,7 +144,7 @@ def test_what_a_set_does_not_take():
             call()
 
 
-def test_a_set_at_a_vector_keeps_all_but_the_values_and_checks_nothing_twice(monkeypatch):
+def test_a_set_at_a_vector_changes_only_the_values(monkeypatch):
     own = ParameterSet(
         {"k": Parameter(2.0, "N/m", (1.0, 3.0), prior=(2.0, 1.0)), "A": Parameter(np.eye(2), fixed=True)}
     )

@@ -159,7 +159,7 @@ def test_several_channels_in_a_hammerstein_model():
 # ---- values, bounds, priors ----
 
 
-def test_values_move_into_their_bounds_and_fixed_ones_stay():
+def test_values_are_clipped_to_bounds_and_fixed_values_stay():
     structure = PILFR(
         2, PrandtlIshlinskii(Play, 3), fixed={"D_yu": 0.5}, bounds={"w": (0.0, 0.2)}, priors={"A": (0.0, 1.0)}
     )
@@ -173,7 +173,7 @@ def test_values_move_into_their_bounds_and_fixed_ones_stay():
     assert (p["r"].bounds[0] == 0).all()
 
 
-def test_no_bound_of_ones_own_leaves_that_of_the_element():
+def test_infinite_bounds_keep_the_elements_bounds():
     w = PILFR(1, PrandtlIshlinskii(Play, 2), bounds={"w": (-np.inf, 3.0)}).model(1, 1).parameters["w"]
     assert (w.bounds[0] == 0).all() and (w.bounds[1] == 3).all()
     with pytest.raises(InputError, match="'envelope_rate' is 2, but the element's envelope_rate is at least 1e-06 and"):
@@ -194,7 +194,7 @@ def test_no_bound_of_ones_own_leaves_that_of_the_element():
         (lambda: PILFR(2).model(1, 1, {"A": np.eye(3)}), "'A' has the shape"),
     ],
 )
-def test_what_cannot_be_a_structure(make, words):
+def test_invalid_structures_are_refused(make, words):
     with pytest.raises(InputError, match=words):
         make()
 
@@ -234,13 +234,13 @@ NAN = float("nan")
         ({"priors": {"w": (0.0, None)}}, "prior of 'w'; give a pair"),
     ],
 )
-def test_nothing_is_stretched_to_a_shape(given, says):
+def test_values_of_another_shape_are_refused(given, says):
     with pytest.raises(InputError, match=says) as caught:
         PILFR(2, ONE, **given)
     assert str(caught.value).count(". ") == 0
 
 
-def test_shapes_that_data_tells_are_checked_with_it():
+def test_shapes_that_depend_on_data_are_checked_with_the_data():
     structure = PILFR(2, ONE, fixed={"B_u": [[1.0], [0.0]], "A": [[0.9, NAN], [0.0, NAN]]})
     p = structure.model(1, 1).parameters
     assert p["A"].fixed.tolist() == [[True, False], [True, False]] and p["B_u"].fixed.all()
@@ -263,5 +263,5 @@ def test_shapes_that_data_tells_are_checked_with_it():
     ],
     ids=str,
 )
-def test_free_parameters_are_counted_as_the_model_has_them(structure):
+def test_the_count_equals_the_models_free_parameters(structure):
     assert structure.count(2, 3) == int(structure.model(2, 3).parameters.free.sum())

@@ -1,4 +1,4 @@
-"""Constrained and regularized fits: exact to the last digit, multipliers told, sparse where the truth is."""
+"""Constrained and regularized fits: exact limits, multipliers, and sparse results."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ from pilfr_casadi.optimise import (
     stable,
     violated_exact,
 )
-from pilfr_casadi.optimise.constraints import BeyondRadius
+from pilfr_casadi.optimise.constraints import RadiusExcess
 from pilfr_casadi.optimise.exact_limits import point_as_solution
 from problems.constrained import infeasible_sentences, radius, slowest_pole, sparse_plays, stability_table, three_plays
 
@@ -70,12 +70,12 @@ def test_a_result_outside_is_moved_inside_by_a_small_step(record, full):
     assert violated_exact(problem, before.theta) == [limit.name]
     after = move_inside_exact(problem, before)
     assert not violated_exact(problem, after.theta) and after.cost <= before.cost * (1 + 1e-3)
-    assert abs(float(problem.constraint(after.theta)[1]) - _gain(full)) < 1e-6  # the other one is kept
+    assert abs(float(problem.constraint(after.theta)[1]) - _gain(full)) < 1e-6  # the other constraint is still met
     values = problem.model.parameters.unpack(problem.parameters(after.theta))
-    assert np.array_equal(values["r"], full.parameters["r"])  # and so is what is fixed
+    assert np.array_equal(values["r"], full.parameters["r"])  # fixed parameters stay
 
 
-def test_what_no_small_step_can_mend_is_infeasible(record, full):
+def test_a_result_that_no_small_step_moves_inside_is_infeasible(record, full):
     held = full.model.with_parameters(full.model.parameters.change(A={"bounds": (0.75, 1.0)}))
     problem = Problem(held, record, constraints=(stable(0.5, exact=True),))
     solution = pilfr.GaussNewton(max_iterations=30).solve(problem)
@@ -123,8 +123,8 @@ def test_a_known_gain_and_its_multiplier(record):
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_at_a_kink_multipliers_are_not_known(record, tmp_path):
-    """The last step's are those of its damping: they are told in no print, file or report."""
+def test_multipliers_at_a_kink_are_unknown(record, tmp_path):
+    """The multipliers of the last step come from its damping, so no print, file or report shows them."""
     fit = pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=1, constraints=dc_gain(1.1))
     assert fit.status is Status.CONVERGED and "not known" not in str(fit)
     problem = Problem(fit.model, record, constraints=(dc_gain(1.1),))
@@ -139,7 +139,7 @@ def test_at_a_kink_multipliers_are_not_known(record, tmp_path):
     assert "Multipliers are not known (DC gain = 1.1)" in page
 
 
-def test_where_no_solver_has_been_multipliers_are_not_known(record):
+def test_multipliers_are_unknown_where_no_solver_has_stepped(record):
     fit = pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=1, stable=0.7)
     problem = Problem(fit.model, record, constraints=stability_limits(fit.structure, 0.7))
     scaled = point_as_solution(problem, fit.solution.theta, Status.RESTORED)
@@ -157,7 +157,7 @@ def test_a_model_that_diverges_has_not_converged(record):
     assert fit.status is Status.DIVERGES and not fit.status.converged
     assert str(fit).startswith("Failed: the model diverges on the training recordings")
     assert all(len(line) < 300 for line in str(fit).splitlines())
-    offset = record.with_(y=record.y + 1e5 * np.std(record.y))  # an error of 1e5 that is none of its growth
+    offset = record.with_(y=record.y + 1e5 * np.std(record.y))  # a large error without growth of the model
     assert pilfr.fit(pilfr.PILFR(1), offset).status is not Status.DIVERGES
 
 
@@ -185,7 +185,7 @@ def test_ordered_thresholds_are_ordered_exactly(record):
         assert fit.status is not Status.INFEASIBLE
 
 
-def test_limits_that_are_missed_say_so(record, full):
+def test_missed_limits_are_reported(record, full):
     problem = Problem(full.model, record, constraints=(Constraint(lambda p: p["A"], upper=0.1, name="pole"),))
     limit = limits_of(problem, pilfr.GaussNewton(max_iterations=0).solve(problem))[0]
     assert not limit.met and "NOT MET, off by" in str(limit)
@@ -198,7 +198,7 @@ def test_the_report_has_the_limits(record, tmp_path):
     assert "Constraints and active bounds" in page and "DC gain = 1.1" in page and "multiplier" in page
 
 
-def test_known_entries_of_blocks_stay_and_the_rest_is_found():
+def test_known_entries_stay_and_the_others_are_estimated():
     rng = np.random.default_rng(0)
     u = pilfr.multisine(1500, f_max=10.0, fs=100.0, rng=rng)
     amplifier, q, stage, y = 0.0, 0.0, 0.0, np.zeros_like(u)
@@ -244,7 +244,7 @@ def test_the_basis_of_known_entries_is_found():
     assert np.allclose(np.sort(np.linalg.eigvals(found["A"]).real), [-0.2, 0.5, 0.9])
 
 
-def test_pruning_keeps_what_the_model_does(record, full):
+def test_pruning_keeps_the_outputs(record, full):
     penalised = pilfr.fit(full, record, l1={"w": 1e-4})
     small = pilfr.prune(penalised, record)
     n = small.structure.element.n
@@ -255,7 +255,7 @@ def test_pruning_keeps_what_the_model_does(record, full):
         pilfr.prune(pilfr.fit(pilfr.PILFR(1), record), record)
 
 
-def test_pruning_takes_an_estimated_initial_state_along(record):
+def test_pruning_keeps_an_estimated_initial_state(record):
     there = record.slice(200, 1200).with_(initial="estimate")
     full = pilfr.fit(pilfr.hammerstein(1, pilfr.PrandtlIshlinskii(pilfr.Play, 6)), there, starts=1)
     small = pilfr.prune(pilfr.fit(full, there, l1={"w": 1e-4}), there)
@@ -308,24 +308,24 @@ def test_a_path_over_priors(record, full):
         ({"strengths": (True,)}, r"strengths = \(True,\) and"),
     ],
 )
-def test_what_cannot_be_a_path(record, full, options, says):
+def test_invalid_paths_are_refused(record, full, options, says):
     with pytest.raises(InputError, match=says):
         pilfr.regularization_path(full, record, three_plays(7, 1200), **options)
 
 
-def test_a_path_of_what_is_no_fit(record):
+def test_a_path_needs_a_fit(record):
     with pytest.raises(InputError, match=r"A str was given .* give a Fit"):
         pilfr.regularization_path("f", record, three_plays(7, 1200))
     with pytest.raises(InputError, match="give a fit of one"):
         pilfr.prune("f", record)
 
 
-def test_a_fixed_radius_is_told_in_its_own_units(record):
+def test_a_radius_of_fixed_parameters_is_reported_without_the_logarithm(record):
     with pytest.raises(InputError, match=r"'spectral radius <= 1' is infeasible: .* give 2, with limits 0 and 1;"):
         pilfr.fit(pilfr.PILFR(1, PLAYS, fixed={"A": 2.0}), record, starts=1)
 
 
-def test_validation_is_no_training(record, full):
+def test_training_recordings_are_refused_for_validation(record, full):
     with pytest.raises(InputError, match="also a training recording"):
         pilfr.regularization_path(full, record, [record])
 
@@ -347,7 +347,7 @@ def test_validation_is_no_training(record, full):
         (lambda: dc_gain(1, slope="a"), "slope of a dc_gain is a; give a number"),
     ],
 )
-def test_what_cannot_be_known(make, says):
+def test_invalid_known_gains_are_refused(make, says):
     with pytest.raises(InputError, match=says):
         make()
 
@@ -358,7 +358,7 @@ def test_an_exact_equation_is_refused(record, full):
 
 
 def test_the_check_of_a_radius_is_on_eigenvalues():
-    check = BeyondRadius(0.5)
+    check = RadiusExcess(0.5)
     assert check({"A": np.diag([0.5, -0.2])}) <= 0 < check({"A": np.diag([np.nextafter(0.5, 1), 0.0])})
 
 
@@ -391,7 +391,7 @@ def test_a_sparse_fit_halves_the_operators():
         ({"constraints": 3}, "a Constraint"),
     ],
 )
-def test_what_bounds_nothing_is_refused(record, given, says):
+def test_invalid_bounds_on_the_radius_are_refused(record, given, says):
     with pytest.raises(InputError, match=says):
         pilfr.fit(pilfr.PILFR(2, PLAYS), record, starts=1, **given)
 
@@ -414,7 +414,7 @@ def test_a_gain_is_refused_where_its_formula_does_not_hold(record, model, kind):
 
 @pytest.fixture(scope="module")
 def bounded(record):
-    """A fit with a bound and a constraint that hold it, and what the data alone would have gone to."""
+    """Make a fit with an active bound and constraint, and the fit without them."""
     model = pilfr.hammerstein(1, pilfr.PrandtlIshlinskii(pilfr.Play, 6))
     return pilfr.fit(model, record, starts=1, stable=0.78, constraints=[ordered(gap=0.05)])
 
@@ -424,7 +424,7 @@ def holds(fit):
 
 
 @pytest.mark.slow
-def test_what_is_made_from_a_fit_holds_what_the_fit_was_asked_to_hold(record, bounded):
+def test_fits_made_from_a_fit_keep_its_bound_and_constraints(record, bounded):
     assert holds(bounded)
     for fit in (pilfr.fit(bounded, record), pilfr.prune(bounded, record), *thin_operators(bounded, record, 3)):
         assert holds(fit) and fit.options.stable == 0.78
@@ -438,7 +438,7 @@ def test_what_is_made_from_a_fit_holds_what_the_fit_was_asked_to_hold(record, bo
     )
 
 
-def test_what_is_given_wins_over_what_the_fit_was_asked_to_hold(record, bounded):
+def test_new_options_replace_the_options_of_a_fit(record, bounded):
     again = pilfr.prune(bounded, record, stable=0.7)
     assert radius(again) <= 0.7 and np.all(np.diff(again.parameters["r"]) >= 0.05)
     free = pilfr.fit(bounded, record, stable=True, constraints=())
@@ -446,7 +446,7 @@ def test_what_is_given_wins_over_what_the_fit_was_asked_to_hold(record, bounded)
     assert next(limit.name for limit in free.limits if limit.kind == "constraint") == "spectral radius <= 1"
 
 
-def test_a_loaded_fit_keeps_its_bound_and_asks_for_its_constraints(record, bounded, tmp_path):
+def test_a_loaded_fit_keeps_its_bound_and_needs_its_constraints(record, bounded, tmp_path):
     bounded.save(tmp_path / "m.json")
     loaded = pilfr.load(tmp_path / "m.json")
     assert loaded.options.stable == 0.78
@@ -459,7 +459,7 @@ def test_a_loaded_fit_keeps_its_bound_and_asks_for_its_constraints(record, bound
     assert pilfr.load(tmp_path / "free.json").options.stable is False
 
 
-def test_constraints_hold_a_linear_model_without_a_bound_on_its_radius(record):
+def test_a_linear_model_without_a_bound_meets_its_constraints(record):
     gain = float(Gain()({k: ca.DM(v) for k, v in pilfr.fit(pilfr.PILFR(2), record).parameters.items()}))
     fit = pilfr.fit(pilfr.PILFR(2), record, stable=False, constraints=[dc_gain(1.2 * gain)])
     assert float(Gain()({k: ca.DM(v) for k, v in fit.parameters.items()})) == pytest.approx(1.2 * gain, rel=1e-5)

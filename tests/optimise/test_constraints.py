@@ -1,4 +1,4 @@
-"""Constraints: the bound on the spectral radius holds exactly, and expressions of a user's own."""
+"""Constraints: the bound on the spectral radius holds exactly; user-defined expressions."""
 
 import casadi as ca
 import numpy as np
@@ -39,7 +39,7 @@ def test_exactly_known_spectra(seed, n, radius):
 
 
 @given(st.integers(0, 10**6), st.integers(1, 8))
-def test_it_is_tight(seed, n):
+def test_the_bound_is_tight(seed, n):
     matrix = np.random.default_rng(seed).normal(size=(n, n))
     gap = float(log_norm_of_power(ca.DM(matrix))) - log_radius(matrix)
     assert -1e-9 <= gap < 1e-3
@@ -121,7 +121,7 @@ def test_no_constraints():
         ),
     ],
 )
-def test_what_cannot_be_a_constraint(make, words):
+def test_invalid_constraints_are_refused(make, words):
     with pytest.raises(InputError, match=words):
         make()
 
@@ -135,7 +135,7 @@ def test_what_cannot_be_a_constraint(make, words):
         (lambda p: p["A"][5, 5], "cannot be formed"),
     ],
 )
-def test_what_is_no_expression_gets_one_sentence(expression, words):
+def test_invalid_expressions_are_refused_in_one_sentence(expression, words):
     with pytest.raises(InputError, match=words) as refused:
         Rows((Constraint(expression, upper=1.0, name="mine"),), system())
     assert "'mine'" in str(refused.value) and "\n" not in str(refused.value)
@@ -149,7 +149,7 @@ def test_what_is_no_expression_gets_one_sentence(expression, words):
         (lambda p: ca.sqrt(p["y_0"]), "no finite slope"),
     ],
 )
-def test_what_is_no_number_at_the_start_gets_one_sentence(expression, words):
+def test_constraints_without_a_finite_start_are_refused_in_one_sentence(expression, words):
     model = PILFR(1).model(1, 1, {"A": 0.5, "B_u": 1.0, "C_y": 1.0, "D_yu": 0.1})
     record = Recording(np.ones(20), np.ones(20), dt=0.1, initial="zero")
     with pytest.raises(InputError, match=words) as refused:

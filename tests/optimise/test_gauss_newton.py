@@ -1,4 +1,4 @@
-"""Gauss-Newton SQP: what it calls converged, feasible and infeasible, how it damps, and that units do not matter."""
+"""Gauss-Newton SQP: convergence, feasibility, damping, and independence of units."""
 
 import casadi as ca
 import numpy as np
@@ -10,7 +10,7 @@ from pilfr_casadi.identify import fit, linear_model
 from pilfr_casadi.linear import subspace_matrices
 from pilfr_casadi.models import PILFR, Neighbours, Play
 from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, Status, stable
-from pilfr_casadi.optimise.gauss_newton import _Run, _Step, replace_rounding
+from pilfr_casadi.optimise.gauss_newton import Step, _Run, replace_rounding
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def sum_of_thresholds(values, unit=1.0, share=0.5):
 
 
 class Scalar:
-    """A problem in one variable: residual and slope, and the points at which derivatives were asked for."""
+    """A problem in one variable, from its residual and slope; it stores the points of its derivatives."""
 
     lower, upper, g_lower, g_upper = np.full(1, -np.inf), np.full(1, np.inf), np.zeros(0), np.zeros(0)
     start, size, labels = np.zeros(1), 1, ("x",)
@@ -103,12 +103,12 @@ def test_a_correction_leaves_penalty_and_multipliers_alone(case, monkeypatch):
     model, record, _ = case
     curved = Constraint(lambda p: ca.sumsqr(p["C_z"]), 1.0, 1.0)
     problem = Problem(model, record, constraints=(curved,))
-    run = _Run(GaussNewton(), problem, problem.start, None)
+    run = _Run(GaussNewton(), problem, problem.start, None, None)
     run.penalty.weight, run.multipliers = 3.0, np.ones(problem.size + 1)
     run.cost, gradient, hessian = problem.normal(run.theta)
-    wild = _Step(np.zeros(problem.size), np.full(problem.size + 1, 1e9), True)
+    wild = Step(np.zeros(problem.size), np.full(problem.size + 1, 1e9), True)
     monkeypatch.setattr(run, "_step", lambda *_: wild)
-    forward = _Step(0.1 * np.ones(problem.size), np.zeros(problem.size + 1), True)
+    forward = Step(0.1 * np.ones(problem.size), np.zeros(problem.size + 1), True)
     run._judge(forward, hessian, gradient, problem.constraint_jacobian(run.theta))
     assert run.penalty.weight == 3.0 and np.all(run.multipliers == 1.0)
 
@@ -124,7 +124,7 @@ def test_damping_remembers_the_largest_diagonal():
 
 
 class Wavy(Scalar):
-    """A slope down to x = 7 under `0.3 x <= cos x`: in the valley near 2π linear steps do not lead back from."""
+    """A cost that falls towards x = 7 under `0.3 x <= cos x`; linear steps do not leave the valley near 2π."""
 
     g_lower, g_upper, edge = np.full(1, -np.inf), np.zeros(1), 1.2019131
 
@@ -143,10 +143,10 @@ class Wavy(Scalar):
 
 
 @pytest.mark.parametrize("start", [-0.5, -1.0])
-def test_a_run_that_strays_comes_back_to_what_was_feasible(start, monkeypatch):
+def test_a_run_that_strays_returns_to_its_best_feasible_point(start, monkeypatch):
     strays = Wavy(start)
     found = GaussNewton().solve(strays)
-    assert max(strays.points) > 5.0  # it has been to where the constraint cannot be met
+    assert max(strays.points) > 5.0  # the run has visited a region where the constraint cannot be met
     assert found.status is Status.CONVERGED and found.theta[0] == pytest.approx(strays.edge, abs=1e-5)
     assert found.cost == found.history[-1].cost and found.violation <= 1e-9
     monkeypatch.setattr("pilfr_casadi.optimise.gauss_newton.MOST_RETURNS", 0)
@@ -166,10 +166,12 @@ def test_no_limit_ends_a_run_worse_than_a_feasible_point_it_has_seen(most):
     assert there.status is Status.MAX_ITERATIONS and there.theta[0] > 5 and there.cost < found.cost
 
 
-def test_what_only_damping_makes_small_is_no_minimum():
-    wall = Scalar(lambda x: 1.0 if x == 0 else 2.0, lambda x: -1.0)  # every trial is worse, whatever the slope promises
+def test_a_step_that_only_damping_makes_small_is_no_minimum():
+    wall = Scalar(lambda x: 1.0 if x == 0 else 2.0, lambda x: -1.0)  # every trial is worse, against the slope
     stuck = GaussNewton().solve(wall)
-    assert stuck.status is Status.SMALL_STEP and np.all(np.isnan(stuck.multipliers))  # at a kink there are none
+    assert stuck.status is Status.SMALL_STEP and np.all(
+        np.isnan(stuck.multipliers)
+    )  # at a kink multipliers do not exist
     valley = Scalar(lambda x: 1.0 + x**2, lambda x: 2 * x)
     assert GaussNewton().solve(valley).status is Status.CONVERGED
 
@@ -178,9 +180,9 @@ def test_rounding_is_no_sensitivity():
     labels = ("A[0,0]", "A[1,0]", "A[0,1]", "A[1,1]", "D[0,0]", "E[0,0]")
     theta = np.array([0.5, 0.5, 0.5, 0.5, 1e-17, 0.0])
     squares = np.array([1.0, 1e-32, 0.0, 0.1, 1.0, 2.0])
-    # rounding next to its like and by its effect; a tiny value alone is none, nor a zero
+    # rounding is small beside its neighbours and without effect; a tiny value or a zero alone is not rounding
     np.testing.assert_allclose(replace_rounding(squares, theta, Neighbours(labels)), [1.0, 4.0, 4.0, 0.1, 1.0, 2.0])
-    # inputs in units of their own: the smaller column is no rounding
+    # inputs in different units: the smaller column is not rounding
     mixed = replace_rounding(np.array([1e-12, 1e18]), np.array([1e6, 1e-9]), Neighbours(("B[0,0]", "B[0,1]")))
     np.testing.assert_array_equal(mixed, [1e-12, 1e18])
 
@@ -197,8 +199,8 @@ def test_too_high_an_order_without_noise(nx):
     assert found.status is Status.CONVERGED and found.train_nrmse[0] < 1e-9
 
 
-def test_states_that_nothing_excites_are_no_obstacle():
-    """A third state with responses of the size of rounding, and an offset that is far off."""
+def test_states_without_excitation_are_no_obstacle():
+    """A third state whose responses are rounding, and an offset far from its start."""
     turn = 0.9 * np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
     a, b, c = np.zeros((3, 3)), np.array([[1.0], [0.5], [1e-16]]), np.array([[1.0, 0.3, 1e-16]])
     a[:2, :2], a[2] = turn, [1e-16, 2e-16, 0.5]
@@ -219,7 +221,7 @@ def test_an_unstable_system_is_fitted_within_the_limit():
     assert 0.999 < fit(PILFR(1), record).parameters["A"][0, 0] <= 1.0001
 
 
-def test_the_offset_starts_where_the_linear_model_leaves_it():
+def test_the_linear_model_finds_the_offset():
     structure, values = random_lfr(5, nx=2, n_w=0, radius=0.9)
     u = 3.0 + random_input(4, 800)
     silent = Recording(u, np.zeros((800, 1)), 0.1, initial="zero")
@@ -248,7 +250,7 @@ def test_a_double_integrator_is_within_the_limit(seed, offset):
     assert np.max(np.abs(np.linalg.eigvals(found.parameters["A"]))) <= 1 + 1e-4
 
 
-def test_a_cost_of_nothing_is_converged():
+def test_a_cost_of_zero_is_converged():
     nothing = Scalar(lambda x: 1e-13, lambda x: 1e-13)
     found = GaussNewton().solve(nothing)
     assert found.status is Status.CONVERGED and found.iterations == 0

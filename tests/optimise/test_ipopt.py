@@ -1,4 +1,4 @@
-"""`Ipopt` by itself: how it ends, what it returns, units, and the parts it is made of."""
+"""`Ipopt` alone: endings, results, units, and its parts."""
 
 import signal
 from dataclasses import replace
@@ -142,7 +142,7 @@ def test_interrupted_by_a_signal(wiener, monkeypatch, calls):
     np.testing.assert_array_equal(np.clip(found.theta, wiener.lower, wiener.upper), found.theta)
 
 
-def test_what_the_progress_function_raises_is_raised(wiener):
+def test_errors_of_the_progress_function_are_raised(wiener):
     def progress(iteration):
         raise ZeroDivisionError("in the user's function")
 
@@ -150,7 +150,7 @@ def test_what_the_progress_function_raises_is_raised(wiener):
         Ipopt().solve(wiener, progress=progress)
 
 
-def test_infeasible_start_is_mended(wiener):
+def test_an_infeasible_start_becomes_feasible(wiener):
     def slope(p):
         return ca.sum2(p["w"])
 
@@ -278,7 +278,7 @@ def test_callback():
     assert [str(error) for error in caught] == ["negative"]
 
 
-def test_interrupts_of_others_are_left_to_them():
+def test_interrupts_of_other_handlers_are_passed_on():
     called = []
     before = signal.signal(signal.SIGINT, lambda *_: called.append("theirs"))
     try:

@@ -1,4 +1,4 @@
-"""A known DC gain: met beside poles of 1, and told where it holds beyond the recordings alone."""
+"""A known DC gain: met beside poles of 1, and reported where it holds only beyond the recordings."""
 
 import casadi as ca
 import numpy as np
@@ -16,8 +16,8 @@ PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed, gain", [(5, 2.0), (8, 2.0), (10, 2.0), (11, 1.0)])
-def test_a_gain_far_from_the_machines_own_is_met(seed, gain):
-    """Beside a slow pole a gain has immense slopes, at a pole of 1 no value; one start may miss it, another not."""
+def test_a_gain_far_from_the_data_is_met(seed, gain):
+    """Beside a slow pole a gain has immense slopes, at a pole of 1 no value; some starts may miss it."""
     fit = pilfr.fit(pilfr.PILFR(2, PLAYS), coupled_plays(seed), starts=4, constraints=[dc_gain(gain)])
     assert fit.status.converged and all(limit.met for limit in fit.limits)
 
@@ -33,25 +33,27 @@ def test_a_gain_at_an_integrator_has_no_value(record):
     assert penalty.violations(np.array([1.0, 1.0, 1.0, 0.0, 0.0]))[0] == np.inf
 
 
-def test_a_unit_from_beside_a_pole_is_taken_anew(record):
+def test_a_unit_near_a_pole_is_replaced(record):
     model = pilfr.PILFR(1).model(1, 1, {"A": [[1 - 1e-9]], "B_u": [[1.0]], "C_y": [[1.0]]})
     problem = Problem(model, record, constraints=[dc_gain(1.0)])
     penalty, away = ExactPenalty(problem), np.array([0.9, 1.0, 1.0, 0.0, 0.0])
     penalty.measure_units(problem.start, np.ones(problem.size))
-    assert penalty.unit[0] > 1e11 and penalty.violation(away) < 1e-10  # off by 9, and it seems nothing
+    assert (
+        penalty.unit[0] > 1e11 and penalty.violation(away) < 1e-10
+    )  # the gain is off by 9, but the violation looks tiny
     assert penalty.shrink_units(away) and penalty.unit[0] < 200 and penalty.violation(away) > 0.05
     assert not penalty.shrink_units(away)
 
 
 @pytest.mark.parametrize("gain, says", [(1.0, ""), (3.0, "1 of 3 operators never slip in them; within them it is 1.0")])
-def test_a_gain_that_plays_reach_beyond_the_recording_alone_is_told(record, gain, says):
+def test_a_gain_that_plays_reach_only_beyond_the_recording_is_reported(record, gain, says):
     fit = pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=2, constraints=[dc_gain(gain)])
     assert fit.limits[-1].met and (says in str(fit) if says else "beyond the recordings" not in str(fit))
     beyond_z = fit.parameters["r"] > np.max(np.abs(fit.signals(record)["z"]))
     assert np.any(beyond_z & (fit.parameters["w"] > 0.1)) == bool(says)
 
 
-def test_a_gain_that_a_slow_pole_reaches_is_told(record):
+def test_a_gain_that_a_slow_pole_reaches_late_is_reported(record):
     slow = pilfr.PILFR(2, fixed={"A": np.diag([0.8, 1 - 1e-5])})
     known = {"A": slow.fixed["A"], "B_u": [[0.2], [1e-5]], "C_y": [[1.0, 1.0]]}
     problem = Problem(slow.model(1, 1, known), record, constraints=[dc_gain(2.0)])
@@ -85,7 +87,7 @@ def test_which_operators_keep_a_gain_beyond_the_recording(record, operator, slop
 
 
 def two_by_two(n=300):
-    """Two outputs of two inputs without dynamics worth naming."""
+    """Two outputs of two inputs with almost no dynamics."""
     rng = np.random.default_rng(2)
     u, x = rng.normal(size=(n, 2)), np.zeros(2)
     y = np.empty((n, 2))
@@ -95,7 +97,7 @@ def two_by_two(n=300):
     return pilfr.Recording(u, y + 1e-3 * rng.normal(size=y.shape), 0.01, initial="zero")
 
 
-def test_gains_of_several_channels_are_named_and_held_row_by_row():
+def test_gains_of_several_channels_are_named_and_met_row_by_row():
     wanted = np.array([[2.0, 0.4], [-0.2, 1.0]])
     fit = pilfr.fit(pilfr.PILFR(2), two_by_two(), constraints=[dc_gain(wanted, within=1e-3)])
     limits = [limit for limit in fit.limits if limit.name.startswith("DC gain")]
@@ -104,7 +106,7 @@ def test_gains_of_several_channels_are_named_and_held_row_by_row():
     assert np.allclose([limit.lower for limit in limits], wanted.ravel() - 1e-3)
 
 
-def test_what_is_off_by_a_hundredth_of_a_small_limit_is_not_met():
+def test_a_small_limit_is_met_to_less_than_a_hundredth():
     model = pilfr.PILFR(2).model(2, 2, {"A": 0.5 * np.eye(2), "B_u": np.eye(2), "C_y": [[1.0, 0.5], [1.0, 1.0]]})
     gain = np.array([[2.0, 1.0], [2.0, 2.0]])
     gain[0, 1] = 1e-6
@@ -121,7 +123,7 @@ def test_a_gain_of_another_shape_is_refused(value):
         pilfr.fit(pilfr.PILFR(2), two_by_two(), constraints=[dc_gain(value, within=0.1)])
 
 
-def test_a_plain_list_will_do_for_one_output():
+def test_a_plain_list_is_enough_for_one_output():
     record = two_by_two()
     one = pilfr.Recording(record.u, record.y[:, 0], 0.01, initial="zero")
     for value in ([2.0, 0.4], [[2.0, 0.4]]):

@@ -1,4 +1,4 @@
-"""The problem over the horizon: the same numbers as the recursion, and a problem of the user's own on top of it."""
+"""The problem over the horizon: the same numbers as the recursion, and user-defined costs and constraints."""
 
 import casadi as ca
 import numpy as np
@@ -29,7 +29,7 @@ def recordings_of(kind, n_u, n_y, nx):
 
 
 def four_periods_before(r):
-    """A recording in steady state with four more periods before it, which are not scored; others as they are."""
+    """Put four unscored periods before a recording in steady state; return others unchanged."""
     if r.begins != "periodic":
         return r
     u, y = (np.vstack([np.tile(x[: r.period], (4, 1)), x]) for x in (r.u, r.y))
@@ -97,7 +97,7 @@ def _lag():
     return Problem(structure.model(1, 1, {"A": [[0.8]], "B_u": [[0.1]]}), record)
 
 
-def test_any_solver_takes_it():
+def test_any_solver_takes_the_horizon():
     problem = _lag()
     nlp = problem.to_nlp()
     quiet = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes"}}
@@ -125,7 +125,7 @@ def test_constraint_on_a_simulated_output_and_a_cost_of_ones_own():
     after = problem.simulate(theta)[0]
     assert limit - 1e-4 < after.max() <= limit + 1e-6
     assert problem.cost(theta) > problem.cost(free)
-    # the own cost pulls the pole to where it wants it
+    # the user's cost pulls the pole to its target
     plain = ca.nlpsol("plain", "ipopt", {**program, "f": nlp.f}, quiet)
     without = np.asarray(plain(x0=nlp.x0, lbx=nlp.lbx, ubx=nlp.ubx, **limits)["x"]).ravel()
     pole = problem.labels.index("A[0,0]")

@@ -85,7 +85,7 @@ def test_recordings_count_by_their_scored_samples():
 
 
 @every_recording
-def test_initial_states_are_what_the_recording_says(kind):
+def test_initial_states_follow_the_recording(kind):
     recordings = RECORDINGS[kind]()
     p, _ = problem(recordings)
     theta = somewhere(p)
@@ -162,7 +162,7 @@ def test_stretches_of_any_length_give_the_same(kind, numbers, monkeypatch):
     np.testing.assert_array_equal(p.jacobian(theta), jac)
 
 
-def test_what_is_skipped_is_simulated_but_does_not_count():
+def test_skipped_samples_are_simulated_but_do_not_count():
     r = recording(0, skip=30, initial="zero")
     other = r.with_(y=np.concatenate([r.y[:30] + 100.0, r.y[30:]]))
     a, b = problem(r)[0], problem(other)[0]
@@ -172,7 +172,7 @@ def test_what_is_skipped_is_simulated_but_does_not_count():
     np.testing.assert_array_equal(whole.residual(a.start)[30:], a.residual(a.start))
 
 
-def test_samples_that_are_not_scored_are_simulated_but_do_not_count():
+def test_unscored_samples_are_simulated_but_do_not_count():
     r = recording(0, skip=5, n_y=2, initial="estimate")
     keep = np.random.default_rng(3).random(len(r)) > 0.4
     whole, _ = problem(r, n_y=2)
@@ -203,7 +203,7 @@ def test_a_prior_of_initial_states_runs_whole_samples():
     assert sum(lengths) == 3000 and all(n % 3 == 0 for n in lengths)
 
 
-def test_diverging_is_infinite_and_no_exception():
+def test_a_diverging_simulation_has_an_infinite_cost():
     p, _ = problem(recording(0, 600, initial="zero"))
     wild = p.start.copy()
     wild[:9] = 30 * np.eye(3).ravel()
@@ -216,8 +216,8 @@ def test_diverging_is_infinite_and_no_exception():
 # ---- penalties ----
 
 
-def test_priors_add_what_they_say():
-    """½ Σ ((θ - m)/s)² v/R: as if the prior were one more measurement in units of the noise."""
+def test_priors_add_their_quadratic_cost():
+    """½ Σ ((θ - m)/s)² v/R: the prior acts like one more measurement in units of the noise."""
     changes = {"A": {"prior": (0.5, 0.1)}, "w": {"prior": (np.full((1, 4), 0.2), 0.3)}, "y_0": {"prior": (1.0, 2.0)}}
     plain, _ = problem()
     held, _ = problem(changes=changes, options={"noise": 0.05})
@@ -272,7 +272,7 @@ def test_without_constraints():
     assert p.constraint_jacobian(p.start).shape == (0, p.size)
 
 
-# ---- what goes wrong ----
+# ---- errors ----
 
 
 def test_model_and_recordings_must_fit():
@@ -289,7 +289,7 @@ def test_model_and_recordings_must_fit():
         Problem(structure.model(1, 1, values), recording(0), engine="gpu")
 
 
-def test_something_must_be_left_to_estimate():
+def test_a_problem_needs_a_free_variable():
     names = ("A", "B_u", "B_w", "C_y", "D_yu", "D_yw", "C_z", "D_zu", "y_0", "w", "r")
     changes = {name: {"fixed": True} for name in names}
     with pytest.raises(InputError, match="free at least one parameter"):
@@ -301,7 +301,7 @@ def test_something_must_be_left_to_estimate():
 
 
 def test_a_grey_box_in_physical_units():
-    """Numbers of very different sizes: columns are derivatives in their own units."""
+    """Parameters of very different sizes: each column is a derivative in the parameter's unit."""
     parameters = ParameterSet(
         {"k": Parameter(2e6, bounds=(0, 1e9)), "m": Parameter(1e-3, fixed=True), "d": Parameter(1.0)}
     )

@@ -37,7 +37,7 @@ def solution(name, solver):
 
 
 def solve_all(p):
-    """The three solutions of one problem, converged and within 2 % of each other."""
+    """Solve one problem by all solvers; check that they converge within 2 % of each other."""
     found = [solver.solve(p) for solver in SOLVERS.values()]
     for s in found:
         assert s.status.converged, s.status
@@ -73,7 +73,7 @@ PAIRS = [(name, solver) for name in CASES for solver in SOLVERS]
 @pytest.mark.parametrize(
     ("name", "solver"), [pytest.param(*pair, marks=[pytest.mark.slow] if pair == SLOWEST else []) for pair in PAIRS]
 )
-def test_solutions_are_what_they_say(name, solver):
+def test_solutions_are_consistent(name, solver):
     p, s = problem(name), solution(name, solver)
     assert s.status.converged
     assert np.all(s.theta >= p.lower) and np.all(s.theta <= p.upper)
@@ -202,7 +202,7 @@ def test_infeasible_constraints(limits, solver):
 
 
 def test_zoo_as_a_program(capsys, monkeypatch):
-    """On two cases; the solvers face the others above."""
+    """Two cases are enough here; the tests above cover the others."""
     monkeypatch.setattr(zoo, "CASES", {name: CASES[name] for name in ("lti", "pi_wiener")})
     zoo.main([])
     _, lti, wiener = capsys.readouterr().out.splitlines()

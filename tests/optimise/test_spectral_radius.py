@@ -1,4 +1,4 @@
-"""Bounds on spectral radii: which matrices they bound, smooth rows where eigenvalues meet, and minima inside."""
+"""Bounds on spectral radii: the bounded matrices, smooth rows where eigenvalues meet, and minima inside."""
 
 import pickle
 import time
@@ -12,8 +12,8 @@ from scipy.optimize import minimize
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
-from pilfr_casadi.optimise import Problem, Status, describe_unbounded, solve_within_radii, stable
-from pilfr_casadi.optimise.constraints import least_radius, stability
+from pilfr_casadi.optimise import Problem, Status, describe_unbounded, solve_within_radii, stability_limits, stable
+from pilfr_casadi.optimise.constraints import least_radius
 from pilfr_casadi.optimise.exact_limits import SchurProblem, below_blocks, jury_rows, schur_basis
 from problems.constrained import radius
 
@@ -38,7 +38,7 @@ def test_a_schur_basis_puts_pairs_in_blocks(seed, n, symmetric):
 
 
 @given(st.integers(0, 10**6), st.integers(1, 7), st.sampled_from([0.5, 0.999, 1.001, 2.0]))
-def test_the_rows_hold_where_the_radius_does(seed, n, share):
+def test_jurys_rows_hold_exactly_inside_the_radius(seed, n, share):
     m = np.random.default_rng(seed).normal(size=(n, n))
     q = schur_basis(m)
     held, low = jury_rows(n)(share * (q.T @ m @ q) / radius_of(m), 0)
@@ -52,7 +52,7 @@ def radius_of(m):
 
 @given(st.integers(0, 10**6), st.integers(2, 6))
 def test_rows_with_unknowns_have_the_eigenvalues_of_the_blocks(seed, n):
-    """F = S⁻¹ M S for any X; where the rows below the blocks vanish, the blocks tell the radius."""
+    """F = S⁻¹ M S for any X; if the rows below the blocks vanish, the blocks have the radius."""
     rng = np.random.default_rng(seed)
     t = np.where(below_blocks(n), 0.0, rng.normal(size=(n, n)))
     t /= 1.01 * radius_of(t)
@@ -79,7 +79,7 @@ def test_derivatives_of_the_rows(record):
 
 @pytest.mark.parametrize("bound", [0.6, *(pytest.param(b, marks=pytest.mark.slow) for b in (0.79, 0.3))])
 def test_no_feasible_point_nearby_is_better(record, bound):
-    """SLSQP, which knows the bound by trace and determinant alone, finds nothing better from there, nor by chance."""
+    """SLSQP with the bound by trace and determinant finds no better point from there or from random points."""
     fit = pilfr.fit(pilfr.PILFR(2), record, stable=bound, solver=FINE)
     assert fit.status.converged and radius_of(fit.parameters["A"]) <= bound
     problem = Problem(fit.model, record)
@@ -135,7 +135,7 @@ def test_more_starts_are_never_worse(record):
     assert errors[1] <= errors[0] * 1.0001
 
 
-def test_what_grows_in_the_data_does_not_grow_in_the_model():
+def test_growing_data_do_not_make_the_model_unstable():
     u = np.random.default_rng(0).standard_normal(800)
     x, y = 0.0, []
     for value in u:
@@ -148,7 +148,7 @@ def test_what_grows_in_the_data_does_not_grow_in_the_model():
     assert held.limits[0].active and held.limits[0].multiplier > 0
 
 
-def test_a_double_integrator_is_let_be_one():
+def test_a_double_integrator_is_allowed():
     u = np.random.default_rng(1).standard_normal(500)
     y = np.cumsum(np.cumsum(u)) * 1e-2
     record = pilfr.Recording(u, np.concatenate([[0.0, 0.0], y[:-2]]), dt=0.1, initial="zero")
@@ -170,20 +170,20 @@ def test_a_limit_shows_the_radius_and_its_bound(record):
     assert force == pytest.approx(slope, rel=0.1)
 
 
-def test_a_bound_where_a_is_known(record):
+def test_a_bound_with_a_fixed_matrix(record):
     structure = pilfr.PILFR(2, PLAYS, fixed={"A": [[0.5, 0.1], [np.nan, np.nan]]})
     fit = pilfr.fit(structure, record, starts=1, stable=0.7)
     assert radius(fit) <= 0.7 and fit.parameters["A"][0].tolist() == [0.5, 0.1]
     assert fit.status is not Status.INFEASIBLE
 
 
-def test_the_seed_of_starts_that_are_not_drawn(record):
+def test_the_print_says_that_the_seed_has_no_effect(record):
     quick = pilfr.GaussNewton(max_iterations=2)
     few, more = (pilfr.fit(pilfr.PILFR(1, PLAYS), record, starts=n, solver=quick) for n in (2, 3))
     assert "the seed has no effect" in str(few) and "the seed has no effect" not in str(more)
 
 
-def test_every_step_of_a_tightened_fit_is_told(record, monkeypatch):
+def test_every_step_of_a_tightened_fit_is_reported(record, monkeypatch):
     unheard, counts = [0], []
     normal = Problem.normal
 
@@ -227,7 +227,7 @@ def test_a_limit_on_time_holds_for_all_solves_at_a_bound(record, monkeypatch):
     assert 3 <= len(limits) <= 8 and np.all(np.diff(limits) < 0)
 
 
-def test_a_linear_model_without_the_bound_is_called_so(record):
+def test_a_linear_model_without_the_bound_is_labelled(record):
     tight, free = (pilfr.fit(pilfr.PILFR(1, PLAYS), record, starts=1, stable=stable) for stable in (0.7, True))
     assert "the linear model alone, without the constraints, to judge" in str(tight)
     assert "the linear model alone, to judge" in str(free)
@@ -248,7 +248,7 @@ def resonance(samples=2000):
 
 
 @pytest.mark.slow
-def test_a_bound_next_to_the_radius_that_holds_nothing_costs_nothing():
+def test_an_inactive_bound_near_the_radius_does_not_raise_the_cost():
     record, structure = resonance(), pilfr.PILFR(2, pilfr.PrandtlIshlinskii(pilfr.Stop, 5))
     free = pilfr.fit(structure, record, starts=2)
     for share in (1.0001, 1.001):
@@ -260,7 +260,7 @@ def test_a_bound_next_to_the_radius_that_holds_nothing_costs_nothing():
 
 
 @pytest.mark.parametrize("nx, bounds, least", [(1, (1.5, 2), 1.5), (1, (-3, -1.1), 1.1), (2, (0.6, 2), 1.2)])
-def test_bounds_that_deny_every_stable_model_are_refused(record, nx, bounds, least):
+def test_bounds_without_any_stable_model_are_refused(record, nx, bounds, least):
     structure = pilfr.PILFR(nx, PLAYS, bounds={"A": bounds})
     with pytest.raises(InputError, match=f"allow no spectral radius below {least}.*at most 1 .*widen the bounds"):
         pilfr.fit(structure, record, starts=1)
@@ -295,7 +295,7 @@ def generalized(values, channels=1):
 
 
 def radius_by_simulation(structure, p, size):
-    """Growth a sample of a free motion of the closed model, from rest at `size`, so large that every operator slips."""
+    """Compute the growth per sample of a free motion from `size`, so large that every operator slips."""
     model = structure.model(1, 1, p)
     state, tops = np.zeros(model.n_x + model.n_s), []
     state[0] = size
@@ -305,8 +305,8 @@ def radius_by_simulation(structure, p, size):
     return (tops[-1] / tops[-31]) ** (1 / 30)
 
 
-def test_envelopes_are_bounded_where_large_motions_go():
-    """Rising motions follow the lower envelope: its slope far out, not where it is steepest, says whether they grow."""
+def test_envelopes_are_bounded_by_their_slope_far_out():
+    """Rising motions follow the lower envelope; its slope far out, not its steepest one, decides whether they grow."""
     w = np.full((1, 3), 1 / 3)
     for a0, grows in ((0.52, True), (0.48, False)):
         steep = {
@@ -317,17 +317,17 @@ def test_envelopes_are_bounded_where_large_motions_go():
             "gamma_l_b": [[2.0, 1.0]],
         }
         structure, p = generalized(steep)
-        names = [c.name for c in stability(structure, exact=True)]
+        names = [c.name for c in stability_limits(structure, True)]
         assert names[1:] == [
             f"spectral radius with the element's {which} envelope far out <= 1" for which in ("lower", "upper")
         ]
-        far = [c.check(p) + c.check.radius for c in stability(structure, exact=True)]
+        far = [c.check(p) + c.check.radius for c in stability_limits(structure, True)]
         assert far == pytest.approx([0.5, 0.5 + a0, 0.6])
         assert radius_by_simulation(structure, p, 1e4) == pytest.approx(0.5 + a0, abs=0.01)
         assert (far[1] > 1) == grows
-        assert "steepest the spectral radius is" in describe_unbounded(structure, stability(structure, exact=True), p)
+        assert "steepest the spectral radius is" in describe_unbounded(structure, stability_limits(structure, True), p)
     flat, p = generalized({"w": w, "gamma_l_a0": [[0.3]], "gamma_r_a0": [[0.3]]})
-    assert describe_unbounded(flat, stability(flat, exact=True), p) == ""
+    assert describe_unbounded(flat, stability_limits(flat, True), p) == ""
     assert describe_unbounded(flat, (), p) == ""
 
 
@@ -371,13 +371,13 @@ def test_combined_elements_are_bounded_by_the_sum_of_their_parts():
         "a_w": np.array([[1.0, 2.0]]),
         "b_w": np.array([[0.5, 0.5]]),
     }
-    limits = stability(structure, exact=True)
+    limits = stability_limits(structure, True)
     assert [c.check(p) + 1 for c in limits] == pytest.approx([0.5, 0.5 + 0.2 * 3.0 + 0.1 * 1.0])
     assert describe_unbounded(structure, limits, p) == ""  # products are bounded
     assert pickle.loads(pickle.dumps(limits))[1].name == "spectral radius with the element's full slope <= 1"
 
 
-def test_what_no_slope_is_known_of_is_told(record):
+def test_unknown_slopes_are_reported(record):
     own = pilfr.GeneralizedPlay(gamma_l=gamma, gamma_r=gamma)
     structure = pilfr.PILFR(1, pilfr.PrandtlIshlinskii(own, 2))
     start = {
@@ -392,13 +392,13 @@ def test_what_no_slope_is_known_of_is_told(record):
         "y_0": 0.0,
     }
     fit = pilfr.fit(structure, record, start=start, solver=pilfr.GaussNewton(max_iterations=3))
-    assert [c.name for c in stability(structure)] == ["spectral radius <= 1"]
+    assert [c.name for c in stability_limits(structure, True)] == ["spectral radius <= 1"]
     assert "the spectral radius is bounded for the linear part alone, because the slope of the element" in str(fit)
     wiener = pilfr.wiener(1, pilfr.PrandtlIshlinskii(own, 2))
     values = {k: v.value for k, v in wiener.model(1, 1, {"A": [[0.5]], "C_z": [[1.0]]}).parameters.items()}
-    assert describe_unbounded(wiener, stability(wiener, exact=True), values) == ""  # nothing is fed back
+    assert describe_unbounded(wiener, stability_limits(wiener, True), values) == ""  # nothing is fed back
 
 
 def gamma(z, p):
-    """An envelope of one's own."""
+    """A user-defined envelope."""
     return 0.5 * z + 0.1 * ca.tanh(z)

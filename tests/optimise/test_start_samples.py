@@ -1,4 +1,4 @@
-"""The samples that an unknown initial state is fitted to: as many as the mode that rings longest needs."""
+"""The number of samples to which an unknown initial state is fitted follows the mode that rings longest."""
 
 import numpy as np
 

@@ -19,7 +19,7 @@ def steady(seed=0, length=80, **options):
 
 
 @pytest.mark.parametrize("operator", [Play, Stop])
-def test_the_fixed_point_is_where_many_periods_lead(operator):
+def test_many_periods_lead_to_the_fixed_point(operator):
     structure, values = random_lfr(0, operator=operator)
     model, records = structure.model(1, 1, values), [steady(0), steady(1, skip=10)]
     before = [[np.tile(x[:40], (60, 1)) for x in (r.u, r.y)] for r in records]
@@ -87,8 +87,8 @@ def test_without_a_steady_state_the_cost_is_infinite():
 
 
 @pytest.mark.parametrize("weight, width, resting", [(0.5, 5.0, 1), (0.5, 0.3, 0), (0.0, 5.0, 0)])
-def test_memory_that_a_period_does_not_tell_is_said(weight, width, resting):
-    """A wide play that never slips may rest anywhere: the period decides nothing about it, unless it has no weight."""
+def test_memory_that_a_period_does_not_determine_is_reported(weight, width, resting):
+    """A wide play that never slips may rest anywhere; this matters only if it has a weight."""
     u = np.tile(np.sin(2 * np.pi * np.arange(100) / 100), 2)
     values = {"D_zu": [[1.0]], "D_yw": [[1.0]], "r": [[0.1, width]], "w": [[1.0, weight]]}
     model = PILFR(0, PrandtlIshlinskii(Play, 2), offset=False).model(1, 1, values)
@@ -100,6 +100,6 @@ def test_memory_that_a_period_does_not_tell_is_said(weight, width, resting):
     assert ("never slip in a steady period: 1 in recording 'sine'" in str(found)) == bool(resting)
     assert "never slip" not in str(fit(held, record.with_(initial="zero")))
     state = found.initial_state(record)
-    if resting:  # another memory is a steady state as well, and gives another mean
+    if resting:  # with another memory there is another steady state, of another mean
         shifted = [found.simulate(record.with_(initial=state + np.array([0.0, q]))) for q in (0.0, 2.0)]
         np.testing.assert_allclose(shifted[1] - shifted[0], 2.0 * weight, rtol=1e-9)

@@ -9,7 +9,7 @@ from run_files import DATA
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.cli import main
-from pilfr_casadi.models import ANY, STRUCTURES, TAKES, named_structure
+from pilfr_casadi.models import ALL_OPTIONS, STRUCTURE_OPTIONS, STRUCTURES, named_structure
 from pilfr_casadi.studies import read_run
 
 TEXT = f"""
@@ -55,7 +55,7 @@ def test_a_name_stands_for_the_structure(folder, said, expected):
 def test_what_is_known_goes_beside_what_a_network_holds():
     one = named_structure("ssnn", nx=2, hidden=3, fix={"D_yu": 0.0}, bounds={"A": (-1, 1)})
     assert set(one.fixed) == {*pilfr.ssnn(2, 3).fixed, "D_yu"} and one.bounds == {"A": (-1, 1)}
-    assert {"lags", "nx"} < ANY == {k for takes in TAKES.values() for k in takes}
+    assert {"lags", "nx"} < ALL_OPTIONS == {k for takes in STRUCTURE_OPTIONS.values() for k in takes}
 
 
 def test_a_run_fits_the_same_model_as_the_function(folder):
