@@ -169,13 +169,18 @@ def _with_starts(entries: Iterable[Scored], starts: Sequence[dict[str, Any]]) ->
 
 
 def _extended_laws(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Select laws with one more term than one that came near, if worse or untried: from its values."""
+    """Select laws with one more term than one that came near, if worse or untried: from its values.
+
+    A law that follows a part of the recordings best and diverges on the rest may lack the term that bounds it.
+    """
     near, least = _near(trials), {t.pair: t.error for t in reversed(trials)}
+    unbounded = [t for t in trials if t.mean_square == np.inf and t.part_mean_square < trials[0].part_mean_square]
     out: dict[Pair, Scored] = {}
-    for t in (t for t in trials if t.pair in near):
+    for t in [*(t for t in trials if t.pair in near), *unbounded]:
         for s in scored:
             wider = s.port == t.port and isinstance(s.law, type(t.law)) and type(s.law) is not type(t.law)
-            if wider and least.get(s.pair, np.inf) > t.error and s.pair not in out:
+            worse = s.pair not in least or least[s.pair] > t.error
+            if wider and worse and s.pair not in out:
                 start = s.law.starts_as(t.law, t.own)
                 out |= {s.pair: replace(s, starts=(start,))} if start else {}
     return list(out.values())
