@@ -9,6 +9,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from .errors import (
         LARGEST as LARGEST,
+        REPAIR as REPAIR,
         InputError as InputError,
         check_known as check_known,
         existing_file as existing_file,

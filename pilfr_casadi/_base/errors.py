@@ -7,6 +7,9 @@ from typing import Any, TypeGuard
 import numpy as np
 
 LARGEST = 1e100  # samples above cannot be squared and summed in double precision
+REPAIR = (
+    f"only finite numbers up to {LARGEST:g} can be used, so repair or cut out that piece, or give it in another unit"
+)
 
 
 class InputError(ValueError):

@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
-from pilfr_casadi import InputError, read
+from pilfr_casadi import InputError, read, read_csv
 from pilfr_casadi.data import column_names
 
 T, FORCE, X2 = 0.1 * np.arange(5), np.array([1.0, 2, 3, 4, 5]), np.array([10.0, 20, 30, 40, 50])
@@ -100,3 +100,11 @@ def test_a_missing_package_is_named(monkeypatch, tmp_path, name, package, extra)
 @pytest.mark.parametrize("name", ["none.parquet", "none.mf4"])
 def test_a_missing_file_is_named(tmp_path, name):
     refused(tmp_path / name, "")
+
+
+@pytest.mark.parametrize("suffix", [".mdf", ".mf4", ".parquet"])
+def test_a_binary_file_given_as_csv_names_its_reader(tmp_path, suffix):
+    path = tmp_path / f"rig{suffix}"
+    path.write_bytes(b"\x00\x01" * 50)
+    with pytest.raises(InputError, match=r"binary data\); read it with pilfr\.read"):
+        read_csv(path, "u", "y")

@@ -146,6 +146,8 @@ def test_two_loggers_on_one_clock():
         merge(a, b, start=9.0)
     with pytest.raises(InputError, match="no channel 'y'; they have force, x, current"):
         merge(a, b, outputs="y")
+    with pytest.raises(InputError, match="no channel 3"):
+        merge(a, b, outputs=3)
 
 
 def test_the_same_clock_is_left_as_it_is(tones):

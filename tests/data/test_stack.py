@@ -69,7 +69,7 @@ def test_measured_records_are_judged_and_a_table_is_written(model, tmp_path, cap
         (["--initial", "estimate", "--dt", "0.5"], {"u": arrays()}, "needs measured outputs"),
         (PERIODIC, {"u": arrays()[:, :1]}, r"expected \(samples, 2 channels"),
         (PERIODIC, {"u": arrays(), "y": arrays()[:50]}, "array of the outputs has the shape"),
-        (PERIODIC, {"u": arrays() * np.nan}, "something else than finite numbers"),
+        (PERIODIC, {"u": arrays() * np.nan}, "not finite numbers"),
     ],
 )
 def test_one_sentence_where_a_stack_cannot_be_used(model, tmp_path, capsys, arguments, content, words):
