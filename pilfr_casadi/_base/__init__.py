@@ -1,4 +1,4 @@
-"""Foundation of every other folder: errors with a sentence for the user, worker processes, interrupts and progress."""
+"""Foundation of all other folders: errors for the user, files, worker processes, interrupts and progress."""
 
 from typing import TYPE_CHECKING
 
@@ -20,12 +20,15 @@ if TYPE_CHECKING:
         listed as listed,
         numbers as numbers,
         positive as positive,
+        read_bytes as read_bytes,
         real_array as real_array,
         usable as usable,
         whole as whole,
     )
     from .files import (
+        csv_text as csv_text,
         digest as digest,
+        json_text as json_text,
         make_folder as make_folder,
         ordered_digest as ordered_digest,
         path_text as path_text,
