@@ -12,7 +12,7 @@ a residual e is independent of an input u, their correlation at a lag is normal 
     1/N Σ_k ρ_e(k) ρ_u(k),
 
 with the autocorrelations ρ of both (Ljung 1999, System Identification, sec. 16.6). The residual of a free-run
-simulation is coloured even for a perfect model, since it holds the noise of the output; but it must not depend on the
+simulation is coloured even for a perfect model, since it has the noise of the output; but it must not depend on the
 input, nor on the input's square (Billings & Voon 1986, International Journal of Control 44).
 """
 
@@ -42,7 +42,7 @@ def rmse_per_output(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> np.ndarr
     Returns
     -------
     errors : array, (n_y,)
-        Infinite where the simulation is not finite.
+        Infinite for an output whose simulation is not finite.
 
     Raises
     ------
@@ -109,10 +109,7 @@ def _scored_samples(y: np.ndarray, y_hat: np.ndarray, skip: int) -> tuple[np.nda
 def correlation(a: np.ndarray, b: np.ndarray, lags: int) -> np.ndarray:
     """Return the correlation of a(t + k) with b(t), both (M,), for k = -lags ... lags, (2 lags + 1,).
 
-    Raises
-    ------
-    InputError
-        If the lags are not a whole number below the number of samples, or a signal is constant.
+    InputError is raised if the lags are not a whole number below the number of samples, or a signal is constant.
     """
     if whole(lags, "lags", 1) >= len(a):
         raise InputError(f"lags={lags} was given for {len(a)} samples; give fewer lags than samples.")

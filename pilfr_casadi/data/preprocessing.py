@@ -40,25 +40,9 @@ def remove_trend(values: Array, kind: Any) -> Array:
 
 
 def butterworth(values: Array, dt: float, cutoff: float | tuple[float, float], kind: str, order: int) -> Array:
-    """Run a Butterworth filter forwards and backwards over every column of (M, n).
+    """Run a Butterworth filter forwards and backwards over every column of (M, n); see `Recording.filter`.
 
     The two passes cancel the phase, double the order, and make the gain at a cutoff frequency one half.
-
-    Parameters
-    ----------
-    values : array, (M, n)
-    dt : float
-        Step in s.
-    cutoff : float or two of them
-        Edge, or both edges of a band, in Hz.
-    kind : {"lowpass", "highpass", "bandpass", "bandstop"}
-    order : int
-        Order of one pass.
-
-    Raises
-    ------
-    InputError
-        If a cutoff is not between zero and the Nyquist frequency, or there are too few samples.
     """
     if kind not in FILTERS:
         raise InputError(f"kind={kind!r} was given to filter; give {listed(FILTERS)}.")
@@ -123,12 +107,8 @@ def sample_at(values: Array, dt: float, times: Array, step: float) -> Array:
 def even_grid(t: Array, values: Array, step: float, label: str) -> Array:
     """Interpolate samples at uneven times t (M,), s, onto an even grid from t[0] on.
 
-    The signals are interpolated linearly on a grid at least as fine as the median gap, then resampled to `step`.
-
-    Raises
-    ------
-    InputError
-        If times do not increase, or a gap is longer than `LONGEST_GAP` median gaps; `label` begins the message.
+    The signals are interpolated linearly on a grid at least as fine as the median gap, then resampled to `step`. Times
+    that do not increase, and gaps longer than `LONGEST_GAP` median gaps, are refused; `label` begins the message.
     """
     positive(step, "resample", "the new step in seconds")
     gaps = np.diff(t)

@@ -354,20 +354,9 @@ def step_of(
     """Return the step of a uniform time grid, in seconds.
 
     A grid is uniform if every sample is within `tolerance` steps of ``t(0) + k dt``, plus the rounding of the written
-    digits: a grid of 1/120 s written with six decimals is uniform.
-
-    Parameters
-    ----------
-    t : array, (M,)
-        Times in seconds, finite.
-    column : str
-        File and name of the column, for messages.
-    place : callable
-        Returns the place of sample ``k`` in the file, such as ``"line 17"``.
-    dt : float, optional
-        Stated step; it must agree with the times, and is returned as it is.
-    tolerance : float, optional
-        `TOLERANCE` by default.
+    digits: a grid of 1/120 s written with six decimals is uniform. A stated step `dt` must agree with the times, and is
+    returned as it is. For messages, `column` names the file and the column, and `place` returns the place of a sample,
+    such as ``"line 17"``.
     """
     if len(t) < 2:
         raise InputError(f"{column} has only one sample; at least 2 are needed.")

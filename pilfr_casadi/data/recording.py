@@ -347,21 +347,10 @@ def fingerprint(recording: Recording) -> str:
 def check_for_identification(
     data: Recording | Iterable[Recording], n_min: int = 2, excited: bool = True
 ) -> tuple[Recording, ...]:
-    """Check that recordings can be fitted together and are excited, and return them as a tuple.
+    """Check that recordings can be fitted together, and return them as a tuple.
 
-    Parameters
-    ----------
-    data : Recording or iterable of Recording
-        The recordings to fit.
-    n_min : int
-        Smallest number of scored samples over all recordings, e.g. the number of free parameters.
-    excited : bool
-        Whether to refuse recordings in which no input ever changes.
-
-    Raises
-    ------
-    InputError
-        If outputs are missing, names or steps differ, samples are too few, or every input or an output is constant.
+    They need outputs that change, the same names and step, and together `n_min` scored samples, such as the number of
+    free parameters. With `excited`, at least one input has to change.
     """
     recordings = as_recordings(data)
     first = recordings[0]
@@ -442,14 +431,14 @@ def _signal(values: Any, letter: str, label: str) -> np.ndarray:
             "shape (samples, channels), with numpy.column_stack for several channels."
         )
     if hasattr(values, "toarray"):
-        raise InputError(f"{letter} of {label} is a sparse matrix; give the full array, from its method toarray().")
+        raise InputError(f"{letter} of {label} is a sparse matrix; give a full array, from its method toarray().")
     array = real_array(values)
     if array is None:
         raise InputError(f"{letter} of {label} is not an array of real numbers; give one of shape (samples, channels).")
     if array.ndim not in (1, 2):
         raise InputError(
-            f"{letter} of {label} has the shape {array.shape}; give an array of shape (samples, channels), one "
-            "recording per experiment."
+            f"{letter} of {label} has the shape {array.shape}; give an array of shape (samples, channels), and "
+            "a recording for each experiment."
         )
     return array[:, None] if array.ndim == 1 else array
 

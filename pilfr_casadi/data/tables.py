@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import REPAIR, InputError, existing_file, usable
+from .._base import REPAIR, InputError, existing_file, read_bytes, usable
 
 Array = np.ndarray
 
@@ -350,10 +350,7 @@ def _reason(error: Exception) -> str:
 
 
 def _text(path: Path) -> str:
-    try:
-        raw = existing_file(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); check its permissions.") from None
+    raw = read_bytes(path)
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise InputError(f"{path} is UTF-16 text; save it as UTF-8.")
     if CONTROL_CHARACTER.search(raw, 0, 65536):

@@ -63,7 +63,7 @@ def test_a_parquet_file_is_read(parquet):
     assert np.array_equal(named.y[:, 0], X2)
 
 
-def test_what_a_parquet_file_lacks_is_said(parquet, tmp_path):
+def test_unusable_parquet_files_are_refused(parquet, tmp_path):
     refused(parquet(t=T, force=FORCE), "has no column 'x2'")
     refused(parquet(t=T, force=FORCE, x2=list("abcde")), "'x2' holds")
     refused(parquet(t=T, force=[1.0, None, 3.0, 4.0, 5.0], x2=X2), "'force', sample 1 is nan")
@@ -78,7 +78,7 @@ def test_an_mdf_file_is_read(mdf):
     assert set(column_names(path)) == {"t", "force", "x2", "slow"}
 
 
-def test_what_an_mdf_file_lacks_is_said(mdf, tmp_path):
+def test_unusable_mdf_files_are_refused(mdf, tmp_path):
     path = mdf((T, {"force": FORCE}), (T[::2], {"slow": FORCE[::2]}))
     refused(path, "has no column 'x2'")
     refused(path, "'force' and 'slow' have different times (5 and 3 samples)", outputs="slow")

@@ -198,7 +198,7 @@ def test_a_stated_step_finds_times_in_another_unit(write, factor):
     assert f"a ratio of {factor:.4g}" in sentence(caught)
 
 
-def test_wishes_that_cannot_be_met(write):
+def test_bad_columns_and_options_are_refused(write):
     path = write(GOOD)
     for options, words in [
         (dict(columns={"forc": "u"}), "none of the inputs force"),
