@@ -227,7 +227,7 @@ class _Request:
         both = sorted({*map(self.column, self.inputs)} & {*map(self.column, self.outputs)})
         if both:
             raise InputError(
-                f"{source}: column {both[0]!r} is given for an input and for an output; correct one of them."
+                f"{source}: column {both[0]!r} is given both for an input and for an output; correct one of them."
             )
         if time in wanted:
             raise InputError(

@@ -422,7 +422,7 @@ def test_outputs_may_be_left_out(tmp_path, write, suffix):
 
 
 def test_one_column_is_not_input_and_output(write):
-    with pytest.raises(InputError, match=r"rig\.csv: column 'x2' is given for an input and"):
+    with pytest.raises(InputError, match=r"rig\.csv: column 'x2' is given both for an input and"):
         read_csv(write(GOOD), "force", "x2", columns={"force": "x2"})
 
 
