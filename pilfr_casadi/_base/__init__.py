@@ -1,4 +1,4 @@
-"""Foundation of every other folder: errors with a sentence for the user, worker processes, interrupts and progress."""
+"""Foundation of all other folders: errors for the user, files, worker processes, interrupts and progress."""
 
 from typing import TYPE_CHECKING
 
@@ -9,6 +9,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from .errors import (
         LARGEST as LARGEST,
+        REPAIR as REPAIR,
         InputError as InputError,
         check_known as check_known,
         existing_file as existing_file,
@@ -19,12 +20,15 @@ if TYPE_CHECKING:
         listed as listed,
         numbers as numbers,
         positive as positive,
+        read_bytes as read_bytes,
         real_array as real_array,
         usable as usable,
         whole as whole,
     )
     from .files import (
+        csv_text as csv_text,
         digest as digest,
+        json_text as json_text,
         make_folder as make_folder,
         ordered_digest as ordered_digest,
         path_text as path_text,

@@ -1,4 +1,4 @@
-"""The package's one error for bad input, and the few checks that raise it with a plain sentence."""
+"""Define the error for bad input, and the checks that raise it with a plain sentence."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,33 +7,36 @@ from typing import Any, TypeGuard
 import numpy as np
 
 LARGEST = 1e100  # samples above cannot be squared and summed in double precision
+REPAIR = (
+    f"only finite numbers up to {LARGEST:g} can be used, so repair or cut out that piece, or give it in another unit"
+)
 
 
 class InputError(ValueError):
-    """Something given by the user cannot be used; the message is one plain sentence for that user."""
+    """The user gave something that cannot be used; the message is one plain sentence."""
 
 
 def listed(names: Sequence[Any], most: int = 20) -> str:
-    """Join names for a message; of many, the first ones."""
+    """Join names by commas for a message; abbreviate more than `most` names."""
     return ", ".join(map(str, names[:most])) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def check_known(names: Sequence[str], there: Sequence[str], kind: str, owner: Any) -> None:
-    """Refuse names that are not among those of a kind; `owner` has them."""
+def check_known(names: Sequence[str], known: Sequence[str], kind: str, owner: Any) -> None:
+    """Refuse names that are not among the `known` names of a `kind` that `owner` has."""
     for name in names:
-        if name not in there:
-            raise InputError(f"{owner} has no {name!r} among its {kind}; they are {listed(there) or 'none'}.")
+        if name not in known:
+            raise InputError(f"{owner} has no {name!r} among its {kind}; they are {listed(known) or 'none'}.")
 
 
 def in_words(names: Sequence[str], most: int = 8) -> str:
-    """Join names as a sentence has them, "a, b and c"; of many, the first ones."""
+    """Join names as in a sentence, "a, b and c"; abbreviate more than `most` names."""
     if len(names) > most:
         return listed(names, most)
     return " and ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else "".join(names)
 
 
 def usable(values: np.ndarray) -> np.ndarray:
-    """Tell where the values are finite and small enough for their squares to be summed; a boolean array."""
+    """Tell which values are finite and small enough that their squares can be summed; a boolean array."""
     return np.abs(values) <= LARGEST  # False for nan
 
 
@@ -55,12 +58,9 @@ def is_number(value: Any) -> TypeGuard[float]:
 
 
 def positive(value: Any, what: str, meaning: str = "a number", zero: bool = False) -> float:
-    """Return a finite number above zero, or zero where `zero` allows it.
+    """Return a finite number above zero, or raise InputError; `zero` allows zero too.
 
-    Raises
-    ------
-    InputError
-        If something else is given, `what` being the argument's name; the message asks for `meaning`.
+    The message names the argument `what` and asks for `meaning`.
     """
     if not is_number(value) or not np.isfinite(value) or value < 0 or (value == 0 and not zero):
         raise InputError(f"{what}={value!r} was given; give {meaning}, {'zero or more' if zero else 'above zero'}.")
@@ -68,7 +68,7 @@ def positive(value: Any, what: str, meaning: str = "a number", zero: bool = Fals
 
 
 def real_array(values: Any) -> np.ndarray | None:
-    """Return real numbers as a new array of floats; None if something else is given."""
+    """Return real numbers as a new array of floats, or None if something else is given."""
     try:
         given = np.asarray(values)
         return np.array(given, dtype=float) if given.dtype.kind in "biufO" else None
@@ -77,12 +77,9 @@ def real_array(values: Any) -> np.ndarray | None:
 
 
 def numbers(values: Any, what: str, shape: tuple[int, ...] | None = None, infinite: bool = False) -> np.ndarray:
-    """Return finite real numbers as an array, broadcast to `shape` where that is given.
+    """Return finite real numbers as an array, or raise InputError; `infinite` allows infinity.
 
-    Raises
-    ------
-    InputError
-        If something else is given, or one of them is not finite (with `infinite`: is nan).
+    A given `shape` is the shape of the result, to which the numbers are broadcast.
     """
     found = real_array(values)
     if found is not None and shape is not None:
@@ -101,15 +98,11 @@ def numbers(values: Any, what: str, shape: tuple[int, ...] | None = None, infini
 def filled(
     values: Any, what: str, shape: tuple[int | str, ...], nan: bool = False, infinite: bool = False
 ) -> np.ndarray:
-    """Return an array of a shape from one number for all of it, or from an array of exactly this shape.
+    """Return an array of a shape from a single number or an array of exactly this shape, or raise InputError.
 
     Nothing else is broadcast: a row given for a matrix is more likely a mistake than meant for every row. A name in
-    place of a length stands for an unknown length; a single number then stays a single number.
-
-    Raises
-    ------
-    InputError
-        If something else is given; `what` begins the message.
+    place of a length stands for an unknown length; a single number then stays a single number. `what` begins the
+    message.
     """
     wanted = f"a number or an array of shape ({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"
     wanted = wanted if shape else "a number"
@@ -126,13 +119,7 @@ def filled(
 
 
 def existing_file(path: str | Path) -> Path:
-    """Return the path of a regular file; reading a pipe or a device might wait forever.
-
-    Raises
-    ------
-    InputError
-        If there is nothing, a directory, or anything else that is not a regular file.
-    """
+    """Return the path of a regular file, or raise InputError: reading a pipe or a device might block forever."""
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{path} is a directory; give the file inside it.")
@@ -142,3 +129,11 @@ def existing_file(path: str | Path) -> Path:
     if not path.is_file():
         raise InputError(f"{path} is a pipe or a device, not a regular file; write its content to a file first.")
     return path
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Return the content of a regular file, or raise InputError."""
+    try:
+        return existing_file(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); check its permissions.") from None

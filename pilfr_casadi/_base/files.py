@@ -1,18 +1,20 @@
-"""Files that are never half written, their JSON, and SHA-256 digests by which later changes are noticed.
+"""Atomic writing of files, their JSON, and SHA-256 digests that reveal later changes.
 
-A digest finds damage and changes made by accident or by hand. It is no signature: whoever changes a file on purpose can
-write a new digest into it.
+A digest reveals damage and changes by accident or by hand. It is not a signature: anyone who changes a file on purpose
+can write a new digest into it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import csv
 import errno
 import hashlib
+import io
 import json
 import os
 import secrets
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +24,11 @@ from .errors import InputError
 
 
 def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path:
-    """Write a file so that at any moment either the old or the whole new one is there.
+    """Write a file atomically: at any moment either the old or the complete new content is there.
 
-    The content goes to a temporary file in the same folder, is forced to disk, and takes the name in one step. On any
-    failure the temporary file is removed and an existing file is left untouched.
-
-    Raises
-    ------
-    InputError
-        If the folder does not exist or the file cannot be written there.
+    The content goes to a temporary file in the same folder, is forced to disk, and is renamed in one step. On any
+    failure the temporary file is removed and an existing file stays as it is. InputError is raised if the folder does
+    not exist or is not writable.
     """
     target = Path(os.path.realpath(path_text(path, "file")))
     data = content.encode() if isinstance(content, str) else content
@@ -65,13 +63,7 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
 
 
 def make_folder(folder: str | os.PathLike[str]) -> Path:
-    """Make a folder where it does not exist.
-
-    Raises
-    ------
-    InputError
-        If it cannot be made.
-    """
+    """Make a folder, and the folders above it, unless it exists; raise InputError if that fails."""
     target = Path(path_text(folder, "folder"))
     try:
         target.mkdir(parents=True, exist_ok=True)
@@ -80,25 +72,39 @@ def make_folder(folder: str | os.PathLike[str]) -> Path:
     return target
 
 
+def json_text(content: Any) -> str:
+    """Format a table of standard JSON types as the text of a file, one entry a line."""
+    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def csv_text(rows: Iterable[Sequence[Any]]) -> str:
+    """Format rows as the text of a CSV file; numbers with all digits."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
 def digest(content: Any) -> str:
-    """SHA-256 of bytes, or of a table in its one canonical form: sorted keys, numbers to the last digit."""
+    """Return the SHA-256 of bytes, or of a table in canonical form: sorted keys, numbers to the last digit."""
     data = content if isinstance(content, bytes) else json.dumps(content, sort_keys=True, allow_nan=False).encode()
     return hashlib.sha256(data).hexdigest()
 
 
 def ordered_digest(content: dict[str, Any]) -> str:
-    """SHA-256 of a table whose order carries meaning too, such as that of a model's variables."""
+    """Return the SHA-256 of a table whose order has a meaning, such as the order of a model's variables."""
     return digest(json.dumps(content, allow_nan=False).encode())
 
 
 def path_text(path: Any, kind: str) -> str:
-    """Return a path as text, or refuse what is none."""
+    """Return a path as text; refuse anything else."""
     try:
         name = os.fspath(path)
     except TypeError:
         name = None
     if not isinstance(name, str) or not name or "\0" in name:
-        raise InputError(f"{short(repr(path))} was given as the name of a {kind}; give a text or a Path, not empty.")
+        raise InputError(
+            f"{short(repr(path))} was given as the name of a {kind}; give a text that is not empty, or a Path."
+        )
     return name
 
 
@@ -109,7 +115,7 @@ def short(path: Any) -> str:
 
 
 def to_json(value: Any, infinite: str | None = None) -> Any:
-    """Convert a value to the types of standard JSON; numbers that are not finite become None, infinity `infinite`."""
+    """Convert a value to types of standard JSON; +inf becomes `infinite`, other non-finite numbers None."""
     if isinstance(value, Mapping):
         return {str(k): to_json(v, infinite) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -1,7 +1,7 @@
-"""Ctrl-C, SIGTERM and time limits: how long work is stopped, and what must not be torn apart.
+"""Interrupt long work by Ctrl-C, SIGTERM or a time limit, and defer interrupts where work must not be split.
 
-All three raise KeyboardInterrupt in the main thread: a time limit sends the signal of Ctrl-C to this process, and so
-does SIGTERM, which `timeout` and job schedulers send.
+All three raise KeyboardInterrupt in the main thread: a time limit and SIGTERM, which `timeout` and job schedulers send,
+raise the signal of Ctrl-C in this process.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Any
 
 @contextlib.contextmanager
 def deferred_interrupt(again: bool = True) -> Iterator[list[bool]]:
-    """Defer Ctrl-C to the end of the context: for imports and short writes.
+    """Defer Ctrl-C to the end of the context; for imports and short writes.
 
-    Yields a list that has an entry for each Ctrl-C. Without `again` it is only noted there.
+    Yield a list that receives an entry for each Ctrl-C. Without `again`, Ctrl-C is not raised at the end.
     """
     pressed: list[bool] = []
     if not _in_main_thread() or not callable(signal.getsignal(signal.SIGINT)):
@@ -31,10 +31,10 @@ def deferred_interrupt(again: bool = True) -> Iterator[list[bool]]:
 
 @contextlib.contextmanager
 def unwrapped_interrupt() -> Iterator[None]:
-    """Raise KeyboardInterrupt where Ctrl-C comes out of an extension module as a SystemError.
+    """Raise KeyboardInterrupt if an extension module turns Ctrl-C into a SystemError.
 
-    A function in C that goes on with a pending exception ends in `SystemError: ... returned a result with an exception
-    set`, whose cause is the KeyboardInterrupt; casadi's `DM.__array__` does so.
+    A C function that continues with a pending exception ends in `SystemError: ... returned a result with an exception
+    set`, whose cause is the KeyboardInterrupt; casadi's `DM.__array__` is an example.
     """
     try:
         yield
@@ -45,7 +45,7 @@ def unwrapped_interrupt() -> Iterator[None]:
 
 
 def is_interrupt(error: BaseException | None) -> bool:
-    """Tell whether an exception is a KeyboardInterrupt, or a SystemError that it has caused in an extension module."""
+    """Tell whether an exception is a KeyboardInterrupt, or a SystemError that one caused in an extension module."""
     while isinstance(error, SystemError):
         error = error.__cause__ or error.__context__
     return isinstance(error, KeyboardInterrupt)
@@ -53,7 +53,7 @@ def is_interrupt(error: BaseException | None) -> bool:
 
 @contextlib.contextmanager
 def handled_interrupt(handle: Callable[[], None]) -> Iterator[None]:
-    """Call `handle` on Ctrl-C in place of raising KeyboardInterrupt, which CasADi may swallow.
+    """Call `handle` on Ctrl-C instead of raising KeyboardInterrupt, which CasADi may swallow.
 
     Has no effect outside the main thread, or where other code handles Ctrl-C.
     """
@@ -64,7 +64,7 @@ def handled_interrupt(handle: Callable[[], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def repeated_interrupt() -> Iterator[Callable[[], None]]:
-    """Yield a function that raises the KeyboardInterrupt of Ctrl-C again, once, if one was raised since its last call.
+    """Yield a function that raises KeyboardInterrupt once more if Ctrl-C was pressed since its last call.
 
     CasADi may swallow a KeyboardInterrupt that is raised inside one of its callbacks.
     """
@@ -85,10 +85,10 @@ def repeated_interrupt() -> Iterator[Callable[[], None]]:
 
 @contextlib.contextmanager
 def terminable() -> Iterator[None]:
-    """Let SIGTERM do what Ctrl-C does."""
+    """Make SIGTERM act like Ctrl-C."""
 
     def terminate(*_: object) -> None:
-        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of a script
+        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in the background of a script
             raise KeyboardInterrupt
         signal.raise_signal(signal.SIGINT)
 
@@ -97,14 +97,14 @@ def terminable() -> Iterator[None]:
 
 
 class Clock:
-    """Tells whether a time limit has been reached."""
+    """A flag that a time limit has expired."""
 
     expired = False
 
 
 @contextlib.contextmanager
 def time_limit(seconds: float | None, clock: Clock) -> Iterator[None]:
-    """Interrupt the main thread, as Ctrl-C does, if the context lasts longer than `seconds`; mark the `clock` then."""
+    """Interrupt the main thread like Ctrl-C and mark the `clock` if the context lasts longer than `seconds`."""
     if seconds is None:
         yield
         return
@@ -125,7 +125,7 @@ def time_limit(seconds: float | None, clock: Clock) -> Iterator[None]:
 
     timer = threading.Timer(seconds, interrupt)
     timer.daemon = True
-    # in the background of a script Ctrl-C is ignored, and the interrupt of the clock would be too
+    # a script in the background ignores Ctrl-C, so it would ignore the time limit too
     ignored = _in_main_thread() and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     with _handler(signal.SIGINT, signal.default_int_handler) if ignored else contextlib.nullcontext():
         timer.start()
@@ -139,7 +139,7 @@ def time_limit(seconds: float | None, clock: Clock) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _handler(number: signal.Signals, handler: Callable[..., Any]) -> Iterator[None]:
-    """Handle a signal in another way inside the context."""
+    """Handle a signal by `handler` inside the context."""
     before = signal.signal(number, handler)
     try:
         yield

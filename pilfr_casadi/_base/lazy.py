@@ -1,4 +1,4 @@
-"""Lazy imports: of a package's public names when they are first used, and of verbs of later folders.
+"""Import a package's public names when they are first used, and functions of later folders when they are called.
 
 A face lists its names once, under ``TYPE_CHECKING``; type checkers, editors and this helper read the same list::
 
@@ -11,9 +11,9 @@ A face lists its names once, under ``TYPE_CHECKING``; type checkers, editors and
     else:
         __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
 
-A folder imports only folders before it. A recording that draws itself, or a fit that writes its report, is a matter of
-spelling: the method says in one line `return later("plot_recording")(self)`, and the folder is imported when a user
-calls it. `LATER_VERBS` is the one table of what reaches forward.
+A folder imports only folders before it. Methods such as `recording.plot()` or `fit.report()`, whose work is done in a
+later folder, call `later("plot_recording")(self)`, which imports the folder when a user calls the method. `LATER_VERBS`
+lists all these functions.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from typing import Any
 def lazy_face(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Make `__getattr__`, `__dir__` and `__all__` of a package from its imports under ``TYPE_CHECKING``.
 
-    `__all__` lists those of the first such block; the names of further blocks are found too.
+    `__all__` lists the names of the first such block; names of further blocks can be imported too.
     """
     blocks = [
         [node for node in block.body if isinstance(node, ast.ImportFrom)]
@@ -48,13 +48,13 @@ def lazy_face(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[
         folder = not origin.strip(".")  # `from . import laws` names a sub-package itself
         module = importlib.import_module(f"{origin}{name}" if folder else origin, package)
         value = module if folder else getattr(module, name)
-        vars(sys.modules[package])[name] = value  # found directly from now on
+        vars(sys.modules[package])[name] = value  # later look-ups find it without this function
         return value
 
     return load, lambda: sorted({*vars(sys.modules[package]), *origins}), listed
 
 
-LATER_VERBS = {  # verb -> the folder whose face has it
+LATER_VERBS = {  # function: the folder whose face exports it
     "compare": "identify",
     "diagnosis_card": "report",
     "diagnosis_report": "report",

@@ -1,7 +1,7 @@
-"""Progress of long work on stderr: a bar on a terminal, plain lines anywhere else.
+"""Show the progress of long work on stderr: a bar on a terminal, plain lines elsewhere.
 
-Long work reports to a callable `progress(stage, done, total, best)`: the stage that runs, the parts of it that are
-done, their total (0 where it is not known), and the smallest error so far (nan where there is none).
+Long work calls `progress(stage, done, total, best)`: the current stage, its finished parts, their total (0 if it is not
+known), and the smallest error so far (nan if there is none).
 """
 
 from __future__ import annotations
@@ -19,22 +19,15 @@ from .interrupts import repeated_interrupt
 
 Progress = Callable[[str, int, int, float], None]
 
-NEW_STAGE_LINE = 1.0  # least seconds between plain lines when a new stage begins; quicker work stays silent
-LINE = 10.0  # least seconds between other plain lines, the last step of a stage excepted
+NEW_STAGE_LINE = 1.0  # least seconds between plain lines when a new stage begins; quicker work prints nothing
+LINE = 10.0  # least seconds between other plain lines, except for the last step of a stage
 
 
 @dataclass(eq=False)
 class Stages:
     """A `Progress` that keeps the smallest error over all stages.
 
-    Attributes
-    ----------
-    report : callable
-        Called with (stage, done, total, smallest error so far).
-    prefix : str
-        Stands before each stage's name, as in "other hold: fits".
-    best : list of float
-        The smallest error, shared with the reporters made by `under`.
+    `prefix` stands before each stage's name, as in "other hold: fits". The reporters made by `under` share `best`.
     """
 
     report: Progress
@@ -53,7 +46,7 @@ class Stages:
             self("interrupted", 0, 0)
 
     def under(self, prefix: str) -> Stages:
-        """Make a reporter for a search inside the search; it shares the smallest error."""
+        """Make a reporter for an inner search; it shares the smallest error."""
         return Stages(self.report, f"{prefix}{self.prefix}", self.best)
 
 
@@ -61,14 +54,17 @@ class Stages:
 def progress_bar() -> Iterator[Progress]:
     """Yield a function (stage, done, total, best error) that shows the progress while the context lasts.
 
-    It shows the stage that runs, the parts done, the smallest error of all stages so far, and the time spent since the
-    context began. It raises KeyboardInterrupt if Ctrl-C was pressed and CasADi swallowed the exception.
+    It shows the current stage, its finished parts, the smallest error of all stages, and the time since the context
+    began. It raises KeyboardInterrupt if Ctrl-C was pressed and CasADi swallowed the exception.
     """
-    shown = _Shown()
-    with repeated_interrupt() as repeat, _bar(shown) if sys.stderr.isatty() else nullcontext(_lines(shown)) as show:
+    state = _State()
+    with (
+        repeated_interrupt() as repeat,
+        _draw_bar(state) if sys.stderr.isatty() else nullcontext(_print_lines(state)) as show,
+    ):
 
         def report(stage: str, done: int, total: int, best: float) -> None:
-            shown.best = min(shown.best, best) if math.isfinite(best) else shown.best
+            state.best = min(state.best, best) if math.isfinite(best) else state.best
             show(stage, done, total)
             repeat()
 
@@ -76,44 +72,37 @@ def progress_bar() -> Iterator[Progress]:
 
 
 def shown_progress(progress: Progress | bool | None) -> AbstractContextManager[Progress | None]:
-    """Make a context whose value work reports to: a progress bar for True, the callable, or None.
-
-    Raises
-    ------
-    InputError
-        If it is none of these.
-    """
+    """Return a context that yields a progress bar for True, or the given callable or None; refuse anything else."""
     if progress is not None and not isinstance(progress, bool) and not callable(progress):
         raise InputError(f"progress = {progress!r} was given; give True, or a function of (stage, done, total, error).")
     return progress_bar() if progress is True else nullcontext(progress or None)
 
 
 @dataclass
-class _Shown:
-    """The smallest error so far, and when the work began (seconds of the monotonic clock)."""
+class _State:
+    """The smallest error so far, and the start of the work in seconds of the monotonic clock."""
 
     best: float = math.inf
     began: float = field(default_factory=lambda: time.monotonic())
 
-    def best_text(self) -> str:
-        return f"best NRMSE {self.best:.4f}" if math.isfinite(self.best) else ""
-
-    def time_text(self) -> str:
+    def text(self) -> str:
+        """Describe the smallest error, if there is one, and the time."""
         seconds = int(time.monotonic() - self.began)
-        return f"{seconds} s" if seconds < 60 else f"{seconds // 60} min {seconds % 60:02d} s"
+        duration = f"{seconds} s" if seconds < 60 else f"{seconds // 60} min {seconds % 60:02d} s"
+        return f"best NRMSE {self.best:.4f}, {duration}" if math.isfinite(self.best) else duration
 
 
 Show = Callable[[str, int, int], None]
 
 
-def _lines(shown: _Shown) -> Show:
-    """Print a line when a stage has its first step done, about every ten seconds, and when its last step is done.
+def _print_lines(state: _State) -> Show:
+    """Print a line after the first step of a stage, about every ten seconds, and after its last step.
 
-    A count that stands at zero is left out, and so are all lines of stages that are quick.
+    A count of zero is left out. Quick stages print nothing.
     """
     stages: set[str] = set()
     ended: set[str] = set()
-    last_line = shown.began
+    last_line = state.began
 
     def show(stage: str, done: int, total: int) -> None:
         nonlocal last_line
@@ -126,27 +115,27 @@ def _lines(shown: _Shown) -> Show:
         if complete:
             ended.add(stage)
         last_line = now
-        parts = [f"{stage} {_count(done, total) if done else ''}".rstrip(), shown.best_text(), shown.time_text()]
+        parts = [f"{stage} {_count(done, total) if done else ''}".rstrip(), state.text()]
         print(", ".join(part for part in parts if part), file=sys.stderr, flush=True)
 
     return show
 
 
 @contextmanager
-def _bar(shown: _Shown) -> Iterator[Show]:
-    """Draw one bar, of the stage that runs."""
+def _draw_bar(state: _State) -> Iterator[Show]:
+    """Draw one bar, for the current stage."""
     from rich import progress as rich
     from rich.console import Console
     from rich.text import Text
 
-    class State(rich.ProgressColumn):
-        """The smallest error and the time, which goes on when a stage reports nothing."""
+    class StateColumn(rich.ProgressColumn):
+        """The smallest error and the time, which advances even if a stage reports nothing."""
 
         def render(self, task: rich.Task) -> Text:
-            return Text(", ".join(part for part in (shown.best_text(), shown.time_text()) if part))
+            return Text(state.text())
 
     columns: list[Any] = [rich.TextColumn("{task.description}"), rich.BarColumn()]
-    columns += [rich.TextColumn("{task.fields[count]}"), State()]
+    columns += [rich.TextColumn("{task.fields[count]}"), StateColumn()]
     with rich.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("", total=None, count="", visible=False)
 

@@ -1,17 +1,17 @@
-"""Threads and worker processes: how many there are, how BLAS and CasADi share them, and how they end.
+"""Run work in threads and worker processes, which share BLAS and CasADi and end in every case.
 
 Matrices here have at most a few thousand rows and a few hundred columns, so more BLAS threads do not speed up one fit,
-and fits that run side by side would fight for the cores: each uses one BLAS thread. CasADi releases the interpreter in
-each of the many small calls that build an expression, so threads that build expressions at the same time only slow each
-other down: they take turns.
+and would compete for the cores if fits run side by side. Each fit uses one BLAS thread. CasADi releases the interpreter
+in each of the many small calls that build an expression, so threads that build expressions at the same time slow each
+other down. They take turns.
 
-`worker_pool` is for tasks that end by themselves. `run_in_worker` gives a job a process of its own, which is killed
-when its time is up and whose death harms nobody. An executor's worker (a thread, a process, a Dask worker's thread)
-keeps one such child and sends it one job after the other: a job that hangs, in Python or in compiled code, or that the
-system ends for want of memory takes the child along, and the worker lives on. The child ends when its worker does,
-however that happened, because its standard input closes; and after `IDLE_SECONDS` without a job. Pools of other
-packages with killable workers (pebble, loky) start them by `multiprocessing`, which Dask's workers, daemons themselves,
-may not do, and which imports a user's script again in every child; hence a plain subprocess.
+`worker_pool` is for tasks that end by themselves. `run_in_worker` runs a job in a child process, which can be killed
+when the time is up and may die without harm. An executor's worker (a thread, a process, a Dask worker's thread) keeps
+one child and sends it one job after the other. If a job hangs, in Python or in compiled code, or runs out of memory,
+only the child dies. The child ends when its worker ends, in whatever way, because its standard input closes; it also
+ends after `IDLE_SECONDS` without a job. Pools with killable workers in other packages (pebble, loky) use
+`multiprocessing`, which Dask's workers may not use, because they are daemons, and which imports a user's script again
+in every child; hence a plain subprocess.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ P = ParamSpec("P")
 R = TypeVar("R")
 T = TypeVar("T")
 SYMBOLIC = threading.RLock()
-MANAGER_END = 2.0  # seconds that a pool's own thread may take to end after its processes are gone
-CANCEL_END = 10.0  # seconds that a pool may take to drop the tasks that it has not begun
-IDLE_SECONDS = 60.0  # a child holds some 100 MB
+MANAGER_TIMEOUT = 2.0  # seconds for a pool's own thread to end after its processes have ended
+CANCEL_TIMEOUT = 10.0  # seconds for a pool to drop tasks that have not begun
+IDLE_SECONDS = 60.0  # after which a child, about 100 MB, ends
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @functools.cache
 def _blas_controller() -> Any:
-    import scipy.linalg  # loads a BLAS of its own; only libraries that are loaded by now are limited
+    import scipy.linalg  # loads its own BLAS, which has to be loaded to be limited
     from threadpoolctl import ThreadpoolController
 
     assert scipy.linalg
@@ -84,7 +84,7 @@ def processors() -> int:
 
 
 def side_by_side(function: Callable[[T], R], items: Iterable[T], workers: int) -> list[R]:
-    """Apply a function to each item in threads; return the results in order. After a failure, drop what waits."""
+    """Apply a function to each item in threads; return the results in order. A failure cancels waiting items."""
     pool = ThreadPoolExecutor(workers)
     try:
         return [task.result() for task in [pool.submit(function, item) for item in items]]
@@ -94,10 +94,10 @@ def side_by_side(function: Callable[[T], R], items: Iterable[T], workers: int) -
 
 @contextlib.contextmanager
 def worker_pool(count: int) -> Iterator[Executor | None]:
-    """Yield a pool of `count` processes, or None for one; no process is left behind, however the context ends.
+    """Yield a pool of `count` processes, or None for one; all processes end with the context.
 
-    Ctrl-C reaches every process of the terminal's foreground group. The workers ignore it: the process that waits for
-    their results keeps the best so far and ends them.
+    Ctrl-C reaches every process of the terminal's foreground group. The workers ignore it; the process that waits for
+    their results keeps the best result so far and ends them.
     """
     if count < 2:
         yield None
@@ -121,8 +121,8 @@ def worker_pool(count: int) -> Iterator[Executor | None]:
         finally:
             for worker in set(multiprocessing.active_children()) - others:
                 worker.kill()
-            if manager is not None:  # it closes a pipe that Python would write to at its own end
-                manager.join(MANAGER_END)
+            if manager is not None:  # it closes a pipe to which Python would write at exit
+                manager.join(MANAGER_TIMEOUT)
 
 
 def _ignore_signals() -> None:
@@ -132,10 +132,10 @@ def _ignore_signals() -> None:
 
 
 def _shut_down(pool: ProcessPoolExecutor) -> None:
-    """Shut a pool down once it has dropped the tasks that it has not begun.
+    """Shut a pool down after it has dropped the tasks that have not begun.
 
-    Before Python 3.12 a pool whose processes die while it holds a cancelled task never ends. It drops tasks in the
-    order in which they came, so once a task that was added last is cancelled, all are.
+    Before Python 3.12, a pool whose processes die while it holds a cancelled task never ends. A pool drops tasks in
+    order, so once the last task is cancelled, all are.
     """
     try:
         last = pool.submit(os.getpid)
@@ -143,12 +143,12 @@ def _shut_down(pool: ProcessPoolExecutor) -> None:
         return
     pool.shutdown(wait=False, cancel_futures=True)
     with contextlib.suppress(CancelledError, TimeoutError, BrokenProcessPool):
-        last.result(CANCEL_END)
+        last.result(CANCEL_TIMEOUT)
 
 
 @dataclass(frozen=True)
 class Reply:
-    """The result of a job, or that its time was up, or how the child was lost and whether the job had begun."""
+    """The result of a job, or its time-out, or how the child was lost and whether the job had begun."""
 
     result: Any = None
     timed_out: bool = False
@@ -157,16 +157,16 @@ class Reply:
 
 
 def run_in_worker(shared: bytes, job: bytes, limit: float | None = None, name: str = "") -> Reply:
-    """Call `pickle.loads(shared)(pickle.loads(job))` in the child process of this thread that has a name.
+    """Call `pickle.loads(shared)(pickle.loads(job))` in a child process of this thread, identified by `name`.
 
-    The child keeps the function from one job to the next. Starting it does not count towards the `limit`, seconds.
+    The child keeps the function for the next job. Its start does not count towards the `limit` in seconds.
     """
     children: dict[str, WorkerProcess] = _of_this_thread.__dict__.setdefault("children", {})
     child = children.get(name)
     if child is not None and child.process.poll() is None:
         reply = child.run(shared, job, limit)
         if reply.begun:
-            return reply  # else it was idle for too long, just now
+            return reply  # else the child had just ended because it was idle
     if child is not None:
         child.close()
     child = children[name] = WorkerProcess()
@@ -174,13 +174,13 @@ def run_in_worker(shared: bytes, job: bytes, limit: float | None = None, name: s
 
 
 def close_workers() -> None:
-    """End all child processes of this process; their jobs are lost."""
+    """Kill all child processes of this process; their jobs are lost."""
     for child in list(_children):
         child.close()
 
 
 class WorkerProcess:
-    """The child process, seen from the worker."""
+    """A child process, as its worker sees it."""
 
     def __init__(self) -> None:
         self.errors = tempfile.TemporaryFile()  # noqa: SIM115
@@ -195,7 +195,7 @@ class WorkerProcess:
         )
         self.inbox: Any = self.process.stdin
         self.outbox: Any = self.process.stdout
-        self.function: bytes | None = None  # the one that the child has
+        self.function: bytes | None = None  # the pickled function that the child has
         _children.add(self)
 
     def run(self, shared: bytes, job: bytes, limit: float | None) -> Reply:
@@ -212,7 +212,7 @@ class WorkerProcess:
         try:
             _write(self.inbox, (None if shared == self.function else shared, job))
             self.function = shared
-            _read(self.outbox)  # it has everything
+            _read(self.outbox)  # the child has received everything
             begun = True
             if limit is not None:
                 timer.start()
@@ -221,11 +221,11 @@ class WorkerProcess:
             finally:
                 timer.cancel()
         except (OSError, EOFError, ValueError):
-            lost = self._how_it_ended()
+            lost = self._describe_end()
             self.close()
             return Reply(timed_out=True) if expired.is_set() else Reply(lost=lost, begun=begun)
 
-    def _how_it_ended(self) -> str:
+    def _describe_end(self) -> str:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(5)
         code = self.process.poll()
@@ -236,7 +236,7 @@ class WorkerProcess:
         return f"its process ended: {lines[-1]}" if lines else f"its process ended with status {code}"
 
     def close(self) -> None:
-        """End the process."""
+        """Kill the process and close its pipes."""
         self.process.kill()
         self.process.wait()
         for pipe in (self.inbox, self.outbox, self.errors):
@@ -251,9 +251,9 @@ atexit.register(close_workers)
 
 
 def serve() -> None:
-    """Do jobs in the child process: they come by standard input, results go to standard output."""
+    """Run jobs in the child process: read them from standard input, write results to standard output."""
     replies = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # output of a job must not be taken for a reply
+    os.dup2(2, 1)  # a job that prints must not write into the replies
     inbox: queue.SimpleQueue[tuple[bytes | None, bytes]] = queue.SimpleQueue()
 
     def listen() -> None:
@@ -261,7 +261,7 @@ def serve() -> None:
             try:
                 inbox.put(_read(sys.stdin.buffer))
             except (OSError, EOFError):
-                os._exit(0)  # the worker is gone
+                os._exit(0)  # the worker has ended
 
     threading.Thread(target=listen, daemon=True).start()
     function: Any = None
@@ -276,7 +276,7 @@ def serve() -> None:
         os._exit(0)
     except BaseException as error:
         os.write(2, f"{type(error).__name__}: {error}".encode())
-        os._exit(1)  # without the interpreter's end, which the thread that listens would disturb
+        os._exit(1)  # skip the interpreter's shutdown, which the listening thread would disturb
 
 
 def _write(pipe: Any, content: Any) -> None:
@@ -293,6 +293,6 @@ def _read(pipe: Any) -> Any:
 
 
 def check_executor(executor: Any) -> None:
-    """Refuse what cannot run tasks; None stands for the package's own processes."""
+    """Refuse an object that cannot run tasks; None stands for the package's own processes."""
     if executor is not None and not callable(getattr(executor, "submit", None)):
         raise InputError(f"executor = {executor!r} was given; give a concurrent.futures.Executor, or leave it out.")

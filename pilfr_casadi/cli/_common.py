@@ -1,12 +1,14 @@
-"""Shared parts of the commands: exit statuses, the types of options, and reading recordings as the options say."""
+"""Shared parts of the commands: exit statuses, types of options, and reading the files that the options name."""
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import math
 import os
 import sys
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_type_hints
@@ -20,18 +22,19 @@ if TYPE_CHECKING:
     from ..identify import Fit
 
 DONE, NO_RESULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
-UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # Typer's own name for it has moved between releases
-MOST_SAMPLES = 10**9  # of a period or of samples left out: 8 GB per channel
+UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # Typer has moved its name between releases
+MOST_SAMPLES = 10**9  # of a period, or skipped: 8 GB per channel
+FILE_TYPES = ".csv, .mat, .npz, .parquet, .mf4"  # of recordings, for help texts
 
 
 def say(sentence: str, status: int) -> int:
-    """Print one line on stderr; return the status."""
+    """Print a sentence as one line on stderr; return the status."""
     print("pilfr: " + " ".join(sentence.split()), file=sys.stderr)
     return status
 
 
 def takes_options(function: Callable[[Any], int]) -> Callable[..., int]:
-    """Turn a function of one dataclass into a command: every field of the dataclass is an option or an argument."""
+    """Turn a function of a dataclass into a command: every field of the dataclass is an option or an argument."""
     (kind,) = (hint for name, hint in get_type_hints(function).items() if name != "return")
     hints = get_type_hints(kind)
 
@@ -50,17 +53,19 @@ def takes_options(function: Callable[[Any], int]) -> Callable[..., int]:
 def whole(text: str, least: int, most: int, default: int | None = None, metavar: str = "N") -> Any:
     """Make an option that takes a whole number."""
     wanted = f"a whole number from {least} to {most}"
-    return _parsed(int, lambda value: least <= value <= most, wanted, default, metavar, text)
+    return _parsing_option(int, lambda value: least <= value <= most, wanted, default, metavar, text)
 
 
 def seconds(text: str) -> Any:
     """Make an option that takes a time above zero."""
     wanted = "a number of seconds above zero"
-    return _parsed(float, lambda value: 0 < value < math.inf, wanted, None, "SECONDS", text)
+    return _parsing_option(float, lambda value: 0 < value < math.inf, wanted, None, "SECONDS", text)
 
 
-def _parsed(kind: Any, accepts: Callable[[Any], bool], wanted: str, default: Any, metavar: str, text: str) -> Any:
-    """Make an option that takes a value of a kind, if it `accepts` it."""
+def _parsing_option(
+    kind: Any, accepts: Callable[[Any], bool], wanted: str, default: Any, metavar: str, text: str
+) -> Any:
+    """Make an option that converts its text by `kind`, and refuses values that `accepts` does not accept."""
 
     def parse(given: str) -> Any:
         try:
@@ -75,11 +80,9 @@ def _parsed(kind: Any, accepts: Callable[[Any], bool], wanted: str, default: Any
 
 
 def initial_state(text: str) -> Any:
-    """Make an option that takes the name of an initial state, or its numbers separated by commas."""
-    names, wanted = (
-        ("estimate", "zero", "periodic"),
-        "estimate, zero, periodic, or a number for each state, as in 20,0.5",
-    )
+    """Make an option that takes the name of an initial state, or numbers separated by commas."""
+    names = ("estimate", "zero", "periodic")
+    wanted = "estimate, zero, periodic, or a number for each state, as in 20,0.5"
 
     def read(given: str) -> Any:
         return given if given in names else tuple(map(float, given.split(",")))
@@ -87,11 +90,11 @@ def initial_state(text: str) -> Any:
     def accepts(value: Any) -> bool:
         return value in names or (isinstance(value, tuple) and all(map(math.isfinite, value)))
 
-    return _parsed(read, accepts, wanted, None, "STATE", text)
+    return _parsing_option(read, accepts, wanted, None, "STATE", text)
 
 
 def option(text: str, metavar: str | None = None, default: Any = None, name: str | None = None) -> Any:
-    """Make an option of any other type; it is named after the field unless `name` is given."""
+    """Make an option of any other type; `name` overrides the name of the field."""
     return typer.Option(default, *([name] if name else []), metavar=metavar, help=text, show_default=False)
 
 
@@ -102,13 +105,13 @@ def flag(text: str, name: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class DataOptions:
-    """Options of reading recordings."""
+    """Options to read recordings."""
 
     inputs: str | None = option("Names of the inputs (default: the model's or simulator's).", "NAME[,NAME]")
     outputs: str | None = option("Names of the outputs (default: the model's or simulator's).", "NAME[,NAME]")
     column: list[str] = option(
-        "Column of a name, or of the time t, where they differ (repeatable; of several for a name, each file uses its "
-        "own).",
+        "Column of a name, or of the time t, if it differs (repeatable; of several columns for a name, each file uses "
+        "its own).",
         "NAME=COLUMN",
         [],
     )
@@ -119,7 +122,7 @@ class DataOptions:
     period: int | None = whole("Samples per period; needs --initial.", 0, MOST_SAMPLES, metavar="SAMPLES")
     hold: Literal["zero", "linear"] | None = option("Course of the inputs between samples.")
     skip: int = whole("Leading samples that are simulated but not scored.", 0, MOST_SAMPLES, 0, "SAMPLES")
-    dt: float | None = option("Step, where the file has no time column.", "SECONDS")
+    dt: float | None = option("Step, if the file has no time column.", "SECONDS")
     time_tolerance: float | None = option(
         "Largest deviation of samples from a uniform grid (default: 1e-4 steps, beyond rounding).", "STEPS"
     )
@@ -133,14 +136,14 @@ class DataOptions:
             )
 
     def names(self, inputs: Sequence[str] = (), outputs: Sequence[str] = ()) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return the names of inputs and outputs from the options; these are the defaults."""
+        """Return the names of inputs and outputs from the options, by default the given ones."""
         return (
             tuple(inputs) if self.inputs is None else name_list(self.inputs, "--inputs"),
             tuple(outputs) if self.outputs is None else name_list(self.outputs, "--outputs"),
         )
 
     def columns(self, path: str) -> dict[str, str]:
-        """Return the column of each name in a file; of several columns for a name, the one that the file has counts."""
+        """Return the column of each name in a file; of several columns for a name, choose the one that the file has."""
         given: dict[str, list[str]] = {}
         for text in self.column:
             for name, column in pairs([text], "--column").items():
@@ -154,7 +157,7 @@ class DataOptions:
         for name, columns in given.items():
             found = [column for column in dict.fromkeys(columns) if column in there]
             if len(found) > 1:
-                raise InputError(f"{path} has {listed(found)}, which --column gives for {name}; leave out one of them.")
+                raise InputError(f"{path} has {listed(found)}, which --column gives for {name}; leave one of them out.")
             out[name] = found[0] if found else columns[0]
         return out
 
@@ -168,12 +171,16 @@ class DataOptions:
         more = {key: getattr(self, key) for key in ("period", "hold", "skip", "dt", "time_tolerance", "resample")}
         return read(path, inputs, outputs, columns=columns, initial=self.initial or "estimate", **more)
 
+    def read_all(self, paths: Sequence[str], inputs: tuple[str, ...], outputs: tuple[str, ...]) -> dict[str, Recording]:
+        """Read recordings; return them by their paths."""
+        return {path: self.read(path, inputs, outputs) for path in paths}
+
 
 def simulator_files(metavar: str) -> Any:
     """Make the argument that takes a simulator file and recordings."""
     text = (
         "A Python file that sets `simulator` (or a model.json, or an FMU, which is a program that runs), then training "
-        "recordings (.csv, .mat, .npz, .parquet, .mf4)."
+        f"recordings ({FILE_TYPES})."
     )
     return typer.Argument(..., metavar=metavar, help=text)
 
@@ -192,7 +199,7 @@ class SimulatorOptions(DataOptions):
 
     @property
     def source(self) -> str | None:
-        """The simulator file; None where something stands in for it."""
+        """The simulator file; None if a recorded simulation replaces it."""
         return self.files[0]
 
     @property
@@ -206,9 +213,9 @@ class SimulatorOptions(DataOptions):
         return self.train
 
     def check_files(self, instead: str = "") -> None:
-        """Refuse files in the wrong place, and names that a simulator file has of its own.
+        """Refuse files in the wrong order, and names of channels, which the simulator file defines.
 
-        `instead` is the option that takes a recorded simulation instead of a simulator file, where there is one.
+        `instead` is the option that takes a recorded simulation instead of a simulator file, if there is one.
         """
         from ..data import TABLE_SUFFIXES
 
@@ -226,7 +233,7 @@ class SimulatorOptions(DataOptions):
         check_given_once(self.recordings)
 
     def load_simulator(self) -> Any:
-        """Return the `simulator` of a Python file, the model of a model.json, or that of an FMU or a MuJoCo model."""
+        """Load the `simulator` of a Python file, the model of a model.json, an FMU, or a MuJoCo model."""
         from ..identify import load
         from ..simulators import from_mujoco, simulator_variable
 
@@ -237,13 +244,13 @@ class SimulatorOptions(DataOptions):
         mechanism = kind in (".xml", ".urdf")
         for name in ("port",) if mechanism else ("port", "bound"):
             if getattr(self, name):
-                raise InputError(f"--{name} was given, which is for an FMU; {path} has its own, leave it out.")
+                raise InputError(f"--{name} was given, which is for an FMU; {path} has its own, so leave it out.")
         if mechanism:
             return from_mujoco(path, bounds=bounds_of(self.bound))
         return load(path) if kind == ".json" else simulator_variable(path)
 
     def _load_fmu(self, path: str) -> Any:
-        """Make a simulator of the inputs and outputs of an FMU that the first recording has."""
+        """Make a simulator from an FMU, with the inputs and outputs that the first recording has."""
         from ..data import column_names
         from ..simulators import CoSimulation, fmu_signals, from_fmu
 
@@ -259,10 +266,10 @@ class SimulatorOptions(DataOptions):
         for role, names in zip(("input", "output"), fmu_signals(path), strict=True):
             kept.append(tuple(name for name in names if columns.get(name, name) in recorded))
             forces = {port["into"] for port in ports.values()}
-            left = [name for name in names if name not in kept[-1] and name not in forces]
-            if left and kept[-1]:
-                print(f"note: {self.train[0]} has no column for the {role}s {listed(left)} of {path}", flush=True)
-            if not kept[-1] and (role == "output" or len(left) > 0):
+            missing = [name for name in names if name not in kept[-1] and name not in forces]
+            if missing and kept[-1]:
+                print(f"note: {self.train[0]} has no column for the {role}s {listed(missing)} of {path}", flush=True)
+            if not kept[-1] and (role == "output" or missing):
                 raise InputError(
                     f"{self.train[0]} has no column for any {role} of {path} ({listed(names)}); rename its columns, or "
                     f"say which they are, as in --column {names[0]}=COLUMN."
@@ -273,7 +280,7 @@ class SimulatorOptions(DataOptions):
 
 
 def bounds_of(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Split each `NAME=LOW:HIGH`; an end that is left out is infinite."""
+    """Parse each `NAME=LOW:HIGH`; a missing end is infinite."""
     out = {}
     for name, value in pairs(texts, "--bound").items():
         low, sign, high = value.partition(":")
@@ -298,7 +305,7 @@ def name_list(text: str, option: str) -> tuple[str, ...]:
 
 
 def pairs(texts: Sequence[str], option: str) -> dict[str, str]:
-    """Split each `NAME=VALUE`."""
+    """Parse each `NAME=VALUE`."""
     out: dict[str, str] = {}
     for text in texts:
         name, sign, value = text.partition("=")
@@ -311,7 +318,7 @@ def pairs(texts: Sequence[str], option: str) -> dict[str, str]:
 
 
 def numbers_of(texts: Sequence[str], option: str) -> dict[str, float]:
-    """Split each `NAME=NUMBER`; refuse an infinite one."""
+    """Parse each `NAME=NUMBER`; refuse infinite numbers."""
     found = {name: number(value, f"{option} {name}={value}") for name, value in pairs(texts, option).items()}
     for name, value in found.items():
         if math.isinf(value):
@@ -320,7 +327,7 @@ def numbers_of(texts: Sequence[str], option: str) -> dict[str, float]:
 
 
 def number(text: str, given: str) -> float:
-    """Read a number, which may be infinite; `given` begins the sentence where it is none."""
+    """Parse a number, which may be infinite; `given` begins the message if the text is none."""
     try:
         value = float(text)
     except ValueError:
@@ -337,7 +344,7 @@ def check_given_once(paths: Sequence[str]) -> None:
 
 
 def check_names(fitted: Fit, inputs: Sequence[str], outputs: Sequence[str]) -> None:
-    """Refuse names that are not the model's in its order: swapped ones would be simulated silently."""
+    """Refuse names other than the model's, in its order: swapped channels would give a wrong simulation silently."""
     for role, names, own in (("inputs", inputs, fitted.model.inputs), ("outputs", outputs, fitted.model.outputs)):
         if tuple(names) != tuple(own):
             raise InputError(
@@ -346,14 +353,38 @@ def check_names(fitted: Fit, inputs: Sequence[str], outputs: Sequence[str]) -> N
             )
 
 
-def describe(kind: str, path: str, recording: Recording) -> str:
-    """Describe a recording and its file in one line."""
-    names = f"inputs {', '.join(recording.inputs)}, outputs {', '.join(recording.outputs)}"
-    return f"{kind} data: {path}, {len(recording)} samples, step {recording.dt:.6g} s, {names}"
+def print_line(line: str) -> None:
+    """Print a line at once, also into a pipe."""
+    print(line, flush=True)
+
+
+def print_recordings(kind: str, recordings: Mapping[str, Recording]) -> None:
+    """Print a line about each recording, given by the path of its file."""
+    for path, r in recordings.items():
+        names = f"inputs {', '.join(r.inputs)}, outputs {', '.join(r.outputs)}"
+        print_line(f"{kind} data: {path}, {len(r)} samples, step {r.dt:.6g} s, {names}")
+
+
+def check_cluster(dask: str | None, workers: int | None) -> None:
+    """Refuse a number of workers for a cluster."""
+    if dask and workers is not None:
+        raise InputError("--workers and --dask were given; the cluster has its own workers, so leave one of them out.")
+
+
+@contextlib.contextmanager
+def open_cluster(dask: str | None, workers: int) -> Iterator[tuple[Any, int, int]]:
+    """Yield an executor or None, its number of workers, and the number of jobs to submit at a time."""
+    from ..studies import AHEAD, dask_executor  # here, so that `pilfr --help` is quick
+
+    if not dask:
+        yield None, workers, AHEAD
+        return
+    with dask_executor(dask) as cluster:
+        yield cluster
 
 
 def new_file(folder: str, name: str, overwrite: bool) -> Path:
-    """Return the path of a result; refuse an existing file unless it may be overwritten."""
+    """Return the path of a result; without `overwrite` refuse an existing file."""
     target = Path(folder) / name
     if target.exists() and not overwrite:
         raise InputError(f"{target} exists already; give another --out, or --overwrite to replace it.")
@@ -361,13 +392,12 @@ def new_file(folder: str, name: str, overwrite: bool) -> Path:
 
 
 def make_folder(path: str) -> Path:
-    """Make the folder of the results before any long work, so that a bad one is reported at once."""
+    """Make the folder of the results, and check that it is writable, before any long work."""
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".writable-{os.getpid()}"
-        probe.touch()
-        probe.unlink()
+        with tempfile.TemporaryFile(dir=folder):
+            pass
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"The folder {path} cannot be written ({reason}); give another --out.") from None

@@ -1,7 +1,7 @@
-"""The program `pilfr`: it runs the command, and turns every failure into one sentence and an exit status.
+"""Run a command of the program `pilfr`; turn every failure into one sentence and an exit status.
 
 Exit status: 0 done, 1 no usable result, 2 bad input (one plain sentence on stderr), 130 interrupted (the best so far is
-written). Each family of commands has its own file, imported only when one of its commands runs.
+written). Each group of commands has its own file, imported only when one of its commands runs.
 """
 
 from __future__ import annotations
@@ -33,18 +33,15 @@ COMMANDS = {  # name: (file, help)
     ),
     "demo": ("demo", "Identify a rig and diagnose a simulator, from recordings that come with the package."),
 }
-# keyword arguments in messages of the package that are options of the same name here
-KEYWORDS = (
-    *("dt", "time_tolerance", "resample", "period", "hold", "initial", "skip"),
-    *("starts", "seed", "workers", "engine"),
-)
+# keyword arguments in messages of the package that are options of the same name
+KEYWORDS = "dt|time_tolerance|resample|period|hold|initial|skip|starts|seed|workers|engine"
 
 
 class PlainCommand(typer.core.TyperCommand):
-    """A command whose help names its arguments as they are written, without braces and Python types."""
+    """A command whose help shows its arguments without braces and Python types."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return what follows the command in the usage line."""
+        """Return the words after the command in the usage line."""
         names = [p.metavar + "..." * (p.nargs != 1) for p in _arguments(self)]
         return [self.options_metavar or "", *names]
 
@@ -70,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     arguments : sequence of str, optional
-        Arguments instead of the ones of the process.
+        Arguments; by default those of the process.
 
     Returns
     -------
@@ -109,13 +106,13 @@ def _run(arguments: list[str]) -> int:
 
 
 def _program(wanted: str) -> typer.Typer:
-    """Build the program; import only the wanted command, the help shows the names of the others."""
+    """Build the program; import only the wanted command, and register the others by name for the help."""
     program = typer.Typer(
         help="Identify dynamic models with hysteresis from recordings; find the physics that a simulator lacks.",
         add_completion=False,
         rich_markup_mode=None,
     )
-    program.callback()(_options_of_the_program)
+    program.callback()(_program_options)
     for name, (file, text) in COMMANDS.items():
         command: Callable[..., Any] = _placeholder
         if name == wanted:
@@ -130,7 +127,7 @@ def _show_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-def _options_of_the_program(
+def _program_options(
     version: bool = typer.Option(False, "--version", help="Print the version.", is_eager=True, callback=_show_version),
 ) -> None:
     pass
@@ -141,7 +138,7 @@ def _placeholder() -> None:
 
 
 def _usage_sentence(error: Any) -> str:
-    """Describe what is wrong with the options; start with the option and its value where its type gives them."""
+    """Describe a wrong option; start with the option and its value if its type reports them."""
     if " was given; " in error.message and getattr(error, "param", None) is not None:
         return f"{error.param.opts[-1]} {error.message}"
     sentence = str(error.format_message()).replace("Value error, ", "").replace(". Did you", "; did you")
@@ -155,10 +152,10 @@ def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
 
 
 def name_options(sentence: str) -> str:
-    """Replace Python's keyword arguments in a message by options of the command line."""
+    """Replace keyword arguments in a message by options of the command line."""
     sentence = sentence.replace("give the model as `model=`", "use it in Python with load(FILE, model=MODEL)")
     sentence = re.sub(r"columns=\{'([^']*)': '([^']*)'\}", r"--column \1=\2", sentence)
-    keyword = rf"`?(?<![\w-])({'|'.join(KEYWORDS)})=(?:'([^']*)'|([^\s;,()`]*[^\s;,.()`]))?`?"
+    keyword = rf"`?(?<![\w-])({KEYWORDS})=(?:'([^']*)'|([^\s;,()`]*[^\s;,.()`]))?`?"
     return re.sub(keyword, lambda m: f"--{m[1].replace('_', '-')} {m[2] or m[3] or m[1].upper()}", sentence)
 
 

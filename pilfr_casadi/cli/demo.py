@@ -1,9 +1,9 @@
-"""The demonstration, on recordings that come with the package: a rig identified, and a simulator diagnosed.
+"""Identify a rig and diagnose a simulator, on recordings that come with the package: `pilfr demo`.
 
 The first recordings are the benchmark of Krikelis et al. (2024), Sec. 6, simulated exactly: a training multisine, a
 multisine test and a sine-sweep test, 50 dB signal-to-noise ratio. `python -m problems.masing_data` writes
-them. The others are of a rig of which the simulator `demo_data/rig.py` leaves something out; what it is stands in
-`python -m problems.demo_rig`, which writes them, and nowhere in the package.
+them. `python -m problems.demo_rig` writes the recordings of the other rig, whose simulator `demo_data/rig.py` lacks
+some physics; the package does not state which.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .._base import deferred_interrupt, processors, progress_bar, worker_pool
 from ..data import Recording, read_csv
@@ -43,20 +43,18 @@ SHOWN = {"LTI": "linear model", "PI-LFR N=20": "with 20 hysteresis operators"}  
 
 def demo_recordings() -> dict[str, Recording]:
     """Read the recordings `train`, `multisine` and `sweep`: force u in N, displacement x2 in m, 120 Hz."""
-    out = {}
-    for name in SETS:
-        with as_file(files(__package__) / "demo_data" / f"{name}.csv") as path:
-            out[name] = read_csv(path, "u", "x2", units={"u": "N", "x2": "m"}, initial="zero", hold="zero", name=name)
-    return out
+    units = {"u": "N", "x2": "m"}
+    return {name: _read_demo(f"{name}.csv", "u", name=name, units=units) for name in SETS}
 
 
 def rig_recordings() -> dict[str, Recording]:
     """Read the recordings `train` and `test` of the rig to diagnose: force in N, displacement x2 in m, 100 Hz."""
-    out = {}
-    for name in ("train", "test"):
-        with as_file(files(__package__) / "demo_data" / f"rig_{name}.csv") as path:
-            out[name] = read_csv(path, "force", "x2", initial="zero", hold="zero", name=name)
-    return out
+    return {name: _read_demo(f"rig_{name}.csv", "force", name=name) for name in ("train", "test")}
+
+
+def _read_demo(file: str, force: str, **options: Any) -> Recording:
+    with as_file(files(__package__) / "demo_data" / file) as path:
+        return read_csv(path, force, "x2", initial="zero", hold="zero", **options)
 
 
 def structure(n: int) -> PILFR:
@@ -74,7 +72,7 @@ class DemoOptions:
 
 @takes_options
 def demo_command(options: DemoOptions) -> int:
-    """A rig is identified beside the published figures; the simulator of another one is diagnosed."""
+    """Compares one rig with published results; diagnoses the simulator of another rig."""
     from rich.console import Console
 
     console = Console(highlight=False)
@@ -87,7 +85,7 @@ def demo_command(options: DemoOptions) -> int:
 
 
 def identify_rig(folder: Path, workers: int, console: Console) -> int:
-    """Identify a rig, print the table beside the published one, write the report; return the exit status."""
+    """Identify a rig, compare with the published errors, write the report; return the exit status."""
     from ..report import fit_report
 
     recordings = demo_recordings()
@@ -115,7 +113,7 @@ def identify_rig(folder: Path, workers: int, console: Console) -> int:
 
 
 def _fit_rows(recordings: Mapping[str, Recording], workers: int) -> list[Fit]:
-    """Fit the rows of the table; fewer of them where Ctrl-C ends it."""
+    """Fit the rows of the table; Ctrl-C ends it with fewer rows."""
     found: list[Fit] = []
     try:
         with worker_pool(workers) as pool:
@@ -146,7 +144,7 @@ def _table(found: Sequence[Fit], recordings: Mapping[str, Recording]) -> Table:
 
 
 def diagnose_rig(folder: Path, workers: int) -> int:
-    """Find what a simulator leaves out, print and write it; return the exit status."""
+    """Diagnose the simulator, print and write the result; return the exit status."""
     from ..diagnose import diagnose
 
     with as_file(files(__package__) / "demo_data" / "rig.py") as path:

@@ -1,12 +1,11 @@
-"""`pilfr diagnose` and `pilfr check`: read and check the files, and compare the simulator with the recordings.
+"""Compare a simulator with recordings: `pilfr diagnose` and `pilfr check`.
 
-The first finds the missing physics, and writes and prints the diagnosis. The second prints what the recordings can
-reveal, and writes check.json where a folder is given.
+`diagnose` finds the missing physics, prints the diagnosis and writes it. `check` prints what the recordings can reveal,
+and writes check.json if a folder is given.
 """
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from .._base import InputError, deferred_interrupt, listed, progress_bar, write_atomically
+from .._base import InputError, deferred_interrupt, json_text, listed, progress_bar, write_atomically
 from ..data import SAME_STEP, TIME_NAMES, Recording, column_names
 from ..simulators import Simulator, as_simulator
 from ..studies import LARGEST_SIZE
@@ -24,12 +23,13 @@ from ._common import (
     INTERRUPTED,
     NO_RESULT,
     SimulatorOptions,
-    describe,
     flag,
     make_folder,
     new_file,
     numbers_of,
     option,
+    print_line,
+    print_recordings,
     say,
     seconds,
     simulator_files,
@@ -57,12 +57,14 @@ class DiagnoseOptions(SimulatorOptions):
     workers: int | None = whole(
         "Number of parallel fits (default: one per processor, at most four).", 1, LARGEST_SIZE["workers"]
     )
-    time_limit: float | None = seconds("Answer after about this time from what was found (default: no limit).")
+    time_limit: float | None = seconds(
+        "End the search after about this time, with the best answer so far (default: no limit)."
+    )
     focus: Literal["simulation", "prediction"] | None = option(
-        "Errors of a free run, or of predictions one sample ahead (default: a free run, where the simulator can)."
+        "Errors of a free run, or of predictions one sample ahead (default: a free run, if the simulator can)."
     )
     search_samples: int | None = whole(
-        "Training samples up to which the search uses everything; of more it uses stretches (default: 60000).",
+        "Training samples up to which the search uses all; of more it uses stretches (default: 60000).",
         20,
         LARGEST_SIZE["samples"],
     )
@@ -85,7 +87,7 @@ class DiagnoseOptions(SimulatorOptions):
         return [*([self.simulated] if self.simulated else []), *self.train, *self.test]
 
     def columns(self, path: str) -> dict[str, str]:
-        """Return the column of each name in a file; some files may have the name itself as a column."""
+        """Return the column of each name in a file; a file may have the name itself as a column instead."""
         columns = super().columns(path)
         if not columns or not self.simulated:
             return columns
@@ -106,8 +108,8 @@ def diagnose_command(options: DiagnoseOptions) -> int:
         given = options.load_simulator()
         simulator = as_simulator(given)
         inputs, outputs = simulator.inputs, simulator.output_names
-    train = {path: options.read(path, inputs, outputs) for path in options.train}
-    tests = {path: options.read(path, inputs, outputs) for path in options.test}
+    train = options.read_all(options.train, inputs, outputs)
+    tests = options.read_all(options.test, inputs, outputs)
     _check_recordings(train, tests)
     folder = make_folder(options.out)
     error, poor = 0.0, ""
@@ -119,7 +121,7 @@ def diagnose_command(options: DiagnoseOptions) -> int:
         name = f"surrogate of {options.simulated} (NRMSE {error:.4f})"
     _announce(simulator, name, train, tests)
     if poor:
-        print(f"note: {poor}", flush=True)
+        print_line(f"note: {poor}")
     with deferred_interrupt():
         from ..diagnose import diagnose
     try:
@@ -143,9 +145,9 @@ def diagnose_command(options: DiagnoseOptions) -> int:
 
 
 def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: str = "") -> int:
-    """Write diagnosis.json, corrected.py, then the page; print the diagnosis and its paths; return the exit status.
+    """Write diagnosis.json, corrected.py, then the report; print the diagnosis and the paths; return the exit status.
 
-    corrected.py corrects the simulator file `source`, if the simulator is from a Python file.
+    corrected.py corrects the simulator file `source`, if that is a Python file.
     """
     target = folder / "diagnosis.json"
     try:
@@ -175,7 +177,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: str = "") -> int
 
 
 def _check_recordings(train: dict[str, Recording], tests: dict[str, Recording]) -> None:
-    """Refuse a test on training data, and recordings of different steps."""
+    """Refuse a test on training data, and recordings with different steps."""
     for there, t in tests.items():
         for path, r in train.items():
             if len(r) == len(t) and np.array_equal(r.u, t.u) and np.array_equal(r.y, t.y):
@@ -192,10 +194,9 @@ def _announce(simulator: Simulator, name: str, train: dict[str, Recording], test
     ports = listed([port.name for port in simulator.all_ports()])
     free = sum(not bool(np.all(p.fixed)) for p in simulator.parameters.values())
     counts = f"{len(simulator.states)} states, {len(simulator.parameters)} parameters ({free} free)"
-    print(f"{name}, {counts}; ports {ports}", flush=True)
-    for kind, recordings in (("training", train), ("test", tests)):
-        for path, recording in recordings.items():
-            print(describe(kind, path, recording), flush=True)
+    print_line(f"{name}, {counts}; ports {ports}")
+    print_recordings("training", train)
+    print_recordings("test", tests)
 
 
 def _surrogate(
@@ -212,7 +213,7 @@ def _surrogate(
 
 
 def _simulated_names(options: DiagnoseOptions) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return inputs and outputs as given, else sort the columns that the files share by their values."""
+    """Return the given inputs and outputs, or find them among the columns that the files share."""
     if options.inputs and options.outputs:
         return options.names()
     if options.inputs or options.outputs:
@@ -222,27 +223,27 @@ def _simulated_names(options: DiagnoseOptions) -> tuple[tuple[str, ...], tuple[s
     shared = [n for n in first if n not in TIME_NAMES and all(n in other for other in others)]
     inputs = tuple(n for n in shared if _same_samples(options, n)) or tuple(n for n in shared if n[:1] in "uU")
     if not inputs and len(shared) == 2:
-        inputs = _cause(options, shared)
+        inputs = _find_cause(options, shared)
     outputs = tuple(n for n in shared if n not in inputs)
     if not inputs or not outputs:
         raise InputError(
             f"The columns {listed(shared) or '(none)'} that {files[0]} and the recordings share do not tell inputs "
             "from outputs; give --inputs NAMES and --outputs NAMES."
         )
-    for note in _unshared(files, (first, *others), shared):
-        print(note, flush=True)
-    print(f"inputs {listed(inputs)}, outputs {listed(outputs)}, as found in the files", flush=True)
+    for note in _report_unshared(files, (first, *others), shared):
+        print_line(note)
+    print_line(f"inputs {listed(inputs)}, outputs {listed(outputs)}, as found in the files")
     return inputs, outputs
 
 
 def _column_names(options: DiagnoseOptions, path: str) -> list[str]:
-    """Return the columns of a file under the names that the options give them."""
+    """Return the columns of a file, by the names that the options give them."""
     names = {column: name for name, column in options.columns(path).items()}
     return [names.get(column, column) for column in column_names(path)]
 
 
-def _unshared(files: Sequence[str], columns: Sequence[Sequence[str]], shared: Sequence[str]) -> Iterator[str]:
-    """Note each column that only one file has; refuse if both have some, which may be one column with two names."""
+def _report_unshared(files: Sequence[str], columns: Sequence[Sequence[str]], shared: Sequence[str]) -> Iterator[str]:
+    """Note each column that only one file has; refuse if both have some: it may be one column with two names."""
     first, *others = ([n for n in names if n not in TIME_NAMES and n not in shared] for names in columns)
     for path, names, own in zip(files[1:], columns[1:], others, strict=True):
         lost = [n for n in first if n not in names]
@@ -256,8 +257,8 @@ def _unshared(files: Sequence[str], columns: Sequence[Sequence[str]], shared: Se
                 yield f"note: {listed(extra)} of {there} is left out, because {lacks} has no such column"
 
 
-def _cause(options: DiagnoseOptions, shared: Sequence[str]) -> tuple[str, ...]:
-    """Return which of two columns is the input: a linear model fits only from cause to effect."""
+def _find_cause(options: DiagnoseOptions, shared: Sequence[str]) -> tuple[str, ...]:
+    """Return the column that is the input: a linear model fits only from cause to effect."""
     from ..identify import surrogate
 
     assert options.simulated is not None
@@ -294,17 +295,16 @@ def check_command(options: CheckOptions) -> int:
         new_file(options.out, "check.json", options.overwrite)
     given = options.load_simulator()
     simulator = as_simulator(given)
-    recordings = [options.read(path, simulator.inputs, simulator.output_names) for path in options.train]
+    recordings = options.read_all(options.train, simulator.inputs, simulator.output_names)
     folder = make_folder(options.out) if options.out is not None else None
-    for path, recording in zip(options.train, recordings, strict=True):
-        print(describe("training", path, recording), flush=True)
+    print_recordings("training", recordings)
     with deferred_interrupt():
         from ..diagnose import check
-    found = check(as_simulator(given, recordings), recordings, hold=options.hold)
+    train = list(recordings.values())
+    found = check(as_simulator(given, train), train, hold=options.hold)
     print(name_options(str(found)))
     if folder is not None:
         target = folder / "check.json"
-        content = json.dumps(found.to_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-        write_atomically(target, content)
+        write_atomically(target, json_text(found.to_dict()))
         print(f"check: {target}")
     return DONE

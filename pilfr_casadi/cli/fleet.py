@@ -1,8 +1,7 @@
-"""`pilfr fleet`: read the recordings of many machines; print what all of them lack, and which differ."""
+"""Diagnose the recordings of many machines: `pilfr fleet`."""
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,14 +11,18 @@ import typer
 
 from .._base import InputError, deferred_interrupt, progress_bar
 from ..simulators import as_simulator
-from ..studies import AHEAD, LARGEST_SIZE, NoModel, RunInterrupted, dask_executor
+from ..studies import LARGEST_SIZE, NoModel, RunInterrupted
 from ._common import (
     DONE,
+    FILE_TYPES,
     INTERRUPTED,
     NO_RESULT,
     SimulatorOptions,
+    check_cluster,
     flag,
+    open_cluster,
     option,
+    print_line,
     say,
     seconds,
     takes_options,
@@ -37,15 +40,15 @@ class FleetOptions(SimulatorOptions):
     files: list[str] = typer.Argument(
         ...,
         metavar="SIMULATOR FOLDER",
-        help="The simulator, as for `pilfr diagnose`, then a folder with a recording (.csv, .mat, .npz), or a folder "
-        "of recordings in the order of their names, for each machine.",
+        help=f"The simulator, as for `pilfr diagnose`, then a folder with a recording ({FILE_TYPES}), or a folder of "
+        "recordings in the order of their names, for each machine.",
     )
     sample: int = whole("Number of machines that are diagnosed to find the common physics (default: 4).", 1, 1000, 4)
     workers: int | None = whole(
         "Number of processes; it does not change the results (default: one per processor).", 1, LARGEST_SIZE["workers"]
     )
-    dask: str | None = option("Work on the Dask cluster of this scheduler.", "ADDRESS")
-    time_limit: float | None = seconds("Give up the work at a machine after this time (default: no limit).")
+    dask: str | None = option("Run the jobs on the Dask cluster of this scheduler.", "ADDRESS")
+    time_limit: float | None = seconds("Stop the work at a machine after this time (default: no limit).")
     out: str | None = option("Folder of the results (default: fleet).", "DIR")
     overwrite: bool = flag("Compute everything again, even finished jobs.", "--overwrite")
     against: str | None = option("Judge the machines against the fleet in this folder, and write nothing.", "DIR")
@@ -69,18 +72,17 @@ class FleetOptions(SimulatorOptions):
         def tables(where: Path) -> list[Path]:
             return sorted(p for p in where.iterdir() if p.is_file() and p.suffix.lower() in TABLE_SUFFIXES)
 
-        alone = {p.stem: [str(p)] for p in tables(folder)}
-        inside = {p.name: [str(q) for q in tables(p)] for p in sorted(folder.iterdir()) if p.is_dir()}
-        several = {name: paths for name, paths in inside.items() if paths}
-        if twice := sorted(set(alone) & set(several)):
-            raise InputError(f"{folder} has both a file and a folder for the machine {twice[0]!r}; leave one out.")
-        if len({path.stem for path in tables(folder)}) < len(tables(folder)):
-            raise InputError(
-                f"{folder} has two files for one machine; put recordings of a machine into a folder of it."
-            )
-        found = alone | several
+        files = tables(folder)
+        from_files = {p.stem: [str(p)] for p in files}
+        subfolders = {p.name: [str(q) for q in tables(p)] for p in sorted(folder.iterdir()) if p.is_dir()}
+        from_folders = {name: paths for name, paths in subfolders.items() if paths}
+        if both := sorted(set(from_files) & set(from_folders)):
+            raise InputError(f"{folder} has both a file and a folder for the machine {both[0]!r}; leave one out.")
+        if len(from_files) < len(files):
+            raise InputError(f"{folder} has two files for one machine; put a machine's recordings into its own folder.")
+        found = from_files | from_folders
         if not found:
-            raise InputError(f"{folder} holds no recording (.csv, .mat, .npz), nor a folder with one.")
+            raise InputError(f"{folder} holds no recording ({FILE_TYPES}), nor a folder with one.")
         return dict(sorted(found.items()))
 
     @property
@@ -89,7 +91,7 @@ class FleetOptions(SimulatorOptions):
         return [path for paths in self.machines.values() for path in paths]
 
     def check_folder(self) -> None:
-        """Refuse results among the recordings, where the next call would take them for a machine."""
+        """Refuse to write results among the recordings: the next call would take them for a machine."""
         if Path(self.files[1]).resolve() in (Path(self.target).resolve(), *Path(self.target).resolve().parents):
             raise InputError(f"The folder {self.target} is inside {self.files[1]}; give the results another --out.")
 
@@ -97,8 +99,7 @@ class FleetOptions(SimulatorOptions):
 @takes_options
 def fleet_command(options: FleetOptions) -> int:
     """Writes report.html, fleet.json and fleet.csv to DIR. The same command continues after an interrupt."""
-    if options.dask and options.workers is not None:
-        raise InputError("--workers and --dask were given; the cluster has its own workers, so leave one of them out.")
+    check_cluster(options.dask, options.workers)
     if options.against is not None and options.out is not None:
         raise InputError("--against and --out were given; --against writes nothing, so leave one of them out.")
     options.check_files()
@@ -108,20 +109,16 @@ def fleet_command(options: FleetOptions) -> int:
     simulator = as_simulator(given)
     inputs, outputs = simulator.inputs, simulator.output_names
     machines = {
-        name: [options.read(path, inputs, outputs) for path in paths] for name, paths in options.machines.items()
+        name: list(options.read_all(paths, inputs, outputs).values()) for name, paths in options.machines.items()
     }
     with deferred_interrupt():
         from ..studies import fleet
     if options.against is not None:
         return _judge(options, given, machines)
     count = sum(map(len, machines.values()))
-    print(f"fleet: {len(machines)} machines, {count} recordings, results in {options.target}", flush=True)
+    print_line(f"fleet: {len(machines)} machines, {count} recordings, results in {options.target}")
     try:
-        with contextlib.ExitStack() as stack:
-            executor, _, ahead = None, 0, AHEAD
-            if options.dask:
-                executor, _, ahead = stack.enter_context(dask_executor(options.dask))
-            progress = stack.enter_context(progress_bar())
+        with open_cluster(options.dask, 0) as (executor, _, ahead), progress_bar() as progress:
             result = fleet(
                 given,
                 machines,
@@ -134,7 +131,7 @@ def fleet_command(options: FleetOptions) -> int:
                 out=options.target,
                 overwrite=options.overwrite,
                 progress=progress,
-                tell=lambda line: print(line, flush=True),
+                tell=print_line,
             )
     except RunInterrupted as stop:
         return say(f"Interrupted; {stop}, the same command continues from there.", INTERRUPTED)
@@ -153,6 +150,6 @@ def _judge(options: FleetOptions, simulator: object, machines: dict[str, list[Re
     fleet = read_fleet(options.against, simulator)
     for name, recordings in machines.items():
         found = fleet.judge(name, recordings)
-        said = "; ".join(f"{text} ({p:.2f})" for text, p in found.reasons) or "as the others"
-        print(f"{name}: {said}", flush=True)
+        findings = "; ".join(f"{text} ({p:.2f})" for text, p in found.reasons) or "as the others"
+        print_line(f"{name}: {findings}")
     return DONE

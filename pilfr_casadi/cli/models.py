@@ -1,4 +1,4 @@
-"""`pilfr fit`, `simulate` and `export`: identify a model from recordings, save it, and use it."""
+"""Identify a model from recordings, save it, and use it: `pilfr fit`, `simulate` and `export`."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from .._base import (
     Clock,
     InputError,
     Progress,
+    csv_text,
     deferred_interrupt,
     in_words,
     listed,
@@ -45,36 +46,36 @@ from ..simulators import load_simulator, unit_notes
 from ..studies import LARGEST_SIZE
 from ._common import (
     DONE,
+    FILE_TYPES,
     INTERRUPTED,
     NO_RESULT,
     DataOptions,
     bounds_of,
     check_given_once,
     check_names,
-    describe,
     flag,
     make_folder,
     new_file,
     numbers_of,
     option,
+    print_line,
+    print_recordings,
     say,
     seconds,
     takes_options,
     whole,
 )
 
-# options of a search, which a saved model to start from replaces
+# options of a search, which a saved model replaces
 SEARCH = ("nx", "operators", "operator", "channels", "structure", "hidden", "lags", "bound", "fix", "starts", "seed")
-STRUCTURE_NAMES = {"bound": "bounds"}  # options with another name in the structures
+STRUCTURE_NAMES = {"bound": "bounds"}  # option: its name in `TAKES`
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions(DataOptions):
-    """The options of `pilfr fit`; options of a search have no default, to show which ones were given."""
+    """The options of `pilfr fit`; options of a search have no default, which shows whether they were given."""
 
-    train: list[str] = typer.Argument(
-        ..., metavar="TRAIN", help="Training recordings (.csv, .mat, .npz, .parquet, .mf4)."
-    )
+    train: list[str] = typer.Argument(..., metavar="TRAIN", help=f"Training recordings ({FILE_TYPES}).")
     inputs: str = option("Names of the inputs.", "NAME[,NAME]", ...)
     outputs: str = option("Names of the outputs.", "NAME[,NAME]", ...)
     test: list[str] = option("Test recording, never fitted (repeatable).", "FILE", [])
@@ -105,7 +106,7 @@ class FitOptions(DataOptions):
     )
     time_limit: float | None = seconds("Stop after this time and keep the best so far (default: no limit).")
     out: str = option("Folder for model.json and report.html (default: fit).", "DIR", "fit")
-    overwrite: bool = flag("Replace a model that is in that folder already.", "--overwrite")
+    overwrite: bool = flag("Replace an existing model in that folder.", "--overwrite")
 
     @property
     def search(self) -> list[str]:
@@ -116,17 +117,17 @@ class FitOptions(DataOptions):
 @takes_options
 def fit_command(options: FitOptions) -> int:
     """Writes the model to DIR/model.json and the report to DIR/report.html."""
-    target = _check(options)
+    target = _check_options(options)
     inputs, outputs = options.names()
     saved = load(options.start_from) if options.start_from else None
     if saved is not None:
         check_names(saved, inputs, outputs)
-    train = [options.read(path, inputs, outputs) for path in options.train]
-    tests = [options.read(path, inputs, outputs) for path in options.test]
+    train_by_path = options.read_all(options.train, inputs, outputs)
+    tests_by_path = options.read_all(options.test, inputs, outputs)
     make_folder(options.out)
-    for kind, paths, recordings in (("training", options.train, train), ("test", options.test, tests)):
-        for path, recording in zip(paths, recordings, strict=True):
-            print(describe(kind, path, recording), flush=True)
+    print_recordings("training", train_by_path)
+    print_recordings("test", tests_by_path)
+    train, tests = list(train_by_path.values()), list(tests_by_path.values())
     clock = Clock()
     try:
         with time_limit(options.time_limit, clock), progress_bar() as progress:
@@ -149,7 +150,7 @@ def fit_command(options: FitOptions) -> int:
     return say(NOTHING_SENTENCE, NO_RESULT) if explains_nothing(result.train_nrmse) else DONE
 
 
-def _check(options: FitOptions) -> Path:
+def _check_options(options: FitOptions) -> Path:
     """Refuse options that exclude each other; return the path of the model file."""
     if options.start_from and options.search:
         raise InputError(
@@ -170,10 +171,10 @@ def _check(options: FitOptions) -> Path:
 def _identify(
     options: FitOptions, saved: Fit | None, train: list[Recording], progress: Progress
 ) -> tuple[Fit | PILFR | Lagged, Fit]:
-    """Return the model that was to be fitted, and the fit."""
+    """Fit; return the structure or the saved model that was fitted, and the fit."""
     solver = GaussNewton() if options.solver == "gauss-newton" else Ipopt()
     with worker_pool(options.workers) as pool:
-        task = saved if saved is not None else _structure(options, train, progress)
+        task = saved if saved is not None else _build_structure(options, train, progress)
         check_recordings(task, train)  # before the engine is compiled
         progress("building the engine", 0, 0, np.nan)
         engine = announce_engine(task, train[0], options.engine)
@@ -184,7 +185,7 @@ def _identify(
     return task, replace(result, engine=engine)
 
 
-def _structure(options: FitOptions, train: Sequence[Recording], progress: Progress) -> PILFR | Lagged:
+def _build_structure(options: FitOptions, train: Sequence[Recording], progress: Progress) -> PILFR | Lagged:
     structure = options.structure or "lfr"
     given: dict[str, Any] = {k: getattr(options, k) for k in ("operators", "operator", "channels", "hidden", "lags")}
     if "nx" in STRUCTURE_OPTIONS[structure]:
@@ -192,16 +193,16 @@ def _structure(options: FitOptions, train: Sequence[Recording], progress: Progre
         if nx is None:
             choice = select_order(train, range(1, 9), offset=True, progress=progress)
             nx, how = int(choice.recommended), "chosen on the training data"
-        print(f"order: {nx}, {how}", flush=True)
+        print_line(f"order: {nx}, {how}")
         given |= {"nx": nx, "bounds": bounds_of(options.bound), "fix": numbers_of(options.fix, "--fix")}
     return named_structure(structure, **{k: v for k, v in given.items() if v is not None})
 
 
 def announce_engine(task: PILFR | Lagged | Fit, recording: Recording, choice: str, quiet: bool = False) -> str:
-    """Build the engine once, announce it with the reason; return the choice that gives it without a warning."""
+    """Build the engine and announce it; return the choice that builds it again without a warning."""
     if choice == "vm":
         if not quiet:
-            print("engine: CasADi's virtual machine, as given", flush=True)
+            print_line("engine: CasADi's virtual machine, as given")
         return choice
     model = task.model if isinstance(task, Fit) else task.model(recording.n_u, recording.n_y)
     with warnings.catch_warnings(record=True) as caught:
@@ -209,13 +210,13 @@ def announce_engine(task: PILFR | Lagged | Fit, recording: Recording, choice: st
         engine = make_engine(model, choice)
     if not isinstance(engine, VirtualMachine):
         if not quiet:
-            print("engine: generated C, compiled", flush=True)
+            print_line("engine: generated C, compiled")
         return choice
     found = [str(w.message) for w in caught if issubclass(w.category, RuntimeWarning)]
     reason = "no C compiler was found" if compiler() is None else "it could not be built"
     if found:
         reason = found[-1].rpartition(";")[0] or found[-1]
-    print(f"engine: CasADi's virtual machine, which is slower: {' '.join(reason.split())}", flush=True)
+    print_line(f"engine: CasADi's virtual machine, which is slower: {' '.join(reason.split())}")
     return "vm"
 
 
@@ -238,16 +239,17 @@ def _write(
 
 
 def describe_test_error(result: Fit, recording: Recording) -> str:
-    """Describe the error on a test recording, or say why there is none."""
+    """Describe the error on a test recording, or explain why there is none."""
     try:
         error, first = result.nrmse(recording), result.scored_from(recording)
     except InputError as reason:
         return f"no NRMSE on {recording.name}: {reason}"
-    left = (result.simulate(recording) - recording.y)[first:]
-    share = 100 * np.sqrt(np.mean(left**2, axis=0)) / np.ptp(recording.y[first:], axis=0)
+    residual = (result.simulate(recording) - recording.y)[first:]
+    share = 100 * np.sqrt(np.mean(residual**2, axis=0)) / np.ptp(recording.y[first:], axis=0)
     text = f"NRMSE on {recording.name}: {error:.4f} (rms error {', '.join(f'{s:.2f}' for s in share)} % of the range)"
-    fitted = first > recording.skip
-    return text + (f"; the first {first} samples estimate the initial state and are not scored" if fitted else "")
+    if first > recording.skip:
+        text += f"; the first {first} samples estimate the initial state and are not scored"
+    return text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,15 +262,14 @@ class SimulateOptions(DataOptions):
     data: str = typer.Argument(
         ...,
         metavar="DATA",
-        help="A recording (.csv, .mat, .npz, .parquet, .mf4), or several in one array (.npz, .npy: samples, "
-        "channels, ...).",
+        help=f"A recording ({FILE_TYPES}), or several in one array (.npz, .npy: samples, channels, ...).",
     )
     out: str = option("CSV file; for several records also .npz or .npy.", "FILE", ...)
 
 
 @takes_options
 def simulate_command(options: SimulateOptions) -> int:
-    """If the file has the outputs too, the error of the simulation is printed."""
+    """Prints the error of the simulation if the file has the outputs too."""
     _check_out(options)
     if Path(options.model).suffix.lower() == ".py":
         return _simulate_equations(options)
@@ -290,9 +291,10 @@ def simulate_command(options: SimulateOptions) -> int:
 
 
 def _simulate_equations(options: SimulateOptions) -> int:
+    """Simulate the equations of a Python file."""
     simulator = load_simulator(options.model)
     if {Path(options.data).suffix.lower(), Path(options.out).suffix.lower()} & set(STACK_SUFFIXES) - {".npz"}:
-        raise InputError("Several records in one array are simulated by a saved model only; give one recording.")
+        raise InputError("Only a saved model simulates several records in one array; give one recording.")
     inputs, outputs = options.names(simulator.inputs, simulator.output_names)
     recording, columns, _ = _read_to_simulate(options, inputs, outputs)
     for note in unit_notes(simulator, recording).values():
@@ -304,7 +306,7 @@ def _simulate_equations(options: SimulateOptions) -> int:
 def _read_to_simulate(
     options: SimulateOptions, inputs: tuple[str, ...], outputs: tuple[str, ...]
 ) -> tuple[Recording, dict[str, str], bool]:
-    """Read a recording, with the outputs if it has them; return it, its columns by name, and whether it has."""
+    """Read a recording; return it, its columns by name, and whether it has the outputs."""
     columns, measured = _columns_to_read(options, inputs, outputs)
     options = replace(
         options,
@@ -322,12 +324,12 @@ def _write_simulated(
     columns: dict[str, str],
     scored_from: Callable[[Recording], int],
 ) -> int:
-    """Write the simulated outputs, and print their error or where the simulation began."""
+    """Write the simulated outputs; print their error, or the initial state if none were measured."""
     if not np.all(np.isfinite(y)):
         return say(f"The simulation of {options.model} diverges on {options.data}; nothing was written.", NO_RESULT)
-    write_atomically(Path(options.out), _table(options, recording, y, outputs, columns))
+    write_atomically(Path(options.out), _recording_table(options, recording, y, outputs, columns))
     if recording.n_y:
-        print(_error_line(recording, y, scored_from))
+        _print_error(recording, y, scored_from)
     else:
         state = {"zero": "zero", "periodic": "periodic steady state"}.get(recording.begins, "as given")
         print(f"{options.data} has no outputs ({listed(outputs)}) to compare with; initial state: {state}")
@@ -364,27 +366,31 @@ def _check_initial(options: SimulateOptions, lack: str) -> None:
         )
 
 
-def _table(
+def _recording_table(
     options: SimulateOptions, recording: Recording, y: np.ndarray, outputs: Sequence[str], columns: dict[str, str]
 ) -> str:
-    """Write times (as they were read), inputs and simulated outputs as CSV."""
+    """Write the times as in the file, the inputs, and the simulated outputs as CSV."""
     written = None if options.resample else written_times(options.data, columns)
-    times = written or [repr(float(f"{t:.12g}")) for t in recording.t]
+    times = written or map(_time_text, recording.t)
     rows = np.column_stack([recording.u, y]).tolist()
-    lines = [",".join([t.strip(), *map(repr, row)]) for t, row in zip(times, rows, strict=True)]
-    header = ",".join(["t", *recording.inputs, *outputs])
-    return "\n".join([header, *lines]) + "\n"
+    lines = [[t.strip(), *row] for t, row in zip(times, rows, strict=True)]
+    return csv_text([["t", *recording.inputs, *outputs], *lines])
+
+
+def _time_text(t: float) -> str:
+    """Write a time without the digits that come from multiplying the step."""
+    return repr(float(f"{t:.12g}"))
 
 
 def _simulate_stack(options: SimulateOptions, fitted: Fit, u: np.ndarray, y: np.ndarray | None) -> int:
-    """Simulate records (samples, channels, further axes), one after the other, each from its own initial state."""
+    """Simulate records in arrays (samples, channels, further axes), each from its own initial state."""
     axes, initial = u.shape[2:], options.initial or ("zero" if y is None else "estimate")
     if y is None:
         _check_initial(options, "none")
     if options.dt is None:
         raise InputError(f"{options.data} has no time column; state the step with --dt SECONDS.")
     more: dict[str, Any] = {key: getattr(options, key) for key in ("period", "hold", "skip")}
-    found, errors = np.empty((len(u), fitted.model.n_y, *axes)), []
+    found, errors = np.empty((len(u), fitted.model.n_y, *axes)), list[float]()
     for k, index in enumerate(np.ndindex(*axes)):
         at = (slice(None), slice(None), *index)
         measured = np.empty((len(u), 0)) if y is None else y[at]
@@ -398,8 +404,7 @@ def _simulate_stack(options: SimulateOptions, fitted: Fit, u: np.ndarray, y: np.
         if not np.all(np.isfinite(found[at])):
             return say(f"The simulation of {options.model} diverges on {name}; nothing was written.", NO_RESULT)
         if y is not None:
-            print(_error_line(record, found[at], fitted.scored_from))
-            errors.append(nrmse(record.y, found[at], skip=fitted.scored_from(record)))
+            errors += _print_error(record, found[at], fitted.scored_from)
     write_atomically(Path(options.out), _stack_content(Path(options.out), u, found, options.dt, fitted))
     if errors:
         print(f"NRMSE, mean over {len(errors)} records: {np.mean(errors):.4f}")
@@ -408,7 +413,7 @@ def _simulate_stack(options: SimulateOptions, fitted: Fit, u: np.ndarray, y: np.
 
 
 def _stack_content(out: Path, u: np.ndarray, y: np.ndarray, dt: float, fitted: Fit) -> bytes:
-    """Write `y` as an array laid out like the inputs (.npz, .npy), or as CSV whose first column numbers the records."""
+    """Write `y` as an array like the inputs (.npz, .npy), or as CSV whose first column numbers the records."""
     if out.suffix.lower() in STACK_SUFFIXES:
         buffer = BytesIO()
         if out.suffix.lower() == ".npz":
@@ -416,19 +421,23 @@ def _stack_content(out: Path, u: np.ndarray, y: np.ndarray, dt: float, fitted: F
         else:
             np.save(buffer, y)
         return buffer.getvalue()
-    lines = [",".join(["record", "t", *fitted.model.inputs, *fitted.model.outputs])]
+    lines: list[list[Any]] = [["record", "t", *fitted.model.inputs, *fitted.model.outputs]]
     for record, index in enumerate(np.ndindex(*u.shape[2:])):
         at = (slice(None), slice(None), *index)
         for k, row in enumerate(np.hstack([u[at], y[at]]).tolist()):
-            lines.append(",".join([str(record + 1), repr(float(f"{k * dt:.12g}")), *map(repr, row)]))
-    return ("\n".join(lines) + "\n").encode()
+            lines.append([record + 1, _time_text(k * dt), *row])
+    return csv_text(lines).encode()
 
 
-def _error_line(recording: Recording, y: np.ndarray, scored_from: Callable[[Recording], int]) -> str:
+def _print_error(recording: Recording, y: np.ndarray, scored_from: Callable[[Recording], int]) -> list[float]:
+    """Print the error of simulated outputs, and return it; an empty list if it does not exist."""
     try:
-        return f"NRMSE on {recording.name}: {nrmse(recording.y, y, skip=scored_from(recording)):.4f}"
-    except InputError as error:
-        return f"no NRMSE on {recording.name}: {error}"
+        error = nrmse(recording.y, y, skip=scored_from(recording))
+    except InputError as reason:
+        print(f"no NRMSE on {recording.name}: {reason}")
+        return []
+    print(f"NRMSE on {recording.name}: {error:.4f}")
+    return [error]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -449,7 +458,7 @@ class ExportOptions:
 
 @takes_options
 def export_command(options: ExportOptions) -> int:
-    """The function maps (x, u) to (x_next, y), with the memory of the operators inside x."""
+    """The function maps (x, u) to (x_next, y); x includes the memory of the operators."""
     kinds = [f"--{kind}" for kind in ("casadi", "c", "fmu") if getattr(options, kind)]
     if len(kinds) > 1:
         raise InputError(f"{in_words(kinds)} were given; give one of them.")

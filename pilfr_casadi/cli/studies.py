@@ -1,18 +1,16 @@
-"""`pilfr run` and `pilfr campaign`: execute a run file, and print its results."""
+"""Execute a run file and print its results: `pilfr run` and `pilfr campaign`."""
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import typer
 
-from .._base import InputError, progress_bar, worker_pool
+from .._base import progress_bar, worker_pool
 from ..data import NOTHING_SENTENCE, explains_nothing
 from ..studies import (
-    AHEAD,
     LARGEST_SIZE,
     MODEL,
     PAGE,
@@ -26,16 +24,29 @@ from ..studies import (
     RunResult,
     campaign,
     check_own,
-    dask_executor,
     grid_keys,
     read_run,
     reasons,
     run,
     seeds_advice,
 )
-from ._common import DONE, INTERRUPTED, NO_RESULT, flag, make_folder, option, say, seconds, takes_options, whole
+from ._common import (
+    DONE,
+    INTERRUPTED,
+    NO_RESULT,
+    check_cluster,
+    flag,
+    make_folder,
+    open_cluster,
+    option,
+    print_line,
+    say,
+    seconds,
+    takes_options,
+    whole,
+)
 
-LINE_WIDTH = 10_000  # characters: a table must not be wrapped, because a truncated number is a wrong number
+LINE_WIDTH = 10_000  # characters: too wide to wrap or truncate a number of a table
 EVERY_KEY = Path(__file__).parent / "demo_data" / "every_key.toml"
 
 
@@ -51,7 +62,7 @@ class RunOptions:
     overwrite: bool = flag("Compute everything again, even finished jobs.", "--overwrite")
 
     def read(self, kind: str) -> Run:
-        """Read the run file; folder and workers of the command line override the file."""
+        """Read the run file; the folder and the workers of the command line override its own."""
         given = read_run(self.run_file, kind)
         if self.out is not None:
             check_own(Path(self.out), given.file, self.overwrite)
@@ -72,11 +83,11 @@ def run_command(options: RunOptions) -> int:
     """Jobs run one after the other, the starts of each side by side."""
     given = options.read("run")
     count = len(given.seeds) * len(given.cells)
-    print(f"run: {given.file}, {count} job{'s' * (count > 1)}, results in {given.out}", flush=True)
+    print_line(f"run: {given.file}, {count} job{'s' * (count > 1)}, results in {given.out}")
 
     def execute() -> RunResult:
         with worker_pool(given.workers) as pool, progress_bar() as progress:
-            return run(given, overwrite=options.overwrite, executor=pool, progress=progress, tell=_print_line)
+            return run(given, overwrite=options.overwrite, executor=pool, progress=progress, tell=print_line)
 
     return _report(given, execute, TABLE, MODEL)
 
@@ -84,29 +95,25 @@ def run_command(options: RunOptions) -> int:
 @takes_options
 def campaign_command(options: CampaignOptions) -> int:
     """Jobs run side by side; a job that fails, hangs or dies does not stop the others."""
-    if options.dask and options.workers is not None:
-        raise InputError("--workers and --dask were given; the cluster has its own workers, so leave one of them out.")
+    check_cluster(options.dask, options.workers)
     given = options.read("campaign")
     if options.time_limit is not None:
         given = replace(given, time_limit=options.time_limit)
 
     def execute() -> RunResult:
-        with contextlib.ExitStack() as stack:
-            executor, workers, ahead = None, given.workers, AHEAD
-            if options.dask:
-                executor, workers, ahead = stack.enter_context(dask_executor(options.dask))
+        with open_cluster(options.dask, given.workers) as (executor, workers, ahead):
             folds = f" x {given.folds} folds" if given.folds else ""
             size = f"{len(given.cells)} cells x {len(given.seeds)} seeds{folds}"
-            print(f"campaign: {given.file}, {size}, {workers} workers, results in {given.out}", flush=True)
-            progress = stack.enter_context(progress_bar())
-            result = campaign(
-                given,
-                overwrite=options.overwrite,
-                executor=executor,
-                ahead=ahead,
-                progress=progress,
-                tell=_print_line,
-            )
+            print_line(f"campaign: {given.file}, {size}, {workers} workers, results in {given.out}")
+            with progress_bar() as progress:
+                result = campaign(
+                    given,
+                    overwrite=options.overwrite,
+                    executor=executor,
+                    ahead=ahead,
+                    progress=progress,
+                    tell=print_line,
+                )
         _print_summary(result)
         return result
 
@@ -114,7 +121,7 @@ def campaign_command(options: CampaignOptions) -> int:
 
 
 def _report(given: Run, execute: Callable[[], RunResult], *files: str) -> int:
-    """Execute a run; print the errors of the chosen model and the paths of all results; return the exit status."""
+    """Execute a run; print the errors of the chosen model and the paths of the results; return the exit status."""
     try:
         result = execute()
     except RunInterrupted as stop:
@@ -159,10 +166,6 @@ def _print_summary(result: RunResult) -> None:
     Console(highlight=False, width=LINE_WIDTH).print(table)
     if result.selection is not None:
         print(result.selection)
-
-
-def _print_line(line: str) -> None:
-    print(line, flush=True)
 
 
 # shown at the end of the help of both commands

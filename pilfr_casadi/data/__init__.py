@@ -1,4 +1,4 @@
-"""Recordings and what is done with them before any model: reading files, excitation signals, metrics, periods."""
+"""Recordings: reading and preprocessing them, excitation signals, metrics, periods and units; before any model."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Records of one experiment by two loggers on one clock.
+"""Merge the records that two loggers made of one experiment.
 
 Records of two experiments are not joined end to end, because the state would jump between them: `fit` and `diagnose`
 take them as a list.
@@ -13,7 +13,7 @@ import numpy as np
 
 from .._base import InputError, is_number, listed, positive
 from .preprocessing import sample_at
-from .recording import SAME_STEP, Recording
+from .recording import SAME_STEP, Recording, as_names
 
 Names = Sequence[str] | str | None
 
@@ -29,19 +29,19 @@ def merge(
 ) -> Recording:
     """Put the channels of two records of one experiment on one clock, over the time that both cover.
 
-    Name, initial state and skipped samples are those of the first record; an initial state stays only if the common
-    time begins with the first record. Where an input was resampled, it is no longer held between samples, and `hold`
-    becomes `"linear"` if it was said.
+    Name, initial state and skipped samples come from the first record. The initial state is kept only if the common
+    time begins with the first record. Resampled inputs are no longer held between samples, so a stated `hold` becomes
+    `"linear"`.
 
     Parameters
     ----------
     first, second : Recording
     dt : float, optional
-        Common step in seconds; the longer of both by default. An anti-alias filter precedes a longer step.
+        Common step in seconds; by default the longer step. An anti-alias filter precedes a longer step.
     start : float
         Time of the second record's first sample on the clock of the first, in seconds; it may be negative.
     inputs, outputs : names, optional
-        Channels of both that are inputs and outputs; by default each keeps its role.
+        Channels of the result that are inputs and outputs; by default each channel keeps its role.
 
     Raises
     ------
@@ -57,38 +57,43 @@ def merge(
     if not is_number(start) or not np.isfinite(start):
         raise InputError(f"start={start!r} was given; give the time of the second record's first sample in seconds.")
     step = max(first.dt, second.dt) if dt is None else positive(dt, "dt", "the common step in seconds")
-    begin, end = max(0.0, start), min(first.t[-1], start + second.t[-1])
-    times = begin + np.arange(int(np.floor(max(end - begin, 0.0) / step + SAME_STEP)) + 1) * step
-    if end < begin or len(times) < 2:
-        raise InputError(f"the recordings have fewer than 2 samples of {step:g} s in common; check start and dt.")
+    times = _common_times(first, second, start, step)
     signals: dict[str, np.ndarray] = {}
     for r, offset in ((first, 0.0), (second, start)):
         values = sample_at(np.hstack([r.u, r.y]), r.dt, times - offset, step)
         signals |= dict(zip((*r.inputs, *r.outputs), values.T, strict=True))
-    u, y = (_chosen(inputs, first.inputs + second.inputs), _chosen(outputs, first.outputs + second.outputs))
+    u = first.inputs + second.inputs if inputs is None else as_names(inputs)
+    y = first.outputs + second.outputs if outputs is None else as_names(outputs)
     for name in (*u, *y):
         if name not in signals:
             raise InputError(f"the two recordings have no channel {name!r}; they have {listed(list(signals))}.")
+    begin = times[0]
     as_sampled = begin == 0 and step == first.dt and (step == second.dt or not second.n_u)
-    keeps = begin == 0 and first.begins != "periodic"
+    keeps_initial = begin == 0 and first.begins != "periodic"
     return replace(
         first,
-        u=_columns(signals, u, len(times)),
-        y=_columns(signals, y, len(times)),
+        u=_stack_columns(signals, u, len(times)),
+        y=_stack_columns(signals, y, len(times)),
         dt=step,
         inputs=u,
         outputs=y,
         units={name: unit for name, unit in {**second.units, **first.units}.items() if name in {*u, *y}},
         period=None,
-        initial=first.initial if keeps else "estimate",
+        initial=first.initial if keeps_initial else "estimate",
         hold=first.hold if as_sampled or not first.hold else "linear",
         skip=min(max(int(np.ceil((first.skip * first.dt - begin) / step - SAME_STEP)), 0), len(times) - 1),
     )
 
 
-def _chosen(given: Names, default: tuple[str, ...]) -> tuple[str, ...]:
-    return default if given is None else (given,) if isinstance(given, str) else tuple(given)
+def _common_times(first: Recording, second: Recording, start: float, step: float) -> np.ndarray:
+    """Return the times that both records cover, on the clock of the first, (M,), in seconds."""
+    begin, end = max(0.0, start), min(first.t[-1], start + second.t[-1])
+    times = begin + np.arange(int(np.floor(max(end - begin, 0.0) / step + SAME_STEP)) + 1) * step
+    if end < begin or len(times) < 2:
+        raise InputError(f"the recordings have fewer than 2 samples of {step:g} s in common; check start and dt.")
+    return times
 
 
-def _columns(signals: dict[str, np.ndarray], names: tuple[str, ...], count: int) -> np.ndarray:
+def _stack_columns(signals: dict[str, np.ndarray], names: tuple[str, ...], count: int) -> np.ndarray:
+    """Stack named signals as columns, (count, n); n may be 0."""
     return np.column_stack([np.empty((count, 0)), *(signals[name] for name in names)])

@@ -1,14 +1,14 @@
-"""Excitation signals: random-phase and orthogonal multisines, Tukey-shaped realizations, sine sweeps, binary sequences.
+"""Excitation signals: random-phase and orthogonal multisines, Tukey-windowed realizations, sine sweeps, and PRBS.
 
 One period of a multisine is Krikelis et al. (2024), Eq. 18–19, with k the sample index,
 
     u(k) = 1/√N Σ_n A_n sin(2π k n / N + φ_n),  n ≤ n_max = round(f_max N / f_s),  φ_n uniform in [0, 2π),
 
 so it has exactly the chosen amplitudes at the bins n and nothing elsewhere. The bin at half the sampling frequency is
-left out: a sine there depends on its phase. Grids of odd bins, and of odd bins with one left out at random in every
-group of four, separate even from odd nonlinear distortion (Pintelon & Schoukens, System Identification, 2nd ed., 2012,
-Ch. 4). Several inputs are excited by orthogonal multisines (Dobrowiecki, Schoukens & Guillaume, IEEE Trans. Instrum.
-Meas. 55, 2006), whose input matrix is well conditioned at each bin.
+left out, because the size of a sine there depends on its phase. Grids of odd bins, and of odd bins with one left out at
+random in every group of four, separate even from odd nonlinear distortion (Pintelon & Schoukens, System Identification,
+2nd ed., 2012, Ch. 4). Orthogonal multisines excite several inputs (Dobrowiecki, Schoukens & Guillaume, IEEE Trans.
+Instrum. Meas. 55, 2006): their input matrix is well conditioned at each bin.
 """
 
 from collections.abc import Callable
@@ -45,7 +45,9 @@ def excited_bins(
     if not isinstance(grid, str):
         bins = np.unique(np.asarray(grid, dtype=int))
         if bins.size == 0 or bins[0] < 1 or bins[-1] > top:
-            raise InputError(f"the bins of the grid must lie from 1 to {top} for {n_samples} samples; choose those.")
+            raise InputError(
+                f"the bins of the grid must lie from 1 to {top} for {n_samples} samples; give bins in this range."
+            )
         return bins
     if grid not in ("full", "odd", "odd-random"):
         raise InputError(f"the grid {grid!r} is unknown; use 'full', 'odd', 'odd-random' or an array of bins.")
@@ -55,7 +57,7 @@ def excited_bins(
         bins = bins[bins % 2 == 1]
     if grid == "odd-random":
         if rng is None:
-            raise InputError("the grid 'odd-random' is drawn at random; pass rng, a numpy.random.Generator.")
+            raise InputError("the grid 'odd-random' is random; pass rng, a numpy.random.Generator.")
         starts = np.arange(0, len(bins) - GROUP + 1, GROUP)
         bins = np.delete(bins, starts + rng.integers(0, GROUP, len(starts)))
     if bins.size == 0:
@@ -87,7 +89,7 @@ def multisine(
     f_max, fs : float
         Highest excited and sampling frequency, Hz.
     rng : numpy.random.Generator
-        Draws the grid, if that is random, then the phases.
+        Draws the random grid, if any, then the phases.
     f_min : float
         Lowest excited frequency, Hz.
     amplitude : callable or array, optional
@@ -108,8 +110,10 @@ def multisine(
     InputError
         If band, grid, amplitude, periods or rms cannot be used.
     """
-    options: dict[str, Any] = dict(f_min=f_min, amplitude=amplitude, grid=grid, periods=periods, rms=rms)
-    return orthogonal_multisine(1, n_samples, f_max, fs, rng, **options)[0, :, 0]
+    u = orthogonal_multisine(
+        1, n_samples, f_max, fs, rng, f_min=f_min, amplitude=amplitude, grid=grid, periods=periods, rms=rms
+    )
+    return u[0, :, 0]
 
 
 def orthogonal_multisine(
@@ -148,14 +152,14 @@ def orthogonal_multisine(
     Raises
     ------
     InputError
-        As :func:`multisine`, and if there is no such matrix.
+        As :func:`multisine`, or if `matrix` does not exist for `n_u` inputs.
     """
     n_u = whole(n_u, "n_u", 1)
     bins = excited_bins(n_samples, f_max, fs, f_min=f_min, grid=grid, rng=rng)
     phases = np.exp(1j * rng.uniform(0.0, 2.0 * np.pi, (n_u, bins.size)))
     phasors = _amplitudes(bins, n_samples, fs, amplitude, rms) * phases
     spectrum = np.zeros((n_u, n_u, n_samples // 2 + 1), dtype=complex)  # experiments, inputs, bins
-    spectrum[..., bins] = -0.5j * n_samples * (_orthogonal(n_u, matrix)[:, :, None] * phasors[None, :, :])
+    spectrum[..., bins] = -0.5j * n_samples * (_orthogonal_matrix(n_u, matrix)[:, :, None] * phasors[None, :, :])
     u = np.swapaxes(np.fft.irfft(spectrum, n_samples), 1, 2)
     return np.tile(u, (1, whole(periods, "periods", 1), 1))
 
@@ -170,10 +174,10 @@ def tukey_realizations(
     normalize: Literal["record", "steady"] = "record",
     **options: Any,
 ) -> np.ndarray:
-    """Make the training signal of Krikelis et al. (2024), Sec. 6.2.1: realizations of a multisine that fade in and out.
+    """Make the training signal of Krikelis et al. (2024), Sec. 6.2.1: multisine realizations that fade in and out.
 
     Each realization has 2 `n_period` samples: half a period ramped up, one full steady period, half a period ramped
-    down by a Tukey (cosine-tapered) window. It starts at zero and the next one joins it there without a step.
+    down by a Tukey (cosine-tapered) window. It starts and ends at zero, so realizations join without a step.
 
     Parameters
     ----------
@@ -184,7 +188,7 @@ def tukey_realizations(
     f_max, fs, rng, **options
         As for :func:`multisine`: `f_min`, `amplitude` and `grid`.
     normalize : {"record", "steady"}
-        Part that gets unit standard deviation: the whole record, ramps included, or each steady period.
+        Part that is scaled to unit standard deviation: the whole record, ramps included, or each steady period.
 
     Returns
     -------
@@ -193,11 +197,11 @@ def tukey_realizations(
     Raises
     ------
     InputError
-        As :func:`multisine`, and for an odd `n_period` or an unknown `normalize`.
+        As :func:`multisine`, or for an odd `n_period` or an unknown `normalize`.
 
     See Also
     --------
-    steady_periods : where the steady periods lie.
+    steady_periods : the samples of the steady periods.
     """
     if n_period % 2:
         raise InputError(f"a period of {n_period} samples cannot be halved for the ramps; choose an even n_period.")
@@ -228,11 +232,11 @@ def sine_sweep(
     Parameters
     ----------
     f0, f1 : float
-        Frequencies at start and end, Hz; `f1` may be the lower.
+        Frequencies at start and end, Hz; `f1` may be below `f0`.
     fs : float
         Sampling frequency, Hz.
     rate, duration : float
-        Sweep rate in Hz/s (its magnitude) or the duration ``T`` in s; give one of them.
+        Magnitude of the sweep rate in Hz/s, or the duration ``T`` in s; give one of them.
     amplitude : float
         Peak of the sine.
 
@@ -263,7 +267,7 @@ def sine_sweep(
 def prbs(
     n_samples: int, rng: np.random.Generator, *, order: int | None = None, hold: int = 1, amplitude: float = 1.0
 ) -> np.ndarray:
-    """Make a pseudo-random binary sequence of maximum length that starts at a random place.
+    """Make a maximum-length pseudo-random binary sequence that starts at a random state.
 
     Parameters
     ----------
@@ -293,7 +297,9 @@ def prbs(
     if order is None:
         order = max(2, int(n_values).bit_length())
     if not 2 <= order <= 32:
-        raise InputError(f"the order {order} of the binary sequence lies outside 2 to 32; choose one inside.")
+        raise InputError(
+            f"the order {order} of the binary sequence lies outside 2 to 32; choose an order from 2 to 32."
+        )
     seed = int(rng.integers(1, 2**order))
     state = np.array([seed >> i & 1 for i in range(order)], dtype=np.int8)
     values, _ = max_len_seq(order, state=state, length=n_values)
@@ -306,8 +312,8 @@ def _amplitudes(bins: np.ndarray, n_samples: int, fs: float, amplitude: Amplitud
     a = np.asarray(given(bins * fs / n_samples) if callable(given) else given, dtype=float)
     if a.shape != bins.shape or not np.isfinite(a).all() or (a < 0).any() or not a.any():
         raise InputError(
-            f"the amplitude spectrum has the shape {a.shape} for {bins.size} excited bins; give each one finite "
-            "value of at least 0, not all 0."
+            f"the amplitude spectrum has the shape {a.shape} for {bins.size} excited bins; give each bin one "
+            "finite value of at least 0, not all 0."
         )
     if rms is None:
         return a / np.sqrt(n_samples)
@@ -315,7 +321,7 @@ def _amplitudes(bins: np.ndarray, n_samples: int, fs: float, amplitude: Amplitud
     return a * (rms / np.sqrt(np.sum(a**2) / 2))
 
 
-def _orthogonal(n: int, kind: str) -> np.ndarray:
+def _orthogonal_matrix(n: int, kind: str) -> np.ndarray:
     """Return the DFT or the Hadamard matrix, (n, n)."""
     if kind == "dft":
         index = np.arange(n)

@@ -4,16 +4,16 @@ The normalised error is Krikelis et al. (2024), Eq. 27: each output is scaled by
 
     e_i = sqrt( 1/M Σ_k ((y_i(k) − ŷ_i(k)) / σ_yi)² ),
 
-averaged over the outputs. A simulation that ran away (infinite or not a number) has an infinite error.
+averaged over the outputs. A simulation that diverges (infinite or not a number) has an infinite error.
 
-Correlations of residuals with themselves and with inputs are judged in standard deviations of pure chance. If a
-residual e is independent of an input u, their correlation at a lag is normal with the variance
+Correlations of residuals with themselves and with inputs are judged in standard deviations of a chance correlation. If
+a residual e is independent of an input u, their correlation at a lag is normal with the variance
 
     1/N Σ_k ρ_e(k) ρ_u(k),
 
 with the autocorrelations ρ of both (Ljung 1999, System Identification, sec. 16.6). The residual of a free-run
-simulation is coloured even for a perfect model, since it holds the noise of the output; it may then still not depend on
-the input, nor on the input's square (Billings & Voon 1986, International Journal of Control 44).
+simulation is coloured even for a perfect model, since it has the noise of the output; but it must not depend on the
+input, nor on the input's square (Billings & Voon 1986, International Journal of Control 44).
 """
 
 from collections.abc import Sequence
@@ -42,14 +42,14 @@ def rmse_per_output(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> np.ndarr
     Returns
     -------
     errors : array, (n_y,)
-        Infinite where the simulation is not finite.
+        Infinite for an output whose simulation is not finite.
 
     Raises
     ------
     InputError
         If shapes differ, no sample is left after `skip`, or `y` is not finite.
     """
-    measured, simulated = _scored(y, y_hat, skip)
+    measured, simulated = _scored_samples(y, y_hat, skip)
     with np.errstate(over="ignore", invalid="ignore"):
         errors = np.sqrt(np.mean((measured - simulated) ** 2, axis=0))
     return np.where(np.isfinite(errors), errors, np.inf)
@@ -64,7 +64,7 @@ def nrmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0, resting: np.ndarray |
     """Return the error relative to the standard deviation of the output, averaged over outputs.
 
     Krikelis et al. (2024), Eq. 27; 0 is perfect, 1 is as good as the mean of the output. Parameters are those of
-    :func:`rmse_per_output`; an output that never changes here is scaled by its entry of `resting`, (n_y,), if given.
+    :func:`rmse_per_output`. An output that never changes is scaled by its entry of `resting`, (n_y,), if given.
 
     Raises
     ------
@@ -72,25 +72,26 @@ def nrmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0, resting: np.ndarray |
         As :func:`rmse_per_output`, and if an output is constant and there is no scale for it.
     """
     errors = rmse_per_output(y, y_hat, skip)
-    measured, _ = _scored(y, y_hat, skip)
+    measured, _ = _scored_samples(y, y_hat, skip)
     sigma = measured.std(axis=0)
-    still = sigma <= 1e-14 * np.abs(measured).max(axis=0)
+    constant = sigma <= 1e-14 * np.abs(measured).max(axis=0)
     if resting is not None:
-        sigma = np.where(still, resting, sigma)
-    elif np.any(still):
+        sigma = np.where(constant, resting, sigma)
+    elif np.any(constant):
         raise InputError(
-            f"output {int(np.argmax(still)) + 1} of {len(sigma)} never changes, so an error relative to its standard "
-            "deviation does not exist; leave it out or use rmse."
+            f"output {int(np.argmax(constant)) + 1} of {len(sigma)} never changes, so it has no error relative to its "
+            "standard deviation; leave it out or use rmse."
         )
     return float(np.mean(errors / sigma))
 
 
 def explains_nothing(errors: Sequence[float]) -> bool:
-    """Tell whether the NRMSEs on all recordings are those of a constant, `CONSTANT_ERROR` or more."""
+    """Tell whether the NRMSEs on all recordings are no better than a constant's: `CONSTANT_ERROR` or more."""
     return bool(errors) and min(errors) >= CONSTANT_ERROR
 
 
-def _scored(y: np.ndarray, y_hat: np.ndarray, skip: int) -> tuple[np.ndarray, np.ndarray]:
+def _scored_samples(y: np.ndarray, y_hat: np.ndarray, skip: int) -> tuple[np.ndarray, np.ndarray]:
+    """Check both outputs; return their samples after `skip`, (M, n_y) each."""
     y, y_hat = np.asarray(y, dtype=float), np.asarray(y_hat, dtype=float)
     if y.shape != y_hat.shape or y.ndim not in (1, 2):
         raise InputError(
@@ -101,20 +102,17 @@ def _scored(y: np.ndarray, y_hat: np.ndarray, skip: int) -> tuple[np.ndarray, np
         raise InputError(f"skip is {skip} of {len(y)} samples; at least one sample must be scored.")
     measured, simulated = (a[skip:].reshape(len(y) - skip, -1) for a in (y, y_hat))
     if not np.isfinite(measured).all():
-        raise InputError("the measured outputs hold values that are not finite; repair or cut out that piece.")
+        raise InputError("the measured outputs have values that are not finite; repair or cut out that piece.")
     return measured, simulated
 
 
 def correlation(a: np.ndarray, b: np.ndarray, lags: int) -> np.ndarray:
     """Return the correlation of a(t + k) with b(t), both (M,), for k = -lags ... lags, (2 lags + 1,).
 
-    Raises
-    ------
-    InputError
-        If the lags are not a whole number below the number of samples, or a signal is constant.
+    InputError is raised if the lags are not a whole number below the number of samples, or a signal is constant.
     """
     if whole(lags, "lags", 1) >= len(a):
-        raise InputError(f"lags={lags} were asked of {len(a)} samples; give fewer.")
+        raise InputError(f"lags={lags} was given for {len(a)} samples; give fewer lags than samples.")
     a, b = a - np.mean(a), b - np.mean(b)
     size = float(np.sqrt((a @ a) * (b @ b)))
     if not size > 0:
@@ -125,10 +123,10 @@ def correlation(a: np.ndarray, b: np.ndarray, lags: int) -> np.ndarray:
 
 
 def chance(a: np.ndarray, b: np.ndarray, lags: int) -> float:
-    """Return the standard deviation of the correlation of two independent signals (M,) with their own colours.
+    """Return the standard deviation of the correlation between two independent coloured signals, both (M,).
 
-    The sum over the autocorrelations takes `lags` lags, tapered to zero there, so that their noise does not add up.
+    The autocorrelations are summed up to `lags` and tapered to zero there, so that their noise does not add up.
     """
     taper = np.bartlett(2 * lags + 3)[1:-1]
-    together = float(np.sum(taper * correlation(a, a, lags) * correlation(b, b, lags)))
-    return float(np.sqrt(max(together, 1.0 / len(a)) / len(a)))
+    total = float(np.sum(taper * correlation(a, a, lags) * correlation(b, b, lags)))
+    return float(np.sqrt(max(total, 1.0 / len(a)) / len(a)))

@@ -1,12 +1,12 @@
-"""Periodic recordings: mean period, noise between periods, weights by noise, and whether an input is repeated.
+"""Periodic recordings: mean period, noise from the scatter of periods, weights by noise, and repeated inputs.
 
 In steady state the response to a periodic input repeats, hysteresis included; the part that does not repeat is noise.
-With P periods the variance of one sample is `Σ (y_p - mean)² / (P - 1)`, and that of the mean period is a P-th of it
+With P periods the variance of one sample is `Σ (y_p - mean)² / (P - 1)`; averaging over the periods divides it by P
 (Pintelon & Schoukens 2012, chapter 2). This needs no knowledge of the system.
 
-Data held out prove nothing if their input is in the data that are fitted: a model that has memorised one period
-predicts the next. Two stretches of input are the same if the root mean square of their difference is at most
-`SAME_INPUT` of their standard deviation.
+Held-out data prove nothing if their input also occurs in the training data: a model that has memorised one period
+predicts the next. Two stretches of input count as the same if the root mean square of their difference is at most
+`SAME_INPUT` times their standard deviation.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from .recording import Recording, as_recordings
 
 Array = np.ndarray
 
-SAME_INPUT = 0.02  # rms difference over standard deviation of the same input; a measured input is never quite the same
-UNLIKE = 0.5  # the same ratio above which the stated period is wrong; two unrelated stretches give 1.4
-LARGEST_LAG = 2 / 3  # share of a recording: largest lag at which it is compared with itself
+SAME_INPUT = 0.02  # rms difference over standard deviation up to which inputs are the same; a measured one has noise
+WRONG_PERIOD = 0.5  # the same ratio above which the stated period is wrong; two unrelated stretches give 1.4
+LARGEST_LAG = 2 / 3  # largest lag at which a recording is compared with itself, as a share of its length
 CONSTANT_CHANNEL = 1e-9  # standard deviation over largest value up to which a channel counts as constant
 
 
@@ -55,12 +55,12 @@ def period_noise(recording: Recording) -> Array:
 def noise_weights(recordings: Recording | Iterable[Recording], error: float = 0.03) -> Array:
     """Return weights for fitting the mean periods of recordings with different levels and noise, one each.
 
-    The error of a recording counts relative to its own standard deviation, and less where noise hides it: with the
-    expected relative `error` of the model and the relative noise n of the mean period,
+    The error of a recording counts relative to its own standard deviation, and counts less if noise exceeds it. With
+    the expected relative `error` of the model and the relative noise n of the mean period,
 
         weight = (deviation in all recordings / own deviation) / sqrt(1 + (n / error)²).
 
-    No recording is dropped. For `fit(..., weights=...)`.
+    Pass the result to `fit(..., weights=...)`. No recording gets the weight zero.
 
     Parameters
     ----------
@@ -77,10 +77,10 @@ def noise_weights(recordings: Recording | Iterable[Recording], error: float = 0.
     positive(error, "error", "the relative error that the model is expected to reach")
     given = as_recordings(recordings)
     deviation = np.array([np.std(_by_period(r, r.y), axis=(0, 1)) for r in given])
-    every = np.sqrt(np.mean(deviation**2, axis=0))
+    overall = np.sqrt(np.mean(deviation**2, axis=0))
     counts = np.array([np.sqrt(len(_by_period(r, r.y))) for r in given])
     noise = np.mean([period_noise(r) for r in given] / deviation, axis=1) / counts
-    return np.asarray(np.mean(every / deviation, axis=1) / np.sqrt(1.0 + (noise / error) ** 2))
+    return np.asarray(np.mean(overall / deviation, axis=1) / np.sqrt(1.0 + (noise / error) ** 2))
 
 
 def repeats_itself(recording: Recording) -> bool:
@@ -93,11 +93,12 @@ def repeats_itself(recording: Recording) -> bool:
         return False
     n = np.arange(m, 0, -1)
     power = np.concatenate([[0.0], np.cumsum(np.sum(u**2, axis=1))])
-    apart = (power[-1] - power[:m] + power[m - np.arange(m)] - 2 * _correlate(u, u)[:m]) / n  # (1/n) Σ |u(t+p) - u(t)|²
-    size = float(u.shape[1])
-    away = np.argmax(apart > size)  # a slow input resembles itself a moment later: the first lag where it does not
+    # (1/n) Σ |u(t+p) - u(t)|² for each lag p
+    difference = (power[-1] - power[:m] + power[m - np.arange(m)] - 2 * _correlate(u, u)[:m]) / n
+    variance = float(u.shape[1])
+    first = np.argmax(difference > variance)  # a slow input resembles itself at small lags, which are left out
     last = int(LARGEST_LAG * m)
-    return bool(away and away < last and np.min(apart[away : last + 1]) <= SAME_INPUT**2 * size)
+    return bool(first and first < last and np.min(difference[first : last + 1]) <= SAME_INPUT**2 * variance)
 
 
 def keeps_its_period(recording: Recording) -> bool:
@@ -105,8 +106,8 @@ def keeps_its_period(recording: Recording) -> bool:
     u, n = recording.u[recording.skip :], recording.period or 0
     if recording.begins != "periodic" or not 0 < n < len(u):
         return True
-    apart = np.sqrt(np.mean((u[n:] - u[:-n]) ** 2, axis=0))
-    return bool(np.all(apart <= UNLIKE * np.std(u, axis=0)))
+    difference = np.sqrt(np.mean((u[n:] - u[:-n]) ** 2, axis=0))
+    return bool(np.all(difference <= WRONG_PERIOD * np.std(u, axis=0)))
 
 
 def same_input(one: Recording, other: Recording) -> bool:
@@ -120,7 +121,7 @@ def same_input(one: Recording, other: Recording) -> bool:
 
 
 def group_by_input(recordings: Sequence[Recording]) -> list[list[int]]:
-    """Group the recordings by their inputs; return their indices, in their order."""
+    """Group the recordings by their inputs; return the indices of each group, in the order of the recordings."""
     groups: list[list[int]] = []
     for k, r in enumerate(recordings):
         own = next((g for g in groups if any(same_input(r, recordings[i]) for i in g)), None)
@@ -132,7 +133,7 @@ def group_by_input(recordings: Sequence[Recording]) -> list[list[int]]:
 
 
 def _contains(u: Array, wanted: Array) -> bool:
-    """Tell whether a stretch (L, n_u) that is not constant is contained in an input (M, n_u)."""
+    """Tell whether an input (M, n_u) contains a stretch (L, n_u); False for a constant stretch."""
     middle, size = wanted.mean(axis=0), wanted.std(axis=0)
     moving = size > CONSTANT_CHANNEL * np.max(np.abs(u), initial=1e-300)
     if len(u) < len(wanted) or not np.any(moving):
@@ -140,8 +141,8 @@ def _contains(u: Array, wanted: Array) -> bool:
     a, b = ((x - middle)[:, moving] / size[moving] for x in (wanted, u))
     power = np.concatenate([[0.0], np.cumsum(np.sum(b**2, axis=1))])
     lags = len(u) - len(a) + 1
-    apart = np.sum(a**2) + power[len(a) :] - power[:lags] - 2 * _correlate(b, a)[:lags]
-    return bool(np.min(apart) <= SAME_INPUT**2 * a.size)
+    difference = np.sum(a**2) + power[len(a) :] - power[:lags] - 2 * _correlate(b, a)[:lags]
+    return bool(np.min(difference) <= SAME_INPUT**2 * a.size)
 
 
 def _standardise(u: Array) -> Array | None:

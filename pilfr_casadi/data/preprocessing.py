@@ -1,10 +1,10 @@
-"""Signals before identification: detrend, filter, resample, put on an even clock; on arrays, by SciPy.
+"""Preprocess signals given as arrays, by SciPy: detrend, filter, resample, interpolate onto an even grid.
 
 The verbs of `Recording` (`cut`, `detrend`, `filter`, `resample`, `merge`) call these functions and keep the rest of the
 recording consistent.
 
-All filters are linear. A linear model relates inputs and outputs that went through the same filter exactly as it
-relates the signals themselves, so filter both alike. A hysteresis does not commute with a filter: its memory turns at
+All filters are linear. If inputs and outputs go through the same filter, a linear model relates the filtered signals
+exactly as the original ones, so filter both alike. A hysteresis does not commute with a filter: its memory turns at
 the extremes of its own input, and a filter rounds them off. For a model with hysteresis or friction, filter only above
 the band in which the machine moves, and never with a high-pass. Oppenheim & Schafer (2010), Discrete-Time Signal
 Processing, sec. 4.6 (change of step), 5.7 (zero phase).
@@ -23,42 +23,26 @@ Array = np.ndarray
 
 TRENDS = ("constant", "linear")
 FILTERS = ("lowpass", "highpass", "bandpass", "bandstop")
-LARGEST_FACTOR = 1000  # numerator and denominator up to which a change of step is a ratio of whole numbers
+LARGEST_FACTOR = 1000  # largest numerator and denominator of a rational change of step
 RATIO_ERROR = 1e-9  # relative error of that ratio, far below a sample over the longest recordings
-PASSED = 0.8  # share of the new Nyquist frequency that an anti-alias filter passes: the rest is its transition
-ORDER = 8  # order of the Butterworth filter before a step that is no ratio of whole numbers
-LONGEST_GAP = 10  # usual steps; over a longer gap interpolated samples would be an invention
+PASSBAND = 0.8  # share of the new Nyquist frequency that the anti-alias filter passes; the rest is its transition band
+ANTI_ALIAS_ORDER = 8  # order of the Butterworth filter before an irrational change of step
+LONGEST_GAP = 10  # in median steps; samples interpolated over a longer gap would be invented
 
 
-def remove_trend(values: Array, kind: str) -> Array:
-    """Subtract the mean, or the straight line of least squares, from every column of (M, n)."""
+def remove_trend(values: Array, kind: Any) -> Array:
+    """Subtract the mean, or the least-squares line, from every column of (M, n)."""
     if kind not in TRENDS:
         raise InputError(f"kind={kind!r} was given to detrend; give {listed(TRENDS)}.")
     from scipy.signal import detrend
 
-    return np.asarray(detrend(values, axis=0, type="linear" if kind == "linear" else "constant"))
+    return np.asarray(detrend(values, axis=0, type=kind))
 
 
 def butterworth(values: Array, dt: float, cutoff: float | tuple[float, float], kind: str, order: int) -> Array:
-    """Run a Butterworth filter forwards and backwards over every column of (M, n): no phase, twice the order.
+    """Run a Butterworth filter forwards and backwards over every column of (M, n); see `Recording.filter`.
 
-    The gain at a cutoff frequency is one half.
-
-    Parameters
-    ----------
-    values : array, (M, n)
-    dt : float
-        Step in s.
-    cutoff : float or two of them
-        Edge, or both edges of a band, in Hz.
-    kind : {"lowpass", "highpass", "bandpass", "bandstop"}
-    order : int
-        Order of one pass.
-
-    Raises
-    ------
-    InputError
-        If a cutoff is not between zero and the Nyquist frequency, or there are too few samples.
+    The two passes cancel the phase, double the order, and make the gain at a cutoff frequency one half.
     """
     if kind not in FILTERS:
         raise InputError(f"kind={kind!r} was given to filter; give {listed(FILTERS)}.")
@@ -78,7 +62,7 @@ def butterworth(values: Array, dt: float, cutoff: float | tuple[float, float], k
 
 
 def _zero_phase(values: Array, dt: float, edges: Any, kind: Any, order: int) -> Array:
-    """Filter forwards and backwards; the ends are continued by their reflection in the first and last value."""
+    """Filter forwards and backwards; the signal is extended beyond its ends by odd reflection."""
     from scipy.signal import butter, sosfiltfilt
 
     sections = butter(order, edges, kind, fs=1 / dt, output="sos")
@@ -89,10 +73,10 @@ def _zero_phase(values: Array, dt: float, edges: Any, kind: Any, order: int) -> 
 
 
 def change_step(values: Array, dt: float, step: float) -> Array:
-    """Resample every column of (M, n) from one step to another, s, with an anti-alias filter where it grows.
+    """Resample every column of (M, n) from step `dt` to `step`, s; an anti-alias filter precedes a longer step.
 
-    A ratio of whole numbers is done by a polyphase filter. Any other is done by a zero-phase low-pass and a cubic
-    spline. The first sample stays the first.
+    A rational change of step uses a polyphase filter, any other a zero-phase low-pass and a cubic spline. The first
+    sample stays the first.
     """
     ratio = Fraction(dt / step).limit_denominator(LARGEST_FACTOR)
     count = int(np.floor((len(values) - 1) * dt / step * (1 + RATIO_ERROR))) + 1
@@ -111,24 +95,20 @@ def change_step(values: Array, dt: float, step: float) -> Array:
 
 
 def sample_at(values: Array, dt: float, times: Array, step: float) -> Array:
-    """Sample every column of (M, n) at times in s after its first sample, for a later step of `step` seconds."""
+    """Interpolate every column of (M, n) at times in s after its first sample; low-pass it if `step` exceeds `dt`."""
     from scipy.interpolate import CubicSpline
 
     if step > dt * (1 + RATIO_ERROR):
-        values = _zero_phase(values, dt, PASSED * 0.5 / step, "lowpass", ORDER)
+        values = _zero_phase(values, dt, PASSBAND * 0.5 / step, "lowpass", ANTI_ALIAS_ORDER)
     known = np.arange(len(values)) * dt
     return np.asarray(CubicSpline(known, values, axis=0)(np.clip(times, 0.0, known[-1])))
 
 
 def even_grid(t: Array, values: Array, step: float, label: str) -> Array:
-    """Interpolate uneven samples at times t (M,), s, onto an even grid from t[0] on, with an anti-alias filter.
+    """Interpolate samples at uneven times t (M,), s, onto an even grid from t[0] on.
 
-    The signals are interpolated linearly on a grid at least as fine as the usual gap, and then resampled.
-
-    Raises
-    ------
-    InputError
-        If times do not increase, or a gap is longer than `LONGEST_GAP` usual ones; `label` begins the message.
+    The signals are interpolated linearly on a grid at least as fine as the median gap, then resampled to `step`. Times
+    that do not increase, and gaps longer than `LONGEST_GAP` median gaps, are refused; `label` begins the message.
     """
     positive(step, "resample", "the new step in seconds")
     gaps = np.diff(t)

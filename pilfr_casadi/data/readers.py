@@ -1,8 +1,8 @@
-"""Readers: CSV, ``.mat``, ``.npz``, Parquet and MDF files, and frames of pandas or polars, into recordings.
+"""Read recordings from CSV, ``.mat``, ``.npz``, Parquet and MDF files, and from frames of pandas or polars.
 
 A file holds one recording: a time column (``t``, ``t_s`` or ``time``, in seconds, uniform) and one column for each
-input and output by name, with or without its unit in brackets; other columns are ignored. Any fault of a file is
-reported in one sentence that names the file, the column and the line.
+input and output by name, with or without its unit in brackets; other columns are ignored. One sentence reports a fault
+of a file; it names the file, the column and the line.
 """
 
 import re
@@ -15,15 +15,15 @@ import numpy as np
 
 from .._base import InputError, listed, positive
 from .preprocessing import even_grid
-from .recording import Recording
+from .recording import Recording, as_names
 from .tables import ArrayTable, CsvTable, frame_table, open_table
 
 PathLike = str | Path
 Names = Sequence[str] | str
 
 TIME_NAMES = ("t", "t_s", "time")
-TOLERANCE = 1e-4  # steps that a sample may lie off the grid; the clocks of recorders do not drift by more in a record
-AGREEMENT = 1e-3  # relative difference between a stated step and the written times; another unit differs by far more
+TOLERANCE = 1e-4  # allowed deviation of a sample from the grid, in steps; recorders' clocks drift less in a record
+AGREEMENT = 1e-3  # allowed relative difference of a stated step from the times; a wrong unit differs by far more
 _UNITS = r"ns|us|µs|μs|ms|min|h|d|nanoseconds?|microseconds?|milliseconds?|minutes?|hours?|days?"
 _WITH_UNIT = re.compile(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")  # such as "force [N]" or "speed (rad/s)"
 _OTHER_UNIT = re.compile(rf"(?:t|time)[\s_\-\[(]+({_UNITS})[\])]?", re.IGNORECASE)
@@ -51,23 +51,23 @@ def read_csv(
     path : str or Path, or several
         One file, or a list of files with the same columns.
     inputs, outputs : str or sequence of str
-        Names of the inputs and outputs, and of their columns unless `columns` maps them. A column may say its unit
-        behind the name, as in ``force [N]`` or ``force (N)``; it becomes the unit of the recording. Without outputs
-        (`()`) the recording can be simulated but not fitted.
+        Names of the inputs and outputs, and of their columns unless `columns` maps them. A unit behind a column's name,
+        as in ``force [N]`` or ``force (N)``, becomes the unit of the channel. Without outputs (`()`) the recording can
+        be simulated but not fitted.
     columns : mapping, optional
         Column by name, e.g. ``{"force": "u_vir_V"}``; the key ``"t"`` chooses the time column.
     dt : float, optional
-        Step in seconds. Needed if there is no time column; otherwise the times must agree with it within 0.1 %, which
-        finds times that are not in seconds.
+        Step in seconds. Required without a time column; otherwise the times must agree with it within 0.1 %, which
+        reveals times that are not in seconds.
     time_tolerance : float, optional
         Allowed deviation of the times from a uniform grid, in steps, beyond the rounding of the written times; 1e-4 by
         default.
     resample : float, optional
-        New step in seconds, for times that are not uniform: linear interpolation on a fine grid, then an anti-alias
-        filter. A gap of more than ten usual steps is refused.
+        New step in seconds, for times that are not uniform: linear interpolation onto a fine grid, then an anti-alias
+        filter. A gap longer than ten median steps is refused.
     **recording_options
-        Further fields of :class:`Recording`: `hold`, `initial`, `period`, `skip`, `units`, `name` (by default the
-        file's).
+        Further fields of :class:`Recording`: `hold`, `initial`, `period`, `skip`, `units`, and `name` (by default the
+        file's name).
 
     Returns
     -------
@@ -91,8 +91,8 @@ def read_mat(
 ) -> Recording | tuple[Recording, ...]:
     """Read recordings from MATLAB files (up to version 7.2): one vector for time and for each input and output.
 
-    Parameters, returned values and errors are those of :func:`read_csv`. A matrix with a row for each sample gives the
-    channels ``name1, name2, ...``.
+    Parameters, returned values and errors are the same as for :func:`read_csv`. A matrix with one row per sample holds
+    the channels ``name1, name2, ...``.
     """
     return _read_each(path, _Request(inputs, outputs, **options), ".mat")
 
@@ -104,11 +104,7 @@ def read_npz(path: Iterable[PathLike], inputs: Names, outputs: Names, **options:
 def read_npz(
     path: PathLike | Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
 ) -> Recording | tuple[Recording, ...]:
-    """Read recordings from NumPy archives (``numpy.savez``): one vector for time and for each input and output.
-
-    Parameters, returned values and errors are those of :func:`read_csv`. A matrix with a row for each sample gives the
-    channels ``name1, name2, ...``.
-    """
+    """Read recordings from NumPy archives (``numpy.savez``); otherwise as :func:`read_mat`."""
     return _read_each(path, _Request(inputs, outputs, **options), ".npz")
 
 
@@ -122,9 +118,9 @@ def read(
     """Read recordings with the reader for the file's suffix.
 
     The suffixes are .csv, .tsv, .txt or .dat, .mat, .npz, .parquet, .mf4 and .mdf. Parquet files need
-    ``pilfr-casadi[parquet]``, MDF files ``pilfr-casadi[mdf]``. The times of an MDF file's channels are its column
-    ``t``; all channels that are read must have the same. Parameters, returned values and errors are those of
-    :func:`read_csv`; files of different kinds may be mixed.
+    ``pilfr-casadi[parquet]``, MDF files ``pilfr-casadi[mdf]``. The column ``t`` of an MDF file holds the times of its
+    channels; all channels that are read must have the same times. Parameters, returned values and errors are the same
+    as for :func:`read_csv`; a list may mix kinds of files.
     """
     return _read_each(path, _Request(inputs, outputs, **options))
 
@@ -132,21 +128,21 @@ def read(
 def read_frame(
     frame: Any, inputs: Names, outputs: Names, *, columns: Mapping[str, str] | None = None, **options: Any
 ) -> Recording:
-    """Make a recording from a pandas or polars data frame, or from any table with `columns` of named arrays.
+    """Make a recording from a data frame of pandas or polars, or from any table whose `columns` are named arrays.
 
     Parameters
     ----------
     frame : DataFrame
-        A time column in seconds, or one of dates or durations (of which the seconds from the first on are taken), and
-        a column for each input and output. Without a time column, the index of a pandas frame is the time if it has
-        the name of one, or holds dates or durations.
+        A column for each input and output, and a time column: seconds, or dates or durations, which become seconds
+        after the first one. Without a time column, the index of a pandas frame is the time if it has the name of a
+        time column, or holds dates or durations.
     inputs, outputs, columns, **options
         As for :func:`read_csv`.
 
     Raises
     ------
     InputError
-        If it is no frame, or a column or a value cannot be used.
+        If `frame` is not a data frame, or a column or a value cannot be used.
     """
     request = _Request(inputs, outputs, columns=columns, **{"name": "", **options})
     return request.recording(frame_table(frame, TIME_NAMES, request.wanted))
@@ -155,24 +151,24 @@ def read_frame(
 def column_names(path: PathLike, wanted: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the names of a file's columns or variables; `wanted` helps to find the delimiter of a CSV file.
 
-    One that has a wanted name with a unit behind it, as in ``force [N]``, is returned by the wanted name.
+    A column with a unit behind a wanted name, such as ``force [N]``, is returned by the wanted name.
     """
     names = open_table(Path(path), wanted).names
-    short = {_with_unit(name, names): name for name in wanted}
+    short = {_find_column(name, names): name for name in wanted}
     return tuple(short.get(name, name) for name in names)
 
 
 def written_times(path: PathLike, columns: Mapping[str, str] | None = None) -> list[str] | None:
-    """Return the times of a file as they are written there, an array's to the last digit; None without times."""
+    """Return the times of a file as text, all digits included; None if it has no time column."""
     columns = columns or {}
     chosen = next((columns[name] for name in TIME_NAMES if name in columns), None)
     table = open_table(Path(path), [chosen or "t"])
-    time = _time_column(table.names, chosen, str(path))
+    time = _find_time_column(table.names, chosen, str(path))
     return table.texts(time) if time else None
 
 
 class _Request:
-    """The columns and options that a reader was called with, checked by themselves and against a file's columns."""
+    """The columns and options of a call to a reader; checks them, also against the columns of a file."""
 
     def __init__(
         self,
@@ -184,14 +180,14 @@ class _Request:
         resample: float | None = None,
         **options: Any,
     ) -> None:
-        self.inputs, self.outputs = _names(inputs, "inputs"), _names(outputs, "outputs")
+        self.inputs, self.outputs = _check_names(inputs, "inputs"), _check_names(outputs, "outputs")
         self.dt, self.time_tolerance, self.new_step, self.options = dt, time_tolerance, resample, options
         if not self.inputs:
             raise InputError("a recording needs at least one input; name its column.")
         known = [f.name for f in fields(Recording) if f.name not in ("u", "y", "dt", "inputs", "outputs")]
         for name in options:
             if name not in known:
-                raise InputError(f"{name!r} is no option of a reader; there are {listed(known)}.")
+                raise InputError(f"{name!r} is not an option of a reader; the options are {listed(known)}.")
         if not isinstance(columns or {}, Mapping):
             raise InputError(f"columns={columns!r} was given; give columns={{'NAME': 'COLUMN'}}.")
         self.columns = columns or {}
@@ -206,9 +202,13 @@ class _Request:
         if resample is not None:
             positive(resample, "resample", "the new step in seconds")
             if dt is not None or time_tolerance is not None:
-                raise InputError("resample was given with dt or time_tolerance; it makes times uniform by itself.")
+                raise InputError(
+                    "resample was given with dt or time_tolerance, but it makes times uniform; leave the others out."
+                )
         if time_tolerance is not None:
-            positive(time_tolerance, "time_tolerance", "the steps that samples may lie off the grid", zero=True)
+            positive(
+                time_tolerance, "time_tolerance", "the allowed deviation of samples from the grid, in steps", zero=True
+            )
 
     def column(self, name: str) -> str:
         """Return the column of an input or an output."""
@@ -220,17 +220,19 @@ class _Request:
         return [self.column(name) for name in (*self.inputs, *self.outputs)]
 
     def locate(self, names: Sequence[str], source: str) -> tuple[str | None, list[str]]:
-        """Return the time column, if any, and those of the inputs and outputs."""
+        """Return the time column, or None, and the columns of the inputs and outputs."""
         mapped = [column for name, column in self.columns.items() if name in TIME_NAMES]
-        time = _time_column(names, mapped[0] if mapped else None, source)
-        wanted = [_with_unit(column, names) for column in self.wanted]
+        time = _find_time_column(names, mapped[0] if mapped else None, source)
+        wanted = [_find_column(column, names) for column in self.wanted]
         both = sorted({*map(self.column, self.inputs)} & {*map(self.column, self.outputs)})
         if both:
-            raise InputError(f"{source}: column {both[0]!r} is taken both for an input and for an output; correct one.")
+            raise InputError(
+                f"{source}: column {both[0]!r} is given both for an input and for an output; correct one of them."
+            )
         if time in wanted:
             raise InputError(
                 f"{source}: column {time!r} holds the time and cannot be an input or an output too; name another "
-                "column, or say which one holds the time, as in columns={'t': 'COLUMN'}."
+                "column, or map the time column, as in columns={'t': 'COLUMN'}."
             )
         for role, column in zip((*self.inputs, *self.outputs), wanted, strict=True):
             if column not in names:
@@ -269,8 +271,8 @@ class _Request:
         n_u = len(self.inputs)
         u, y = np.hstack(parts[:n_u]), np.hstack([np.empty((len(parts[0]), 0)), *parts[n_u:]])
         names = _channel_names(self.inputs, parts[:n_u]), _channel_names(self.outputs, parts[n_u:])
-        written = zip((*self.inputs, *self.outputs), map(_unit_in, wanted), strict=True)
-        units = {name: unit for name, unit in written if unit and name in names[0] + names[1]}
+        found = zip((*self.inputs, *self.outputs), map(_read_unit, wanted), strict=True)
+        units = {name: unit for name, unit in found if unit and name in names[0] + names[1]}
         units |= self.options.get("units") or {}
         try:
             return Recording(u, y, dt, *names, **{"name": table.path.stem, **self.options, "units": units})
@@ -278,20 +280,20 @@ class _Request:
             raise InputError(f"{table.path}: {error}") from None
 
 
-def _with_unit(column: str, names: Sequence[str]) -> str:
-    """Find a column among a file's names, which may say its unit in brackets; the name as given if it is not there."""
+def _find_column(column: str, names: Sequence[str]) -> str:
+    """Return a file's name of a column, which may have a unit in brackets; `column` itself if there is none."""
     found = [name for name in names if (parts := _WITH_UNIT.fullmatch(name)) and parts.group(1) == column]
     return found[0] if column not in names and len(found) == 1 else column
 
 
-def _unit_in(column: str) -> str:
-    """Read the unit that a column's name says in brackets; empty if it says none."""
+def _read_unit(column: str) -> str:
+    """Return the unit in brackets behind the name of a column; empty if there is none."""
     parts = _WITH_UNIT.fullmatch(column)
     return (parts.group(2) or parts.group(3) or "").strip() if parts else ""
 
 
-def _names(given: Any, role: str) -> tuple[str, ...]:
-    names = (given,) if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
+def _check_names(given: Any, role: str) -> tuple[str, ...]:
+    names = as_names(given)
     if not all(isinstance(name, str) for name in names):
         raise InputError(f"{role}={given!r} was given; give the names of the columns.")
     return names
@@ -300,7 +302,7 @@ def _names(given: Any, role: str) -> tuple[str, ...]:
 def _read_each(
     path: PathLike | Iterable[PathLike], request: _Request, suffix: str = ""
 ) -> Recording | tuple[Recording, ...]:
-    """Read one file, or several into a tuple; with a `suffix`, whatever their own are."""
+    """Read one file, or several into a tuple; a `suffix` overrides that of the files."""
     if isinstance(path, PathLike):
         return request.recording(open_table(Path(path), request.wanted, suffix))
     paths = tuple(path) if isinstance(path, Iterable) else (path,)
@@ -315,15 +317,14 @@ def _channel_names(names: Sequence[str], parts: Sequence[np.ndarray]) -> tuple[s
     return tuple(f"{n}{i + 1}" if p.shape[1] > 1 else n for n, p in pairs for i in range(p.shape[1]))
 
 
-def _time_column(names: Sequence[str], chosen: str | None, source: str) -> str | None:
-    """Find the time column among the names: the chosen one, or one of `TIME_NAMES`; None where there is none."""
+def _find_time_column(names: Sequence[str], chosen: str | None, source: str) -> str | None:
+    """Return the time column among the names: the chosen one, or one of `TIME_NAMES`; None if there is none."""
     found = [chosen] if chosen is not None else [name for name in TIME_NAMES if name in names]
     if not found:
         return None
     if len(found) > 1:
         raise InputError(
-            f"{source} has several time columns ({', '.join(found)}); say which one, as in "
-            f"columns={{'t': '{found[0]}'}}."
+            f"{source} has several time columns ({', '.join(found)}); choose one, as in columns={{'t': '{found[0]}'}}."
         )
     if found[0] not in names:
         raise InputError(f"{source} has no column {found[0]!r} for the time; its columns are {listed(names)}.")
@@ -332,12 +333,12 @@ def _time_column(names: Sequence[str], chosen: str | None, source: str) -> str |
 
 
 def _refuse_other_unit(names: Sequence[str], source: str) -> None:
-    """Raise :class:`InputError` if a name such as ``t_ms`` or ``Time [min]`` states a unit other than seconds."""
+    """Refuse a name such as ``t_ms`` or ``Time [min]``, which states a unit other than seconds."""
     for name in names:
         unit = _OTHER_UNIT.fullmatch(name.strip())
         if unit:
             raise InputError(
-                f"{source}: column {name!r} is time in {unit.group(1)} by its name, but time must be in seconds; "
+                f"{source}: column {name!r} is named as time in {unit.group(1)}, but time must be in seconds; "
                 "convert it and name it t_s, or leave it out and state the step in seconds with dt=STEP."
             )
 
@@ -352,41 +353,29 @@ def step_of(
 ) -> float:
     """Return the step of a uniform time grid, in seconds.
 
-    A grid is uniform if no sample is further than `tolerance` steps from ``t(0) + k dt``, beyond the rounding to the
-    digits written: a grid of 1/120 s written with six decimals is uniform.
-
-    Parameters
-    ----------
-    t : array, (M,)
-        Times in seconds, finite.
-    column : str
-        Name of the column, with its file, for messages.
-    place : callable
-        Returns the place of sample ``k`` in the file, e.g. ``"line 17"``.
-    dt : float, optional
-        Stated step; it must agree with the times and is returned in their place.
-    tolerance : float, optional
-        `TOLERANCE` by default.
+    A grid is uniform if every sample is within `tolerance` steps of ``t(0) + k dt``, plus the rounding of the written
+    digits: a grid of 1/120 s written with six decimals is uniform. A stated step `dt` must agree with the times, and is
+    returned as it is. For messages, `column` names the file and the column, and `place` returns the place of a sample,
+    such as ``"line 17"``.
     """
     if len(t) < 2:
         raise InputError(f"{column} has only one sample; at least 2 are needed.")
     gaps = np.diff(t)
-    back = np.flatnonzero(gaps <= 0)
-    if back.size:
-        k = int(back[0]) + 1
+    if np.any(gaps <= 0):
+        k = int(np.argmax(gaps <= 0)) + 1
         raise InputError(
             f"{column}: {place(k)} is {t[k]:.10g} s, after {t[k - 1]:.10g} s; time must increase from sample to sample."
         )
     step = (t[-1] - t[0]) / (len(t) - 1)
     deviation = np.abs(t - t[0] - np.arange(len(t)) * step)
     allowed = (TOLERANCE if tolerance is None else tolerance) * step
-    if (deviation > allowed).any() and (deviation > allowed + _rounding(t, step)).any():
-        usual = float(np.median(gaps))
-        odd = np.abs(gaps - usual)
-        k = int(np.argmax(odd > 0.5 * odd.max())) + 1
+    if (deviation > allowed).any() and (deviation > allowed + _bound_rounding(t, step)).any():
+        median = float(np.median(gaps))
+        error = np.abs(gaps - median)
+        k = int(np.argmax(error > 0.5 * error.max())) + 1
         raise InputError(
             f"{column} is not uniform: {place(k)} comes {gaps[k - 1]:.6g} s after the sample before it where "
-            f"{usual:.6g} s is usual, and samples lie up to {deviation.max() / step:.2g} steps off a uniform grid; "
+            f"{median:.6g} s is usual, and samples lie up to {deviation.max() / step:.2g} steps off a uniform grid; "
             "resample with resample=STEP, or allow more with time_tolerance=STEPS."
         )
     step = float(f"{step:.12g}")
@@ -400,23 +389,24 @@ def step_of(
     return float(dt)
 
 
-def _rounding(t: np.ndarray, step: float) -> np.ndarray:
-    """Bound how far samples may lie off the grid because written times are rounded, (M,), in seconds.
+def _bound_rounding(t: np.ndarray, step: float) -> np.ndarray:
+    """Bound the deviation of samples from the grid by the rounding of written times, (M,), in seconds.
 
-    Times are rounded to D decimals or to S significant digits, whichever is coarser at a sample; the error of the last
-    time turns the grid. The bound is at most a tenth of a step, so that it never hides a missing sample.
+    Times are rounded to D decimals or to S significant digits, whichever is coarser at a sample. The errors of the
+    first and last time shift and stretch the grid. The bound is at most a tenth of a step, so it never hides a missing
+    sample.
     """
     size = np.abs(t)
     exponent = np.floor(np.log10(size, where=size > 0, out=np.full(len(t), -np.inf)))
     exponent[~np.isfinite(exponent)] = exponent[np.isfinite(exponent)].min()
-    digits = _fewest(lambda n: size * 10.0 ** (n - 1 - exponent))
-    decimals = _fewest(lambda n: size * 10.0**n)
+    digits = _count_digits(lambda n: size * 10.0 ** (n - 1 - exponent))
+    decimals = _count_digits(lambda n: size * 10.0**n)
     own = 0.5 * np.maximum(10.0 ** (exponent + 1 - digits), 10.0**-decimals)
     return np.minimum(own + own[0] + own[-1], 0.1 * step)
 
 
-def _fewest(scaled: Callable[[float], np.ndarray]) -> float:
-    """Return the smallest n for which all scaled times are whole numbers; infinite where they are not rounded."""
+def _count_digits(scaled: Callable[[float], np.ndarray]) -> float:
+    """Return the smallest n for which all scaled times are whole numbers; infinite if there is none below 15."""
     for n in range(15):
         times = scaled(float(n))
         near = np.abs(times - np.rint(times)) <= 4 * np.finfo(float).eps * np.abs(times)

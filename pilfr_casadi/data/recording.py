@@ -1,8 +1,8 @@
 """The recording: sampled inputs and outputs of one experiment, checked once where data enters.
 
-A :class:`Recording` holds ``M`` samples of ``n_u`` inputs and ``n_y`` outputs on one uniform time grid, and states
-the rest that a simulation of it needs: the initial state, the input between the samples, the period, and the number of
-leading samples that are not scored. It is immutable, and all code that receives one trusts it.
+A :class:`Recording` holds ``M`` samples of ``n_u`` inputs and ``n_y`` outputs on one uniform time grid, and everything
+else that a simulation needs: the initial state, the input between the samples, the period, and the number of leading
+samples that are not scored. It is immutable, and all code that receives one trusts it.
 """
 
 import hashlib
@@ -13,10 +13,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from .._base import LARGEST, InputError, is_number, is_whole, later, listed, positive, real_array, usable
+from .._base import REPAIR, InputError, is_number, is_whole, later, listed, positive, real_array, usable
 from .preprocessing import butterworth, change_step, remove_trend
 
-SAME_STEP = 1e-4  # relative difference up to which two steps are the same; written times have few digits
+SAME_STEP = 1e-4  # relative difference up to which two steps count as the same; written times have few digits
 HOLDS = ("zero", "linear", None)
 INITIALS = ("zero", "estimate", "periodic")
 
@@ -30,22 +30,22 @@ class Recording:
     u : array, (M, n_u) or (M,)
         Inputs at the samples. Copied; stored as a read-only (M, n_u) array.
     y : array, (M, n_y) or (M,)
-        Outputs at the same samples. Copied; stored as a read-only (M, n_y) array. (M, 0) where none was measured:
-        such a recording can be simulated but not fitted.
+        Outputs at the same samples. Copied; stored as a read-only (M, n_y) array. With (M, 0), no measured output, a
+        recording can be simulated but not fitted.
     dt : float
         Time from one sample to the next, in seconds.
     inputs, outputs : tuple of str
-        Names of the columns; ``u`` or ``u1, u2, ...`` and ``y`` or ``y1, y2, ...`` where left out.
+        Names of the columns; by default ``u`` or ``u1, u2, ...`` and ``y`` or ``y1, y2, ...``.
     units : mapping of str to str
-        Unit by column name, for figures and reports; columns may be missing.
+        Unit by column name, for figures and reports; not every column needs one.
     period : int, optional
-        Samples per period, when the recording is in periodic steady state from sample `skip` on.
+        Samples per period, if the recording is in periodic steady state from sample `skip` on.
     initial : {"estimate", "zero", "periodic"} or array, (nx,)
-        State at the first sample: estimated, zero, periodic steady state, or given as numbers. The memory of an
-        operator that never slips in a period is not unique in steady state; the one reached from rest with zero memory
+        State at the first sample: estimated, zero, periodic steady state, or given as numbers. In steady state the
+        memory of an operator that never slips in a period is not unique; the memory reached from rest with zero memory
         is used, and `fit` reports this.
     hold : {"zero", "linear"}, optional
-        Input between the samples: held or interpolated. ``None`` leaves it open.
+        Input between the samples: held or interpolated linearly. ``None`` leaves it open.
     skip : int
         Leading samples that are simulated but not scored.
     name : str
@@ -54,12 +54,12 @@ class Recording:
     Raises
     ------
     InputError
-        When a value is not a finite real number, or lengths, shapes, names or options do not fit together.
+        If a value is not a finite real number, or lengths, shapes, names or options do not fit together.
     """
 
     u: np.ndarray
-    y: np.ndarray = None  # type: ignore[assignment]  # needed, and missed with a sentence
-    dt: float = None  # type: ignore[assignment]  # needed too
+    y: np.ndarray = None  # type: ignore[assignment]  # required; `_signal` reports its absence
+    dt: float = None  # type: ignore[assignment]  # required too
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
@@ -82,9 +82,9 @@ class Recording:
                 f"{self.label} has {len(u)} sample(s) and at least 2 are needed; arrays are (samples, channels), "
                 "so transpose them if they lie the other way."
             )
-        twice = sorted(set(inputs) & set(outputs))
-        if twice:
-            raise InputError(f"{self.label} names {twice[0]!r} both as an input and as an output; give it one role.")
+        both = sorted(set(inputs) & set(outputs))
+        if both:
+            raise InputError(f"{self.label} names {both[0]!r} both as an input and as an output; give it one role.")
         _check_options(self, len(u))
         for name in self.units:
             if name not in inputs + outputs:
@@ -103,7 +103,7 @@ class Recording:
 
     @property
     def begins(self) -> str:
-        """The kind of initial state: "zero", "estimate", "periodic", or "given" where it is numbers."""
+        """Kind of initial state: "zero", "estimate", "periodic", or "given" if it is numbers."""
         return self.initial if isinstance(self.initial, str) else "given"
 
     @property
@@ -142,7 +142,7 @@ class Recording:
         return f"<{text}, {', '.join(shown)}>"
 
     def plot(self) -> Any:
-        """Draw every channel over time and over frequency; look at a recording before you fit it.
+        """Draw every channel over time and over frequency.
 
         Returns
         -------
@@ -154,19 +154,19 @@ class Recording:
         return str(later("recording_card")(self))
 
     def with_(self, **changes: Any) -> Self:
-        """Return a copy with some fields replaced, checked anew."""
+        """Return a copy with some fields replaced; it is checked again."""
         return replace(self, **changes)
 
     def slice(self, start: int | None = None, stop: int | None = None) -> Self:
         """Return the samples from `start` up to `stop`, counted as in a Python slice.
 
         A piece that begins later has another initial state, so its ``initial`` becomes ``"estimate"``; ``"periodic"``
-        stays if a whole period is left.
+        is kept if a whole period is left.
 
         Raises
         ------
         InputError
-            When fewer than two samples are left.
+            If fewer than two samples are left.
         """
         first, last, _ = slice(start, stop).indices(len(self))
         if last - first < 2:
@@ -175,9 +175,8 @@ class Recording:
             )
         skip = max(self.skip - first, 0) if self.skip < last else 0
         period = self.period if (self.period or 0) <= last - first - skip else None
-        periodic = self.begins == "periodic"
-        keeps = period is not None if periodic else first == 0
-        initial = self.initial if keeps else "estimate"
+        keeps_initial = period is not None if self.begins == "periodic" else first == 0
+        initial = self.initial if keeps_initial else "estimate"
         return replace(self, u=self.u[first:last], y=self.y[first:last], period=period, skip=skip, initial=initial)
 
     def split(self, fraction: float) -> tuple[Self, Self]:
@@ -203,18 +202,18 @@ class Recording:
         return self.slice(first, after)
 
     def detrend(self, kind: str = "constant", channels: Sequence[str] | str | None = None) -> Self:
-        """Subtract the mean (`"constant"`) or a straight line (`"linear"`) from every channel, or from those named.
+        """Subtract the mean (`"constant"`) or a straight line (`"linear"`) from all channels or from `channels`.
 
-        The working point of a nonlinear machine belongs to its physics, so a simulator of it needs the signals as they
-        are; a linear or a PI-LFR model is fitted about a working point. An initial state of zero or given as numbers
-        no longer holds and is estimated.
+        A linear or a PI-LFR model is fitted about a working point. A simulator needs the original signals, because the
+        working point of a nonlinear machine belongs to its physics. An initial state of zero or given as numbers
+        becomes invalid and is estimated.
 
         Raises
         ------
         InputError
             If the kind or a channel is unknown.
         """
-        return self._edited(lambda values: remove_trend(values, kind), channels)
+        return self._edit_channels(lambda values: remove_trend(values, kind), channels)
 
     def filter(
         self,
@@ -223,17 +222,17 @@ class Recording:
         order: int = 4,
         channels: Sequence[str] | str | None = None,
     ) -> Self:
-        """Filter every channel, or those named, forwards and backwards: without phase.
+        """Filter all channels, or `channels`, forwards and backwards, which cancels the phase.
 
-        Inputs and outputs that are filtered alike keep the relation of a linear model. They do not keep that of a
-        hysteresis or of friction, whose memory turns at the extremes of the signal, which a filter rounds off: filter
+        If inputs and outputs are filtered alike, a linear model still relates them. A model with hysteresis or friction
+        does not: its memory turns at the extremes of the signal, which a filter rounds off. For such a model filter
         only above the band in which the machine moves, and use no high-pass. A filtered input is no longer held
-        between samples, so `hold` becomes `"linear"` if it was said. An initial state of zero or given as numbers no
-        longer holds and is estimated.
+        between samples, so a stated `hold` becomes `"linear"`. An initial state of zero or given as numbers becomes
+        invalid and is estimated.
 
         Parameters
         ----------
-        cutoff : float, or two of them for a band
+        cutoff : float, or two floats for a band
             Frequency in Hz where the gain is one half.
         kind : {"lowpass", "highpass", "bandpass", "bandstop"}
         order : int
@@ -246,14 +245,14 @@ class Recording:
         InputError
             If a cutoff is not below the Nyquist frequency, there are too few samples, or a name is unknown.
         """
-        edited = self._edited(lambda values: butterworth(values, self.dt, cutoff, kind, order), channels)
-        return replace(edited, hold=edited._sloped(edited.inputs if channels is None else channels))
+        edited = self._edit_channels(lambda values: butterworth(values, self.dt, cutoff, kind, order), channels)
+        return replace(edited, hold=self._hold_after_smoothing(channels))
 
     def resample(self, dt: float) -> Self:
-        """Resample to another step in seconds; an anti-alias filter precedes a longer one.
+        """Resample to another step in seconds; an anti-alias filter precedes a longer step.
 
-        The input between the new samples is no longer held, so `hold` becomes `"linear"` if it was said. `skip` covers
-        the same time. A period that is no whole number of new samples is dropped.
+        The input is no longer held between samples, so a stated `hold` becomes `"linear"`. `skip` covers the same time
+        as before. A period that is not a whole number of new samples is dropped.
 
         Raises
         ------
@@ -270,7 +269,8 @@ class Recording:
         kept = period if whole and 2 <= period <= len(u) - skip else None
         initial = "estimate" if self.begins == "periodic" and kept is None else self.initial
         y = y if self.n_y else np.empty((len(u), 0))
-        return replace(self, u=u, y=y, dt=dt, skip=skip, period=kept, initial=initial, hold=self._sloped(self.inputs))
+        hold = self._hold_after_smoothing(None)
+        return replace(self, u=u, y=y, dt=dt, skip=skip, period=kept, initial=initial, hold=hold)
 
     def to_frame(self) -> Any:
         """Return a pandas `DataFrame` with a column for each input and output over the index `t`, in seconds.
@@ -287,10 +287,10 @@ class Recording:
         names = (*self.inputs, *self.outputs)
         return DataFrame(np.hstack([self.u, self.y]), columns=list(names), index=Index(self.t, name="t"))
 
-    def _edited(self, edit: Callable[[np.ndarray], np.ndarray], channels: Sequence[str] | str | None) -> Self:
+    def _edit_channels(self, edit: Callable[[np.ndarray], np.ndarray], channels: Sequence[str] | str | None) -> Self:
         """Return a copy with some channels edited; its initial state is estimated unless it is periodic."""
         every = (*self.inputs, *self.outputs)
-        chosen = every if channels is None else (channels,) if isinstance(channels, str) else tuple(channels)
+        chosen = self._select(channels)
         for name in chosen:
             if name not in every:
                 raise InputError(f"{self.label} has no channel {name!r}; it has {listed(every)}.")
@@ -301,10 +301,18 @@ class Recording:
         initial = self.initial if self.begins == "periodic" else "estimate"
         return replace(self, u=values[:, : self.n_u], y=values[:, self.n_u :], initial=initial)
 
-    def _sloped(self, channels: Sequence[str] | str) -> str | None:
-        """Return the hold after inputs among the channels were smoothed: straight between samples, if it was said."""
-        named = (channels,) if isinstance(channels, str) else channels
-        return "linear" if self.hold and set(named) & set(self.inputs) else self.hold
+    def _select(self, channels: Sequence[str] | str | None) -> tuple[str, ...]:
+        """Return the given channels as a tuple of names; None stands for all of them."""
+        return (*self.inputs, *self.outputs) if channels is None else as_names(channels)
+
+    def _hold_after_smoothing(self, channels: Sequence[str] | str | None) -> str | None:
+        """Return the hold after some channels were smoothed: a stated hold becomes linear if they include inputs."""
+        return "linear" if self.hold and set(self._select(channels)) & set(self.inputs) else self.hold
+
+
+def as_names(given: Any) -> tuple[Any, ...]:
+    """Return one name or several as a tuple."""
+    return (given,) if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
 
 
 def as_recordings(data: "Recording | Iterable[Recording]") -> tuple[Recording, ...]:
@@ -321,7 +329,7 @@ def as_recordings(data: "Recording | Iterable[Recording]") -> tuple[Recording, .
     for item in recordings:
         if not isinstance(item, Recording):
             raise InputError(
-                f"a Recording or a list of them is needed, not {type(item).__name__}; Recording(u, y, dt) makes one "
+                f"give a Recording or a list of them, not {type(item).__name__}; Recording(u, y, dt) makes one "
                 "from arrays, read_csv from a file."
             )
     if not recordings:
@@ -339,21 +347,10 @@ def fingerprint(recording: Recording) -> str:
 def check_for_identification(
     data: Recording | Iterable[Recording], n_min: int = 2, excited: bool = True
 ) -> tuple[Recording, ...]:
-    """Check that recordings can be fitted together and are excited; return them as a tuple.
+    """Check that recordings can be fitted together, and return them as a tuple.
 
-    Parameters
-    ----------
-    data : Recording or iterable of Recording
-        The recordings to fit.
-    n_min : int
-        Smallest number of scored samples over all recordings, e.g. the number of free parameters.
-    excited : bool
-        Whether recordings are refused where no input ever changes.
-
-    Raises
-    ------
-    InputError
-        When outputs are missing, names or steps differ, samples are too few, every input or an output is constant.
+    They need outputs that change, the same names and step, and together `n_min` scored samples, such as the number of
+    free parameters. With `excited`, at least one input has to change.
     """
     recordings = as_recordings(data)
     first = recordings[0]
@@ -380,10 +377,11 @@ def check_for_identification(
             "record longer or choose a smaller model."
         )
     if excited and not any(_varies(r.u[:, i]) for r in recordings for i in range(r.n_u)):
-        still = "s {} never change" if first.n_u > 1 else " {} never changes"
+        inputs = (
+            f"inputs {listed(first.inputs)} never change" if first.n_u > 1 else f"input {first.inputs[0]} never changes"
+        )
         raise InputError(
-            f"the input{still.format(listed(first.inputs))} in {listed([r.label for r in recordings])}; "
-            "nothing can be identified without excitation."
+            f"the {inputs} in {listed([r.label for r in recordings])}; nothing can be identified without excitation."
         )
     for i, name in enumerate(first.outputs):
         if not any(_varies(r.y[r.skip :, i]) for r in recordings):
@@ -401,14 +399,14 @@ def _varies(x: np.ndarray) -> bool:
 def _channels(
     values: Any, names: Any, letter: str, role: str, label: str, none: bool = False
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return a signal as a read-only (M, n) copy, and its names; (M, 0) only where `none` allows it."""
+    """Return a signal as a read-only (M, n) copy, and its names; `none` allows a signal without channels, (M, 0)."""
     array = _signal(values, letter, label)
     n = array.shape[1]
     if n == 0 and not none:
         raise InputError(
             f"{letter} of {label} has the shape {array.shape}; give an array of shape (samples, channels)."
         )
-    names = (names,) if isinstance(names, str) or not isinstance(names, Iterable) else tuple(names)
+    names = as_names(names)
     if not names and n:
         names = (letter,) if n == 1 else tuple(f"{letter}{i + 1}" for i in range(n))
     if len(names) != n:
@@ -418,10 +416,7 @@ def _channels(
     unusable = ~usable(array)
     if unusable.any():
         k, i = np.argwhere(unusable)[0]
-        raise InputError(
-            f"sample {k} of {role} {names[i]!r} in {label} is {array[k, i]}; only finite numbers up to {LARGEST:g} can "
-            "be used, so repair or cut out that piece, or give it in another unit."
-        )
+        raise InputError(f"sample {k} of {role} {names[i]!r} in {label} is {array[k, i]}; {REPAIR}.")
     array.setflags(write=False)
     return array, names
 
@@ -436,14 +431,14 @@ def _signal(values: Any, letter: str, label: str) -> np.ndarray:
             "shape (samples, channels), with numpy.column_stack for several channels."
         )
     if hasattr(values, "toarray"):
-        raise InputError(f"{letter} of {label} is a sparse matrix; give a full array, as its toarray() makes one.")
+        raise InputError(f"{letter} of {label} is a sparse matrix; give a full array, from its method toarray().")
     array = real_array(values)
     if array is None:
         raise InputError(f"{letter} of {label} is not an array of real numbers; give one of shape (samples, channels).")
     if array.ndim not in (1, 2):
         raise InputError(
-            f"{letter} of {label} has the shape {array.shape}; give an array of shape (samples, channels), and a "
-            "recording for each experiment."
+            f"{letter} of {label} has the shape {array.shape}; give an array of shape (samples, channels), and "
+            "a recording for each experiment."
         )
     return array[:, None] if array.ndim == 1 else array
 

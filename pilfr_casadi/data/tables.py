@@ -1,25 +1,27 @@
-"""Numbers by column name out of CSV, MATLAB, NumPy, Parquet and MDF files, or one sentence with file, column and line.
+"""Read named columns of numbers from CSV, MATLAB, NumPy, Parquet and MDF files; errors name the file, column and line.
 
-A CSV file is read at once by NumPy, and cell by cell only if that fails, to find the bad cell. Commas, semicolons and
-tabs separate cells; a byte-order mark, Windows line ends, quoted cells and blank lines are accepted. Lines are counted
-as an editor does, so the header is line 1. No code in a ``.mat`` or ``.npz`` file is run.
+NumPy reads a CSV file at once; only if that fails, the file is read cell by cell to find the bad cell. Commas,
+semicolons and tabs separate cells; a byte-order mark, Windows line ends, quoted cells and blank lines are accepted.
+Lines are counted as in an editor: the header is line 1. Code in a ``.mat`` or ``.npz`` file is never run.
 """
 
 import contextlib
 import csv
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._base import LARGEST, InputError, existing_file, usable
+from .._base import REPAIR, InputError, existing_file, read_bytes, usable
 
 Array = np.ndarray
 
+CONTROL_CHARACTER = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
 DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
-REPAIR = "only finite numbers up to {:g} can be used: repair or cut out that piece, or give it in another unit."
 KINDS = {
     "c": "complex numbers",
     "V": "a struct",
@@ -32,7 +34,7 @@ KINDS = {
 
 @dataclass(frozen=True)
 class CsvTable:
-    """The text of a CSV file, with the lines below its header and the number of the first of them in the file."""
+    """The text of a CSV file: the lines below its header, and the number of the first of these lines in the file."""
 
     path: Path
     names: tuple[str, ...]
@@ -55,8 +57,8 @@ class CsvTable:
 
     def place(self, row: int) -> str:
         """Return the line of the data row `row`, counted from 0, in words."""
-        filled = [i for i, line in enumerate(self.lines) if line.strip()]
-        return f"line {self.first_line + filled[row]}"
+        rows = [i for i, line in enumerate(self.lines) if line.strip()]
+        return f"line {self.first_line + rows[row]}"
 
     def _read_at_once(self, where: Sequence[int]) -> Array | None:
         width = len(self.names) - 1
@@ -92,13 +94,17 @@ class CsvTable:
                 hint = "write decimals with a point"
             raise InputError(f"{place} reads {cell.strip()[:40]!r}, which is not a number; {hint}.")
         if not usable(np.array(value)):
-            raise InputError(f"{place} is {cell.strip()}; {REPAIR.format(LARGEST)}")
+            raise InputError(f"{place} is {cell.strip()}; {REPAIR}.")
         return value
 
 
 @dataclass(frozen=True)
 class ArrayTable:
-    """The variables of a file other than CSV, or the error that reading one raised: it matters only if used."""
+    """The variables of a file other than CSV.
+
+    An entry of `arrays` is an array, a function that reads one, or the error of reading it, which is raised when the
+    variable is used.
+    """
 
     path: Path
     names: tuple[str, ...]
@@ -123,6 +129,11 @@ class ArrayTable:
     def array(self, name: str) -> Array:
         """Return a variable as it is in the file."""
         values = self.arrays[name]
+        if callable(values):
+            try:
+                values = values()
+            except Exception as error:  # damaged files and odd types raise many kinds
+                values = error
         if isinstance(values, Exception):
             raise InputError(f"{self.path}: variable {name!r} cannot be read ({_reason(values)}); write it again.")
         if hasattr(values, "toarray"):
@@ -134,9 +145,9 @@ class ArrayTable:
     def _samples(self, name: str) -> Array:
         values = self.array(name)
         if values.dtype.kind not in "biuf" or values.ndim > 2 or values.size == 0:
-            held = KINDS.get(values.dtype.kind, f"{values.dtype} numbers")
+            kind = KINDS.get(values.dtype.kind, f"{values.dtype} numbers")
             raise InputError(
-                f"{self.path}: variable {name!r} holds {held} of shape {values.shape}; give a vector of real numbers, "
+                f"{self.path}: variable {name!r} holds {kind} of shape {values.shape}; give a vector of real numbers, "
                 "or a matrix with a row for each sample."
             )
         column = values.reshape(-1, 1) if values.ndim < 2 or 1 in values.shape else values
@@ -144,14 +155,14 @@ class ArrayTable:
         bad = np.argwhere(~usable(column))
         if bad.size:
             k, i = bad[0]
-            raise InputError(f"{self.path}: variable {name!r}, sample {k} is {column[k, i]}; {REPAIR.format(LARGEST)}")
+            raise InputError(f"{self.path}: variable {name!r}, sample {k} is {column[k, i]}; {REPAIR}.")
         return column
 
 
 def frame_table(frame: Any, time_names: Sequence[str], wanted: Sequence[str]) -> ArrayTable:
-    """Take the columns of a data frame as named arrays; an index that holds times becomes a column.
+    """Convert a data frame to named arrays; an index that holds times becomes a column.
 
-    Dates and durations become seconds from the first one on. Columns that are not `wanted` are taken as they are.
+    Dates and durations become seconds after the first one. Only `wanted` columns need distinct names.
     """
     if isinstance(frame, Mapping) or not hasattr(frame, "columns") or not hasattr(frame, "__getitem__"):
         raise InputError(f"a {type(frame).__name__} was given; give a data frame of pandas or polars.")
@@ -170,21 +181,21 @@ def frame_table(frame: Any, time_names: Sequence[str], wanted: Sequence[str]) ->
 
 
 def _seconds(values: Array) -> Array:
-    """Return dates and durations as seconds from the first one on; anything else as it is."""
+    """Convert dates and durations to seconds after the first one; return anything else unchanged."""
     return (values - values[0]) / np.timedelta64(1, "s") if values.dtype.kind in "mM" and len(values) else values
 
 
 def open_table(path: Path, wanted: Sequence[str] = (), suffix: str = "") -> CsvTable | ArrayTable:
-    """Open a file by its suffix, or as a file with another one; `wanted` columns tell the delimiter of a CSV file."""
+    """Open a file by its suffix, or by another `suffix`; the `wanted` columns help to find a CSV file's delimiter."""
     suffix = suffix or path.suffix.lower()
     if suffix in OPENERS:
         return OPENERS[suffix](path, wanted)
     existing_file(path)
-    raise InputError(f"{path} has the suffix {suffix!r}; files named {', '.join(OPENERS)} can be read.")
+    raise InputError(f"{path} has the suffix {suffix!r}; give a file with one of {', '.join(OPENERS)}.")
 
 
 def _open_csv(path: Path, wanted: Sequence[str]) -> CsvTable:
-    """Read the header; the delimiter is the one that yields most of the `wanted` columns."""
+    """Read the header; choose the delimiter that yields most of the `wanted` columns."""
     lines = _text(path).split("\n")
     top = next((i for i, line in enumerate(lines) if line.strip()), None)
     if top is None:
@@ -206,7 +217,7 @@ def _open_mat(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:
     """Read the variables of a MATLAB file (up to version 7.2)."""
     from scipy.io import loadmat
 
-    with _parsing(path, "a MATLAB file", "save it again with the option -v7"):
+    with _report_parser_errors(path, "a MATLAB file", "save it again with the option -v7"):
         try:
             content = loadmat(path)
         except NotImplementedError:
@@ -217,7 +228,7 @@ def _open_mat(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:
 
 def _open_npz(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:
     arrays: dict[str, Any] = {}
-    with _parsing(path, "a NumPy archive", "write it with numpy.savez"), path.open("rb") as file:
+    with _report_parser_errors(path, "a NumPy archive", "write it with numpy.savez"), path.open("rb") as file:
         content = np.load(file, allow_pickle=False)
         if isinstance(content, np.ndarray):
             raise ValueError("it holds a single array")
@@ -231,13 +242,13 @@ def _open_npz(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:
 
 def _open_parquet(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:
     """Read the names of a Parquet file's columns; a column is read when it is needed."""
-    with _parsing(path, "a Parquet file", "write it again"):
+    with _report_parser_errors(path, "a Parquet file", "write it again"):
         try:
             from pyarrow import parquet
         except ImportError:
             raise InputError(f"{path} is a Parquet file; install pilfr-casadi[parquet] to read it.") from None
         names = tuple(parquet.read_schema(path).names)
-    return ArrayTable(path, names, _Columns(names, lambda name: _parquet_column(path, names.index(name))))
+    return ArrayTable(path, names, {name: partial(_parquet_column, path, names.index(name)) for name in names})
 
 
 def _parquet_column(path: Path, index: int) -> Array:
@@ -250,7 +261,7 @@ def _parquet_column(path: Path, index: int) -> Array:
 
 def _open_mdf(path: Path, wanted: Sequence[str] = ()) -> ArrayTable:
     """Read the `wanted` channels of an MDF file, in physical units, and their common times as ``t``."""
-    with _parsing(path, "an MDF file", "save it again as MDF 4"):
+    with _report_parser_errors(path, "an MDF file", "save it again as MDF 4"):
         try:
             from asammdf import MDF
         except ImportError:
@@ -270,28 +281,7 @@ def _open_mdf(path: Path, wanted: Sequence[str] = ()) -> ArrayTable:
     return ArrayTable(path, tuple(dict.fromkeys(["t", *names])), arrays)
 
 
-class _Columns(Mapping[str, Any]):
-    """Columns that are read when they are needed; if reading one fails, the error is its value."""
-
-    def __init__(self, names: Sequence[str], read: Callable[[str], Array]) -> None:
-        self._names, self._read = names, read
-
-    def __getitem__(self, name: str) -> Any:
-        if name not in self._names:
-            raise KeyError(name)
-        try:
-            return self._read(name)
-        except Exception as error:  # damaged files and odd types raise many kinds
-            return error
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-
-# the function that opens a file, by the file's suffix
+# file suffix: the function that opens such a file
 OPENERS: dict[str, Callable[[Path, Sequence[str]], CsvTable | ArrayTable]] = {
     **dict.fromkeys((".csv", ".tsv", ".txt", ".dat"), _open_csv),
     ".mat": _open_mat,
@@ -300,12 +290,12 @@ OPENERS: dict[str, Callable[[Path, Sequence[str]], CsvTable | ArrayTable]] = {
     **dict.fromkeys((".mf4", ".mdf"), _open_mdf),
 }
 STACK_SUFFIXES = (".npz", ".npy")  # files that may hold several records in one array; see `read_stack`
-TABLE_SUFFIXES = (*OPENERS, ".npy")  # files of numbers, which are no simulators
+TABLE_SUFFIXES = (*OPENERS, ".npy")  # recordings, not simulators
 
 
 @contextlib.contextmanager
-def _parsing(path: Path, kind: str, remedy: str) -> Iterator[None]:
-    """Turn the errors of a parser, which are of many kinds on damaged files, into a sentence."""
+def _report_parser_errors(path: Path, kind: str, remedy: str) -> Iterator[None]:
+    """Turn any error of a parser into a sentence; damaged files raise many kinds."""
     existing_file(path)
     try:
         yield
@@ -318,18 +308,18 @@ def _parsing(path: Path, kind: str, remedy: str) -> Iterator[None]:
 def read_stack(path: Path, inputs: Sequence[str], outputs: Sequence[str]) -> tuple[Array, Array | None] | None:
     """Read several records in one array: samples, channels, and further axes such as realizations and periods.
 
-    An .npz file holds arrays with one name for all channels, `u` for `u1, u2, u3`, the outputs being optional; an .npy
-    file holds the inputs alone. Return the inputs (M, n_u, ...) and the outputs (M, n_y, ...) or None; None alone where
-    the file holds a single record.
+    An .npz file holds one array for all inputs, named `u` for `u1, u2, u3`, and optionally one for all outputs; an .npy
+    file holds the inputs alone. Return the inputs (M, n_u, ...) and the outputs (M, n_y, ...) or None. If the file
+    holds a single record, return None.
     """
     y: Array | None = None
     if path.suffix.lower() == ".npy":
-        with _parsing(path, "a NumPy array", "write it with numpy.save"), path.open("rb") as file:
+        with _report_parser_errors(path, "a NumPy array", "write it with numpy.save"), path.open("rb") as file:
             u = np.asarray(np.load(file, allow_pickle=False))
         u = u if u.ndim > 2 else u.reshape(*u.shape, *(1,) * (3 - u.ndim))
     else:
         table = _open_npz(path)
-        found = [table.array(name) if name in table.arrays else None for name in map(_stem, (inputs, outputs))]
+        found = [table.array(name) if name in table.arrays else None for name in map(_array_name, (inputs, outputs))]
         if found[0] is None or found[0].ndim < 3:
             return None
         u, y = found[0], found[1]
@@ -337,7 +327,7 @@ def read_stack(path: Path, inputs: Sequence[str], outputs: Sequence[str]) -> tup
         if x is None:
             continue
         if x.dtype.kind not in "biuf" or x.size == 0 or not np.all(usable(x)):
-            raise InputError(f"{path}: the array of the {what} holds something else than finite numbers; repair it.")
+            raise InputError(f"{path}: the array of the {what} has values that are not finite numbers; repair it.")
         if x.ndim != u.ndim or x.shape != (len(u), x.shape[1], *u.shape[2:]) or len(names) not in (1, x.shape[1]):
             raise InputError(
                 f"{path}: the array of the {what} has the shape {x.shape}; expected (samples, {len(names)} channels, "
@@ -346,8 +336,8 @@ def read_stack(path: Path, inputs: Sequence[str], outputs: Sequence[str]) -> tup
     return u.astype(float), None if y is None else y.astype(float)
 
 
-def _stem(names: Sequence[str]) -> str:
-    """Return the one name of several channels: `u` of `u1, u2, u3`."""
+def _array_name(names: Sequence[str]) -> str:
+    """Return the name of the array that holds all these channels: `u` for `u1, u2, u3`."""
     if len(names) > 1 and all(name == f"{names[0][:-1]}{i + 1}" for i, name in enumerate(names)):
         return names[0][:-1]
     return names[0]
@@ -360,21 +350,17 @@ def _reason(error: Exception) -> str:
 
 
 def _text(path: Path) -> str:
-    try:
-        raw = existing_file(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); check its permissions.") from None
+    raw = read_bytes(path)
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise InputError(f"{path} is UTF-16 text; save it as UTF-8.")
-    odd = sum(raw[:65536].count(bytes([b])) for b in range(32) if b not in (9, 10, 12, 13))
-    if odd:
-        known = path.suffix.lower() in (".mat", ".npz", ".parquet", ".mf4")
-        what = "read it with pilfr.read" if known else "give a CSV file, or name it .mat or .npz if it is one"
-        raise InputError(f"{path} is not text (it holds binary data); {what}.")
+    if CONTROL_CHARACTER.search(raw, 0, 65536):
+        is_csv = OPENERS.get(path.suffix.lower(), _open_csv) is _open_csv
+        remedy = "give a CSV file, or name it .mat or .npz if it is one" if is_csv else "read it with pilfr.read"
+        raise InputError(f"{path} is not text (it holds binary data); {remedy}.")
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError:
-        text = raw.decode("latin-1")  # a degree sign or a micro from an older instrument
+        text = raw.decode("latin-1")  # an older instrument's degree or micro sign
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

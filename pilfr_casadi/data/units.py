@@ -1,4 +1,4 @@
-"""Units as they are written: their dimensions and sizes, such as those of "N s/m", "mm" or "l/min"."""
+"""Parse units such as "N s/m", "mm" or "l/min": their dimensions, and their sizes in SI."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ _UNITS: dict[str, tuple[float, tuple[int, int, int, int, int, int]]] = {
     for unit in units.split()
 }
 _POWERS = {"p": -12, "n": -9, "uµμ": -6, "m": -3, "c": -2, "d": -1, "h": 2, "k": 3, "M": 6, "G": 9}
-_WRITTEN = str.maketrans({"²": "^2", "³": "^3", "⋅": "·", "⁻": "^-", "¹": "1"})  # "s⁻¹" as "s^-1"
+_SUPERSCRIPTS = str.maketrans({"²": "^2", "³": "^3", "⋅": "·", "⁻": "^-", "¹": "1"})  # "s⁻¹" as "s^-1"
 _PREFIXES = {letter: 10.0**power for letters, power in _POWERS.items() for letter in letters}
 _NO_PREFIX = "t in inch min h rpm °C degC Ncm Nmm 1 % deg ° degree degrees radian radians"
 _NO_PREFIX += " rev revs revolution revolutions turn turns"
 _PREFIXED = set(_UNITS) - set(_NO_PREFIX.split())
-_CELSIUS = {"°C", "degC"}  # the zero is another one than that of K
-_AMBIGUOUS = {"g", "C", "T", "F", "h", "t"}  # also of an acceleration, a temperature, a torque, time and so on
+_CELSIUS = {"°C", "degC"}  # an offset to K, so no factor converts them
+_AMBIGUOUS = {"g", "C", "T", "F", "h", "t"}  # may also name an acceleration, a temperature, a torque, a time
 _ANGLES = {unit for unit, (_, exponents) in _UNITS.items() if exponents == (0, 0, 0, 0, 0, 1)}
 
 
@@ -63,14 +63,14 @@ def dimension(unit: str) -> tuple[int, ...] | None:
     >>> dimension("N s/m"), dimension("m^3/s"), dimension("counts")
     ((1, 0, -1, 0, 0), (0, 3, -1, 0, 0), None)
     """
-    found = _read(unit)
+    found = _parse(unit)
     return None if found is None else found[1][:5]
 
 
 def conversion(unit: str, wanted: str) -> float | None:
-    """Return the factor from a unit to another: nan if no factor converts it, None if that is not known.
+    """Return the factor that converts a unit to another: nan if there is none, None if it is not known.
 
-    It is not known between an angle and a number, as between rpm and Hz.
+    Units that differ only by an angle, such as rpm and Hz, are ambiguous: their factor counts as not known.
 
     >>> conversion("mm", "m"), conversion("N m", "Nm"), conversion("counts", "m"), conversion("rpm", "Hz")
     (0.001, 1.0, None, None)
@@ -79,23 +79,23 @@ def conversion(unit: str, wanted: str) -> float | None:
     """
     if unit.strip() == wanted.strip():
         return 1.0
-    one, other = _read(unit), _read(wanted)
+    one, other = _parse(unit), _parse(wanted)
     if one is None or other is None:
         return None
     if one[1] == other[1]:
-        celsius = len({name.strip() in _CELSIUS for name in (unit, wanted)}) == 1
-        return float(f"{one[0] / other[0]:.12g}") if celsius else np.nan
-    unsure = one[1][:5] == other[1][:5] or _AMBIGUOUS & {unit.strip(), wanted.strip()}
-    return None if unsure else np.nan
+        same_zero = (unit.strip() in _CELSIUS) == (wanted.strip() in _CELSIUS)
+        return float(f"{one[0] / other[0]:.12g}") if same_zero else np.nan
+    ambiguous = one[1][:5] == other[1][:5] or _AMBIGUOUS & {unit.strip(), wanted.strip()}
+    return None if ambiguous else np.nan
 
 
 def revolution_in(unit: str) -> float:
-    """Return one revolution in the unit of an angle; nan if it is none.
+    """Return one revolution in a unit of angle; nan for any other unit.
 
     >>> revolution_in("deg"), revolution_in("turns"), revolution_in("rad/s"), revolution_in("m"), revolution_in("")
     (360.0, 1.0, nan, nan, nan)
     """
-    found = _split(unit.strip())
+    found = _split_prefix(unit.strip())
     return float(f"{2 * np.pi / found[1]:.15g}") if found is not None and found[0] in _ANGLES else np.nan
 
 
@@ -105,32 +105,32 @@ def symbols(unit: str) -> list[str]:
     >>> symbols("mrad/s^2")
     ['rad', 's']
     """
-    found = (_split(symbol) for symbol in re.findall(r"[^\s*/·^()\d-]+", unit))
+    found = (_split_prefix(symbol) for symbol in re.findall(r"[^\s*/·^()\d-]+", unit))
     return [known[0] for known in found if known is not None]
 
 
-def _read(unit: str) -> tuple[float, tuple[int, ...]] | None:
+def _parse(unit: str) -> tuple[float, tuple[int, ...]] | None:
     """Return a unit's size in SI and its exponents; None if it is empty or not known."""
-    size, total, below = 1.0, [0, 0, 0, 0, 0, 0], False
-    plain = unit.translate(_WRITTEN)
+    size, total, in_denominator = 1.0, [0, 0, 0, 0, 0, 0], False
+    plain = unit.translate(_SUPERSCRIPTS)
     if re.search(r"\([^)]*/", plain):  # a quotient in brackets
         return None
     tokens = re.findall(r"[^\s*/·^()]+(?:\^\(?-?\d+\)?)?|/", plain)
     for token in tokens:
         if token == "/":
-            below = True
+            in_denominator = True
             continue
         symbol, _, power = token.partition("^")
-        found = _split(symbol)
+        found = _split_prefix(symbol)
         if found is None:
             return None
-        times = int(power.strip("()") or 1) * (-1 if below else 1)
-        size *= found[1] ** times
-        total = [a + times * b for a, b in zip(total, _UNITS[found[0]][1], strict=True)]
+        exponent = int(power.strip("()") or 1) * (-1 if in_denominator else 1)
+        size *= found[1] ** exponent
+        total = [a + exponent * b for a, b in zip(total, _UNITS[found[0]][1], strict=True)]
     return (size, tuple(total)) if tokens else None
 
 
-def _split(symbol: str) -> tuple[str, float] | None:
+def _split_prefix(symbol: str) -> tuple[str, float] | None:
     """Return a symbol without its prefix, and its size in SI; None if it is not known."""
     if symbol in _UNITS:
         return symbol, _UNITS[symbol][0]

@@ -110,12 +110,12 @@ class QuadraticStiffness(Law):
 
 
 class ProgressiveStiffness(QuadraticStiffness):
-    """A spring that is progressively stiffer in one direction: an air spring, a bellows."""
+    """A spring or a conductance that is progressively stiffer in one direction: an air spring, a junction."""
 
     form = "progressive"
     equation = "w = k_2 (z^2 + b z^3)"
     units = {"k_2": "w/z^2", "b": "1/z"}
-    domains = ("mechanical", "fluid")
+    domains = ("mechanical", "fluid", "thermal")
     two_sided = True
     starts = {"b": lambda at: (-0.5 / at.reach, 0.5 / at.reach)}
     ranges = {"b": lambda at: (-1 / at.reach, 1 / at.reach)}  # the cubic part stays below the quadratic one

@@ -1,7 +1,7 @@
-"""Many jobs, kept in a folder: runs and campaigns, which a file describes, and fleets of machines.
+"""Studies of many jobs in a folder of results: runs and campaigns, which a run file describes, and fleets of machines.
 
-`executor` runs jobs of any kind side by side, `folder` keeps their results. Of runs: `schema` (the tables of the file),
-`run_file`, `jobs`, `execution`, `summary`. Of fleets: `fleets` (the steps), `machines` (the work at one machine),
+`executor` runs jobs of any kind side by side, `folder` keeps their results. Runs: `schema` (the tables of the file),
+`run_file`, `jobs`, `execution`, `summary`. Fleets: `fleets` (the steps), `machines` (the steps at one machine),
 `population` (statistics over machines), `fleet_result`.
 """
 

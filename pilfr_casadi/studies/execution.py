@@ -1,8 +1,8 @@
-"""Execution of a run: finished jobs are kept; missing or outdated ones are executed.
+"""Execute a run: keep finished jobs, execute missing or outdated ones.
 
-After every job its model is written, then the manifest, each atomically. However a run ends (Ctrl-C, `kill -9`, a power
-cut), the next one continues with the first job that is not complete and gives the same results as an uninterrupted run.
-Executed twice on a machine, a run gives the same bytes in every file but `times.json`.
+Every job writes its model, then the manifest, each atomically. However a run ends (Ctrl-C, `kill -9`, a power cut), the
+next one continues with the first job that is not complete and gives the same results as an uninterrupted run. On one
+machine, every execution of a run writes the same bytes to all files except `times.json`.
 
 `run` executes the jobs one after the other. `campaign` executes them side by side, in processes, on a cluster, or on
 any other executor. A job that fails, takes too long or loses its worker is recorded too. The table of errors can be
@@ -27,7 +27,7 @@ from ..models import PILFR, places
 from ..optimise import Status
 from .executor import AHEAD, Batch, Effort, run_side_by_side
 from .folder import PAGE, PICTURE, SUMMARY, TABLE, Store, check_own, lock_folder, read_times
-from .jobs import MODEL, RunJob, fold, input_digests, jobs_of, outcome
+from .jobs import MODEL, RunJob, execute_job, fold, input_digests, jobs_of
 from .run_file import ROLES, Cell, Run, read_run
 from .summary import (
     CellSummary,
@@ -63,12 +63,12 @@ class NoModel(InputError):
 
 
 class ConstraintsNotMet(NoModel):
-    """No job of a run meets its constraints; the manifest states by how much each job misses them."""
+    """No job of a run meets its constraints; the manifest states by how much each job violates them."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """A run that is complete.
+    """The result of a complete run.
 
     Attributes
     ----------
@@ -152,7 +152,7 @@ def run(
 
     def run_in_turn(store: Store, jobs: Sequence[RunJob]) -> Iterator[Batch]:
         for job in jobs:
-            yield [(job, outcome(given, store.recordings, job, executor=executor, progress=progress))]
+            yield [(job, execute_job(given, store.recordings, job, executor=executor, progress=progress))]
 
     return _execute(given, run_in_turn, overwrite, progress, tell)
 
@@ -206,7 +206,7 @@ def campaign(
             raise InputError(f"{given.file}: {len(given.seeds)} seeds were given, but {advice}.")
 
     def run_in_processes(store: Store, jobs: Sequence[RunJob]) -> Iterator[Batch]:
-        work = functools.partial(outcome, given, store.recordings)
+        work = functools.partial(execute_job, given, store.recordings)
         effort = Effort(given.workers, given.time_limit, given.retries)
         return run_side_by_side(work, jobs, effort, executor, ahead)
 
@@ -214,14 +214,14 @@ def campaign(
 
 
 def _read_run(path: Any, kind: str, executor: Any, **changes: Any) -> Run:
-    """Read the run, with `changes` that are not None instead of the file's values."""
+    """Read the run; `changes` that are not None override values of the file."""
     given = path if isinstance(path, Run) else read_run(path, kind)
     check_executor(executor)
     return replace(given, **{name: value for name, value in changes.items() if value is not None})
 
 
 def seeds_advice(cell: Cell) -> str:
-    """Explain why every seed gives the same model of a cell, with advice; empty if starts are random."""
+    """Explain why every seed gives a cell the same model, and what to change; empty if starts are random."""
     model, start, starts = cell.model, cell.search.get("start", ""), cell.search.get("starts", 1)
     if not isinstance(model, PILFR):
         return ""
@@ -242,13 +242,13 @@ def _execute(
     print_line: PrintLine | None,
     campaign: bool = False,
 ) -> RunResult:
-    """Execute a run; `runner` executes its jobs, in any order."""
+    """Execute a run; `runner` executes the jobs, in any order."""
     folder = Path(given.out)
     check_own(folder, given.file, overwrite)
     inputs = input_digests(given)
-    recordings = {role: tuple(_read(given, name) for name in given.files[role]) for role in ROLES}
+    recordings = {role: tuple(_read_recording(given, name) for name in given.files[role]) for role in ROLES}
     if given.folds:
-        fold(recordings["train"], 0, given.folds)  # refuses recordings that are too short for it
+        fold(recordings["train"], 0, given.folds)  # refuses recordings that are too short
     make_folder(folder)
     with lock_folder(folder):
         store = Store(folder, given, inputs, recordings, overwrite, campaign)
@@ -256,7 +256,7 @@ def _execute(
 
 
 class _Execution:
-    """Execution of the jobs of a run: first the cross-validation, then the jobs on all training recordings."""
+    """The execution of a run: first the cross-validation, then the jobs on all training recordings."""
 
     def __init__(self, store: Store, runner: Runner, progress: Progress, print_line: PrintLine) -> None:
         self.store, self.runner, self.progress, self.print_line = store, runner, progress, print_line
@@ -267,12 +267,12 @@ class _Execution:
     def execute(self) -> RunResult:
         """Execute all jobs that are not complete, then choose among their models."""
         try:
-            jobs, selection = self._do_jobs()
+            jobs, selection = self._run_jobs()
             return self._finish(jobs, selection)
         except KeyboardInterrupt:
             raise RunInterrupted(len(self.done) + len(self.skipped), self.total) from None
 
-    def _do_jobs(self) -> tuple[Sequence[RunJob], Selection | None]:
+    def _run_jobs(self) -> tuple[Sequence[RunJob], Selection | None]:
         store, given = self.store, self.store.run
         first = store.recordings["train"][0]
         folds: tuple[RunJob, ...] = ()
@@ -281,19 +281,19 @@ class _Execution:
         self.total = len(jobs)
         if given.folds:
             folds = jobs_of(given, store.inputs, store.recordings["train"])
-            self._do_missing(folds)
+            self._run_missing(folds)
             selection = select(given, folds, store.scores(folds), store.manifest.entries, first)
             jobs = tuple(j for j in jobs if j.cell == selection.cell)
-        self._do_missing(jobs, folds)
+        self._run_missing(jobs, folds)
         if not given.folds and given.files["validation"] and len(given.cells) > 1:
             selection = select(given, jobs, store.scores(jobs), store.manifest.entries, first)
         return (*folds, *jobs), selection
 
-    def _do_missing(self, jobs: Sequence[RunJob], before: Sequence[RunJob] = ()) -> None:
-        """Execute the jobs that are not complete."""
+    def _run_missing(self, jobs: Sequence[RunJob], before: Sequence[RunJob] = ()) -> None:
+        """Execute the jobs that are not complete; the jobs `before` are."""
         store = self.store
         self.total = total = len(before) + len(jobs)
-        ready = [j for j in jobs if store.complete(j)]
+        ready = [j for j in jobs if store.is_complete(j)]
         self.skipped += [j.id for j in ready]
         if ready:
             self.print_line(f"{len(ready)} jobs done before")
@@ -306,20 +306,20 @@ class _Execution:
                     ready += [job for job, _ in batch]
                     self.done += [job.id for job, _ in batch]
                 for job, found in batch:
-                    none = f"no model ({found.entry['status'].lower().replace('_', ' ')})"
-                    self.print_line(f"{job.id}: {found.entry['sentence'] if store.ended_well(job) else none}")
+                    failure = f"no model ({found.entry['status'].lower().replace('_', ' ')})"
+                    self.print_line(f"{job.id}: {found.entry['sentence'] if store.gave_model(job) else failure}")
                 store.write_table((*before, *ready))
                 best = min(store.manifest.entries[j.id].get("train", np.inf) for j in ready)
                 self.progress("jobs", len(before) + len(ready), total, best)
         finally:
-            with deferred_interrupt():  # however it ends, the table has all finished jobs
+            with deferred_interrupt():  # the table has all finished jobs, however the run ends
                 store.write_table((*before, *ready), last=True)
 
     def _finish(self, jobs: Sequence[RunJob], selection: Selection | None) -> RunResult:
-        """Write errors, tables, and the model and page of the chosen job."""
+        """Write the tables, and the model and page of the chosen job."""
         store, given = self.store, self.store.run
         manifest, entries = store.manifest, store.manifest.entries
-        usable = self._usable([j for j in jobs if j.fold is None and (selection is None or j.cell == selection.cell)])
+        usable = self._select_usable(jobs, selection)
         scores = store.scores(jobs, last=True)
         best = choose_job(scores, [j.id for j in usable])
         job = next(j for j in usable if j.id == best)
@@ -338,14 +338,15 @@ class _Execution:
             self._write_page(fit)
         manifest.content.pop("writing", None)
         manifest.write()
-        failed = tuple(j.id for j in jobs if not store.ended_well(j))
+        failed = tuple(j.id for j in jobs if not store.gave_model(j))
         fit = replace(fit, seconds=times.get(best, 0.0))
         parts = tuple(self.done), tuple(self.skipped), failed
         return RunResult(store.path, *parts, best, tuple(scores), fit, manifest.content, summary, selection, note)
 
-    def _usable(self, jobs: Sequence[RunJob]) -> list[RunJob]:
-        """Return the jobs with a model; refuse a run without any."""
+    def _select_usable(self, jobs: Sequence[RunJob], selection: Selection | None) -> list[RunJob]:
+        """Return the jobs of the selected cell that have a model; refuse a run without any."""
         file, entries = self.store.run.file, self.store.manifest.entries
+        jobs = [j for j in jobs if j.fold is None and (selection is None or j.cell == selection.cell)]
         usable = [j for j in jobs if self.store.has_model(j)]
         if not usable:
             about = "; ".join(reasons(entries, [j.id for j in jobs]))
@@ -356,7 +357,7 @@ class _Execution:
         return usable
 
     def _write_page(self, fit: Fit) -> None:
-        """Write the page about the chosen model, unless it is there."""
+        """Write the page about the chosen model, unless it is up to date."""
         store, given, manifest = self.store, self.store.run, self.store.manifest
         key = digest([manifest.content["files"][MODEL], store.inputs, given.files, str(given.reading)])
         if manifest.content.get("report") == key and manifest.holds(PAGE):
@@ -370,12 +371,12 @@ class _Execution:
         manifest.content["report"] = key
 
 
-def _read(given: Run, name: str) -> Recording:
+def _read_recording(given: Run, name: str) -> Recording:
     options = dict(given.reading)
     found = read(given.path_of(name), options.pop("inputs"), options.pop("outputs"), **options)
     if not keeps_its_period(found):
         raise InputError(
-            f'{given.file}: the input of {name} does not repeat after {found.period} samples, as initial = "periodic" '
-            'says of every recording of the run; correct `period`, or give initial = "estimate".'
+            f'{given.file}: the input of {name} does not repeat after {found.period} samples, but initial = "periodic" '
+            'claims this for every recording of the run; correct `period`, or give initial = "estimate".'
         )
     return found

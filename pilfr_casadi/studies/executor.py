@@ -1,6 +1,6 @@
-"""Jobs side by side on an executor: outcomes in the order in which they arrive, retries where a worker has died.
+"""Run jobs side by side on an executor, yield their outcomes as they arrive, and retry jobs whose worker has died.
 
-Every job runs in a separate process beside its worker, with any kind of executor. The result of a job does not depend
+With any kind of executor, every job runs in a separate process beside its worker. The result of a job does not depend
 on where, when or how often it ran.
 """
 
@@ -32,8 +32,8 @@ from .._base import InputError, Reply, __version__, close_workers, run_in_worker
 
 AHEAD = 64  # jobs submitted to an executor at a time
 SCHEDULER_TIMEOUT = 10.0  # seconds to wait for a Dask scheduler
-RETRIES = 2  # trials of a job whose worker was lost, after the first
-FAILED, TIMED_OUT, LOST = "FAILED", "TIMED_OUT", "LOST"  # endings of a job without a result
+RETRIES = 2  # further trials of a job whose worker was lost
+FAILED, TIMED_OUT, LOST = "FAILED", "TIMED_OUT", "LOST"  # statuses of jobs without a result
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,13 +43,13 @@ class Outcome:
     Attributes
     ----------
     entry : dict
-        Its entry in the manifest, with `status` and `sentence`.
+        Entry in the manifest, with `status` and `sentence`.
     seconds : float
-        The time it took.
+        Computing time.
     files : mapping
-        Its files by name, below the folder of the job.
+        Files by name below the folder of the job.
     errors : mapping
-        NRMSE by recording, of a job of a run.
+        NRMSE by recording, for a job of a run.
     """
 
     entry: dict[str, Any]
@@ -59,12 +59,12 @@ class Outcome:
 
 
 Work = Callable[[Any], Outcome]  # executes a job
-Batch = list[tuple[Any, Outcome]]  # jobs that ended together
+Batch = list[tuple[Any, Outcome]]  # jobs that finished together
 
 
 @dataclass(frozen=True)
 class Effort:
-    """Processes for jobs without an executor, the time limit of a job in seconds, and retries of a lost job."""
+    """Number of processes if there is no executor, time limit of a job in seconds, and retries of a lost job."""
 
     workers: int = 1
     time_limit: float | None = None
@@ -92,7 +92,7 @@ def failure(status: str, sentence: str, **more: Any) -> Outcome:
 
 
 def attempt(work: Work, job: Any) -> Outcome:
-    """Execute a job; a failure is an outcome too."""
+    """Execute a job; turn an exception into an outcome."""
     try:
         return work(job)
     except Exception as error:
@@ -104,25 +104,25 @@ def attempt(work: Work, job: Any) -> Outcome:
 def run_side_by_side(
     work: Work, jobs: Sequence[Any], effort: Effort, executor: Executor | None = None, ahead: int = AHEAD
 ) -> Iterator[Batch]:
-    """Run jobs on an executor, else in processes, else (one worker without a time limit) in this process.
+    """Run jobs on an executor, else in processes, or in this process (one worker without a time limit).
 
-    `work` and the jobs are sent to the processes, `work` once to each.
+    Every process receives `work` once, and its jobs one by one.
     """
     if executor is not None:
-        yield from _outcomes(work, jobs, effort, executor, ahead)
+        yield from _collect_outcomes(work, jobs, effort, executor, ahead)
     elif effort.workers > 1 or effort.time_limit is not None:
         pool = ThreadPoolExecutor(effort.workers)
         try:
-            yield from _outcomes(work, jobs, effort, pool, 2 * effort.workers)
+            yield from _collect_outcomes(work, jobs, effort, pool, 2 * effort.workers)
         finally:
-            _end(pool)
+            _end_pool(pool)
     else:
         for job in jobs:
             yield [(job, attempt(work, job))]
 
 
-def _end(pool: ThreadPoolExecutor) -> None:
-    """End a pool and its worker processes, including processes that its threads are about to start."""
+def _end_pool(pool: ThreadPoolExecutor) -> None:
+    """End a pool and its worker processes, also processes that its threads are about to start."""
     pool.shutdown(wait=False, cancel_futures=True)
     ending = threading.Thread(target=pool.shutdown, daemon=True)
     ending.start()
@@ -132,8 +132,10 @@ def _end(pool: ThreadPoolExecutor) -> None:
     close_workers()
 
 
-def _outcomes(work: Work, jobs: Sequence[Any], effort: Effort, executor: Executor, ahead: int) -> Iterator[Batch]:
-    """Yield outcomes as they arrive; keep `ahead` jobs submitted at a time."""
+def _collect_outcomes(
+    work: Work, jobs: Sequence[Any], effort: Effort, executor: Executor, ahead: int
+) -> Iterator[Batch]:
+    """Submit jobs, at most `ahead` at a time; yield their outcomes as they arrive."""
     shared = _pickle(functools.partial(_attempt_with_versions, work))
     waiting, running = deque((job, 1) for job in jobs), dict[Future[Reply], tuple[Any, int]]()
     try:
@@ -146,7 +148,7 @@ def _outcomes(work: Work, jobs: Sequence[Any], effort: Effort, executor: Executo
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, trial = running.pop(future)
                 try:
-                    outcome = _outcome(future, trial > effort.retries, effort.time_limit)
+                    outcome = _read_outcome(future, trial > effort.retries, effort.time_limit)
                     if outcome is None:
                         waiting.appendleft((job, trial + 1))
                     else:
@@ -154,7 +156,7 @@ def _outcomes(work: Work, jobs: Sequence[Any], effort: Effort, executor: Executo
                 except (InputError, BrokenExecutor, CancelledError) as error:
                     stop = error
             if batch:
-                yield batch  # results that have arrived are kept, whatever stops the others
+                yield batch  # before the error of another job is raised: these results are kept
             if stop is not None:
                 raise stop
     except (BrokenExecutor, CancelledError, RuntimeError, OSError) as error:
@@ -167,8 +169,8 @@ def _outcomes(work: Work, jobs: Sequence[Any], effort: Effort, executor: Executo
             future.cancel()
 
 
-def _outcome(future: Future[Reply], last: bool, time_limit: float | None) -> Outcome | None:
-    """Return the outcome of a job; None if its worker was lost and trials are left."""
+def _read_outcome(future: Future[Reply], last: bool, time_limit: float | None) -> Outcome | None:
+    """Return the outcome of a job; None if its worker was lost and retries are left."""
     try:
         reply = future.result()
     except (BrokenExecutor, CancelledError):
@@ -183,7 +185,7 @@ def _outcome(future: Future[Reply], last: bool, time_limit: float | None) -> Out
             return None
         if not reply.begun:
             raise InputError(f"The workers cannot start a job ({reply.lost}); check that they can import this package.")
-        return failure(LOST, f"Failed: its worker was lost in every trial, lastly {reply.lost}.")
+        return failure(LOST, f"Failed: its worker was lost in every trial; in the last one {reply.lost}.")
     outcome, used = reply.result
     for name, version in versions().items():
         if used.get(name) != version:
@@ -195,7 +197,7 @@ def _outcome(future: Future[Reply], last: bool, time_limit: float | None) -> Out
 
 
 def _attempt_with_versions(work: Work, job: Any) -> tuple[Outcome, dict[str, str]]:
-    """Compute the outcome of a job in a worker; return it with the versions in use there."""
+    """Execute a job in a worker; return its outcome and the versions there."""
     return attempt(work, job), versions()
 
 
@@ -204,7 +206,7 @@ def _pickle(thing: Any) -> bytes:
         data = pickle.dumps(thing)
         if b"__main__" not in data:
             return data
-        reason: object = "the script that runs defines it"  # a worker has another main script
+        reason: object = "the main script defines it"  # a worker has another main script
     except Exception as error:
         reason = error
     try:  # workers cannot import code of a run file, a simulator file or a notebook; cloudpickle sends it
@@ -220,7 +222,7 @@ def _pickle(thing: Any) -> bytes:
 
 @contextlib.contextmanager
 def dask_executor(address: str) -> Iterator[tuple[Executor, int, int]]:
-    """Yield an executor of a Dask cluster, its number of threads, and the number of jobs to submit at a time."""
+    """Yield an executor on a Dask cluster, its number of threads, and the number of jobs to submit at a time."""
     try:
         from distributed import Client
     except ImportError:

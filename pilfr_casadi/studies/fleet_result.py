@@ -1,7 +1,7 @@
-"""The result of a fleet: what all its machines lack, how their values are distributed, and which machines differ.
+"""The result of a fleet: the common physics, the distribution of each value, and the machines that differ.
 
-One scale decides: the probabilities of `population`. A machine differs in a value, drifts in a value, or lacks more
-than the common physics, if that is more likely than not.
+The probabilities of `population` decide: a machine differs in a value, drifts in a value, or lacks more than the common
+physics, if that is more likely than not.
 """
 
 from __future__ import annotations
@@ -14,18 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, existing_file, make_folder, to_json, write_atomically
+from .._base import InputError, csv_text, json_text, make_folder, read_bytes, to_json, write_atomically
 from ..data import Recording
 from ..diagnose import SURE, check_laws, replicate
 from ..laws import Law
 from ..simulators import as_simulator, name_at
 from .machines import DONE, PAGE, RESIDUAL, LawAt, MachineWork, measured_entry
 from .population import Population, combine, estimate_population, slope, with_nan
-from .summary import csv_text
 
 CONTENT, TABLE = "fleet.json", "fleet.csv"
 SCHEMA = 1
-MOST_SHOWN = 20  # machines that are printed
+MOST_SHOWN = 20  # machines in the printed result
 SHARED, OWN = "shared", "per machine"
 
 
@@ -40,26 +39,26 @@ class Trend:
 
 @dataclass(frozen=True, eq=False)
 class Machine:
-    """A machine beside the others.
+    """A machine judged against the fleet.
 
     Attributes
     ----------
     values, errors : mapping
         Each free parameter by label, with its standard error.
     differs : mapping
-        Probability that each value is not one of a regular machine.
+        Probability that each value is not from a regular machine.
     trends : mapping
         Trend of each value over the recordings.
     beyond : float
         Probability that the machine lacks more than the common physics.
     ratio : float
-        The error that remains, over the noise.
+        Remaining error over the noise.
     gain : float
         Log evidence that the machine has the common physics.
     nrmse_before, nrmse_after, noise : float
-        NRMSE refitted, and with the common physics; the noise on the same scale.
+        NRMSE of the plain refit and with the common physics; the noise on the same scale.
     failed : str
-        The sentence about a machine that could not be fitted.
+        Why the machine could not be fitted; empty if it could.
     rest : mapping
         The diagnosis of what remains: `verdict`, `sentence`, `effects`; empty if there was none.
     report : str
@@ -83,14 +82,14 @@ class Machine:
 
     @property
     def probability(self) -> float:
-        """Probability of the surest difference to a regular machine; 1 for a machine that could not be fitted."""
+        """Largest probability of a difference from regular machines; 1 for a machine that could not be fitted."""
         every = [self.beyond, *self.differs.values(), *(t.probability for t in self.trends.values())]
         return 1.0 if self.failed else max((p for p in every if np.isfinite(p)), default=0.0)
 
     @property
     def reasons(self) -> tuple[tuple[str, float], ...]:
-        """Findings about the machine that are more likely than not, each with its probability; the surest first."""
-        found = [(self._rest(), self.beyond)] if self.beyond > SURE else []
+        """Findings that are more likely than not, each with its probability; the most probable first."""
+        found = [(self._describe_rest(), self.beyond)] if self.beyond > SURE else []
         found += [
             (f"{name} = {_with_error(self.values[name], self.errors[name])}", p)
             for name, p in self.differs.items()
@@ -103,10 +102,10 @@ class Machine:
         ]
         return tuple(sorted(found, key=lambda r: -r[1]))
 
-    def _rest(self) -> str:
-        said = f"lacks more: its error is {self.ratio:.3g} times the noise"
+    def _describe_rest(self) -> str:
+        text = f"lacks more: its error is {self.ratio:.3g} times the noise"
         named = ", ".join(name_at(e["port"], e["law"], e.get("form", "")) for e in self.rest.get("effects", ()))
-        return f"{said}; {named}" if named else said
+        return f"{text}; {named}" if named else text
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for JSON."""
@@ -115,17 +114,14 @@ class Machine:
 
     @classmethod
     def of(cls, content: Mapping[str, Any]) -> Machine:
-        """Read it from JSON."""
+        """Make a machine from its JSON content."""
         own = {f.name: content[f.name] if f.name == "rest" else with_nan(content[f.name]) for f in fields(cls)}
         return cls(**{**own, "trends": {name: Trend(**t) for name, t in own["trends"].items()}})
 
 
 @dataclass(frozen=True, eq=False)
 class FleetValue:
-    """A parameter over the fleet: its distribution over regular machines, and that of its trends.
-
-    `kind` is "shared" if a deviation between machines is not more likely than not, else "per machine".
-    """
+    """A parameter over the fleet: the distributions of its value and of its trend over regular machines."""
 
     name: str
     unit: str
@@ -134,7 +130,7 @@ class FleetValue:
 
     @property
     def kind(self) -> str:
-        """Whether regular machines share the value."""
+        """The text `OWN` if the value more likely than not varies between regular machines, else `SHARED`."""
         return OWN if self.population.varies > SURE else SHARED
 
     def to_dict(self) -> dict[str, Any]:
@@ -145,18 +141,18 @@ class FleetValue:
 
 @dataclass(frozen=True, eq=False)
 class Common:
-    """The physics that all machines lack: laws with their ports, and how sure they are.
+    """The physics that all machines lack: laws at their ports, and their probability.
 
     Attributes
     ----------
     laws : tuple of LawAt
         Empty if nothing is missing in common.
     probability : float
-        Posterior probability, from the sampled machines, of these laws (whatever their form).
+        Posterior probability of these laws, in any form, from the sampled machines.
     sample : tuple of str
         The machines that were diagnosed alone.
     starts : tuple of mapping
-        Values by name from which every machine is fitted, besides the user's.
+        Start values by name for every machine, besides the user's.
     """
 
     laws: tuple[LawAt, ...]
@@ -183,9 +179,9 @@ class Fleet:
     values : tuple of FleetValue
         The free parameters over the fleet.
     remainder : Population
-        Of the logarithm of the remaining error over the noise.
+        Distribution of the logarithm of the remaining error over the noise.
     machines : tuple of Machine
-        All machines, the surest to differ first.
+        All machines, the most probable to differ first.
     work : MachineWork
         The simulator and the options.
     files : mapping
@@ -209,7 +205,7 @@ class Fleet:
 
     @property
     def differing(self) -> tuple[Machine, ...]:
-        """Machines that lack more, or differ in a value, or could not be fitted; the surest first."""
+        """Machines that lack more, differ in a value, or could not be fitted; the most probable first."""
         return tuple(
             m for m in self.machines if m.failed or m.beyond > SURE or any(p > SURE for p in m.differs.values())
         )
@@ -224,14 +220,14 @@ class Fleet:
         """The result in a sentence or two."""
         n, sampled = len(self.machines), len(self.common.sample)
         if self.common.laws:
-            said = (
+            text = (
                 f"The machines lack {self.common.words} (probability {self.common.probability:.2f} on a sample of "
                 f"{sampled}; confirmed on {self.confirmed} of {n})."
             )
         else:
-            said = f"The machines lack nothing in common (probability {self.common.probability:.2f} on {sampled})."
+            text = f"The machines lack nothing in common (probability {self.common.probability:.2f} on {sampled})."
         counts = [(len(self.differing), "differ"), (len(self.drifting), "drift")]
-        return f"{said} Of {n} machines, " + " and ".join(f"{count} {word}" for count, word in counts) + "."
+        return f"{text} Of {n} machines, " + " and ".join(f"{count} {word}" for count, word in counts) + "."
 
     def judge(
         self,
@@ -239,7 +235,7 @@ class Fleet:
         recordings: Recording | Sequence[Recording],
         times: Sequence[float] | None = None,
     ) -> Machine:
-        """Judge a new machine against the fleet; nothing of the fleet changes.
+        """Judge a new machine against the fleet, which does not change.
 
         Parameters
         ----------
@@ -248,7 +244,7 @@ class Fleet:
         recordings : Recording or sequence of Recording
             Its recordings, with the simulator's channels.
         times : sequence of float, optional
-            Time of each recording, in the unit of the fleet's; by default 0, 1, 2, ...
+            Time of each recording, in the unit that the fleet uses; by default 0, 1, 2, ...
 
         Raises
         ------
@@ -260,7 +256,7 @@ class Fleet:
         return judge_entry(name, measured_entry(found), self.values, self.remainder, times)
 
     def table(self) -> list[dict[str, Any]]:
-        """List the machines as rows, the surest to differ first: the content of fleet.csv."""
+        """List the machines as the rows of fleet.csv, the most probable to differ first."""
         rows = []
         for m in self.machines:
             row: dict[str, Any] = {"machine": m.name, "probability": m.probability, "beyond": m.beyond}
@@ -275,7 +271,7 @@ class Fleet:
         return rows
 
     def plot(self) -> Any:
-        """Draw the map of the machines: see `plots.machine_map`, with one value `plots.machine_strips`."""
+        """Draw the map of the machines: `plots.machine_map`, or `plots.machine_strips` if there is one value."""
         from ..report import fleet_map
 
         return fleet_map(self.to_dict())
@@ -306,7 +302,7 @@ class Fleet:
         return content
 
     def documents(self) -> dict[str, str]:
-        """Make the files of the fleet as a whole: fleet.json, fleet.csv and report.html."""
+        """Make the contents of fleet.json, fleet.csv and report.html."""
         from ..report import fleet_page
 
         content, rows = self.to_dict(), self.table()
@@ -317,7 +313,7 @@ class Fleet:
             if (path := f"jobs/measure-{m.name}/{RESIDUAL}") in self.files
         }
         return {
-            CONTENT: json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n",
+            CONTENT: json_text(content),
             TABLE: csv_text([names, *([row.get(name, "") for name in names] for row in rows)]),
             PAGE: fleet_page(content, residuals).html(),
         }
@@ -353,7 +349,7 @@ def judge_entry(
     remainder: Population,
     times: Sequence[float] | None,
 ) -> Machine:
-    """Judge the numbers of a machine by the distributions over the fleet."""
+    """Judge the manifest entry of a machine by the distributions over the fleet."""
     found = {v.name: trend_of(entry, v.name, times) for v in values}
     trends = {
         v.name: Trend(*found[v.name][:2], v.trends.probability(*found[v.name]))
@@ -385,33 +381,38 @@ def judge_entry(
 
 
 def estimates_of(entry: Mapping[str, Any], drifts: bool) -> dict[str, tuple[float, float]]:
-    """Return value and standard error of each parameter: of the fit to all recordings, or means if values drift.
+    """Return the value and standard error of each parameter, from the fit to all recordings.
 
-    A fit to all recordings with the same values is bent by those that drift.
+    Values that drift would bias that fit. If any value `drifts`, means over the fits to single recordings are used.
     """
     out = {}
     for label, value in entry["values"].items():
-        rows = entry["by_recording"] if drifts else []
-        alone = (np.array([r[kind].get(label) for r in rows], dtype=float) for kind in ("values", "errors"))
-        mean, error = combine(*alone)
-        fitted = tuple(np.nan if x is None else float(x) for x in (value, entry["errors"].get(label)))
-        out[label] = (mean, error) if np.isfinite(mean) else (fitted[0], fitted[1])
+        mean, error = combine(*values_by_recording(entry, label)) if drifts else (np.nan, np.nan)
+        if not np.isfinite(mean):
+            mean, error = (np.nan if x is None else float(x) for x in (value, entry["errors"].get(label)))
+        out[label] = mean, error
     return out
 
 
+def values_by_recording(entry: Mapping[str, Any], label: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values and standard errors of a parameter from the fits to single recordings, nan if unknown."""
+    rows = entry["by_recording"]
+    values, errors = (np.array([r[kind].get(label) for r in rows], dtype=float) for kind in ("values", "errors"))
+    return values, errors
+
+
 def remainder_width(entry: Mapping[str, Any]) -> float:
-    """Return the range of log(error / noise): from the noise to the outputs' deviation."""
+    """Return the range of log(error / noise), from the noise to the standard deviation of the outputs."""
     return max(-float(np.log(max(entry["noise"], 1e-300))), 0.0)
 
 
 def trend_of(entry: Mapping[str, Any], name: str, times: Sequence[float] | None) -> tuple[float, float, float]:
-    """Return slope, its standard error, and the width of its range: a change across the prior range; nan if unknown."""
+    """Return the slope of a value, its standard error, and the width of its prior range; nan if unknown."""
     rows = entry["by_recording"]
     if len(rows) < 2:
         return np.nan, np.nan, np.nan
     t = np.arange(len(rows), dtype=float) if times is None else np.asarray(times, dtype=float)
-    v, e = (np.array([r[kind].get(name) for r in rows], dtype=float) for kind in ("values", "errors"))
-    return *slope(t, v, e), float(entry["widths"][name] / max(np.ptp(t), 1e-300))
+    return *slope(t, *values_by_recording(entry, name)), float(entry["widths"][name] / max(np.ptp(t), 1e-300))
 
 
 def distributions(
@@ -419,7 +420,7 @@ def distributions(
 ) -> tuple[tuple[FleetValue, ...], Population]:
     """Estimate the distribution of every value, and of the remaining error, over the machines of a fleet.
 
-    `units` are those of the parameters by label, in the order in which they are shown.
+    `units` maps the labels of the parameters, in the order of the result, to their units.
     """
     good = {name: e for name, e in entries.items() if e["status"] == DONE}
     labels = [label for label in units if any(label in e["values"] for e in good.values())]
@@ -442,20 +443,21 @@ def read_fleet(folder: Any, simulator: Any, laws: Sequence[type[Law]] | None = N
     Parameters
     ----------
     folder : path
-        The folder of the fleet, or its fleet.json.
+        The folder of a fleet, or its fleet.json.
     simulator, laws
-        As they were given to `fleet`.
+        As for `fleet`.
 
     Raises
     ------
     InputError
-        If the file cannot be read or is not of a fleet.
+        If the file cannot be read, or does not hold a fleet.
     """
     own = as_simulator(simulator)
     tried = check_laws(laws)
     path = Path(folder) / CONTENT if Path(folder).is_dir() else Path(folder)
+    text = read_bytes(path)
     try:
-        content = json.loads(existing_file(path).read_text(encoding="utf-8"))
+        content = json.loads(text)
         if content["schema"] != SCHEMA:
             raise KeyError
         common = content["common"]

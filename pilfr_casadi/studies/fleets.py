@@ -1,18 +1,18 @@
-"""A fleet: one simulator, recordings of many machines; what all of them lack, and which of them differ.
+"""Diagnose a fleet, one simulator and recordings of many machines: the physics they all lack, and which differ.
 
 The steps:
 
 1. Every machine: the simulator is refitted as given.
-2. A sample of machines, drawn evenly over the size of these errors, is diagnosed, each machine alone. The common
-   physics is the hypothesis with the largest evidence, summed over the sample, among those that were fitted to every
-   sampled machine; or nothing.
+2. A sample of machines, spread evenly over the ranks of their errors, is diagnosed, each machine alone. The common
+   physics is the hypothesis with the largest evidence, summed over the sample, among the hypotheses that were fitted to
+   every sampled machine. It may be the hypothesis that nothing is missing.
 3. Every machine: the simulator is fitted with and without the common physics (`machines`, `diagnose.replicate`). With
    several recordings, each is also fitted alone.
-4. `population` estimates the distribution of each value over the machines, of its trend in time, and of the error that
-   remains. It gives each machine's probability to differ.
-5. Machines whose error says that they lack more are diagnosed alone, from the simulator with the common physics.
+4. `population` estimates the distributions of each value, of its trend in time, and of the remaining error over the
+   machines, and the probability that each machine differs.
+5. Machines whose error shows that they lack more are diagnosed alone, from the simulator with the common physics.
 
-The work at a machine is a job. Jobs run side by side and are recorded in the folder, as those of a campaign: however it
+A step at a machine is a job. Jobs run side by side and are recorded in the folder, as in a campaign: however a fleet
 ends, the same call continues from there, and gives the same bytes with any executor and any number of workers.
 """
 
@@ -48,7 +48,7 @@ from ..laws import Law
 from ..simulators import Simulator, as_simulator
 from .execution import NoModel, PrintLine, RunInterrupted
 from .executor import AHEAD, LOST, Effort, run_side_by_side, versions
-from .fleet_result import CONTENT, TABLE, Common, Fleet, Machine, distributions, judge_entry
+from .fleet_result import CONTENT, TABLE, Common, Fleet, Machine, distributions, judge_entry, values_by_recording
 from .folder import JOBS, Layout, Manifest, check_own, lock_folder, refuse_other_versions
 from .machines import (
     CONTENT as DIAGNOSIS,
@@ -62,9 +62,10 @@ from .machines import (
     LawAt,
     MachineJob,
     MachineWork,
+    fill_missing,
 )
 
-SAMPLED = 4  # machines that are diagnosed to find the common physics
+SAMPLE_SIZE = 4  # machines that are diagnosed to find the common physics
 FEWEST_MACHINES = 2
 FLEET = Layout("fleet", "simulator file", (CONTENT, TABLE, PAGE), (PAGE, DIAGNOSIS, RESIDUAL))
 Recordings = Recording | Sequence[Recording]
@@ -75,7 +76,7 @@ def fleet(
     machines: Mapping[str, Recordings],
     *,
     times: Mapping[str, Sequence[float]] | None = None,
-    sample: int = SAMPLED,
+    sample: int = SAMPLE_SIZE,
     hold: str | None = None,
     laws: Sequence[type[Law]] | None = None,
     effects: int | None = None,
@@ -89,7 +90,7 @@ def fleet(
     progress: Progress | None = None,
     tell: PrintLine | None = None,
 ) -> Fleet:
-    """Find what all machines of a fleet lack, and which of them differ, drift or lack more.
+    """Find the physics that all machines of a fleet lack, and the machines that differ, drift or lack more.
 
     Parameters
     ----------
@@ -110,9 +111,9 @@ def fleet(
     ahead : int
         Number of jobs submitted to the executor at a time; at least its number of workers.
     time_limit : float, optional
-        Seconds after which the work at a machine is given up, and recorded as such.
+        Seconds after which a step at a machine is stopped; its entry records this.
     out : path, optional
-        Folder of the results: empty, new, or from an earlier call, which is continued. By default nothing is written.
+        Folder of the results: empty, new, or from an earlier call, which continues. By default nothing is written.
     overwrite : bool
         Compute everything again, even if the folder has results.
     progress : callable
@@ -133,28 +134,28 @@ def fleet(
         On Ctrl-C; complete jobs are kept in `out`.
     """
     check_executor(executor)
-    given = _checked_machines(machines)
+    given = _check_machines(machines)
     count = min(whole(sample, "sample", 1), len(given))
     effort = Effort(processors() if workers is None else whole(workers, "workers", 1), time_limit)
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"time_limit={time_limit!r} was given; give seconds, a positive number.")
     own = as_simulator(simulator, next(iter(given.values())))
-    given = _matched(own, given, hold)
+    given = _match_machines(own, given, hold)
     most = None if effects is None else whole(effects, "effects", 0)
     work = MachineWork(own, hold, check_laws(laws), most, engine)
-    when = _checked_times(times, given)
-    with _opened(out, overwrite) as manifest:
-        steps = _Steps(
+    when = _check_times(times, given)
+    with _open_folder(out, overwrite) as manifest:
+        execution = _FleetExecution(
             work, given, manifest, effort, executor, ahead, progress or (lambda *_: None), tell or (lambda _: None)
         )
         try:
-            return steps.execute(count, when)
+            return execution.execute(count, when)
         except KeyboardInterrupt:
-            raise RunInterrupted(steps.done, steps.total) from None
+            raise RunInterrupted(execution.done, execution.total) from None
 
 
-def _checked_machines(machines: Any) -> dict[str, tuple[Recording, ...]]:
-    """Return the recordings of each machine; refuse names that cannot be those of folders."""
+def _check_machines(machines: Any) -> dict[str, tuple[Recording, ...]]:
+    """Return the recordings of each machine; refuse names that cannot name a folder."""
     if not isinstance(machines, Mapping) or len(machines) < FEWEST_MACHINES:
         raise InputError(
             f"A fleet needs a dict of at least {FEWEST_MACHINES} machines, {{name: recordings}}; for one machine use "
@@ -170,10 +171,10 @@ def _checked_machines(machines: Any) -> dict[str, tuple[Recording, ...]]:
     return {name: tuple(as_recordings(found)) for name, found in sorted(machines.items())}
 
 
-def _matched(
+def _match_machines(
     simulator: Simulator, machines: Mapping[str, tuple[Recording, ...]], hold: str | None
 ) -> dict[str, tuple[Recording, ...]]:
-    """Return the recordings with the simulator's channels; refuse those that do not fit it, with the machine's name."""
+    """Match the recordings to the simulator's channels; an error names the machine."""
     out = {}
     for name, recordings in machines.items():
         try:
@@ -183,12 +184,12 @@ def _matched(
     return out
 
 
-def _checked_times(times: Any, machines: Mapping[str, tuple[Recording, ...]]) -> dict[str, tuple[float, ...]]:
+def _check_times(times: Any, machines: Mapping[str, tuple[Recording, ...]]) -> dict[str, tuple[float, ...]]:
     """Return the time of each recording by machine."""
     out = {}
     for name, found in (times or {}).items():
         if name not in machines:
-            raise InputError(f"times holds {name!r}, which is no machine of the fleet.")
+            raise InputError(f"times has {name!r}, which is no machine of the fleet; correct the name.")
         t = numbers(found, f"times of {name!r}")
         count = len(machines[name])
         if t.shape != (count,):
@@ -198,7 +199,7 @@ def _checked_times(times: Any, machines: Mapping[str, tuple[Recording, ...]]) ->
 
 
 @contextmanager
-def _opened(out: Any, overwrite: bool) -> Iterator[Manifest]:
+def _open_folder(out: Any, overwrite: bool) -> Iterator[Manifest]:
     """Open the folder of the results, or a temporary one."""
     if out is None:
         with tempfile.TemporaryDirectory() as folder:
@@ -214,8 +215,8 @@ def _opened(out: Any, overwrite: bool) -> Iterator[Manifest]:
 
 
 @dataclass(eq=False)
-class _Steps:
-    """The execution of the steps; `done` of `total` jobs are complete."""
+class _FleetExecution:
+    """The execution of the steps of a fleet; `done` of `total` jobs are complete."""
 
     work: MachineWork
     machines: Mapping[str, tuple[Recording, ...]]
@@ -226,22 +227,22 @@ class _Steps:
     progress: Progress
     print_line: PrintLine
     done: int = 0
-    used: dict[str, MachineJob] = field(default_factory=dict)
+    jobs: dict[str, MachineJob] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.total = 2 * len(self.machines)
 
     def execute(self, sample: int, times: Mapping[str, Sequence[float]]) -> Fleet:
         """Execute the steps of the module docstring."""
-        refits = self._do(REFIT, list(self.machines))
+        refits = self._run_step(REFIT, list(self.machines))
         names = _spread_sample({name: e["nrmse"] for name, e in refits.items() if e["status"] == DONE}, sample)
         if not names:
             raise NoModel(f"No machine could be fitted; {refits[next(iter(refits))]['sentence']}")
         self.total += len(names)
-        common, hold = common_physics(self._do(SAMPLE, names))
+        common, hold = common_physics(self._run_step(SAMPLE, names))
         if self.work.hold is None and self.work.simulator.hold is None:
             self.work = replace(self.work, hold=hold)
-        entries = self._do(MEASURE, list(self.machines), common.laws, common.starts)
+        entries = self._run_step(MEASURE, list(self.machines), common.laws, common.starts)
         values, remainder = distributions(entries, self._units(common.laws), times)
         if not values and not np.isfinite(remainder.mean):
             raise NoModel(f"No machine could be fitted; {entries[next(iter(entries))]['sentence']}")
@@ -261,30 +262,30 @@ class _Steps:
             remainder,
             tuple(ranked),
             self.work,
-            self._files(),
-            _histories(ranked, entries, times),
+            self._read_files(),
+            _collect_histories(ranked, entries, times),
         )
-        self._finish(result)
+        self._write(result)
         return result
 
-    def _do(
+    def _run_step(
         self,
         step: str,
         names: Sequence[str],
         laws: tuple[LawAt, ...] = (),
         starts: Sequence[Mapping[str, Any]] | Mapping[str, Any] = (),
     ) -> dict[str, dict[str, Any]]:
-        """Execute a step at some machines, as far as it is not complete; return the entries.
+        """Execute a step at some machines, unless it is complete there; return the entries.
 
-        `starts` are those of all machines, or a mapping from machines to theirs.
+        `starts` are the start values of all machines, or a mapping from each machine to its own.
         """
         jobs = []
         for name in names:
             own = (starts[name],) if isinstance(starts, Mapping) else tuple(starts)
             job = MachineJob(step, name, "", self.machines[name], laws, own)
             jobs.append(replace(job, key=digest([self.work.key(job), versions()])))
-        self.used |= {job.id: job for job in jobs}
-        ready = {job.id for job in jobs if self._complete(job)}
+        self.jobs |= {job.id: job for job in jobs}
+        ready = {job.id for job in jobs if self._is_complete(job)}
         self.done += len(ready)
         missing = [job for job in jobs if job.id not in ready]
         for batch in run_side_by_side(self.work, missing, self.effort, self.executor, self.ahead):
@@ -298,14 +299,14 @@ class _Steps:
         entries: dict[str, dict[str, Any]] = json.loads(text)  # in the order in which a resumed fleet reads them
         return entries
 
-    def _complete(self, job: MachineJob) -> bool:
+    def _is_complete(self, job: MachineJob) -> bool:
         """Tell whether a job ended with the same inputs, and its files are unchanged."""
         entry = self.manifest.entries.get(job.id, {})
         if entry.get("key") != job.key or entry["status"] == LOST or "time_limit" in entry:
             return False
-        return all([self.manifest.holds(name) for name in self._names(job)])
+        return all([self.manifest.holds(name) for name in self._file_names(job)])
 
-    def _names(self, job: MachineJob) -> list[str]:
+    def _file_names(self, job: MachineJob) -> list[str]:
         return [name for name in self.manifest.content["files"] if name.startswith(f"{JOBS}/{job.id}/")]
 
     def _diagnose_rest(
@@ -315,11 +316,11 @@ class _Steps:
         laws: tuple[LawAt, ...],
         sampled: Sequence[str],
     ) -> dict[str, Machine]:
-        """Diagnose the machines that lack more than the common physics; add what was found and the reports."""
+        """Diagnose the machines that lack more than the common physics; add the diagnoses and the reports."""
         names = [name for name, m in judged.items() if m.beyond > SURE]
         self.total += len(names)
         values = {n: {k: np.asarray(v, dtype=float) for k, v in entries[n]["parameters"].items()} for n in names}
-        found = self._do(REST, names, laws, values)
+        found = self._run_step(REST, names, laws, values)
         out = dict(judged)
         for name, m in judged.items():
             step = REST if name in found and found[name]["status"] == DONE else SAMPLE if name in sampled else ""
@@ -337,14 +338,14 @@ class _Steps:
         own = placed.readable_parameters()
         return {label: own[label.partition("[")[0]].unit for label in own.labels}
 
-    def _files(self) -> dict[str, bytes]:
-        """Read the files of the jobs of this fleet."""
-        names = [name for job in self.used.values() for name in self._names(job)]
+    def _read_files(self) -> dict[str, bytes]:
+        """Read the files of this fleet's jobs."""
+        names = [name for job in self.jobs.values() for name in self._file_names(job)]
         return {name: (self.manifest.folder / name).read_bytes() for name in sorted(names)}
 
-    def _finish(self, result: Fleet) -> None:
-        """Write the files of the fleet as a whole, and forget jobs that are no longer part of it."""
-        self.manifest.content["jobs"] = {k: v for k, v in self.manifest.entries.items() if k in self.used}
+    def _write(self, result: Fleet) -> None:
+        """Write the files of the whole fleet; drop the entries of jobs that no longer belong to it."""
+        self.manifest.content["jobs"] = {k: v for k, v in self.manifest.entries.items() if k in self.jobs}
         for name, text in result.documents().items():
             self.manifest.put(name, text)
         self.manifest.content.pop("writing", None)
@@ -352,7 +353,7 @@ class _Steps:
 
 
 def _spread_sample(errors: Mapping[str, float], count: int) -> list[str]:
-    """Draw machines evenly over the ranks of their errors: the middles of equal parts."""
+    """Choose machines spread evenly over the ranks of their errors: the middles of equal parts."""
     ranked = sorted(errors, key=lambda name: (errors[name], name))
     count = min(count, len(ranked))
     return [ranked[int((k + 0.5) * len(ranked) / count)] for k in range(count)]
@@ -361,13 +362,13 @@ def _spread_sample(errors: Mapping[str, float], count: int) -> list[str]:
 def common_physics(sample: Mapping[str, Mapping[str, Any]]) -> tuple[Common, str]:
     """Choose the hypothesis with the largest evidence summed over the diagnosed machines; also return the hold.
 
-    Only hypotheses that were fitted to all of them count; the one of no missing physics always is. The evidences of
-    machines are independent, so their logarithms add up, and the prior counts once.
+    Only hypotheses that were fitted to all these machines count; the hypothesis that nothing is missing always was. The
+    evidences of machines are independent, so their logarithms add up, and the prior counts once.
     """
     good = {name: e for name, e in sample.items() if e["status"] == DONE}
     if not good:
         raise NoModel(f"No machine of the sample could be diagnosed; {next(iter(sample.values()))['sentence']}")
-    found = [{_key(h): h for h in e["hypotheses"]} for e in good.values()]
+    found = [{_law_classes(h): h for h in e["hypotheses"]} for e in good.values()]
     shared = [key for key in found[0] if all(key in other for other in found)]
     score = {
         key: sum(f[key]["log_evidence"] for f in found) + np.mean([f[key]["log_prior"] for f in found])
@@ -375,45 +376,43 @@ def common_physics(sample: Mapping[str, Mapping[str, Any]]) -> tuple[Common, str
     }
     best = max(shared, key=lambda key: score[key])
     weight = {key: float(np.exp(score[key] - score[best])) for key in shared}
-    alike = [key for key in shared if _ids(found[0][key]) == _ids(found[0][best])]
+    alike = [key for key in shared if _law_ids(found[0][key]) == _law_ids(found[0][best])]
     holds = [e["hold"] for e in good.values()]
-    laws = tuple(_typical(k, [f[best]["laws"] for f in found]) for k in range(len(found[0][best]["laws"])))
+    laws = tuple(_median_law(k, [f[best]["laws"] for f in found]) for k in range(len(found[0][best]["laws"])))
     probability = sum(weight[key] for key in alike) / sum(weight.values())
     return Common(laws, probability, tuple(good)), max(sorted(set(holds)), key=holds.count)
 
 
-def _key(hypothesis: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+def _law_classes(hypothesis: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     return tuple(sorted((law["port"], law["law"]) for law in hypothesis["laws"]))
 
 
-def _ids(hypothesis: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _law_ids(hypothesis: Mapping[str, Any]) -> list[tuple[str, str]]:
     return sorted((law["port"], law["id"]) for law in hypothesis["laws"])
 
 
-def _typical(k: int, laws: Sequence[Sequence[Mapping[str, Any]]]) -> LawAt:
-    """Return the k-th law of a hypothesis with its median values over the sample, and limits that hold all of them."""
+def _median_law(k: int, laws: Sequence[Sequence[Mapping[str, Any]]]) -> LawAt:
+    """Return the k-th law of a hypothesis with its median values over the sample, and the widest limits."""
     first = laws[0][k]
     same = [next(law for law in own if (law["port"], law["law"]) == (first["port"], first["law"])) for own in laws]
     parameters = {}
     for name in first["parameters"]:
         rows = [law["parameters"][name] for law in same]
         value = np.median([np.asarray(r["value"], dtype=float) for r in rows], axis=0)
-        low, high = (
-            [np.nan_to_num(np.asarray(r[end], dtype=float), nan=free) for r in rows]
-            for end, free in (("low", -np.inf), ("high", np.inf))
-        )
-        parameters[name] = to_json({"value": value, "low": np.min(low, axis=0), "high": np.max(high, axis=0)})
+        low = np.min([fill_missing(r["low"], -np.inf) for r in rows], axis=0)
+        high = np.max([fill_missing(r["high"], np.inf) for r in rows], axis=0)
+        parameters[name] = to_json({"value": value, "low": low, "high": high})
     return LawAt(first["port"], first["law"], first["id"], first["form"], parameters)
 
 
-def _histories(
+def _collect_histories(
     machines: Sequence[Machine], entries: Mapping[str, Mapping[str, Any]], times: Mapping[str, Sequence[float]]
 ) -> dict[str, dict[str, Any]]:
     """Collect the values over time of machines that drift: machine -> parameter -> times, values, errors."""
     out: dict[str, dict[str, Any]] = {}
     for m in machines:
-        rows = entries[m.name].get("by_recording", [])
         for label in (label for label, t in m.trends.items() if t.probability > SURE):
-            history = {kind: [r[kind].get(label) for r in rows] for kind in ("values", "errors")}
-            out.setdefault(m.name, {})[label] = {"times": list(times.get(m.name, range(len(rows)))), **history}
+            values, errors = values_by_recording(entries[m.name], label)
+            history = {"times": list(times.get(m.name, range(len(values)))), "values": values, "errors": errors}
+            out.setdefault(m.name, {})[label] = history
     return out

@@ -1,8 +1,8 @@
-"""The folder of a run: the manifest, the models and tables, and which jobs are complete.
+"""The folder of a study: its lock, manifest, models and tables, and which jobs are complete.
 
-The manifest states what was computed, from which inputs and with which versions, and the SHA-256 of every file. It
-carries its own digest, so an edited manifest is noticed; the digests of the files do the same for models and tables. It
-holds no times: every file in the folder but `times.json` has the same bytes in every execution of a run on one machine.
+The manifest lists the jobs, the inputs, the versions, and the SHA-256 of every file. It includes its own digest, which
+reveals an edited manifest, as the digests of the files reveal edited models and tables. It has no times: on one
+machine, every execution of a run writes the same bytes to all files except `times.json`.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, digest, listed, make_folder, write_atomically
+from .._base import InputError, digest, listed, make_folder, read_bytes, write_atomically
 from ..identify import load
 from ..models import Model
 from .executor import FAILED, LOST, TIMED_OUT, Batch, versions
-from .jobs import BAD_ENDS, MODEL, Recordings, RunJob, error_of, file_digest, scored_files
+from .jobs import MODEL, WITHOUT_MODEL, Recordings, RunJob, error_of, scored_files
 from .run_file import Run
 from .summary import Score, results_table
 
 VERSION, MANIFEST = 1, "manifest.json"
 TABLE, PAGE, TIMES, JOBS, LOCK = "results.csv", "report.html", "times.json", "jobs", ".lock"
 SUMMARY, PICTURE = "summary.csv", "spread.png"  # of a campaign
-TABLE_PAUSE = 1.0  # seconds between two tables of a running campaign
+TABLE_PAUSE = 1.0  # least seconds between two updates of the table of a running campaign
 ADVICE = "restore it, or give --overwrite to compute everything again"
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The layout of a folder of results: the `kind` of study, its files, and the names of files of its jobs.
+    """The layout of a folder of results: the kind of study, and the names of its files and of its jobs' files.
 
-    `source` names the file that a study starts from, in messages.
+    `source` names the kind of file that describes the study, for messages.
     """
 
     kind: str
     source: str
     files: tuple[str, ...]
-    of_jobs: tuple[str, ...]
+    job_files: tuple[str, ...]
 
     @property
     def format(self) -> str:
@@ -52,13 +52,13 @@ class Layout:
         return f"pilfr_casadi {self.kind}"
 
     @property
-    def own(self) -> tuple[str, ...]:
-        """Names of files and folders that the study writes."""
+    def names(self) -> tuple[str, ...]:
+        """Names of all files and folders that the study writes."""
         return (MANIFEST, *self.files, TIMES, JOBS)
 
     def is_half_written(self, name: str) -> bool:
-        """Tell whether a file is half-written, by the names that `write_atomically` gives."""
-        names = "|".join(map(re.escape, (*self.own, *self.of_jobs)))
+        """Tell whether a file has the name of a temporary file of `write_atomically`."""
+        names = "|".join(map(re.escape, (*self.names, *self.job_files)))
         return re.fullmatch(rf"\.({names})\.[0-9a-f]{{8}}\.tmp", name) is not None
 
 
@@ -66,7 +66,7 @@ RUN = Layout("run", "run file", (TABLE, PAGE, MODEL, SUMMARY, PICTURE), (MODEL,)
 
 
 def check_own(folder: Path, file: Path | None, overwrite: bool, layout: Layout = RUN) -> None:
-    """Refuse a folder that holds the file that the study starts from, or files that no such study wrote."""
+    """Refuse a folder that contains the file of the study, or files that no such study wrote."""
     target, kind = os.path.realpath(folder), layout.kind
     if file is not None and target in map(str, Path(os.path.realpath(file)).parents):
         raise InputError(f"The folder {folder} holds the {layout.source} {file.name}; give the results another folder.")
@@ -78,7 +78,7 @@ def check_own(folder: Path, file: Path | None, overwrite: bool, layout: Layout =
         raise InputError(f"The folder {folder} cannot be read ({error.strerror}); give another one.") from None
     if MANIFEST in found:
         return
-    foreign = [name for name in found if name not in layout.own]
+    foreign = [name for name in found if name not in layout.names]
     if foreign:
         raise InputError(
             f"{folder} holds {listed(foreign, 3)} and no manifest of a {kind}; give an empty or a new folder as --out."
@@ -89,7 +89,7 @@ def check_own(folder: Path, file: Path | None, overwrite: bool, layout: Layout =
 
 @contextlib.contextmanager
 def lock_folder(folder: Path, layout: Layout = RUN) -> Iterator[None]:
-    """Lock a folder against other processes, and remove half-written files."""
+    """Lock a folder against other processes, and remove temporary files of an interrupted one."""
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(ImportError):  # on systems without such locks
             import fcntl
@@ -111,7 +111,7 @@ def lock_folder(folder: Path, layout: Layout = RUN) -> Iterator[None]:
 
 
 def read_times(folder: Path) -> dict[str, float]:
-    """Read the seconds that each job took, as far as they are known."""
+    """Read the computing time of each job in seconds, as far as it is known."""
     try:
         found = json.loads((folder / TIMES).read_text(encoding="utf-8"))
         return {str(job): float(seconds) for job, seconds in found.items()}
@@ -120,7 +120,7 @@ def read_times(folder: Path) -> dict[str, float]:
 
 
 class Manifest:
-    """The manifest in a folder, rewritten atomically after every step."""
+    """The manifest of a folder, rewritten atomically after every change."""
 
     def __init__(self, folder: Path, content: dict[str, Any] | None = None, layout: Layout = RUN) -> None:
         tables: dict[str, Any] = {key: {} for key in ("jobs", "scores", "files", "inputs")}
@@ -129,7 +129,7 @@ class Manifest:
 
     @classmethod
     def read(cls, folder: Path, layout: Layout = RUN) -> Manifest:
-        """Read the manifest of an earlier study, or start an empty one; refuse one that was changed."""
+        """Read the manifest of an earlier study, or start an empty one; refuse an edited manifest."""
         path, kind = folder / MANIFEST, layout.kind
         if not path.exists():
             return cls(folder, layout=layout)
@@ -152,19 +152,19 @@ class Manifest:
         return entries
 
     def write(self) -> None:
-        """Write it, with its digest."""
+        """Write the manifest with its digest."""
         content = {**self.content, "sha256": digest(self.content)}
         text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False)
         write_atomically(self.folder / MANIFEST, text + "\n")
 
     def holds(self, name: str) -> bool:
-        """Tell whether a file of the study is there; refuse one that was changed."""
+        """Tell whether a file of the study exists; refuse an edited file."""
         path = self.folder / name
         if name not in self.content["files"] or not path.is_file():
             return False
-        # if a run ended after writing a file and before the manifest, the manifest announced the file beforehand
+        # the manifest announces a file before it is written, because a run may end between the two
         expected = self.content["files"][name], self.content.get("writing", {}).get(name)
-        if file_digest(path) not in expected:
+        if digest(read_bytes(path)) not in expected:
             raise InputError(
                 f"{path} was changed after the {self.layout.kind} wrote it; restore it, remove it, or give "
                 "--overwrite to compute everything again."
@@ -178,7 +178,7 @@ class Manifest:
             self.put_all({name: data})
 
     def put_all(self, contents: Mapping[str, bytes], jobs: Mapping[str, Any] | None = None) -> None:
-        """Announce files in the manifest, write them, then record their digests and the entries of their jobs."""
+        """Announce files in the manifest, write them, then record their digests and the entries of the jobs."""
         found = {name: digest(data) for name, data in contents.items()}
         if contents:
             self.content["writing"] = found
@@ -200,7 +200,7 @@ class Manifest:
 
 
 class Store:
-    """The results of a run on disk, read and written; files that were changed afterwards are refused."""
+    """Read and write the results of a run; refuse edited files."""
 
     def __init__(
         self, path: Path, run: Run, inputs: Mapping[str, str], recordings: Recordings, overwrite: bool, campaign: bool
@@ -216,27 +216,27 @@ class Store:
         self.manifest.write()
         self.written = -np.inf
 
-    def complete(self, job: RunJob) -> bool:
-        """Tell whether a job is finished with the same inputs, and its model is unchanged on disk."""
+    def is_complete(self, job: RunJob) -> bool:
+        """Tell whether a job finished with the same inputs, and its model is unchanged on disk."""
         entry = self.manifest.entries.get(job.id, {})
         if entry.get("key") != job.key or entry["status"] == LOST:
             return False
-        if entry["status"] == TIMED_OUT:  # tried again with more time
+        if entry["status"] == TIMED_OUT:  # a longer limit runs the job again
             return self.campaign and self.run.time_limit is not None and self.run.time_limit <= entry["time_limit"]
         if entry["status"] == FAILED:
             return self.campaign
         return not self.has_model(job) or self.manifest.holds(job.model_file)
 
-    def ended_well(self, job: RunJob) -> bool:
+    def gave_model(self, job: RunJob) -> bool:
         """Tell whether a job gave a model that meets its constraints."""
-        return self.manifest.entries[job.id]["status"] not in BAD_ENDS
+        return self.manifest.entries[job.id]["status"] not in WITHOUT_MODEL
 
     def has_model(self, job: RunJob) -> bool:
-        """Tell whether the folder has a model of a job."""
-        return job.fold is None and self.ended_well(job)
+        """Tell whether the folder has a model of a job; models of a cross-validation are not kept."""
+        return job.fold is None and self.gave_model(job)
 
     def record(self, batch: Batch) -> None:
-        """Note the errors of finished jobs, and record them in the manifest."""
+        """Record finished jobs and their errors in the manifest."""
         for _, found in batch:
             for name, error in found.errors.items():
                 model = digest(str(found.files[MODEL]).encode())
@@ -244,9 +244,9 @@ class Store:
         self.manifest.record(batch)
 
     def scores(self, jobs: Sequence[RunJob], last: bool = False) -> list[Score]:
-        """Return the errors of the jobs' models, computed where the manifest lacks them; `last` drops other entries."""
+        """Return the errors of the jobs' models; compute missing ones. `last` drops the entries of other models."""
         out, used, known = [], set(), self.manifest.content["scores"]
-        for job in (j for j in jobs if self.ended_well(j)):
+        for job in (j for j in jobs if self.gave_model(j)):
             if job.fold is not None:
                 entry, name = self.manifest.entries[job.id], f"fold {job.fold}"
                 out += [Score(job.id, "train", name, entry["train"]), Score(job.id, "held", name, entry["held"])]
@@ -273,7 +273,7 @@ class Store:
         return digest({"model": model, "data": self.inputs[name], "reading": reading})
 
     def write_table(self, jobs: Sequence[RunJob], last: bool = False) -> None:
-        """Write the errors so far while a campaign runs, at most once per `TABLE_PAUSE` unless it is the last table."""
+        """Write the errors so far of a running campaign, at most once per `TABLE_PAUSE` except the last time."""
         if not self.campaign or (not last and time.monotonic() < self.written + TABLE_PAUSE) or not jobs:
             return
         self.manifest.put(TABLE, results_table(self.scores(jobs), jobs, self.manifest.entries, ""))
@@ -281,7 +281,7 @@ class Store:
 
 
 def refuse_other_versions(manifest: Manifest) -> None:
-    """Refuse to mix results of different versions in one campaign, which compares its results."""
+    """Refuse to mix results of different versions, because a study compares its results."""
     before, now = manifest.content.get("versions", {}), versions()
     for name in now:
         if manifest.entries and before.get(name) != now[name]:

@@ -1,14 +1,14 @@
-"""The jobs of a run: independent identifications with stable ids, and keys that tell which of them are outdated.
+"""The jobs of a run: independent identifications with stable ids, and keys that reveal outdated results.
 
-The id of a job names how it differs from the others (`seed-0`). Its key is the SHA-256 of everything that its model
+The id of a job states how it differs from the others (`seed-0`). Its key is the SHA-256 of everything that its model
 depends on: the contents of the recordings it reads, how they are read, model, solver, constraints, seed, versions, and
 in a cross-validation the samples that its fold fits and holds out. A job is finished if the manifest has its key and
 the folder its model.
 
 A cross-validation divides the training recordings into parts and holds each out once. With at least as many different
-inputs as folds, whole recordings are dealt out in turn, recordings of one input together. With fewer, every recording
-is cut into as many blocks as there are folds. The state after a cut is estimated; in a held-out block the samples used
-for this are not scored (`Fit.scored_from`). Blocks of a repeating input, as in steady periods, are refused, because the
+inputs as folds, whole recordings are assigned to the folds in turn, recordings of one input together. With fewer, every
+recording is cut into one block per fold. The state after a cut is estimated; in a held-out block the samples used for
+this are not scored (`Fit.scored_from`). A repeating input, as in steady periods, is not cut but refused, because the
 other blocks contain the same input.
 """
 
@@ -17,12 +17,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, digest, existing_file
+from .._base import InputError, Progress, digest, read_bytes
 from ..data import NOTHING_SENTENCE, Recording, explains_nothing, fingerprint, group_by_input, repeats_itself
 from ..export import model_text
 from ..identify import Fit, fit as identify, operators_used, prune, regularization_path
@@ -32,9 +31,9 @@ from .executor import FAILED, LOST, TIMED_OUT, Outcome, versions
 from .run_file import ROLES, Run
 
 Recordings = Mapping[str, tuple[Recording, ...]]
-BAD_ENDS = (FAILED, TIMED_OUT, LOST, Status.INFEASIBLE.name)  # without a model
+WITHOUT_MODEL = (FAILED, TIMED_OUT, LOST, Status.INFEASIBLE.name)  # statuses of jobs without a model
 MODEL = "model.json"
-FEWEST_SAMPLES = 20  # in a block of a cross-validation: needed to estimate its initial state
+FEWEST_SAMPLES = 20  # per block of a cross-validation, to estimate its initial state
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,33 +51,25 @@ class RunJob:
 
     @property
     def fold(self) -> int | None:
-        """Number of the fold that the job holds out; None without cross-validation."""
+        """Number of the held-out fold; None without cross-validation."""
         return self.parameters.get("fold")
 
     @property
     def model_file(self) -> str:
-        """Path of its model file below the folder of the run."""
+        """Path of the model file below the folder of the run."""
         return f"jobs/{self.id}/{MODEL}"
 
 
-def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file; refuse one that cannot be read."""
-    try:
-        return digest(existing_file(path).read_bytes())
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); check its permissions.") from None
-
-
 def input_digests(run: Run) -> dict[str, str]:
-    """Return the SHA-256 of every recording by its name in the run file."""
-    return {name: file_digest(run.path_of(name)) for names in run.files.values() for name in names}
+    """Return the SHA-256 of every recording, by its name in the run file."""
+    return {name: digest(read_bytes(run.path_of(name))) for names in run.files.values() for name in names}
 
 
 def jobs_of(run: Run, inputs: Mapping[str, str], train: Sequence[Recording] | None = None) -> tuple[RunJob, ...]:
-    """List one job per cell and seed; given the training recordings, one per cell, fold and seed."""
+    """List one job per cell and seed, or, given the training recordings, one per cell, fold and seed."""
     read = run.files["train"] + (run.files["validation"] if run.regularization.path else ())
     common = {
-        "program": file_digest(run.file) if run.own else None,
+        "program": digest(read_bytes(run.file)) if run.own else None,
         "reading": {k: list(v) if isinstance(v, tuple) else v for k, v in run.reading.items()},
         "data": [[name, inputs[name]] for name in read],
         "engine": run.engine,
@@ -105,16 +96,13 @@ def jobs_of(run: Run, inputs: Mapping[str, str], train: Sequence[Recording] | No
 def fold(recordings: Sequence[Recording], k: int, folds: int) -> tuple[tuple[Recording, ...], tuple[Recording, ...]]:
     """Return the fitted and the held-out recordings of fold k of `folds`.
 
-    Raises
-    ------
-    InputError
-        If the recordings are too short to be cut, or a block of one has the same input as its other blocks.
+    Recordings that are too short to be cut, and blocks with the same input as the other blocks, are refused.
     """
     groups = group_by_input(recordings)
     if len(groups) >= folds:
         out = {i for number, group in enumerate(groups) if number % folds == k for i in group}
-        dealt = list(enumerate(recordings))
-        return tuple(r for i, r in dealt if i not in out), tuple(r for i, r in dealt if i in out)
+        fitted = tuple(r for i, r in enumerate(recordings) if i not in out)
+        return fitted, tuple(recordings[i] for i in sorted(out))
     train: list[Recording] = []
     held: list[Recording] = []
     for r in recordings:
@@ -135,7 +123,7 @@ def fold(recordings: Sequence[Recording], k: int, folds: int) -> tuple[tuple[Rec
     return tuple(train), tuple(held)
 
 
-def outcome(
+def execute_job(
     run: Run,
     recordings: Recordings,
     job: RunJob,
@@ -143,39 +131,38 @@ def outcome(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Outcome:
-    """Execute a job: identify its model and compute its errors."""
-    fit = _without_times(found := _identify(run, recordings, job, executor, progress))
+    """Identify the model of a job and compute its errors."""
+    found = _identify(run, recordings, job, executor, progress)
+    fit = _drop_times(found)
     if fit.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
-    missed = [str(limit) for limit in fit.limits if not limit.met]
-    infeasible = fit.status is Status.INFEASIBLE
     nothing = explains_nothing(fit.train_nrmse)
-    training = f"NRMSE on training {', '.join(f'{e:.4f}' for e in fit.train_nrmse)}."
-    training += f" {NOTHING_SENTENCE}" if nothing else ""
-    about = {
+    entry = {
         "status": fit.status.name,
-        "sentence": f"{fit.status.value} ({'; '.join(missed)})" if infeasible else f"{training} {fit.status.value}",
         "train": float(np.mean(fit.train_nrmse)),
         "operators_used": operators_used(fit),
         "explains_nothing": nothing,
     }
-    if infeasible:
-        return Outcome(about, found.seconds)
+    if fit.status is Status.INFEASIBLE:
+        missed = "; ".join(str(limit) for limit in fit.limits if not limit.met)
+        return Outcome({**entry, "sentence": f"{fit.status.value} ({missed})"}, found.seconds)
+    errors = ", ".join(f"{e:.4f}" for e in fit.train_nrmse)
+    entry["sentence"] = f"NRMSE on training {errors}. {NOTHING_SENTENCE + ' ' if nothing else ''}{fit.status.value}"
     if job.fold is not None:
-        return Outcome({**about, "held": fit.nrmse(fold(recordings["train"], job.fold, run.folds)[1])}, found.seconds)
-    errors = {name: error_of(fit, recording) for _, name, recording in scored_files(run, recordings)}
-    return Outcome(about, found.seconds, {MODEL: model_text(fit.content())}, errors)
+        return Outcome({**entry, "held": fit.nrmse(fold(recordings["train"], job.fold, run.folds)[1])}, found.seconds)
+    scores = {name: error_of(fit, recording) for _, name, recording in scored_files(run, recordings)}
+    return Outcome(entry, found.seconds, {MODEL: model_text(fit.content())}, scores)
 
 
 def scored_files(run: Run, recordings: Recordings) -> Iterator[tuple[str, str, Recording]]:
-    """Yield role, name and recording of every file of a run."""
+    """Yield the role, name and recording of every file of a run."""
     for role in ROLES:
         for name, recording in zip(run.files[role], recordings[role], strict=True):
             yield role, name, recording
 
 
 def error_of(fit: Fit, recording: Recording) -> float | None:
-    """Compute the NRMSE (Krikelis et al. 2024, Eq. 27) on a recording; None where it cannot be computed."""
+    """Compute the NRMSE (Krikelis et al. 2024, Eq. 27) on a recording; None if it does not exist or is not finite."""
     try:
         error = fit.nrmse(recording)
     except InputError:
@@ -186,7 +173,7 @@ def error_of(fit: Fit, recording: Recording) -> float | None:
 def _identify(
     run: Run, recordings: Recordings, job: RunJob, executor: Executor | None, progress: Progress | None
 ) -> Fit:
-    """Identify the model of a job from its training recordings, and for a path also from the validation recordings."""
+    """Identify the model of a job; a regularization path also uses the validation recordings."""
     options: dict[str, Any] = {
         "solver": run.solver,
         "stable": run.stable,
@@ -210,7 +197,7 @@ def _identify(
     return found
 
 
-def _without_times(fit: Fit) -> Fit:
+def _drop_times(fit: Fit) -> Fit:
     """Drop the computing times of a fit, which differ in every execution."""
 
     def timeless(solution: Solution) -> Solution:

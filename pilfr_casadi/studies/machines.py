@@ -1,7 +1,7 @@
-"""The work at one machine of a fleet: a refit, a diagnosis, values with the common physics, and what is left.
+"""The steps at one machine of a fleet: a refit, a diagnosis, a fit with the common physics, a diagnosis of the rest.
 
-Each step is a job: it depends on the recordings of one machine and on what the fleet has found so far, runs in any
-process, and gives numbers for the manifest and files for its folder.
+Each step is a job. It depends on the recordings of one machine and on earlier results of the fleet, runs in any
+process, and returns numbers for the manifest and files for its folder.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, digest, to_json
+from .._base import InputError, digest, json_text, to_json
 from ..data import Recording, fingerprint
 from ..diagnose import Diagnosis, Replication, add_scaled_laws, diagnose, refit_error, replicate
 from ..laws import Law
@@ -25,12 +25,12 @@ from .executor import Outcome
 REFIT, SAMPLE, MEASURE, REST = "refit", "sample", "measure", "rest"  # the steps at a machine
 DONE = "DONE"  # status of a job with a result
 PAGE, CONTENT, RESIDUAL = "report.html", "diagnosis.json", "residual.json"  # files of jobs
-MOST_POINTS = 400  # samples of a residual that are kept for its picture
+MOST_POINTS = 400  # samples of a residual that its picture shows
 
 
 @dataclass(frozen=True, eq=False)
 class LawAt:
-    """A law of the common physics: its port, class, start values and limits, as JSON can hold them."""
+    """A law of the common physics: its port, class, start values and limits, as JSON types."""
 
     port: str
     law: str
@@ -42,29 +42,30 @@ class LawAt:
         """Return the port and the law; `known` are the classes by name."""
         if self.law not in known:
             raise InputError(
-                f"The common physics has the law {self.law}, which is not among the laws; give it in laws=."
+                f"The common physics has the law {self.law}, which is not among the given laws; add it to laws=."
             )
-        values = {name: _array(p["value"], 0.0) for name, p in self.parameters.items()}
-        ends = {k: (_array(p["low"], -np.inf), _array(p["high"], np.inf)) for k, p in self.parameters.items()}
-        return self.port, known[self.law]().at(values, ends)
+        values = {name: fill_missing(p["value"], 0.0) for name, p in self.parameters.items()}
+        limits = {
+            name: (fill_missing(p["low"], -np.inf), fill_missing(p["high"], np.inf))
+            for name, p in self.parameters.items()
+        }
+        return self.port, known[self.law]().at(values, limits)
 
 
-def _array(value: Any, missing: float) -> Any:
-    """Return a number or array with `missing` in place of None."""
-    found = np.asarray(value, dtype=float)
-    found = np.where(np.isnan(found), missing, found)
-    return float(found) if found.ndim == 0 else found
+def fill_missing(value: Any, missing: float) -> np.ndarray:
+    """Convert a number or array of JSON, with `missing` in place of null."""
+    return np.nan_to_num(np.asarray(value, dtype=float), nan=missing, posinf=np.inf, neginf=-np.inf)
 
 
 @dataclass(frozen=True, eq=False)
 class MachineJob:
-    """A step at a machine; `laws` are the common physics, `starts` values by name to fit from."""
+    """A step at a machine; `laws` are the common physics, `starts` are values by name from which to fit."""
 
     step: str
     machine: str
     key: str
     recordings: tuple[Recording, ...]
-    laws: tuple[LawAt, ...] = ()  # not the laws themselves: a class made at run time is another one once it is sent
+    laws: tuple[LawAt, ...] = ()  # not classes: a class made at run time is a different one after unpickling
     starts: tuple[Mapping[str, Any], ...] = ()
 
     @property
@@ -90,7 +91,7 @@ class MachineWork:
 
     @property
     def known(self) -> dict[str, type[Law]]:
-        """The laws that a diagnosis tries, by the names of their classes."""
+        """The laws that a diagnosis tries, by class name."""
         return {law.__name__: law for law in add_scaled_laws(self.laws, self.simulator)}
 
     def build(self, laws: Sequence[LawAt]) -> list[tuple[str, Law]]:
@@ -105,12 +106,12 @@ class MachineWork:
         return replace(step(job), seconds=time.perf_counter() - began)
 
     def key(self, job: MachineJob) -> str:
-        """Compute the digest of everything that a job's result depends on, but for versions."""
+        """Compute the digest of everything that a job's result depends on, except versions."""
         return digest(
             {
                 "step": job.step,
                 "simulator": simulator_digest(self.simulator),
-                "data": [_contents(r) for r in job.recordings],
+                "data": [_recording_content(r) for r in job.recordings],
                 "options": [self.hold, [*self.known], self.effects, self.engine],
                 "laws": [asdict(law) for law in job.laws],
                 "starts": to_json(job.starts),
@@ -123,12 +124,14 @@ class MachineWork:
 
     def _sample(self, job: MachineJob) -> Outcome:
         found = self._diagnose(self.simulator, job.recordings)
-        return Outcome({**_answer(found), "hypotheses": self._hypotheses(found)}, files=_files(found))
+        return Outcome(
+            {**_diagnosis_entry(found), "hypotheses": self._hypotheses(found)}, files=_diagnosis_files(found)
+        )
 
     def _measure(self, job: MachineJob) -> Outcome:
         laws = self.build(job.laws)
         found = replicate(self.simulator, job.recordings, laws, job.starts, hold=self.hold, engine=self.engine)
-        return Outcome(measured_entry(found), files={RESIDUAL: _residual(found, job.recordings)})
+        return Outcome(measured_entry(found), files={RESIDUAL: _bin_residual(found, job.recordings)})
 
     def _rest(self, job: MachineJob) -> Outcome:
         """Diagnose a machine that lacks more than the common physics, from the simulator with that physics."""
@@ -138,7 +141,7 @@ class MachineWork:
         own = corrected.parameter_set
         corrected = corrected.with_parameters(own.at(own.pack(job.starts[0])))
         found = self._diagnose(corrected, job.recordings)
-        return Outcome(_answer(found), files=_files(found))
+        return Outcome(_diagnosis_entry(found), files=_diagnosis_files(found))
 
     def _diagnose(self, simulator: Simulator, recordings: Sequence[Recording]) -> Diagnosis:
         found = diagnose(
@@ -152,10 +155,10 @@ class MachineWork:
         )
         if found.interrupted:
             raise KeyboardInterrupt
-        return replace(found, seconds=0.0)  # the page is the same in every execution
+        return replace(found, seconds=0.0)  # so that the page is the same in every execution
 
     def _hypotheses(self, found: Diagnosis) -> list[dict[str, Any]]:
-        """List the fitted hypotheses whose laws are among `laws`, with their evidence relative to the refit's."""
+        """List the fitted hypotheses whose laws are known, with their evidence relative to the plain refit."""
         search, known = found.evidence["search"], self.known
         out = []
         for trial in search.memo.values():
@@ -166,15 +169,15 @@ class MachineWork:
             if not np.isfinite(gain):
                 continue
             laws = [
-                asdict(LawAt(e.port, type(e.law).__name__, e.law.id, e.law.form, _numbers(e, trial.fitted)))
+                asdict(LawAt(e.port, type(e.law).__name__, e.law.id, e.law.form, _describe_parameters(e, trial.fitted)))
                 for e in trial.laws
             ]
             out.append({"laws": laws, "log_evidence": float(gain - prior), "log_prior": float(prior)})
         return out
 
 
-def _numbers(element: Any, fitted: Any) -> dict[str, Any]:
-    """Return value and limits of each parameter of a fitted law."""
+def _describe_parameters(element: Any, fitted: Any) -> dict[str, Any]:
+    """Return the value and limits of each parameter of a fitted law."""
     own = element.own(fitted.values)
     return {
         name: to_json({"value": own[name], "low": p.bounds[0], "high": p.bounds[1]})
@@ -182,24 +185,23 @@ def _numbers(element: Any, fitted: Any) -> dict[str, Any]:
     }
 
 
-def _answer(found: Diagnosis) -> dict[str, Any]:
-    """Return the entry of a diagnosis."""
+def _diagnosis_entry(found: Diagnosis) -> dict[str, Any]:
+    """Return the manifest entry of a diagnosis."""
     content = found.to_dict()
     effects = [{k: e[k] for k in ("port", "law", "confidence", "parameters")} for e in content["effects"]]
-    answer = {"status": DONE, "verdict": found.verdict, "sentence": found.summary, "hold": found.hold}
-    return {**answer, "effects": effects, "fit": content["fit"]}
+    entry = {"status": DONE, "verdict": found.verdict, "sentence": found.summary, "hold": found.hold}
+    return {**entry, "effects": effects, "fit": content["fit"]}
 
 
-def _files(found: Diagnosis) -> dict[str, str]:
-    """Return the page and the content of a diagnosis."""
+def _diagnosis_files(found: Diagnosis) -> dict[str, str]:
+    """Return the page and the JSON content of a diagnosis."""
     from ..report import diagnosis_page
 
-    content = json.dumps(found.to_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-    return {PAGE: diagnosis_page(found).html(), CONTENT: content}
+    return {PAGE: diagnosis_page(found).html(), CONTENT: json_text(found.to_dict())}
 
 
 def measured_entry(found: Replication) -> dict[str, Any]:
-    """Return the numbers of a machine with the common physics, for JSON."""
+    """Return the manifest entry of a machine that was fitted with the common physics."""
     numbers = {
         "nrmse_before": found.nrmse_before,
         "nrmse_after": found.nrmse_after,
@@ -217,8 +219,8 @@ def measured_entry(found: Replication) -> dict[str, Any]:
     return {"status": DONE, "sentence": sentence, **to_json(numbers)}
 
 
-def _residual(found: Replication, recordings: Sequence[Recording]) -> str:
-    """Return the first output's residual over all recordings, in bins with their largest and smallest value."""
+def _bin_residual(found: Replication, recordings: Sequence[Recording]) -> str:
+    """Bin the first output's residual over all recordings; return the extremes of each bin as JSON."""
     error = np.concatenate([e[:, 0] for e in found.residuals])
     bins = np.array_split(error, min(MOST_POINTS // 2, len(error)))
     low, high = ([float(f"{pick(b):.4g}") for b in bins] for pick in (np.min, np.max))
@@ -226,14 +228,14 @@ def _residual(found: Replication, recordings: Sequence[Recording]) -> str:
     return json.dumps({"seconds": round(seconds, 9), "low": low, "high": high, "noise": found.noise}) + "\n"
 
 
-def _contents(recording: Recording) -> list[Any]:
-    """Return everything of a recording that a result depends on."""
+def _recording_content(recording: Recording) -> list[Any]:
+    """List everything in a recording that a result depends on."""
     names = [list(recording.inputs), list(recording.outputs), recording.name]
     return [fingerprint(recording), *names, recording.dt, recording.hold, recording.skip]
 
 
 def simulator_digest(simulator: Simulator) -> str:
-    """Compute the digest of a simulator: its equations with ports, and its parameters."""
+    """Compute the digest of a simulator's equations, ports and parameters."""
     x, u, p, t = simulator.symbols()
     ports, z = {}, ca.SX.sym("z", 2)
     parts = [simulator.derivatives(x, u, p, t), *simulator.measured(x, u, p, t).values()]
@@ -256,5 +258,5 @@ def simulator_digest(simulator: Simulator) -> str:
         for name, q in simulator.parameters.items()
     }
     elements = [[e.port, type(e.law).__name__] for e in simulator.elements]
-    said = [simulator.hold, simulator.discrete, to_json(simulator.observer), simulator.substeps]
-    return digest({"equations": equations, "ports": ports, "parameters": parameters, "laws": elements, "said": said})
+    options = [simulator.hold, simulator.discrete, to_json(simulator.observer), simulator.substeps]
+    return digest({"equations": equations, "ports": ports, "parameters": parameters, "laws": elements, "said": options})

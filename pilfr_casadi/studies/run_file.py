@@ -1,4 +1,4 @@
-"""From a run file to a checked `Run`: its paths, its solver, and the cell of every combination of the grid."""
+"""Read a run file into a checked `Run`: its paths, its solver, and a cell for every combination of the grid."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from .._base import InputError, existing_file
+from .._base import InputError, existing_file, read_bytes
 from ..models import ALL_OPTIONS, HYSTERETIC_OPTIONS, LAGGED, PILFR, STRUCTURE_OPTIONS, Lagged, Model
 from ..optimise import Constraint
 from ..simulators import user_variable
@@ -31,9 +31,9 @@ READING = ("period", "hold", "skip", "dt", "time_tolerance", "initial")  # field
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """One model of a study, with the options of its search: `starts`, `start` and, if given, `linear`, as for `fit`."""
+    """One model of a study, with the search options of `fit`: `starts`, `start` and, if given, `linear`."""
 
-    values: Mapping[str, Any]  # key of the grid -> value, for the keys that matter to the cell
+    values: Mapping[str, Any]  # key of the grid -> value, for the keys that apply to the cell
     model: PILFR | Lagged | Model
     search: dict[str, Any]
     plain_tables: dict[str, Any] = field(default_factory=dict)  # `model` and `solver` as plain numbers and texts
@@ -53,14 +53,15 @@ class Run:
     file, out : Path
         The run file, and the folder of the results.
     plain_tables : dict
-        The tables `model`, `grid`, `solver`, `constraints` and `regularization` as plain numbers and texts. With data
-        and seed, a job depends on these alone, or on the Python file too if `own` is True (objects are among them).
+        The tables `model`, `grid`, `solver`, `constraints` and `regularization` as plain numbers and texts. A job
+        depends on these, the data and the seed; if `own` is True, there are objects, and it depends on the Python file
+        too.
     files : dict
         Names of the recordings in the file, by role (`train`, `validation`, `test`).
     reading : dict
-        Options of reading them: `inputs`, `outputs`, `columns` and fields of `Recording`.
+        Options to read the recordings: `inputs`, `outputs`, `columns` and fields of `Recording`.
     cells : tuple of Cell
-        The models of the grid with their searches; one cell without a grid.
+        The models of the grid with their search options; one cell without a grid.
     """
 
     file: Path
@@ -88,7 +89,7 @@ class Run:
 
 
 def as_plain(value: Any) -> tuple[Any, bool]:
-    """Convert a value for JSON, objects into a mark; return it and whether there are any objects."""
+    """Convert a value to JSON types, objects to a placeholder; also tell whether there are objects."""
     if isinstance(value, Mapping):
         parts = {str(k): as_plain(v) for k, v in sorted(value.items(), key=lambda kv: str(kv[0]))}
         return {k: v for k, (v, _) in parts.items()}, any(o for _, o in parts.values())
@@ -103,26 +104,23 @@ def as_plain(value: Any) -> tuple[Any, bool]:
 
 
 def read_run(path: Any, kind: str = "run") -> Run:
-    """Read a run file, `.toml` or `.py`; `kind` ends the default name of the folder of the results.
+    """Read a run file, `.toml` or `.py`; the default folder of the results is named after the file and `kind`.
 
     Raises
     ------
     InputError
-        If it cannot be read, or asks for something impossible: one sentence with the file and the key.
+        If the file cannot be read, or a key has a bad value; the sentence names the file and the key.
     """
     if not isinstance(path, str | os.PathLike):
         raise InputError(f"{path!r} was given for a run file; give its path, or the result of `read_run`.")
     file = Path(path)
     try:
-        existing_file(file)
         if file.suffix.lower() == ".py":
-            content = user_variable(file, "run", "the run")
+            content = user_variable(existing_file(file), "run", "the run")
         else:
-            content = tomllib.loads(file.read_bytes().decode())
+            content = tomllib.loads(read_bytes(file).decode())
     except InputError as error:
         raise InputError(f"The run file cannot be read: {error}") from None
-    except OSError as error:
-        raise InputError(f"The run file {file} cannot be read ({error.strerror}); check its permissions.") from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"{file} is not a TOML file ({error}); correct it.") from None
     try:
@@ -138,14 +136,14 @@ def _check_content(file: Path, content: Any, kind: str) -> Run:
     _check_files(file, files)
     reading = {"inputs": table.data.inputs, "outputs": table.data.outputs, "columns": table.data.columns}
     reading |= {key: content["data"][key] for key in READING if getattr(table.data, key) is not None}
-    cells, solver = _cells(table)
+    cells, solver = _build_cells(table)
     if "period" not in reading and any("linear" in cell.search for cell in cells):
         raise InputError(
             "linear = 'bla' is for periodic training recordings; give their 'period' in [data], in samples."
         )
     return Run(
         file=file,
-        out=_folder(file, f"{file.stem}-{kind}" if table.out is None else table.out),
+        out=_output_folder(file, f"{file.stem}-{kind}" if table.out is None else table.out),
         plain_tables=plain,
         own=own,
         files=files,
@@ -159,8 +157,8 @@ def _check_content(file: Path, content: Any, kind: str) -> Run:
     )
 
 
-def _folder(file: Path, out: str) -> Path:
-    """Return the folder of the results; refuse one that is not below the folder of the run file."""
+def _output_folder(file: Path, out: str) -> Path:
+    """Return the folder of the results; refuse a folder that is not below the folder of the run file."""
     above = os.path.realpath(file.parent)
     try:
         inside = above in map(str, Path(os.path.realpath(os.path.join(above, out))).parents)
@@ -187,17 +185,18 @@ def _check_files(file: Path, files: Mapping[str, tuple[str, ...]]) -> None:
             seen[path] = role
 
 
-def _cells(table: RunTable) -> tuple[tuple[Cell, ...], Any]:
-    """Build the cells, in the order of the grid's keys with the last varying fastest, and the solver of all.
+def _build_cells(table: RunTable) -> tuple[tuple[Cell, ...], Any]:
+    """Build the cells, in the order of the grid's keys with the last key varying fastest, and their solver.
 
-    A cell keeps the keys that matter to its model (a NARX has lags and no operators); combinations that differ only
-    in other keys are one cell.
+    A cell keeps the keys that apply to its model (a NARX has lags and no operators); combinations that differ only in
+    other keys are one cell.
     """
     model, solver, axes = table.model, table.solver, table.axes
     if isinstance(model, PILFR | Lagged | Model):
         if axes:
             raise InputError("[grid] varies a [model] table, and the model is an object; leave one of them out.")
-        return (_cell({}, model, {"model": model, "solver": solver}),), validate(SolverTable, solver, "solver").build()
+        cell = _build_cell({}, model, {"model": model, "solver": solver})
+        return (cell,), validate(SolverTable, solver, "solver").build()
     for name, content in (("model", model), ("solver", solver)):
         if not isinstance(content, Mapping):
             raise InputError(f"{name} is {show_value(content)}; give a table.")
@@ -211,14 +210,14 @@ def _cells(table: RunTable) -> tuple[tuple[Cell, ...], Any]:
         idle = _idle_keys(tables["model"], axes)
         tables = {name: {k: v for k, v in content.items() if k not in idle} for name, content in tables.items()}
         built = validate(ModelTable, tables["model"], "model").build()
-        cell = _cell({k: v for k, v in values.items() if k not in idle}, built, tables)
+        cell = _build_cell({k: v for k, v in values.items() if k not in idle}, built, tables)
         form = "linear" if _is_linear(tables["model"]) else tables["model"].get("structure", "lfr")
         cells.setdefault(str({**cell.plain_tables, "model": {**cell.plain_tables["model"], "structure": form}}), cell)
     return tuple(cells.values()), validate(SolverTable, solver, "solver").build()
 
 
-def _cell(values: Mapping[str, Any], model: PILFR | Lagged | Model, tables: dict[str, Any]) -> Cell:
-    """Build a cell; refuse a search that does not suit its model."""
+def _build_cell(values: Mapping[str, Any], model: PILFR | Lagged | Model, tables: dict[str, Any]) -> Cell:
+    """Build a cell; refuse search options that do not apply to its model."""
     search = validate(SolverTable, tables["solver"], "solver").search
     if isinstance(model, Lagged) and search["start"] != "grid":
         raise InputError(f"start = {search['start']!r} is not for a NARX or NOE, which has other starts; leave it out.")
@@ -229,12 +228,12 @@ def _cell(values: Mapping[str, Any], model: PILFR | Lagged | Model, tables: dict
 
 
 def _is_linear(model: Mapping[str, Any]) -> bool:
-    """Tell whether a [model] table asks for a linear model: no operators."""
+    """Tell whether a [model] table describes a linear model, without operators."""
     return STRUCTURE_OPTIONS.get(model.get("structure", "lfr")) == HYSTERETIC_OPTIONS and model.get("operators") == 0
 
 
 def _idle_keys(model: Mapping[str, Any], axes: Mapping[str, Sequence[Any]]) -> set[str]:
-    """Return the keys that do not matter to a cell: keys of other structures, and keys without effect on its model."""
+    """Return the keys without effect on a cell's model, such as keys of other structures."""
     structure, out = model.get("structure", "lfr"), set[str]()
     if "structure" in axes and structure in STRUCTURE_OPTIONS:
         others = {name for s in axes["structure"] for name in STRUCTURE_OPTIONS.get(s, ())}
@@ -251,6 +250,6 @@ def _idle_keys(model: Mapping[str, Any], axes: Mapping[str, Sequence[Any]]) -> s
 
 
 def grid_keys(found: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return the keys of the grid that at least one cell has, in the order of the grid."""
+    """Return the keys of the grid that any cell has, in the order of the grid."""
     given = {k for values in found for k in values}
     return [k for k in (*MODEL_KEYS, *SOLVER_KEYS) if k in given]

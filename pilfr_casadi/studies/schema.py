@@ -1,11 +1,11 @@
-"""The schema of a run file: data, model, solver, constraints, grid, seeds and the folder of the results.
+"""Define the schema of a run file: data, model, solver, constraints, grid, seeds and the folder of the results.
 
 A run file is TOML, or a Python file that sets `run` to such a table. In Python the model may be a `PILFR` or a closed
-`Model`, the solver an object, and `own` under `constraints` a list of constraints. Paths are relative to the file. If
-there are objects, the jobs depend on the contents of the Python file, but not on the modules that it imports.
+`Model`, the solver an object, and `own` under `constraints` a list of constraints. Paths are relative to the file. With
+objects, the jobs depend on the text of the Python file, but not on the modules that it imports.
 
-Each table is a pydantic model. The `description` of a field ends the sentence about a bad value: "'nx' in
-[model] is 'one'; give a whole number from 0 to 1000".
+Each table is a pydantic model. The `description` of a field ends the message about a bad value: "'nx' in [model] is
+'one'; give a whole number from 0 to 1000".
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ from ..identify import BLA_OPTION, DEFAULT_SOLVER, START_KINDS
 from ..models import OPERATORS, PILFR, STRUCTURE_OPTIONS, STRUCTURES, Lagged, Model, named_structure
 from ..optimise import Constraint, GaussNewton, Ipopt, check_gain, dc_gain, ordered
 
-# keys of the grid: those of [model] and [solver] that a study varies
+# keys of [model] and [solver] that a grid may vary
 MODEL_KEYS = ("structure", "nx", "operator", "operators", "channels", "neurons", "hidden", "lags")
 SOLVER_KEYS = ("start", "starts", "linear")
 SIZE = {"nx": "states", "lags": "past outputs"}
 
-# The largest sizes that a run file or the command line may ask for, far above every sensible model: anything larger
-# never ends, or fills the memory.
+# The largest sizes that a run file or the command line accepts, far above every sensible model: a larger job never ends
+# or exhausts the memory.
 LARGEST_SIZE = {
     "nx": 1_000,  # states: A alone has 1e6 parameters, and the Gauss-Newton matrix 1e12 entries
-    "operators": 10_000,  # per channel: the Jacobian of the paper's 6144 samples has 1 GB then
-    "channels": 100,  # of the element: each has all its operators
+    "operators": 10_000,  # per channel: the Jacobian of the paper's 6144 samples then has 1 GB
+    "channels": 100,  # of the element: each has all operators
     "neurons": 1_000,  # of an envelope
-    "hidden": 10_000,  # neurons of a network: as operators
-    "lags": 10_000,  # samples: a recording must be longer, as the fit says
+    "hidden": 10_000,  # neurons of a network: like operators
+    "lags": 10_000,  # samples: `fit` requires a longer recording
     "input_lags": 10_000,
     "starts": 1_000_000,  # 12 days at one second per start
     "seed": 2**63 - 1,  # the largest integer of 64 bits
@@ -56,13 +56,13 @@ LARGEST_SIZE = {
     "folds": 10_000,
     "retries": 1_000,
     "workers": 1_024,  # processes: each takes 100 MB and more
-    "samples": 10**9,  # of a period, or left out: 8 GB per channel
+    "samples": 10**9,  # of a period, or skipped: 8 GB per channel
     "jobs": 100_000,  # of a run: the manifest names each, about 300 bytes per job, and is written after every one
 }
 
 
 class Table(BaseModel):
-    """A table of a run file: no unknown keys, and no conversions between kinds of values."""
+    """A table of a run file, without unknown keys or conversions between types."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -172,7 +172,7 @@ class ModelTable(Table):
     priors: dict[str, Any] | None = Field(None, description="a table of parameters and their priors")
 
     def build(self) -> PILFR | Lagged:
-        """Build the model; refuse keys that its structure does not take."""
+        """Build the model; refuse keys that do not apply to its structure."""
         given = {key: value for key, value in self if value is not None and key != "structure"}
         takes = STRUCTURE_OPTIONS[self.structure]
         if takes[0] not in given:
@@ -202,7 +202,7 @@ class SolverTable(Table):
 
     @property
     def search(self) -> dict[str, Any]:
-        """The options of the search, as for `fit`."""
+        """The search options of `fit`."""
         search = {"starts": self.starts, "start": self.start}
         return {**search, "linear": BLA_OPTION} if self.linear == BLA_OPTION else search
 
@@ -237,8 +237,8 @@ class ConstraintsTable(Table):
     )
 
     def for_models(self, models: Sequence[PILFR | Lagged | Model]) -> tuple[Constraint, ...]:
-        """Return the constraints; refuse ones that do not suit all models."""
-        given: list[Any] = [self.dc_gain, self.ordered_thresholds]  # constraints by now
+        """Return the constraints; refuse constraints that do not apply to all models."""
+        given: list[Any] = [self.dc_gain, self.ordered_thresholds]  # the validators made constraints of them
         found = [c for c in given if c is not None]
         try:
             for model in models:
@@ -335,11 +335,11 @@ def validate(kind: type[T], content: Any, name: str = "") -> T:
 
 
 def _sentence(error: ValidationError, kind: type[Table], name: str) -> str:
-    """Describe the first error; unknown keys go first, since a misspelt key leaves another one missing."""
+    """Describe the first error; an unknown key precedes a missing one, since it may be its misspelling."""
     found = error.errors(include_url=False)
     first = next((e for e in found if e["type"] == "extra_forbidden"), found[0])
     own = first.get("ctx", {}).get("error")
-    if isinstance(own, InputError):  # inside a table the sentence lacks the place
+    if isinstance(own, InputError):  # raised inside a table, without its name
         return f"[{first['loc'][0]}]: {own}" if len(first["loc"]) > 1 else str(own)
     if not first["loc"]:
         return f"{name or 'the run'} is {show_value(first['input'])}; give a table."
@@ -357,9 +357,9 @@ def _sentence(error: ValidationError, kind: type[Table], name: str) -> str:
 
 
 def show_value(value: Any) -> str:
-    """Write a value in a sentence, shortened."""
+    """Write a value for a message, shortened."""
     try:
         text = repr(value)
-    except ValueError:  # of more digits than Python writes
+    except ValueError:  # a number with more digits than Python converts
         return "a number of thousands of digits"
     return text if len(text) <= 60 else text[:57] + "..."

@@ -1,24 +1,23 @@
-r"""The errors of a run in tables and box plots, the chosen model, and the recommended structure.
+r"""Summarise the errors of a run in tables and box plots, choose a model, and recommend a structure.
 
 Box plots as in Krikelis et al. (2024), Fig. 11.
 
 A structure is selected by cross-validation, or by a validation recording, with the rule of `select_order`. With
-:math:`e(c)` the error of a cell on recordings it has not been fitted to, take the cell with the fewest free parameters
+:math:`e(c)` the error of a cell on recordings that it was not fitted to, take the cell with the fewest free parameters
 among :math:`\{c : e(c) \le (1 + m) \min_k e(k)\}`. In each fold the seed with the smallest training error represents
 its cell, and :math:`e(c)` is the mean over the folds. The held-out part does not influence the choice of the seed.
 """
 
 from __future__ import annotations
 
-import csv
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, csv_text
 from ..data import Recording
 from ..models import Model
 from .jobs import RunJob
@@ -26,12 +25,12 @@ from .run_file import Run, grid_keys
 
 QUARTILES = ("smallest", "lower_quartile", "median", "upper_quartile", "largest")
 FOLDS = "folds"
-SELECTION_MARGIN = 0.05  # share of the smallest error that a smaller structure may cost; convention, as select_order
+SELECTION_MARGIN = 0.05  # excess error, relative to the smallest, allowed for a smaller structure; as in select_order
 
 
 @dataclass(frozen=True)
 class Score:
-    """NRMSE (Krikelis et al. 2024, Eq. 27) of a job's model on a recording; nan where it cannot be computed."""
+    """NRMSE (Krikelis et al. 2024, Eq. 27) of a job's model on a recording; nan if it cannot be computed."""
 
     job: str
     role: str
@@ -49,15 +48,8 @@ def choose_job(scores: Sequence[Score], jobs: Sequence[str]) -> str:
     return min(errors, key=lambda job: (float(np.mean(errors[job])), list(errors).index(job)))
 
 
-def csv_text(rows: Iterable[Sequence[Any]]) -> str:
-    """Write rows as the text of a CSV file."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue()
-
-
 def results_table(scores: Sequence[Score], jobs: Sequence[RunJob], entries: Mapping[str, Any], best: str) -> str:
-    """Write results.csv: one row per job and recording, one row for a job without a model; all digits."""
+    """Write results.csv: one row per job and recording, or per job without a model; numbers with all digits."""
     keys = grid_keys(job.parameters for job in jobs) + ["fold"] * any(job.fold is not None for job in jobs)
     by_job: dict[str, list[Score]] = {}
     for s in scores:
@@ -73,7 +65,7 @@ def results_table(scores: Sequence[Score], jobs: Sequence[RunJob], entries: Mapp
 
 
 def reasons(entries: Mapping[str, Mapping[str, Any]], ids: Sequence[str]) -> list[str]:
-    """Say why jobs have no model: one line per distinct reason, with its first job."""
+    """Explain why jobs have no model, in one line per distinct reason, with its first job."""
     found: dict[str, list[str]] = {}
     for job in ids:
         found.setdefault(entries[job]["sentence"], []).append(job)
@@ -83,10 +75,10 @@ def reasons(entries: Mapping[str, Mapping[str, Any]], ids: Sequence[str]) -> lis
 
 @dataclass(frozen=True)
 class CellSummary:
-    """Errors of one cell's jobs on one recording; the roles `held` and `train` on `folds` are of the cross-validation.
+    """Errors of one cell's jobs on one recording; a cross-validation has the roles `held` and `train` on `folds`.
 
-    A job failed if it has no model, if its model explains nothing of the training (an NRMSE of 0.99 or more, as of a
-    constant), or if its error here is not finite.
+    A job failed if it has no model, if its model explains nothing of the training data (an NRMSE of 0.99 or more, like
+    a constant), or if its error on this recording is not finite.
     """
 
     cell: Mapping[str, Any]
@@ -106,7 +98,7 @@ class CellSummary:
 def errors_by_cell(
     run: Run, jobs: Sequence[RunJob], scores: Sequence[Score]
 ) -> dict[tuple[str, str], dict[int, dict[str, float]]]:
-    """Map (role, recording) -> number of the cell -> job -> NRMSE, infinite where the job has none."""
+    """Map (role, recording) -> number of the cell -> job -> NRMSE, infinite if the job has none."""
     known = {(s.job, s.role, FOLDS if s.recording.startswith("fold ") else s.recording): s.nrmse for s in scores}
     whole = [(role, name) for role, names in run.files.items() for name in names]
     pairs = [(p, False) for p in whole] + [((role, FOLDS), True) for role in ("train", "held") if run.folds]
@@ -141,7 +133,7 @@ def summarise(
 
 
 def summary_table(run: Run, summary: Sequence[CellSummary]) -> str:
-    """Write summary.csv: one row per recording and cell, numbers to the last digit."""
+    """Write summary.csv: one row per recording and cell, numbers with all digits."""
     keys = grid_keys(cell.values for cell in run.cells)
     rows: list[list[Any]] = [["role", "recording", *keys, "jobs", "failed", "failure_rate", *QUARTILES]]
     for s in summary:
@@ -171,13 +163,13 @@ def box_plots(run: Run, jobs: Sequence[RunJob], scores: Sequence[Score]) -> byte
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Selection:
-    """Errors of the structures on recordings they have not been fitted to, and the recommended structure."""
+    """Errors of the structures on held-out recordings, and the recommended structure."""
 
     names: tuple[str, ...]  # the cells by their values
     parameters: tuple[int, ...]  # free parameters of each
     errors: tuple[float, ...]  # held-out NRMSE; infinite if the cell, or one of its folds, has no model
     cell: int  # number of the recommended cell
-    margin: float  # how much worse than the best it may be, as a share
+    margin: float  # its largest excess error, relative to the smallest error
     judge: str  # the recordings that were held out
 
     def __repr__(self) -> str:
@@ -197,7 +189,7 @@ def select(
 ) -> Selection:
     """Compare the cells of a run by cross-validation, or by the errors on the validation recordings.
 
-    Any `recording` of the run serves: only its numbers of inputs and outputs are used.
+    Only the numbers of inputs and outputs of `recording` are used, so any recording of the run serves.
     """
     counts, errors = [], []
     judged: dict[str, list[float]] = {}

@@ -88,7 +88,7 @@ def test_quick_work_prints_nothing(clock, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_a_fit_tells_its_stages_and_its_best_error_never_rises(capsys, monkeypatch):
+def test_a_fit_reports_its_stages_and_its_best_error_never_rises(capsys, monkeypatch):
     for name in ("NEW_STAGE_LINE", "LINE"):
         monkeypatch.setattr(f"pilfr_casadi._base.progress.{name}", 0.0)
     u = np.sin(np.arange(100) * 0.31) * np.linspace(0.5, 2, 100)

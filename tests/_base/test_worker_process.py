@@ -1,4 +1,4 @@
-"""A job in a process of its own: it keeps what it was sent, and its end harms nobody."""
+"""A child process keeps the function it was sent, and may end without harm."""
 
 import os
 import pickle
@@ -7,7 +7,7 @@ import time
 from pilfr_casadi._base import close_workers, run_in_worker, workers
 
 
-def test_a_hand_keeps_its_function_and_its_end_is_told():
+def test_a_child_keeps_its_function_and_reports_its_end():
     shared = pickle.dumps(abs)
     assert [run_in_worker(shared, pickle.dumps(k)).result for k in (-3, -4)] == [3, 4]
     mine = workers._of_this_thread.children[""].process.pid
@@ -22,7 +22,7 @@ def test_a_hand_keeps_its_function_and_its_end_is_told():
     close_workers()
 
 
-def test_an_idle_hand_ends_and_another_takes_over():
+def test_an_idle_child_ends_and_is_replaced():
     shared = pickle.dumps(abs)
     assert run_in_worker(shared, pickle.dumps(-1)).result == 1
     first = workers._of_this_thread.children[""]

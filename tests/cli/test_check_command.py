@@ -20,7 +20,7 @@ def files(tmp_path):
     return tmp_path
 
 
-def test_it_prints_what_is_found_and_writes_it(capsys, files):
+def test_findings_are_printed_and_written(capsys, files):
     given = ("check", files / "rig.py", files / "rig_train.csv", "--initial", "zero", "--hold", "zero")
     status, out, err = run(capsys, *given, "--out", files / "out")
     assert status == 0 and not err
@@ -34,7 +34,7 @@ def test_it_prints_what_is_found_and_writes_it(capsys, files):
     assert run(capsys, *given, "--out", files / "out", "--overwrite")[0] == 0
 
 
-def test_it_writes_nothing_unless_asked(capsys, files):
+def test_nothing_is_written_without_out(capsys, files):
     before = sorted(files.iterdir())
     assert run(capsys, "check", files / "rig.py", files / "rig_train.csv")[0] == 0
     assert sorted(files.iterdir()) == before
@@ -63,7 +63,7 @@ def test_an_unstable_simulator_gets_a_sentence(capsys, files):
     refused(capsys, "check", files / "falling.py", files / "rig_train.csv", says=("unstable", "controller"))
 
 
-def test_a_simulator_without_free_parameters_is_told(capsys, files):
+def test_a_simulator_without_free_parameters_is_reported(capsys, files):
     text = (files / "rig.py").read_text(encoding="utf-8")
     fixed = text + (
         "\nfrom dataclasses import replace\n"
@@ -75,7 +75,7 @@ def test_a_simulator_without_free_parameters_is_told(capsys, files):
     assert status == 0 and "no free parameter" in out
 
 
-def test_an_input_that_never_changes_is_told(capsys, files):
+def test_a_constant_input_is_reported(capsys, files):
     t = np.arange(300) * 0.01
     rows = "\n".join(f"{a:.2f},5,{b:.6f}" for a, b in zip(t, 0.01 * (1 - np.cos(6 * t)), strict=True))
     (files / "still.csv").write_text(f"t,force,x2\n{rows}\n", encoding="utf-8")

@@ -67,7 +67,7 @@ def test_fit_simulate_and_export_run_end_to_end(capsys, tmp_path, fitted):
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_fit_tells_its_stages_in_plain_lines(capsys, tmp_path, train, monkeypatch):
+def test_fit_prints_its_stages_in_plain_lines(capsys, tmp_path, train, monkeypatch):
     """Piped, each line has the stage, what is done of it, the best error so far, which never rises, and the time."""
     for pause in ("NEW_STAGE_LINE", "LINE"):
         monkeypatch.setattr(f"pilfr_casadi._base.progress.{pause}", 0.0)
@@ -297,7 +297,7 @@ def test_options_are_not_abbreviated(capsys, tmp_path, train):
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_a_model_is_overwritten_only_when_asked(capsys, tmp_path, train):
+def test_a_model_is_overwritten_only_with_overwrite(capsys, tmp_path, train):
     model = tmp_path / "out" / "model.json"
     model.parent.mkdir()
     model.write_text("mine")
@@ -309,7 +309,7 @@ def test_a_model_is_overwritten_only_when_asked(capsys, tmp_path, train):
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_fit_says_what_it_works_with(capsys, tmp_path, train, monkeypatch):
+def test_fit_prints_its_data_order_and_engine(capsys, tmp_path, train, monkeypatch):
     arguments = list(fit_arguments(train, tmp_path, "--operators", 0))
     del arguments[arguments.index("--nx") : arguments.index("--nx") + 2]
     monkeypatch.setattr("pilfr_casadi.engine.compiled.compiler", lambda: None)
@@ -438,7 +438,7 @@ def wrapped_interrupt(*_, **__):
 
 @pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize("done", [0, 1])
-def test_an_interrupt_that_casadi_wraps_is_one_still(capsys, tmp_path, train, monkeypatch, done):
+def test_an_interrupt_that_casadi_wraps_is_recognised(capsys, tmp_path, train, monkeypatch, done):
     """In the first start there is only the linear model to write, in the second one that of the first."""
     starts = [multistart.explore] * done
     monkeypatch.setattr(multistart, "explore", lambda *task: (starts.pop() if starts else wrapped_interrupt)(*task))
@@ -448,7 +448,7 @@ def test_an_interrupt_that_casadi_wraps_is_one_still(capsys, tmp_path, train, mo
     assert ("r" in model["parameters"]) == bool(done)
 
 
-def test_a_wrapped_interrupt_before_any_work_is_one_still(capsys, tmp_path, train, monkeypatch):
+def test_a_wrapped_interrupt_before_any_work_is_recognised(capsys, tmp_path, train, monkeypatch):
     monkeypatch.setattr("pilfr_casadi.cli.models.make_folder", wrapped_interrupt)
     status, _, err = run(capsys, *fit_arguments(train, tmp_path))
     assert status == 130 and "Interrupted" in err

@@ -81,7 +81,7 @@ def test_a_failure_is_one_sentence_and_a_status(capsys, tmp_path, monkeypatch, f
     assert words in sentence(err) if words else not err
 
 
-def test_a_failure_shows_where_it_was_when_asked(tmp_path, monkeypatch):
+def test_a_failure_shows_its_traceback_in_debug_mode(tmp_path, monkeypatch):
     monkeypatch.setenv("PILFR_DEBUG", "1")
     monkeypatch.setattr(demo, "demo_recordings", lambda: 1 / 0)
     with pytest.raises(ZeroDivisionError):

@@ -225,7 +225,7 @@ def test_files_that_are_missing_or_in_the_wrong_place(capsys, files):
 
 
 @pytest.mark.parametrize("limit", ["force=much", "force", "torque=3", "force=-1", "force=nan", "force=inf"])
-def test_limits_that_are_none(capsys, files, limit):
+def test_bad_limits_are_refused(capsys, files, limit):
     refused(capsys, *arguments(files, "--limit", limit), says=("limit", limit.partition("=")[0]))
 
 
@@ -235,7 +235,7 @@ def test_recordings_that_do_not_fit_each_other(capsys, files, truth):
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_what_a_simulation_answered_stands_in_for_it(capsys, files, catalogue):
+def test_a_recorded_simulation_replaces_the_simulator(capsys, files, catalogue):
     catalogue(CubicStiffness, Saturation)
     write_csv(files / "simulated.csv", *rig(5, m=1200, k=95.0, cubic=0.0))
     status, out, err = run(capsys, *arguments(files, "--hold", "zero", "--initial", "zero", simulator=None))
@@ -253,8 +253,8 @@ def test_what_a_simulation_answered_stands_in_for_it(capsys, files, catalogue):
 
 
 @pytest.mark.slow
-def test_what_stands_for_a_simulation_is_not_to_be_nearer_the_machine_than_to_it(capsys, files):
-    """A simulation that stiffens as the machine does, of which a linear model cannot tell."""
+def test_a_simulation_that_stiffens_like_the_machine_lacks_nothing(capsys, files):
+    """Its linear surrogate cannot show the stiffening."""
     write_csv(files / "simulated.csv", *rig(5, m=1200, k=95.0))
     names = ("--inputs", "force", "--outputs", "position")
     status, out, err = run(capsys, *arguments(files, "--hold", "zero", "--initial", "zero", *names, simulator=None))
@@ -291,7 +291,7 @@ def test_inputs_of_a_simulation_are_the_columns_that_agree(capsys, files, truth,
 
 
 @pytest.mark.slow
-def test_a_column_that_the_recordings_have_not_is_told(capsys, files, truth, monkeypatch):
+def test_a_column_missing_in_the_recordings_is_reported(capsys, files, truth, monkeypatch):
     seen = {}
 
     def stop(simulator, recordings, **options):

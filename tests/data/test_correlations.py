@@ -37,8 +37,8 @@ def test_a_dependence_on_the_input_or_its_square_is_seen():
     assert np.max(np.abs(correlation(e, square, 20))) / chance(e, square, 20) > 5
 
 
-def test_what_has_no_correlation():
+def test_signals_without_a_correlation_are_refused():
     with pytest.raises(InputError, match="never changes"):
         correlation(np.ones(50), np.arange(50.0), 5)
-    with pytest.raises(InputError, match="lags=60 were asked of 50 samples"):
+    with pytest.raises(InputError, match="lags=60 was given for 50 samples"):
         correlation(np.arange(50.0), np.arange(50.0), 60)

@@ -211,6 +211,6 @@ def test_prbs_holds_and_scales():
         (lambda: prbs(10, rng(), order=1), "2 to 32"),
     ],
 )
-def test_what_cannot_be_made(call, words):
+def test_bad_options_are_refused(call, words):
     with pytest.raises(InputError, match=words):
         call()

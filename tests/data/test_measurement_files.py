@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
-from pilfr_casadi import InputError, read
+from pilfr_casadi import InputError, read, read_csv
 from pilfr_casadi.data import column_names
 
 T, FORCE, X2 = 0.1 * np.arange(5), np.array([1.0, 2, 3, 4, 5]), np.array([10.0, 20, 30, 40, 50])
@@ -63,7 +63,7 @@ def test_a_parquet_file_is_read(parquet):
     assert np.array_equal(named.y[:, 0], X2)
 
 
-def test_what_a_parquet_file_lacks_is_said(parquet, tmp_path):
+def test_unusable_parquet_files_are_refused(parquet, tmp_path):
     refused(parquet(t=T, force=FORCE), "has no column 'x2'")
     refused(parquet(t=T, force=FORCE, x2=list("abcde")), "'x2' holds")
     refused(parquet(t=T, force=[1.0, None, 3.0, 4.0, 5.0], x2=X2), "'force', sample 1 is nan")
@@ -78,7 +78,7 @@ def test_an_mdf_file_is_read(mdf):
     assert set(column_names(path)) == {"t", "force", "x2", "slow"}
 
 
-def test_what_an_mdf_file_lacks_is_said(mdf, tmp_path):
+def test_unusable_mdf_files_are_refused(mdf, tmp_path):
     path = mdf((T, {"force": FORCE}), (T[::2], {"slow": FORCE[::2]}))
     refused(path, "has no column 'x2'")
     refused(path, "'force' and 'slow' have different times (5 and 3 samples)", outputs="slow")
@@ -100,3 +100,11 @@ def test_a_missing_package_is_named(monkeypatch, tmp_path, name, package, extra)
 @pytest.mark.parametrize("name", ["none.parquet", "none.mf4"])
 def test_a_missing_file_is_named(tmp_path, name):
     refused(tmp_path / name, "")
+
+
+@pytest.mark.parametrize("suffix", [".mdf", ".mf4", ".parquet"])
+def test_a_binary_file_given_as_csv_names_its_reader(tmp_path, suffix):
+    path = tmp_path / f"rig{suffix}"
+    path.write_bytes(b"\x00\x01" * 50)
+    with pytest.raises(InputError, match=r"binary data\); read it with pilfr\.read"):
+        read_csv(path, "u", "y")

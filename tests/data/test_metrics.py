@@ -44,7 +44,7 @@ def test_skip_cuts_error_and_scale():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e200])
-def test_a_simulation_that_ran_away_is_infinitely_wrong(value):
+def test_a_diverged_simulation_has_an_infinite_error(value):
     y_hat = Y.copy()
     y_hat[7, 1] = value
     assert np.isfinite(rmse_per_output(Y, y_hat)[0])
@@ -61,6 +61,6 @@ def test_a_simulation_that_ran_away_is_infinitely_wrong(value):
         (Y * [1.0, 0.0] + 0.1, Y, 0, "output 2 of 2 never changes"),
     ],
 )
-def test_what_cannot_be_scored(y, y_hat, skip, words):
+def test_outputs_without_a_score_are_refused(y, y_hat, skip, words):
     with pytest.raises(InputError, match=words):
         nrmse(y, y_hat, skip)

@@ -48,7 +48,7 @@ def test_noisy_recordings_count_less_and_levels_alike():
         (lambda: noise_weights(noisy(), error=0.0), "above zero"),
     ],
 )
-def test_what_is_not_periodic(make, words):
+def test_recordings_without_periods_are_refused(make, words):
     with pytest.raises(InputError, match=words):
         make()
 

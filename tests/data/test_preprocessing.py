@@ -87,7 +87,7 @@ def test_filtering_inputs_and_outputs_alike_keeps_a_linear_relation(tones):
         (10.0, "median", "give lowpass, highpass, bandpass, bandstop"),
     ],
 )
-def test_a_filter_that_cannot_be_is_refused(tones, cutoff, kind, said):
+def test_bad_filters_are_refused(tones, cutoff, kind, said):
     with pytest.raises(InputError, match=said):
         tones.filter(cutoff, kind)
 
@@ -123,7 +123,7 @@ def test_resampling_keeps_a_period_of_whole_samples():
 
 
 @pytest.mark.parametrize("dt, said", [(0.0, "dt=0.0 was given"), (10.0, "leaves 1 sample of"), ("1", "dt='1'")])
-def test_a_step_that_cannot_be_is_refused(tones, dt, said):
+def test_bad_steps_are_refused(tones, dt, said):
     with pytest.raises(InputError, match=said):
         tones.resample(dt)
 
@@ -146,6 +146,8 @@ def test_two_loggers_on_one_clock():
         merge(a, b, start=9.0)
     with pytest.raises(InputError, match="no channel 'y'; they have force, x, current"):
         merge(a, b, outputs="y")
+    with pytest.raises(InputError, match="no channel 3"):
+        merge(a, b, outputs=3)
 
 
 def test_the_same_clock_is_left_as_it_is(tones):
@@ -158,7 +160,7 @@ def test_the_same_clock_is_left_as_it_is(tones):
 # ---------------------------------------------------------------------------------------------------- uneven time
 
 
-def test_uneven_times_are_resampled_where_the_user_says_so(tmp_path):
+def test_uneven_times_are_resampled_on_request(tmp_path):
     rng = np.random.default_rng(0)
     t = np.cumsum(rng.uniform(0.5e-3, 1.5e-3, 4000))
     table = np.column_stack([t, np.sin(2 * np.pi * 2 * t), np.cos(2 * np.pi * 2 * t)])

@@ -125,7 +125,7 @@ def test_many_rows_are_read_at_once(tmp_path):
 
 
 def test_an_unknown_option_is_refused(write):
-    with pytest.raises(InputError, match="'bogus' is no option of a reader; there are units, period, initial"):
+    with pytest.raises(InputError, match="'bogus' is not an option of a reader; the options are units, period"):
         read_csv(write(GOOD), inputs="force", outputs="x2", bogus=1)
 
 
@@ -146,8 +146,8 @@ BAD_FILES = {
     "duplicate time": (GOOD.replace("x2", "x2,t").replace("0\n", "0,0\n"), "2 columns named 't'"),
     "two times": (GOOD.replace("x2", "x2,time").replace("0\n", "0,0\n"), r"several time columns \(t, time\)"),
     "no time": (GOOD.replace("t,", "clock,"), "no time column; it has clock, force, x2"),
-    "milliseconds": (GOOD.replace("t,", "t_ms,"), "'t_ms' is time in ms"),
-    "unit in brackets": (GOOD.replace("t,", "Time [us],"), "'Time \\[us\\]' is time in us"),
+    "milliseconds": (GOOD.replace("t,", "t_ms,"), "'t_ms' is named as time in ms"),
+    "unit in brackets": (GOOD.replace("t,", "Time [us],"), r"'Time \[us\]' is named as time in us"),
     "word": (GOOD.replace("0.2,3", "0.2,high"), "column 'force', line 4 reads 'high', which is not a number"),
     "underscore": (GOOD.replace("0.2,3,30", "0.2,3,3_0"), "column 'x2', line 4 reads '3_0'"),
     "decimal comma": (GOOD.replace(",", ";").replace("0.2;3", "0.2;3,5"), "line 4 reads '3,5'.* with a point"),
@@ -198,7 +198,7 @@ def test_a_stated_step_finds_times_in_another_unit(write, factor):
     assert f"a ratio of {factor:.4g}" in sentence(caught)
 
 
-def test_wishes_that_cannot_be_met(write):
+def test_bad_columns_and_options_are_refused(write):
     path = write(GOOD)
     for options, words in [
         (dict(columns={"forc": "u"}), "none of the inputs force"),
@@ -407,7 +407,7 @@ def test_read_by_suffix(write, tmp_path):
     npz = save(tmp_path / "b.npz", t=T, force=U, x2=Y)
     a, b = read([write(GOOD, "a.TXT"), npz], "force", "x2")
     assert np.array_equal(a.u, b.u)
-    with pytest.raises(InputError, match=r"suffix '\.xlsx'; files named \.csv"):
+    with pytest.raises(InputError, match=r"suffix '\.xlsx'; give a file with one of \.csv"):
         read(write(GOOD, "a.xlsx"), "force", "x2")
     with pytest.raises(InputError, match="no file"):
         read(tmp_path / "gone.xlsx", "force", "x2")
@@ -422,7 +422,7 @@ def test_outputs_may_be_left_out(tmp_path, write, suffix):
 
 
 def test_one_column_is_not_input_and_output(write):
-    with pytest.raises(InputError, match=r"rig\.csv: column 'x2' is taken both"):
+    with pytest.raises(InputError, match=r"rig\.csv: column 'x2' is given both for an input and"):
         read_csv(write(GOOD), "force", "x2", columns={"force": "x2"})
 
 

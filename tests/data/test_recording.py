@@ -118,7 +118,7 @@ def test_each_fault_has_its_sentence(change, words):
     assert "'rig'" in str(caught.value)
 
 
-def test_a_dict_alone_is_answered_with_a_sentence():
+def test_a_dict_alone_is_refused():
     with pytest.raises(InputError, match="is a dict with the keys u, y; give one array"):
         Recording({"u": np.zeros(20), "y": np.zeros(20)})
 
@@ -179,7 +179,7 @@ def test_as_recordings():
             as_recordings(wrong)
 
 
-def test_identification_takes_what_varies():
+def test_one_varying_input_is_enough_to_identify():
     still = recording().with_(u=np.full(20, 3.0))
     both = check_for_identification([still, recording()], n_min=40)
     assert len(both) == 2

@@ -62,6 +62,17 @@ def test_measured_records_are_judged_and_a_table_is_written(model, tmp_path, cap
     assert len(table) == 6 * N and table["record"][-1] == 6 and table["t"][N - 1] == 0.5 * (N - 1)
 
 
+def test_a_record_with_a_constant_output_does_not_stop_the_others(model, tmp_path, capsys):
+    path, _ = model
+    u, data, out = arrays(), tmp_path / "data.npz", tmp_path / "out.npz"
+    y = u.copy()
+    y[..., 0, 0] = 1.0
+    np.savez(data, u=u, y=y)
+    assert cli.main(["simulate", str(path), str(data), "--out", str(out), *PERIODIC]) == 0
+    said = capsys.readouterr().out
+    assert "no NRMSE on data [0, 0]" in said and "mean over 5 records" in said and out.exists()
+
+
 @pytest.mark.parametrize(
     "arguments, content, words",
     [
@@ -69,7 +80,7 @@ def test_measured_records_are_judged_and_a_table_is_written(model, tmp_path, cap
         (["--initial", "estimate", "--dt", "0.5"], {"u": arrays()}, "needs measured outputs"),
         (PERIODIC, {"u": arrays()[:, :1]}, r"expected \(samples, 2 channels"),
         (PERIODIC, {"u": arrays(), "y": arrays()[:50]}, "array of the outputs has the shape"),
-        (PERIODIC, {"u": arrays() * np.nan}, "something else than finite numbers"),
+        (PERIODIC, {"u": arrays() * np.nan}, "not finite numbers"),
     ],
 )
 def test_one_sentence_where_a_stack_cannot_be_used(model, tmp_path, capsys, arguments, content, words):

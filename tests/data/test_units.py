@@ -44,7 +44,7 @@ def test_a_unit_is_converted_to_another(unit, wanted, factor):
 
 
 @pytest.mark.parametrize(("unit", "wanted"), [("V", "m"), ("°C", "K"), ("m", "m/s")])
-def test_what_no_factor_converts_is_told(unit, wanted):
+def test_units_without_a_factor(unit, wanted):
     assert np.isnan(conversion(unit, wanted))
 
 
@@ -67,7 +67,7 @@ def recorded():
     return blank.with_(u=u / 1e3, y=1e3 * (y + noise), units=units)
 
 
-def test_a_recording_in_other_units_is_converted_and_that_is_told(recorded):
+def test_the_conversion_of_a_recording_is_reported(recorded):
     stated = replace(cart(), units={"force": "N", "pos": "m"})
     found = pilfr.diagnose(stated, recorded, laws=(CoulombFriction,), workers=1)
     assert [(e.port, e.law) for e in found.effects] == [("ground", "coulomb_friction")]

@@ -101,7 +101,7 @@ def test_dask_gives_the_same_numbers(folder, serial, cluster):
     close_workers()
 
 
-def test_what_a_campaign_tells(folder, capsys):
+def test_the_output_of_a_campaign(folder, capsys):
     few = ("count = 4", "count = 3")
     long = f"{'long' * 25}.csv"
     (folder / "test.csv").rename(folder / long)
@@ -170,7 +170,7 @@ def test_processes_are_killed_and_none_is_left_behind(folder, serial):
     assert compared(out) == serial
 
 
-def test_an_interrupted_campaign_goes_on(folder, serial, capsys):
+def test_an_interrupted_campaign_continues(folder, serial, capsys):
     path, out = folder / "mine.py", folder / "mine-campaign"
     path.write_text(SLOW.replace("TROUBLE", "time.sleep(600)").replace("FOLDER", str(folder)).replace("10.0", "600.0"))
     driver = command(folder, "campaign", run_file=path.name)
@@ -203,7 +203,7 @@ def test_ctrl_c_after_the_jobs_says_that_they_are_done(folder, monkeypatch, caps
 
 
 @pytest.mark.usefixtures("heard")
-def test_ctrl_c_ends_a_hand_that_is_about_to_begin(folder, monkeypatch):
+def test_ctrl_c_ends_a_child_that_is_about_to_start(folder, monkeypatch):
     begin, ended = workers.WorkerProcess.__init__, threading.Event()
 
     def late(self):

@@ -95,7 +95,7 @@ def test_unfit_workers_get_one_sentence(folder, monkeypatch):
         pilfr.campaign(folder / "rig.toml")
 
 
-def test_why_jobs_have_no_model_is_told_once_a_reason(capsys, folder):
+def test_each_reason_for_missing_models_is_printed_once(capsys, folder):
     two = ("count = 4", "count = 2")
     gain = "[constraints]\ndc_gain = { value = 1e9, within = 1.0 }\n[grid]"
     bounds = "nx = 1\nbounds = { A = [-0.5, 0.5], w = [0, 1], B_w = [0, 1], C_y = [0, 1], D_yw = [0, 1] }"
@@ -126,7 +126,7 @@ def test_reasons_are_grouped():
         ("ssnn", 1, ""),
     ],
 )
-def test_seeds_are_advised_on_only_where_it_is_true(structure, starts, says):
+def test_seeds_advice_is_given_only_if_it_applies(structure, starts, says):
     own = {"hidden": 2} if structure == "ssnn" else {"operators": 3}
     cell = Cell({}, named_structure(structure, nx=1, **own), {"start": "grid", "starts": starts})
     assert seeds_advice(cell).endswith(says) and bool(seeds_advice(cell)) == bool(says)

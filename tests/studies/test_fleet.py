@@ -116,7 +116,7 @@ def test_a_report_elsewhere_is_complete(found, tmp_path):
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_what_is_missing_is_done_again_and_nothing_else(found, days, tmp_path, monkeypatch):
+def test_only_missing_jobs_are_executed_again(found, days, tmp_path, monkeypatch):
     _, folder = found
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)
@@ -225,7 +225,7 @@ def test_bad_commands(tmp_path, days, capsys):
     refused(capsys, "fleet", rig_file, data, "--out", data / "out", says="give the results another --out")
     refused(capsys, "fleet", rig_file, data, "--workers", 2, "--dask", "x", "--out", out, says="leave one of them out")
     refused(capsys, "fleet", rig_file, data, "--dask", "nonsense://", "--out", out, says="No Dask scheduler")
-    refused(capsys, "fleet", rig_file, data, "--against", folder / "none", says="none")
+    refused(capsys, "fleet", rig_file, data, "--against", folder / "none", says="there is no file")
     (data / "b" / "1.csv").write_text("t,force\n0,1\n")
     refused(capsys, "fleet", rig_file, data, "--out", out, says="position")
     (folder / "empty").mkdir()

@@ -52,7 +52,7 @@ def test_a_name_stands_for_the_structure(folder, said, expected):
     assert type(cell.model) is type(expected) and repr(cell.model) == repr(expected)
 
 
-def test_what_is_known_goes_beside_what_a_network_holds():
+def test_fix_and_bounds_add_to_those_of_a_network():
     one = named_structure("ssnn", nx=2, hidden=3, fix={"D_yu": 0.0}, bounds={"A": (-1, 1)})
     assert set(one.fixed) == {*pilfr.ssnn(2, 3).fixed, "D_yu"} and one.bounds == {"A": (-1, 1)}
     assert {"lags", "nx"} < ALL_OPTIONS == {k for takes in STRUCTURE_OPTIONS.values() for k in takes}
@@ -66,7 +66,7 @@ def test_a_run_fits_the_same_model_as_the_function(folder):
     assert found.train_nrmse == pilfr.fit(pilfr.NOE(2, 3), train, **options).train_nrmse
 
 
-def test_a_campaign_compares_structures_and_each_takes_what_is_its_own(folder):
+def test_a_campaign_compares_structures_with_their_own_options(folder):
     grid = f"[grid]\nstructure = {list(STRUCTURES)}\n"
     model = "nx = 1\noperators = 2\noperator = 'stop'\nhidden = 2\nlags = 2"
     result = pilfr.campaign(written(folder, model, grid).rename(folder / "all.toml"))

@@ -65,7 +65,7 @@ def test_a_run_gives_the_same_bytes_twice_and_skips_what_is_done(folder, drawn, 
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_what_is_written(done):
+def test_the_files_of_a_run(done):
     folder = done
     result = pilfr.run(changed(folder, "report = false", "report = true"))
     manifest = json.loads((result.folder / "manifest.json").read_text())
@@ -95,7 +95,7 @@ def test_the_numbers_do_not_depend_on_the_executor_or_on_other_seeds(folder):
 
 
 @pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGINT])
-def test_an_interrupted_run_goes_on_and_ends_the_same(folder, finished, kind):
+def test_an_interrupted_run_continues_with_the_same_result(folder, finished, kind):
     out = folder / "rig-run"
     process = command(folder, "run")
     deadline = time.monotonic() + 60
@@ -346,7 +346,7 @@ def test_foreign_content_is_not_written_over(capsys, folder, more):
     assert not (folder / "manifest.json").exists() and not (folder.parent / "manifest.json").exists()
 
 
-def test_an_empty_folder_and_what_a_killed_process_left_will_do(folder):
+def test_an_empty_folder_and_leftovers_of_a_killed_process_are_accepted(folder):
     changed(folder, "[0, 1, 2]", "[0]")
     (folder / "empty").mkdir()
     assert pilfr.run(folder / "rig.toml", out=folder / "empty").done == ("seed-0",)
@@ -429,7 +429,7 @@ def test_regularization_in_a_run(folder):
 
 
 @pytest.mark.parametrize("content", ["[]", "3", "null", "{", '"text"'])
-def test_a_manifest_that_is_none_gets_one_sentence(capsys, folder, content):
+def test_a_bad_manifest_gets_one_sentence(capsys, folder, content):
     (folder / "rig-run").mkdir()
     (folder / "rig-run" / "manifest.json").write_text(content)
     refused(capsys, "run", folder / "rig.toml", says="manifest.json is not a manifest of a run; restore it")
