@@ -34,7 +34,7 @@ from .evidence import (
 )
 from .floor import FEWEST, Floor, effective_size, white_part
 from .gates import EQUAL_RATIO
-from .screen import Scored, flexible_shares, screen
+from .screen import Scored, explains_by_chance, flexible_shares, screen
 from .trials import Key, Trial, Trials
 from .workbench import DIVERGED, Fitted, Workbench
 
@@ -51,6 +51,8 @@ class Findings:
         The scores of all further laws, and the observer's gain; see `screen`.
     flexible : dict, optional
         The share of the residual that a flexible force at each port explains.
+    by_chance : bool, optional
+        Whether that is no more than it explains of slow noise.
     learned : list of Fitted, optional
         The learned forces beside it, best first.
     held_out : HeldOut, optional
@@ -59,6 +61,7 @@ class Findings:
 
     screened: tuple[list[Scored], np.ndarray | None] | None = None
     flexible: dict[str, float] | None = None
+    by_chance: bool | None = None
     learned: list[Fitted] | None = None
     held_out: HeldOut | None = None
 
@@ -253,6 +256,13 @@ class Hypotheses:
             with self.stage("flexible"):
                 known.flexible = flexible_shares(self.bench, trial.fitted)
         return known.flexible
+
+    def explained_by_chance(self, trial: Trial) -> bool:
+        """Tell whether a flexible force explains no more of a trial's residual than of noise as slow as that."""
+        known = self.findings[trial.key]
+        if known.by_chance is None:
+            known.by_chance = explains_by_chance(self.bench, trial.fitted)
+        return known.by_chance
 
     def screened(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
         """Score every port and law beside a hypothesis; see `screen`."""

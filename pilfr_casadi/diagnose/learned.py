@@ -199,7 +199,7 @@ def _solve_weights(
     weights[felt] = -ridge_solution(phi, rest.left, unit * ridge) / size[felt]
     std[felt] = 1 / (size[felt] * np.sqrt(unit * ridge * repeated))
     law = learned_force(factor)({**scales, "c": weights, "std": std})
-    return Start(task.port.name, law, 1 - wrong / max(float(rest.left @ rest.left), 1e-300))
+    return Start(task.port.name, law, 1 - float(wrong) / max(float(rest.left @ rest.left), 1e-300))
 
 
 def learn_forces(bench: Workbench, base: Fitted, port_names: Sequence[str], workers: int = 1) -> list[Fitted]:

@@ -46,6 +46,7 @@ Pair = tuple[str, type[Law]]  # a port and the class of a law
 SCREENED_SAMPLES = 6000  # samples used at most
 HUGE = 1e60  # ratio to an output's deviation above which a response diverges
 BLOCKS = 10  # blocks a recording; every second block is held out in turn
+SHIFTS = np.linspace(0.1, 0.9, 33)  # of a residual against the signals, over the length of a recording
 RIDGES = (1e-6, 1e-3)  # strengths of the ridge regression of flexible forces, relative to a column of unit length
 DEGREE = 4  # of the flexible surface
 # degrees in z and dz/dt of the surface's terms
@@ -265,14 +266,17 @@ def held_out(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: Sequenc
     if not np.any(size > 0):
         return 0.0
     phi = phi[:, size > 0] / size[size > 0]
-    wrong = min(held_out_squares(phi, left, odd, ridge) for ridge in ridges)
+    wrong = min(float(held_out_squares(phi, left, odd, ridge)) for ridge in ridges)
     return max(0.0, 1 - wrong / max(float(left @ left), 1e-300))
 
 
-def held_out_squares(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> float:
-    """Compute the sum of squares on every second block by coefficients fitted to the others, and vice versa."""
+def held_out_squares(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> np.ndarray:
+    """Compute the sum of squares on every second block by coefficients fitted to the others, and vice versa.
+
+    `left` is one column (R,) or several (R, k), each with its own sum.
+    """
     parts = ((fold, ~fold) for fold in (odd, ~odd))
-    return sum(float(np.sum((left[b] - phi[b] @ ridge_solution(phi[a], left[a], ridge)) ** 2)) for a, b in parts)
+    return sum(np.sum((left[b] - phi[b] @ ridge_solution(phi[a], left[a], ridge)) ** 2, axis=0) for a, b in parts)
 
 
 def ridge_solution(a: np.ndarray, b: np.ndarray, ridge: float) -> np.ndarray:
@@ -479,10 +483,37 @@ FLEXIBLE = (Surface, StopHysteresis, PlayHysteresis, Relaxation, Creep)
 
 def flexible_shares(bench: Workbench, fitted: Fitted) -> dict[str, float]:
     """Compute the held-out share of the residual's power that any force at a port explains, by port."""
+    rest = _remainder_for_flexible_forces(bench, fitted)
+    return {t.port.name: held_out(rest.columns(t)[0], rest.left, rest.odd, RIDGES) for t in rest.tasks}
+
+
+def explains_by_chance(bench: Workbench, fitted: Fitted) -> bool:
+    """Tell whether a flexible force explains no more of the residual than it explains of noise as slow as that.
+
+    Shift the residual in a circle against the signals, so that it has its own spectrum and no relation to them
+    (Theiler et al. 1992, Physica D 58). Slow noise is explained as well at some shifts, because a block is known from
+    its neighbours and its few independent samples follow any force a little. A residual that repeats with the signals
+    is explained at all shifts, and is no noise.
+    """
+    rest, n_y = _remainder_for_flexible_forces(bench, fitted), bench.recordings[0].n_y
+    ends = np.cumsum([len(r.z) for r in rest.runs])[:-1]
+    parts = np.split(rest.left.reshape(-1, n_y), ends)
+    moved = [np.concatenate([np.roll(p, int(s * len(p)), axis=0).ravel() for p in parts]) for s in (0.0, *SHIFTS)]
+    left = project_off(np.column_stack(moved), rest.base)
+    shares = np.zeros(left.shape[1])
+    for task in rest.tasks:
+        phi = rest.columns(task)[0]
+        size = lengths(phi)
+        phi = phi[:, size > 0] / size[size > 0]
+        wrong = [held_out_squares(phi, left, rest.odd, ridge) for ridge in RIDGES]
+        shares = np.maximum(shares, 1 - np.min(wrong, axis=0) / np.maximum(np.sum(left**2, axis=0), 1e-300))
+    own, shifted = shares[0], shares[1:]
+    return bool(own <= np.max(shifted) and np.min(shifted) < own / 2)
+
+
+def _remainder_for_flexible_forces(bench: Workbench, fitted: Fitted) -> Remainder:
     size = max(fitted.model.n_state, 1) ** 2  # hundreds of states if a law holds a long delay
     most = max(MOST_WORK // size, min(LEAST_SAMPLES, MOST_MEMORY // size)) // len(bench.recordings)
     if any(len(r) > most for r in bench.recordings):
         bench = bench.on([r.slice(0, max(most, r.skip + LEAST_SAMPLES // 10)) for r in bench.recordings])
-    probe, runs = linearise_runs(bench, fitted)
-    rest = Remainder.of(bench, probe, runs, FLEXIBLE)
-    return {t.port.name: held_out(rest.columns(t)[0], rest.left, rest.odd, RIDGES) for t in rest.tasks}
+    return Remainder.of(bench, *linearise_runs(bench, fitted), FLEXIBLE)

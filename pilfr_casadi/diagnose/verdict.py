@@ -306,16 +306,23 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
         return Verdict("missing-physics", _describe_effects(search, found))
     shares = search.flexible(search.root)
     share = max(shares.values(), default=0.0)
-    steady = [g for g in gates if g.finding == "tone" and not found.effects]
+    # a law without a name may have followed slow noise
+    by_chance = (share > EXPLAINED_NOISE or bool(found.effects)) and search.explained_by_chance(search.root)
+    share, unnamed = 0.0 if by_chance else share, by_chance or not found.effects
+    steady = [g for g in gates if g.finding == "tone" and unnamed]
     mode = find_ringing_mode(search.bench, search.root.fitted)
     quiet = max(1 - sum(1 - g.left for g in steady), 0.0) ** 0.5  # share of the error that is left without the tones
-    measured = not found.effects and search.floor.may_be(quiet * search.rms(search.root))
-    noise = not found.effects and (measured or _is_noise(search, quiet, share, mode))
+    measured = unnamed and search.floor.may_be(quiet * search.rms(search.root))
+    noise = unnamed and (measured or _is_noise(search, quiet, share, mode))
     if faults and (noise or cured):
         return Verdict("recording-fault", faults[0].sentence)
     if noise and (measured or share < LEAST_EXPLAINED):
         beside = f" but a steady tone in {' and '.join(g.channel for g in steady)}" if steady else ""
-        rest = "the rest is as large as the noise" if measured else "no force at any port explains any of the rest"
+        rest = "no force at any port explains any of the rest"
+        if measured:
+            rest = "the rest is as large as the noise"
+        elif by_chance:
+            rest = "a force at a port explains no more of the rest than of other noise that is as slow"
         return Verdict(
             "complete",
             f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {off:.3g} of the "

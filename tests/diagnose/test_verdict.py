@@ -39,21 +39,60 @@ def test_slow_noise_that_two_periods_show_is_no_missing_physics():
     assert "the rest is as large as the noise" in found.sentence
 
 
-@pytest.mark.parametrize("pole", [0.3, 0.6])
-def test_noise_in_a_slow_machine_does_not_swell_with_it(pole):
-    """The rates of the measured level are those of the noise."""
-    u = np.repeat(np.random.default_rng(3).uniform(1, 5, 25), 60)[:, None]
-    tank = pilfr.Simulator(
+def tank():
+    return pilfr.Simulator(
         lambda x, u, p: {"level": (p.k * u.pump - p.a * x.level) / 0.05},
         lambda x: {"level": x.level},
         states=("level",),
         inputs=("pump",),
         parameters={"k": pilfr.Parameter(2.4e-5, bounds=(5e-6, 1e-4)), "a": pilfr.Parameter(2e-4, bounds=(0, 1e-3))},
     )
-    blank = Recording(u, u, 0.5, ("pump",), ("level",), initial="zero", hold="zero")
-    noise = lfilter([1], [1, -pole], np.random.default_rng(1).standard_normal((len(u), 1)), axis=0)
-    found = pilfr.diagnose(tank, blank.with_(y=tank.simulate(blank) + 2e-3 * noise), laws=(StaticPower,), workers=1)
+
+
+def levels(seed, dt):
+    """A blank recording of a pump whose voltage steps at random."""
+    u = np.repeat(np.random.default_rng(seed).uniform(1, 5, 25), 60)[:, None]
+    return Recording(u, u, dt, ("pump",), ("level",), initial="zero", hold="zero")
+
+
+@pytest.mark.parametrize("pole", [0.3, 0.6])
+def test_noise_in_a_slow_machine_does_not_swell_with_it(pole):
+    """The rates of the measured level are those of the noise."""
+    blank = levels(3, 0.5)
+    noise = lfilter([1], [1, -pole], np.random.default_rng(1).standard_normal((len(blank), 1)), axis=0)
+    found = pilfr.diagnose(tank(), blank.with_(y=tank().simulate(blank) + 2e-3 * noise), laws=(StaticPower,), workers=1)
     assert found.verdict == "complete", found.sentence
+
+
+def test_the_drift_of_a_sensor_is_hardly_called_missing_physics():
+    """Its few independent samples follow any force a little, and neighbouring blocks are alike."""
+    complete = 0
+    for seed in range(6):
+        rng, blank = np.random.default_rng([seed, 1]), levels(seed, 2.0)
+        white = rng.standard_normal((len(blank), 1))
+        drift = lfilter([0.1], [1, -0.995], rng.standard_normal((len(blank) + 2000, 1)), axis=0)[2000:]
+        y = tank().simulate(blank)
+        noisy = blank.with_(y=y + np.std(y) * (0.003 * white + 0.008 * drift))
+        complete += pilfr.diagnose(tank(), noisy, laws=(StaticPower, CoulombFriction), workers=1).verdict == "complete"
+    assert complete >= 5
+
+
+@pytest.mark.parametrize("kind", ["random", "sweep", "sine"])
+def test_a_force_is_told_from_chance(kind):
+    """A residual that repeats with a sine is explained at any shift, and is no noise."""
+    t = 0.05 * np.arange(1200)
+    signals = {
+        "random": 20 * multisine(1200, f_max=3.0, fs=20.0, rng=np.random.default_rng(1)),
+        "sweep": 10 * np.sin(2 * np.pi * (0.2 + 0.015 * t) * t)[:, None],
+        "sine": 10 * np.sin(2 * np.pi * 0.7 * t)[:, None],
+    }
+    blank = Recording(signals[kind], signals[kind], 0.05, ("force",), ("pos",), initial="zero", hold="zero")
+    y = cart().with_element("ground", CubicDamping().at({"c_3": 0.05})).simulate(blank)
+    noise = 1e-3 * np.std(y) * np.random.default_rng(2).standard_normal(y.shape)
+    found = pilfr.diagnose(cart(), blank.with_(y=y + noise), laws=(CoulombFriction,), effects=1, workers=1)
+    search = found.evidence["search"]
+    assert max(search.flexible(search.root).values()) > 0.5
+    assert not search.explained_by_chance(search.root)
 
 
 @pytest.mark.parametrize("offset", [0.0, 3.0])
