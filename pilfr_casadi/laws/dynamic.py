@@ -245,6 +245,7 @@ class Attached(SprungMass, Resonance):
     source = "Den Hartog (1956), Mechanical Vibrations, sec. 3.2"
     sentence = "an unmodelled mode: a part on a spring of its own that is carried along"
     units = {"k_a": "w/z", "W": "rad/s", "D": ""}
+    domains = ("mechanical",)
     places = ("parallel",)
     dissipative = True
     starts = {"W": lambda at: np.geomspace(0.015, 1.2, 32) / at.dt, "D": ("", 0.05)}

@@ -119,6 +119,7 @@ class ElasticDrive(SprungMass, _InLine):
     source = "Spong (1987), Journal of Dynamic Systems, Measurement, and Control 109(4)"
     sentence = "an elastic drive: a spring stands between the motor, where the sensor is, and the joint"
     units = {"k": "w/z", "W": "rad/s", "D": ""}
+    domains = ("mechanical",)
     strength: ClassVar[tuple[str, ...]] = ()  # the force is not linear in k
     position = False
     driven = True
