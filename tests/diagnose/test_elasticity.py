@@ -4,9 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cart import GROUND, cart
 
-from pilfr_casadi import InputError, Port, Simulator, diagnose
-from pilfr_casadi.laws import Compliance, ElasticDrive, ElasticDriveSeenAtLoad, ElasticJoint, LineGap, Local
+from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, diagnose, multisine
+from pilfr_casadi.diagnose.arguments import add_scaled_laws
+from pilfr_casadi.laws import (
+    Compliance,
+    CoulombFriction,
+    ElasticDrive,
+    ElasticDriveSeenAtLoad,
+    ElasticJoint,
+    LineGap,
+    Local,
+    seen_by,
+)
 from problems import elastic_joint, loose_mount
 
 MOUNT = {"m": 2.0, "k": 1000.0, "d": 20.0, "k_3": 1e6}
@@ -71,6 +82,75 @@ def test_a_rotor_before_a_joint_is_a_mass_behind_it(seen, kind):
     law = kind().at({"k": stiffness, "W": resonance, "D": damping / (2 * resonance * rotor)})
     elastic = replace(plain, ports=(drive,)).with_element("joint", law)
     assert elastic.nrmse(record) < 2 * elastic_joint.NOISE
+
+
+def axis(sensors, **options):
+    """A rigid axis: a torque moves one inertia; `sensors` are its outputs."""
+    port = Port("axis", lambda p: {"speed": -1 / p.J}, lambda x: x.angle, lambda x: x.speed, "N m", "rad", **options)
+    return Simulator(
+        lambda x, u, p: {"angle": x.speed, "speed": (u.torque - p.d * x.speed) / p.J},
+        lambda x: {name: x.angle for name in sensors},
+        states=("angle", "speed"),
+        inputs=("torque",),
+        parameters={"J": Parameter(0.02, bounds=(1e-3, 0.2)), "d": Parameter(0.1, bounds=(0, 2))},
+        ports=port,
+        units={"torque": "N m"},
+    )
+
+
+def recorded_axis(sensors, seed=1, samples=3000):
+    """A motor, a spring and a load with dry friction: motor 8e-3, load 12e-3 kg m^2, 12 N m/rad, 0.2 N m."""
+    u = 2 * multisine(samples, f_max=25.0, fs=250.0, rng=np.random.default_rng(seed))
+    blank = Recording(u, np.zeros((samples, len(sensors))), 0.004, ("torque",), sensors, initial="zero", hold="zero")
+    law = ElasticDrive if len(sensors) == 1 else seen_by(ElasticDrive, sensors[0])
+    drive = law().at({"k": 12.0, "W": np.sqrt(12 / 8e-3), "D": 0.03})
+    friction = CoulombFriction().at({"F_c": 0.2, "v_0": 0.05})
+    true = axis(sensors).with_parameters({"J": 0.012}).with_element("axis", drive).with_element("axis", friction)
+    y = true.simulate(blank)
+    return blank.with_(y=y + 1e-3 * np.std(y, axis=0) * np.random.default_rng(seed + 1).standard_normal(y.shape))
+
+
+def test_the_force_of_a_drive_is_found_in_the_equations():
+    own, given = axis(("motor",)), axis(("motor",), term=lambda u: -u.torque)
+    port, declared = own.port("axis"), given.port("axis")
+    assert port.implied and not declared.implied
+    alike = [
+        s.with_element("axis", ElasticDrive().at({"k": 12.0, "W": 40.0, "D": 0.05})).simulate(recorded_axis(("motor",)))
+        for s in (own, given)
+    ]
+    assert np.allclose(*alike, rtol=1e-9)
+    assert port.admits(ElasticDrive) and not port.admits(LineGap)  # it does not vary with the coordinate
+    with pytest.raises(InputError, match="names none"):
+        own.with_element("axis", LineGap())
+    lagged = elastic_joint.simulator({"J": 0.02, "d": 0.2, "F_c": 0.3, "T": 0.003}, "link")
+    assert lagged.port("joint").implied  # by a state that only the input moves
+    assert not cart(ports=(replace(GROUND, domain="electrical"),)).port("ground").implied
+
+
+def test_the_motion_of_the_ground_is_no_drive():
+    rig = cart()
+    moved = replace(rig, units={"force": "m"}, ports=(GROUND,))
+    assert rig.port("ground").implied and not moved.port("ground").implied
+
+
+def test_one_of_two_sensors_is_on_the_far_side():
+    rig, record = axis(("motor", "load")), recorded_axis(("motor", "load"))
+    assert rig.readers(rig.port("axis")) == ("motor", "load")
+    motor, load = record.y.T
+    assert np.std(motor - load) > 0.005 * np.std(load)
+    tried = [law.form for law in add_scaled_laws((ElasticDrive,), rig)]
+    assert tried == ["elastic drive", "elastic drive, seen by load", "elastic drive, seen by motor"]
+    assert [law.form for law in add_scaled_laws((ElasticDrive,), axis(("motor",)))] == ["elastic drive"]
+    with pytest.raises(InputError, match="laws that outputs see"):
+        seen_by(LineGap, "motor")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensors", [("motor",), ("motor", "load")])
+def test_an_elastic_drive_with_friction_is_named_without_a_term(sensors):
+    found = diagnose(axis(sensors), recorded_axis(sensors), test=recorded_axis(sensors, seed=5))
+    assert {(e.port, e.law) for e in found.effects} == {("axis", "coulomb_friction"), ("axis", "extra_mode")}
+    assert found.errors["test"]["after"] < 2e-3
 
 
 def test_a_term_is_there_with_its_sign_and_laws_in_line_want_one():

@@ -34,6 +34,10 @@ def test_friction_and_ripple_at_one_port_are_both_named():
         (laws.CubicStiffness, laws.PiecewiseStiffness, False),  # both of position
         (laws.Relaxation, laws.CubicStiffness, False),  # it is a spring itself
         (laws.CoulombFriction, laws.Drift, False),  # neither of position
+        (laws.CoulombFriction, laws.ElasticDrive, True),  # a mass on a spring has friction as well
+        (laws.CubicStiffness, laws.Attached, True),
+        (laws.Attached, laws.ElasticDrive, False),  # both masses on springs
+        (laws.Relaxation, laws.Attached, False),  # both may follow anything slow
         (laws.CubicStiffness, laws.scaled(laws.LinearStiffness, "pressure"), True),  # a signal varies one of them
         (laws.CubicStiffness, laws.scheduled(laws.LinearStiffness, "z"), False),
     ],
