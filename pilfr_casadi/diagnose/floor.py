@@ -131,6 +131,11 @@ def white_part(residuals: Sequence[np.ndarray]) -> np.ndarray:
     return np.asarray(np.min([np.sqrt(np.mean(third_differences(e) ** 2, axis=0)) for e in residuals], axis=0))
 
 
+def times_white(residual: np.ndarray) -> float:
+    """Compute the ratio of a residual's rms to that of the white noise in it, over all outputs."""
+    return float(np.sqrt(np.mean(residual**2) / max(float(np.mean(white_part([residual]) ** 2)), 1e-300)))
+
+
 def effective_size(residuals: Sequence[np.ndarray]) -> float:
     """Count the independent samples: all samples over the residuals' correlation time `1 + 2 Σ ρ²`."""
     total = 0.0

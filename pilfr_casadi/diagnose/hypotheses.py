@@ -15,6 +15,7 @@ import numpy as np
 from .._base import Stages, is_interrupt
 from ..laws import Law
 from ..simulators import Placed, Simulator
+from .coloured_noise import log_likelihood
 from .evidence import (
     CONTENDING_NATS,
     EFFECT_PRIOR,
@@ -24,17 +25,18 @@ from .evidence import (
     LARGE_MODEL_ERROR,
     LOUDEST_NOISE,
     WRONG_MODEL_SAMPLES,
+    Complexity,
     HeldOut,
     Sample,
+    complexity,
     held_out_errors,
-    information,
     log_evidence,
     log_prior,
     spread,
 )
 from .floor import FEWEST, Floor, effective_size, white_part
 from .gates import EQUAL_RATIO
-from .screen import Scored, explains_by_chance, flexible_shares, screen
+from .screen import Scored, flexible_shares, innovation_share, screen
 from .trials import Key, Trial, Trials
 from .workbench import DIVERGED, Fitted, Workbench
 
@@ -51,8 +53,10 @@ class Findings:
         The scores of all further laws, and the observer's gain; see `screen`.
     flexible : dict, optional
         The share of the residual that a flexible force at each port explains.
-    by_chance : bool, optional
-        Whether that is no more than it explains of slow noise.
+    innovations : float, optional
+        The share of the residual's innovations that it explains.
+    likelihood : float, optional
+        The log likelihood of the residual as coloured noise.
     learned : list of Fitted, optional
         The learned forces beside it, best first.
     held_out : HeldOut, optional
@@ -61,7 +65,8 @@ class Findings:
 
     screened: tuple[list[Scored], np.ndarray | None] | None = None
     flexible: dict[str, float] | None = None
-    by_chance: bool | None = None
+    innovations: float | None = None
+    likelihood: float | None = None
     learned: list[Fitted] | None = None
     held_out: HeldOut | None = None
 
@@ -173,8 +178,8 @@ class Hypotheses:
         return float(np.median(ratios)) if ratios else 1.0
 
     def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
-        known = trial.information if trial.information is not None else np.zeros(0)
-        return log_evidence(v + self.tolerance, known, self.log_prior(trial), n)
+        known = trial.complexity or Complexity(np.zeros(0), 0.0)
+        return log_evidence(v + self.tolerance, known.information, self.log_prior(trial) + known.log_prior, n)
 
     def log_prior(self, trial: Trial) -> float:
         """Compute the log prior probability of a hypothesis."""
@@ -257,12 +262,22 @@ class Hypotheses:
                 known.flexible = flexible_shares(self.bench, trial.fitted)
         return known.flexible
 
-    def explained_by_chance(self, trial: Trial) -> bool:
-        """Tell whether a flexible force explains no more of a trial's residual than of noise as slow as that."""
+    def innovation_share(self, trial: Trial) -> float:
+        """Compute the share of the innovations of a trial's residual that a flexible force explains."""
         known = self.findings[trial.key]
-        if known.by_chance is None:
-            known.by_chance = explains_by_chance(self.bench, trial.fitted)
-        return known.by_chance
+        if known.innovations is None:
+            known.innovations = innovation_share(self.bench, trial.fitted)
+        return known.innovations
+
+    def evidence_in_noise(self, trial: Trial) -> float:
+        """Compute the log evidence of a hypothesis whose residual is coloured noise; all samples count."""
+        known, own = self.findings[trial.key], trial.complexity or Complexity(np.zeros(0), 0.0)
+        residuals = self.scored_residuals(trial)
+        if known.likelihood is None:
+            known.likelihood = log_likelihood(residuals)
+        n = sum(e.size for e in residuals)
+        occam = 0.5 * float(np.sum(np.log1p(n * own.information / trial.mean_square)))
+        return known.likelihood - occam + own.log_prior + self.log_prior(trial)
 
     def screened(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
         """Score every port and law beside a hypothesis; see `screen`."""
@@ -312,8 +327,8 @@ class Hypotheses:
 
     def keep(self, trial: Trial) -> None:
         """Put a trial into the memo, unless the same hypothesis fits better there."""
-        if trial.information is None:
-            trial = replace(trial, information=information(self.bench, trial.fitted, trial.laws))
+        if trial.complexity is None:
+            trial = replace(trial, complexity=complexity(self.bench, trial.fitted, trial.laws))
         known = self.memo.get(trial.key)
         if known is None or trial.supersedes(known):
             self.memo[trial.key] = trial
@@ -347,10 +362,13 @@ class Hypotheses:
         noise = np.minimum(np.hypot(np.maximum(white, rest), known), self.rms(nearest))
         self.floor = Floor(noise, "estimated")
 
+    def scored_residuals(self, trial: Trial) -> list[np.ndarray]:
+        """Return the residual of each recording (M, n_y) without the samples that do not count."""
+        return [e[r.skip :] for e, r in zip(trial.fitted.residual, self.bench.recordings, strict=True)]
+
     def rms(self, trial: Trial) -> np.ndarray:
         """Compute the rms error of each output, (n_y,)."""
-        pairs = zip(trial.fitted.residual, self.bench.recordings, strict=True)
-        return np.asarray(np.sqrt(np.mean(np.concatenate([e[r.skip :] for e, r in pairs]) ** 2, axis=0)))
+        return np.asarray(np.sqrt(np.mean(np.concatenate(self.scored_residuals(trial)) ** 2, axis=0)))
 
     def run_laws(self, laws: Sequence[Placed], joint: Trial) -> Trial:
         """Run some laws of a hypothesis, perhaps of another search, at its values, and return them as a trial.

@@ -29,6 +29,7 @@ from ..data import Recording
 from ..laws import Creep, Law, Local, PlayHysteresis, Relaxation, StopHysteresis, count_columns, unit_forces
 from ..models import Parameter
 from ..simulators import EQUATION, PARAMETER, SENSOR, Port, kind_of, port_name
+from .coloured_noise import whiten, whitening_filters
 from .linearise import (
     Probe,
     Run,
@@ -46,7 +47,6 @@ Pair = tuple[str, type[Law]]  # a port and the class of a law
 SCREENED_SAMPLES = 6000  # samples used at most
 HUGE = 1e60  # ratio to an output's deviation above which a response diverges
 BLOCKS = 10  # blocks a recording; every second block is held out in turn
-SHIFTS = np.linspace(0.1, 0.9, 33)  # of a residual against the signals, over the length of a recording
 RIDGES = (1e-6, 1e-3)  # strengths of the ridge regression of flexible forces, relative to a column of unit length
 DEGREE = 4  # of the flexible surface
 # degrees in z and dz/dt of the surface's terms
@@ -487,28 +487,19 @@ def flexible_shares(bench: Workbench, fitted: Fitted) -> dict[str, float]:
     return {t.port.name: held_out(rest.columns(t)[0], rest.left, rest.odd, RIDGES) for t in rest.tasks}
 
 
-def explains_by_chance(bench: Workbench, fitted: Fitted) -> bool:
-    """Tell whether a flexible force explains no more of the residual than it explains of noise as slow as that.
+def innovation_share(bench: Workbench, fitted: Fitted) -> float:
+    """Compute the largest held-out share that a force at any port explains of the residual's innovations.
 
-    Shift the residual in a circle against the signals, so that it has its own spectrum and no relation to them
-    (Theiler et al. 1992, Physica D 58). Slow noise is explained as well at some shifts, because a block is known from
-    its neighbours and its few independent samples follow any force a little. A residual that repeats with the signals
-    is explained at all shifts, and is no noise.
+    A force seems to explain slow noise on held-out blocks, because a block is known from its neighbours. The
+    innovations have no such neighbours; see `coloured_noise`.
     """
     rest, n_y = _remainder_for_flexible_forces(bench, fitted), bench.recordings[0].n_y
-    ends = np.cumsum([len(r.z) for r in rest.runs])[:-1]
-    parts = np.split(rest.left.reshape(-1, n_y), ends)
-    moved = [np.concatenate([np.roll(p, int(s * len(p)), axis=0).ravel() for p in parts]) for s in (0.0, *SHIFTS)]
-    left = project_off(np.column_stack(moved), rest.base)
-    shares = np.zeros(left.shape[1])
-    for task in rest.tasks:
-        phi = rest.columns(task)[0]
-        size = lengths(phi)
-        phi = phi[:, size > 0] / size[size > 0]
-        wrong = [held_out_squares(phi, left, rest.odd, ridge) for ridge in RIDGES]
-        shares = np.maximum(shares, 1 - np.min(wrong, axis=0) / np.maximum(np.sum(left**2, axis=0), 1e-300))
-    own, shifted = shares[0], shares[1:]
-    return bool(own <= np.max(shifted) and np.min(shifted) < own / 2)
+    sizes = [len(r.z) for r in rest.runs]
+    filters = whitening_filters(np.split(rest.left.reshape(-1, n_y), np.cumsum(sizes)[:-1]))
+    base = orthonormal(whiten(rest.base, filters, sizes))
+    left = project_off(whiten(rest.left[:, None], filters, sizes)[:, 0], base)
+    columns = (project_off(whiten(rest.columns(task)[0], filters, sizes), base) for task in rest.tasks)
+    return max((held_out(phi, left, rest.odd, RIDGES) for phi in columns), default=0.0)
 
 
 def _remainder_for_flexible_forces(bench: Workbench, fitted: Fitted) -> Remainder:

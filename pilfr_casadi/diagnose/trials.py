@@ -20,7 +20,7 @@ from .._base import InputError
 from ..data import Recording
 from ..laws import Law
 from ..simulators import Placed, Simulator
-from .evidence import FAR_RATIO, FORMULA_ERROR
+from .evidence import FAR_RATIO, FORMULA_ERROR, Complexity
 from .gates import EQUAL_RATIO, open_start
 from .offsets import Offset
 from .screen import Pair, Scored
@@ -58,8 +58,8 @@ class Trial:
         The same on all recordings.
     thorough : bool
         Whether it was fitted to convergence and to all samples.
-    information : array
-        See `evidence.information`.
+    complexity : Complexity, optional
+        What the laws add, once the hypothesis is kept.
     """
 
     laws: tuple[Placed, ...]
@@ -67,7 +67,7 @@ class Trial:
     part_mean_square: float
     mean_square: float
     thorough: bool = False
-    information: np.ndarray | None = None
+    complexity: Complexity | None = None
 
     @property
     def key(self) -> Key:

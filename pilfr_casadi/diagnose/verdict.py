@@ -30,6 +30,7 @@ from .evidence import (
     AT_NOISE_RATIO,
     BETTER_RATIO,
     COLOURED_NOISE_RATIO,
+    CONTENDING_NATS,
     DISTURBANCE_WEIGHT,
     EXPLAINED_NOISE,
     EXPLAINED_QUIET_NOISE,
@@ -46,7 +47,7 @@ from .evidence import (
     SURE,
     WHITE_NOISE_RATIO,
 )
-from .floor import ABOVE_NOISE, swells_with, white_part
+from .floor import ABOVE_NOISE, swells_with, times_white, white_part
 from .gates import Gate
 from .hypotheses import Hypotheses
 from .proof import mean_nrmse
@@ -234,11 +235,15 @@ def _make_effect(
 def _weights(search: Hypotheses, trials: Sequence[Trial]) -> np.ndarray:
     """Compute the probability of each hypothesis.
 
-    The simulator alone claims that its whole error is noise, so samples count in full against it. Laws claim only to be
-    near the physics; they are weighed by samples that count as far as their error is noise.
+    The simulator alone claims that its whole error is noise, so samples count in full against it; where that noise may
+    be slow, its innovations count. Laws claim only to be near the physics; they are weighed by samples that count as
+    far as their error is noise.
     """
-    full, tempered = (np.array([of(t) for t in trials]) for of in (search.optimistic_evidence, search.evidence))
+    against_noise = search.evidence_in_noise if may_be_coloured_noise(search) else search.optimistic_evidence
+    tempered = np.array([search.evidence(t) for t in trials])
     alone = np.array([not names(t) for t in trials])
+    near = alone | (tempered > max(tempered[~alone], default=0.0) - CONTENDING_NATS)
+    full = np.array([against_noise(t) if one else -np.inf for t, one in zip(trials, near, strict=True)])
     nothing = float(np.sum(_shares(full)[alone]))
     weights = np.empty(len(trials))
     weights[alone] = nothing * _shares(full[alone])
@@ -306,9 +311,10 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
         return Verdict("missing-physics", _describe_effects(search, found))
     shares = search.flexible(search.root)
     share = max(shares.values(), default=0.0)
-    # a law without a name may have followed slow noise
-    by_chance = (share > EXPLAINED_NOISE or bool(found.effects)) and search.explained_by_chance(search.root)
-    share, unnamed = 0.0 if by_chance else share, by_chance or not found.effects
+    slow = share > EXPLAINED_NOISE and may_be_coloured_noise(search)
+    if slow:  # a force seems to explain some of slow noise
+        share = search.innovation_share(search.root)
+    unnamed = not found.effects
     steady = [g for g in gates if g.finding == "tone" and unnamed]
     mode = find_ringing_mode(search.bench, search.root.fitted)
     quiet = max(1 - sum(1 - g.left for g in steady), 0.0) ** 0.5  # share of the error that is left without the tones
@@ -321,8 +327,8 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
         rest = "no force at any port explains any of the rest"
         if measured:
             rest = "the rest is as large as the noise"
-        elif by_chance:
-            rest = "a force at a port explains no more of the rest than of other noise that is as slow"
+        elif slow:
+            rest = "the rest is slow noise: no force at any port explains its changes from sample to sample"
         return Verdict(
             "complete",
             f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {off:.3g} of the "
@@ -342,22 +348,35 @@ def closest_law(search: Hypotheses, likeliest: Trial) -> Trial:
     return max((t for t in search.memo.values() if t.laws), key=search.optimistic_evidence, default=likeliest)
 
 
+def may_be_coloured_noise(search: Hypotheses, quiet: float = 1.0) -> bool:
+    """Tell whether the refit's residual is small and irregular enough to be noise of any colour.
+
+    `quiet` is the share of its rms that is left without steady tones.
+    """
+    return search.root.mean_square < LOUDEST_NOISE**2 and quiet * _times_white(search) < COLOURED_NOISE_RATIO
+
+
+def _times_white(search: Hypotheses) -> float:
+    """Compute the ratio of the refit's error to the noise: measured, or the white noise in its residual."""
+    if search.floor.source == "estimated":
+        return max(times_white(e / search.bench.scale) for e in search.scored_residuals(search.root))
+    noise2 = np.mean((search.floor.deviation / search.bench.scale) ** 2)
+    return search.root.error / max(float(np.sqrt(noise2)), 1e-300)
+
+
 def _is_noise(search: Hypotheses, quiet: float, share: float, mode: float | None) -> bool:
     """Tell whether the refit's residual can be noise: no force explains it, no mode rings, and its power is steady.
 
     `quiet` is the share of its rms that is left without steady tones.
     """
-    root = search.root
-    white = white_part(root.fitted.residual) if search.floor.source == "estimated" else search.floor.deviation
-    times = quiet * root.error / max(float(np.sqrt(np.mean((white / search.bench.scale) ** 2))), 1e-300)
+    root, times = search.root, quiet * _times_white(search)
     if times < AT_NOISE_RATIO:
         return True
     unexplained = share < (EXPLAINED_QUIET_NOISE if root.mean_square < NEGLIGIBLE_ERROR**2 else EXPLAINED_NOISE)
     if search.floor.source != "estimated":
         like = times < ABOVE_NOISE and unexplained
     else:
-        coloured = times < COLOURED_NOISE_RATIO and unexplained and root.mean_square < LOUDEST_NOISE**2
-        like = times < WHITE_NOISE_RATIO or coloured
+        like = times < WHITE_NOISE_RATIO or (unexplained and may_be_coloured_noise(search, quiet))
     return like and mode is None and not _swells(search)
 
 
@@ -366,11 +385,12 @@ def _swells(search: Hypotheses) -> bool:
 
     The measured outputs hold the noise itself, and their rates hardly anything else where the machine is slow.
     """
-    fitted, signals, rest = search.root.fitted, [], []
-    for r, e in zip(search.bench.recordings, fitted.residual, strict=True):
+    signals = []
+    for r, e in zip(search.bench.recordings, search.root.fitted.residual, strict=True):
         simulated = r.y + e
         signals.append(np.column_stack([r.u, simulated, np.gradient(simulated, axis=0)])[r.skip :])
-        rest.append(e[r.skip :])
+    # the noise may be of another level in each recording, such as with another range of a sensor
+    rest = [e / np.maximum(white_part([e]), 1e-300) for e in search.scored_residuals(search.root)]
     return swells_with(rest, signals)
 
 

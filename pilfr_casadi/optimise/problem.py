@@ -157,9 +157,18 @@ class Penalties:
 def state_precision(engine: Engine, drive: Array, p: Array, n_x: int, n_s: int) -> Array | None:
     """Compute the prior precision (n_state, n_state) of an initial state with memory, in units of the outputs.
 
-    The prior is `N(0, S)`. S holds the second moments of the states in a run from rest on the same inputs. So an
-    operator that this run does not move begins at rest, and states and memories are correlated as they are in motion.
-    The prior is weighed against errors of `STATE_NOISE` per sample. None if the run diverges.
+    The prior is `N(0, S)`; see `state_covariance`. It is weighed against errors of `STATE_NOISE` per sample. None if
+    the run diverges.
+    """
+    covariance = state_covariance(engine, drive, p, n_x, n_s)
+    return None if covariance is None else STATE_NOISE**2 * np.linalg.inv(covariance)
+
+
+def state_covariance(engine: Engine, drive: Array, p: Array, n_x: int, n_s: int) -> Array | None:
+    """Compute the prior covariance S (n_state, n_state) of an initial state with memory; None if the run diverges.
+
+    S holds the second moments of the states in a run from rest on the same inputs. So an operator that this run does
+    not move begins at rest, and states and memories are correlated as they are in motion.
     """
     state, found = np.zeros(n_x + n_s), []
     with np.errstate(over="ignore", invalid="ignore"):
@@ -177,7 +186,7 @@ def state_precision(engine: Engine, drive: Array, p: Array, n_x: int, n_s: int) 
         largest = np.max(size[group], initial=0.0)
         size[group] = np.maximum(size[group], STILL_STATE * largest) if largest > 0 else 1.0
     together = moments / size / size[:, None] + LEAST_CORRELATION_VARIANCE * np.eye(len(size))
-    return np.asarray(STATE_NOISE**2 * np.linalg.inv(together) / size / size[:, None])
+    return np.asarray(together * size * size[:, None])
 
 
 class Problem:
@@ -277,6 +286,28 @@ class Problem:
         """Return the same problem under other constraints."""
         other = copy(self)
         other._constrain(tuple(constraints))
+        return other
+
+    def state_priors(self, theta: Array, own: int) -> tuple[tuple[int, Array], ...]:
+        """Compute the prior covariance of each estimated initial state without its first `own` entries.
+
+        See `state_covariance`. Returns the first variable and the covariance for each such state whose run from rest
+        at the parameters in θ does not diverge.
+        """
+        p, n_x, n = self.parameters(theta), self.model.n_x, self.model.n_state
+        if own >= n:
+            return ()
+        estimated = [part for part in self._placed if part.first is not None]
+        found = [(part.first, state_covariance(self.engine, part.drive, p, n_x, n - n_x)) for part in estimated]
+        return tuple((at + own, s[own:, own:]) for at, s in found if at is not None and s is not None)
+
+    def with_state_priors(self, priors: Sequence[tuple[int, Array]], noise2: float) -> Problem:
+        """Return the problem with priors around rest (`state_priors`), weighed against a mean square noise."""
+        if not priors:
+            return self
+        other = copy(self)
+        squares = [(at, noise2 * np.linalg.inv(covariance)) for at, covariance in priors]
+        other.penalties = Penalties(self.model.parameters, self.l1, self.noise, self.residuals, self.size, squares)
         return other
 
     @property
