@@ -407,7 +407,7 @@ class Equations:
         moves = len(into) == 1 and z.is_symbolic() and self._integrals.get(z.name()) == speed
         if not moves or port.domain not in (MECHANICAL, UNKNOWN):
             return None
-        rates = dict(zip(self.states, ca.vertsplit(self.derivatives(x, u, p, t)), strict=True))
+        rates = self.by_state(self.derivatives(x, u, p, t))
         actuators = set(self.states) - {z.name(), speed}
         mechanism = [x[n] for n in self.states if n not in actuators]
         while coupled := {n for n in actuators if ca.depends_on(rates[n], ca.vertcat(*mechanism))}:
