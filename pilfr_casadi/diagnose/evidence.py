@@ -1,13 +1,13 @@
 """The one scale on which all hypotheses of a diagnosis are compared: log evidence, and errors on held-out data.
 
 Let v be the mean square error of a fitted hypothesis in units of the outputs' variance, n the effective samples, λ the
-eigenvalues of the Fisher information of one sample on the laws' parameters and first states (in units of their prior
-widths), and p the prior probability. Then
+eigenvalues of the Fisher information of one sample on the laws' parameters (in units of their prior widths), and p the
+prior probability. Then
 
     log Z = -n/2 log v - 1/2 Σ log(1 + n λ / v) + log p.
 
-This is Laplace's approximation (MacKay 1992) with unknown noise variance. The simulator's own parameters and initial
-states are projected out of the information first. A model of a machine is never exact, and its error is
+This is Laplace's approximation (MacKay 1992) with unknown noise variance. The simulator's own parameters and the
+initial states are projected out of the information first. A model of a machine is never exact, and its error is
 correlated from sample to sample; so samples do not count in full. With m the share of the error that is model error, N
 samples, and n_0 the number of samples that a wholly wrong model is worth,
 
@@ -107,56 +107,33 @@ class Sample:
         return WRONG_MODEL_SAMPLES * self.count / (WRONG_MODEL_SAMPLES + wrong * self.count)
 
 
-@dataclass(frozen=True, eq=False)
-class Complexity:
-    """What a hypothesis adds to the simulator, in units of its priors.
-
-    Attributes
-    ----------
-    information : array
-        Eigenvalues λ of a sample's information on the laws' parameters and on the states in which the laws begin.
-    log_prior : float
-        Log prior density of these states, relative to the largest.
-    """
-
-    information: np.ndarray
-    log_prior: float
-
-
-def complexity(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> Complexity:
-    """Compute the information on the parameters of laws in units of their prior widths, and on their memories.
+def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
+    """Compute the eigenvalues λ of a sample's information on the laws' parameters, in units of their prior widths.
 
     One law in several sensors counts once, as in `log_prior`.
     """
-    if not laws and fitted.model.n_state == len(bench.simulator.states):
-        return Complexity(np.zeros(0), 0.0)
-    problem, theta, hessian = _hessian(bench, fitted)
     numbers = _number_parameters(fitted, laws)[fitted.model.parameters.free]
-    widths = _widths(fitted, laws, problem.free, np.diag(hessian)[: len(numbers)])
-    columns, log_prior_ = [], 0.0
-    for number in np.unique(numbers[numbers >= 0]):  # of one law in several sensors, each parameter is one
-        where = np.flatnonzero(numbers == number)
-        columns.append(np.zeros((len(theta), 1)))
-        columns[-1][where] = min(widths[where])
-    for at, covariance in bench.memory_priors(problem, theta):
-        where = np.arange(at, at + len(covariance))
-        columns.append(np.zeros((len(theta), len(covariance))))
-        columns[-1][where] = np.linalg.cholesky(covariance)
-        log_prior_ -= 0.5 * float(theta[where] @ np.linalg.solve(covariance, theta[where]))
-    if not columns:
-        return Complexity(np.zeros(0), 0.0)
-    unit = np.hstack(columns)
+    laws_at = np.flatnonzero(numbers >= 0)
+    # of one law in several sensors, each parameter is one
+    shared = np.equal.outer(numbers[laws_at], np.unique(numbers[laws_at])).astype(float)
+    if not laws_at.size:
+        return np.zeros(0)
+    problem, _, hessian = _hessian(bench, fitted)
     if not np.all(np.isfinite(hessian)):  # a run at the edge of divergence has no derivatives
-        return Complexity(np.full(unit.shape[1], np.inf), log_prior_)
-    rest = np.flatnonzero(~np.any(unit, axis=1))
+        return np.full(shared.shape[1], np.inf)
+    rest = np.setdiff1d(np.arange(len(hessian)), laws_at)
+    width = _widths(fitted, laws, problem.free, np.diag(hessian)[: len(numbers)])[laws_at]
     with np.errstate(all="ignore"):
+        width = np.array([min(width[column > 0]) for column in shared[:, np.argmax(shared, axis=1)].T])  # of its group
+        block = hessian[np.ix_(laws_at, laws_at)] * np.outer(width, width)
         size = np.sqrt(np.maximum(np.diag(hessian)[rest], 1e-300))
-        across = hessian[rest] @ unit / size[:, None]
+        across = hessian[np.ix_(rest, laws_at)] * width / size[:, None]
         inner = hessian[np.ix_(rest, rest)] / np.outer(size, size)
-        block = unit.T @ hessian @ unit - across.T @ np.linalg.pinv(inner, rcond=1e-10, hermitian=True) @ across
+        block = block - across.T @ np.linalg.pinv(inner, rcond=1e-10, hermitian=True) @ across
+        block = shared.T @ block @ shared
     if not np.all(np.isfinite(block)):
-        return Complexity(np.full(len(block), np.inf), log_prior_)
-    return Complexity(np.maximum(np.linalg.eigvalsh(block), 0.0), log_prior_)
+        return np.full(len(block), np.inf)
+    return np.maximum(np.linalg.eigvalsh(block), 0.0)
 
 
 def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n: float) -> float:
@@ -321,6 +298,19 @@ def log_prior(
         total += _log_share(e.law.id, there, (domains or {}).get(e.port, UNKNOWN))
         total += FLEXIBLE_PRIOR if e.law.flexible else 0.0
     return float(total)
+
+
+def log_prior_of_states(bench: Workbench, fitted: Fitted) -> float:
+    """Compute the log prior density of the estimated states in which laws begin, relative to the largest.
+
+    The machine was at work before, with signals like the recorded ones; see `Problem.state_priors`.
+    """
+    problem, theta = bench.problem_at(fitted)
+    total = 0.0
+    for at, covariance in problem.state_priors(theta, len(bench.simulator.states)):
+        state = theta[at : at + len(covariance)]
+        total -= 0.5 * float(state @ np.linalg.solve(covariance, state))
+    return total
 
 
 def _log_share(law: str, there: Sequence[Law], domain: str) -> float:

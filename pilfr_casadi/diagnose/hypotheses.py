@@ -25,13 +25,13 @@ from .evidence import (
     LARGE_MODEL_ERROR,
     LOUDEST_NOISE,
     WRONG_MODEL_SAMPLES,
-    Complexity,
     HeldOut,
     Sample,
-    complexity,
     held_out_errors,
+    information,
     log_evidence,
     log_prior,
+    log_prior_of_states,
     spread,
 )
 from .floor import FEWEST, Floor, effective_size, white_part
@@ -56,7 +56,7 @@ class Findings:
     innovations : float, optional
         The share of the residual's innovations that it explains.
     likelihood : float, optional
-        The log likelihood of the residual as coloured noise.
+        The log likelihood of its residual as coloured noise and of its first states.
     learned : list of Fitted, optional
         The learned forces beside it, best first.
     held_out : HeldOut, optional
@@ -178,8 +178,8 @@ class Hypotheses:
         return float(np.median(ratios)) if ratios else 1.0
 
     def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
-        known = trial.complexity or Complexity(np.zeros(0), 0.0)
-        return log_evidence(v + self.tolerance, known.information, self.log_prior(trial) + known.log_prior, n)
+        known = trial.information if trial.information is not None else np.zeros(0)
+        return log_evidence(v + self.tolerance, known, self.log_prior(trial), n)
 
     def log_prior(self, trial: Trial) -> float:
         """Compute the log prior probability of a hypothesis."""
@@ -270,14 +270,17 @@ class Hypotheses:
         return known.innovations
 
     def evidence_in_noise(self, trial: Trial) -> float:
-        """Compute the log evidence of a hypothesis whose residual is coloured noise; all samples count."""
-        known, own = self.findings[trial.key], trial.complexity or Complexity(np.zeros(0), 0.0)
-        residuals = self.scored_residuals(trial)
+        """Compute the log evidence of a hypothesis whose residual is coloured noise; all samples count.
+
+        A law would follow slow noise by a first state that it never reaches otherwise, so that counts as well.
+        """
+        known, residuals = self.findings[trial.key], self.scored_residuals(trial)
         if known.likelihood is None:
-            known.likelihood = log_likelihood(residuals)
+            known.likelihood = log_likelihood(residuals) + log_prior_of_states(self.bench, trial.fitted)
         n = sum(e.size for e in residuals)
-        occam = 0.5 * float(np.sum(np.log1p(n * own.information / trial.mean_square)))
-        return known.likelihood - occam + own.log_prior + self.log_prior(trial)
+        information = trial.information if trial.information is not None else np.zeros(0)
+        occam = 0.5 * float(np.sum(np.log1p(n * information / trial.mean_square)))
+        return known.likelihood - occam + self.log_prior(trial)
 
     def screened(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
         """Score every port and law beside a hypothesis; see `screen`."""
@@ -327,8 +330,8 @@ class Hypotheses:
 
     def keep(self, trial: Trial) -> None:
         """Put a trial into the memo, unless the same hypothesis fits better there."""
-        if trial.complexity is None:
-            trial = replace(trial, complexity=complexity(self.bench, trial.fitted, trial.laws))
+        if trial.information is None:
+            trial = replace(trial, information=information(self.bench, trial.fitted, trial.laws))
         known = self.memo.get(trial.key)
         if known is None or trial.supersedes(known):
             self.memo[trial.key] = trial

@@ -2,7 +2,7 @@
 
 A relative is a pair of port and law with its own start values:
 
-- a special case of the best law of a port, and a law that one which came near refines;
+- a special case of the best law, and a law that the best one refines;
 - another form of a law that came near, and a form that shares a shape with the best law but stayed behind it;
 - a law with one more term than one that came near, from its values;
 - a resonance of known frequency: as a mass attached at another port, or in place of a delay or a lag;
@@ -45,9 +45,9 @@ COMPARED_SAMPLES = 4000  # approximate number of samples on which forces are com
 def complements(one: Law, other: Law) -> bool:
     """Tell whether two laws of a port are different physics: one opposes motion, the other is a curve of position.
 
-    So are dry friction and a drag that grows with speed; creep, which is slow, and hysteresis, which knows no time; and
-    two curves of position if a signal, such as a pressure, varies the strength of one alone. A constant offset may
-    stand beside any other law, and a mass on a spring beside any force without such a mass.
+    So are dry friction and a drag that grows with speed, and two curves of position if a signal, such as a pressure,
+    varies the strength of one alone. A constant offset may stand beside any other law, and a mass on a spring beside
+    any force without such a mass.
     """
     if "offset" in (one.id, other.id):
         return one.id != other.id
@@ -55,8 +55,6 @@ def complements(one: Law, other: Law) -> bool:
     if any(sprung):
         plain = other if sprung[0] else one
         return not all(sprung) and plain.order == 0
-    if {one.id, other.id} == {"creep", "hysteresis"}:
-        return True
     if any(a.id in DRY and b.id in DRAGS for a, b in ((one, other), (other, one))):
         return True
     rubs, springs = sorted((one, other), key=lambda law: not law.dissipative)
@@ -98,11 +96,10 @@ def _near(trials: Sequence[Trial]) -> set[Pair]:
 
 
 def _special_cases(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Select special cases of the best law of each port that did not come near, as from a wrong minimum."""
-    near, best = _near(trials), dict[str, Trial]()
-    for t in trials:
-        best.setdefault(t.port, t)
-    return [s for s in scored if s.port in best and s.law.id in best[s.port].law.contains and s.pair not in near]
+    """Select special cases of the best law at its port that did not come near, as from a wrong minimum."""
+    best, near = trials[0], _near(trials)
+    cases = best.law.contains
+    return [s for s in scored if s.port == best.port and s.law.id in cases and s.pair not in near]
 
 
 def _other_forms(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:

@@ -25,7 +25,7 @@ from ..data import Recording
 from ..laws import Law
 from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
 from .arguments import match_recordings, stated_hold
-from .evidence import FORMULA_ERROR, Sample, complexity, deviations, log_evidence, log_prior, prior_width
+from .evidence import FORMULA_ERROR, Sample, deviations, information, log_evidence, log_prior, prior_width
 from .floor import effective_size, measured_floor, third_differences
 from .linearise import sample_run
 from .proof import mean_nrmse
@@ -237,13 +237,8 @@ def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ..
     tolerance = FORMULA_ERROR * max(plain.cost - noise2, 0.0)
     costs = plain.cost + tolerance, after.cost + tolerance
     n = Sample(noise2 + tolerance, max(effective_size(after.residual), 1.0)).effective(min(costs))
-    both = [complexity(bench, plain, ()), complexity(bench, after, laws)]
-    priors = 0.0, log_prior(laws, {})
-    without, with_laws = (
-        log_evidence(v, known.information, known.log_prior + prior, n)
-        for v, known, prior in zip(costs, both, priors, strict=True)
-    )
-    return with_laws - without
+    known = information(bench, after, laws)
+    return log_evidence(costs[1], known, log_prior(laws, {}), n) - log_evidence(costs[0], np.zeros(0), 0.0, n)
 
 
 def _values(bench: Workbench, fitted: Fitted) -> Values:

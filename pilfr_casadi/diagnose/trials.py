@@ -20,7 +20,7 @@ from .._base import InputError
 from ..data import Recording
 from ..laws import Law
 from ..simulators import Placed, Simulator
-from .evidence import FAR_RATIO, FORMULA_ERROR, Complexity
+from .evidence import FAR_RATIO, FORMULA_ERROR
 from .gates import EQUAL_RATIO, open_start
 from .offsets import Offset
 from .screen import Pair, Scored
@@ -58,8 +58,8 @@ class Trial:
         The same on all recordings.
     thorough : bool
         Whether it was fitted to convergence and to all samples.
-    complexity : Complexity, optional
-        What the laws add, once the hypothesis is kept.
+    information : array
+        See `evidence.information`.
     """
 
     laws: tuple[Placed, ...]
@@ -67,7 +67,7 @@ class Trial:
     part_mean_square: float
     mean_square: float
     thorough: bool = False
-    complexity: Complexity | None = None
+    information: np.ndarray | None = None
 
     @property
     def key(self) -> Key:
@@ -342,26 +342,34 @@ def _head(r: Recording, share: float) -> Recording:
 
 
 def select_pairs(scored: Sequence[Scored], best: int) -> list[list[Scored]]:
-    """Select the pairs worth a full fit: the best of both lists and of each port, and the laws made for a port.
+    """Select the pairs worth a full fit: the best of both lists and of each port, and some whatever their score.
 
-    These are special laws of its domain, and laws in line with its term. Their forces are so curved that a small dose
+    These are the best law of each port with a single parameter, which richer ones hide in the list, and the laws made
+    for a port: special laws of its domain, and laws in line with its term. Their forces are so curved that a small dose
     says little about them.
     """
     chosen: dict[Pair, list[Scored]] = {}
     for source in ("simulation", "observer"):
-        ports, passed = set[str](), list[Scored]()
+        ports, plain, passed = set[str](), set[str](), list[Scored]()
         for s in (s for s in scored if s.source == source):
-            if len(passed) < best or s.port not in ports or s.law.special or s.law.in_line:
+            first = s.port not in ports or (s.port not in plain and _is_plain(s.law))
+            if len(passed) < best or first or s.law.special or s.law.in_line:
                 chosen.setdefault(s.pair, [])
             if not any(_is_redundant(s, other) for other in passed):  # two forms of one law are one hypothesis
                 passed.append(s)
             ports.add(s.port)
+            plain |= {s.port} if _is_plain(s.law) else set()
     largest = dict[str, float]()  # by run, because shares of different residuals are not comparable
     for s in scored:
         largest[s.source] = max(largest.get(s.source, 0.0), s.share)
         if s.pair in chosen:
             chosen[s.pair].append(s)
     return [[s for s in found if s.share > LEAST_SHARE * largest[s.source]] or found for found in chosen.values()]
+
+
+def _is_plain(law: Law) -> bool:
+    """Tell whether a law has a single parameter."""
+    return sum(p.size for p in law.parameters().values()) == 1
 
 
 def _is_redundant(one: Scored, other: Scored) -> bool:

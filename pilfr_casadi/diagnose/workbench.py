@@ -217,16 +217,7 @@ class Workbench:
         """Make the simulation-error problem of a fitted simulator; return it and its variables at the fitted values."""
         problem = self.problem(fitted.fitted_model, fitted.engine, scored)
         states = [s for r, s in zip(self.recordings, fitted.initial, strict=True) if r.begins == "estimate"]
-        theta = np.concatenate([problem.start[: problem.n_free], *states])
-        return problem.with_state_priors(self.memory_priors(problem, theta), fitted.cost), theta
-
-    def memory_priors(self, problem: Problem, theta: np.ndarray) -> tuple[tuple[int, np.ndarray], ...]:
-        """Compute the prior of the laws' states at the beginning of each recording whose beginning is estimated.
-
-        The machine was at work before, with signals like the recorded ones. Without a prior, a law would follow a drift
-        by states that it never reaches otherwise.
-        """
-        return problem.state_priors(theta, len(self.simulator.states))
+        return problem, np.concatenate([problem.start[: problem.n_free], *states])
 
     def fit(
         self,
@@ -338,12 +329,10 @@ class Workbench:
             theta = problem.start.copy()
             if states is not None:
                 theta[n_free:] = states
-            left = 2 * problem.cost(theta)
-            if not np.isfinite(left):
+            if not np.isfinite(problem.cost(theta)):
                 if gamma == 0.0 and not path:
                     return None
                 continue
-            problem = problem.with_state_priors(self.memory_priors(problem, theta), left)
             try:
                 timed = replace(solver, time_limit=min(solver.time_limit, self.deadline - time.perf_counter()))
                 with np.errstate(all="ignore"):

@@ -289,26 +289,17 @@ class Problem:
         return other
 
     def state_priors(self, theta: Array, own: int) -> tuple[tuple[int, Array], ...]:
-        """Compute the prior covariance of each estimated initial state without its first `own` entries.
+        """Compute the prior covariance of each estimated initial state without its first `own` entries and memories.
 
-        See `state_covariance`. Returns the first variable and the covariance for each such state whose run from rest
-        at the parameters in θ does not diverge.
+        See `state_covariance`; the signal of an operator limits its memory. Returns the first variable and the
+        covariance for each such state whose run from rest at the parameters in θ does not diverge.
         """
         p, n_x, n = self.parameters(theta), self.model.n_x, self.model.n_state
-        if own >= n:
+        if own >= n_x:
             return ()
         estimated = [part for part in self._placed if part.first is not None]
         found = [(part.first, state_covariance(self.engine, part.drive, p, n_x, n - n_x)) for part in estimated]
-        return tuple((at + own, s[own:, own:]) for at, s in found if at is not None and s is not None)
-
-    def with_state_priors(self, priors: Sequence[tuple[int, Array]], noise2: float) -> Problem:
-        """Return the problem with priors around rest (`state_priors`), weighed against a mean square noise."""
-        if not priors:
-            return self
-        other = copy(self)
-        squares = [(at, noise2 * np.linalg.inv(covariance)) for at, covariance in priors]
-        other.penalties = Penalties(self.model.parameters, self.l1, self.noise, self.residuals, self.size, squares)
-        return other
+        return tuple((at + own, s[own:n_x, own:n_x]) for at, s in found if at is not None and s is not None)
 
     @property
     def size(self) -> int:

@@ -10,7 +10,6 @@ from cart import GROUND, cart
 from pilfr_casadi import Recording, multisine
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.evidence import Complexity
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.hypotheses import Findings, Hypotheses
 from pilfr_casadi.diagnose.trials import Trial
@@ -47,7 +46,7 @@ def hypothesis(tiny):
         fitted = run(*laws)
         if own:
             fitted = replace(fitted, values={**fitted.values, **fitted.simulator.elements[-1].named(own)})
-        return Trial(fitted.last_elements(len(laws)), fitted, error**2, error**2, True, Complexity(np.zeros(0), 0.0))
+        return Trial(fitted.last_elements(len(laws)), fitted, error**2, error**2, True, np.zeros(0))
 
     return make
 
@@ -63,7 +62,7 @@ def hypotheses(tiny):
     def put(*trials):
         floor = Floor(NOISE2**0.5 * bench.scale, "repeats")
         found = Hypotheses(bench, refit, floor, (), 1, Stages(lambda *_: None), count=400.0)
-        for trial in (Trial((), refit, 1.0, 1.0, True, Complexity(np.zeros(0), 0.0)), *trials):
+        for trial in (Trial((), refit, 1.0, 1.0, True, np.zeros(0)), *trials):
             found.keep(trial)
             found.findings[trial.key] = Findings(flexible={"a": 0.0, "b": 0.0})
         return found

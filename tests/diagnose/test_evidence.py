@@ -9,7 +9,7 @@ from diagnosis_rig import OFF, recordings, rig
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.evidence import WRONG_MODEL_SAMPLES, Sample, complexity, log_evidence, log_prior, spread
+from pilfr_casadi.diagnose.evidence import WRONG_MODEL_SAMPLES, Sample, information, log_evidence, log_prior, spread
 from pilfr_casadi.diagnose.verdict import share_named
 
 NONE = np.zeros(0)
@@ -68,11 +68,11 @@ def test_a_parameters_unit_does_not_change_its_information():
     train = recordings(laws.CubicStiffness(values={"k_3": 3e5}), count=1)
     bench = Workbench.of(rig(OFF), train, "zero")
     fitted = bench.fit(rig(OFF).with_element("ground-m1", laws.CubicStiffness()))
-    (told,) = complexity(bench, fitted, fitted.simulator.elements).information
+    (told,) = information(bench, fitted, fitted.simulator.elements)
     assert 0 < told <= 1  # its prior width moves the outputs by their deviation, the simulator's own follow a part
     softer = replace(bench, scale=2 * bench.scale)
-    assert complexity(softer, fitted, fitted.simulator.elements).information[0] == pytest.approx(told, rel=1e-6)
-    assert complexity(bench, fitted, ()).information.size == 0
+    assert information(softer, fitted, fitted.simulator.elements)[0] == pytest.approx(told, rel=1e-6)
+    assert information(bench, fitted, ()).size == 0
 
 
 def test_values_that_two_levels_of_an_input_hardly_determine_spread_predictions_between_them():

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pilfr_casadi.diagnose.evidence import Complexity
 from pilfr_casadi.diagnose.offsets import Offset
 from pilfr_casadi.diagnose.verdict import closest_law, explainable_remainder, posterior, share_named
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Delay, DirectionalFriction, QuadraticDrag
@@ -32,7 +31,7 @@ def search(hypotheses):
         for t, behind in costly.items():
             ratio = np.expm1(2 * (found.evidence(t) - level + behind))
             information = np.array([ratio * (t.mean_square + found.tolerance) / found.samples])
-            found.memo[t.key] = replace(t, complexity=Complexity(information, 0.0))
+            found.memo[t.key] = replace(t, information=information)
         return found
 
     return put

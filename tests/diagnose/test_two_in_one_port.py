@@ -33,8 +33,6 @@ def test_friction_and_ripple_at_one_port_are_both_named():
         (laws.ViscousDamping, laws.QuadraticDrag, False),  # both grow with speed
         (laws.CubicStiffness, laws.PiecewiseStiffness, False),  # both of position
         (laws.Relaxation, laws.CubicStiffness, False),  # it is a spring itself
-        (laws.Relaxation, laws.BoucWen, True),  # slow memory, and memory that knows no time
-        (laws.TwoStageCreep, laws.PlayHysteresis, True),
         (laws.CoulombFriction, laws.Drift, False),  # neither of position
         (laws.CoulombFriction, laws.ElasticDrive, True),  # a mass on a spring has friction as well
         (laws.CubicStiffness, laws.Attached, True),
