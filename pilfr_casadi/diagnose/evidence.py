@@ -305,9 +305,11 @@ def log_prior_of_states(bench: Workbench, fitted: Fitted) -> float:
 
     The machine was at work before, with signals like the recorded ones; see `Problem.state_priors`.
     """
+    own, total = len(bench.simulator.states), 0.0
+    if fitted.model.n_x == own or all(r.begins != "estimate" for r in bench.recordings):
+        return total
     problem, theta = bench.problem_at(fitted)
-    total = 0.0
-    for at, covariance in problem.state_priors(theta, len(bench.simulator.states)):
+    for at, covariance in problem.state_priors(theta, own):
         state = theta[at : at + len(covariance)]
         total -= 0.5 * float(state @ np.linalg.solve(covariance, state))
     return total

@@ -295,8 +295,6 @@ class Problem:
         covariance for each such state whose run from rest at the parameters in θ does not diverge.
         """
         p, n_x, n = self.parameters(theta), self.model.n_x, self.model.n_state
-        if own >= n_x:
-            return ()
         estimated = [part for part in self._placed if part.first is not None]
         found = [(part.first, state_covariance(self.engine, part.drive, p, n_x, n - n_x)) for part in estimated]
         return tuple((at + own, s[own:n_x, own:n_x]) for at, s in found if at is not None and s is not None)
