@@ -61,6 +61,12 @@ class StopHysteresis(_Hysteresis):
     def parameters(self) -> dict[str, Parameter]:
         """Parameters with start values and limits; weights and thresholds are vectors (n,)."""
         given = {"w": 0.0, "r": np.linspace(0.1, 1, self.n), **self.values}
+        for name in ("w", "r"):
+            if np.shape(given[name]) not in ((), (1,), (self.n,)):
+                raise InputError(
+                    f"The law {self.id!r} ({self.form}) has {self.n} values of {name}; {np.size(given[name])} were given. "
+                    "Give one number for all, or one for each."
+                )
         vectors = {name: np.broadcast_to(np.asarray(given[name], dtype=float), (self.n,)) for name in ("w", "r")}
         whole = replace(self, values={**given, **vectors}, limits={"r": (0.0, np.inf), **self.limits})
         return super(StopHysteresis, whole).parameters()

@@ -334,6 +334,12 @@ def test_values_that_a_law_cannot_have(given, says):
         Clearance(**given)
 
 
+def test_a_layer_refuses_weights_for_another_number_of_plays():
+    with pytest.raises(InputError, match=r"has 6 values of w; 3 were given. Give one number for all, or one for each."):
+        StopHysteresis().at({"w": [1.0, 2.0, 3.0]}).parameters()
+    assert StopHysteresis().at({"w": 2.0}).parameters()["w"].value == pytest.approx(np.full(6, 2.0))
+
+
 def test_hysteresis_behind_a_gap_keeps_the_gap():
     law = behind_gap(StopHysteresis)()
     assert list(law.at(next(iter(law.shapes(LOCAL)))).parameters()) == ["w", "r", "g"]
