@@ -167,7 +167,7 @@ def _waves(m: int, dt: float) -> Iterator[tuple[str, float, np.ndarray]]:
 
 def _describe_experiment(bench: Workbench, best: Mapping[str, Any], recorded: float) -> str:
     """Describe an experiment; `recorded` is the separation in the recordings."""
-    unit = bench.recordings[0].units.get(best["input"], "")
+    unit = {**bench.simulator.units, **bench.recordings[0].units}.get(best["input"], "")
     so_far = f"by {recorded:.2g} times" if recorded > VISIBLE_DIFFERENCE else "not at all"
     return (
         f"A {best['waveform']} of {best['frequency']:.3g} Hz with amplitude {best['amplitude']:.3g}"

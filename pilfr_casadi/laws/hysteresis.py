@@ -64,8 +64,8 @@ class StopHysteresis(_Hysteresis):
         for name in ("w", "r"):
             if np.shape(given[name]) not in ((), (1,), (self.n,)):
                 raise InputError(
-                    f"The law {self.id!r} ({self.form}) has {self.n} values of {name}; {np.size(given[name])} were given. "
-                    "Give one number for all, or one for each."
+                    f"The law {self.id!r} ({self.form}) has {self.n} values of {name}; {np.size(given[name])} were "
+                    "given. Give one number for all, or one for each."
                 )
         vectors = {name: np.broadcast_to(np.asarray(given[name], dtype=float), (self.n,)) for name in ("w", "r")}
         whole = replace(self, values={**given, **vectors}, limits={"r": (0.0, np.inf), **self.limits})

@@ -10,7 +10,8 @@ from diagnosis_example import example, recorded, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
-from pilfr_casadi.diagnose import BlindSpot
+from pilfr_casadi.diagnose import BlindSpot, Workbench
+from pilfr_casadi.diagnose.proof import next_experiment
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness
 from pilfr_casadi.models import Parameter
 from pilfr_casadi.report import diagnosis_report
@@ -171,3 +172,14 @@ def test_a_free_vector_parameter_is_diagnosed_to_the_end(tmp_path):
     assert any("c[1] (4.5) came out at its bound" in note for note in found.warnings())
     page = found.report(tmp_path)
     assert "c[1]" in page.read_text() and json.loads((tmp_path / "diagnosis.json").read_text())["parameters"]["c"]
+
+
+def test_the_next_experiment_has_a_unit_that_the_simulator_knows():
+    """Recordings without units are in those of the simulator."""
+    r = recorded(HIDDEN, 0, samples=200)
+    known = replace(rig(), units={"force": "N"})
+    bench = Workbench.of(known, [r.with_(units={})], "zero")
+    stiffening = known.with_element("ground", CubicStiffness().at({"k_3": 2.0e4}))
+    both = [bench.run(s, {k: p.value for k, p in s.parameters.items()}, [np.zeros(2)]) for s in (known, stiffening)]
+    found = next_experiment(bench, *both, noise=1e-3 * bench.scale)
+    assert " N at force separates them best" in found["sentence"]
