@@ -77,7 +77,7 @@ AS_GIVEN_RATIO = 0.5  # largest ratio of mean squares of a search with channels 
 # Noise, by rms ratios to the noise and by shares of an output's deviation
 AT_NOISE_RATIO = 1.15  # ratio to the noise that counts as at the noise
 WHITE_NOISE_RATIO = 4.0  # largest ratio of an error that is noise to the estimated (white) noise
-COLOURED_NOISE_RATIO = 20.0  # the same if no force explains its innovations: that of first-order noise with a pole of 0.996
+COLOURED_NOISE_RATIO = 20.0  # the same if no force explains it: that of first-order noise with a pole of 0.996
 LOUDEST_NOISE = 0.05  # share of the deviation above which an error is not sensor noise
 NEGLIGIBLE_ERROR = 0.01  # share of the deviation below which an error does not matter
 EXPLAINED_NOISE = 0.01  # largest share of noise that a force may explain
