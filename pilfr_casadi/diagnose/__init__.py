@@ -9,7 +9,7 @@ about. The files by stage:
   `preparation` checks the recordings. A check corrects a fault where it finds one; `gates` is what a finding is and
   when it is accepted. The faults: `channel_faults` (sign, unit or gain, exchange), `offsets`, `recording_faults`
   (glitches, stale and clipped samples, unsettled periods, tones), `timing` (shift, clock) and `lost_samples`. `floor`
-  estimates the noise.
+  estimates the noise, and `coloured_noise` tells slow noise from missing physics.
 - Long recordings: `stretches` chooses what the search sees of them, and fits the leading hypotheses to everything.
 - Search: `hypotheses` keeps what was fitted, with its evidence. `search` moves from one hypothesis to others.
   `linearise`, `screen` and `relatives` select those that are worth a fit, `trials` fits them. `learned` fits forces

@@ -1,7 +1,8 @@
 """The posterior of all answers, from the log evidences of all fitted hypotheses, and the verdict that follows.
 
 A hypothesis with laws has a probability in proportion to its evidence. The simulator alone claims that its whole error
-is noise; so it is weighed with samples that count in full (`hypotheses.Hypotheses.optimistic_evidence`).
+is noise; so it is weighed with samples that count in full (`hypotheses.Hypotheses.optimistic_evidence`), and where that
+noise may be slow, with its innovations (`hypotheses.Hypotheses.evidence_in_noise`).
 
 The right law leaves little of the mismatch for a flexible force to explain. Let s be the share of the mismatch that the
 law leaves and that a flexible force at some port would explain. The density of s is
