@@ -325,11 +325,16 @@ def _log_share(law: str, there: Sequence[Law], domain: str) -> float:
     return float((DOMAIN_PRIOR if law in own else 0.0) - np.log(max(total, 1.0)))
 
 
-def log_evidence(v: float, information: np.ndarray, prior: float, n: float) -> float:
+def log_evidence(v: float, information: np.ndarray | None, prior: float, n: float) -> float:
     """Compute log Z from the mean square error v; see the module docstring."""
     if not np.isfinite(v):
         return -np.inf
-    return float(-0.5 * n * np.log(v) - 0.5 * np.sum(np.log1p(n * information / v)) + prior)
+    return float(-0.5 * n * np.log(v) - log_occam(v, information, n) + prior)
+
+
+def log_occam(v: float, information: np.ndarray | None, n: float) -> float:
+    """Compute what a law's parameters cost: the log ratio of prior to posterior widths, if the information is known."""
+    return 0.0 if information is None else float(0.5 * np.sum(np.log1p(n * information / v)))
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from .evidence import (
     held_out_errors,
     information,
     log_evidence,
+    log_occam,
     log_prior,
     log_prior_of_states,
     spread,
@@ -178,8 +179,7 @@ class Hypotheses:
         return float(np.median(ratios)) if ratios else 1.0
 
     def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
-        known = trial.information if trial.information is not None else np.zeros(0)
-        return log_evidence(v + self.tolerance, known, self.log_prior(trial), n)
+        return log_evidence(v + self.tolerance, trial.information, self.log_prior(trial), n)
 
     def log_prior(self, trial: Trial) -> float:
         """Compute the log prior probability of a hypothesis."""
@@ -278,9 +278,7 @@ class Hypotheses:
         if known.likelihood is None:
             known.likelihood = log_likelihood(residuals) + log_prior_of_states(self.bench, trial.fitted)
         n = sum(e.size for e in residuals)
-        information = trial.information if trial.information is not None else np.zeros(0)
-        occam = 0.5 * float(np.sum(np.log1p(n * information / trial.mean_square)))
-        return known.likelihood - occam + self.log_prior(trial)
+        return known.likelihood - log_occam(trial.mean_square, trial.information, n) + self.log_prior(trial)
 
     def screened(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
         """Score every port and law beside a hypothesis; see `screen`."""
@@ -367,7 +365,7 @@ class Hypotheses:
 
     def scored_residuals(self, trial: Trial) -> list[np.ndarray]:
         """Return the residual of each recording (M, n_y) without the samples that do not count."""
-        return [e[r.skip :] for e, r in zip(trial.fitted.residual, self.bench.recordings, strict=True)]
+        return self.bench.scored(trial.fitted.residual)
 
     def rms(self, trial: Trial) -> np.ndarray:
         """Compute the rms error of each output, (n_y,)."""
@@ -455,5 +453,4 @@ def likeliest(trials: Sequence[Trial], evidence: Callable[[Trial], float]) -> li
 
 def count_samples(fitted: Fitted, bench: Workbench) -> float:
     """Compute the number of samples over the correlation time of a fit's residual."""
-    residual = [e[r.skip :] for e, r in zip(fitted.residual, bench.recordings, strict=True)]
-    return max(effective_size(residual), FEWEST)
+    return max(effective_size(bench.scored(fitted.residual)), FEWEST)

@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import one_at_a_time
-from ..data import Recording, revolution_in
+from ..data import Recording
 from ..laws import Law, Local
 from ..linear import steady_state_gain, with_output_injection
 from ..models import Model, map_points
@@ -361,7 +361,7 @@ def _with_equations(
         local,
         readers=simulator.readers(port),
         term=term_along if term is not None else None,
-        revolution=revolution_in(port.across_unit),
+        revolution=port.revolution,
     )
 
 

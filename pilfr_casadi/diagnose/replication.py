@@ -147,7 +147,7 @@ def replicate(
     after = _refine_steps(bench, after)
     alone, values = _fit_each_recording(bench, after)
     _raise_if_interrupted(bench)
-    residuals = tuple((e / bench.scale)[r.skip :] for e, r in zip(alone, bench.recordings, strict=True))
+    residuals = tuple(e / bench.scale for e in bench.scored(alone))
     noise2 = _noise2(bench, residuals)
     square = float(np.mean(np.concatenate(residuals) ** 2))
     total = sum(e.size for e in residuals)

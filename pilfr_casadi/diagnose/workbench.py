@@ -396,6 +396,10 @@ class Workbench:
         initial = self.initial_states(model, vector, states)
         return self.result(simulator, model.parameters.unpack(vector), initial, engine, model)
 
+    def scored(self, residual: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Return the residual of each recording (M, n_y) without the samples that do not count."""
+        return [e[r.skip :] for e, r in zip(residual, self.recordings, strict=True)]
+
     def result(
         self,
         simulator: Simulator,
@@ -409,8 +413,7 @@ class Workbench:
         with np.errstate(over="ignore", invalid="ignore"):  # a diverging run has an infinite cost
             runs = zip(self.recordings, initial, strict=True)
             residual = [engine.simulate(model.drive(r), vector, state)[0] - r.y for r, state in runs]
-            scored = [(e / self.scale)[r.skip :] for e, r in zip(residual, self.recordings, strict=True)]
-            cost = float(np.mean(np.concatenate(scored) ** 2))
+            cost = float(np.mean((np.concatenate(self.scored(residual)) / self.scale) ** 2))
         return Fitted(simulator, model, engine, values, initial, residual, cost)
 
 
@@ -447,8 +450,8 @@ def refine_steps(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
 
 def _difference2(bench: Workbench, one: Fitted, other: Fitted) -> float:
     """Compute the mean square of the difference of two runs."""
-    both = zip(one.residual, other.residual, bench.recordings, strict=True)
-    return float(np.mean(np.concatenate([((a - b) / bench.scale)[r.skip :] for a, b, r in both]) ** 2))
+    moved = [a - b for a, b in zip(one.residual, other.residual, strict=True)]
+    return float(np.mean((np.concatenate(bench.scored(moved)) / bench.scale) ** 2))
 
 
 def converge(bench: Workbench, fitted: Fitted, seconds: float) -> Fitted:

@@ -167,6 +167,12 @@ class Port:
         before, per_second, after = self.across_unit.rpartition("/s")
         return before if per_second and not after else f"{self.across_unit} s"
 
+    @property
+    def revolution(self) -> float:
+        """One revolution in the unit of z; nan if z is no angle. A position without a unit may be an angle in rad."""
+        position = not (self.across_unit or self.is_speed or self.series) and self.domain in (MECHANICAL, UNKNOWN)
+        return revolution_in("rad" if position else self.across_unit)
+
     def has_term_for(self, law: Any) -> bool:
         """Tell whether it has the force that a law in line needs: its own term, or that of a drive."""
         return self.term is not None and (law.driven or not self.implied)
@@ -181,7 +187,7 @@ class Port:
             return False
         if law.in_line and not self.has_term_for(law):
             return False
-        if law.angular and np.isnan(revolution_in(self.across_unit)):
+        if law.angular and np.isnan(self.revolution):
             return False
         if not self.kinds & set(law.places) or (law.across and not may_convert(self.across_unit, law.across)):
             return False

@@ -14,7 +14,7 @@ TONES = ((0.8, 0.13), (0.35, 0.37), (0.25, 0.8), (0.2, 1.3))  # N m, Hz
 TRIED = (laws.LinearStiffness, laws.CubicStiffness, laws.QuinticStiffness, laws.PeriodicForce, laws.Gravity)
 
 
-def arm(gravity):
+def arm(gravity, unit="rad"):
     return Simulator(
         lambda x, u, p: {"angle": x.speed, "speed": (u.torque - gravity(x, p) - p.d * x.speed) / p.J},
         lambda x: {"encoder": x.angle},
@@ -26,7 +26,12 @@ def arm(gravity):
             "G": Parameter(1.2, bounds=(0, 5)),
         },
         ports=Port(
-            "joint", lambda p: {"speed": -1 / p.J}, lambda x: x.angle, lambda x: x.speed, unit="N m", across_unit="rad"
+            "joint",
+            lambda p: {"speed": -1 / p.J},
+            lambda x: x.angle,
+            lambda x: x.speed,
+            unit="N m" if unit else "",
+            across_unit=unit,
         ),
     )
 
@@ -51,9 +56,11 @@ def recorded(hang, seed):
     return Recording(torque[:, None], y[:, None], DT, ("torque",), ("encoder",), initial="zero", hold="zero")
 
 
-@pytest.mark.parametrize(("hang", "law"), [(0.0, laws.Gravity), (0.4, laws.WholeGravity)])
-def test_gravity_is_named_where_small_angles_are_left_and_where_it_was_forgotten(hang, law):
-    simulator = arm((lambda x, p: p.G * x.angle) if not hang else (lambda x, p: 0 * p.G))
+@pytest.mark.parametrize(
+    ("hang", "law", "unit"), [(0.0, laws.Gravity, "rad"), (0.4, laws.WholeGravity, "rad"), (0.0, laws.Gravity, "")]
+)
+def test_gravity_is_named_where_small_angles_are_left_and_where_it_was_forgotten(hang, law, unit):
+    simulator = arm((lambda x, p: p.G * x.angle) if not hang else (lambda x, p: 0 * p.G), unit)
     train, test = ([recorded(hang, seed) for seed in seeds] for seeds in ((1, 2), (3,)))
     found = pilfr.diagnose(simulator, train, test=test, laws=[*TRIED, law], workers=1)
     (effect,) = found.effects
