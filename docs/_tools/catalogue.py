@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 from dataclasses import replace
 from itertools import groupby
@@ -50,15 +49,16 @@ def motion() -> Local:
     fade = np.clip((t - 2) / 0.5, 0, 1)
     fade = fade**2 * (3 - 2 * fade)  # no jump of the rate
     z = (1 - 0.65 * fade) * np.sin(2 * np.pi * t) + 0.25 * fade
-    limits = {"max_stiffness": 1e4, "max_damping": 1e2, "revolution": 2 * np.pi}
-    return Local(z=z, dz=np.gradient(z, dt), dt=dt, lengths=(len(t),), **limits)
+    return Local(
+        z=z, dz=np.gradient(z, dt), dt=dt, lengths=(len(t),), max_stiffness=1e4, max_damping=1e2, revolution=2 * np.pi
+    )
 
 
 def motion_of(law: type[Law], local: Local) -> Local:
     """The motion that a law is shown on: temperatures in K for radiation, and a term for a law in line with it."""
     if law.in_line:
         drive = -np.cos(7 * local.dt * np.arange(len(local.z)))
-        return replace(local, shown=True, term=lambda z, dz: drive if law.order == 2 else z + 0.05 * dz)
+        return replace(local, readers=(law.seen_by, "y"), term=lambda z, dz: drive if law.order == 2 else z + 0.05 * dz)
     if law.id != "radiation":
         return local
     return replace(local, z=WARM * local.z + (HOT if law.form == "absolute" else 0.0), dz=WARM * local.dz)
@@ -248,7 +248,7 @@ def build() -> None:
     for law_id, laws in by_id.items():
         write(f"laws/{law_id}.rst", page(law_id, laws, alike))
     text = [heading("Laws"), INTRODUCTION]
-    kind = {law_id: KINDS[inspect.getmodule(laws[0]).__name__.rpartition(".")[2]] for law_id, laws in by_id.items()}
+    kind = {law_id: KINDS[laws[0].__module__.rpartition(".")[2]] for law_id, laws in by_id.items()}
     for name, ids in groupby(by_id, kind.__getitem__):
         rows = [(link(i), by_id[i][0].sentence, f"``{by_id[i][0].equation}``") for i in ids]
         text += [heading(name, "-"), table(("law", "says", "equation of the first form"), rows, "20 40 40")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
@@ -33,7 +34,7 @@ def heading(text: str, line: str = "=") -> str:
     return f"{text}\n{line * len(text)}\n"
 
 
-def table(header: tuple[str, ...], rows: list[tuple[str, ...]], widths: str = "auto") -> str:
+def table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]], widths: str = "auto") -> str:
     """Write a table of reStructuredText."""
     lines = [".. list-table::", "   :header-rows: 1", f"   :widths: {widths}", ""]
     for row in (header, *rows):

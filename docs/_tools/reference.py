@@ -40,7 +40,7 @@ def entries(folder: str) -> tuple[list[str], list[str]]:
     own = [n for n in pilfr.__all__ if not inspect.ismodule(getattr(pilfr, n)) and n != "__version__"]
     own = sorted((n for n in own if origin(n) == folder), key=str.lower)
     face = importlib.import_module(f"pilfr_casadi.{folder}")
-    more = [n for n in face.__all__ if n not in own and documented(getattr(face, n), folder, n)]
+    more = [n for n in vars(face)["__all__"] if n not in own and documented(getattr(face, n), folder, n)]
     return own, sorted(more, key=str.lower)
 
 
