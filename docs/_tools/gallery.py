@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from matplotlib.figure import Figure
 FOLDER = DOCS.parent / "examples" / "gallery"
 SCRIPTS = sorted(FOLDER.glob("plot_*.py"))
 STORED = {path.stem: sorted(FOLDER.glob(f"{path.stem}*.png")) for path in SCRIPTS if path.with_suffix(".png").exists()}
+SHOWN = weakref.WeakSet[Figure]()  # a script has its figures in all blocks after the one that made them
 RUN = [path.name for path in SCRIPTS if path.stem not in STORED]
 SETTINGS = {
     "examples_dirs": str(FOLDER),
@@ -46,8 +48,8 @@ def scrape_figures(block: Any, block_vars: dict[str, Any], gallery_conf: dict[st
     paths = []
     for value in list(block_vars["example_globals"].values()):
         figure = value.figure if isinstance(value, Axes) else value
-        if isinstance(figure, Figure) and not hasattr(figure, "number") and not hasattr(figure, "shown"):
-            figure.shown = True
+        if isinstance(figure, Figure) and not hasattr(figure, "number") and figure not in SHOWN:
+            SHOWN.add(figure)
             paths.append(next(block_vars["image_path_iterator"]))
             figure.savefig(paths[-1], dpi=110)
     return figure_rst(paths, gallery_conf["src_dir"])
