@@ -37,10 +37,10 @@ def origin(name: str) -> str:
 
 def entries(folder: str) -> tuple[list[str], list[str]]:
     """Names of the package that live in a folder, and names that are reached through the folder."""
-    own = [n for n in pilfr.__all__ if not inspect.ismodule(getattr(pilfr, n)) and n != "__version__"]
+    own = [n for n in vars(pilfr)["__all__"] if not inspect.ismodule(getattr(pilfr, n)) and n != "__version__"]
     own = sorted((n for n in own if origin(n) == folder), key=str.lower)
     face = importlib.import_module(f"pilfr_casadi.{folder}")
-    more = [n for n in vars(face)["__all__"] if n not in own and documented(getattr(face, n), folder, n)]
+    more = [n for n in face.__all__ if n not in own and documented(getattr(face, n), folder, n)]
     return own, sorted(more, key=str.lower)
 
 
