@@ -45,6 +45,7 @@ html_theme_options = {
     "navbar_persistent": ["search-button"],
     "navbar_end": ["theme-switcher"],
     "show_prev_next": False,
+    "collapse_navigation": True,  # its toggles would have no names for a screen reader
     "secondary_sidebar_items": {"**": ["page-toc"], "index": []},
     "article_header_start": [],
     "footer_start": ["copyright"],
