@@ -17,7 +17,8 @@ import numpy as np
 
 ORDERS = (0, 1, 2, 4, 8)  # that are tried; a higher order also predicts a sine, which no noise is
 MOST_ROWS = 50_000  # samples to which coefficients are fitted
-FEWEST_PER_COEFFICIENT = 10  # samples of the shortest recording
+FEWEST_PER_COEFFICIENT = 10  # samples of all recordings that are long enough
+LEAST_LENGTH = 2  # of a recording that counts, in orders
 
 
 def whitening_filters(residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -49,8 +50,8 @@ def whiten(columns: np.ndarray, filters: Sequence[np.ndarray], lengths: Sequence
 
 def _likeliest(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
     """Return the filter of the order with the least BIC, and its log likelihood less its cost."""
-    most = [p for p in ORDERS if p * FEWEST_PER_COEFFICIENT <= min(map(len, columns))]
-    first = most[-1]
+    first = max(p for p in ORDERS if p * FEWEST_PER_COEFFICIENT <= sum(map(len, _long_enough(columns, p))))
+    columns, most = _long_enough(columns, first), [p for p in ORDERS if p <= first]
     n = sum(len(e) - first for e in columns)
     found = []
     for p in most:
@@ -59,6 +60,11 @@ def _likeliest(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
         logs = [(len(e) - first) * np.log(max(v, 1e-300)) for e, v in zip(columns, variances, strict=True)]
         found.append((taps, -0.5 * float(sum(logs) + p * np.log(n))))
     return max(found, key=lambda one: one[1])
+
+
+def _long_enough(columns: Sequence[np.ndarray], p: int) -> list[np.ndarray]:
+    """Select the recordings that say something about the order p."""
+    return [e for e in columns if len(e) >= max(LEAST_LENGTH * p, 1)]
 
 
 def _taps(columns: Sequence[np.ndarray], p: int, first: int) -> np.ndarray:

@@ -81,7 +81,8 @@ COLOURED_NOISE_RATIO = 20.0  # the same if no force explains it: that of first-o
 LOUDEST_NOISE = 0.05  # share of the deviation above which an error is not sensor noise
 NEGLIGIBLE_ERROR = 0.01  # share of the deviation below which an error does not matter
 EXPLAINED_NOISE = 0.01  # largest share of noise that a force may explain
-EXPLAINED_QUIET_NOISE = 0.05  # the same of noise that does not matter
+EXPLAINED_QUIET_NOISE = 0.05  # the same of noise that does not matter, and of innovations
+MOST_INNOVATIONS = 0.5  # share of a residual's innovations that a force explains from which it is no noise
 LEAST_EXPLAINED = 0.1  # least share of a residual that a flexible force has to explain to count
 
 LEAST_KNOWN = 1e-12  # eigenvalue of the scaled information, over the largest, below which a combination is unknown
@@ -303,15 +304,15 @@ def log_prior(
 def log_prior_of_states(bench: Workbench, fitted: Fitted) -> float:
     """Compute the log prior density of the estimated states in which laws begin, relative to the largest.
 
-    The machine was at work before, with signals like the recorded ones; see `Problem.state_priors`.
+    The machine was at work before, with signals like the recorded ones or others; so the density is that of Cauchy,
+    whose tail is heavy, with the covariance of `Problem.state_priors`. States are counted from rest.
     """
     own, total = len(bench.simulator.states), 0.0
     if fitted.model.n_x == own or all(r.begins != "estimate" for r in bench.recordings):
         return total
     problem, theta = bench.problem_at(fitted)
-    for at, covariance in problem.state_priors(theta, own):
-        state = theta[at : at + len(covariance)]
-        total -= 0.5 * float(state @ np.linalg.solve(covariance, state))
+    for state, covariance in problem.state_priors(theta, own):
+        total -= 0.5 * (1 + len(state)) * np.log1p(float(state @ np.linalg.solve(covariance, state)))
     return total
 
 

@@ -132,8 +132,9 @@ def white_part(residuals: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def times_white(residual: np.ndarray) -> float:
-    """Compute the ratio of a residual's rms to that of the white noise in it, over all outputs."""
-    return float(np.sqrt(np.mean(residual**2) / max(float(np.mean(white_part([residual]) ** 2)), 1e-300)))
+    """Compute the ratio of a residual's rms to that of the white noise in it, the largest of all outputs."""
+    rms, white = np.sqrt(np.mean(residual**2, axis=0)), white_part([residual])
+    return float(np.max(rms / np.maximum(white, 1e-9 * np.max(rms, initial=1e-300))))
 
 
 def effective_size(residuals: Sequence[np.ndarray]) -> float:

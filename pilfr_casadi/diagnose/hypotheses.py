@@ -56,8 +56,8 @@ class Findings:
         The share of the residual that a flexible force at each port explains.
     innovations : float, optional
         The share of the residual's innovations that it explains.
-    likelihood : float, optional
-        The log likelihood of its residual as coloured noise and of its first states.
+    likelihood : tuple of float, optional
+        The log likelihood of a sample of its residual as coloured noise, and the log prior density of its first states.
     learned : list of Fitted, optional
         The learned forces beside it, best first.
     held_out : HeldOut, optional
@@ -67,7 +67,7 @@ class Findings:
     screened: tuple[list[Scored], np.ndarray | None] | None = None
     flexible: dict[str, float] | None = None
     innovations: float | None = None
-    likelihood: float | None = None
+    likelihood: tuple[float, float] | None = None
     learned: list[Fitted] | None = None
     held_out: HeldOut | None = None
 
@@ -173,10 +173,13 @@ class Hypotheses:
         return self._log_evidence(trial, v, self.samples)
 
     def _held_out_ratio(self) -> float:
-        """Compute the usual ratio of held-out to fit error (mean squares), for hypotheses that were not predicted."""
+        """Compute the usual ratio of held-out to fit error (mean squares), for hypotheses that were not predicted.
+
+        Of two ratios the smaller is usual: one hypothesis that predicts badly says nothing about the others.
+        """
         known = [(self.findings[key].held_out, trial.mean_square) for key, trial in self.memo.items()]
         ratios = [h.error**2 / fit for h, fit in known if h and np.isfinite(h.error) and fit > 0]
-        return float(np.median(ratios)) if ratios else 1.0
+        return float(np.quantile(ratios, 0.5, method="lower")) if ratios else 1.0
 
     def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
         return log_evidence(v + self.tolerance, trial.information, self.log_prior(trial), n)
@@ -270,15 +273,21 @@ class Hypotheses:
         return known.innovations
 
     def evidence_in_noise(self, trial: Trial) -> float:
-        """Compute the log evidence of a hypothesis whose residual is coloured noise; all samples count.
+        """Compute the log evidence of a hypothesis whose residual is coloured noise.
 
-        A law would follow slow noise by a first state that it never reaches otherwise, so that counts as well.
+        Its innovations count as far as white noise would. A law would follow slow noise by a first state that it never
+        reaches otherwise, so that counts as well.
         """
+        if not np.isfinite(trial.mean_square):
+            return -np.inf
         known, residuals = self.findings[trial.key], self.scored_residuals(trial)
+        size = sum(e.size for e in residuals)
+        n = replace(self.sample, count=size).effective(0.0)
         if known.likelihood is None:
-            known.likelihood = log_likelihood(residuals) + log_prior_of_states(self.bench, trial.fitted)
-        n = sum(e.size for e in residuals)
-        return known.likelihood - log_occam(trial.mean_square, trial.information, n) + self.log_prior(trial)
+            known.likelihood = log_likelihood(residuals) / size, log_prior_of_states(self.bench, trial.fitted)
+        likelihood, states = known.likelihood
+        occam = log_occam(trial.mean_square, trial.information, n)
+        return n * likelihood + states - occam + self.log_prior(trial)
 
     def screened(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
         """Score every port and law beside a hypothesis; see `screen`."""

@@ -262,21 +262,33 @@ def folds(recordings: Sequence[Recording], windows: Sequence[slice]) -> np.ndarr
 
 def held_out(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: Sequence[float] = RIDGES[:1]) -> float:
     """Compute the share of `left` that the columns explain on blocks that they were not fitted to."""
+    rest = _held_out_rest(phi, left, odd, ridges)
+    return max(0.0, 1 - float(rest @ rest) / max(float(left @ left), 1e-300))
+
+
+def _held_out_rest(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: Sequence[float]) -> np.ndarray:
+    """Compute what the columns leave of `left` on blocks that they were not fitted to, with the best penalty."""
     size = lengths(phi)
     if not np.any(size > 0):
-        return 0.0
+        return left
     phi = phi[:, size > 0] / size[size > 0]
-    wrong = min(float(held_out_squares(phi, left, odd, ridge)) for ridge in ridges)
-    return max(0.0, 1 - wrong / max(float(left @ left), 1e-300))
+    return min((held_out_rest(phi, left, odd, ridge) for ridge in ridges), key=lambda rest: float(rest @ rest))
 
 
 def held_out_squares(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> np.ndarray:
-    """Compute the sum of squares on every second block by coefficients fitted to the others, and vice versa.
+    """Compute the sum of squares of the rest on held-out blocks, for each column of `left`."""
+    return np.asarray(np.sum(held_out_rest(phi, left, odd, ridge) ** 2, axis=0))
 
-    `left` is one column (R,) or several (R, k), each with its own sum.
+
+def held_out_rest(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> np.ndarray:
+    """Compute the rest on every second block with coefficients fitted to the others, and vice versa.
+
+    `left` is one column (R,) or several (R, k).
     """
-    parts = ((fold, ~fold) for fold in (odd, ~odd))
-    return sum(np.sum((left[b] - phi[b] @ ridge_solution(phi[a], left[a], ridge)) ** 2, axis=0) for a, b in parts)
+    rest = np.empty_like(left)
+    for a, b in ((odd, ~odd), (~odd, odd)):
+        rest[b] = left[b] - phi[b] @ ridge_solution(phi[a], left[a], ridge)
+    return rest
 
 
 def ridge_solution(a: np.ndarray, b: np.ndarray, ridge: float) -> np.ndarray:
@@ -491,15 +503,21 @@ def innovation_share(bench: Workbench, fitted: Fitted) -> float:
     """Compute the largest held-out share that a force at any port explains of the residual's innovations.
 
     A force seems to explain slow noise on held-out blocks, because a block is known from its neighbours. The
-    innovations have no such neighbours; see `coloured_noise`.
+    innovations have no such neighbours; see `coloured_noise`. The noise is what the force leaves (Cochrane & Orcutt
+    1949): a filter made for the whole residual would also predict slow physics.
     """
     rest, n_y = _remainder_for_flexible_forces(bench, fitted), bench.recordings[0].n_y
     sizes = [len(r.z) for r in rest.runs]
-    filters = whitening_filters(np.split(rest.left.reshape(-1, n_y), np.cumsum(sizes)[:-1]))
-    base = orthonormal(whiten(rest.base, filters, sizes))
-    left = project_off(whiten(rest.left[:, None], filters, sizes)[:, 0], base)
-    columns = (project_off(whiten(rest.columns(task)[0], filters, sizes), base) for task in rest.tasks)
-    return max((held_out(phi, left, rest.odd, RIDGES) for phi in columns), default=0.0)
+    found = [0.0]
+    for task in rest.tasks:
+        phi = rest.columns(task)[0]
+        noise = _held_out_rest(phi, rest.left, rest.odd, RIDGES)
+        noise = noise if noise @ noise < rest.left @ rest.left else rest.left
+        filters = whitening_filters(np.split(noise.reshape(-1, n_y), np.cumsum(sizes)[:-1]))
+        base = orthonormal(whiten(rest.base, filters, sizes))
+        left, phi = (project_off(whiten(a, filters, sizes), base) for a in (rest.left[:, None], phi))
+        found.append(held_out(phi, left[:, 0], rest.odd, RIDGES))
+    return max(found)
 
 
 def _remainder_for_flexible_forces(bench: Workbench, fitted: Fitted) -> Remainder:

@@ -344,9 +344,9 @@ def _head(r: Recording, share: float) -> Recording:
 def select_pairs(scored: Sequence[Scored], best: int) -> list[list[Scored]]:
     """Select the pairs worth a full fit: the best of both lists and of each port, and some whatever their score.
 
-    These are the best law of each port with a single parameter, which richer ones hide in the list, and the laws made
-    for a port: special laws of its domain, and laws in line with its term. Their forces are so curved that a small dose
-    says little about them.
+    These are the best law of each port with a single free parameter, which richer ones hide in the list, and the laws
+    made for a port: special laws of its domain, and laws in line with its term. Their forces are so curved that a small
+    dose says little about them.
     """
     chosen: dict[Pair, list[Scored]] = {}
     for source in ("simulation", "observer"):
@@ -368,8 +368,8 @@ def select_pairs(scored: Sequence[Scored], best: int) -> list[list[Scored]]:
 
 
 def _is_plain(law: Law) -> bool:
-    """Tell whether a law has a single parameter."""
-    return sum(p.size for p in law.parameters().values()) == 1
+    """Tell whether a law has a single free parameter."""
+    return sum(int(np.sum(~np.broadcast_to(p.fixed, p.size))) for p in law.parameters().values()) == 1
 
 
 def _is_redundant(one: Scored, other: Scored) -> bool:

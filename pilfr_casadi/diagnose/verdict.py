@@ -41,6 +41,7 @@ from .evidence import (
     LEAST_EXPLAINED,
     LEAST_MODEL_ERROR,
     LOUDEST_NOISE,
+    MOST_INNOVATIONS,
     NEAR_RATIO,
     NEGLIGIBLE_ERROR,
     OUTSIDE_CATALOGUE,
@@ -240,11 +241,13 @@ def _weights(search: Hypotheses, trials: Sequence[Trial]) -> np.ndarray:
     be slow, its innovations count. Laws claim only to be near the physics; they are weighed by samples that count as
     far as their error is noise.
     """
-    against_noise = search.evidence_in_noise if may_be_coloured_noise(search) else search.optimistic_evidence
     tempered = np.array([search.evidence(t) for t in trials])
     alone = np.array([not names(t) for t in trials])
-    near = alone | (tempered > max(tempered[~alone], default=0.0) - CONTENDING_NATS)
-    full = np.array([against_noise(t) if one else -np.inf for t, one in zip(trials, near, strict=True)])
+    if _is_slow_noise(search):
+        near = alone | (tempered > max(tempered[~alone], default=0.0) - CONTENDING_NATS)
+        full = np.array([search.evidence_in_noise(t) if one else -np.inf for t, one in zip(trials, near, strict=True)])
+    else:
+        full = np.array([search.optimistic_evidence(t) for t in trials])
     nothing = float(np.sum(_shares(full)[alone]))
     weights = np.empty(len(trials))
     weights[alone] = nothing * _shares(full[alone])
@@ -313,23 +316,26 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
     shares = search.flexible(search.root)
     share = max(shares.values(), default=0.0)
     slow = share > EXPLAINED_NOISE and may_be_coloured_noise(search)
-    if slow:  # a force seems to explain some of slow noise
+    if slow:  # a force always seems to explain some of slow noise
         share = search.innovation_share(search.root)
+    matters = not slow and search.root.mean_square > NEGLIGIBLE_ERROR**2
+    explained = share > (EXPLAINED_NOISE if matters else EXPLAINED_QUIET_NOISE)
     unnamed = not found.effects
     steady = [g for g in gates if g.finding == "tone" and unnamed]
     mode = find_ringing_mode(search.bench, search.root.fitted)
     quiet = max(1 - sum(1 - g.left for g in steady), 0.0) ** 0.5  # share of the error that is left without the tones
     measured = unnamed and search.floor.may_be(quiet * search.rms(search.root))
-    noise = unnamed and (measured or _is_noise(search, quiet, share, mode))
+    noise = unnamed and (measured or _is_noise(search, quiet, explained, mode))
+    noise = noise and (measured or share < LEAST_EXPLAINED)
     if faults and (noise or cured):
         return Verdict("recording-fault", faults[0].sentence)
-    if noise and (measured or share < LEAST_EXPLAINED):
+    if noise:
         beside = f" but a steady tone in {' and '.join(g.channel for g in steady)}" if steady else ""
         rest = "no force at any port explains any of the rest"
         if measured:
             rest = "the rest is as large as the noise"
         elif slow:
-            rest = "the rest is slow noise: no force at any port explains its changes from sample to sample"
+            rest = "the rest is slow noise: hardly any force explains its changes from sample to sample"
         return Verdict(
             "complete",
             f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {off:.3g} of the "
@@ -352,9 +358,15 @@ def closest_law(search: Hypotheses, likeliest: Trial) -> Trial:
 def may_be_coloured_noise(search: Hypotheses, quiet: float = 1.0) -> bool:
     """Tell whether the refit's residual is small and irregular enough to be noise of any colour.
 
-    `quiet` is the share of its rms that is left without steady tones.
+    `quiet` is the share of its rms that is left without steady tones. Measured noise has its colour already.
     """
-    return search.root.mean_square < LOUDEST_NOISE**2 and quiet * _times_white(search) < COLOURED_NOISE_RATIO
+    most = COLOURED_NOISE_RATIO if search.floor.source == "estimated" else ABOVE_NOISE
+    return search.root.mean_square < LOUDEST_NOISE**2 and quiet * _times_white(search) < most
+
+
+def _is_slow_noise(search: Hypotheses) -> bool:
+    """Tell whether the refit's residual may be coloured noise, and no force explains most of its innovations."""
+    return may_be_coloured_noise(search) and search.innovation_share(search.root) < MOST_INNOVATIONS
 
 
 def _times_white(search: Hypotheses) -> float:
@@ -365,19 +377,18 @@ def _times_white(search: Hypotheses) -> float:
     return search.root.error / max(float(np.sqrt(noise2)), 1e-300)
 
 
-def _is_noise(search: Hypotheses, quiet: float, share: float, mode: float | None) -> bool:
-    """Tell whether the refit's residual can be noise: no force explains it, no mode rings, and its power is steady.
+def _is_noise(search: Hypotheses, quiet: float, explained: bool, mode: float | None) -> bool:
+    """Tell whether the refit's residual can be noise: not explained, no mode rings, and its power is steady.
 
     `quiet` is the share of its rms that is left without steady tones.
     """
-    root, times = search.root, quiet * _times_white(search)
+    times = quiet * _times_white(search)
     if times < AT_NOISE_RATIO:
         return True
-    unexplained = share < (EXPLAINED_QUIET_NOISE if root.mean_square < NEGLIGIBLE_ERROR**2 else EXPLAINED_NOISE)
     if search.floor.source != "estimated":
-        like = times < ABOVE_NOISE and unexplained
+        like = times < ABOVE_NOISE and not explained
     else:
-        like = times < WHITE_NOISE_RATIO or (unexplained and may_be_coloured_noise(search, quiet))
+        like = times < WHITE_NOISE_RATIO or (not explained and may_be_coloured_noise(search, quiet))
     return like and mode is None and not _swells(search)
 
 

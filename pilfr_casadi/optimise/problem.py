@@ -288,16 +288,20 @@ class Problem:
         other._constrain(tuple(constraints))
         return other
 
-    def state_priors(self, theta: Array, own: int) -> tuple[tuple[int, Array], ...]:
-        """Compute the prior covariance of each estimated initial state without its first `own` entries and memories.
+    def state_priors(self, theta: Array, own: int) -> list[tuple[Array, Array]]:
+        """Compute each estimated initial state beyond its first `own` entries, from rest, and its prior covariance.
 
-        See `state_covariance`; the signal of an operator limits its memory. Returns the first variable and the
-        covariance for each such state whose run from rest at the parameters in θ does not diverge.
+        See `state_covariance`. Memories of operators are left out: an operator cannot hold more than its signal has
+        given it. So are states whose run from rest at the parameters in θ diverges.
         """
         p, n_x, n = self.parameters(theta), self.model.n_x, self.model.n_state
-        estimated = [part for part in self._placed if part.first is not None]
-        found = [(part.first, state_covariance(self.engine, part.drive, p, n_x, n - n_x)) for part in estimated]
-        return tuple((at + own, s[own:n_x, own:n_x]) for at, s in found if at is not None and s is not None)
+        out = []
+        for part, state in zip(self._placed, self.initial_states(theta), strict=True):
+            covariance = None if part.first is None else state_covariance(self.engine, part.drive, p, n_x, n - n_x)
+            if covariance is not None:
+                moved = state - self.model.rest_at(state[:own], part.recording.u[0], p)
+                out.append((moved[own:n_x], covariance[own:n_x, own:n_x]))
+        return out
 
     @property
     def size(self) -> int:

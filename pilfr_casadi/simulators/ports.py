@@ -170,7 +170,8 @@ class Port:
     @property
     def revolution(self) -> float:
         """One revolution in the unit of z; nan if z is no angle. A position without a unit may be an angle in rad."""
-        position = not (self.across_unit or self.is_speed or self.series) and self.domain in (MECHANICAL, UNKNOWN)
+        torque = not self.unit or may_convert(self.unit, "N m")
+        position = not (self.across_unit or self.is_speed or self.series) and torque
         return revolution_in("rad" if position else self.across_unit)
 
     def has_term_for(self, law: Any) -> bool:

@@ -11,7 +11,7 @@ from pilfr_casadi import Recording, multisine
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.correction import Correction
 from pilfr_casadi.diagnose.offsets import Offset, fix_idle_offsets
-from pilfr_casadi.laws import CoulombFriction, CubicDamping, Power as StaticPower
+from pilfr_casadi.laws import CoulombFriction, CubicDamping, Power as StaticPower, Relaxation
 
 
 def test_a_value_of_the_simulator_that_a_law_replaces_is_told_to_come_out_as_zero():
@@ -52,9 +52,9 @@ def test_noise_of_another_level_in_each_recording_is_no_missing_physics():
     assert found.verdict == "complete", found.sentence
 
 
-def tank():
+def tank(curved=0.0):
     return pilfr.Simulator(
-        lambda x, u, p: {"level": (p.k * u.pump - p.a * x.level) / 0.05},
+        lambda x, u, p: {"level": (p.k * u.pump - p.a * x.level - curved * (x.level**2 - 0.9 * x.level)) / 0.05},
         lambda x: {"level": x.level},
         states=("level",),
         inputs=("pump",),
@@ -88,6 +88,30 @@ def test_the_drift_of_a_sensor_is_hardly_called_missing_physics():
         noisy = blank.with_(y=y + np.std(y) * (0.003 * white + 0.008 * drift))
         complete += pilfr.diagnose(tank(), noisy, laws=(StaticPower, CoulombFriction), workers=1).verdict == "complete"
     assert complete >= 5
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_slow_physics_outside_the_catalogue_is_no_slow_noise(seed):
+    """A filter for the whole residual would predict the curved outflow of a slow tank, and leave nothing to explain."""
+    blank = levels(seed, 2.0)
+    y = tank(curved=3e-5).simulate(blank)
+    noise = 0.005 * np.std(y) * np.random.default_rng(seed + 10).standard_normal(y.shape)
+    found = pilfr.diagnose(tank(), blank.with_(y=y + noise), laws=(Relaxation,), workers=1)
+    assert found.verdict == "unexplained", found.sentence
+
+
+@pytest.mark.parametrize(("k", "T", "share", "load"), [(1.0, 20.0, 0.002, 40.0), (4.0, 30.0, 0.01, 30.0)])
+def test_creep_under_a_load_before_the_recording_is_no_slow_noise(k, T, share, load):
+    """The law begins at a state that the recorded inputs never bring about."""
+    u = 10 * np.asarray(multisine(1200, f_max=2.0, fs=20.0, rng=np.random.default_rng(2))).reshape(-1, 1)
+    whole = np.concatenate([load + u[np.arange(6000) % 1200], u])
+    true = cart().with_element("ground", Relaxation().at({"k_v": k, "T": T}))
+    before = Recording(whole, whole, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
+    y = true.simulate(before)[6000:]
+    y = y + share * np.std(y) * np.random.default_rng(3).standard_normal(y.shape)
+    train = Recording(u, y, 0.05, ("force",), ("pos",), initial="estimate", hold="zero")
+    found = pilfr.diagnose(cart(), train, laws=(Relaxation, CubicDamping), effects=1, workers=1)
+    assert [e.law for e in found.effects] == ["creep"], found.sentence
 
 
 @pytest.mark.parametrize("kind", ["random", "sweep", "sine"])
