@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from .._base import InputError, deferred_interrupt, json_text, listed, progress_bar, write_atomically
-from ..data import SAME_STEP, TIME_NAMES, Recording, column_names
+from ..data import SAME_STEP, Recording, column_names, is_time
 from ..simulators import Simulator, as_simulator
 from ..studies import LARGEST_SIZE
 from ._common import (
@@ -220,7 +220,7 @@ def _simulated_names(options: DiagnoseOptions) -> tuple[tuple[str, ...], tuple[s
         raise InputError("Only one of --inputs and --outputs was given; give both.")
     files = options.recordings
     first, *others = (_column_names(options, f) for f in files)
-    shared = [n for n in first if n not in TIME_NAMES and all(n in other for other in others)]
+    shared = [n for n in first if not is_time(n) and all(n in other for other in others)]
     inputs = tuple(n for n in shared if _same_samples(options, n)) or tuple(n for n in shared if n[:1] in "uU")
     if not inputs and len(shared) == 2:
         inputs = _find_cause(options, shared)
@@ -244,7 +244,7 @@ def _column_names(options: DiagnoseOptions, path: str) -> list[str]:
 
 def _report_unshared(files: Sequence[str], columns: Sequence[Sequence[str]], shared: Sequence[str]) -> Iterator[str]:
     """Note each column that only one file has; refuse if both have some: it may be one column with two names."""
-    first, *others = ([n for n in names if n not in TIME_NAMES and n not in shared] for names in columns)
+    first, *others = ([n for n in names if not is_time(n) and n not in shared] for names in columns)
     for path, names, own in zip(files[1:], columns[1:], others, strict=True):
         lost = [n for n in first if n not in names]
         if lost and own:

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from .readers import (
         TIME_NAMES as TIME_NAMES,
         column_names as column_names,
+        is_time as is_time,
         read as read,
         read_csv as read_csv,
         read_frame as read_frame,

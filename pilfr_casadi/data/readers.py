@@ -1,8 +1,8 @@
 """Read recordings from CSV, ``.mat``, ``.npz``, Parquet and MDF files, and from frames of pandas or polars.
 
-A file holds one recording: a time column (``t``, ``t_s`` or ``time``, in seconds, uniform) and one column for each
-input and output by name, with or without its unit in brackets; other columns are ignored. One sentence reports a fault
-of a file; it names the file, the column and the line.
+A file holds one recording: a time column (``t``, ``t_s``, ``time`` or ``time [s]``, in seconds, uniform) and one column
+for each input and output by name, with or without its unit in brackets; other columns are ignored. One sentence reports
+a fault of a file; it names the file, the column and the line.
 """
 
 import re
@@ -26,6 +26,7 @@ TOLERANCE = 1e-4  # allowed deviation of a sample from the grid, in steps; recor
 AGREEMENT = 1e-3  # allowed relative difference of a stated step from the times; a wrong unit differs by far more
 _UNITS = r"ns|us|µs|μs|ms|min|h|d|nanoseconds?|microseconds?|milliseconds?|minutes?|hours?|days?"
 _WITH_UNIT = re.compile(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")  # such as "force [N]" or "speed (rad/s)"
+_IN_SECONDS = re.compile(r"(?:t|time)\s*[\[(]\s*(?:s|sec|secs|seconds?)\s*[\])]", re.IGNORECASE)
 _OTHER_UNIT = re.compile(rf"(?:t|time)[\s_\-\[(]+({_UNITS})[\])]?", re.IGNORECASE)
 
 
@@ -317,9 +318,18 @@ def _channel_names(names: Sequence[str], parts: Sequence[np.ndarray]) -> tuple[s
     return tuple(f"{n}{i + 1}" if p.shape[1] > 1 else n for n, p in pairs for i in range(p.shape[1]))
 
 
+def is_time(column: str) -> bool:
+    """Tell whether a column holds the time in seconds by its name, which may have the unit in brackets.
+
+    >>> is_time("t"), is_time("Time [s]"), is_time("time (ms)"), is_time("T")
+    (True, True, False, False)
+    """
+    return column in TIME_NAMES or bool(_IN_SECONDS.fullmatch(column.strip()))
+
+
 def _find_time_column(names: Sequence[str], chosen: str | None, source: str) -> str | None:
-    """Return the time column among the names: the chosen one, or one of `TIME_NAMES`; None if there is none."""
-    found = [chosen] if chosen is not None else [name for name in TIME_NAMES if name in names]
+    """Return the time column among the names: the chosen one, or one that `is_time`; None if there is none."""
+    found = [chosen] if chosen is not None else [*dict.fromkeys(name for name in names if is_time(name))]
     if not found:
         return None
     if len(found) > 1:

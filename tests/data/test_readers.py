@@ -89,6 +89,11 @@ def test_dt_instead_of_time(write):
     assert read_csv(write(GOOD), "force", "x2", dt=0.10005).dt == 0.10005  # agrees within 0.1 %
 
 
+@pytest.mark.parametrize("name", ["time", "time [s]", "Time (s)", "t [sec]"])
+def test_the_time_may_state_its_unit(write, name):
+    assert read_csv(write(GOOD.replace("t,force", f"{name},force")), "force", "x2").dt == pytest.approx(0.1)
+
+
 def test_several_files_give_a_tuple(write):
     paths = [write(GOOD, "a.csv"), str(write(GOOD, "b.csv"))]
     a, b = read_csv(paths, "force", "x2")
