@@ -5,14 +5,15 @@ training recordings (`evidence`): the refitted simulator; the named laws, all of
 likely hypotheses if no law is named; and a learned force, alone or beside laws. The score is the held-out error plus
 the spread of predictions for other inputs (`evidence.spread`), which is large if many parameters are hardly determined.
 The smallest score wins. Candidates are predicted in the order of their fit error plus spread, until that exceeds the
-smallest score. Test recordings are never used.
+smallest score. If the time is over before, the hypothesis with the least fit error plus spread corrects where the refit
+is not near it. Test recordings are never used.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ import numpy as np
 from .._base import InputError
 from ..laws import CATALOGUE
 from ..simulators import Placed, name_at
-from .evidence import FORMULA_ERROR, SURE, HeldOut
+from .evidence import FORMULA_ERROR, NEAR_RATIO, SURE, HeldOut
 from .hypotheses import likeliest
 from .learned import Learned, LearnedForce, describe_learned, refit_learned
 from .search import Search
@@ -47,6 +48,8 @@ class Correction:
         nan if nothing was compared.
     closest : Trial, optional
         The hypothesis with its named laws, if something was compared.
+    late : bool
+        Whether there was no time left to compare it with others.
     """
 
     elements: tuple[tuple[str, str, str], ...]
@@ -55,6 +58,7 @@ class Correction:
     before: float = np.nan
     after: float = np.nan
     closest: Trial | None = None
+    late: bool = False
 
     @property
     def words(self) -> str:
@@ -76,6 +80,11 @@ class Correction:
             why = "nothing that was tried is expected to predict further recordings better"
             late = "there was no time left to compare it with others"
             return f"The corrected simulator is still the refitted one: {why if np.isfinite(self.after) else late}."
+        if self.late:
+            return (
+                f"The corrected simulator has {self.words}, with which it follows the training recordings far better. "
+                f"There was no time left to test this on parts that it was not fitted to. {shares}"
+            )
         if not np.isfinite(self.after):
             return shares
         return (
@@ -124,10 +133,11 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
         return named_correction(search, best_laws.fitted), best_laws.fitted
     refitted = _predict(search, [_make_candidate(search, search.root)], [])
     tried = _named_hypotheses(search, answer) if named else _hypotheses_with_laws(search)
-    predicted = _predict(search, [_make_candidate(search, t) for t in tried], refitted)
-    if len(predicted) == 1 and search.past_deadline:  # without a comparison the named laws, or the refit, stay
-        stays = tried[0] if named else search.root
-        return named_correction(search, stays.fitted), stays.fitted
+    candidates = [_make_candidate(search, t) for t in tried]
+    predicted = _predict(search, candidates, refitted)
+    if len(predicted) == 1 and search.past_deadline:  # without a comparison the named laws stay, or what is far better
+        stays = tried[0] if named else _far_better(search, candidates)
+        return replace(named_correction(search, stays.fitted), late=not named), stays.fitted
     chosen = _choose(predicted)[0].base
     beside = best_laws if named and not chosen.laws else chosen
     learned = _learned_candidates(search, search.memo[beside.key]) if beside.laws else []
@@ -160,6 +170,13 @@ def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_
         bare = c.fitted is c.base.fitted
         out.append((c, search.held_out(c.base) if bare else search.held_out_errors(c.fitted, c.spread)))
     return out
+
+
+def _far_better(search: Search, candidates: Sequence[_Candidate]) -> Trial:
+    """Return the hypothesis with the least expected error if the refit is not near it, else the refit."""
+    best = min(candidates, key=lambda c: c.least, default=None)
+    near = best is None or NEAR_RATIO**2 * best.least > search.root.mean_square
+    return search.root if best is None or near else best.base
 
 
 def _choose(predicted: Sequence[_Predicted]) -> _Predicted:

@@ -149,3 +149,5 @@ def test_a_refit_that_was_compared_with_nothing_is_not_said_to_predict_best():
     shares = {"named": 0.0, "learned": 0.0, "left": 1.0}
     assert "no time left to compare" in Correction((), shares).sentence
     assert "nothing that was tried" in Correction((), shares, before=0.1, after=0.1).sentence
+    untested = Correction((("guide", "coulomb_friction", "smooth"),), {**shares, "named": 0.8}, late=True).sentence
+    assert "far better" in untested and "no time left to test" in untested
