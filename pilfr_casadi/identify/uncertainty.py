@@ -366,11 +366,11 @@ def _autocovariances(problem: Problem, theta: Array, weights: Array) -> Array:
 def _autoregression(lags: Array, samples: int) -> tuple[Array, float]:
     """Fit an autoregression `polynomial(q^-1) e = white`; return its polynomial and the variance of the white part.
 
-    Yule-Walker by the recursion of Levinson and Durbin; the order has the smallest BIC.
+    Yule-Walker by the recursion of Levinson and Durbin; the order has the smallest BIC. An exact fit leaves nothing.
     """
     polynomial, variance = np.ones(1), float(lags[0])
     best, criterion = (polynomial, variance), 0.0
-    for order in range(1, len(lags)):
+    for order in range(1, len(lags) if variance > 0 else 0):
         reflection = -float(polynomial @ lags[order:0:-1]) / max(variance, 1e-300)
         if not abs(reflection) < 1:
             break

@@ -88,3 +88,11 @@ def test_the_verbs(record, fitted, tmp_path):
     assert fitted.to_casadi().size1_in(0) == 2
     assert fitted.plot(record) is not None
     assert pilfr.fit(fitted, record, engine="vm").simulator is not None
+
+
+def test_an_exact_fit_has_no_warning(record):
+    """Nothing is left whose colour could be estimated; a warning would be an error here."""
+    exact = simulator(1500.0, 25.0)
+    start = record.with_(initial="zero", hold="zero")
+    fit = pilfr.fit(exact, start.with_(y=exact.simulate(start)), engine="vm")
+    assert fit.errors["k"] == pytest.approx(0.0, abs=1e-6)
