@@ -218,8 +218,7 @@ def _predict(search: Search, fitted: Fitted) -> HeldOut:
     bench = search.bench
     found = held_out_errors(bench, fitted, search.workers)
     v = max(found.blocks, found.ahead)
-    residual = [e[r.skip :] for e, r in zip(fitted.residual, bench.recordings, strict=True)]
-    n = Sample(search.floor2, effective_size(residual)).effective(v)
+    n = Sample(search.floor2, effective_size(bench.scored(fitted.residual))).effective(v)
     own = fitted.simulator.elements[len(bench.simulator.elements) :]
     return replace(found, spread=spread(bench, fitted, own, v, n) if np.isfinite(v) else np.inf)
 

@@ -393,7 +393,7 @@ def _is_noise(search: Hypotheses, quiet: float, explained: bool, mode: float | N
 
 
 def _swells(search: Hypotheses) -> bool:
-    """Tell whether the residual's power follows the inputs, the simulated outputs or their rates.
+    """Tell whether the residual's power follows the inputs, the simulated outputs or their rates within the recordings.
 
     The measured outputs hold the noise itself, and their rates hardly anything else where the machine is slow.
     """

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from tank import tank
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Recording
@@ -63,22 +64,16 @@ def test_the_level_of_the_noise_may_differ_between_recordings():
 
 def test_a_random_walk_of_a_sensor_is_no_creep():
     """Creep would follow it by first states that it never reaches otherwise."""
-    tank = pilfr.Simulator(
-        lambda x, u, p: {"level": (p.k * u.pump - p.a * x.level) / 0.05},
-        lambda x: {"level": x.level},
-        states=("level",),
-        inputs=("pump",),
-        parameters={"k": pilfr.Parameter(2.4e-5, bounds=(5e-6, 1e-4)), "a": pilfr.Parameter(1e-4, bounds=(0, 1e-3))},
-    )
+    slow_tank = tank(outflow=1e-4)
     complete = 0
     for seed in range(1, 7):  # the first walk resembles the tank's own motions, and stays unexplained
         rng = np.random.default_rng(seed)
         u = np.repeat(rng.uniform(1, 5, 40), 30)[:, None]
         blank = Recording(u, u, 2.0, ("pump",), ("level",), initial="estimate", hold="zero")
-        y = tank.simulate(blank.with_(initial=[0.3]))
+        y = slow_tank.simulate(blank.with_(initial=[0.3]))
         walk = np.cumsum(rng.standard_normal(y.shape), axis=0) / len(y) ** 0.5
         noisy = blank.with_(y=y + np.std(y) * (0.003 * rng.standard_normal(y.shape) + 0.03 * walk))
-        found = pilfr.diagnose(tank, noisy, laws=(TwoStageRelaxation,), workers=1)
+        found = pilfr.diagnose(slow_tank, noisy, laws=(TwoStageRelaxation,), workers=1)
         assert not found.effects, found.sentence
         complete += found.verdict == "complete"
     assert complete >= 5

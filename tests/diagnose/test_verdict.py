@@ -5,6 +5,7 @@ import pytest
 from cart import cart
 from diagnosis_rig import recordings, rig
 from scipy.signal import lfilter
+from tank import tank
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Recording, multisine
@@ -50,16 +51,6 @@ def test_noise_of_another_level_in_each_recording_is_no_missing_physics():
         recordings.append(blank.with_(y=y + 4e-3 * amplitude * rng.standard_normal(y.shape)))
     found = pilfr.diagnose(cart(), recordings, laws=(CoulombFriction, CubicDamping), effects=1, workers=1)
     assert found.verdict == "complete", found.sentence
-
-
-def tank(curved=0.0):
-    return pilfr.Simulator(
-        lambda x, u, p: {"level": (p.k * u.pump - p.a * x.level - curved * (x.level**2 - 0.9 * x.level)) / 0.05},
-        lambda x: {"level": x.level},
-        states=("level",),
-        inputs=("pump",),
-        parameters={"k": pilfr.Parameter(2.4e-5, bounds=(5e-6, 1e-4)), "a": pilfr.Parameter(2e-4, bounds=(0, 1e-3))},
-    )
 
 
 def levels(seed, dt):
