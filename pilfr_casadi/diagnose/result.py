@@ -438,7 +438,7 @@ class Diagnosis:
             one = len(at_bounds) == 1
             out.append(
                 f"{', '.join(at_bounds)} came out at {'its bound' if one else 'their bounds'}: more is missing, or "
-                f"{'it has' if one else 'they have'} too little room."
+                f"{'it has' if one else 'they have'} too little room. The ± of the other values do not include that."
             )
         test, train = self.errors["test"], self.errors["train"]
         if train and train["before"] > NEAR_CONSTANT and self.verdict in ("missing-physics", "unexplained"):
@@ -496,10 +496,10 @@ class Diagnosis:
         for kind in ("train", "test", "free_run"):
             errors = self.errors.get(kind)
             if errors:
-                shown = (f"{errors[k]:.4f}" if errors[k] < RUN_AWAY else "runs away" for k in ERROR_NAMES)
+                shown = (_error_text(errors[k]) for k in ERROR_NAMES)
                 lines.append(f"  {kind.replace('_', ' '):<10}" + "".join(f"{text:>11}" for text in shown))
         least = "at least " if self.verdict == "unexplained" and self.floor["source"] == "estimated" else ""
-        return [*lines, f"  noise floor {least}{self.floor['nrmse']:.4f} ({self.floor['source']})"]
+        return [*lines, f"  noise floor {least}{_error_text(self.floor['nrmse'])} ({self.floor['source']})"]
 
     def gravest_blind_spots(self) -> list[str]:
         """Describe the gravest facts that the recordings cannot reveal, one a line."""
@@ -541,6 +541,13 @@ class Diagnosis:
             value, unit = float(own[f"{e.prefix}w_0"].value), self.corrected.port(e.port).unit
             more.append(f"  offset of {e.port.rpartition(':')[2]} = {value:.4g} {unit}".rstrip())
         return ["the simulator's own values, refitted:", *lines, *more] if lines or more else []
+
+
+def _error_text(nrmse: float) -> str:
+    """Write an error with four decimals, or two digits if it is below them."""
+    if not nrmse < RUN_AWAY:
+        return "runs away"
+    return f"{nrmse:.4f}" if nrmse >= 1e-3 or nrmse == 0 else f"{nrmse:.2g}"
 
 
 def _effect_lines(e: Effect) -> list[str]:
