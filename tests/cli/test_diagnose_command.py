@@ -131,7 +131,8 @@ def test_a_whole_diagnosis(capsys, files, catalogue):
     errors = found["fit"]["test"]
     assert errors["after"] < 0.2 * errors["before"]
     assert "cubic stiffness at ground-mass" in out and "noise floor" in out
-    assert re.search(r"NRMSE +as given +refitted +corrected\n  train( +\d\.\d{4,5}){3}\n  test( +\d\.\d{4,5}){3}\n", out)
+    three = r"( +\d\.\d{4,5}){3}"
+    assert re.search(rf"NRMSE +as given +refitted +corrected\n  train{three}\n  test{three}\n", out)
     assert re.search(r"computed in [\d.]+ s\n", out)
     assert f"report: {files / 'out' / 'report.html'}" in out
     assert "<html" in (files / "out" / "report.html").read_text().lower()
