@@ -130,6 +130,8 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
         size = np.sqrt(np.maximum(np.diag(hessian)[rest], 1e-300))
         across = hessian[np.ix_(rest, laws_at)] * width / size[:, None]
         inner = hessian[np.ix_(rest, rest)] / np.outer(size, size)
+        if not np.all(np.isfinite(inner)):  # so has one whose derivatives overflow
+            return np.full(shared.shape[1], np.inf)
         block = block - across.T @ np.linalg.pinv(inner, rcond=1e-10, hermitian=True) @ across
         block = shared.T @ block @ shared
     if not np.all(np.isfinite(block)):
