@@ -11,6 +11,7 @@ from pilfr_casadi import laws
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.evidence import WRONG_MODEL_SAMPLES, Sample, information, log_evidence, log_prior, spread
 from pilfr_casadi.diagnose.verdict import share_named
+from pilfr_casadi.optimise import Problem
 
 NONE = np.zeros(0)
 
@@ -135,3 +136,15 @@ def test_the_same_law_at_two_ports_that_cannot_be_told_apart_is_sure_all_the_sam
     (effect,) = found.effects
     assert effect.law == "cubic_stiffness" and effect.confidence > 0.9
     assert {effect.port, *(port for port, _ in effect.indistinguishable)} == {"ground-m1", "twin"}
+
+
+def test_derivatives_that_overflow_give_no_information(monkeypatch):
+    """As at the edge of divergence; no decomposition would exist."""
+    law = laws.CoulombFriction().at({"F_c": 4.0, "v_0": 0.01})
+    simulator = rig().with_element("ground-m1", law)
+    bench = Workbench.of(simulator, recordings(law, count=1), "zero")
+    fitted = bench.run(simulator, {}, [np.zeros(len(simulator.states))])
+    size = len(bench.problem_at(fitted)[1])
+    square = np.full((size, size), 1e200) - 2e200 * np.eye(size)
+    monkeypatch.setattr(Problem, "normal", lambda self, theta: (1.0, np.zeros(size), square))
+    assert np.all(np.isinf(information(bench, fitted, fitted.last_elements(1))))
