@@ -64,7 +64,7 @@ def test_special_laws_are_for_their_own_domain_alone():
     special = {law for law in laws.CATALOGUE if law.special}
     assert {laws.Radiation, laws.Diode, laws.SaturatingInductance, laws.FreeCurve} <= special
     at = {name: {law for law in laws.CATALOGUE if port(domain=name).admits(law)} for name in ("mechanical", "unknown")}
-    everywhere = {k for k in laws.CATALOGUE if "parallel" in k.places and not (k.in_line or k.angular)}
+    everywhere = {k for k in laws.CATALOGUE if "parallel" in k.places and not k.in_line}  # no unit: z may be an angle
     assert not at["mechanical"] & special and not at["unknown"] & special
     assert at["mechanical"] == at["unknown"] == everywhere - special
     assert port("N m", "rad").admits(laws.Gravity) and port("N m", "deg").admits(laws.WholeGravity)
