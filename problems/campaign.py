@@ -79,7 +79,7 @@ def on_a_cluster(path: Path, out: Path, jobs: int, workers: int = 4) -> tuple[fl
     began, said = time.perf_counter(), []
     options = {"threads_per_worker": 1, "processes": True, "dashboard_address": ":0", "silence_logs": logging.ERROR}
     with LocalCluster(workers, **options) as cluster:
-        command = [sys.executable, "-m", "pilfr_casadi.cli.app", "campaign", str(path), "--out", str(out)]
+        command = [sys.executable, "-m", "pilfr_casadi", "campaign", str(path), "--out", str(out)]
         command += ["--dask", cluster.scheduler_address]
         driver = subprocess.Popen(command, stdout=subprocess.DEVNULL)
         _wait(out, jobs // 3, driver)

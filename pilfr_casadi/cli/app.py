@@ -157,7 +157,3 @@ def name_options(sentence: str) -> str:
     sentence = re.sub(r"columns=\{'([^']*)': '([^']*)'\}", r"--column \1=\2", sentence)
     keyword = rf"`?(?<![\w-])({KEYWORDS})=(?:'([^']*)'|([^\s;,()`]*[^\s;,.()`]))?`?"
     return re.sub(keyword, lambda m: f"--{m[1].replace('_', '-')} {m[2] or m[3] or m[1].upper()}", sentence)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -280,6 +280,11 @@ def test_a_period_without_an_initial_state_is_refused(capsys, tmp_path, train, m
     refused(capsys, "simulate", model, train, "--period", 20, "--out", tmp_path / "s.csv", says="--period 20")
 
 
+def test_the_package_runs_as_a_module():
+    done = subprocess.run([sys.executable, "-m", "pilfr_casadi", "--version"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"pilfr {pilfr.__version__}\n", "")
+
+
 def test_version_and_help(capsys):
     assert run(capsys, "--version") == (0, f"pilfr {pilfr.__version__}\n", "")
     status, out, err = run(capsys, "--help")
