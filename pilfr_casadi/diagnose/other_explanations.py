@@ -73,7 +73,7 @@ def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameter
         and float(p.value) != 0
         and bool(np.all(p.fixed) or np.all(without.at_bound(name)))
     ]
-    most = max(1, _count_free(answer.best))
+    most = max(1, answer.best.size)
     freed: tuple[str, ...] = ()
     best = without
     while len(freed) < min(len(pinned), most):
@@ -91,11 +91,6 @@ def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameter
         if best.cost <= enough and gain(without.cost, best.cost, best.residual, len(freed)) > LEAST_GAIN:
             return PinnedParameters(freed, best, _describe_pinned(search, freed, best, named))
     return None
-
-
-def _count_free(trial: Trial) -> int:
-    """Count the free entries of the parameters of a hypothesis's laws."""
-    return sum(p.size for e in trial.effects for p in e.law.parameters().values() if not np.all(p.fixed))
 
 
 def _free(search: Search, names: Sequence[str], start: Fitted, enough: float) -> Fitted | None:

@@ -127,6 +127,11 @@ class Trial:
         return f"{self.element.prefix}{knee}" if knee else ""
 
     @functools.cached_property
+    def size(self) -> int:
+        """Count the free numbers of the effects."""
+        return sum(e.law.size(e.own(self.fitted.values)) for e in self.effects)
+
+    @functools.cached_property
     def doubtful(self) -> bool:
         """Whether a law degenerates at its fitted values."""
         return any(e.law.doubtful(e.own(self.fitted.values)) for e in self.laws)
@@ -352,13 +357,13 @@ def select_pairs(scored: Sequence[Scored], best: int) -> list[list[Scored]]:
     for source in ("simulation", "observer"):
         ports, plain, passed = set[str](), set[str](), list[Scored]()
         for s in (s for s in scored if s.source == source):
-            first = s.port not in ports or (s.port not in plain and _is_plain(s.law))
+            first = s.port not in ports or (s.port not in plain and _is_plain(s))
             if len(passed) < best or first or s.law.special or s.law.in_line:
                 chosen.setdefault(s.pair, [])
             if not any(_is_redundant(s, other) for other in passed):  # two forms of one law are one hypothesis
                 passed.append(s)
             ports.add(s.port)
-            plain |= {s.port} if _is_plain(s.law) else set()
+            plain |= {s.port} if _is_plain(s) else set()
     largest = dict[str, float]()  # by run, because shares of different residuals are not comparable
     for s in scored:
         largest[s.source] = max(largest.get(s.source, 0.0), s.share)
@@ -367,9 +372,9 @@ def select_pairs(scored: Sequence[Scored], best: int) -> list[list[Scored]]:
     return [[s for s in found if s.share > LEAST_SHARE * largest[s.source]] or found for found in chosen.values()]
 
 
-def _is_plain(law: Law) -> bool:
+def _is_plain(one: Scored) -> bool:
     """Tell whether a law has a single free parameter."""
-    return sum(int(np.sum(~np.broadcast_to(p.fixed, p.size))) for p in law.parameters().values()) == 1
+    return one.law.size(one.starts[0]) == 1
 
 
 def _is_redundant(one: Scored, other: Scored) -> bool:

@@ -215,11 +215,7 @@ def _plainest(search: Hypotheses, trials: Sequence[Trial]) -> Trial:
     best = max(trials, key=search.evidence)
     least, most = search.evidence(best) - INDISTINGUISHABLE_NATS, BETTER_RATIO**2 * best.mean_square
     alike = (t for t in trials if search.evidence(t) >= least and t.mean_square <= most)
-    return min(alike, key=lambda t: (sum(map(_count_parameters, t.laws)), -search.evidence(t)))
-
-
-def _count_parameters(placed: Placed) -> int:
-    return sum(p.size for p in placed.law.parameters().values())
+    return min(alike, key=lambda t: (t.size, -search.evidence(t)))
 
 
 def _make_effect(

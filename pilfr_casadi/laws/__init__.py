@@ -111,6 +111,7 @@ if TYPE_CHECKING:
         GeneralizedHysteresis as GeneralizedHysteresis,
         PlayHysteresis as PlayHysteresis,
         SmoothHysteresis as SmoothHysteresis,
+        StiffeningBoucWen as StiffeningBoucWen,
         StopHysteresis as StopHysteresis,
         hysteresis_layer as hysteresis_layer,
     )

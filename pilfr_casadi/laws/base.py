@@ -47,7 +47,11 @@ ONSET_WIDTH = 0.05  # of a contact, as a share of its gap
 MIN_SIDE = 0.05  # share of the reach that a signal must visit on either side, to tell the sides apart
 
 PEOPLE = ("coulomb", "stribeck", "hertz")  # persons in the names of laws and forms
-PROPER_NAMES = {"bouc_wen": "Bouc-Wen", "prandtl_ishlinskii": "Prandtl-Ishlinskii"}
+PROPER_NAMES = {
+    "bouc_wen": "Bouc-Wen",
+    "bouc_wen_stiffening": "stiffening Bouc-Wen",
+    "prandtl_ishlinskii": "Prandtl-Ishlinskii",
+}
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from .._base import InputError
 from ..models import Parameter, play
 from .base import Law, Local, size_to_power
 
+STIFFEST = 20.0  # ratio q/q_0 from which a stiffening loop stiffens no further
 PARTS = 4  # parts into which a step of a held signal is divided
 THIN_LOOPS = 0.1  # ratio of the loops' width to the bend beside them, below which a fit is a curve without memory
 DIRECT = 0.05  # ratio of the direct gain to the plays' total weight, below which they may be a mere backlash
@@ -208,6 +209,26 @@ class BoucWen(_Hysteresis):
         """Rate of the hysteretic displacement q, which exceeds q_0 only where a step is too long."""
         size = size_to_power(ca.fmin(ca.fabs(q / p["q_0"]), 1), p["n"], 1e-9)
         return dz * (1 - (1 - p["s"]) * size) - p["s"] * ca.fabs(dz) * ca.sign(q) * size
+
+
+class StiffeningBoucWen(BoucWen):
+    """Bouc-Wen hysteresis whose loops may stiffen: the force grows the more steeply, the further the motion goes.
+
+    In `dq/dt = dz/dt - (β |dz/dt| q + γ dz/dt |q|) |q|^(n-1)` the sign of γ is free, and β + γ < 0 stiffens:
+    q_0 = β^(-1/n), h = -γ/β.
+    """
+
+    form = "bouc_wen_stiffening"
+    equation = "w = k_h q,  dq/dt = dz/dt (1 + h |q/q_0|^n) - |dz/dt| sign(q) |q/q_0|^n"
+    source = "Wen (1976), J. Eng. Mech. 102(2); Ikhouane, Mañosa & Rodellar (2007), J. Sound Vib. 300"
+    units = {"k_h": "w/z", "q_0": "z", "h": "", "n": ""}
+    starts = {"q_0": ("half", 0.1, 0.3, 1.0, 3.0), "h": ("", 0.5, 1.5), "n": ("", 1.0)}
+    ranges = {"q_0": ("half", 0.01, 20), "h": ("", 0.0, 10.0), "n": ("", 0.5, 4.0)}
+
+    def flow(self, dz: Any, q: Any, p: Any) -> Any:
+        """Rate of the hysteretic displacement q, which a motion far beyond the fitted one could make infinite."""
+        size = size_to_power(ca.fmin(ca.fabs(q / p["q_0"]), STIFFEST), p["n"], 1e-9)
+        return dz * (1 + p["h"] * size) - ca.fabs(dz) * ca.sign(q) * size
 
 
 class BoucWenActuator(BoucWen):
