@@ -102,7 +102,8 @@ class Constant(Gate):
 def describe_constant(port: str, value: float = 0.0, parameter: str = "") -> Constant:
     """Return the fault that a channel has a constant offset."""
     kind, name = split_port(port)
-    where, load = ("input", ", or a constant load acts like one") if kind == ACTUATOR else ("output", "")
+    alike = ", or a constant load acts like one, as do dry friction and a dead zone while the input keeps its sign"
+    where, load = ("input", alike) if kind == ACTUATOR else ("output", "")
     words = f"The {where} {name} has a constant offset of about {value:.3g}{load}"
     return Constant(name, "offset", value, words, parameter=parameter, port=port)
 

@@ -51,6 +51,7 @@ NEIGHBOURHOOD = 6  # widths on either side of a glitch or a spectral line with w
 
 CUBIC, STENCIL = np.array([-1, 4, 0, 4, -1]) / 6, 2  # through the neighbours at -2, -1, 1, 2
 GLITCH_SIZE = 0.1  # least distance of a glitch over the output's deviation
+FEWEST_STEPS = 2.0  # least distance of a glitch over the resolution of a quantised signal, whose rounding leaves 1.4
 ISOLATED_SHARE = 0.12  # distance of neighbours, and deviation nearby, over a glitch's distance; a kink leaves 1/6
 
 ROUNDING = 1e-6  # bound on the relative rounding of distances
@@ -98,10 +99,12 @@ def mend(r: Recording) -> Recording:
 
 def find_glitches(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find single samples far off their neighbours, shape (k,); return them and the output without them."""
-    clean, found, deviation = np.array(y), np.zeros(0, dtype=int), float(np.std(y))
+    clean, found = np.array(y), np.zeros(0, dtype=int)
+    resolution = np.min(np.diff(np.unique(y)), initial=np.inf)
+    least = max(GLITCH_SIZE * float(np.std(y)), FEWEST_STEPS * resolution)
     while len(y) > 4 * NEIGHBOURHOOD * STENCIL and len(found) < EXCEPTION_SHARE * len(y):
         d = distances(clean)
-        large = np.flatnonzero(np.abs(d) > GLITCH_SIZE * deviation)
+        large = np.flatnonzero(np.abs(d) > least)
         more = [k for k in large[_may_stand_alone(d, large)] if _stands_alone(clean, d, int(k))]
         if not more:
             return np.sort(found), clean

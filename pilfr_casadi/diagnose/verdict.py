@@ -462,10 +462,11 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
     rest = max(search.flexible(closest).values(), default=0.0) if looked else 0.0
     words = " and ".join(name_at(e.port, e.law.id, e.law.form) for e in laws)
     named = f"laws, {words}, remove" if laws[1:] else f"law, {words}, removes"
+    removed = f"{1 - left:.0%}" if round(left, 2) else f"all but {100 * left:.1g} %"
     explained = ": nothing tried explains it" if looked else ""
     if rest > LEAST_EXPLAINED:
         explained = f": a force at a port explains {rest:.0%} of it"
     return (
         f"Physics is missing, most likely at {port}, and no law of the catalogue explains all of it. The closest "
-        f"{named} {1 - left:.0%} of the mismatch on the training recordings. The rest is not noise{explained}."
+        f"{named} {removed} of the mismatch on the training recordings. The rest is not noise{explained}."
     )

@@ -91,7 +91,7 @@ def answer(diagnosis: Diagnosis, forces: Sequence[str]) -> str:
         named.append(f"{name}{strong and ', ' + strong}, {100 * e.confidence:.0f}\u00a0% sure")
     places = ", ".join(dict.fromkeys(f.port for f in d.learned))
     nameless = f"A force without a name at {places}" if places else "Something is missing that has no name"
-    at_fault = dict.fromkeys(f"{display_name(g.finding)} of {g.channel}" for g in d.gates if g.corrected)
+    at_fault = dict.fromkeys(f"{display_name(g.finding)} of {g.channel}" for g in d.gates if g.fault)
     are = "are" if " and " in d.freed else "is"
     other = {
         "complete": f"{d.freed} {are} not as stated" if d.freed else "Nothing is missing",

@@ -15,7 +15,7 @@ import numpy as np
 from .._base import InputError
 from ..data import revolution_in
 from ..laws import display_name, short_name
-from .domains import DOMAINS, MECHANICAL, UNKNOWN, infer_domain, may_convert
+from .domains import DOMAINS, MECHANICAL, UNKNOWN, infer_domain, is_motion, may_convert
 
 Expression = Callable[..., Any]
 ACTUATOR, SENSOR, EQUATION, PARAMETER = BUILT_IN = ("actuator", "sensor", "equation", "parameter")
@@ -182,9 +182,11 @@ class Port:
         """Tell whether a law (or its class) may be missing here: by its places, physical domains and coordinate.
 
         A port of unknown domain admits the laws of all domains, except special ones. If z is a speed, laws of the
-        position are excluded; in an unknown domain z may be another quantity, so laws of z alone are admitted.
+        position are excluded; in an unknown domain z may be another quantity, so laws of z alone are admitted unless
+        its unit is one of speed.
         """
-        if self.is_speed and "z" in law.reads() and (self.domain == MECHANICAL or "dz" in law.reads()):
+        mechanical = self.domain == MECHANICAL or is_motion(self.across_unit)
+        if self.is_speed and "z" in law.reads() and (mechanical or "dz" in law.reads()):
             return False
         if law.in_line and not self.has_term_for(law):
             return False

@@ -42,7 +42,7 @@ def test_glitches_are_found_replaced_and_told():
     np.testing.assert_array_equal(mend(r).y, r.y)
 
 
-@pytest.mark.parametrize("kind", ["noise", "step", "pulse", "shock", "coarse", "short"])
+@pytest.mark.parametrize("kind", ["noise", "step", "pulse", "shock", "coarse", "toggle", "short"])
 def test_what_lasts_longer_than_a_sample_is_no_glitch(kind):
     rng = np.random.default_rng(3)
     y = np.sin(np.arange(4000) / 40) + 1e-3 * rng.standard_normal(4000)
@@ -56,6 +56,9 @@ def test_what_lasts_longer_than_a_sample_is_no_glitch(kind):
         y[2000:] += 3 * np.exp(-np.arange(2000) / 4) * np.cos(np.arange(2000))
     if kind == "coarse":
         y = np.round(y, 1)
+    if kind == "toggle":  # of the last digit
+        y = np.round(np.sin(np.arange(4000) / 400), 1)
+        y[1000] += 0.1
     if kind == "short":
         y = y[:40]
         y[20] += 3

@@ -27,7 +27,7 @@ def drive(*ports: Port, units: dict[str, str] | None = None) -> Simulator:
 
 def shaft(**options: object) -> Port:
     """A torque at the shaft."""
-    return Port("shaft", {"w": -1 / J}, lambda x: x.w, unit="N m", **options)  # type: ignore[arg-type]
+    return Port("shaft", {"w": -1 / J}, lambda x: x.w, **{"unit": "N m", **options})  # type: ignore[arg-type]
 
 
 def measured(seed: int) -> Recording:
@@ -109,9 +109,10 @@ def test_friction_of_a_drive_without_an_angle_is_named(ports: tuple[Port, ...]) 
     assert torque == pytest.approx(F_C, rel=0.1)
 
 
-def test_no_law_of_a_position_is_admitted_at_a_speed() -> None:
-    """What reads z is left out, whatever its class; what reads only the rate stays."""
-    port = drive(shaft()).port("shaft")
+@pytest.mark.parametrize("units", [{}, {"unit": "V", "across_unit": "deg/s"}], ids=["no units", "volts"])
+def test_no_law_of_a_position_is_admitted_at_a_speed(units: dict[str, str]) -> None:
+    """What reads z is left out, whatever its class and the unit of the force; what reads only the rate stays."""
+    port = drive(shaft(**units)).port("shaft")
     assert not any(port.admits(law) for law in CATALOGUE if "z" in law.reads())
     assert {"coulomb_friction", "stribeck_friction", "cubic_damping"} <= {
         law.id for law in CATALOGUE if port.admits(law)
