@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from .._base import in_words, one_blas_thread, to_json
+from .._base import InputError, in_words, one_blas_thread, to_json
 from ..data import Recording
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, in_series, kind_of, split_port
 from .arguments import check_laws, match_recordings, stated_hold
+from .evidence import BETTER_RATIO
 from .floor import ABOVE_NOISE, Floor, noise_floor
 from .identifiability import (
     SMALL_SHARE,
@@ -59,12 +61,8 @@ MOTION = {  # by kind of blind spot: the record that removes it
     "no-reversal": "A slow triangle of {} with reversals, at two amplitudes.",
     "one-amplitude": "A second amplitude of {}, such as half of it.",
 }
-# by stated hold: its name in the printed result
-HOLD_WORDS = {
-    "zero": "held",
-    "linear": "interpolated",
-    "": "not stated, here taken as held; say hold='zero' or hold='linear' if you know",
-}
+# by hold: its name in the printed result
+HOLD_WORDS = {"zero": "held", "linear": "interpolated"}
 # by kind of initial state: its name in the printed result
 START_WORDS = {"zero": "at zero", "estimate": "estimated", "periodic": "periodic", "given": "as given"}
 # by source of the noise floor: its name in the printed result
@@ -130,6 +128,8 @@ class Check:
         NRMSE of the refitted simulator.
     hold, starts : str, tuple of str
         Stated course of the inputs between samples ("" if not stated), and the start of each recording.
+    hold_taken : str
+        The course with which the simulator was refitted: the stated one, or the one that fits better.
     next_record : str
         The recording that would help most.
     seconds : float
@@ -145,6 +145,7 @@ class Check:
     error: float
     hold: str
     starts: tuple[str, ...]
+    hold_taken: str = "zero"
     next_record: str = ""
     seconds: float = 0.0
 
@@ -227,7 +228,9 @@ class Check:
         yield f"refitted: error {100 * self.error:.3g} % of the outputs' deviation, {times:.2g} times the noise"
         if times > ABOVE_NOISE:
             yield "  Something is missing or the noise is slow: the strengths above count the noise alone."
-        yield f"inputs between samples: {HOLD_WORDS[self.hold]}"
+        taken = HOLD_WORDS[self.hold_taken]
+        unsaid = f"not stated, here taken as {taken}; say hold='zero' or hold='linear' if you know"
+        yield f"inputs between samples: {taken if self.hold else unsaid}"
         yield f"start of each recording: {', '.join(self.starts)}"
 
 
@@ -260,7 +263,8 @@ def check(
     train : Recording or sequence of Recording
         The recordings that are to be diagnosed.
     hold : {"zero", "linear"}, optional
-        Course of the inputs between samples, if neither recordings nor simulator say; held by default.
+        Course of the inputs between samples, if neither recordings nor simulator say; by default the one with which
+        the refitted simulator follows better.
     laws : sequence of Law classes, optional
         By default the plainest form of each law of the catalogue.
     engine : {"auto", "c", "vm"}
@@ -280,6 +284,12 @@ def check(
     stated = stated_hold(simulator, recordings, hold)
     bench = Workbench.of(simulator, recordings, stated or "zero", engine)
     fitted = bench.fit(simulator)
+    if not stated:
+        with suppress(InputError):
+            other = bench.with_other_hold()
+            again = other.fit(simulator)
+            if again.cost * BETTER_RATIO**2 < fitted.cost:
+                bench, fitted = other, again
     bench.check_followed(fitted)
     return assess_recordings(bench, fitted, noise_floor(recordings, fitted.residual), stated or "", laws)
 
@@ -309,6 +319,7 @@ def assess_recordings(
         },
         error=mean_nrmse(bench, fitted),
         hold=stated,
+        hold_taken=bench.hold,
         starts=tuple(START_WORDS[r.begins] for r in bench.recordings),
     )
     swings = np.ptp(np.concatenate([r.u for r in bench.recordings]), axis=0)

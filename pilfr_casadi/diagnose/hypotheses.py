@@ -44,7 +44,7 @@ from .workbench import DIVERGED, Fitted, Workbench
 MOST_PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Findings:
     """Results about one hypothesis that are computed when they are first needed.
 
@@ -72,7 +72,7 @@ class Findings:
     held_out: HeldOut | None = None
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Hypotheses:
     """The hypotheses that were fitted to some recordings, and the results about each.
 

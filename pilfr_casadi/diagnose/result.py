@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, later, to_json, write_atomically
+from .._base import InputError, in_words, later, to_json, write_atomically
 from ..data import SAME_STEP, Recording, as_recordings, nrmse
 from ..engine import make_engine
 from ..identify import RUN_AWAY, match_channels, run_free
@@ -205,7 +205,7 @@ class Diagnosis:
         if self.effects and (self.interrupted or self.out_of_time):
             said += " The search was cut short, so that a further effect may not have been tried."
         if not errors or self.outcome not in ("worse", "same"):
-            return said
+            return said + self._idle_on_tests()
         before, after = (_percent(errors[k]) for k in ("before", "after"))
         if self.outcome == "same":
             return f"{said} On the test recordings it makes no difference: {before} before, {after} after."
@@ -221,6 +221,18 @@ class Diagnosis:
             return ""
         with_it, without = _percent(errors["after"]), _percent(effect.test_without)
         return f"error on the test recordings: {with_it} with it, {without} without it (the rest refitted)"
+
+    def _idle_on_tests(self) -> str:
+        """Name the effects without which the test recordings are followed as well; empty if there are none."""
+        after = (self.errors.get("test") or {}).get("after", np.nan)
+        idle = [name_at(e.port, e.law, e.form) for e in self.effects if e.test_without <= after]
+        if not idle:
+            return ""
+        rest = "their names rest" if idle[1:] else "its name rests"
+        return (
+            f" The test recordings are followed as well without {in_words(idle)}; {rest} on the training recordings "
+            "alone."
+        )
 
     def _better_without(self) -> str:
         """Name the effect of a harmful correction without which the test error is lowest, if that helps."""

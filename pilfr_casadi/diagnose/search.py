@@ -60,7 +60,7 @@ class Step:
     trials: tuple[Trial, ...]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Search(Hypotheses):
     """A search, filled by `run`.
 

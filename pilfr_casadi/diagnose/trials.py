@@ -44,7 +44,7 @@ LEAST_SHARE = 0.01  # share over the largest of the same run below which start v
 Key = frozenset[Pair]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Trial:
     """A fitted hypothesis: laws in ports of the simulator.
 

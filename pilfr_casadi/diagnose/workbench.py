@@ -65,7 +65,7 @@ class RunsAway(InputError):
     """The simulator is unstable, and no values within its bounds keep it near the recordings."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fitted:
     """A simulator fitted to recordings.
 
@@ -134,7 +134,7 @@ class Fitted:
         return self.simulator.with_parameters(own.at(vector))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Workbench:
     """The data of one diagnosis, with the settings for running and fitting simulators on it."""
 

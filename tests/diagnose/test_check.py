@@ -293,6 +293,14 @@ def test_hold_and_start_are_told(mass):
     assert unsaid.hold == "" and "not stated" in str(unsaid) and unsaid.starts == ("estimated",)
 
 
+def test_an_unstated_hold_is_the_one_that_fits_better(mass):
+    given, _ = mass
+    for hold in ("zero", "linear"):
+        y = MASS.simulate(given.with_(hold=hold))
+        unsaid = check(MASS, given.with_(y=y + 1e-3 * given.y, hold=None), laws=())
+        assert (unsaid.hold, unsaid.hold_taken) == ("", hold)
+
+
 def test_noise_from_periods_is_told_as_such():
     u = np.tile(multisine(500, f_max=8.0, fs=1 / DT, rng=np.random.default_rng(0)), 4)
     given = record(MASS, u).slice(500, 2000).with_(initial="periodic", period=500)
