@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,7 +24,16 @@ from .identifiability import port_units
 from .mismatch_map import mismatch
 from .offsets import remove_zero_offsets, update_offsets
 from .preparation import Prepared
-from .proof import errors_of, free_run_errors, mean_nrmse, next_experiment, parameter_table, placebo, test_errors
+from .proof import (
+    errors_of,
+    find_resting_tests,
+    free_run_errors,
+    mean_nrmse,
+    next_experiment,
+    parameter_table,
+    placebo,
+    test_errors,
+)
 from .result import Diagnosis, Effect
 from .search import Search
 from .trials import Trial
@@ -118,6 +127,7 @@ def build_diagnosis(
         gates=(
             *_surrogate_note(request.stand_in_error),
             *_convergence_note(after),
+            *_resting_notes(tests, after),
             *_combination_note(after, std, blind_spots),
             *update_offsets(found.gates, after, std, bool(effects), settled),
         ),
@@ -180,6 +190,17 @@ def _convergence_note(after: Fitted) -> tuple[Gate, ...]:
         "than their standard errors; bound known ones, or add a recording that distinguishes them."
     )
     return (Gate("simulation", "convergence", after.status.name.lower(), words, False),)
+
+
+def _resting_notes(tests: Sequence[Recording], after: Fitted) -> Iterator[Gate]:
+    """Note test recordings whose scored part hardly moves, so that their relative errors are large."""
+    for name, first in find_resting_tests(tests, after):
+        words = (
+            f"{name or 'The test recording'} hardly moves after its first {first} samples. They serve to estimate its "
+            "initial state and are not scored, so that relative errors on the rest are large. Give its initial state, "
+            "or a longer test recording."
+        )
+        yield Gate("simulation", "resting test", first, words, False)
 
 
 def _combination_note(

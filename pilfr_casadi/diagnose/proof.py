@@ -13,6 +13,7 @@ from ..engine import make_engine
 from ..identify import run_free
 from ..laws import Law
 from ..models import Model
+from ..optimise import samples_to_start
 from ..simulators import Simulator, discretise
 from .evidence import BETTER_RATIO
 from .gates import Gate
@@ -25,6 +26,7 @@ K = TypeVar("K")
 AMPLITUDES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
 SINES, TRIANGLES = 12, 5  # frequencies that are tried
 LONGEST_EXPERIMENT = 3000  # longest simulated experiment, in samples
+LEAST_MOTION = 0.5  # deviation of an output's scored samples over that of all, below which it hardly moves
 VISIBLE_DIFFERENCE = 0.01  # difference of two answers over the noise, above which a recording shows it
 
 
@@ -68,6 +70,25 @@ def test_errors(
         if g.change is not None:
             tests = [g.change(r) for r in tests]
     return {name: errors_of(bench.on(tests), one.fitted_model, starts_of(one)) for name, one in fits.items()}
+
+
+def find_resting_tests(tests: Sequence[Recording], fitted: Fitted) -> list[tuple[str, int]]:
+    """Find test recordings that hardly move after the samples from which their initial state is estimated.
+
+    Returns
+    -------
+    list of (name, samples)
+        Each with the number of those samples. Relative errors on the others are large.
+    """
+    out = []
+    for r in tests:
+        if r.begins != "estimate" or not fitted.model.n_state:
+            continue
+        first = max(r.skip, samples_to_start(fitted.model, fitted.engine, r))
+        whole, scored = (np.std(r.y[k:], axis=0) for k in (r.skip, first))
+        if np.any(scored < LEAST_MOTION * whole):
+            out.append((r.name, first))
+    return out
 
 
 def free_run_errors(

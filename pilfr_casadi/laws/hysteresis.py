@@ -22,7 +22,7 @@ from .._base import InputError
 from ..models import Parameter, play
 from .base import Law, Local, size_to_power
 
-STIFFEST = 20.0  # ratio q/q_0 from which a stiffening loop stiffens no further
+STIFFEST = 5.0  # ratio q/q_0 from which a stiffening loop stiffens no further
 PARTS = 4  # parts into which a step of a held signal is divided
 THIN_LOOPS = 0.1  # ratio of the loops' width to the bend beside them, below which a fit is a curve without memory
 DIRECT = 0.05  # ratio of the direct gain to the plays' total weight, below which they may be a mere backlash
@@ -222,8 +222,8 @@ class StiffeningBoucWen(BoucWen):
     equation = "w = k_h q,  dq/dt = dz/dt (1 + h |q/q_0|^n) - |dz/dt| sign(q) |q/q_0|^n"
     source = "Wen (1976), J. Eng. Mech. 102(2); Ikhouane, Mañosa & Rodellar (2007), J. Sound Vib. 300"
     units = {"k_h": "w/z", "q_0": "z", "h": "", "n": ""}
-    starts = {"q_0": ("half", 0.1, 0.3, 1.0, 3.0), "h": ("", 0.5, 1.5), "n": ("", 1.0)}
-    ranges = {"q_0": ("half", 0.01, 20), "h": ("", 0.0, 10.0), "n": ("", 0.5, 4.0)}
+    starts = {"q_0": ("half", 0.3, 1.0, 3.0), "h": ("", 0.5, 1.5), "n": ("", 1.0)}
+    ranges = {"q_0": ("half", 0.2, 20), "h": ("", 0.0, 5.0), "n": ("", 0.5, 3.0)}
 
     def flow(self, dz: Any, q: Any, p: Any) -> Any:
         """Rate of the hysteretic displacement q, which a motion far beyond the fitted one could make infinite."""

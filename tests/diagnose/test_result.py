@@ -6,12 +6,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from diagnosis_example import example, recorded, rig
+from diagnosis_example import as_it_stands, example, recorded, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
 from pilfr_casadi.diagnose import BlindSpot, Workbench
-from pilfr_casadi.diagnose.proof import next_experiment
+from pilfr_casadi.diagnose.proof import find_resting_tests, next_experiment
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness
 from pilfr_casadi.models import Parameter
 from pilfr_casadi.report import diagnosis_report
@@ -191,3 +191,13 @@ def test_the_next_experiment_has_a_unit_that_the_simulator_knows():
     both = [bench.run(s, {k: p.value for k, p in s.parameters.items()}, [np.zeros(2)]) for s in (known, stiffening)]
     found = next_experiment(bench, *both, noise=1e-3 * bench.scale)
     assert " N at force separates them best" in found["sentence"]
+
+
+def test_a_test_recording_that_rests_after_its_start_is_told():
+    """Its initial state is estimated from the swing, which is not scored."""
+    swing, rest = recorded(rig(), 0), recorded(rig(), 1)
+    push = np.where(np.arange(700) < 40, 20.0, 0.0)[:, None]
+    fading = swing.with_(u=push, y=rig().simulate(swing.with_(u=push)), initial="estimate", name="push")
+    fitted = as_it_stands(Workbench.of(rig(), [rest], "zero"), rig())
+    assert [name for name, _ in find_resting_tests([fading, rest], fitted)] == ["push"]
+    assert not find_resting_tests([fading.with_(initial="zero")], fitted)
