@@ -106,8 +106,7 @@ def build_diagnosis(
     request.say("proof", 0, 1)
     bench, without, after = final.bench, final.without, final.after
     std = deviations(bench, after)
-    errors = _compute_errors(request, found, final, tests)
-    fewer = test_errors(bench, tests, found.gates, _without_each_effect(search, found)) if tests else {}
+    errors, fewer = _compute_errors(request, search, found, final, tests)
     effects = tuple(_make_effect(search, e, after, std, fewer.get(e, np.nan)) for e in found.effects)
     floor = search.least_floor if found.verdict.kind == "unexplained" else search.floor
     settled = found.verdict.kind in ("complete", "recording-fault") or (
@@ -127,7 +126,7 @@ def build_diagnosis(
         gates=(
             *_surrogate_note(request.stand_in_error),
             *_convergence_note(after),
-            *_resting_notes(tests, after),
+            *_resting_notes(tests, (without, after)),
             *_combination_note(after, std, blind_spots),
             *update_offsets(found.gates, after, std, bool(effects), settled),
         ),
@@ -154,23 +153,26 @@ def build_diagnosis(
 
 
 def _compute_errors(
-    request: Request, found: Conclusion, final: FinalFits, tests: tuple[Recording, ...]
-) -> dict[str, dict[str, float] | None]:
-    """Compute the table of errors; see `Diagnosis`."""
-    bench, without, after = final.bench, final.without, final.after
+    request: Request, search: Search, found: Conclusion, final: FinalFits, tests: tuple[Recording, ...]
+) -> tuple[dict[str, dict[str, float] | None], dict[NamedEffect, float]]:
+    """Compute the table of errors (see `Diagnosis`), and the test errors without each of several effects."""
+    bench, without, after, fewer = final.bench, final.without, final.after, dict[NamedEffect, float]()
     errors: dict[str, dict[str, float] | None] = {
         "train": {"nominal": final.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
         "test": None,
     }
     if tests:
-        as_given = bench.on(tests)
+        as_given, each = bench.on(tests), _without_each_effect(search, found)
+        on_tests = test_errors(bench, tests, found.gates, {"before": without, "after": after, **each})
+        fewer = {e: on_tests[e] for e in each}
         errors["test"] = {
             "nominal": errors_of(as_given, as_given.model(request.simulator)),
-            **test_errors(bench, tests, found.gates, {"before": without, "after": after}),
+            "before": on_tests["before"],
+            "after": on_tests["after"],
         }
     if bench.simulator.observer is not None:
         errors["free_run"] = free_run_errors(bench, tests or bench.recordings, request.simulator, without, after)
-    return errors
+    return errors, fewer
 
 
 def _surrogate_note(error: float) -> tuple[Gate, ...]:
@@ -192,9 +194,9 @@ def _convergence_note(after: Fitted) -> tuple[Gate, ...]:
     return (Gate("simulation", "convergence", after.status.name.lower(), words, False),)
 
 
-def _resting_notes(tests: Sequence[Recording], after: Fitted) -> Iterator[Gate]:
+def _resting_notes(tests: Sequence[Recording], fits: Sequence[Fitted]) -> Iterator[Gate]:
     """Note test recordings whose scored part hardly moves, so that their relative errors are large."""
-    for name, first in find_resting_tests(tests, after):
+    for name, first in find_resting_tests(tests, fits):
         words = (
             f"{name or 'The test recording'} hardly moves after its first {first} samples. They serve to estimate its "
             "initial state and are not scored, so that relative errors on the rest are large. Give its initial state, "

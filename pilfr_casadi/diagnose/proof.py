@@ -36,20 +36,31 @@ def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
     return float(np.mean([nrmse(r.y, r.y + e, skip=r.skip) for e, r in pairs]))
 
 
-def errors_of(bench: Workbench, model: Model, starts: Sequence[np.ndarray] = (), *, whole: bool = False) -> float:
-    """Compute the NRMSE of a model at its start values, averaged over recordings; infinite if the simulation diverges.
+def errors_of(bench: Workbench, model: Model, *, whole: bool = False) -> float:
+    """Compute the NRMSE of a model at its start values; see `compare_errors`."""
+    return compare_errors(bench, {"": (model, ())}, whole=whole)[""]
 
-    Unknown initial states are estimated from rest and from `starts`, on a first part that is not scored. With `whole`
-    they are fitted to all samples, which are all scored; use it to compare errors on training recordings with fits.
+
+def compare_errors(
+    bench: Workbench, models: Mapping[K, tuple[Model, Sequence[np.ndarray]]], *, whole: bool = False
+) -> dict[K, float]:
+    """Compute the NRMSEs of models at their start values on the same samples, averaged over recordings.
+
+    Each model has further initial states to start from. Unknown initial states are estimated from rest and from these,
+    on a first part that is not scored; it is the longest that a model needs. With `whole` they are fitted to all
+    samples, which are all scored; use it to compare errors on training recordings with fits. An error is infinite if
+    the simulation diverges.
     """
-    engine = make_engine(model, bench.engine)
-    errors = []
+    engines = {name: make_engine(model, bench.engine) for name, (model, _) in models.items()}
+    errors: dict[K, list[float]] = {name: [] for name in models}
     for r in bench.recordings:
-        y, skip = run_free(model, engine, r, starts, whole=whole)
-        if not np.all(np.isfinite(y)):
-            return np.inf
-        errors.append(nrmse(r.y, y, skip=skip))
-    return float(np.mean(errors))
+        runs = {
+            name: run_free(model, engines[name], r, starts, whole=whole) for name, (model, starts) in models.items()
+        }
+        first = max((skip for _, skip in runs.values()), default=0)
+        for name, (y, _) in runs.items():
+            errors[name].append(nrmse(r.y, y, skip=first) if np.all(np.isfinite(y)) else np.inf)
+    return {name: float(np.mean(each)) for name, each in errors.items()}
 
 
 def starts_of(fitted: Fitted) -> list[np.ndarray]:
@@ -65,15 +76,18 @@ def starts_of(fitted: Fitted) -> list[np.ndarray]:
 def test_errors(
     bench: Workbench, tests: Sequence[Recording], gates: Sequence[Gate], fits: Mapping[K, Fitted]
 ) -> dict[K, float]:
-    """Compute the NRMSE of fits on test recordings with the gates' edits, on the sub-steps that they were fitted on."""
+    """Compute the NRMSEs of fits on the same samples of test recordings with the gates' edits.
+
+    The sub-steps are those that they were fitted on.
+    """
     for g in gates:
         if g.change is not None:
             tests = [g.change(r) for r in tests]
-    return {name: errors_of(bench.on(tests), one.fitted_model, starts_of(one)) for name, one in fits.items()}
+    return compare_errors(bench.on(tests), {name: (one.fitted_model, starts_of(one)) for name, one in fits.items()})
 
 
-def find_resting_tests(tests: Sequence[Recording], fitted: Fitted) -> list[tuple[str, int]]:
-    """Find test recordings that hardly move after the samples from which their initial state is estimated.
+def find_resting_tests(tests: Sequence[Recording], fits: Sequence[Fitted]) -> list[tuple[str, int]]:
+    """Find test recordings that hardly move after the samples from which fits estimate their initial state.
 
     Returns
     -------
@@ -82,9 +96,9 @@ def find_resting_tests(tests: Sequence[Recording], fitted: Fitted) -> list[tuple
     """
     out = []
     for r in tests:
-        if r.begins != "estimate" or not fitted.model.n_state:
+        if r.begins != "estimate":
             continue
-        first = max(r.skip, samples_to_start(fitted.model, fitted.engine, r))
+        first = max(r.skip, *(samples_to_start(f.model, f.engine, r) if f.model.n_state else 0 for f in fits))
         whole, scored = (np.std(r.y[k:], axis=0) for k in (r.skip, first))
         if np.any(scored < LEAST_MOTION * whole):
             out.append((r.name, first))
@@ -94,14 +108,13 @@ def find_resting_tests(tests: Sequence[Recording], fitted: Fitted) -> list[tuple
 def free_run_errors(
     bench: Workbench, recordings: Sequence[Recording], simulator: Simulator, without: Fitted, after: Fitted
 ) -> dict[str, float]:
-    """Compute the NRMSE without an observer, on recordings as they are."""
-    bench, out = bench.on(recordings), dict[str, float]()
-    steps = {"nominal": without, "before": without, "after": after}
-    for name, fitted in steps.items():
+    """Compute the NRMSEs without an observer, on recordings as they are."""
+    models = {}
+    for name, fitted in {"nominal": without, "before": without, "after": after}.items():
         led = simulator if name == "nominal" else fitted.corrected()
         free = discretise(replace(led, observer=None), bench.dt, bench.hold, fitted.model.substeps)
-        out[name] = errors_of(bench, free, starts_of(fitted))
-    return out
+        models[name] = free, starts_of(fitted)
+    return compare_errors(bench.on(recordings), models)
 
 
 def parameter_table(

@@ -10,9 +10,12 @@ from diagnosis_example import as_it_stands, example, recorded, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
+from pilfr_casadi.data import nrmse
 from pilfr_casadi.diagnose import BlindSpot, Workbench
-from pilfr_casadi.diagnose.proof import find_resting_tests, next_experiment
-from pilfr_casadi.laws import CoulombFriction, CubicStiffness
+from pilfr_casadi.diagnose.proof import compare_errors, find_resting_tests, next_experiment
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.identify import run_free
+from pilfr_casadi.laws import CoulombFriction, CubicStiffness, StopHysteresis
 from pilfr_casadi.models import Parameter
 from pilfr_casadi.report import diagnosis_report
 from pilfr_casadi.simulators import Simulator
@@ -193,11 +196,22 @@ def test_the_next_experiment_has_a_unit_that_the_simulator_knows():
     assert " N at force separates them best" in found["sentence"]
 
 
+def test_simulators_are_compared_on_the_same_samples():
+    """A law with memory takes longer to start; the simulator without it is scored from there on as well."""
+    r = recorded(HIDDEN, 0).with_(initial="estimate")
+    bench = Workbench.of(rig(), [r], "zero")
+    plain, rich = (bench.model(s) for s in (rig(), rig().with_element("ground", StopHysteresis())))
+    (alone, sooner), (_, first) = (run_free(m, make_engine(m), r) for m in (plain, rich))
+    assert first > sooner
+    errors = compare_errors(bench, {"plain": (plain, ()), "rich": (rich, ())})
+    assert errors["plain"] == pytest.approx(nrmse(r.y, alone, skip=first))
+
+
 def test_a_test_recording_that_rests_after_its_start_is_told():
     """Its initial state is estimated from the swing, which is not scored."""
     swing, rest = recorded(rig(), 0), recorded(rig(), 1)
     push = np.where(np.arange(700) < 40, 20.0, 0.0)[:, None]
     fading = swing.with_(u=push, y=rig().simulate(swing.with_(u=push)), initial="estimate", name="push")
     fitted = as_it_stands(Workbench.of(rig(), [rest], "zero"), rig())
-    assert [name for name, _ in find_resting_tests([fading, rest], fitted)] == ["push"]
-    assert not find_resting_tests([fading.with_(initial="zero")], fitted)
+    assert [name for name, _ in find_resting_tests([fading, rest], [fitted])] == ["push"]
+    assert not find_resting_tests([fading.with_(initial="zero")], [fitted])
