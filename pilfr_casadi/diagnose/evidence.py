@@ -50,7 +50,7 @@ from .workbench import DIVERGED, Fitted, Workbench
 EFFECT_PRIOR = np.log(0.5)  # log probability of each further effect: one more effect is as likely as not
 FLEXIBLE_PRIOR = np.log(0.2)  # the same of a law that can imitate others, relative to a law that cannot
 DOUBTFUL_PRIOR = np.log(0.01)  # the same of parameter values at which a law degenerates into another
-DOMAIN_PRIOR = np.log(4.0)  # the same of a law that belongs to the domain of its port, relative to a general one
+DOMAIN_PRIOR = np.log(4.0)  # the same of a law of the port's domain relative to a general one, or of that to a rare one
 OUTSIDE_CATALOGUE = 0.1  # probability that missing physics is in no law of the catalogue
 STRAINED_ODDS = 10.0  # how much likelier a wrong law drives a parameter of the simulator to a bound than the right one
 STATE_PRIOR = 1e-9  # precision of initial states relative to the information of a sample: hardly any prior
@@ -281,9 +281,9 @@ def log_prior(
     """Compute the log prior probability of laws: all ports are alike, in a port all laws, and in a law all its forms.
 
     The parameters, which nobody declared as ports, count as one port together. At a port of a known domain (`domains`)
-    the laws of that domain are likelier than general ones. One law in several sensors, such as a logger's filters,
-    counts once. `alternatives` are the laws allowed in each port; `doubtful` tells that a law degenerates at its fitted
-    values.
+    the laws of that domain are likelier than general ones, and these than laws that are rare there. One law in several
+    sensors, such as a logger's filters, counts once. `alternatives` are the laws allowed in each port; `doubtful` tells
+    that a law degenerates at its fitted values.
     """
     total = DOUBTFUL_PRIOR if doubtful else 0.0
     in_sensors = set[type[Law]]()
@@ -298,7 +298,9 @@ def log_prior(
         forms = sum(law.id == e.law.id for law in there)
         total += EFFECT_PRIOR - np.log(ports) - np.log(max(forms, 1))
         total -= np.log(max(parameters, 1)) if kind_of(e.port) == PARAMETER else 0.0
-        total += _log_share(e.law.id, there, (domains or {}).get(e.port, UNKNOWN))
+        domain = (domains or {}).get(e.port, UNKNOWN)
+        total += _log_share(e.law.id, there, domain)
+        total -= DOMAIN_PRIOR if domain in e.law.rare else 0.0
         total += FLEXIBLE_PRIOR if e.law.flexible else 0.0
     return float(total)
 

@@ -158,9 +158,14 @@ class Run:
         return int(self.b.shape[2] - len(self.sign))
 
     def sense(self, law: Law, port: int) -> int:
-        """Return the sign of the law's strengths at a port if the law opposes motion or pushes back; else 0."""
-        side = self.sign if law.dissipative else self.back
-        return int(side[port]) if law.dissipative or law.restoring else 0
+        """Return the sign of the law's strengths at a port if the law opposes motion or pushes back; else 0.
+
+        A coordinate without inertia, such as a temperature, has no motion to oppose. There a law with memory, such as
+        a second heat capacity, pushes back.
+        """
+        if law.dissipative and (self.sign[port] or not (law.order or law.memory)):
+            return int(self.sign[port])
+        return int(self.back[port]) if law.dissipative or law.restoring else 0
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -14,6 +14,7 @@ from ..models import Parameter
 from .base import Law, Local
 
 LONGEST_SCREENED = 24  # memory of a delay in the screen, in steps; longer delays are not tried
+MOST_CREEP = 1.0  # largest ratio of a slow part of a signal to what follows at once; beyond that it is a lag
 NO_PEAK = 0.5**0.5  # damping ratio above which a second-order response has no peak
 
 
@@ -140,8 +141,8 @@ class Creep(Relaxation):
     strength: ClassVar[tuple[str, ...]] = ("c",)
     places = ("series",)
     dissipative = False
-    # with a negative strength the signal would come back; creep continues in the same direction
-    ranges = {**Relaxation.ranges, "c": ("", 0.0, np.inf)}
+    # with a negative strength the signal would come back; if most of it came slowly, it would be a lag
+    ranges = {**Relaxation.ranges, "c": ("", 0.0, MOST_CREEP)}
 
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.c * q
@@ -154,7 +155,7 @@ class TwoStageCreep(_TwoStages, Creep):
     units = {"c_1": "", "c_2": "", "T_1": "s", "T_2": "s"}
     strength = ("c_1", "c_2")
     one_stage = Creep
-    ranges = {**_TwoStages.ranges, "c_1": ("", 0.0, np.inf), "c_2": ("", 0.0, np.inf)}
+    ranges = {**_TwoStages.ranges, "c_1": ("", 0.0, MOST_CREEP), "c_2": ("", 0.0, MOST_CREEP)}
 
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.c_1 * q[0] + p.c_2 * q[1]
@@ -196,6 +197,7 @@ class Resonance(Law):
     sentence = "an unmodelled resonance in the path of the signal"
     units = {"W": "rad/s", "D": ""}
     places: ClassVar[tuple[str, ...]] = ("series",)
+    rare = ("thermal",)  # heat has no inertia
     order, follows = 2, 1
     starts = {"W": lambda at: np.geomspace(0.015, 1.2, 16) / at.dt, "D": ("", 0.05)}
     ranges = {"W": lambda at: (8 / at.duration, 1.6 / at.dt), "D": ("", 1e-3, 1.0)}

@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -22,6 +22,7 @@ from .._base import InputError
 from ..models import Parameter, play
 from .base import Law, Local, size_to_power
 
+FEWEST_REVERSALS = 2  # up, down and up again: with fewer, a loop looks like a curve or a slow motion
 STIFFEST = 5.0  # ratio q/q_0 from which a stiffening loop stiffens no further
 PARTS = 4  # parts into which a step of a held signal is divided
 THIN_LOOPS = 0.1  # ratio of the loops' width to the bend beside them, below which a fit is a curve without memory
@@ -36,6 +37,11 @@ Q = _MOMENT / _MASS  # centres of the cells
 WIDTH = _MASS * np.exp(Q)  # widths of the cells, for the density exp(-q) at the centres
 
 
+def _hardly_turns(local: Local) -> str:
+    """Say that memory of turning points does not show; empty if it may."""
+    return "" if local.reversals >= FEWEST_REVERSALS else "the motion hardly reverses"
+
+
 class _Hysteresis(Law):
     """The common part of forces with rate-independent hysteresis."""
 
@@ -44,6 +50,9 @@ class _Hysteresis(Law):
     contains = ("backlash", "coulomb_friction", "linear_stiffness")
     sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
     dissipative = True
+
+    def why_not(self, local: Local) -> str:
+        return _hardly_turns(local) or super().why_not(local)
 
 
 class StopHysteresis(_Hysteresis):
@@ -94,6 +103,7 @@ class PlayHysteresis(StopHysteresis):
     source = "Krikelis et al. (2024), Eq. 1 and 16"
     sentence = "rate-independent hysteresis: the output depends on where the signal last turned round"
     places = ("series",)
+    rare: ClassVar[tuple[str, ...]] = ("thermal",)
     dissipative = False
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
@@ -237,6 +247,7 @@ class BoucWenActuator(BoucWen):
     equation = "w = b z + k_h q,  q+ = q + dz (1 - (1 - s + s sign(q dz)) |q/q_0|^n) at each step dz of z"
     units = {"b": "w/z", "k_h": "w/z", "q_0": "z", "s": "", "n": ""}
     places = ("series",)
+    rare: ClassVar[tuple[str, ...]] = ("thermal",)
     dissipative = False
     order = 0
     memory = 2  # the last z, and the q that was reached there
@@ -259,9 +270,13 @@ class Backlash(Law):
     sentence = "backlash: on every reversal the signal is lost until the play is taken up"
     units = {"r": "z"}
     places = ("series",)
+    rare: ClassVar[tuple[str, ...]] = ("thermal",)
     memory = 1
     starts = {"r": ("half", 0.01, 0.03, 0.08, 0.18, 0.35, 0.6)}
     ranges = {"r": ("half", 0.001, 0.9)}
+
+    def why_not(self, local: Local) -> str:
+        return _hardly_turns(local) or super().why_not(local)
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
         following = play(z, s, p["r"])

@@ -65,6 +65,17 @@ def test_laws_of_the_domain_of_a_port_are_likelier_and_no_law_is_so_at_a_mechani
     assert sum(map(np.exp, ids)) == pytest.approx(0.5)  # one more effect is as likely as not
 
 
+def test_a_law_that_is_rare_in_the_domain_of_a_port_is_less_likely():
+    room = pilfr.Simulator(lambda x: {"T": -x.T}, lambda x: {"y": x.T}, states=("T",))
+    there = {"sensor:y": (laws.Backlash(), laws.Saturation())}
+    play, limit = (room.with_element("sensor:y", law).elements for law in there["sensor:y"])
+    for domain, ratio in (("thermal", 4), ("mechanical", 1), ("unknown", 1)):
+        domains = {"sensor:y": domain}
+        assert log_prior(limit, there, domains=domains) - log_prior(play, there, domains=domains) == pytest.approx(
+            np.log(ratio)
+        )
+
+
 def test_a_parameters_unit_does_not_change_its_information():
     train = recordings(laws.CubicStiffness(values={"k_3": 3e5}), count=1)
     bench = Workbench.of(rig(OFF), train, "zero")

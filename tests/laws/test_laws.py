@@ -294,9 +294,9 @@ def test_a_mode_that_cannot_swing_is_hardly_a_mode():
 
 
 @pytest.mark.parametrize("kind", (laws.Creep, laws.TwoStageCreep))
-def test_creep_of_a_signal_goes_on_in_its_direction(kind):
+def test_creep_of_a_signal_goes_on_in_its_direction_and_is_no_lag(kind):
     bounds = kind().bounds(LOCAL)
-    assert all(bounds[name] == (0.0, np.inf) for name in kind.strength)
+    assert all(bounds[name] == (0.0, 1.0) for name in kind.strength)
     assert all(bounds[name][1] == 2 * LOCAL.duration for name in kind.units if name.startswith("T"))
 
 
