@@ -302,12 +302,15 @@ def _design_experiment(
         if effect.alike:
             name, other = next(iter(effect.alike.items()))
             one = max((t for t in search.memo.values() if effect.name in names(t)), key=search.evidence)
-            best = next_experiment(search.bench, one.fitted, other.fitted, search.floor.deviation, limits)
+            rivals = in_words([name_at(*pair, brief=True) for pair in (effect.name, name)])
+            best = next_experiment(search.bench, one.fitted, other.fitted, search.floor.deviation, limits, rivals)
             tied = [list(effect.name), list(name)]
             if best is not None:
                 return {"between": tied, **best}
-            rivals = in_words([name_at(*pair, brief=True) for pair in (effect.name, name)])
-            sentence = f"No sine or triangle within the allowed amplitude tells {rivals} apart beyond the noise."
+            sentence = (
+                f"No sine or triangle within the allowed amplitude tells {rivals} apart beyond the noise and better "
+                "than these recordings do."
+            )
             return {"between": tied, "sentence": sentence}
     return None
 

@@ -280,7 +280,7 @@ class NearLaw:
     kind: Law
     start: dict[str, Any]
     error: float
-    force: np.ndarray
+    force: np.ndarray = field(repr=False)
 
     @property
     def law(self) -> str:
@@ -316,9 +316,9 @@ class Learned:
     port: str
     factor: str
     share: float
-    z: np.ndarray
-    dz: np.ndarray
-    force: np.ndarray
+    z: np.ndarray = field(repr=False)
+    dz: np.ndarray = field(repr=False)
+    force: np.ndarray = field(repr=False)
     nearest: tuple[NearLaw, ...] = field(default=())
 
     @property

@@ -135,9 +135,14 @@ def parameter_table(
 
 
 def next_experiment(
-    bench: Workbench, one: Fitted, other: Fitted, noise: np.ndarray, limits: Mapping[str, float] | None = None
+    bench: Workbench,
+    one: Fitted,
+    other: Fitted,
+    noise: np.ndarray,
+    limits: Mapping[str, float] | None = None,
+    rivals: str = "the two",
 ) -> dict[str, Any] | None:
-    """Find the input that separates two fitted explanations best.
+    """Find the input that separates two fitted explanations, the `rivals`, best.
 
     Parameters
     ----------
@@ -150,7 +155,8 @@ def next_experiment(
     -------
     dict or None
         `input`, `waveform`, `amplitude`, `frequency` (Hz), `separation` (rms difference over the noise), `recorded`
-        (the separation in the recordings) and `sentence`; None if nothing within the limits separates them.
+        (the separation in the recordings) and `sentence`; None if nothing within the limits separates them better than
+        the recordings do.
     """
     u = np.concatenate([r.u for r in bench.recordings])
     m = min(max(map(len, bench.recordings)), LONGEST_EXPERIMENT)
@@ -187,7 +193,9 @@ def next_experiment(
     if best is None or best["separation"] < 1.0:
         return None
     recorded = max(separation(r.u[:m]) for r in bench.recordings)
-    return {**best, "recorded": recorded, "sentence": _describe_experiment(bench, best, recorded)}
+    if best["separation"] < BETTER_RATIO * recorded:
+        return None
+    return {**best, "recorded": recorded, "sentence": _describe_experiment(bench, best, recorded, rivals)}
 
 
 def _waves(m: int, dt: float) -> Iterator[tuple[str, float, np.ndarray]]:
@@ -199,13 +207,13 @@ def _waves(m: int, dt: float) -> Iterator[tuple[str, float, np.ndarray]]:
         yield "triangle", f, 2 / np.pi * np.arcsin(np.sin(2 * np.pi * f * t))
 
 
-def _describe_experiment(bench: Workbench, best: Mapping[str, Any], recorded: float) -> str:
+def _describe_experiment(bench: Workbench, best: Mapping[str, Any], recorded: float, rivals: str) -> str:
     """Describe an experiment; `recorded` is the separation in the recordings."""
     unit = {**bench.simulator.units, **bench.recordings[0].units}.get(best["input"], "")
     so_far = f"by {recorded:.2g} times" if recorded > VISIBLE_DIFFERENCE else "not at all"
     return (
         f"A {best['waveform']} of {best['frequency']:.3g} Hz with amplitude {best['amplitude']:.3g}"
-        f"{' ' + unit if unit else ''} at {best['input']} separates them best: their outputs then differ by "
+        f"{' ' + unit if unit else ''} at {best['input']} separates {rivals} best: their outputs then differ by "
         f"{best['separation']:.3g} times the noise (in these recordings {so_far})."
     )
 

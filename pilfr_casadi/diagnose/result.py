@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from ..data import SAME_STEP, Recording, as_recordings, nrmse
 from ..engine import make_engine
 from ..identify import RUN_AWAY, match_channels, run_free
 from ..models import ParameterSet
-from ..simulators import EQUATION, PARAMETER, Simulator, discretise, in_series, name_at, split_port
+from ..simulators import ACTUATOR, EQUATION, PARAMETER, Simulator, discretise, in_series, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
 from .evidence import BETTER_RATIO, FAR_RATIO, SURE
@@ -452,6 +452,7 @@ class Diagnosis:
                 f"{', '.join(at_bounds)} came out at {'its bound' if one else 'their bounds'}: more is missing, or "
                 f"{'it has' if one else 'they have'} too little room. The ± of the other values do not include that."
             )
+        out += self._doubtful_offsets()
         test, train = self.errors["test"], self.errors["train"]
         if train and train["before"] > NEAR_CONSTANT and self.verdict in ("missing-physics", "unexplained"):
             out.append(
@@ -468,6 +469,20 @@ class Diagnosis:
                 "recording visits states that the training recordings do not."
             )
         return out
+
+    def _doubtful_offsets(self) -> Iterator[str]:
+        """Generate a note on each offset that is larger than its signal ever was."""
+        own, r = self.corrected.parameters, self.train[0]
+        for e in (e for e in self.corrected.elements if e.law.id == "offset"):
+            kind, name = split_port(e.port)
+            side, names = ("u", r.inputs) if kind == ACTUATOR else ("y", r.outputs)
+            reach = max(float(np.max(np.abs(getattr(one, side)[:, names.index(name)]))) for one in self.train)
+            value = float(own[f"{e.prefix}w_0"].value)
+            if abs(value) > reach:
+                yield (
+                    f"The offset of {name} ({value:.3g}) is larger than {name} ever was ({reach:.3g}): it makes up for "
+                    "something else, such as a wrong level or gain, or missing physics."
+                )
 
     def _at_bounds(self) -> list[str]:
         """List the free entries of parameters at a bound, each with its value.

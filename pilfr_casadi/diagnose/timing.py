@@ -57,7 +57,8 @@ class TimeShift(Gate):
         words = f"The clock of {self.channel} runs {value * 100:+.3g} % off the others'"
         if self.finding == "alignment":
             late = "late" if value > 0 else "early"
-            words = f"{self.channel} is recorded {abs(value / dt):.3g} samples ({abs(value):.3g} s) too {late}"
+            are = "are" if "," in self.channel else "is"
+            words = f"{self.channel} {are} recorded {abs(value / dt):.3g} samples ({abs(value):.3g} s) too {late}"
             words += ", or the machine delays it by as much" if self.kind == "y" and value > 0 else ""
         moved = replace(self, value=value, sentence=words)
         return replace(moved, change=moved.read)

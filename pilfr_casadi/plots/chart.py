@@ -132,8 +132,8 @@ def _thin_in_windows(x: np.ndarray, y: np.ndarray, windows: list[float], most: i
 
 def _pack_numbers(values: np.ndarray) -> Any:
     """Write numbers as base64 of single precision; write equidistant numbers as first value, step and count."""
-    steps = np.diff(values)
+    finite = np.where(np.abs(values) <= ENDLESS, values, np.nan)
+    steps = np.diff(finite)
     if len(values) > 2 and np.ptp(steps) <= 1e-6 * abs(steps[0]):
         return [float(values[0]), float((values[-1] - values[0]) / (len(values) - 1)), len(values)]
-    finite = np.where(np.abs(values) <= ENDLESS, values, np.nan)
     return base64.b64encode(finite.astype("<f4").tobytes()).decode()

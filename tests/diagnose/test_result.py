@@ -12,6 +12,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
 from pilfr_casadi.data import nrmse
 from pilfr_casadi.diagnose import BlindSpot, Workbench
+from pilfr_casadi.diagnose.offsets import Offset
 from pilfr_casadi.diagnose.proof import compare_errors, find_resting_tests, next_experiment
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.identify import run_free
@@ -193,7 +194,7 @@ def test_the_next_experiment_has_a_unit_that_the_simulator_knows():
     stiffening = known.with_element("ground", CubicStiffness().at({"k_3": 2.0e4}))
     both = [bench.run(s, {k: p.value for k, p in s.parameters.items()}, [np.zeros(2)]) for s in (known, stiffening)]
     found = next_experiment(bench, *both, noise=1e-3 * bench.scale)
-    assert " N at force separates them best" in found["sentence"]
+    assert " N at force separates the two best" in found["sentence"]
 
 
 def test_simulators_are_compared_on_the_same_samples():
@@ -215,3 +216,11 @@ def test_a_test_recording_that_rests_after_its_start_is_told():
     fitted = as_it_stands(Workbench.of(rig(), [rest], "zero"), rig())
     assert [name for name, _ in find_resting_tests([fading, rest], [fitted])] == ["push"]
     assert not find_resting_tests([fading.with_(initial="zero")], [fitted])
+
+
+def test_an_offset_beyond_the_range_of_its_signal_is_doubted():
+    d = example()
+    for value, doubted in ((1e3, True), (1.0, False)):
+        shifted = d.corrected.with_element("actuator:force", Offset(values={"w_0": value}))
+        told = [w for w in replace(d, corrected=shifted).warnings() if "is larger than force ever was" in w]
+        assert bool(told) == doubted
