@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from ..laws import DRAGS, DRY, Attached, Delay, Lag, Law, Local, Resonance, SprungMass, unit_forces
+from ..laws import DRAGS, DRY, SMALL_AND_LARGE, Attached, Delay, Lag, Law, Local, Resonance, SprungMass, unit_forces
 from ..simulators import in_series
 from .evidence import FAR_RATIO, NEAR_RATIO
 from .linearise import port_signals
@@ -45,9 +45,9 @@ COMPARED_SAMPLES = 4000  # approximate number of samples on which forces are com
 def complements(one: Law, other: Law) -> bool:
     """Tell whether two laws of a port are different physics: one opposes motion, the other is a curve of position.
 
-    So are dry friction and a drag that grows with speed, and two curves of position if a signal, such as a pressure,
-    varies the strength of one alone. A constant offset may stand beside any other law, and a mass on a spring beside
-    any force without such a mass.
+    So are dry friction and a drag that grows with speed, a dead zone and a saturation, and two curves of position if a
+    signal, such as a pressure, varies the strength of one alone. A constant offset may stand beside any other law, and
+    a mass on a spring beside any force without such a mass.
     """
     if "offset" in (one.id, other.id):
         return one.id != other.id
@@ -56,6 +56,8 @@ def complements(one: Law, other: Law) -> bool:
         plain = other if sprung[0] else one
         return not all(sprung) and plain.order == 0
     if any(a.id in DRY and b.id in DRAGS for a, b in ((one, other), (other, one))):
+        return True
+    if {one.id, other.id} == set(SMALL_AND_LARGE):
         return True
     rubs, springs = sorted((one, other), key=lambda law: not law.dissipative)
     if _is_curve(rubs):

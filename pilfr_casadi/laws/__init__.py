@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         LINEAR as LINEAR,
         POSITION_GAINS as POSITION_GAINS,
         SCALABLE as SCALABLE,
+        SMALL_AND_LARGE as SMALL_AND_LARGE,
     )
     from .composed import (
         PROFILES as PROFILES,

@@ -33,6 +33,9 @@ LINEAR = (stiffness.LinearStiffness.id, friction.ViscousDamping.id)
 DRY = (friction.CoulombFriction.id, friction.StribeckFriction.id)
 DRAGS = (friction.ViscousDamping.id, friction.QuadraticDrag.id, friction.CubicDamping.id)
 
+# ids of what becomes of small and of large signals; a drive or a valve may have one of each
+SMALL_AND_LARGE = (curves.DeadZone.id, curves.Saturation.id)
+
 # laws of the position that an input may scale: a force constant or a valve's gain that varies with the position
 POSITION_GAINS: tuple[type[Law], ...] = (stiffness.LinearStiffness, stiffness.QuadraticStiffness)
 

@@ -1,6 +1,7 @@
 """Two laws missing at one port: friction and a curve of position are different physics there."""
 
 import pytest
+from diagnosis_example import recorded, rig as example_rig
 from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
@@ -22,6 +23,21 @@ def test_friction_and_ripple_at_one_port_are_both_named():
     assert found.errors["test"]["after"] < 1.2 * found.floor["nrmse"]
 
 
+def test_a_drive_may_have_a_dead_zone_and_a_limit():
+    """Both at one actuator, as of a motor's power stage: they add up to clip(u, -L, L) - clip(u, -g, g)."""
+    true = example_rig().with_element("actuator:force", laws.DeadZone().at({"g": 1.5}))
+    true = true.with_element("actuator:force", laws.Saturation().at({"L": 12.0}))
+    train, test = recorded(true, 0), recorded(true, 1)
+    found = pilfr.diagnose(example_rig(430.0, 5.0), train, test=test)
+    assert {(e.port, e.law) for e in found.effects} == {
+        ("actuator:force", "dead_zone"),
+        ("actuator:force", "saturation"),
+    }
+    values = {name: p["value"] for e in found.effects for name, p in e.parameters.items()}
+    assert values == pytest.approx({"g": 1.5, "L": 12.0}, rel=0.03)
+    assert found.errors["test"]["after"] < 1.3 * found.floor["nrmse"]
+
+
 @pytest.mark.parametrize(
     ("one", "other", "apart"),
     [
@@ -39,6 +55,8 @@ def test_friction_and_ripple_at_one_port_are_both_named():
         (laws.Attached, laws.ElasticDrive, False),  # both masses on springs
         (laws.Relaxation, laws.Attached, False),  # both may follow anything slow
         (laws.CubicStiffness, laws.scaled(laws.LinearStiffness, "pressure"), True),  # a signal varies one of them
+        (laws.DeadZone, laws.SoftSaturation, True),  # of small and of large signals
+        (laws.DeadZone, laws.AsymmetricDeadZone, False),
         (laws.CubicStiffness, laws.scheduled(laws.LinearStiffness, "z"), False),
     ],
 )
