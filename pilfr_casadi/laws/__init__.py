@@ -125,6 +125,7 @@ if TYPE_CHECKING:
         LineGap as LineGap,
     )
     from .stiffness import (
+        AsymmetricCubicStiffness as AsymmetricCubicStiffness,
         Clearance as Clearance,
         CubicStiffness as CubicStiffness,
         GeometricStiffness as GeometricStiffness,

@@ -96,6 +96,23 @@ class QuinticStiffness(CubicStiffness):
         return super().force(z, p) + p.k_5 * z**5
 
 
+class AsymmetricCubicStiffness(CubicStiffness):
+    """A hardening or softening spring that differs between the directions: a suspension, a preloaded membrane."""
+
+    form = "asymmetric"
+    equation = "w = k_3 (z^3 + b z^2)"
+    source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 4.2; Klippel (2006), J. Audio Eng. Soc. 54(10)"
+    sentence = "a stiffness that grows (or falls) with the square of the deflection, not the same in both directions"
+    units = {"k_3": "w/z^3", "b": "z"}
+    domains = ("mechanical", "fluid")
+    two_sided = True
+    starts = {"b": ("reach", -0.3, 0.3)}
+    ranges = {"b": ("reach", -1, 1)}  # the quadratic part stays below the cubic one
+
+    def force(self, z: Any, p: Any) -> Any:
+        return super().force(z, p) + p.k_3 * p.b * z**2
+
+
 class QuadraticStiffness(Law):
     """A spring that is stiffer in one direction (Nayfeh & Mook 1979)."""
 
