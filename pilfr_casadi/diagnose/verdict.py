@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..simulators import SENSOR, Placed, name_at, port_name
+from ..simulators import SENSOR, Placed, name_at, name_at_any, port_name
 from .evidence import (
     AT_NOISE_RATIO,
     BETTER_RATIO,
@@ -79,6 +79,11 @@ class NamedEffect:
     def name(self) -> Name:
         """Port and law id."""
         return self.element.port, self.element.law.id
+
+    @property
+    def words(self) -> str:
+        """Name it with every place where it would look the same: "delay at sensor:y or actuator:u"."""
+        return name_at_any(*self.name, self.element.law.form, self.alike)
 
 
 @dataclass(frozen=True, eq=False)
@@ -404,10 +409,7 @@ def _swells(search: Hypotheses) -> bool:
 
 def _describe_effects(search: Hypotheses, found: Posterior) -> str:
     sure, unsure = (
-        " and ".join(
-            name_at(*e.name, e.element.law.form, brief=True) for e in found.effects if (e.confidence > SURE) is known
-        )
-        for known in (True, False)
+        " and ".join(e.words for e in found.effects if (e.confidence > SURE) is known) for known in (True, False)
     )
     names_are = "names are" if " and " in unsure else "name is"
     if not unsure:

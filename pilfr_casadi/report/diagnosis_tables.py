@@ -15,7 +15,7 @@ from ..diagnose import ERROR_NAMES, Diagnosis, Effect, Fitted, Workbench, law_si
 from ..identify import RUN_AWAY
 from ..laws import VaryingParameter, display_name, heated, readable_unit, scaled, scheduled, short_name, varying
 from ..models import Parameter, ParameterSet
-from ..simulators import PARAMETER, kind_of, name_at
+from ..simulators import PARAMETER, kind_of, name_at, name_at_any
 from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
@@ -87,7 +87,7 @@ def answer(diagnosis: Diagnosis, forces: Sequence[str]) -> str:
     for e, force in zip(d.effects, forces, strict=True):
         sizes = [f"{name} {number_text(p['value'], 3)}\u00a0{p['unit']}".strip() for name, p in e.defined.items()]
         strong = sizes[0] if sizes else force
-        name = name_at(e.port, e.law, e.form, brief=True)
+        name = name_at_any(e.port, e.law, e.form, e.indistinguishable)
         named.append(f"{name}{strong and ', ' + strong}, {100 * e.confidence:.0f}\u00a0% sure")
     places = ", ".join(dict.fromkeys(f.port for f in d.learned))
     nameless = f"A force without a name at {places}" if places else "Something is missing that has no name"

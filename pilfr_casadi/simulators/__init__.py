@@ -66,6 +66,7 @@ if TYPE_CHECKING:
         in_series as in_series,
         kind_of as kind_of,
         name_at as name_at,
+        name_at_any as name_at_any,
         port_name as port_name,
         split_port as split_port,
     )

@@ -6,7 +6,7 @@ and their owner: `actuator:<input>`, `sensor:<output>`, `equation:<state>`, `par
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -58,6 +58,18 @@ def name_at(port: str, law: str, form: str = "", brief: bool = False) -> str:
         _, _, by = form.rpartition("scheduled by ")
         return f"variation of {of}" + (f" with {'time' if by == 't' else by}" if by else "")
     return f"{(short_name if brief else display_name)(law, form)} at {port}"
+
+
+def name_at_any(port: str, law: str, form: str, alike: Iterable[tuple[str, str]]) -> str:
+    """Name a law in a port briefly, with the other ports where it would look the same; `alike` are (port, law).
+
+    Examples
+    --------
+    >>> name_at_any("guide", "coulomb_friction", "smooth", [("screw", "coulomb_friction"), ("guide", "hysteresis")])
+    'Coulomb friction at guide or screw'
+    """
+    others = (place for place, other in alike if other == law and place != port)
+    return " or ".join([name_at(port, law, form, brief=True), *others])
 
 
 @dataclass(frozen=True, eq=False)
