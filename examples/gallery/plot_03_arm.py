@@ -47,9 +47,9 @@ simulator, train, test = arm(1.0, 0.05), record(machine, 1), record(machine, 2)
 beside = simulator.plot(test)
 
 # %%
-# The next term of the sine is a cubic stiffness that falls with the angle.
+# The unit of the angle is known, so that the torque of gravity is tried with its sine.
 
 diagnosis = pilfr.diagnose(simulator, train, test=test)
 print(diagnosis)
 proof = diagnosis.plot(test)
-assert "cubic_stiffness" in {effect.law for effect in diagnosis.effects} and diagnosis.outcome == "better"
+assert {effect.law for effect in diagnosis.effects} == {"gravity", "coulomb_friction"} and diagnosis.outcome == "better"
