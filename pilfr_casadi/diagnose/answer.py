@@ -13,8 +13,8 @@ import numpy as np
 from .._base import InputError, in_words
 from ..data import Recording
 from ..identify import surrogate_warning
-from ..laws import readable_unit
-from ..simulators import name_at, split_port
+from ..laws import readable_unit, short_name
+from ..simulators import Placed, in_series, name_at, split_port
 from .arguments import Request
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction
@@ -22,10 +22,9 @@ from .evidence import SURE, deviations
 from .gates import Gate
 from .identifiability import port_units
 from .mismatch_map import mismatch
-from .offsets import remove_zero_offsets, update_offsets
+from .offsets import Offset, remove_zero_offsets, update_offsets
 from .preparation import Prepared
 from .proof import (
-    errors_of,
     find_resting_tests,
     free_run_errors,
     mean_nrmse,
@@ -162,14 +161,11 @@ def _compute_errors(
         "test": None,
     }
     if tests:
-        as_given, each = bench.on(tests), _without_each_effect(search, found)
-        on_tests = test_errors(bench, tests, found.gates, {"before": without, "after": after, **each})
-        fewer = {e: on_tests[e] for e in each}
-        errors["test"] = {
-            "nominal": errors_of(as_given, as_given.model(request.simulator)),
-            "before": on_tests["before"],
-            "after": on_tests["after"],
-        }
+        each = _without_each_effect(search, found)
+        fits = {"before": without, "after": after, **{f"without {i}": f for i, f in enumerate(each.values())}}
+        on_tests = test_errors(bench, tests, found.gates, fits, bench.on(tests).model(request.simulator))
+        fewer = {e: on_tests[f"without {i}"] for i, e in enumerate(each)}
+        errors["test"] = {name: on_tests[name] for name in ("nominal", "before", "after")}
     if bench.simulator.observer is not None:
         errors["free_run"] = free_run_errors(bench, tests or bench.recordings, request.simulator, without, after)
     return errors, fewer
@@ -198,9 +194,9 @@ def _resting_notes(tests: Sequence[Recording], fits: Sequence[Fitted]) -> Iterat
     """Note test recordings whose scored part hardly moves, so that their relative errors are large."""
     for name, first in find_resting_tests(tests, fits):
         words = (
-            f"{name or 'The test recording'} hardly moves after its first {first} samples. They serve to estimate its "
-            "initial state and are not scored, so that relative errors on the rest are large. Give its initial state, "
-            "or a longer test recording."
+            f"In {name or 'the test recording'} an output moves less than half as much after {first} samples. These "
+            "serve to estimate its initial state and are not scored, so that relative errors on the rest are "
+            "large. Give its initial state, or a longer test recording."
         )
         yield Gate("simulation", "resting test", first, words, False)
 
@@ -277,12 +273,12 @@ def _make_effect(
             label = name.removeprefix(element.prefix) + (f"[{i}]" if len(flat) > 1 else "")
             error = float(np.ravel(std[name])[i])
             shown[label] = {"value": float(v), "std": error if np.isfinite(error) else None, "unit": unit}
-    remark = law.remark(element.own(fitted.values))
+    remarks = [law.remark(element.own(fitted.values)), *_order(fitted, element)]
     return Effect(
         port=element.port,
         law=law.id,
         confidence=named.confidence,
-        sentence=f"{law.sentence}; {remark}" if remark else law.sentence,
+        sentence="; ".join(filter(None, [law.sentence, *remarks])),
         equation=law.equation.replace("dz/dt", "v") if port.is_speed else law.equation,
         parameters=shown,
         indistinguishable=tuple(named.alike),
@@ -290,6 +286,15 @@ def _make_effect(
         placebo={"own": own, "unrelated": unrelated},
         test_without=test_without,
     )
+
+
+def _order(fitted: Fitted, element: Placed) -> Iterator[str]:
+    """Tell which laws of the same signal come before a law."""
+    for e in fitted.simulator.elements:
+        if e is element:
+            return
+        if e.port == element.port and in_series(e.port) and not isinstance(e.law, Offset):
+            yield f"it acts on the signal after the {short_name(e.law.id, e.law.form)}"
 
 
 def _design_experiment(

@@ -74,16 +74,22 @@ def starts_of(fitted: Fitted) -> list[np.ndarray]:
 
 
 def test_errors(
-    bench: Workbench, tests: Sequence[Recording], gates: Sequence[Gate], fits: Mapping[K, Fitted]
-) -> dict[K, float]:
-    """Compute the NRMSEs of fits on the same samples of test recordings with the gates' edits.
+    bench: Workbench, tests: Sequence[Recording], gates: Sequence[Gate], fits: Mapping[str, Fitted], given: Model
+) -> dict[str, float]:
+    """Compute the NRMSEs of fits, on the sub-steps that they were fitted on, and of the `given` model as "nominal".
 
-    The sub-steps are those that they were fitted on.
+    The fits see the test recordings with the gates' edits, the given model as they are. All are scored on the same
+    samples, unless an edit changes these.
     """
-    for g in gates:
-        if g.change is not None:
-            tests = [g.change(r) for r in tests]
-    return compare_errors(bench.on(tests), {name: (one.fitted_model, starts_of(one)) for name, one in fits.items()})
+    models = {name: (one.fitted_model, starts_of(one)) for name, one in fits.items()}
+    nominal: dict[str, tuple[Model, Sequence[np.ndarray]]] = {"nominal": (given, ())}
+    edits = [g.change for g in gates if g.change is not None]
+    if not edits:
+        return compare_errors(bench.on(tests), {**nominal, **models})
+    edited = list(tests)
+    for change in edits:
+        edited = [change(r) for r in edited]
+    return {**compare_errors(bench.on(tests), nominal), **compare_errors(bench.on(edited), models)}
 
 
 def find_resting_tests(tests: Sequence[Recording], fits: Sequence[Fitted]) -> list[tuple[str, int]]:

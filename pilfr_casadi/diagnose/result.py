@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, in_words, later, to_json, write_atomically
+from .._base import InputError, later, to_json, write_atomically
 from ..data import SAME_STEP, Recording, as_recordings, nrmse
 from ..engine import make_engine
 from ..identify import RUN_AWAY, match_channels, run_free
@@ -24,6 +24,7 @@ from .evidence import BETTER_RATIO, FAR_RATIO, SURE
 from .floor import ABOVE_NOISE
 from .gates import Gate
 from .learned import Learned
+from .offsets import Offset
 from .proof import starts_of
 from .refinement import Refinement, refine
 from .workbench import Fitted
@@ -223,15 +224,15 @@ class Diagnosis:
         return f"error on the test recordings: {with_it} with it, {without} without it (the rest refitted)"
 
     def _idle_on_tests(self) -> str:
-        """Name the effects without which the test recordings are followed as well; empty if there are none."""
+        """Name the effects without which, one at a time, the test recordings are followed as well."""
         after = (self.errors.get("test") or {}).get("after", np.nan)
         idle = [name_at(e.port, e.law, e.form) for e in self.effects if e.test_without <= after]
         if not idle:
             return ""
         rest = "their names rest" if idle[1:] else "its name rests"
         return (
-            f" The test recordings are followed as well without {in_words(idle)}; {rest} on the training recordings "
-            "alone."
+            f" The test recordings are followed as well without {', or without '.join(idle)}; {rest} on the training "
+            "recordings alone."
         )
 
     def _better_without(self) -> str:
@@ -472,16 +473,16 @@ class Diagnosis:
 
     def _doubtful_offsets(self) -> Iterator[str]:
         """Generate a note on each offset that is larger than its signal ever was."""
-        own, r = self.corrected.parameters, self.train[0]
-        for e in (e for e in self.corrected.elements if e.law.id == "offset"):
+        own = self.corrected.parameters
+        for e in (e for e in self.corrected.elements if isinstance(e.law, Offset) and self.train):
             kind, name = split_port(e.port)
-            side, names = ("u", r.inputs) if kind == ACTUATOR else ("y", r.outputs)
-            reach = max(float(np.max(np.abs(getattr(one, side)[:, names.index(name)]))) for one in self.train)
-            value = float(own[f"{e.prefix}w_0"].value)
+            values = [r.u if kind == ACTUATOR else r.y for r in self.train]
+            at = (self.train[0].inputs if kind == ACTUATOR else self.train[0].outputs).index(name)
+            reach, value = max(float(np.max(np.abs(v[:, at]))) for v in values), float(own[f"{e.prefix}w_0"].value)
             if abs(value) > reach:
                 yield (
-                    f"The offset of {name} ({value:.3g}) is larger than {name} ever was ({reach:.3g}): it makes up for "
-                    "something else, such as a wrong level or gain, or missing physics."
+                    f"The offset of {name} ({value:.3g}) is larger than {name} ever was ({reach:.3g}): it may make up "
+                    "for something else, such as a wrong level or gain, or missing physics."
                 )
 
     def _at_bounds(self) -> list[str]:

@@ -13,13 +13,11 @@ from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
     from .base import (
-        SMALLEST_SWING as SMALLEST_SWING,
         Law as Law,
         Local as Local,
         display_name as display_name,
         readable_unit as readable_unit,
         short_name as short_name,
-        turning_points as turning_points,
     )
     from .catalogue import (
         CATALOGUE as CATALOGUE,

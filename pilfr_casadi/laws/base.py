@@ -44,7 +44,6 @@ from ..models import Parameter
 
 ONSET_WIDTH = 0.05  # of a contact, as a share of its gap
 
-SMALLEST_SWING = 0.05  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
 MIN_SIDE = 0.05  # share of the reach that a signal must visit on either side, to tell the sides apart
 
 PEOPLE = ("coulomb", "stribeck", "hertz")  # persons in the names of laws and forms
@@ -129,13 +128,6 @@ class Local:
         """Largest |ż|, without the outermost 1 %."""
         return max(float(np.quantile(np.abs(self.dz), 0.99)), 1e-300)
 
-    @cached_property
-    def reversals(self) -> int:
-        """Number of turning points of z with swings of at least `SMALLEST_SWING` of its travel on both sides."""
-        least = SMALLEST_SWING * float(np.ptp(self.z))
-        parts = np.split(self.z, np.cumsum(self.lengths)[:-1]) if least > 0 else []
-        return sum(max(len(turning_points(part, least)) - 2, 0) for part in parts)
-
     @property
     def duration(self) -> float:
         """Length of the longest recording, s."""
@@ -145,21 +137,6 @@ class Local:
 def size_to_power(z: Any, n: Any, least: float = 1e-12) -> Any:
     """Compute (|z| + least)^n as exp(n log(|z| + least)), whose derivatives need no further power."""
     return ca.exp(n * ca.log(ca.fabs(z) + least))
-
-
-def turning_points(z: np.ndarray, least: float) -> list[int]:
-    """Find the turning points of z (M,) between swings of at least `least`, the first and the last included."""
-    turns, extreme, direction = [0], 0, 0.0
-    for k, value in enumerate(z.tolist()):
-        if direction == 0:
-            if abs(value - z[0]) >= least:
-                direction, extreme = np.sign(value - z[0]), k
-        elif direction * (value - z[extreme]) >= 0:
-            extreme = k
-        elif direction * (z[extreme] - value) >= least:
-            turns.append(extreme)
-            direction, extreme = -direction, k
-    return [*turns, extreme] if extreme > turns[-1] else turns
 
 
 # an attribute of `Local` ("" for none) and its multiples, or the values as a function of it

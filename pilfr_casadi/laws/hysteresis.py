@@ -22,8 +22,8 @@ from .._base import InputError
 from ..models import Parameter, play
 from .base import Law, Local, size_to_power
 
-FEWEST_REVERSALS = 2  # up, down and up again: with fewer, a loop looks like a curve or a slow motion
-STIFFEST = 5.0  # ratio q/q_0 from which a stiffening loop stiffens no further
+WIDEST_BEND = 5.0  # largest q_0 of a softening loop over half the travel; a wider one is a spring
+STIFFEST = 5.0  # ratio q/q_0 from which a stiffening loop stiffens no further, as its equation says
 PARTS = 4  # parts into which a step of a held signal is divided
 THIN_LOOPS = 0.1  # ratio of the loops' width to the bend beside them, below which a fit is a curve without memory
 DIRECT = 0.05  # ratio of the direct gain to the plays' total weight, below which they may be a mere backlash
@@ -37,11 +37,6 @@ Q = _MOMENT / _MASS  # centres of the cells
 WIDTH = _MASS * np.exp(Q)  # widths of the cells, for the density exp(-q) at the centres
 
 
-def _hardly_turns(local: Local) -> str:
-    """Say that memory of turning points does not show; empty if it may."""
-    return "" if local.reversals >= FEWEST_REVERSALS else "the motion hardly reverses"
-
-
 class _Hysteresis(Law):
     """The common part of forces with rate-independent hysteresis."""
 
@@ -50,9 +45,6 @@ class _Hysteresis(Law):
     contains = ("backlash", "coulomb_friction", "linear_stiffness")
     sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
     dissipative = True
-
-    def why_not(self, local: Local) -> str:
-        return _hardly_turns(local) or super().why_not(local)
 
 
 class StopHysteresis(_Hysteresis):
@@ -210,7 +202,7 @@ class BoucWen(_Hysteresis):
     units = {"k_h": "w/z", "q_0": "z", "s": "", "n": ""}
     order = 1
     starts = {"q_0": ("half", 0.03, 0.1, 0.3, 0.8), "s": ("", 0.5, 0.8), "n": ("", 1.0)}
-    ranges = {"q_0": ("half", 0.002, 5), "s": ("", 0.3, 1.5), "n": ("", 0.5, 4.0)}
+    ranges = {"q_0": ("half", 0.002, WIDEST_BEND), "s": ("", 0.3, 1.5), "n": ("", 0.5, 4.0)}
 
     def force(self, q: Any, p: Any) -> Any:
         return p.k_h * q
@@ -224,19 +216,19 @@ class BoucWen(_Hysteresis):
 class StiffeningBoucWen(BoucWen):
     """Bouc-Wen hysteresis whose loops may stiffen: the force grows the more steeply, the further the motion goes.
 
-    In `dq/dt = dz/dt - (β |dz/dt| q + γ dz/dt |q|) |q|^(n-1)` the sign of γ is free, and β + γ < 0 stiffens:
-    q_0 = β^(-1/n), h = -γ/β.
+    In `dq/dt = dz/dt - (β |dz/dt| q + γ dz/dt |q|) |q|^(n-1)` with γ <= 0, loops stiffen if β + γ < 0:
+    q_0 = β^(-1/n), h = -γ/β. Beyond 5 q_0 they stiffen no further, so that the force stays finite.
     """
 
     form = "bouc_wen_stiffening"
-    equation = "w = k_h q,  dq/dt = dz/dt (1 + h |q/q_0|^n) - |dz/dt| sign(q) |q/q_0|^n"
+    equation = "w = k_h q,  dq/dt = dz/dt (1 + h x^n) - |dz/dt| sign(q) x^n,  x = min(|q/q_0|, 5)"
     source = "Wen (1976), J. Eng. Mech. 102(2); Ikhouane, Mañosa & Rodellar (2007), J. Sound Vib. 300"
     units = {"k_h": "w/z", "q_0": "z", "h": "", "n": ""}
     starts = {"q_0": ("half", 0.3, 1.0, 3.0), "h": ("", 0.5, 1.5), "n": ("", 1.0)}
     ranges = {"q_0": ("half", 0.2, 20), "h": ("", 0.0, 5.0), "n": ("", 0.5, 3.0)}
 
     def flow(self, dz: Any, q: Any, p: Any) -> Any:
-        """Rate of the hysteretic displacement q, which a motion far beyond the fitted one could make infinite."""
+        """Rate of the hysteretic displacement q, which could become infinite without a limit of x."""
         size = size_to_power(ca.fmin(ca.fabs(q / p["q_0"]), STIFFEST), p["n"], 1e-9)
         return dz * (1 + p["h"] * size) - ca.fabs(dz) * ca.sign(q) * size
 
@@ -251,6 +243,12 @@ class BoucWenActuator(BoucWen):
     dissipative = False
     order = 0
     memory = 2  # the last z, and the q that was reached there
+
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """Tell whether its loops are thin beside the direct gain, so that it is a gain."""
+        half = float(self.parameters()["q_0"].bounds[1]) / WIDEST_BEND
+        gain = abs(1 + float(values["b"]) + float(values["k_h"]))
+        return bool(abs(values["k_h"]) * min(float(values["q_0"]), half) < THIN_LOOPS**2 * gain * half)
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
         """Integrate along the chord from the last z, in parts."""
@@ -274,9 +272,6 @@ class Backlash(Law):
     memory = 1
     starts = {"r": ("half", 0.01, 0.03, 0.08, 0.18, 0.35, 0.6)}
     ranges = {"r": ("half", 0.001, 0.9)}
-
-    def why_not(self, local: Local) -> str:
-        return _hardly_turns(local) or super().why_not(local)
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
         following = play(z, s, p["r"])

@@ -107,7 +107,7 @@ class AsymmetricCubicStiffness(CubicStiffness):
     domains = ("mechanical", "fluid")
     two_sided = True
     starts = {"b": ("reach", -0.3, 0.3)}
-    ranges = {"b": ("reach", -1, 1)}  # the quadratic part stays below the cubic one
+    ranges = {"b": ("reach", -1, 1)}  # beyond that it is a quadratic force
 
     def force(self, z: Any, p: Any) -> Any:
         return super().force(z, p) + p.k_3 * p.b * z**2

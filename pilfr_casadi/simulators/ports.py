@@ -197,7 +197,7 @@ class Port:
         position are excluded; in an unknown domain z may be another quantity, so laws of z alone are admitted unless
         its unit is one of speed.
         """
-        mechanical = self.domain == MECHANICAL or is_motion(self.across_unit)
+        mechanical = self.domain == MECHANICAL or (self.domain == UNKNOWN and is_motion(self.across_unit))
         if self.is_speed and "z" in law.reads() and (mechanical or "dz" in law.reads()):
             return False
         if law.in_line and not self.has_term_for(law):
