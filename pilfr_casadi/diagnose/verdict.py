@@ -82,7 +82,7 @@ class NamedEffect:
 
     @property
     def words(self) -> str:
-        """Name it with every place where it would look the same: "delay at sensor:y or actuator:u"."""
+        """Name it with every place where it would look the same: "delay at sensor:y (or actuator:u)"."""
         return name_at_any(*self.name, self.element.law.form, self.alike)
 
 

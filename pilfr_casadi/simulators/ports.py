@@ -66,10 +66,10 @@ def name_at_any(port: str, law: str, form: str, alike: Iterable[tuple[str, str]]
     Examples
     --------
     >>> name_at_any("guide", "coulomb_friction", "smooth", [("screw", "coulomb_friction"), ("guide", "hysteresis")])
-    'Coulomb friction at guide or screw'
+    'Coulomb friction at guide (or screw)'
     """
-    others = (place for place, other in alike if other == law and place != port)
-    return " or ".join([name_at(port, law, form, brief=True), *others])
+    others = [place for place, other in alike if other == law and place != port]
+    return name_at(port, law, form, brief=True) + (f" (or {' or '.join(others)})" if others else "")
 
 
 @dataclass(frozen=True, eq=False)

@@ -147,7 +147,7 @@ def test_the_same_law_at_two_ports_that_cannot_be_told_apart_is_sure_all_the_sam
     (effect,) = found.effects
     assert effect.law == "cubic_stiffness" and effect.confidence > 0.9
     assert {effect.port, *(port for port, _ in effect.indistinguishable)} == {"ground-m1", "twin"}
-    assert " at ground-m1 or twin." in found.sentence or " at twin or ground-m1." in found.sentence
+    assert " at ground-m1 (or twin)." in found.sentence or " at twin (or ground-m1)." in found.sentence
 
 
 def test_derivatives_that_overflow_give_no_information(monkeypatch):
