@@ -23,7 +23,7 @@ from ..models import Parameter, play
 from .base import Law, Local, size_to_power
 
 WIDEST_BEND = 5.0  # largest q_0 of a softening loop over half the travel; a wider one is a spring
-STIFFEST = 5.0  # ratio q/q_0 from which a stiffening loop stiffens no further, as its equation says
+STIFFEST = 5.0  # ratio q/q_0 from which a stiffening loop stiffens no further
 PARTS = 4  # parts into which a step of a held signal is divided
 THIN_LOOPS = 0.1  # ratio of the loops' width to the bend beside them, below which a fit is a curve without memory
 DIRECT = 0.05  # ratio of the direct gain to the plays' total weight, below which they may be a mere backlash
@@ -221,8 +221,8 @@ class StiffeningBoucWen(BoucWen):
     """
 
     form = "bouc_wen_stiffening"
-    equation = "w = k_h q,  dq/dt = dz/dt (1 + h x^n) - |dz/dt| sign(q) x^n,  x = min(|q/q_0|, 5)"
-    source = "Wen (1976), J. Eng. Mech. 102(2); Ikhouane, Mañosa & Rodellar (2007), J. Sound Vib. 300"
+    equation = f"w = k_h q,  dq/dt = dz/dt (1 + h x^n) - |dz/dt| sign(q) x^n,  x = min(|q/q_0|, {STIFFEST:g})"
+    source = "Wen (1976), J. Eng. Mech. 102(2); Ikhouane & Rodellar (2007), Systems with Hysteresis"
     units = {"k_h": "w/z", "q_0": "z", "h": "", "n": ""}
     starts = {"q_0": ("half", 0.3, 1.0, 3.0), "h": ("", 0.5, 1.5), "n": ("", 1.0)}
     ranges = {"q_0": ("half", 0.2, 20), "h": ("", 0.0, 5.0), "n": ("", 0.5, 3.0)}

@@ -10,12 +10,15 @@ from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.linearise import Probe, locals_of, run
 from pilfr_casadi.diagnose.screen import _gain
 from pilfr_casadi.laws import (
+    BoucWen,
     CubicStiffness,
     DirectionalFriction,
     HertzContact,
     Local,
     PiecewiseStiffness,
     QuinticStiffness,
+    Relaxation,
+    ViscousDamping,
 )
 from pilfr_casadi.optimise import GaussNewton
 
@@ -155,3 +158,18 @@ def test_a_fit_goes_on_from_given_states():
     glance = GaussNewton(max_iterations=1)
     away = [np.array([80.0, 80.0])]
     assert bench.fit(held, states=away, solver=glance).cost > 2 * bench.fit(held, states=one.begin, solver=glance).cost
+
+
+def test_a_second_heat_capacity_takes_heat_up_and_an_error_of_the_first_has_either_sign():
+    """A coordinate without inertia: what has memory pushes it back, whichever way the port counts its flow."""
+    for sign in (-1.0, 1.0):
+        wall = Port("wall", {"T": sign}, lambda x: x.T, unit="W", across_unit="K")
+        body = Simulator(lambda x, u: {"T": u.q - x.T}, lambda x: {"y": x.T}, ("T",), ("q",), ports=wall)
+        q = np.repeat([1.0, 0.0, 2.0], 100)
+        r = Recording(q, body.simulate(Recording(q, q, 0.02, ("q",), ("y",), initial="zero")), 0.02, ("q",), ("y",))
+        bench = Workbench.of(body, [r], "zero")
+        fitted = bench.fit(body)
+        along = run(bench, Probe.of(bench, fitted), fitted, 0)
+        at = [port.name for port in body.all_ports()].index("wall")
+        assert along.sense(Relaxation(), at) == along.sense(BoucWen(), at) == -sign
+        assert along.sense(ViscousDamping(), at) == 0

@@ -65,6 +65,13 @@ def test_what_lasts_longer_than_a_sample_is_no_glitch(kind):
     assert not len(find_glitches(y)[0])
 
 
+def test_a_lost_sample_of_a_channel_that_rests_is_a_glitch():
+    """The two values that it has are no quantisation."""
+    y = np.full(1400, 23.0)
+    y[700] = 0.0
+    assert find_glitches(y)[0].tolist() == [700]
+
+
 @pytest.mark.slow
 def test_friction_is_named_beside_glitches():
     train = [spoilt(r) for r in recordings(laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01}))]

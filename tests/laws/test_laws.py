@@ -300,6 +300,12 @@ def test_creep_of_a_signal_goes_on_in_its_direction_and_is_no_lag(kind):
     assert all(bounds[name][1] == 2 * LOCAL.duration for name in kind.units if name.startswith("T"))
 
 
+def test_a_bouc_wen_actuator_with_hardly_a_loop_is_doubted():
+    law = laws.BoucWenActuator(limits=laws.BoucWenActuator().bounds(LOCAL))
+    shape = {"b": 0.8, "q_0": LOCAL.half, "s": 0.5, "n": 1.0}
+    assert law.doubtful({**shape, "k_h": 5e-4}) and not law.doubtful({**shape, "k_h": 0.2})
+
+
 def test_steps_too_long_for_bouc_wen_do_not_run_away():
     """A motion faster than what it was fitted to; the step's length alone, for q itself stays within q_0."""
     law, p = BoucWen(), {"q_0": 1.0, "s": 0.9, "n": 0.9}
