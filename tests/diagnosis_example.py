@@ -86,7 +86,8 @@ def example(verdict="missing-physics", port="ground", law="ground", test=True, o
     rows = [dict(zip(columns, row, strict=True)) for row in tried]
     named = verdict == "missing-physics"
     errors = {"nominal": 0.4, "before": 0.2, "after": NOISE if named else 0.2}
-    gate = Gate("pos", "wrong_sign", -1.0, "The sign of pos is the wrong way round.", True)
+    fault = Gate("pos", "wrong_sign", -1.0, "The sign of pos is the wrong way round.", fault=True)
+    gates = (fault, Gate("force", "hold", "linear", "Interpolated between samples fits better."))
     fields = dict(
         verdict=verdict,
         sentence={"missing-physics": f"The simulator leaves out {element.id} at {port}."}.get(
@@ -94,7 +95,7 @@ def example(verdict="missing-physics", port="ground", law="ground", test=True, o
         ),
         effects=(effect,) if named else (),
         candidates=tuple(rows),
-        gates=(gate,) if verdict == "recording-fault" else (),
+        gates=gates if verdict == "recording-fault" else (),
         mismatch=mismatch(
             train, before.residual, [e + r.y for e, r in zip(before.residual, train, strict=True)], noise, bench.scale
         ),

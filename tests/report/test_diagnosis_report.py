@@ -56,6 +56,7 @@ def test_every_verdict_has_its_files(verdict, tmp_path, without_drawing):
         assert "3 more" not in reader.text and "6 more, with larger errors" in reader.text
     if verdict == "recording-fault":
         assert titles[0] == "What the recordings" + "&#39; checks found" and "wrong way round" in reader.text
+        assert "The recordings are at fault: wrong sign of pos;" in reader.text  # what was not stated is no fault
 
 
 @pytest.mark.usefixtures("blank_figures")
