@@ -18,6 +18,7 @@ from ..simulators import Placed, in_series, name_at, split_port
 from .arguments import Request
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction
+from .effect import Effect
 from .evidence import SURE, deviations
 from .gates import Gate
 from .identifiability import port_units
@@ -25,7 +26,6 @@ from .mismatch_map import mismatch
 from .offsets import Offset, remove_zero_offsets, update_offsets
 from .preparation import Prepared
 from .proof import (
-    find_resting_tests,
     free_run_errors,
     mean_nrmse,
     next_experiment,
@@ -33,7 +33,7 @@ from .proof import (
     placebo,
     test_errors,
 )
-from .result import Diagnosis, Effect
+from .result import Diagnosis
 from .search import Search
 from .trials import Trial
 from .verdict import NamedEffect, Verdict, names
@@ -105,7 +105,7 @@ def build_diagnosis(
     request.say("proof", 0, 1)
     bench, without, after = final.bench, final.without, final.after
     std = deviations(bench, after)
-    errors, fewer = _compute_errors(request, search, found, final, tests)
+    errors, fewer, resting = _compute_errors(request, search, found, final, tests)
     effects = tuple(_make_effect(search, e, after, std, fewer.get(e, np.nan)) for e in found.effects)
     floor = search.least_floor if found.verdict.kind == "unexplained" else search.floor
     settled = found.verdict.kind in ("complete", "recording-fault") or (
@@ -125,7 +125,7 @@ def build_diagnosis(
         gates=(
             *_surrogate_note(request.stand_in_error),
             *_convergence_note(after),
-            *_resting_notes(tests, (without, after)),
+            *_resting_notes(resting),
             *_combination_note(after, std, blind_spots),
             *update_offsets(found.gates, after, std, bool(effects), settled),
         ),
@@ -153,9 +153,13 @@ def build_diagnosis(
 
 def _compute_errors(
     request: Request, search: Search, found: Conclusion, final: FinalFits, tests: tuple[Recording, ...]
-) -> tuple[dict[str, dict[str, float] | None], dict[NamedEffect, float]]:
-    """Compute the table of errors (see `Diagnosis`), and the test errors without each of several effects."""
+) -> tuple[dict[str, dict[str, float] | None], dict[NamedEffect, float], list[tuple[str, int]]]:
+    """Compute the table of errors (see `Diagnosis`) and the test errors without each of several effects.
+
+    Also return the tests that `Comparison.find_resting` lists.
+    """
     bench, without, after, fewer = final.bench, final.without, final.after, dict[NamedEffect, float]()
+    resting = list[tuple[str, int]]()
     errors: dict[str, dict[str, float] | None] = {
         "train": {"nominal": final.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
         "test": None,
@@ -163,12 +167,13 @@ def _compute_errors(
     if tests:
         each = _without_each_effect(search, found)
         fits = {"before": without, "after": after, **{f"without {i}": f for i, f in enumerate(each.values())}}
-        on_tests = test_errors(bench, tests, found.gates, fits, bench.on(tests).model(request.simulator))
+        compared = test_errors(bench, tests, found.gates, fits, bench.on(tests).model(request.simulator))
+        on_tests, resting = compared.errors, compared.find_resting()
         fewer = {e: on_tests[f"without {i}"] for i, e in enumerate(each)}
         errors["test"] = {name: on_tests[name] for name in ("nominal", "before", "after")}
     if bench.simulator.observer is not None:
         errors["free_run"] = free_run_errors(bench, tests or bench.recordings, request.simulator, without, after)
-    return errors, fewer
+    return errors, fewer, resting
 
 
 def _surrogate_note(error: float) -> tuple[Gate, ...]:
@@ -190,9 +195,9 @@ def _convergence_note(after: Fitted) -> tuple[Gate, ...]:
     return (Gate("simulation", "convergence", after.status.name.lower(), words, False),)
 
 
-def _resting_notes(tests: Sequence[Recording], fits: Sequence[Fitted]) -> Iterator[Gate]:
+def _resting_notes(resting: Sequence[tuple[str, int]]) -> Iterator[Gate]:
     """Note test recordings whose scored part hardly moves, so that their relative errors are large."""
-    for name, first in find_resting_tests(tests, fits):
+    for name, first in resting:
         words = (
             f"In {name or 'the test recording'} an output moves less than half as much after {first} samples. These "
             "serve to estimate its initial state and are not scored, so that relative errors on the rest are "

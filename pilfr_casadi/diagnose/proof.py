@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from ..engine import make_engine
 from ..identify import run_free
 from ..laws import Law
 from ..models import Model
-from ..optimise import samples_to_start
 from ..simulators import Simulator, discretise
 from .evidence import BETTER_RATIO
 from .gates import Gate
@@ -22,6 +21,7 @@ from .screen import RIDGES, Remainder, held_out
 from .workbench import Fitted, Workbench
 
 K = TypeVar("K")
+Models = Mapping[K, tuple[Model, Sequence[np.ndarray]]]  # each with further initial states to start from
 
 AMPLITUDES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
 SINES, TRIANGLES = 12, 5  # frequencies that are tried
@@ -36,31 +36,50 @@ def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
     return float(np.mean([nrmse(r.y, r.y + e, skip=r.skip) for e, r in pairs]))
 
 
+@dataclass(frozen=True)
+class Comparison(Generic[K]):
+    """NRMSEs of models, averaged over recordings, and the recordings with the first sample that is scored in each."""
+
+    errors: dict[K, float]
+    scored: tuple[tuple[Recording, int], ...]
+
+    def find_resting(self) -> list[tuple[str, int]]:
+        """List (name, first scored sample) of the recordings that hardly move from there on.
+
+        Samples before served to estimate the initial state. Relative errors on the rest are large.
+        """
+        return [(r.name, first) for r, first in self.scored if _rests_after(r, first)]
+
+
+def _rests_after(recording: Recording, first: int) -> bool:
+    whole, scored = (np.std(recording.y[k:], axis=0) for k in (recording.skip, first))
+    return bool(np.any(scored < LEAST_MOTION * whole))
+
+
 def errors_of(bench: Workbench, model: Model, *, whole: bool = False) -> float:
     """Compute the NRMSE of a model at its start values; see `compare_errors`."""
-    return compare_errors(bench, {"": (model, ())}, whole=whole)[""]
+    return compare_errors(bench, {"": (model, ())}, whole=whole).errors[""]
 
 
-def compare_errors(
-    bench: Workbench, models: Mapping[K, tuple[Model, Sequence[np.ndarray]]], *, whole: bool = False
-) -> dict[K, float]:
-    """Compute the NRMSEs of models at their start values on the same samples, averaged over recordings.
+def compare_errors(bench: Workbench, models: Models[K], *, whole: bool = False) -> Comparison[K]:
+    """Compute the errors of models at their start values on the same samples.
 
-    Each model has further initial states to start from. Unknown initial states are estimated from rest and from these,
-    on a first part that is not scored; it is the longest that a model needs. With `whole` they are fitted to all
-    samples, which are all scored; use it to compare errors on training recordings with fits. An error is infinite if
-    the simulation diverges.
+    Unknown initial states are estimated from rest and from the models' further initial states, on a first part that is
+    not scored; it is the longest that a model needs. With `whole` they are fitted to all samples, which are all scored;
+    use it to compare errors on training recordings with fits. An error is infinite if the simulation diverges.
     """
     engines = {name: make_engine(model, bench.engine) for name, (model, _) in models.items()}
     errors: dict[K, list[float]] = {name: [] for name in models}
+    scored = list[tuple[Recording, int]]()
     for r in bench.recordings:
         runs = {
             name: run_free(model, engines[name], r, starts, whole=whole) for name, (model, starts) in models.items()
         }
         first = max((skip for _, skip in runs.values()), default=0)
+        scored.append((r, first))
         for name, (y, _) in runs.items():
             errors[name].append(nrmse(r.y, y, skip=first) if np.all(np.isfinite(y)) else np.inf)
-    return {name: float(np.mean(each)) for name, each in errors.items()}
+    return Comparison({name: float(np.mean(each)) for name, each in errors.items()}, tuple(scored))
 
 
 def starts_of(fitted: Fitted) -> list[np.ndarray]:
@@ -75,40 +94,22 @@ def starts_of(fitted: Fitted) -> list[np.ndarray]:
 
 def test_errors(
     bench: Workbench, tests: Sequence[Recording], gates: Sequence[Gate], fits: Mapping[str, Fitted], given: Model
-) -> dict[str, float]:
-    """Compute the NRMSEs of fits, on the sub-steps that they were fitted on, and of the `given` model as "nominal".
+) -> Comparison[str]:
+    """Compute the errors of fits, on the sub-steps that they were fitted on, and of the `given` model as "nominal".
 
     The fits see the test recordings with the gates' edits, the given model as they are. All are scored on the same
     samples, unless an edit changes these.
     """
     models = {name: (one.fitted_model, starts_of(one)) for name, one in fits.items()}
-    nominal: dict[str, tuple[Model, Sequence[np.ndarray]]] = {"nominal": (given, ())}
+    nominal: Models[str] = {"nominal": (given, ())}
     edits = [g.change for g in gates if g.change is not None]
     if not edits:
         return compare_errors(bench.on(tests), {**nominal, **models})
     edited = list(tests)
     for change in edits:
         edited = [change(r) for r in edited]
-    return {**compare_errors(bench.on(tests), nominal), **compare_errors(bench.on(edited), models)}
-
-
-def find_resting_tests(tests: Sequence[Recording], fits: Sequence[Fitted]) -> list[tuple[str, int]]:
-    """Find test recordings that hardly move after the samples from which fits estimate their initial state.
-
-    Returns
-    -------
-    list of (name, samples)
-        Each with the number of those samples. Relative errors on the others are large.
-    """
-    out = []
-    for r in tests:
-        if r.begins != "estimate":
-            continue
-        first = max(r.skip, *(samples_to_start(f.model, f.engine, r) if f.model.n_state else 0 for f in fits))
-        whole, scored = (np.std(r.y[k:], axis=0) for k in (r.skip, first))
-        if np.any(scored < LEAST_MOTION * whole):
-            out.append((r.name, first))
-    return out
+    found = compare_errors(bench.on(edited), models)
+    return replace(found, errors={**compare_errors(bench.on(tests), nominal).errors, **found.errors})
 
 
 def free_run_errors(
@@ -120,7 +121,7 @@ def free_run_errors(
         led = simulator if name == "nominal" else fitted.corrected()
         free = discretise(replace(led, observer=None), bench.dt, bench.hold, fitted.model.substeps)
         models[name] = free, starts_of(fitted)
-    return compare_errors(bench.on(recordings), models)
+    return compare_errors(bench.on(recordings), models).errors
 
 
 def parameter_table(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -17,9 +16,10 @@ from ..data import SAME_STEP, Recording, as_recordings, nrmse
 from ..engine import make_engine
 from ..identify import RUN_AWAY, match_channels, run_free
 from ..models import ParameterSet
-from ..simulators import ACTUATOR, EQUATION, PARAMETER, Simulator, discretise, in_series, name_at, split_port
+from ..simulators import ACTUATOR, Simulator, discretise, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
+from .effect import Effect
 from .evidence import BETTER_RATIO, FAR_RATIO, SURE
 from .floor import ABOVE_NOISE
 from .gates import Gate
@@ -37,62 +37,6 @@ GRAVEST_SPOTS = 2  # blind spots that are printed right after the verdict
 NEAR_CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
 OUT_OF_TIME = "The time limit ended the search: the answer rests on the fits made until then."
-
-
-@dataclass(frozen=True, eq=False)
-class Effect:
-    """A piece of physics that the simulator leaves out.
-
-    Attributes
-    ----------
-    test_without : float, optional
-        NRMSE on the test recordings of the corrected simulator without this effect, the others refitted; nan if there
-        is no other.
-    """
-
-    port: str
-    law: str
-    confidence: float
-    sentence: str
-    equation: str
-    parameters: dict[str, dict[str, Any]]
-    indistinguishable: tuple[tuple[str, str], ...] = ()
-    form: str = ""
-    placebo: Mapping[str, float] = field(default_factory=dict)
-    test_without: float = np.nan
-
-    @property
-    def defined(self) -> dict[str, dict[str, Any]]:
-        """Derived quantities: a product in the equation, such as `F_c = k_t r`, or the whole gap of a clearance."""
-        if self.law == "clearance" and "g" in self.parameters:
-            half = self.parameters["g"]
-            std = None if half["std"] is None else 2 * half["std"]
-            return {"gap": {"value": 2 * half["value"], "std": std, "unit": half["unit"]}}
-        found = re.search(r",  (\w+) = (\w+) (\w+)$", self.equation)
-        if not found or not all(name in self.parameters for name in found.groups()[1:]):
-            return {}
-        a, b = (self.parameters[key] for key in found.groups()[1:])
-        unit = a["unit"].removesuffix(f"/{b['unit']}") if a["unit"].endswith(f"/{b['unit']}") else ""
-        return {found[1]: {"value": a["value"] * b["value"], "std": None, "unit": unit}}
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content for diagnosis.json."""
-        out: dict[str, Any] = {
-            "port": self.port,
-            "law": self.law,
-            "confidence": self.confidence,
-            "sentence": self.sentence,
-            "equation": self.equation,
-            "parameters": self.parameters,
-            "indistinguishable": [{"port": p, "law": law} for p, law in self.indistinguishable],
-        }
-        if self.form:
-            out["form"] = self.form
-        if self.placebo:
-            out["placebo"] = dict(self.placebo)
-        if not np.isnan(self.test_without):
-            out["test_without"] = self.test_without
-        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +170,7 @@ class Diagnosis:
     def _idle_on_tests(self) -> str:
         """Name the effects without which, one at a time, the test recordings are followed as well."""
         after = (self.errors.get("test") or {}).get("after", np.nan)
-        idle = [name_at(e.port, e.law, e.form) for e in self.effects if e.test_without <= after]
+        idle = [e.name for e in self.effects if e.test_without <= after]
         if not idle:
             return ""
         rest = "their names rest" if idle[1:] else "its name rests"
@@ -242,7 +186,7 @@ class Diagnosis:
         least = min(known, key=lambda e: e.test_without, default=None)
         if least is None or not least.test_without < errors["before"]:
             return ""
-        return f" Without {name_at(least.port, least.law, least.form)} it is {_percent(least.test_without)}."
+        return f" Without {least.name} it is {_percent(least.test_without)}."
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of diagnosis.json; numbers that are not finite are None."""
@@ -504,8 +448,7 @@ class Diagnosis:
     def __str__(self) -> str:
         lines = [self.summary, *self.gravest_blind_spots()]
         for e in self.effects:
-            lines += _effect_lines(e)
-            lines += [f"  {self.worth(e)}"] if self.worth(e) else []
+            lines += [str(e), f"  {self.worth(e)}"] if self.worth(e) else [str(e)]
         lines += [*self._nameless_lines(), *self._value_lines(), *self._error_lines(), *self._blind_lines()]
         lines += [f"note: {text}" for text in (*(g.sentence for g in self.gates), *self.warnings())]
         if self.next_experiment:
@@ -576,31 +519,6 @@ def _error_text(nrmse: float) -> str:
     if not nrmse < RUN_AWAY:
         return "runs away"
     return f"{nrmse:.4f}" if nrmse >= 1e-3 or nrmse == 0 else f"{nrmse:.2g}"
-
-
-def _effect_lines(e: Effect) -> list[str]:
-    """Describe an effect with its equation, its numbers, and the laws indistinguishable from it."""
-    kind, of = split_port(e.port)
-    if kind == PARAMETER:
-        symbols = f"where the change is added to {of}"
-    elif in_series(e.port):
-        symbols = "where u or z is the signal, and w is added to it"
-    else:
-        local = "v the speed" if re.search(r"\bv\b", e.equation) else "z the local coordinate"
-        what = f"subtracted from the derivative of {of}" if kind == EQUATION else "the force or flow"
-        symbols = f"where w is {what} and {local} at the port"
-    lines = [
-        f"{name_at(e.port, e.law, e.form)}, confidence {e.confidence:.2f}",
-        f"  {e.sentence}: {e.equation}",
-        f"  {symbols}",
-    ]
-    for name, p in (e.parameters | e.defined).items():
-        std = "" if p["std"] is None else f" ± {p['std']:.2g}"
-        lines.append(f"  {name} = {p['value']:.5g}{std} {p['unit']}".rstrip())
-    if e.indistinguishable:
-        others = ", ".join(name_at(port, law) for port, law in e.indistinguishable)
-        lines.append(f"  cannot be told apart from {others}")
-    return lines
 
 
 def _percent(value: float) -> str:

@@ -6,14 +6,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from diagnosis_example import as_it_stands, example, recorded, rig
+from diagnosis_example import example, recorded, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
 from pilfr_casadi.data import nrmse
 from pilfr_casadi.diagnose import BlindSpot, Workbench
 from pilfr_casadi.diagnose.offsets import Offset
-from pilfr_casadi.diagnose.proof import compare_errors, find_resting_tests, next_experiment
+from pilfr_casadi.diagnose.proof import compare_errors, next_experiment
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.identify import run_free
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, StopHysteresis
@@ -204,7 +204,7 @@ def test_simulators_are_compared_on_the_same_samples():
     plain, rich = (bench.model(s) for s in (rig(), rig().with_element("ground", StopHysteresis())))
     (alone, sooner), (_, first) = (run_free(m, make_engine(m), r) for m in (plain, rich))
     assert first > sooner
-    errors = compare_errors(bench, {"plain": (plain, ()), "rich": (rich, ())})
+    errors = compare_errors(bench, {"plain": (plain, ()), "rich": (rich, ())}).errors
     assert errors["plain"] == pytest.approx(nrmse(r.y, alone, skip=first))
 
 
@@ -213,9 +213,13 @@ def test_a_test_recording_that_rests_after_its_start_is_told():
     swing, rest = recorded(rig(), 0), recorded(rig(), 1)
     push = np.where(np.arange(700) < 40, 20.0, 0.0)[:, None]
     fading = swing.with_(u=push, y=rig().simulate(swing.with_(u=push)), initial="estimate", name="push")
-    fitted = as_it_stands(Workbench.of(rig(), [rest], "zero"), rig())
-    assert [name for name, _ in find_resting_tests([fading, rest], [fitted])] == ["push"]
-    assert not find_resting_tests([fading.with_(initial="zero")], [fitted])
+
+    def resting(*tests):
+        bench = Workbench.of(rig(), tests, "zero")
+        return [name for name, _ in compare_errors(bench, {"": (bench.model(rig()), ())}).find_resting()]
+
+    assert resting(fading, rest) == ["push"]
+    assert not resting(fading.with_(initial="zero"))
 
 
 def test_an_offset_beyond_the_range_of_its_signal_is_doubted():
@@ -224,3 +228,10 @@ def test_an_offset_beyond_the_range_of_its_signal_is_doubted():
         shifted = d.corrected.with_element("actuator:force", Offset(values={"w_0": value}))
         told = [w for w in replace(d, corrected=shifted).warnings() if "is larger than force ever was" in w]
         assert bool(told) == doubted
+
+
+def test_parts_of_a_diagnosis_print_briefly():
+    """Their fits hold recordings and models, which nobody wants to read."""
+    d = example()
+    for part in (d.correction, d.effects, dict(d.evidence)):
+        assert len(repr(part)) < 1500
