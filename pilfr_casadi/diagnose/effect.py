@@ -1,0 +1,98 @@
+"""An effect: a piece of physics that the simulator leaves out, as data and as text."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..simulators import EQUATION, PARAMETER, in_series, name_at, split_port
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """A piece of physics that the simulator leaves out.
+
+    Attributes
+    ----------
+    test_without : float, optional
+        NRMSE on the test recordings of the corrected simulator without this effect, the others refitted; nan if there
+        is no other.
+    """
+
+    port: str
+    law: str
+    confidence: float
+    sentence: str
+    equation: str
+    parameters: dict[str, dict[str, Any]]
+    indistinguishable: tuple[tuple[str, str], ...] = ()
+    form: str = ""
+    placebo: Mapping[str, float] = field(default_factory=dict)
+    test_without: float = np.nan
+
+    @property
+    def name(self) -> str:
+        """The law and its port in words."""
+        return name_at(self.port, self.law, self.form)
+
+    @property
+    def defined(self) -> dict[str, dict[str, Any]]:
+        """Derived quantities: a product in the equation, such as `F_c = k_t r`, or the whole gap of a clearance."""
+        if self.law == "clearance" and "g" in self.parameters:
+            half = self.parameters["g"]
+            std = None if half["std"] is None else 2 * half["std"]
+            return {"gap": {"value": 2 * half["value"], "std": std, "unit": half["unit"]}}
+        found = re.search(r",  (\w+) = (\w+) (\w+)$", self.equation)
+        if not found or not all(name in self.parameters for name in found.groups()[1:]):
+            return {}
+        a, b = (self.parameters[key] for key in found.groups()[1:])
+        unit = a["unit"].removesuffix(f"/{b['unit']}") if a["unit"].endswith(f"/{b['unit']}") else ""
+        return {found[1]: {"value": a["value"] * b["value"], "std": None, "unit": unit}}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content for diagnosis.json."""
+        out: dict[str, Any] = {
+            "port": self.port,
+            "law": self.law,
+            "confidence": self.confidence,
+            "sentence": self.sentence,
+            "equation": self.equation,
+            "parameters": self.parameters,
+            "indistinguishable": [{"port": p, "law": law} for p, law in self.indistinguishable],
+        }
+        if self.form:
+            out["form"] = self.form
+        if self.placebo:
+            out["placebo"] = dict(self.placebo)
+        if not np.isnan(self.test_without):
+            out["test_without"] = self.test_without
+        return out
+
+    def __str__(self) -> str:
+        kind, of = split_port(self.port)
+        if kind == PARAMETER:
+            symbols = f"where the change is added to {of}"
+        elif in_series(self.port):
+            symbols = "where u or z is the signal, and w is added to it"
+        else:
+            local = "v the speed" if re.search(r"\bv\b", self.equation) else "z the local coordinate"
+            what = f"subtracted from the derivative of {of}" if kind == EQUATION else "the force or flow"
+            symbols = f"where w is {what} and {local} at the port"
+        lines = [
+            f"{self.name}, confidence {self.confidence:.2f}",
+            f"  {self.sentence}: {self.equation}",
+            f"  {symbols}",
+        ]
+        for name, p in (self.parameters | self.defined).items():
+            std = "" if p["std"] is None else f" ± {p['std']:.2g}"
+            lines.append(f"  {name} = {p['value']:.5g}{std} {p['unit']}".rstrip())
+        if self.indistinguishable:
+            others = ", ".join(name_at(port, law) for port, law in self.indistinguishable)
+            lines.append(f"  cannot be told apart from {others}")
+        return "\n".join(lines)
+
+    __repr__ = __str__
