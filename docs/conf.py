@@ -10,10 +10,11 @@ import catalogue
 import gallery
 import pictures
 import reference
+import sketches
 
 import pilfr_casadi
 
-for part in (catalogue, gallery, pictures, reference):
+for part in (catalogue, gallery, pictures, reference, sketches):
     part.build()
 
 project, copyright = "pilfr_casadi", "the authors of pilfr_casadi, Apache-2.0"
@@ -38,7 +39,7 @@ html_title = "pilfr_casadi"
 html_static_path = ["_static"]
 html_css_files = ["pilfr.css"]
 html_show_sourcelink = html_copy_source = False
-html_sidebars = {"index": [], "getting_started": [], "comparison": [], "validation": []}
+html_sidebars = {"index": [], "gallery/index": [], "getting_started": [], "comparison": [], "validation": []}
 html_theme_options = {
     "header_links_before_dropdown": 8,
     "navbar_align": "left",

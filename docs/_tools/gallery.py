@@ -29,6 +29,7 @@ SETTINGS = {
     "download_all_examples": False,
     "remove_config_comments": True,
     "show_memory": False,
+    "thumbnail_size": (480, 336),
     "image_scrapers": ("matplotlib", "gallery.scrape_figures"),
     "capture_repr": (),
     "write_computation_times": False,

@@ -4,8 +4,13 @@ A slide with dry friction
 
 A carriage is pushed along a guide against a spring. Its simulator has mass, spring and a viscous damper. The dry
 friction of the guide is missing.
+
+.. image:: /pictures/sketch_slide.svg
+   :alt: A carriage on a guide, held by a spring and a damper; the missing physics is red
+   :width: 400
 """
 
+# sphinx_gallery_thumbnail_path = "pictures/sketch_slide.svg"
 import numpy as np
 
 import pilfr_casadi as pilfr

@@ -3,8 +3,13 @@ A tank whose pump does not start at once
 ========================================
 
 A pump fills a tank, which empties through an orifice. In the simulator the pump's flow is proportional to its voltage.
+
+.. image:: /pictures/sketch_tank.svg
+   :alt: A tank that a pump fills and an orifice empties; the missing physics is red
+   :width: 400
 """
 
+# sphinx_gallery_thumbnail_path = "pictures/sketch_tank.svg"
 import casadi as ca
 import numpy as np
 

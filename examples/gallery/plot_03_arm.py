@@ -3,8 +3,13 @@ An arm that swings far
 ======================
 
 The simulator of a hanging arm linearises gravity for small angles and neglects the dry friction of the bearing.
+
+.. image:: /pictures/sketch_arm.svg
+   :alt: An arm that hangs in a bearing; the missing physics is red
+   :width: 400
 """
 
+# sphinx_gallery_thumbnail_path = "pictures/sketch_arm.svg"
 import casadi as ca
 import numpy as np
 

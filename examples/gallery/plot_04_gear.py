@@ -3,8 +3,13 @@ A worn gear
 ===========
 
 A servo turns a table through a gear. The simulator is a mode at 1.6 Hz; the play between the teeth is missing.
+
+.. image:: /pictures/sketch_gear.svg
+   :alt: Two toothed wheels with play between their teeth; the missing physics is red
+   :width: 400
 """
 
+# sphinx_gallery_thumbnail_path = "pictures/sketch_gear.svg"
 import numpy as np
 
 import pilfr_casadi as pilfr

@@ -4,8 +4,13 @@ Two masses and a joint that loses energy
 
 A motor mass moves a load through a bolted joint, and only the load is measured. The simulator has two masses, springs
 and dampers. Microslip in the joint makes its spring hysteretic: the force depends on the past motion.
+
+.. image:: /pictures/sketch_two_masses.svg
+   :alt: Two masses on a mount, with a joint between them; the missing physics is red
+   :width: 400
 """
 
+# sphinx_gallery_thumbnail_path = "pictures/sketch_two_masses.svg"
 import numpy as np
 
 import pilfr_casadi as pilfr
