@@ -189,6 +189,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table; return 0 where the units are answered as the equations in all cases but one of twenty."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=3, help="number of seeds (default: 3)")
+    parser.add_argument("--first", type=int, default=0, help="first seed (default: 0)")
     parser.add_argument(
         "--kinds", nargs="+", default=["c"], choices=["c", "casadi", "pythonfmu"], help="units (default: c)"
     )
@@ -198,7 +199,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         makers = {"c": c_rig, "casadi": casadi_rig, "pythonfmu": python_rig}
         files = {kind: makers[kind](Path(folder) / f"{kind}.fmu") for kind in options.kinds}
         same, ratios = dict.fromkeys(files, 0), {kind: list[float]() for kind in files}
-        for seed in range(options.cases):
+        for seed in range(options.first, options.first + options.cases):
             wanted, seconds = answer(rig(), seed)
             print(f"{seed:3} equations {seconds:6.1f} s  {wanted}", flush=True)
             for kind, path in files.items():
