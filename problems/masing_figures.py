@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -21,12 +21,28 @@ from pilfr_casadi.plots.canvas import BLUE, VERMILLION, finish
 
 from .masing_data import FS, Benchmark, benchmark
 
-if TYPE_CHECKING:
-    from .table2 import Result
-
 FREQUENCIES = (0.5, 1.5, 3.0, 6.0, 12.0, 24.0)  # Hz, Fig. 7
 LOW = 5.0  # Hz: "low frequencies" of Sec. 6.3
 KINDS = {"fig11_starts": "paper's start", "fig11_regridded": "re-gridded"}
+
+
+class Result(Protocol):
+    """What the figures show of a row of the table."""
+
+    @property
+    def row(self) -> Any:
+        """The row, with its name."""
+
+    @property
+    def errors(self) -> np.ndarray:
+        """Errors of its starts on the three records: (starts, 3)."""
+
+    @property
+    def fit(self) -> Fit:
+        """The best fit."""
+
+    def percentile(self, share: float) -> np.ndarray:
+        """A percentile of each column of the errors."""
 
 
 @dataclass(frozen=True)

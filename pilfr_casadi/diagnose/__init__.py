@@ -19,8 +19,8 @@ about. The files by stage:
 - Correction: `correction` chooses the corrected simulator, with a learned force where named laws do not suffice.
 - Other explanations: `other_explanations` (a pinned value, an undeclared port, a machine that changed).
 - Proof: `proof` (errors before and after, placebo, next experiment), `force_recovery`, `mismatch_map`.
-- Result: `answer` puts it together, `result` is what users hold, and `refinement` puts a Prandtl-Ishlinskii layer in
-  place of the hysteresis that was found.
+- Result: `answer` puts it together, `result` is what users hold, an `effect` is a law that was found, and `refinement`
+  puts a Prandtl-Ishlinskii layer in place of the hysteresis that was found.
 - After a diagnosis: `replication` fits laws that were found to the recordings of further machines.
 - Before a diagnosis: `blind_spots` (`check`: what the recordings cannot reveal), based on `identifiability` (which
   parameters are identifiable, and which laws detectable).
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
         match_recordings as match_recordings,
     )
     from .blind_spots import BlindSpot as BlindSpot, Check as Check, check as check
+    from .effect import Effect as Effect
     from .evidence import SURE as SURE
     from .force_recovery import (
         HiddenForce as HiddenForce,
@@ -65,7 +66,6 @@ if TYPE_CHECKING:
         ERROR_NAMES as ERROR_NAMES,
         BeforeAfter as BeforeAfter,
         Diagnosis as Diagnosis,
-        Effect as Effect,
     )
     from .workbench import Fitted as Fitted, Workbench as Workbench
 else:
