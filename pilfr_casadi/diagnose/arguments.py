@@ -36,6 +36,7 @@ class Request:
     focus: str | None = None
     notes: tuple[Gate, ...] = ()
     stretches: Stretches | None = None  # where `recordings` are stretches of long ones
+    aligned: bool = False  # whether the times of the channels are settled
 
     @property
     def hold_said(self) -> bool:

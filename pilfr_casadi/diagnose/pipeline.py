@@ -24,12 +24,12 @@ How an answer comes about:
 **Long recordings.** Steps 1 to 6 see only their most informative stretches (`stretches`). The leading hypotheses are
 then fitted to everything before step 3, and the answer's simulator before step 7.
 
-**Repetitions.** Steps 1 and 2 are repeated in three cases: with an observer if the simulator is unstable and runs away
+**Repetitions.** Steps 1 and 2 are repeated in four cases: with an observer if the simulator is unstable and runs away
 from the recordings (`prediction`); with the other hold if nobody stated it and the best hypothesis follows better with
-it; without a shift if a channel seemed to be early, because missing physics can look like a lead. Each search fits
-different data. Its evidence is therefore not comparable; the smaller error decides. If nothing has a name after step 6
-and the simulator drifts, the search is repeated in predictions, and the laws that are found there are refitted in free
-run (`_name_in_predictions`).
+it; without a shift if a channel seemed to be early, because missing physics can look like a lead; and with a shift that
+shows only beside the first law. Each search fits different data. Its evidence is therefore not comparable; the smaller
+error decides. If nothing has a name after step 6 and the simulator drifts, the search is repeated in predictions, and
+the laws that are found there are refitted in free run (`_name_in_predictions`).
 """
 
 from __future__ import annotations
@@ -205,8 +205,13 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
 
 
 def _search(request: Request) -> tuple[Prepared, Search]:
-    """Prepare and search; if an early channel was shifted, repeat without, and keep that if it is clearly better."""
+    """Prepare and search; if an early channel was shifted, repeat without, and keep that if it is clearly better.
+
+    If a channel proves shifted beside a law, repeat with it at its right times.
+    """
     ready, search = _search_once(request, shift_early=True)
+    if search.shift is not None:
+        return _search_realigned(request, ready, search, search.shift)
     seemed_early = any(g.finding == "alignment" and g.value < 0 for g in ready.gates)
     if not seemed_early or search.interrupted or search.out_of_time or not search.can_improve(search.best):
         return ready, search
@@ -220,6 +225,27 @@ def _search(request: Request) -> tuple[Prepared, Search]:
         return other, again
     search.interrupted = again.interrupted
     return ready, search
+
+
+def _search_realigned(request: Request, ready: Prepared, search: Search, shift: Gate) -> tuple[Prepared, Search]:
+    """Search with a shifted channel at its right times, which ended a search; go on with that if it is clearly better.
+
+    Missing physics can look like a lead.
+    """
+    recordings = tuple(shift.change(r) if shift.change else r for r in request.recordings)
+    moved = replace(request, recordings=recordings, aligned=True, say=request.say.under("shifted: "))
+    search.shift, search.aligned = None, True
+    found: tuple[Prepared, Search] | None = None
+    with search.until_interrupted():
+        found = _search_once(moved, shift_early=True)
+    if found is None:
+        return ready, search
+    other, again = found
+    if again.can_improve(again.best) and not (again.interrupted or again.out_of_time):
+        search.run(request.most_effects)
+    if search.best.mean_square < AS_GIVEN_RATIO * again.best.mean_square:
+        return ready, search
+    return replace(other, nominal=ready.nominal, gates=(shift, *other.gates)), again
 
 
 def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]:
@@ -248,6 +274,7 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         request.workers,
         request.say,
         hold_said=request.hold_said,
+        aligned=request.aligned,
         stand_in_error=request.stand_in_error,
         until=until,
         times={CHECKS: time.perf_counter() - began},

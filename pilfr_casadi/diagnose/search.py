@@ -32,15 +32,16 @@ from ..laws import (
     scheduled,
     varying,
 )
-from ..simulators import ACTUATOR, PARAMETER, SENSOR, Placed, kind_of, port_name
+from ..simulators import ACTUATOR, PARAMETER, SENSOR, Placed, kind_of, name_at, port_name
 from .evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR, NEAR_RATIO
 from .floor import ABOVE_NOISE
-from .gates import CLEARLY_BETTER
+from .gates import CLEARLY_BETTER, Checked, Gate
 from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
 from .linearise import linearise_runs
 from .relatives import choose_pairs, complements, fit_pair, relatives
 from .screen import Remainder, Scored, screen, usable
+from .timing import find_time_shift
 from .trials import Key, Trial, place_law
 from .workbench import DIVERGED, FEW, THOROUGH, Fitted
 
@@ -68,9 +69,15 @@ class Search(Hypotheses):
     ----------
     steps : list of Step
         The moves, in their order.
+    aligned : bool
+        Whether the times of the channels are settled, so that no shift is looked for.
+    shift : Gate, optional
+        The shift of a channel that ended the search, because it shows only beside a law.
     """
 
     steps: list[Step] = field(default_factory=list)
+    aligned: bool = False
+    shift: Gate | None = None
 
     def run(self, effects: float) -> Search:
         """Search for up to `effects` effects; an interrupt ends the search with the present results."""
@@ -103,7 +110,7 @@ class Search(Hypotheses):
         return [Step(parent, (), tuple(trials)) for parent, trials in ranked if trials]
 
     def _grow(self, effects: float) -> bool:
-        """Add effects while that pays; return False as soon as the other hold proves better."""
+        """Add effects while that pays; return False as soon as the other hold, or a channel's shift, proves better."""
         while (
             self.can_improve(parent := self.best)
             and len(parent.effects) < effects
@@ -113,7 +120,7 @@ class Search(Hypotheses):
             self.add(parent)
             if not parent.laws and self.in_time() and self._escape_local_minimum():
                 self.add(self.root)
-            if self.other_hold_fits_better():
+            if self.other_hold_fits_better() or (not parent.laws and self._finds_shift()):
                 return False
             if len(self.best.effects) > len(parent.effects) >= 1:
                 self.exchange()
@@ -186,6 +193,29 @@ class Search(Hypotheses):
         except InputError:
             return False
         return other.cost * BETTER_RATIO**2 < best.cost
+
+    def _finds_shift(self) -> bool:
+        """Look for a shifted channel beside each of the first laws, whose absence may have hidden it.
+
+        Filters and laws with memory are left out: they imitate a shift.
+        """
+        if self.aligned or not self.can_improve(self.best):
+            return False
+        kept = [self.memo[t.key] for t in self.steps[-1].trials]
+        plain = [t for t in kept if not (t.law.order or t.law.memory)]
+        ranked = sorted(plain, key=self.optimistic_evidence, reverse=True)
+        first = list({(t.port, t.law.id): t for t in reversed(ranked)}.values())[::-1][:FEW]
+        best, part = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_said else 0.5
+        with self.stage("shifts beside a law"):
+            for trial in first if self.in_time() else ():
+                bench = replace(self.bench, simulator=trial.fitted.simulator)
+                found = find_time_shift(Checked(bench, trial.fitted), part)
+                if found.gates and found.cost < best:
+                    beside = name_at(trial.port, trial.law.id, trial.law.form)
+                    sentence = f"{found.gates[0].sentence.rstrip('.')} (beside {beside})."
+                    best, self.shift = found.cost, replace(found.gates[0], sentence=sentence)
+        self.aligned = True
+        return self.shift is not None
 
     def add(self, parent: Trial, again: bool = False) -> None:
         """Fit the laws that the screen selects beside a hypothesis, fewer if `again`; polish those that may win."""

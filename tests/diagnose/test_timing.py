@@ -2,14 +2,24 @@
 
 import numpy as np
 import pytest
+from diagnosis_rig import DT, OFF, recordings, rig
 
 from pilfr_casadi.data import Recording
-from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose import Workbench, diagnose
 from pilfr_casadi.diagnose.gates import Checked, Gate
 from pilfr_casadi.diagnose.preparation import hold_note
 from pilfr_casadi.diagnose.timing import _screen_shifts, find_time_shift
 from pilfr_casadi.engine import make_engine
-from pilfr_casadi.laws import Creep, CubicStiffness, PeriodicForce, Relaxation, TwoStageCreep, TwoStageRelaxation
+from pilfr_casadi.laws import (
+    CoulombFriction,
+    Creep,
+    CubicStiffness,
+    Mode,
+    PeriodicForce,
+    Relaxation,
+    TwoStageCreep,
+    TwoStageRelaxation,
+)
 from pilfr_casadi.models import Parameter
 from pilfr_casadi.simulators import Port, Simulator
 
@@ -123,3 +133,14 @@ def test_creep_in_two_stages_goes_on_from_one(one, two, name):
     own = {next(iter(one.units)): 8.0, "T": 0.5}
     assert two().starts_as(one(), own) == {f"{name}_1": 4.0, f"{name}_2": 4.0, "T_1": 0.25, "T_2": 1.0}
     assert two().starts_as(PeriodicForce(), {"a": 1.0, "b": 0.0, "L": 1.0}) == {}
+
+
+def test_a_shift_that_missing_friction_hides_is_found_beside_it():
+    """With neither, the refit is in a wrong place; a mode of the sensor would imitate the lead."""
+    as_recorded = recordings(CoulombFriction().at({"F_c": 10.0, "v_0": 0.005}), count=1)
+    early = [r.with_(u=r.u[:-1], y=r.y[1:], initial="estimate") for r in as_recorded]
+    found = diagnose(rig(OFF), early, laws=(CoulombFriction, Mode), hold="zero")
+    assert [(e.port, e.law) for e in found.effects] == [("ground-m1", "coulomb_friction")]
+    assert [(g.channel, g.value) for g in found.gates if g.finding == "alignment"] == [("x2", -DT)]
+    assert "(beside Coulomb friction (smooth) at ground-m1)" in str(found)
+    assert found.errors["train"]["after"] < 2e-3
