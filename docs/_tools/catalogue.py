@@ -32,6 +32,7 @@ UNITS = {
     "SaturatingInductance": ("V", "A"),
     "Gravity": ("N m", "rad"),
     "WholeGravity": ("N m", "rad"),
+    "Unbalance": ("N", "rad"),
     "FreeCurve": ("V", "1"),
     "thermal": ("W", "K"),
     "electrical": ("A", "V"),

@@ -143,6 +143,7 @@ if TYPE_CHECKING:
         SlackCoupling as SlackCoupling,
         SlackSpring as SlackSpring,
         SoftClearance as SoftClearance,
+        Unbalance as Unbalance,
         WholeGravity as WholeGravity,
     )
     from .thermal import (

@@ -355,3 +355,19 @@ class WholeGravity(_Gravity):
     def force(self, z: Any, p: Any) -> Any:
         q = 2 * np.pi * z / p.L
         return p.a * ca.sin(q) + p.b * ca.cos(q)
+
+
+class Unbalance(_Gravity):
+    """The centrifugal force of an eccentric rotor, along a fixed direction."""
+
+    id = "periodic_force"
+    form = "unbalance"
+    equation = "w = (dz/dt)^2 (a sin(q) + b cos(q)),  q = 2 pi z / L,  L one revolution"
+    source = "Genta (2005), Dynamics of Rotating Systems, sec. 2.4"
+    sentence = "the force of an unbalanced rotor: it turns with the rotor and grows with the square of its speed"
+    units = {"a": "w*s^2/z^2", "b": "w*s^2/z^2", "L": "z"}
+    least_turn = 1.0  # less is a curve of the angle
+
+    def force(self, z: Any, dz: Any, p: Any) -> Any:
+        q = 2 * np.pi * z / p.L
+        return dz**2 * (p.a * ca.sin(q) + p.b * ca.cos(q))
