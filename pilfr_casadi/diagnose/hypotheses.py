@@ -62,6 +62,8 @@ class Findings:
         The learned forces beside it, best first.
     held_out : HeldOut, optional
         Its errors on held-out data.
+    varied : bool
+        Whether variations of parameters were tried beside it.
     """
 
     screened: tuple[list[Scored], np.ndarray | None] | None = None
@@ -70,6 +72,7 @@ class Findings:
     likelihood: tuple[float, float] | None = None
     learned: list[Fitted] | None = None
     held_out: HeldOut | None = None
+    varied: bool = False
 
 
 @dataclass(eq=False, repr=False)

@@ -466,7 +466,8 @@ def _group_responses(responses: list[_Response]) -> tuple[tuple[tuple[str, str],
     whole = np.column_stack([r.left / max(np.linalg.norm(r.left), 1e-300) for r in order])
     explained = np.array([np.max([np.sum((q.T @ whole) ** 2, axis=0) for q in r.spans], axis=0) for r in order])
     missed = np.sqrt(np.maximum(1 - explained, 0.0))
-    alike = (missed < SMALL_SHARE) | (missed * [r.most for r in order] < DETECTION_ERRORS)
+    visible = np.minimum([r.most for r in order], np.finfo(float).max)  # without a limit, zero times it is still zero
+    alike = (missed < SMALL_SHARE) | (missed * visible < DETECTION_ERRORS)
     groups = group_alike(range(len(order)), lambda i, j: bool(alike[i, j] and alike[j, i]))
     return tuple(tuple(order[i].name for i in group) for group in groups if len(group) > 1)
 

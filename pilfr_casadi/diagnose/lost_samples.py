@@ -326,6 +326,9 @@ def find_output_gaps(now: Checked) -> Checked:
     if after.cost > NEAR_NOISE_RATIO**2 * now.noise2:
         return now
     i, k, lost = gap.value
+    only_cut = correct(now, replace(gap, value=(i, k, 0)), [after.fitted.values], after.fitted.begin)
+    if only_cut is not None and CLEARLY_BETTER * only_cut.cost < after.cost:  # a state that is estimated anew suffices
+        return now
     r = now.bench.recordings[i]
     verb = "are" if len(gap.columns) > 1 else "is"
     off = f"{abs(lost)} samples ({abs(lost) * r.dt:.3g} s) too {'early' if lost > 0 else 'late'}"

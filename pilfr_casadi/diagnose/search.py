@@ -122,6 +122,8 @@ class Search(Hypotheses):
                 self.add(self.root)
             if self.other_hold_fits_better() or (not parent.laws and self._finds_shift()):
                 return False
+            if not parent.laws and self.can_improve(self.best) and self.in_time():
+                self.vary_parameters(self.root)
             if len(self.best.effects) > len(parent.effects) >= 1:
                 self.exchange()
             if len(self.best.laws) <= len(parent.laws):  # no added law is worth its prior
@@ -368,8 +370,10 @@ class Search(Hypotheses):
     def vary_parameters(self, base: Trial) -> None:
         """Let parameters of the simulator vary with a signal beside a hypothesis: fit those that explain most."""
         formulas_leave = self.floor2 + self.tolerance  # no machine follows one exactly
-        if VaryingParameter not in self.laws or self.best.mean_square < formulas_leave:
+        known = self.findings[base.key]
+        if VaryingParameter not in self.laws or self.best.mean_square < formulas_leave or known.varied:
             return
+        known.varied = True
         signals = ("t", *self.bench.simulator.inputs, *self.bench.simulator.states)
         laws = [varying(by, profile) for by in dict.fromkeys(signals) for profile in VARIATIONS[:2]]
         laws += [heated(by) for by in dict.fromkeys(signals[1:])]

@@ -152,10 +152,11 @@ def share_left(
     """Compute the share that a mean square error is of a hypothesis' error above the noise.
 
     The hypothesis is by default the refit, and the noise the floor. What nothing explains may have passed for noise
-    there; the white noise is the least.
+    there; the white noise is the least. An error above the outputs' variance counts as that, which a constant leaves:
+    in a free run errors may accumulate without end, and to have removed them says little of a law.
     """
     noise2 = search.floor2 if noise2 is None else noise2
-    excess = max((before or search.root).mean_square - noise2, 1e-300)
+    excess = max(min((before or search.root).mean_square, 1.0) - noise2, 1e-300)
     return float(np.clip((mean_square - noise2) / excess, 0.0, 1.0))
 
 

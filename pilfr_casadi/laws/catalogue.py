@@ -36,8 +36,13 @@ DRAGS = (friction.ViscousDamping.id, friction.QuadraticDrag.id, friction.CubicDa
 # ids of what becomes of small and of large signals; a drive or a valve may have one of each
 SMALL_AND_LARGE = (curves.DeadZone.id, curves.Saturation.id)
 
-# laws of the position that an input may scale: a force constant or a valve's gain that varies with the position
-POSITION_GAINS: tuple[type[Law], ...] = (stiffness.LinearStiffness, stiffness.QuadraticStiffness)
+# laws of the position that an input may scale: a force constant or a valve's gain that varies with the position, or
+# repeats with it
+POSITION_GAINS: tuple[type[Law], ...] = (
+    stiffness.LinearStiffness,
+    stiffness.QuadraticStiffness,
+    stiffness.PeriodicForce,
+)
 
 # laws whose strength may vary with a signal
 SCALABLE: tuple[type[Law], ...] = (
@@ -46,4 +51,5 @@ SCALABLE: tuple[type[Law], ...] = (
     friction.CoulombFriction,
     friction.PreslidingFriction,
     hysteresis.StopHysteresis,
+    hysteresis.BoucWen,
 )

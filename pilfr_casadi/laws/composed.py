@@ -450,9 +450,15 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
                 have = {"z": z, "s": s, "p": at, "dz": dz}
                 return super().step(**{k: have[k] for k in read if k in have})
 
+        elif "q" in read:
+
+            def force(self, z: Any, dz: Any, q: Any, u: Any, p: Any) -> Any:
+                have = {"z": z, "dz": dz, "q": q, "p": Named("parameter", strengths(p, u, z))}
+                return super().force(**{k: have[k] for k in read if k in have})
+
         else:
 
-            def force(self, z: Any, dz: Any, u: Any, p: Any) -> Any:
+            def force(self, z: Any, dz: Any, u: Any, p: Any) -> Any:  # type: ignore[misc]
                 have = {"z": z, "dz": dz, "p": Named("parameter", strengths(p, u, z))}
                 return super().force(**{k: have[k] for k in read if k in have})
 

@@ -262,6 +262,12 @@ class OffCentreClearance(Clearance):
         return p.k_g * (ca.fmax(z - p.m - p.g, 0) - ca.fmax(p.m - z - p.g, 0))
 
 
+def _periods(local: Local) -> np.ndarray:
+    """Periods to try: parts of the travel, and one revolution where a shaft turns more often than that."""
+    parts = 2 * local.half / np.concatenate([np.arange(1.5, 8, 0.5), np.arange(8, 60.1, 1.0)])
+    return np.append(parts, local.revolution) if local.revolution < parts[-1] else parts
+
+
 class PeriodicForce(Law):
     """A force that repeats with position: cogging, ripple of a screw or gear (Hanselman 2006)."""
 
@@ -273,14 +279,15 @@ class PeriodicForce(Law):
     units = {"a": "w", "b": "w", "L": "z"}
     domains = ("mechanical",)
     min_periods = 1.5  # smallest number of periods within the motion that is tried
-    starts = {"L": lambda at: 2 * at.half / np.concatenate([np.arange(1.5, 8, 0.5), np.arange(8, 60.1, 1.0)])}
+    starts = {"L": lambda at: _periods(at)}
 
     def force(self, z: Any, p: Any) -> Any:
         angle = 2 * np.pi * z / p.L
         return p.a * ca.sin(angle) + p.b * ca.cos(angle)
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"L": (2 * local.half / 60, 2 * local.half / self.min_periods)}
+        least = np.nanmin([2 * local.half / 60, local.revolution])
+        return {"L": (least, 2 * local.half / self.min_periods)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether the motion covers fewer than two periods; the force could then be any other curve."""
@@ -363,7 +370,7 @@ class Unbalance(_Gravity):
     id = "periodic_force"
     form = "unbalance"
     equation = "w = (dz/dt)^2 (a sin(q) + b cos(q)),  q = 2 pi z / L,  L one revolution"
-    source = "Genta (2005), Dynamics of Rotating Systems, sec. 2.4"
+    source = "Genta (2005), Dynamics of Rotating Systems, ch. 2"
     sentence = "the force of an unbalanced rotor: it turns with the rotor and grows with the square of its speed"
     units = {"a": "w*s^2/z^2", "b": "w*s^2/z^2", "L": "z"}
     least_turn = 1.0  # less is a curve of the angle

@@ -1,5 +1,6 @@
-"""Gravity on a swinging arm, whose equations have it for small angles alone or not at all."""
+"""Forces of an angle: unbalance, and gravity on an arm whose equations have it for small angles alone or not at all."""
 
+from dataclasses import replace
 from functools import partial
 
 import casadi as ca
@@ -84,3 +85,31 @@ def test_cogging_is_no_gravity():
     found = pilfr.diagnose(simulator, train, laws=[*TRIED, laws.WholeGravity], workers=1)
     assert [e.law for e in found.effects] == ["periodic_force"]
     assert found.effects[0].parameters["L"]["value"] == pytest.approx(0.5, rel=0.01)
+
+
+def test_unbalance_of_a_rotor_is_told_from_a_force_that_only_repeats():
+    """The rotor runs up; its centrifugal force shakes the bearing and grows with the square of its speed."""
+
+    def run_up(x, u, p):
+        return {"turn": x.speed, "speed": (u.torque - 2e-4 * x.speed) / p.inertia, "y": x.v, "v": -p.k * x.y - 5 * x.v}
+
+    parameters = {"inertia": Parameter(6e-4, bounds=(1e-4, 3e-3)), "k": Parameter(2.5e4, bounds=(5e3, 1e5))}
+    bearing = Port("bearing", {"v": -1.0}, lambda x: x.turn, lambda x: x.speed, "N", "rad")
+    true = Simulator(
+        run_up,
+        lambda x: {"speed": x.speed, "y": 1e3 * x.y},
+        states=("turn", "speed", "y", "v"),
+        inputs=("torque",),
+        parameters=parameters,
+        ports=bearing,
+    )
+    rng = np.random.default_rng(4)
+    torque = np.interp(np.arange(1500), [0, 900, 1500], [0.01, 0.12, 0.02])[:, None]
+    blank = Recording(torque, np.zeros((1500, 2)), 2e-3, "torque", ("speed", "y"), initial="zero", hold="zero")
+    y = true.with_element("bearing", laws.Unbalance().at({"a": 0.0, "b": -5e-4, "L": 2 * np.pi})).simulate(blank)
+    train = blank.with_(y=y + 5e-3 * np.std(y, axis=0) * rng.standard_normal(y.shape))
+    given = true.with_parameters({**parameters, "inertia": replace(parameters["inertia"], value=7e-4)})
+    tried = (laws.PeriodicForce, laws.HarmonicForce, laws.WholeGravity, laws.Unbalance)
+    (effect,) = pilfr.diagnose(given, train, laws=tried, workers=1).effects
+    assert (effect.law, effect.form) == ("periodic_force", "unbalance") and effect.confidence > 0.9
+    assert effect.parameters["b"]["value"] == pytest.approx(-5e-4, rel=0.02)

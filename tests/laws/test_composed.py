@@ -10,6 +10,7 @@ from pilfr_casadi.diagnose.screen import start_values
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
     SCHEDULES,
+    BoucWen,
     CoulombFriction,
     CubicStiffness,
     Drift,
@@ -129,6 +130,16 @@ def test_a_strength_that_varies_is_found_with_its_signal(kind, by, values, ends)
     assert [(e.port, e.law) for e in found.effects] == [("damper", kind.id)], str(found)
     assert found.effects[0].form.endswith(f"scheduled by {by}")
     assert found.errors["train"]["after"] < 1.1e-3
+
+
+def test_a_law_with_states_of_its_own_may_vary():
+    """With equal strengths at both ends of the signal it is the plain law."""
+    own = {"k_h": 300.0, "q_0": 0.005, "s": 0.5, "n": 1.0}
+    ends = {"k_h_high": 300.0, "low": 0.0, "high": 4.0}
+    blank = recorded(rig(), 0)
+    plain, varying = BoucWen().at(own), scheduled(BoucWen, "voltage")().at({**own, **ends})
+    a, b = (rig().with_element("damper", law).simulate(blank) for law in (plain, varying))
+    assert np.allclose(a, b, rtol=1e-9) and np.std(a) > 0
 
 
 @pytest.mark.parametrize(
