@@ -11,7 +11,17 @@ import numpy as np
 from .._base import InputError, Stages, listed
 from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
 from ..identify import match_channels
-from ..laws import CATALOGUE, SCALABLE, Law, LinearStiffness, ViscousDamping, scaled, scheduled, seen_by
+from ..laws import (
+    CATALOGUE,
+    SCALABLE,
+    Law,
+    LinearStiffness,
+    ViscousDamping,
+    scaled,
+    scheduled,
+    seen_by,
+    unread_input,
+)
 from ..simulators import Simulator, as_simulator
 from .gates import Gate
 from .stretches import Stretches
@@ -93,11 +103,13 @@ def check_laws(laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
 def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[type[Law], ...]:
     """Return the laws, and versions of some of them whose strength varies with a signal.
 
-    An input that the equations do not read may scale a law. A spring or damper of the simulator's own may vary with the
-    time, an input, or a port's own signal, and a damper with the position. Other laws are found first, and then let
-    vary (`Search`). Of several sensors at an elastic joint or drive, one alone may be on the far side.
+    An input that the equations do not read may act itself, or scale a law. A spring or damper of the simulator's own
+    may vary with the time, an input, or a port's own signal, and a damper with the position. Other laws are found
+    first, and then let vary (`Search`). Of several sensors at an elastic joint or drive, one alone may be on the far
+    side.
     """
     by_input = [scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs]
+    by_input += [unread_input(by) for by in simulator.idle_inputs if set(CATALOGUE) <= set(laws)]
     signals = ["t", *simulator.inputs, *sorted({name for port in simulator.ports for name in port.signals})]
     pairs = [(law, by) for law in (LinearStiffness, ViscousDamping) for by in signals] + [(ViscousDamping, "z")]
     varying = [scheduled(law, by, "quadratic") for law, by in pairs if law in laws]

@@ -28,7 +28,7 @@ the second half of every recording is also predicted, from a fit to the first ha
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -227,19 +227,41 @@ def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
     the damping of a law beside the simulator's own, have none either.
     """
     full = np.full(fitted.model.parameters.size, np.nan)
+    places, root = _covariance_root(bench, fitted)
+    full[places] = np.sqrt(np.sum(root**2, axis=1))
+    return fitted.model.parameters.unpack(full)
+
+
+def significance(bench: Workbench, fitted: Fitted, names: Iterable[str]) -> float:
+    """Compute the confidence at which not all of some parameters are zero, by Wald's test; 1 if it is unknown.
+
+    It is unknown for parameters that can be identified only together with others, and at bounds.
+    """
+    from scipy.special import gammainc
+
+    own, (places, root) = fitted.model.parameters, _covariance_root(bench, fitted)
+    wanted = np.concatenate([np.arange(own.size)[own.position(name)] for name in names])
+    rows = np.isin(places, wanted)
+    if not np.any(rows) or not np.all(np.isfinite(root[rows])):
+        return 1.0
+    away = np.linalg.pinv(root[rows]) @ fitted.vector[places[rows]]
+    return float(gammainc(np.sum(rows) / 2, away @ away / 2))
+
+
+def _covariance_root(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
+    """Return places in the parameter vector, (k,), and a root of their covariance, (k, r), with nan where unknown."""
     if not np.any(fitted.model.parameters.free):
-        return fitted.model.parameters.unpack(full)
+        return np.zeros(0, dtype=int), np.zeros((0, 0))
     problem, theta, hessian = _hessian(bench, fitted)
     inside, diagonal = (theta > problem.lower) & (theta < problem.upper), np.diag(hessian)
     kept = np.flatnonzero(inside & np.isfinite(diagonal) & (diagonal > 0))
     size = np.sqrt(np.maximum(diagonal[kept], 1e-300))
     values, vectors = np.linalg.eigh(hessian[np.ix_(kept, kept)] / np.outer(size, size))
     known = values > LEAST_KNOWN * values[-1:]
-    variance = np.sum(vectors[:, known] ** 2 / values[known], axis=1)
-    variance[np.sum(vectors[:, ~known] ** 2, axis=1) > UNKNOWN_SHARE] = np.nan
+    root = vectors[:, known] / np.sqrt(values[known])
+    root[np.sum(vectors[:, ~known] ** 2, axis=1) > UNKNOWN_SHARE] = np.nan
     own, n = kept < problem.n_free, max(effective_size(fitted.residual), 10.0)
-    full[np.flatnonzero(problem.free)[kept[own]]] = np.sqrt(variance[own] * fitted.cost / n) / size[own]
-    return fitted.model.parameters.unpack(full)
+    return np.flatnonzero(problem.free)[kept[own]], root[own] * np.sqrt(fitted.cost / n) / size[own][:, None]
 
 
 def _widths(fitted: Fitted, laws: Sequence[Placed], free: np.ndarray, square: np.ndarray) -> np.ndarray:

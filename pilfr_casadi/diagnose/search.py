@@ -172,7 +172,10 @@ class Search(Hypotheses):
             for base in {t.key: t for t in (self.root, best, *without_weakest)}.values():
                 if len(base.effects) < effects and self.can_improve(self.best) and self.in_time():
                     name_rest(base)
-        return self.best is best or self._grow(effects)
+        if self.best is best:
+            return True
+        self.exchange()  # laws that were found before may have made up for this one
+        return self._grow(effects)
 
     def _pays(self, trial: Trial) -> bool:
         """Tell whether the last of several laws was worth it; a wrong model can always use one more."""

@@ -13,7 +13,8 @@ law leaves and that a flexible force at some port would explain. The density of 
 and the probability of a hypothesis is divided between a named and an unnamed answer in this ratio. s_0 is the share
 that the formula of the right law may leave. A wrong law often drives a parameter of the simulator to a bound. The
 verdict is the likeliest of complete, missing physics and unexplained. The confidence of an effect is the probability
-that it is included. An effect beside others is named if that exceeds one half (Barbieri & Berger 2004).
+that it is included and that its strength is not zero. An effect beside others is named if that exceeds one half
+(Barbieri & Berger 2004).
 
 `judge` puts the verdict into words. It also takes into account what the checks of the recordings have found, and
 whether the refit's residual can be noise.
@@ -48,6 +49,7 @@ from .evidence import (
     STRAINED_ODDS,
     SURE,
     WHITE_NOISE_RATIO,
+    significance,
 )
 from .floor import ABOVE_NOISE, swells_with, times_white, white_part
 from .gates import Gate
@@ -188,8 +190,12 @@ def posterior(search: Hypotheses) -> Posterior:
         if least.confidence > SURE or fewer not in by_names or not fewer:
             break
         said = fewer
-    named = share_named(explainable_remainder(search, best), strained(search, best))
-    effects = (replace(e, confidence=_named_beside(search, best, e) * e.confidence) for e in found)
+    acts = [_acts(search, best, e.element) for e in found]
+    named = max(acts) * share_named(explainable_remainder(search, best), strained(search, best))
+    effects = (
+        replace(e, confidence=act * _named_beside(search, best, e) * e.confidence)
+        for act, e in zip(acts, found, strict=True)
+    )
     strongest_first = sorted(effects, key=lambda e: -(_without(search, best, e) or search.root).mean_square)
     return Posterior(best, named, tuple(strongest_first), by_names.get(frozenset(), 0.0))
 
@@ -202,6 +208,12 @@ def _named_beside(search: Hypotheses, best: Trial, effect: NamedEffect) -> float
     """
     remainder = explainable_remainder(search, best, _without(search, best, effect))
     return share_named(remainder, strained(search, best))
+
+
+def _acts(search: Hypotheses, best: Trial, element: Placed) -> float:
+    """Compute the probability that a law's strengths are not zero; the law's first state could imitate its force."""
+    names = [f"{element.prefix}{name}" for name in element.law.strength]
+    return significance(search.bench, best.fitted, names) if names else 1.0
 
 
 def _without(search: Hypotheses, best: Trial, effect: NamedEffect) -> Trial | None:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         PROFILES as PROFILES,
         SCHEDULES as SCHEDULES,
         VARIATIONS as VARIATIONS,
+        UnreadInput as UnreadInput,
         VaryingParameter as VaryingParameter,
         behind_gap as behind_gap,
         constant as constant,
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
         scheduled as scheduled,
         seen_by as seen_by,
         strengths_over as strengths_over,
+        unread_input as unread_input,
         varying as varying,
     )
     from .curves import (

@@ -123,6 +123,31 @@ def scaled(law: type[Law], by: str) -> type[Law]:
     return _scaled(_check_force(law), by)
 
 
+class UnreadInput(Law):
+    """What an input does that the equations do not read; see `unread_input`."""
+
+    id = "unread_input"
+    equation = "w = a"
+    sentence = "a recorded input that the equations do not read"
+    units = {"a": "w"}
+
+    def force(self, p: Any) -> Any:
+        return p.a
+
+
+@functools.cache
+def unread_input(by: str) -> type[Law]:
+    """Make the law of an input that acts at a port although the equations do not read it: `w = a by`.
+
+    A load torque, a wind or the sun may have been recorded and left out of the simulator.
+    """
+    kind: Any = _scaled(UnreadInput, by)
+    kind.form, kind.equation = by, f"w = a {by}"
+    kind.sentence = f"{by} acts here, in proportion; it is recorded, and the equations do not read it"
+    found: type[Law] = kind
+    return found
+
+
 def scheduled(law: type[Law], by: str, profile: str = "linear") -> type[Law]:
     """Make a law whose strength varies with a signal, such as friction that grows with a pressure.
 

@@ -17,6 +17,7 @@ from pilfr_casadi.laws import CubicStiffness, Delay
 
 DT, SAMPLES = 0.05, 200
 NOISE2 = 1e-6  # mean square of the noise, over the outputs' variance
+STIFF = 1e3  # N/m^3, of a spring that stiffens; other strengths are one
 
 
 @pytest.fixture(scope="session")
@@ -25,7 +26,7 @@ def tiny():
     simulator = cart(ports=[replace(GROUND, name=name) for name in "abc"])
     u = 10 * multisine(SAMPLES, f_max=3.0, fs=1 / DT, rng=np.random.default_rng(0))
     r = Recording(u, u, DT, ("force",), ("pos",), initial="zero", hold="zero")
-    y = simulator.with_element("a", CubicStiffness().at({"k_3": 1e3})).simulate(r)
+    y = simulator.with_element("a", CubicStiffness().at({"k_3": STIFF})).simulate(r)
     bench = Workbench.of(simulator, [r.with_(y=y)], "zero", "vm")
     return bench, bench.fit(simulator)
 
@@ -39,11 +40,12 @@ def hypothesis(tiny):
     def run(*laws):
         simulator = bench.simulator
         for port, kind in laws:
-            simulator = simulator.with_element(port, kind({"T": DT}) if kind is Delay else kind())
+            own = dict.fromkeys(kind.strength, STIFF if kind is CubicStiffness else 1.0)
+            simulator = simulator.with_element(port, kind({"T": DT} if kind is Delay else own))
         return bench.run(simulator, {}, refit.begin)
 
     def make(*laws, error, **own):
-        fitted = run(*laws)
+        fitted = replace(run(*laws), cost=error**2)
         if own:
             fitted = replace(fitted, values={**fitted.values, **fitted.simulator.elements[-1].named(own)})
         return Trial(fitted.last_elements(len(laws)), fitted, error**2, error**2, True, np.zeros(0))
