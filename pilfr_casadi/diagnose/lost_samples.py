@@ -12,7 +12,8 @@ one of these explains about as much, or if no state is such an integral. A refit
 
 If only some outputs have lost samples, as in one of two loggers, their later samples are early relative to the others.
 Every sample is tried with every number of lost samples: before it the outputs count as recorded, after it moved.
-Cumulative sums of the error that parameters and initial states leave make this fast.
+Cumulative sums of the error that parameters and initial states leave make this fast. It is no gap if to leave out as
+many samples, with nothing moved, explains as much: a shock may have fallen into them.
 """
 
 from __future__ import annotations
@@ -265,6 +266,17 @@ def _solve_jumps(
 
 
 @dataclass(frozen=True, eq=False)
+class _Pause(_Gap):
+    """Samples that are left out, the rival of lost samples: a shock in them; its value is (recording, begin, end)."""
+
+    def apply(self, bench: Workbench) -> Workbench:
+        """Return the bench with the recording in two pieces."""
+        i, begin, end = self.value
+        r = bench.recordings[i]
+        return self.put_pieces(bench, (r.slice(0, begin), r.slice(end).with_(initial="estimate", period=None)))
+
+
+@dataclass(frozen=True, eq=False)
 class OutputGap(_Gap):
     """Lost samples of some outputs; until it is reported, its value is (recording, sample, number of lost samples).
 
@@ -326,8 +338,9 @@ def find_output_gaps(now: Checked) -> Checked:
     if after.cost > NEAR_NOISE_RATIO**2 * now.noise2:
         return now
     i, k, lost = gap.value
-    only_cut = correct(now, replace(gap, value=(i, k, 0)), [after.fitted.values], after.fitted.begin)
-    if only_cut is not None and CLEARLY_BETTER * only_cut.cost < after.cost:  # a state that is estimated anew suffices
+    pause = _Pause(gap.channel, "pause", (i, k, k + abs(lost)))
+    without = correct(now, pause, [after.fitted.values], after.fitted.begin)
+    if without is not None and CLEARLY_BETTER * without.cost < after.cost:  # nothing has to be moved
         return now
     r = now.bench.recordings[i]
     verb = "are" if len(gap.columns) > 1 else "is"

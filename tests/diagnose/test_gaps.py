@@ -192,3 +192,25 @@ def test_in_a_stretch_the_whole_recording_is_cut():
     before, after = gap.apply_to_whole([given], [(0, 1000)])
     assert len(before) == 1300 and len(after) == len(given) - 1312
     assert np.array_equal(after.y, shaken("zero").y[1312 : 1312 + len(after)])
+
+
+def test_a_shock_that_no_input_explains_is_no_gap_of_an_output():
+    """Without the samples of the shock, the ringing that follows has an initial state; nothing has to be moved."""
+
+    def rings(kick):
+        return pilfr.Simulator(
+            lambda x, u, p: {"speed": u.torque - 2 * x.speed, "y": x.v, "v": kick(u) - p.k * x.y - 5 * x.v},
+            lambda x: {"speed": x.speed, "y": 1e3 * x.y},
+            states=("speed", "y", "v"),
+            inputs=("torque", "kick"),
+            parameters={"k": pilfr.Parameter(2.5e4, bounds=(5e3, 1e5))},
+        )
+
+    u = np.column_stack([np.sin(0.012 * np.arange(1500)), np.zeros(1500)])
+    u[300:310, 1] = 30.0
+    names = ("torque", "kick"), ("speed", "y")
+    r = pilfr.Recording(u, np.zeros((1500, 2)), 2e-3, *names, initial="zero", hold="zero")
+    y = rings(lambda u: u.kick).simulate(r)
+    noise = 5e-3 * np.std(y, axis=0) * np.random.default_rng(4).standard_normal(y.shape)
+    made = Workbench.of(rings(lambda u: 0 * u.kick), [r.with_(y=y + noise)], "zero")
+    assert not find_output_gaps(Checked(made, refitted(made))).gates

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pilfr_casadi.diagnose.evidence import significance
 from pilfr_casadi.diagnose.offsets import Offset
 from pilfr_casadi.diagnose.verdict import closest_law, explainable_remainder, posterior, share_named
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Delay, DirectionalFriction, QuadraticDrag
@@ -171,3 +172,20 @@ def test_a_value_that_the_user_has_excluded_makes_a_law_less_sure(search, trial,
     assert strained.fitted.strained([name]) and not at_bound.fitted.strained([name])
     assert sure_of(posterior(search(strained)))[DRY_NAME] == pytest.approx(share_named(0.0, strained=True))
     assert 0.75 < share_named(0.0, strained=True) < 0.9
+
+
+def test_a_refit_worse_than_a_constant_lends_a_law_no_confidence(search, trial):
+    """A free run can be off by ten deviations; a law that leaves a tenth of the outputs' variance is still far off."""
+    found = search(trial(DRY, left=0.1))
+    (law,) = [t for t in found.memo.values() if t.laws]
+    before = explainable_remainder(found, law)
+    found.memo[found.root.key] = replace(found.root, part_mean_square=100.0, mean_square=100.0)
+    assert explainable_remainder(found, law) == pytest.approx(before) and before > 0.01
+
+
+def test_a_strength_that_may_be_zero_names_nothing(tiny):
+    bench, _ = tiny
+    fitted = bench.fit(bench.simulator.with_element("a", CubicStiffness().at({"k_3": 900.0})))
+    assert significance(bench, fitted, ["a.k_3"]) > 0.999
+    idle = replace(fitted, values={**fitted.values, "a.k_3": np.array(0.0)})
+    assert significance(bench, idle, ["a.k_3"]) < 0.01
