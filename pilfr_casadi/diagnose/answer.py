@@ -132,7 +132,11 @@ def build_diagnosis(
         mismatch=mismatch(bench.recordings, without.residual, simulated, floor.deviation, bench.scale),
         parameters=parameter_table(request.simulator, without, after, std),
         errors=errors,
-        floor={"nrmse": floor.nrmse(bench.scale), "source": floor.source},
+        floor={
+            "nrmse": floor.nrmse(bench.scale),
+            "source": floor.source,
+            "white": search.least_floor.nrmse(bench.scale),
+        },
         corrected=replace(remove_zero_offsets(after.corrected()), substeps=after.model.substeps),
         refitted=replace(without.corrected(), substeps=without.model.substeps),
         hold=bench.hold,

@@ -20,7 +20,7 @@ from ..simulators import ACTUATOR, Simulator, discretise, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
 from .effect import Effect
-from .evidence import BETTER_RATIO, FAR_RATIO, SURE
+from .evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, SURE
 from .floor import ABOVE_NOISE
 from .gates import Gate
 from .learned import Learned
@@ -84,7 +84,7 @@ class Diagnosis:
         `train`, `test` -> `nominal`, `before`, `after`: NRMSE averaged over outputs. With an observer these are errors
         of predictions; `free_run` then has the errors without it, on the test recordings if there are any.
     floor : dict
-        `nrmse` and `source`.
+        `nrmse` and `source` of the noise, and its `white` part; the rest of an estimate may be physics as well.
     out_of_time : bool
         Whether the time limit ended the search.
     substeps : int
@@ -404,9 +404,8 @@ class Diagnosis:
                 f"Refitted, the simulator alone is hardly better than a constant (error {train['before']:.2g} of the "
                 "outputs' deviation). Check its values, units and bounds before you trust a name."
             )
-        times = train["after"] / max(self.floor["nrmse"], 1e-300) if train and self.effects else 1.0
-        if times > ABOVE_NOISE:
-            out.append(f"The remaining error is {times:.2g} times the noise: more is missing, or a law is only near.")
+        if train and self.effects:
+            out += self._remaining_error(train["after"])
         far = test and train and test["after"] > FAR_RATIO * max(train["after"], self.floor["nrmse"])
         if far and self.outcome != "worse":
             out.append(
@@ -414,6 +413,22 @@ class Diagnosis:
                 "recording visits states that the training recordings do not."
             )
         return out
+
+    def _remaining_error(self, after: float) -> Iterator[str]:
+        """Generate a note if the corrected simulator does not follow to the noise, or only to an uncertain one."""
+        noise, white = (max(value, 1e-300) for value in (self.floor["nrmse"], self._white_noise))
+        if after > ABOVE_NOISE * noise:
+            yield f"The remaining error is {after / noise:.2g} times the noise: more is missing, or a law is only near."
+        elif after > FAR_RATIO * white:
+            yield (
+                f"The remaining error is {after / white:.2g} times the white noise. Its slow part may be noise too, or "
+                "physics that no law here explains."
+            )
+
+    @property
+    def _white_noise(self) -> float:
+        """The white part of the noise, or all of it where it is not known apart."""
+        return float(self.floor.get("white", self.floor["nrmse"]))
 
     def _doubtful_offsets(self) -> Iterator[str]:
         """Generate a note on each offset that is larger than its signal ever was."""
@@ -469,8 +484,12 @@ class Diagnosis:
             if errors:
                 shown = (_error_text(errors[k]) for k in ERROR_NAMES)
                 lines.append(f"  {kind.replace('_', ' '):<10}" + "".join(f"{text:>11}" for text in shown))
-        least = "at least " if self.verdict == "unexplained" and self.floor["source"] == "estimated" else ""
-        return [*lines, f"  noise floor {least}{_error_text(self.floor['nrmse'])} ({self.floor['source']})"]
+        noise = _error_text(self.floor["nrmse"])
+        if self.verdict == "unexplained" and self.floor["source"] == "estimated":
+            noise = f"at least {noise}"
+        elif self.floor["nrmse"] > NEAR_RATIO * self._white_noise:
+            noise = f"{_error_text(self._white_noise)} to {noise}"
+        return [*lines, f"  noise floor {noise} ({self.floor['source']})"]
 
     def gravest_blind_spots(self) -> list[str]:
         """Describe the gravest facts that the recordings cannot reveal, one a line."""
