@@ -109,11 +109,14 @@ class Search(Hypotheses):
         ranked = ((parent, sorted(trials.values(), key=lambda t: t.error)) for parent, trials in found.values())
         return [Step(parent, (), tuple(trials)) for parent, trials in ranked if trials]
 
-    def _grow(self, effects: float) -> bool:
-        """Add effects while that pays; return False as soon as the other hold, or a channel's shift, proves better."""
+    def _grow(self, effects: float, varied: bool = False) -> bool:
+        """Add effects while that pays; return False as soon as the other hold, or a channel's shift, proves better.
+
+        A parameter that varies can imitate many laws. So hypotheses with one are a basis for more only if `varied`.
+        """
         while (
-            self.can_improve(parent := self.best)
-            and len(parent.effects) < effects
+            self.can_improve(self.best)
+            and len((parent := self._parent(varied)).effects) < effects
             and self._pays(parent)
             and self.in_time()
         ):
@@ -124,15 +127,22 @@ class Search(Hypotheses):
                 return False
             if not parent.laws and self.can_improve(self.best) and self.in_time():
                 self.vary_parameters(self.root)
-            if len(self.best.effects) > len(parent.effects) >= 1:
+            if len(self._parent(varied).effects) > len(parent.effects) >= 1:
                 self.exchange()
-            if len(self.best.laws) <= len(parent.laws):  # no added law is worth its prior
+            if len(self._parent(varied).laws) <= len(parent.laws):  # no added law is worth its prior
                 break
         if effects > 1 and TWO not in self.times and self.can_improve(self.best) and self.in_time():
             best = self.best
             self.add_two()
-            return self.best is best or self._grow(effects)
+            return self.best is best or self._grow(effects, varied)
         return True
+
+    def _parent(self, varied: bool) -> Trial:
+        """Return the best hypothesis, or the best one in which no parameter varies."""
+        if varied:
+            return self.best
+        fixed = [t for t in self.memo.values() if all(kind_of(e.port) != PARAMETER for e in t.laws)]
+        return max(fixed, key=self.optimistic_evidence)
 
     def _grow_to_noise(self) -> None:
         """Add a law for a rest as small as the formula error of the laws before it.
@@ -165,7 +175,7 @@ class Search(Hypotheses):
         The weakest of several effects may imitate a law that only a learned force shows, such as a gain that varies
         with the position. Go on if one of the laws leads.
         """
-        best = self.best
+        best = self._parent(varied=False)
         fewer = [t for t in self.memo.values() if t.effects and t.key < best.key]
         without_weakest = sorted(fewer, key=lambda t: (-len(t.effects), t.mean_square))[:1]
         for name_rest in (self.vary_parameters, self.name_learned):
@@ -175,7 +185,7 @@ class Search(Hypotheses):
         if self.best is best:
             return True
         self.exchange()  # laws that were found before may have made up for this one
-        return self._grow(effects)
+        return self._grow(effects, varied=True)
 
     def _pays(self, trial: Trial) -> bool:
         """Tell whether the last of several laws was worth it; a wrong model can always use one more."""
@@ -214,7 +224,7 @@ class Search(Hypotheses):
         with self.stage("shifts beside a law"):
             for trial in first if self.in_time() else ():
                 bench = replace(self.bench, simulator=trial.fitted.simulator)
-                found = find_time_shift(Checked(bench, trial.fitted), part)
+                found = find_time_shift(Checked(bench, trial.fitted), part, given=False)
                 if found.gates and found.cost < best:
                     beside = name_at(trial.port, trial.law.id, trial.law.form)
                     sentence = f"{found.gates[0].sentence.rstrip('.')} (beside {beside})."

@@ -165,17 +165,18 @@ def in_steps(value: float, dt: float, part: float = 1.0) -> bool:
     return abs(value / dt - part * round(value / dt / part)) < WHOLE_SHIFT
 
 
-def find_time_shift(now: Checked, part: float = 1.0, early: bool = True) -> Checked:
+def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: bool = True) -> Checked:
     """Find a shifted channel or clock, and correct it if it is a fault of the recording.
 
-    A late channel counts as a fault if it is late by a multiple of `part` samples, nothing else is wrong, and no lag
-    follows it as well. Without `early`, an early channel also counts as a fault only if nothing else is wrong.
+    With `given`, the run at the user's values is screened as well as the refit. A late channel counts as a fault if it
+    is late by a multiple of `part` samples, nothing else is wrong, and no lag follows it as well. Without `early`, an
+    early channel also counts as a fault only if nothing else is wrong.
     """
     bench, noise2 = now.bench, now.noise2
     if now.cost < ABOVE_NOISE**2 * noise2:
         return now
     best: tuple[TimeShift, Checked] | None = None
-    for screened in _screen_shifts(bench, now.fitted):
+    for screened in _screen_shifts(bench, now.fitted, given):
         settled = settle(now, screened)
         if settled is None:
             continue
@@ -221,11 +222,11 @@ def run_as_given(bench: Workbench, plain: Fitted) -> Fitted:
     return bench.result(bench.simulator, values, initial, plain.engine, plain.model)
 
 
-def _screen_shifts(bench: Workbench, plain: Fitted) -> list[TimeShift]:
+def _screen_shifts(bench: Workbench, plain: Fitted, also_given: bool = True) -> list[TimeShift]:
     """List the shifts and clock rates that clearly reduce the remainder, best first, a few at most.
 
-    A shift can lead the refit into a wrong minimum. Therefore the run at the user's values is screened too, unless it
-    runs away.
+    A shift can lead the refit into a wrong minimum. Therefore the run at the user's values is screened too by default,
+    unless it runs away.
     """
     outputs, inputs = bench.simulator.output_names, bench.simulator.inputs
     channels: list[tuple[str, tuple[int, ...], str]] = [("y", (i,), name) for i, name in enumerate(outputs)]
@@ -234,8 +235,8 @@ def _screen_shifts(bench: Workbench, plain: Fitted) -> list[TimeShift]:
     if len(inputs) > 1:
         channels += [("u", (i,), name) for i, name in enumerate(inputs)]
     found = list[tuple[float, TimeShift]]()
-    given = run_as_given(bench, plain)
-    for reference in (plain, given) if given.cost < RUNAWAY**2 else (plain,):
+    given = [run_as_given(bench, plain)] if also_given else []
+    for reference in (plain, *(one for one in given if one.cost < RUNAWAY**2)):
         first = FirstOrder.of(bench, reference)
         for kind, columns, name in channels:
             for finding, values in (("alignment", bench.dt * SHIFTS), ("clock", RATES)):
