@@ -25,10 +25,8 @@ def drive(k1, k2, d2):
         joint = p.k2 * (x.p1 - x.p2) + p.d2 * (x.v1 - x.v2)
         return dict(p1=x.v1, v1=(u.force - p.k1 * x.p1 - 8 * x.v1 - joint) / 2, p2=x.v2, v2=joint)
 
-    mount = Port("mount", dict(v1=-0.5), lambda x: x.p1, lambda x: x.v1, unit="N", across_unit="m")
-    joint = Port(
-        "joint", dict(v1=-0.5, v2=1.0), lambda x: x.p1 - x.p2, lambda x: x.v1 - x.v2, unit="N", across_unit="m"
-    )
+    mount = Port("mount", dict(v1=-0.5), lambda x: x.p1, lambda x: x.v1, "N", "m")
+    joint = Port("joint", dict(v1=-0.5, v2=1.0), lambda x: x.p1 - x.p2, lambda x: x.v1 - x.v2, "N", "m")
     return Simulator(
         dynamics,
         lambda x: dict(load=x.p2),
