@@ -41,7 +41,7 @@ from .learned import learn_forces, nearest_to_learned
 from .linearise import linearise_runs
 from .relatives import choose_pairs, complements, fit_pair, relatives
 from .screen import Remainder, Scored, screen, usable
-from .timing import find_time_shift
+from .timing import TimeShift, find_time_shift
 from .trials import Key, Trial, place_law
 from .workbench import DIVERGED, FEW, THOROUGH, Fitted
 
@@ -210,9 +210,9 @@ class Search(Hypotheses):
         return other.cost * BETTER_RATIO**2 < best.cost
 
     def _finds_shift(self) -> bool:
-        """Look for a shifted channel beside each of the first laws, whose absence may have hidden it.
+        """Look beside each of the first laws for an output that comes before its cause; their absence may hide it.
 
-        Filters and laws with memory are left out: they imitate a shift.
+        Filters and laws with memory are left out: they imitate a shift. A delay is a law itself.
         """
         if self.aligned or not self.can_improve(self.best):
             return False
@@ -225,10 +225,11 @@ class Search(Hypotheses):
             for trial in first if self.in_time() else ():
                 bench = replace(self.bench, simulator=trial.fitted.simulator)
                 found = find_time_shift(Checked(bench, trial.fitted), part, given=False)
-                if found.gates and found.cost < best:
+                shift = found.gates[0] if found.gates else None
+                if isinstance(shift, TimeShift) and shift.leads and found.cost < best:
                     beside = name_at(trial.port, trial.law.id, trial.law.form)
-                    sentence = f"{found.gates[0].sentence.rstrip('.')} (beside {beside})."
-                    best, self.shift = found.cost, replace(found.gates[0], sentence=sentence)
+                    sentence = f"{shift.sentence.rstrip('.')} (beside {beside})."
+                    best, self.shift = found.cost, replace(shift, sentence=sentence)
         self.aligned = True
         return self.shift is not None
 

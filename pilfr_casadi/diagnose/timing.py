@@ -133,6 +133,11 @@ class TimeShift(Gate):
         value = _minimise(self.remainder(first, after.fitted), self.value - width, self.value + width)[0]
         return self if abs(value - self.value) < 2e-3 * width else self.at(value, now.bench.dt)
 
+    @property
+    def leads(self) -> bool:
+        """Whether outputs come before their causes: an early output or a late input, which no physics explains."""
+        return self.finding == "alignment" and (self.value < 0) == (self.kind == "y")
+
     def is_like_delay(self, dt: float, part: float) -> bool:
         """Tell whether it may be a delay: late by a fraction of `part` samples, or by few samples."""
         late = self.finding == "alignment" and self.value > -WHOLE_SHIFT * dt
