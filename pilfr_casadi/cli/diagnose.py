@@ -173,6 +173,8 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: str = "") -> int
     print(f"diagnosis: {target}\nreport: {page}")
     if corrected is not None:
         print(f"corrected simulator: {corrected}")
+    elif source:
+        print(f"corrected simulator: in Python alone, as diagnose(...).corrected, because {source} is no Python file")
     return INTERRUPTED if diagnosis.interrupted else DONE
 
 

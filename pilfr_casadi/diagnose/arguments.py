@@ -109,7 +109,8 @@ def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[ty
     side.
     """
     by_input = [scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs]
-    by_input += [unread_input(by) for by in simulator.idle_inputs if set(CATALOGUE) <= set(laws)]
+    given = {law.__name__ for law in laws}  # in a worker, classes made at run time are others of the same name
+    by_input += [unread_input(by) for by in simulator.idle_inputs if given >= {law.__name__ for law in CATALOGUE}]
     signals = ["t", *simulator.inputs, *sorted({name for port in simulator.ports for name in port.signals})]
     pairs = [(law, by) for law in (LinearStiffness, ViscousDamping) for by in signals] + [(ViscousDamping, "z")]
     varying = [scheduled(law, by, "quadratic") for law, by in pairs if law in laws]

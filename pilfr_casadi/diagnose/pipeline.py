@@ -244,6 +244,8 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
     if again.can_improve(again.best) and not (again.interrupted or again.out_of_time):
         search.run(request.most_effects)
     if search.best.mean_square < AS_GIVEN_RATIO * again.best.mean_square:
+        search.interrupted = search.interrupted or again.interrupted
+        search.out_of_time = search.out_of_time or again.out_of_time
         return ready, search
     return replace(other, nominal=ready.nominal, gates=(shift, *other.gates)), again
 

@@ -58,7 +58,7 @@ class TimeShift(Gate):
         if self.finding == "alignment":
             late = "late" if value > 0 else "early"
             are = "are" if "," in self.channel else "is"
-            words = f"{self.channel} {are} recorded {abs(value / dt):.3g} samples ({abs(value):.3g} s) too {late}"
+            words = f"{self.channel} {are} recorded {_samples(abs(value / dt))} ({abs(value):.3g} s) too {late}"
             words += ", or the machine delays it by as much" if self.kind == "y" and value > 0 else ""
         moved = replace(self, value=value, sentence=words)
         return replace(moved, change=moved.read)
@@ -142,6 +142,10 @@ class TimeShift(Gate):
         """Tell whether it may be a delay: late by a fraction of `part` samples, or by few samples."""
         late = self.finding == "alignment" and self.value > -WHOLE_SHIFT * dt
         return late and not (in_steps(self.value, dt, part) and self.value > LONG_SHIFT * dt)
+
+
+def _samples(count: float) -> str:
+    return "1 sample" if f"{count:.3g}" == "1" else f"{count:.3g} samples"
 
 
 def _interpolant(r: Recording, v: np.ndarray, wraps: bool, smooth: bool) -> _Curve:

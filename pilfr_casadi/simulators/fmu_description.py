@@ -61,10 +61,10 @@ def describe(path: Path) -> Description:
     try:
         with zipfile.ZipFile(existing_file(path)) as archive:
             root = ET.fromstring(archive.read("modelDescription.xml"))
+        entries = list(root.iterfind("ModelVariables/*"))
+        variables = {v.name: v for entry in entries if (v := _read_variable(entry)) is not None}
     except (zipfile.BadZipFile, KeyError, ET.ParseError, OSError, EOFError, ValueError) as error:
         raise InputError(f"{path} is not a functional mock-up unit ({tidy(error)}); export it again.") from None
-    entries = list(root.iterfind("ModelVariables/*"))
-    variables = {v.name: v for entry in entries if (v := _read_variable(entry)) is not None}
     version = root.get("fmiVersion", "").partition(".")[0]
     token = root.get("guid" if version == "2" else "instantiationToken", "")
     kinds = [root.find(kind) for kind in ("ModelExchange", "CoSimulation")]

@@ -357,14 +357,15 @@ def judge_entry(
         if np.isfinite(found[v.name][0])
     }
     estimates = estimates_of(entry, any(t.probability > SURE for t in trends.values()))
-    differs = {
-        v.name: v.population.probability(*estimates[v.name], float(entry["widths"][v.name]))
-        for v in values
-        if np.all(np.isfinite(estimates.get(v.name, np.nan))) and np.isfinite(v.population.mean)
-    }
     above = entry["remainder"] > remainder.mean
     width = remainder_width(entry)
     beyond = remainder.probability(entry["remainder"], entry["remainder_error"], width) if above else 0.0
+    # the values of a machine that lacks more make up for that, and say nothing of the machine
+    differs = {
+        v.name: v.population.probability(*estimates[v.name], float(entry["widths"][v.name]))
+        for v in values
+        if beyond <= SURE and np.all(np.isfinite(estimates.get(v.name, np.nan))) and np.isfinite(v.population.mean)
+    }
     return Machine(
         name,
         values={label: value for label, (value, _) in estimates.items()},
