@@ -6,9 +6,11 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
+from pilfr_casadi.diagnose import add_scaled_laws
 from pilfr_casadi.diagnose.screen import start_values
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
+    CATALOGUE,
     SCHEDULES,
     BoucWen,
     CoulombFriction,
@@ -318,3 +320,10 @@ def test_an_input_that_the_equations_do_not_read_may_act_itself():
     assert [(e.port, e.law, e.form) for e in found.effects] == [("damper", "unread_input", "voltage")], str(found)
     assert found.effects[0].parameters["a"]["value"] == pytest.approx(3.0, rel=0.01)
     assert "voltage acts here, in proportion" in str(found)
+
+
+def test_a_worker_tries_the_input_that_the_equations_do_not_read():
+    """There, classes that were made at run time are others of the same name."""
+    other = type(CATALOGUE[-1].__name__, (CATALOGUE[-1],), {})
+    tried = add_scaled_laws((*CATALOGUE[:-1], other), rig())
+    assert [law.form for law in tried if law.id == "unread_input"] == list(rig().idle_inputs) != []

@@ -152,6 +152,12 @@ def test_an_input_that_is_no_force_is_refused(units):
     one_sentence(error)
 
 
+NUMBER = (
+    '<fmiModelDescription fmiVersion="2.0"><ModelVariables><ScalarVariable name="x" valueReference="one"><Real/>'
+    "</ScalarVariable></ModelVariables></fmiModelDescription>"
+)
+
+
 def test_files_that_are_no_units_are_refused(tmp_path, units):
     def zipped(name, **files):
         with zipfile.ZipFile(tmp_path / name, "w") as archive:
@@ -168,6 +174,7 @@ def test_files_that_are_no_units_are_refused(tmp_path, units):
         tmp_path / "none.fmu": "none.fmu",
         zipped("empty.fmu"): "is not a functional mock-up unit",
         zipped("broken.fmu", **{"modelDescription.xml": "<fmi"}): "is not a functional mock-up unit",
+        zipped("number.fmu", **{"modelDescription.xml": NUMBER}): "is not a functional mock-up unit",
         zipped("bare.fmu", **{"modelDescription.xml": description()}): f"no platform; export it for {FOLDER}",
         zipped("program.fmu", **both): "cannot be evaluated",
         zipped(
