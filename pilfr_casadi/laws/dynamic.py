@@ -14,7 +14,10 @@ from ..models import Parameter
 from .base import Law, Local
 
 LONGEST_SCREENED = 24  # memory of a delay in the screen, in steps; longer delays are not tried
-MOST_CREEP = 1.0  # largest ratio of a slow part of a signal to what follows at once; beyond that it is a lag
+LONGEST_TIME = 2.0  # largest time constant of a relaxation, in durations of the recordings
+# largest ratio of a slow part of a signal to what follows at once: in the longest time constant, as much again follows
+# within the recordings; beyond that it is a lag
+MOST_CREEP = 1 / (1 - np.exp(-1 / LONGEST_TIME))
 NO_PEAK = 0.5**0.5  # damping ratio above which a second-order response has no peak
 
 
@@ -83,7 +86,7 @@ class Relaxation(Law):
     dissipative = True
     order = follows = 1
     starts = {"T": lambda at: np.geomspace(20 * at.dt, at.duration / 2, 7)}
-    ranges = {"T": lambda at: (5 * at.dt, 2 * at.duration)}
+    ranges = {"T": lambda at: (5 * at.dt, LONGEST_TIME * at.duration)}
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
         return p.k_v * (z - q)
