@@ -16,11 +16,11 @@ from ..laws import (
     SCALABLE,
     Law,
     LinearStiffness,
+    UnreadInput,
     ViscousDamping,
     scaled,
     scheduled,
     seen_by,
-    unread_input,
 )
 from ..simulators import Simulator, as_simulator
 from .gates import Gate
@@ -108,9 +108,10 @@ def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[ty
     first, and then let vary (`Search`). Of several sensors at an elastic joint or drive, one alone may be on the far
     side.
     """
-    by_input = [scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs]
     given = {law.__name__ for law in laws}  # in a worker, classes made at run time are others of the same name
-    by_input += [unread_input(by) for by in simulator.idle_inputs if given >= {law.__name__ for law in CATALOGUE}]
+    alone = [UnreadInput] if given >= {law.__name__ for law in CATALOGUE} else []
+    may_scale = [*(law for law in SCALABLE if law in laws), *alone]
+    by_input = [scaled(law, by) for law in may_scale for by in simulator.idle_inputs]
     signals = ["t", *simulator.inputs, *sorted({name for port in simulator.ports for name in port.signals})]
     pairs = [(law, by) for law in (LinearStiffness, ViscousDamping) for by in signals] + [(ViscousDamping, "z")]
     varying = [scheduled(law, by, "quadratic") for law, by in pairs if law in laws]

@@ -215,9 +215,7 @@ def _search(request: Request) -> tuple[Prepared, Search]:
     seemed_early = any(g.finding == "alignment" and g.value < 0 for g in ready.gates)
     if not seemed_early or search.interrupted or search.out_of_time or not search.can_improve(search.best):
         return ready, search
-    found: tuple[Prepared, Search] | None = None
-    with search.until_interrupted():
-        found = _search_once(request, shift_early=False)
+    found = _search_again(search, request, shift_early=False)
     if found is None:
         return ready, search
     other, again = found
@@ -235,9 +233,7 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
     recordings = tuple(shift.change(r) if shift.change else r for r in request.recordings)
     moved = replace(request, recordings=recordings, aligned=True, say=request.say.under("shifted: "))
     search.shift, search.aligned = None, True
-    found: tuple[Prepared, Search] | None = None
-    with search.until_interrupted():
-        found = _search_once(moved, shift_early=True)
+    found = _search_again(search, moved, shift_early=True)
     if found is None:
         return ready, search
     other, again = found
@@ -248,6 +244,13 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
         search.out_of_time = search.out_of_time or again.out_of_time
         return ready, search
     return replace(other, nominal=ready.nominal, gates=(shift, *other.gates)), again
+
+
+def _search_again(search: Search, request: Request, shift_early: bool) -> tuple[Prepared, Search] | None:
+    """Prepare and search once more; None if an interrupt came before that search began."""
+    with search.until_interrupted():
+        return _search_once(request, shift_early)
+    return None
 
 
 def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]:

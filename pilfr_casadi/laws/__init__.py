@@ -43,7 +43,6 @@ if TYPE_CHECKING:
         scheduled as scheduled,
         seen_by as seen_by,
         strengths_over as strengths_over,
-        unread_input as unread_input,
         varying as varying,
     )
     from .curves import (

@@ -124,28 +124,16 @@ def scaled(law: type[Law], by: str) -> type[Law]:
 
 
 class UnreadInput(Law):
-    """What an input does that the equations do not read; see `unread_input`."""
+    """The effect of a recorded input that the equations do not read, such as a load or the sun; `scaled` names it."""
 
     id = "unread_input"
-    equation = "w = a"
-    sentence = "a recorded input that the equations do not read"
+    form = "{by}"
+    equation = "w = a {by}"
+    sentence = "{by} acts here, in proportion; it is recorded, and the equations do not read it"
     units = {"a": "w"}
 
     def force(self, p: Any) -> Any:
         return p.a
-
-
-@functools.cache
-def unread_input(by: str) -> type[Law]:
-    """Make the law of an input that acts at a port although the equations do not read it: `w = a by`.
-
-    A load torque, a wind or the sun may have been recorded and left out of the simulator.
-    """
-    kind: Any = _scaled(UnreadInput, by)
-    kind.form, kind.equation = by, f"w = a {by}"
-    kind.sentence = f"{by} acts here, in proportion; it is recorded, and the equations do not read it"
-    found: type[Law] = kind
-    return found
 
 
 def scheduled(law: type[Law], by: str, profile: str = "linear") -> type[Law]:
@@ -338,10 +326,14 @@ def _seen_by(base: Any, output: str) -> Any:
 def _scaled(base: Any, by: str) -> Any:
     strengths = {name: f"{unit}/[{by}]" if name in base.strength else unit for name, unit in base.units.items()}
 
+    if "{by}" in base.equation:
+        words = [text.format(by=by) for text in (base.form, base.equation, base.sentence)]
+    else:
+        form, equation = f"{base.form}, scaled by {by}".removeprefix(", "), base.equation.replace("w =", "f =", 1)
+        words = [form, f"w = {by} f,  {equation}", f"{base.sentence}; {by} scales its strength"]
+
     class Scaled(base):
-        form = f"{base.form}, scaled by {by}".removeprefix(", ")
-        equation = f"w = {by} f,  {base.equation.replace('w =', 'f =', 1)}"
-        sentence = f"{base.sentence}; {by} scales its strength"
+        form, equation, sentence = words
         units, strength = strengths, base.strength
         places = ("parallel",)
         dissipative = restoring = False  # the signal may have either sign

@@ -279,7 +279,7 @@ class PeriodicForce(Law):
     units = {"a": "w", "b": "w", "L": "z"}
     domains = ("mechanical",)
     min_periods = 1.5  # smallest number of periods within the motion that is tried
-    starts = {"L": lambda at: _periods(at)}
+    starts = {"L": _periods}
 
     def force(self, z: Any, p: Any) -> Any:
         angle = 2 * np.pi * z / p.L

@@ -22,13 +22,13 @@ from pilfr_casadi.laws import (
     Saturation,
     SoftClearance,
     StopHysteresis,
+    UnreadInput,
     ViscousDamping,
     behind_gap,
     likely_profiles,
     scaled,
     scheduled,
     unit_forces,
-    unread_input,
 )
 from pilfr_casadi.models import Named
 from pilfr_casadi.simulators import discretise
@@ -315,7 +315,7 @@ def test_what_cannot_be_composed_is_said(compose, sentence):
 
 def test_an_input_that_the_equations_do_not_read_may_act_itself():
     """A load was recorded and left out of the simulator; it acts at the damper's port."""
-    true = rig().with_element("damper", unread_input("voltage")().at({"a": 3.0}))
+    true = rig().with_element("damper", scaled(UnreadInput, "voltage")().at({"a": 3.0}))
     found = pilfr.diagnose(rig(1000.0, 7.5), recorded(true, 0), effects=1)
     assert [(e.port, e.law, e.form) for e in found.effects] == [("damper", "unread_input", "voltage")], str(found)
     assert found.effects[0].parameters["a"]["value"] == pytest.approx(3.0, rel=0.01)
