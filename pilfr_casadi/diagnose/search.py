@@ -218,11 +218,12 @@ class Search(Hypotheses):
             return False
         kept = [self.memo[t.key] for t in self.steps[-1].trials]
         plain = [t for t in kept if not (t.law.order or t.law.memory)]
-        ranked = sorted(plain, key=self.optimistic_evidence, reverse=True)
-        first = list({(t.port, t.law.id): t for t in reversed(ranked)}.values())[::-1][:FEW]
+        first = dict[tuple[str, str], Trial]()  # of each law the likeliest form, the likeliest laws first
+        for trial in sorted(plain, key=self.optimistic_evidence, reverse=True):
+            first.setdefault((trial.port, trial.law.id), trial)
         best, part = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_said else 0.5
         with self.stage("shifts beside a law"):
-            for trial in first if self.in_time() else ():
+            for trial in list(first.values())[:FEW] if self.in_time() else ():
                 bench = replace(self.bench, simulator=trial.fitted.simulator)
                 found = find_time_shift(Checked(bench, trial.fitted), part, given=False)
                 shift = found.gates[0] if found.gates else None
