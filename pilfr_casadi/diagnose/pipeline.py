@@ -74,6 +74,7 @@ from .recording_faults import find_clipped_input, find_tones, open_unsettled, re
 from .result import Diagnosis
 from .search import Search
 from .stretches import SEARCHED_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
+from .timing import TimeShift
 from .verdict import Posterior, Verdict, judge, names, posterior
 from .workbench import RunsAway, converge
 
@@ -205,15 +206,15 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
 
 
 def _search(request: Request) -> tuple[Prepared, Search]:
-    """Prepare and search; if an early channel was shifted, repeat without, and keep that if it is clearly better.
+    """Prepare and search; if a lead was corrected, repeat without, and keep that if it is clearly better.
 
     If a channel proves shifted beside a law, repeat with it at its right times.
     """
     ready, search = _search_once(request, shift_early=True)
     if search.shift is not None:
         return _search_realigned(request, ready, search, search.shift)
-    seemed_early = any(g.finding == "alignment" and g.value < 0 for g in ready.gates)
-    if not seemed_early or search.interrupted or search.out_of_time or not search.can_improve(search.best):
+    leads = any(isinstance(g, TimeShift) and g.leads for g in ready.gates)
+    if not leads or search.interrupted or search.out_of_time or not search.can_improve(search.best):
         return ready, search
     found = _search_again(search, request, shift_early=False)
     if found is None:

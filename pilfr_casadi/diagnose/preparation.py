@@ -33,7 +33,7 @@ from .lost_samples import find_gaps, find_output_gaps
 from .offsets import find_offsets, find_wrong_start
 from .proof import errors_of
 from .recording_faults import mend_stale_samples, open_unsettled, remove_glitches, unclip
-from .timing import AVERAGED_NOISE, find_time_shift, in_steps, run_as_given
+from .timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps, run_as_given
 from .workbench import THOROUGH, Fitted, Workbench, refine_steps
 
 CHECKED_ABOVE = 4e-4  # mean square error up to which signs and units are not checked
@@ -164,18 +164,18 @@ def _with_better_hold(
     now = both[int(costs[1] < costs[0])]
     ratio = (max(costs) / max(min(costs), 1e-300)) ** 0.5
     held = [hold_note(now.bench.simulator, now.bench.hold, ratio)] if ratio > EQUAL_RATIO else []
-    if any(v > 0 and not in_steps(v, now.bench.dt) for v in _shifts(now)):  # a delay is physics
+    if any(s.delay > 0 and not in_steps(s.value, now.bench.dt) for s in _shifts(now)):  # a delay is physics
         now = checks.run(replace(bench, hold=now.bench.hold), 1.0)
     return now, held
 
 
-def _shifts(found: Checked) -> list[float]:
-    return [g.value for g in found.gates if g.finding == "alignment"]
+def _shifts(found: Checked) -> list[TimeShift]:
+    return [g for g in found.gates if isinstance(g, TimeShift) and g.finding == "alignment"]
 
 
 def _comparable_cost(found: Checked) -> float:
     """Compute the mean square error without the noise reduction by interpolating a channel between its samples."""
-    between = any(not in_steps(v, found.bench.dt) for v in _shifts(found))
+    between = any(not in_steps(s.value, found.bench.dt) for s in _shifts(found))
     return found.cost / (AVERAGED_NOISE if between else 1)
 
 

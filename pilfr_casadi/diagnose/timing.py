@@ -2,8 +2,8 @@
 
 One channel is read at shifted times, and the error of the refitted simulator is projected off the directions that
 parameters and initial states can follow. A refit confirms the shift (or clock rate) with the smallest remainder. A late
-output may be physics (a delay). A shift of many whole samples is typical of a recorder, and only a recorder puts an
-output before its cause.
+output or an early input may be physics (a delay). A shift of many whole samples is typical of a recorder, and only a
+recorder puts an output before its cause.
 """
 
 from __future__ import annotations
@@ -57,10 +57,11 @@ class TimeShift(Gate):
         words = f"The clock of {self.channel} runs {value * 100:+.3g} % off the others'"
         if self.finding == "alignment":
             late = "late" if value > 0 else "early"
-            are = "are" if "," in self.channel else "is"
+            are, it = ("are", "them") if "," in self.channel else ("is", "it")
             words = f"{self.channel} {are} recorded {_samples(abs(value / dt))} ({abs(value):.3g} s) too {late}"
-            words += ", or the machine delays it by as much" if self.kind == "y" and value > 0 else ""
         moved = replace(self, value=value, sentence=words)
+        if moved.delay > 0:
+            moved = replace(moved, sentence=f"{words}, or the machine delays {it} by as much")
         return replace(moved, change=moved.read)
 
     def read(self, r: Recording, cut: bool = True, curves: Sequence[_Curve] = ()) -> Recording:
@@ -85,8 +86,7 @@ class TimeShift(Gate):
 
     def _times(self, r: Recording) -> np.ndarray:
         """Return the times (M,) at which the channel is read."""
-        change = self.value if self.kind == "y" else -self.value
-        return r.t + change if self.finding == "alignment" else r.t * (1 + change)
+        return r.t + self.value if self.finding == "alignment" else r.t * (1 + self.value)
 
     def _recorded(self, r: Recording) -> np.ndarray:
         """Mark the samples (M,) that are read inside the recording; elsewhere the end values are held."""
@@ -134,14 +134,19 @@ class TimeShift(Gate):
         return self if abs(value - self.value) < 2e-3 * width else self.at(value, now.bench.dt)
 
     @property
+    def delay(self) -> float:
+        """Delay in seconds by which the machine would look the same: of a late output or of an early input."""
+        return 0.0 if self.finding == "clock" else self.value if self.kind == "y" else -self.value
+
+    @property
     def leads(self) -> bool:
         """Whether outputs come before their causes: an early output or a late input, which no physics explains."""
-        return self.finding == "alignment" and (self.value < 0) == (self.kind == "y")
+        return self.delay < 0
 
     def is_like_delay(self, dt: float, part: float) -> bool:
-        """Tell whether it may be a delay: late by a fraction of `part` samples, or by few samples."""
-        late = self.finding == "alignment" and self.value > -WHOLE_SHIFT * dt
-        return late and not (in_steps(self.value, dt, part) and self.value > LONG_SHIFT * dt)
+        """Tell whether it may be a delay: by a fraction of `part` samples, or by few samples."""
+        may_be = self.finding == "alignment" and self.delay > -WHOLE_SHIFT * dt
+        return may_be and not (in_steps(self.delay, dt, part) and self.delay > LONG_SHIFT * dt)
 
 
 def _samples(count: float) -> str:
@@ -177,9 +182,9 @@ def in_steps(value: float, dt: float, part: float = 1.0) -> bool:
 def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: bool = True) -> Checked:
     """Find a shifted channel or clock, and correct it if it is a fault of the recording.
 
-    With `given`, the run at the user's values is screened as well as the refit. A late channel counts as a fault if it
-    is late by a multiple of `part` samples, nothing else is wrong, and no lag follows it as well. Without `early`, an
-    early channel also counts as a fault only if nothing else is wrong.
+    With `given`, the run at the user's values is screened as well as the refit. A shift that looks like a delay counts
+    as a fault if it is a multiple of `part` samples, nothing else is wrong, and no lag follows it as well. Without
+    `early`, a shift that puts outputs before their causes also counts as a fault only if nothing else is wrong.
     """
     bench, noise2 = now.bench, now.noise2
     if now.cost < ABOVE_NOISE**2 * noise2:
@@ -203,20 +208,18 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: 
     found = accept(now, after, fault)
     if len(found.gates) == len(now.gates):
         return found
-    late = fault.finding == "clock" or fault.value > 0
-    more_is_wrong = after.cost > NEAR_NOISE_RATIO**2 * noise2  # then a late channel or a slow clock may be physics
-    may_be_physics = fault.is_like_delay(bench.dt, part) or (more_is_wrong and (late or not early))
+    more_is_wrong = after.cost > NEAR_NOISE_RATIO**2 * noise2  # then a delay or a slow clock may be physics
+    may_be_physics = fault.is_like_delay(bench.dt, part) or (more_is_wrong and not (fault.leads and early))
     return now if may_be_physics or _is_lag(now, after, fault) else found
 
 
 def _is_lag(now: Checked, after: Checked, fault: TimeShift) -> bool:
-    """Tell whether lags follow a late channel better than the shift that was found."""
-    late = (fault.value > 0) == (fault.kind == "y")  # an early input looks like late outputs
-    if fault.finding == "clock" or not late:
+    """Tell whether lags follow what looks like a delay better than the shift that was found."""
+    if not fault.delay > 0:
         return False
     simulator = now.bench.simulator
     names, place = (simulator.output_names, "sensor") if fault.kind == "y" else (simulator.inputs, "actuator")
-    slow = Lag().at({"T": abs(fault.value)}, {"T": (now.bench.dt / 10, 10 * abs(fault.value))})
+    slow = Lag().at({"T": fault.delay}, {"T": (now.bench.dt / 10, 10 * fault.delay)})
     for i in fault.columns:
         simulator = simulator.with_element(f"{place}:{names[i]}", slow)
     lagging = refit(now.bench, [after.fitted.values, {}], simulator, states=now.fitted.begin)

@@ -144,3 +144,43 @@ def test_a_shift_that_missing_friction_hides_is_found_beside_it():
     assert [(g.channel, g.value) for g in found.gates if g.finding == "alignment"] == [("x2", -DT)]
     assert "(beside Coulomb friction (smooth) at ground-m1)" in str(found)
     assert found.errors["train"]["after"] < 2e-3
+
+
+def two_motors(m=1500, late=0, seed=5):
+    """A body that two motors drive with their own gains; the second input is recorded so many samples late."""
+    simulator = Simulator(
+        lambda x, u, p: {"v": p.a * u.left + p.b * u.right - p.d * x.v},
+        lambda x: {"v": x.v},
+        states=("v",),
+        inputs=("left", "right"),
+        parameters={n: Parameter(v, bounds=(0.1, 20)) for n, v in (("a", 2.0), ("b", 3.0), ("d", 1.5))},
+    )
+    rng, keep = np.random.default_rng(seed), abs(late)
+    u = np.stack([np.convolve(c, np.ones(4) / 2, "same") for c in rng.standard_normal((2, m))], axis=1)
+    blank = Recording(u, np.zeros((m, 1)), 0.02, ("left", "right"), ("v",), initial="zero")
+    y = simulator.with_parameters({"a": 2.4, "b": 2.6, "d": 1.9}).simulate(blank)
+    y += 1e-3 * y.std() * rng.standard_normal(y.shape)
+    recorded = np.stack([u[:, 0], np.roll(u[:, 1], late)], axis=1)[keep : m - keep]
+    return simulator, Recording(recorded, y[keep : m - keep], 0.02, ("left", "right"), ("v",), initial="estimate")
+
+
+@pytest.mark.parametrize(
+    ("late", "words"),
+    [
+        (7, "right is recorded 7 samples (0.14 s) too late; "),
+        (-7, "right is recorded 7 samples (0.14 s) too early, or the machine delays it by as much; "),
+    ],
+)
+def test_an_input_recorded_late_leads_its_effect_and_one_recorded_early_may_be_a_delay(late, words):
+    simulator, recording = two_motors(late=late)
+    bench = Workbench.of(simulator, [recording], "zero")
+    (shift,) = find_time_shift(Checked(bench, bench.fit(simulator))).gates
+    assert (shift.channel, shift.finding) == ("right", "alignment") and shift.sentence.startswith(words)
+    assert shift.value == pytest.approx(late * 0.02) and shift.leads == (late > 0)
+
+
+@pytest.mark.parametrize(("late", "findings"), [(2, ["alignment"]), (-2, [])])
+def test_a_short_shift_of_an_input_is_a_fault_only_if_no_delay_explains_it(late, findings):
+    simulator, recording = two_motors(late=late)
+    bench = Workbench.of(simulator, [recording], "zero")
+    assert [g.finding for g in find_time_shift(Checked(bench, bench.fit(simulator))).gates] == findings
