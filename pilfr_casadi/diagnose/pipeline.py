@@ -58,7 +58,7 @@ from .arguments import (
 from .correction import find_correction, named_correction
 from .evidence import AS_GIVEN_RATIO, SURE
 from .floor import Floor, measured_floor
-from .gates import USELESS_FIT, Gate
+from .gates import EQUAL_RATIO, USELESS_FIT, Gate
 from .offsets import Offset, fix_idle_offsets, list_offsets
 from .other_explanations import (
     find_pinned_parameters,
@@ -384,7 +384,8 @@ def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: S
 def _name_in_predictions(request: Request, search: Search, found: Conclusion) -> Conclusion:
     """Search once more in predictions if the simulator drifts, so that errors of free runs hardly tell laws apart.
 
-    The laws that are named there are refitted in free run. They have to predict held-out data better than the refit.
+    The laws that are named there are refitted in free run. There they have to act as surely, and to predict held-out
+    data better than the refit, and as well as the correction that was found without a name.
     """
     if request.simulator.observer is not None or not drifts(search.bench, search.root.fitted):
         return found
@@ -397,25 +398,28 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
     search.interrupted = leading.interrupted
     if leading.interrupted:
         return found
-    named = _concluded(leading, ())
-    best = posterior(leading).best
+    named, answer = _concluded(leading, ()), posterior(leading)
+    best = answer.best
     if named.verdict.kind != "missing-physics" or {e.name for e in named.effects} != names(best):
         return found
     with search.stage("fit in free run"):
         search.keep(search.run_laws(best.laws, best))
         trial = search.thorough(search.memo[best.key])
         before, after = search.held_out(search.root), search.held_out(trial)
-    if not after.error < before.error:
+    answer = replace(answer, effects=named.effects).acting(search, trial)
+    verdict = judge(leading, answer, ())
+    predicts = after.error < before.error and not after.error > EQUAL_RATIO * found.correction.after
+    if verdict.kind != "missing-physics" or not predicts:
         return found
     correction = replace(named_correction(search, trial.fitted), before=before.error, after=after.error, closest=trial)
     note = drift_note(request.simulator, memory, " and ".join(display_name(law) for _, law in sorted(names(trial))))
     return replace(
         found,
-        verdict=named.verdict,
+        verdict=verdict,
         gates=(*found.gates, note),
         fitted=trial.fitted,
         correction=correction,
-        effects=named.effects,
+        effects=answer.effects,
         decided=leading,
     )
 

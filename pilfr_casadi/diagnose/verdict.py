@@ -124,6 +124,12 @@ class Posterior:
         ratio = named / max(self.named, 1e-300)
         return replace(self, named=named, effects=tuple(replace(e, confidence=ratio * e.confidence) for e in effects))
 
+    def acting(self, search: Hypotheses, trial: Trial) -> Posterior:
+        """Weigh the effects by the probability that their strengths are not zero in a fit of the same laws."""
+        acts = {(e.port, e.law.id): _acts(search, trial, e) for e in trial.effects}
+        effects = tuple(replace(e, confidence=acts[e.name] * e.confidence) for e in self.effects)
+        return replace(self, named=max(acts.values()) * self.named, effects=effects)
+
     def against(self, odds: float) -> Posterior:
         """Weigh the effects against another explanation of given odds."""
         effects = tuple(replace(e, confidence=e.confidence / (1 + odds)) for e in self.effects)
@@ -190,14 +196,11 @@ def posterior(search: Hypotheses) -> Posterior:
         if least.confidence > SURE or fewer not in by_names or not fewer:
             break
         said = fewer
-    acts = [_acts(search, best, e.element) for e in found]
-    named = max(acts) * share_named(explainable_remainder(search, best), strained(search, best))
-    effects = (
-        replace(e, confidence=act * _named_beside(search, best, e) * e.confidence)
-        for act, e in zip(acts, found, strict=True)
-    )
+    named = share_named(explainable_remainder(search, best), strained(search, best))
+    effects = (replace(e, confidence=_named_beside(search, best, e) * e.confidence) for e in found)
     strongest_first = sorted(effects, key=lambda e: -(_without(search, best, e) or search.root).mean_square)
-    return Posterior(best, named, tuple(strongest_first), by_names.get(frozenset(), 0.0))
+    answer = Posterior(best, named, tuple(strongest_first), by_names.get(frozenset(), 0.0))
+    return answer.acting(search, best)
 
 
 def _named_beside(search: Hypotheses, best: Trial, effect: NamedEffect) -> float:
