@@ -287,7 +287,7 @@ def _make_effect(
         port=element.port,
         law=law.id,
         confidence=named.confidence,
-        sentence="; ".join(filter(None, [law.sentence, *remarks])),
+        sentence="; ".join(filter(None, [law.sentences.get(port.domain, law.sentence), *remarks])),
         equation=law.equation.replace("dz/dt", "v") if port.is_speed else law.equation,
         parameters=shown,
         indistinguishable=tuple(named.alike),

@@ -169,6 +169,10 @@ class Law:
         Physical domains in which it occurs; left out, all of them.
     rare : tuple of domain
         Physical domains in which it hardly occurs; there it is less likely before the data are seen.
+    absent : tuple of domain
+        Physical domains in which it cannot occur; there it is not tried.
+    sentences : mapping
+        What it is in a physical domain, if `sentence` does not say it there.
     special : bool
         It is tried only at ports of its domains, and not where the domain is unknown.
     across : str
@@ -238,6 +242,8 @@ class Law:
     places: ClassVar[tuple[str, ...]] = ("parallel",)
     domains: ClassVar[tuple[str, ...]] = ()
     rare: ClassVar[tuple[str, ...]] = ()
+    absent: ClassVar[tuple[str, ...]] = ()
+    sentences: ClassVar[Mapping[str, str]] = {}
     special: ClassVar[bool] = False
     across: ClassVar[str] = ""
     angular: ClassVar[bool] = False

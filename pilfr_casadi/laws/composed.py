@@ -334,6 +334,7 @@ def _scaled(base: Any, by: str) -> Any:
 
     class Scaled(base):
         form, equation, sentence = words
+        sentences = {domain: f"{text}; {by} scales its strength" for domain, text in base.sentences.items()}
         units, strength = strengths, base.strength
         places = ("parallel",)
         dissipative = restoring = False  # the signal may have either sign
@@ -393,6 +394,7 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
     class Scheduled(base):
         form = f"{base.form}, scheduled{varies.how} by {by}".removeprefix(", ")
         equation, sentence = _in_words(base, varies, by, words)
+        sentences = {k: f"{v}; its strength varies{varies.how} with {words}" for k, v in base.sentences.items()}
         units = {**base.units, **further, **shape, "low": unit, "high": unit}
         strength = (*base.strength, *further)
         places = base.places

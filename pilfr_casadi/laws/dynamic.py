@@ -82,6 +82,7 @@ class Relaxation(Law):
     equation = "w = k_v (z - q),  dq/dt = (z - q) / T"
     source = "Findley, Lai & Onaran (1976), Creep and Relaxation, ch. 5"
     sentence = "creep: under a constant load the deflection goes on slowly"
+    sentences: ClassVar[Mapping[str, str]] = {"thermal": "a slow heat capacity behind a thermal resistance"}
     units = {"k_v": "w/z", "T": "s"}
     dissipative = True
     order = follows = 1
@@ -140,6 +141,7 @@ class Creep(Relaxation):
     equation = "w = c q,  dq/dt = (u - q) / T"
     source = "Kuhnen & Janocha (2002), Control and Intelligent Systems 30(1)"
     sentence = "creep: after a step the signal goes on slowly in the same direction"
+    sentences: ClassVar[Mapping[str, str]] = {}
     units = {"c": "", "T": "s"}
     strength: ClassVar[tuple[str, ...]] = ("c",)
     places = ("series",)
@@ -200,7 +202,7 @@ class Resonance(Law):
     sentence = "an unmodelled resonance in the path of the signal"
     units = {"W": "rad/s", "D": ""}
     places: ClassVar[tuple[str, ...]] = ("series",)
-    rare = ("thermal",)  # heat has no inertia
+    absent: ClassVar[tuple[str, ...]] = ("thermal",)  # heat has no inertia
     order, follows = 2, 1
     starts = {"W": lambda at: np.geomspace(0.015, 1.2, 16) / at.dt, "D": ("", 0.05)}
     ranges = {"W": lambda at: (8 / at.duration, 1.6 / at.dt), "D": ("", 1e-3, 1.0)}

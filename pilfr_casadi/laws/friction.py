@@ -183,6 +183,10 @@ class ViscousDamping(Law):
     equation = "w = c_1 dz/dt"
     source = "Meirovitch (2001), Fundamentals of Vibrations, sec. 1.4"
     sentence = "a viscous damper: a force in proportion to speed"
+    sentences: ClassVar[Mapping[str, str]] = {
+        "thermal": "a heat capacity: a heat flow in proportion to the rate of the temperature"
+    }
+    absent: ClassVar[tuple[str, ...]] = ()
     units = {"c_1": "w*s/z"}
     dissipative = True
 
@@ -197,6 +201,7 @@ class DirectionalDamping(ViscousDamping):
     equation = "w = c_1 dz/dt + c_0 |dz/dt|"
     source = "Dixon (2007), The Shock Absorber Handbook, ch. 6"
     sentence = "viscous damping that differs between the two directions"
+    absent = ("thermal",)
     units = {"c_1": "w*s/z", "c_0": "w*s/z"}
     signed = ("c_0",)
 
@@ -211,6 +216,7 @@ class QuadraticDrag(Law):
     equation = "w = c_2 dz/dt |dz/dt|"
     source = "White (2011), Fluid Mechanics, sec. 7.6"
     sentence = "a drag that grows with the square of speed"
+    absent: ClassVar[tuple[str, ...]] = ("thermal",)
     units = {"c_2": "w*s^2/z^2"}
     dissipative = True
 
@@ -238,6 +244,7 @@ class CubicDamping(Law):
     equation = "w = c_3 (dz/dt)^3"
     source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 3.3"
     sentence = "a damping force in proportion to the cube of speed"
+    absent = ("thermal",)
     units = {"c_3": "w*s^3/z^3"}
 
     def force(self, dz: Any, p: Any) -> Any:

@@ -32,6 +32,7 @@ class LinearStiffness(Law):
     equation = "w = k_1 z"
     source = "Meirovitch (2001), Fundamentals of Vibrations, sec. 1.4"
     sentence = "a spring (or a leak): a force in proportion to the deflection"
+    sentences: ClassVar[Mapping[str, str]] = {"thermal": "a heat path: a heat flow in proportion to the temperature"}
     units = {"k_1": "w/z"}
     ranges = {"k_1": ("max_stiffness", -1.0, 1.0)}
 

@@ -202,7 +202,7 @@ class Port:
             return False
         if law.in_line and not self.has_term_for(law):
             return False
-        if law.angular and np.isnan(self.revolution):
+        if self.domain in law.absent or (law.angular and np.isnan(self.revolution)):
             return False
         if not self.kinds & set(law.places) or (law.across and not may_convert(self.across_unit, law.across)):
             return False

@@ -53,6 +53,21 @@ def rig(*ports):
     )
 
 
+@pytest.mark.parametrize("law", [laws.Mode, laws.QuadraticDrag, laws.CubicDamping, laws.DirectionalDamping])
+def test_heat_has_no_inertia_and_no_drag(law):
+    assert port("N", "m").admits(law) and port().admits(law) and not port("W", "K").admits(law)
+
+
+@pytest.mark.parametrize("law", [laws.LinearStiffness, laws.ViscousDamping, laws.Relaxation])
+def test_general_laws_have_words_of_their_own_for_heat(law):
+    own = law.sentences["thermal"]
+    for one in (law, laws.scheduled(law, "u"), laws.scaled(law, "u")):
+        assert port("W", "K").admits(one) and "heat" in one.sentences["thermal"] and "heat" not in one.sentence
+        assert one.sentence.removeprefix(law.sentence) == one.sentences["thermal"].removeprefix(
+            law.sentences["thermal"]
+        )
+
+
 def test_the_user_may_state_the_domain():
     assert port("level/s", "level", "fluid").domain == "fluid"
     assert port("N", "m", "unknown").domain == "unknown"
