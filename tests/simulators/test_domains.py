@@ -63,9 +63,7 @@ def test_general_laws_have_words_of_their_own_for_heat(law):
     own = law.sentences["thermal"]
     for one in (law, laws.scheduled(law, "u"), laws.scaled(law, "u")):
         assert port("W", "K").admits(one) and "heat" in one.sentences["thermal"] and "heat" not in one.sentence
-        assert one.sentence.removeprefix(law.sentence) == one.sentences["thermal"].removeprefix(
-            law.sentences["thermal"]
-        )
+        assert one.sentence.removeprefix(law.sentence) == one.sentences["thermal"].removeprefix(own)
 
 
 def test_the_user_may_state_the_domain():
