@@ -149,15 +149,21 @@ class Diagnosis:
         errors, said = self.errors.get("test"), self.sentence
         if self.effects and (self.interrupted or self.out_of_time):
             said += " The search was cut short, so that a further effect may not have been tried."
-        if not errors or self.outcome not in ("worse", "same"):
-            return said + self._idle_on_tests()
-        before, after = (_percent(errors[k]) for k in ("before", "after"))
+        if not errors:
+            return said
+        given, before, after = (_percent(errors[k]) for k in ("nominal", "before", "after"))
         if self.outcome == "same":
-            return f"{said} On the test recordings it makes no difference: {before} before, {after} after."
-        return (
-            f"{said} But this correction makes the test recordings worse: their error is {before} refitted "
-            f"and {after} with it. Do not use it as a correction.{self._better_without()}"
-        )
+            said += f" On the test recordings it makes no difference: {before} before, {after} after."
+        elif self.outcome == "worse":
+            said += (
+                f" But this correction makes the test recordings worse: their error is {before} refitted "
+                f"and {after} with it. Do not use it as a correction.{self._better_without()}"
+            )
+        else:
+            said += self._idle_on_tests()
+        if BETTER_RATIO * errors["nominal"] < min(errors["before"], errors["after"]):
+            said += f" As given, the simulator follows the test recordings better than with any fit here: {given}."
+        return said
 
     def worth(self, effect: Effect) -> str:
         """State the test error with and without one of several effects; empty if it is unknown."""

@@ -98,10 +98,12 @@ def answer(diagnosis: Diagnosis, forces: Sequence[str]) -> str:
         "recording-fault": f"The recordings are at fault: {', '.join(at_fault)}".removesuffix(": "),
     }
     words = "; ".join(named) or other.get(d.verdict, nameless)
-    last = "after" if correction_words(d) else "before"
-    gain = f"{percent(errors.get('nominal'))} → {percent(errors.get(last))}"
-    words = f"{words[0].upper()}{words[1:]}; error on {'unseen' if role == 'test' else 'the training'} data {gain}"
-    return f"{words}: worse than {percent(errors.get('before'))} refitted" if d.outcome == "worse" else words
+    steps = {"nominal": "as given", "before": "refitted"} | ({"after": "corrected"} if correction_words(d) else {})
+    gain = ", ".join(f"{percent(errors.get(k))} {name}" for k, name in steps.items())
+    worse = ", which is worse" if d.outcome == "worse" else ""
+    return (
+        f"{words[0].upper()}{words[1:]}; error on {'unseen' if role == 'test' else 'the training'} data {gain}{worse}"
+    )
 
 
 def headline(diagnosis: Diagnosis) -> str:

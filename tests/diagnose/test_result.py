@@ -128,6 +128,14 @@ def test_a_correction_that_diverges_on_the_test_recording_is_worse():
     assert d.outcome == "worse" and "the simulation diverges" in d.summary
 
 
+@pytest.mark.parametrize(("given", "told"), [(0.3, True), (0.45, False)])
+def test_a_simulator_that_is_better_as_given_than_with_any_fit_is_told(given, told):
+    d = with_test_errors(0.5, 0.46, 0.9)
+    d = replace(d, errors={**d.errors, "test": {**d.errors["test"], "nominal": given}})
+    words = "As given, the simulator follows the test recordings better than with any fit here: 30 %."
+    assert (words in d.summary) == told and (words in str(d)) == told
+
+
 def test_an_effect_that_the_test_recordings_do_not_need_is_told():
     d = with_test_errors(0.5, 0.1, 0.9)
     drag = replace(d.effects[0], law="quadratic_drag", form="", test_without=0.09)

@@ -49,7 +49,7 @@ def test_every_verdict_has_its_files(verdict, tmp_path, without_drawing):
     assert f'class="status {tone}"' in path.read_text()
     assert ("The hidden force" in titles) == (verdict in ("missing-physics", "unexplained"))
     if verdict == "missing-physics":
-        answer = r"Cubic stiffness at ground, [\d.]+ N, 93 % sure; error on unseen data 40 % → 0.1 %"
+        answer = r"Cubic stiffness at ground, [\d.]+ N, 93 % sure; error on unseen data 40 % as given, [\d.]+ % refitted, 0.1 % corrected"
         assert re.search(answer, reader.text) and "energy taken per cycle, mean" in reader.text
         assert titles[0] == "What is missing" and "0.1\xa0% with cubic stiffness put back" in path.read_text()
         assert "cannot tell it apart from: creep at sensor:pos" in reader.text
