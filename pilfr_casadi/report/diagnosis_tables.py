@@ -101,9 +101,8 @@ def answer(diagnosis: Diagnosis, forces: Sequence[str]) -> str:
     steps = {"nominal": "as given", "before": "refitted"} | ({"after": "corrected"} if correction_words(d) else {})
     gain = ", ".join(f"{percent(errors.get(k))} {name}" for k, name in steps.items())
     worse = ", which is worse" if d.outcome == "worse" else ""
-    return (
-        f"{words[0].upper()}{words[1:]}; error on {'unseen' if role == 'test' else 'the training'} data {gain}{worse}"
-    )
+    data = "unseen data" if role == "test" else "the training data"
+    return f"{words[0].upper()}{words[1:]}; error on {data} {gain}{worse}"
 
 
 def headline(diagnosis: Diagnosis) -> str:
