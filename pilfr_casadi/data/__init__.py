@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from .units import (
         conversion as conversion,
         dimension as dimension,
+        insert_units as insert_units,
         revolution_in as revolution_in,
         symbols as symbols,
     )

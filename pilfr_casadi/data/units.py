@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -107,6 +108,49 @@ def symbols(unit: str) -> list[str]:
     """
     found = (_split_prefix(symbol) for symbol in re.findall(r"[^\s*/·^()\d-]+", unit))
     return [known[0] for known in found if known is not None]
+
+
+def insert_units(unit: str, values: Mapping[str, str]) -> str:
+    """Replace symbols of a unit by units, and collect the powers of equal symbols.
+
+    >>> insert_units("w*s/z", {"w": "N", "z": "m"}), insert_units("w*s^3/z^3", {"w": "N m", "z": "rpm s"})
+    ('N s/m', 'N m/rpm^3')
+    """
+    if unit in values:
+        return values[unit]
+    powers = dict[str, float]()
+    for symbol, exponent in _factors(unit) or [(unit, 1.0)]:
+        base, _, kept = symbol.partition("^")
+        inserted = values.get(base, base)
+        factors = None if kept else _factors(inserted)
+        if factors is None:  # a symbolic power, or a quotient in brackets
+            compound = {" ", "/", "*", "·"} & set(inserted)
+            factors = [((f"({inserted})" if compound else inserted) + (f"^{kept}" if kept else ""), 1.0)]
+        for own, power in factors:
+            powers[own] = powers.get(own, 0.0) + exponent * power
+    above, below = (
+        [name if abs(n) == 1 else f"{name}^{abs(n):g}" for name, n in powers.items() if sign * n > 0]
+        for sign in (1, -1)
+    )
+    if not below:
+        return " ".join(above)
+    return f"{' '.join(above) or 1}/{below[0] if len(below) == 1 else '(' + ' '.join(below) + ')'}"
+
+
+def _factors(unit: str) -> list[tuple[str, float]] | None:
+    """Split a unit into symbols and exponents; None if it is no product. A symbolic exponent stays with its symbol."""
+    plain = unit.translate(_SUPERSCRIPTS)
+    if re.search(r"\([^)]*/", plain):  # a quotient in brackets
+        return None
+    found, sign = list[tuple[str, float]](), 1.0
+    for token in re.findall(r"\[[^\]]*\]|[^\s*/·^()]+(?:\^\(?[\w.-]+\)?)?|/", plain):
+        symbol, _, power = token.partition("^")
+        number = re.fullmatch(r"-?[\d.]+", power.strip("()"))
+        if token == "/":
+            sign = -1.0
+        elif symbol != "1":
+            found.append((symbol, sign * float(number[0])) if number else (token, sign))
+    return found
 
 
 def _parse(unit: str) -> tuple[float, tuple[int, ...]] | None:

@@ -40,6 +40,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError
+from ..data import insert_units
 from ..models import Parameter
 
 ONSET_WIDTH = 0.05  # of a contact, as a share of its gap
@@ -419,7 +420,11 @@ GENERAL = ("static_curve", "extra_mode", "viscous_damping")  # ids of laws that 
 
 
 def display_name(law: str, form: str = "") -> str:
-    """Write the id of a law, and its form, as words: "coulomb_friction" -> "Coulomb friction"."""
+    """Write the id of a law, and its form, as words: "coulomb_friction" -> "Coulomb friction".
+
+    A form that says no more than the id is left out.
+    """
+    form = "" if form in law.split("_") else form
     text = PROPER_NAMES.get(law, law.replace("_", " "))
     text = text.capitalize() if text.split(" ")[0] in PEOPLE else text
     return f"{text} ({', '.join(map(display_name, form.split(', ')))})" if form else text
@@ -436,17 +441,8 @@ def readable_unit(unit: str, w: str, z: str, signals: Mapping[str, str] | None =
 
     `signals` has the units of signals by name, for units such as "[temperature]".
     """
-    if unit == "w/z" and w == z:
-        return ""
-    units = {"w": w or "[w]", "z": z or "[z]", **{f"[{name}]": own for name, own in (signals or {}).items() if own}}
-    parts = list[str]()
-    for token in unit.replace("*", " * ").replace("/", " / ").split():
-        base, _, power = token.partition("^")
-        known = units.get(base, base)
-        divided = parts[-1:] == ["/"]
-        bracketed = f"({known})" if (power or divided) and {" ", "/", "*"} & set(known) else known
-        parts.append(bracketed + (f"^{power}" if power else ""))
-    return "".join(f" {p} " if p == "*" else p for p in parts).strip()
+    named = {f"[{name}]": own for name, own in (signals or {}).items() if own}
+    return insert_units(unit, {"w": w or "[w]", "z": z or "[z]", **named})
 
 
 def contact_onset(z: Any, g: Any) -> Any:

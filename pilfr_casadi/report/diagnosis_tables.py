@@ -374,7 +374,7 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
     of = "parameter" if kind_of(port.name) == PARAMETER else "signal"
     what = f"largest change of the {of}" if port.series else "largest force"
     rows = [[what, float(np.max(np.abs(w))), port.unit]]
-    unit = readable_unit("w*s/z", port.unit, port.position_unit).replace(" *", "")
+    unit = readable_unit("w*s/z", port.unit, port.position_unit)
     if port.is_speed:
         damping = (w - np.mean(w)) @ z / (z @ z)
         rows += [["equivalent damping", float(damping), unit if port.unit and port.across_unit else ""]]
@@ -382,7 +382,7 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
         (stiffness, damping), *_ = np.linalg.lstsq(np.column_stack([z, dz]), w - np.mean(w), rcond=None)
         taken = sum(float(np.sum((f[1:] + f[:-1]) / 2 * np.diff(x))) for x, _, f in runs)
         cycles = sum(int(np.sum(np.diff(np.signbit(x - np.mean(x)).astype(int)) < 0)) for x, _, _ in runs)
-        units = [readable_unit(u, port.unit, port.across_unit).replace(" *", "") for u in ("w*z", "w/z")]
+        units = [readable_unit(u, port.unit, port.across_unit) for u in ("w*z", "w/z")]
         known = bool(port.unit and port.across_unit)
         rows += [["energy taken per cycle, mean", taken / cycles, units[0] if known else ""]] if cycles else []
         rows += [["equivalent stiffness", float(stiffness), units[1] if known else ""]]

@@ -7,7 +7,7 @@ import pytest
 from cart import cart
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.data import conversion, dimension, revolution_in
+from pilfr_casadi.data import conversion, dimension, insert_units, revolution_in
 from pilfr_casadi.laws import CoulombFriction
 
 
@@ -81,3 +81,21 @@ def test_a_unit_of_something_else_is_refused(recorded):
     stated = replace(cart(), units={"pos": "V"})
     with pytest.raises(pilfr.InputError, match="has 'pos' in mm, and the simulator has it in V; give the values in V"):
         pilfr.diagnose(stated, recorded, laws=(CoulombFriction,), workers=1)
+
+
+@pytest.mark.parametrize(
+    ("unit", "force", "coordinate", "written"),
+    [
+        ("w", "m³/s", "m", "m³/s"),
+        ("w*s/z", "N", "m", "N s/m"),
+        ("w/z^3", "N m", "rad", "N m/rad^3"),
+        ("w*s^3/z^3", "PWM", "rpm s", "PWM/rpm^3"),
+        ("w/z", "N", "N", ""),
+        ("1/z", "N", "m/s", "s/m"),
+        ("w/z^n", "N", "rad/s", "N/(rad/s)^n"),
+        ("w/z^2", "[w]", "m/(s rad)", "[w] s^2 rad^2/m^2"),
+        ("w/z", "N", "m/(s/rad)", "N/(m/(s/rad))"),
+    ],
+)
+def test_units_are_inserted_and_equal_symbols_collected(unit, force, coordinate, written):
+    assert insert_units(unit, {"w": force, "z": coordinate}) == written
