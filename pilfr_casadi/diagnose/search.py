@@ -475,9 +475,12 @@ class Search(Hypotheses):
         filters = [e for e in best.laws if kind_of(e.port) == ACTUATOR and (e.law.order or e.law.shifts)]
         if len(names) < 2 or len(filters) != 1 or not self.in_time():
             return
+        source = filters[0]
+        others = [e for e in best.laws if e is not source]
+        if not all(_may_stand_beside(others, port_name(SENSOR, name), source.law) for name in names):
+            return
         with self.stage("every sensor"):
-            source = filters[0]
-            joint = self.run_laws([e for e in best.laws if e is not source], best)
+            joint = self.run_laws(others, best)
             simulator, named = joint.fitted.simulator, dict[str, object](joint.fitted.values)
             for name in names:
                 simulator = simulator.with_element(port_name(SENSOR, name), source.law)

@@ -152,6 +152,10 @@ class Creep(Relaxation):
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.c * q
 
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """Tell whether most of the signal comes slowly, as behind a lag, or it hardly creeps."""
+        return super().doubtful(values) or any(values[name] >= MOST_CREEP for name in self.strength)
+
 
 class TwoStageCreep(_TwoStages, Creep):
     """Creep of an actuator or a sensor with a fast and a slow part."""
