@@ -7,7 +7,9 @@ Lines are counted as in an editor: the header is line 1. Code in a ``.mat`` or `
 
 import contextlib
 import csv
+import gc
 import re
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -256,7 +258,7 @@ def _parquet_column(path: Path, index: int) -> Array:
 
     with parquet.ParquetFile(path) as file:
         name = file.schema_arrow.names[index]
-        return np.asarray(file.read([name]).column(0).to_numpy())
+        return _seconds(np.asarray(file.read([name]).column(0).to_numpy()))
 
 
 def _open_mdf(path: Path, wanted: Sequence[str] = ()) -> ArrayTable:
@@ -266,7 +268,17 @@ def _open_mdf(path: Path, wanted: Sequence[str] = ()) -> ArrayTable:
             from asammdf import MDF
         except ImportError:
             raise InputError(f"{path} is an MDF file; install pilfr-casadi[mdf] to read it.") from None
-        with MDF(path) as mdf:
+        with _silent_destructors():
+            mdf, failed = None, ""
+            try:
+                mdf = MDF(path)
+            except Exception as error:  # damaged files raise many kinds
+                failed = _reason(error)
+            if failed:
+                gc.collect()  # destroys it here
+        if mdf is None:
+            raise ValueError(failed)
+        with mdf:
             clocks = {mdf.groups[i].channels[k].name for i, k in mdf.masters_db.items()}
             names = [name for name in mdf.channels_db if name not in clocks]
             signals = {name: mdf.get(name) for name in dict.fromkeys(wanted) if name in names}
@@ -279,6 +291,16 @@ def _open_mdf(path: Path, wanted: Sequence[str] = ()) -> ArrayTable:
             )
     arrays = {"t": times[0], **{name: signal.samples for name, signal in signals.items()}}
     return ArrayTable(path, tuple(dict.fromkeys(["t", *names])), arrays)
+
+
+@contextlib.contextmanager
+def _silent_destructors() -> Iterator[None]:
+    """Print no tracebacks of objects that fail when they are destroyed, as half-opened MDF files do."""
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
 
 
 # file suffix: the function that opens such a file

@@ -1,5 +1,6 @@
 """Recordings in Parquet and MDF files, and one sentence for what cannot be used there."""
 
+import gc
 import sys
 import warnings
 
@@ -86,6 +87,20 @@ def test_unusable_mdf_files_are_refused(mdf, tmp_path):
     damaged = tmp_path / "damaged.mf4"
     damaged.write_bytes(b"MDF and no more")
     refused(damaged, "cannot be read as an MDF file")
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.98])
+def test_a_file_that_was_cut_short_is_refused_without_a_traceback(mdf, tmp_path, capfd, share):
+    whole = mdf((T, {"force": FORCE, "x2": X2})).read_bytes()
+    damaged = tmp_path / "damaged.mf4"
+    damaged.write_bytes(whole[: int(share * len(whole))])
+    refused(damaged, "cannot be read as an MDF file")
+    gc.collect()
+    assert capfd.readouterr().err == ""
+
+
+def test_durations_in_a_parquet_file_are_times(parquet):
+    same(read(parquet(t=(1e6 * T).astype("timedelta64[us]"), force=FORCE, x2=X2), "force", "x2"))
 
 
 @pytest.mark.parametrize(
