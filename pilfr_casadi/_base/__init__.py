@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     )
     from .interrupts import (
         Clock as Clock,
+        abandoned as abandoned,
         deferred_interrupt as deferred_interrupt,
         handled_interrupt as handled_interrupt,
         is_interrupt as is_interrupt,

@@ -62,6 +62,24 @@ def handled_interrupt(handle: Callable[[], None]) -> Iterator[None]:
         yield
 
 
+class Abandoned(threading.local):
+    """A mark for a thread that a run of compiled code was interrupted, which cannot end by itself.
+
+    The Python functions that the run calls then return at once, and KeyboardInterrupt is raised where the run returns.
+    """
+
+    pending = False
+
+    def raise_pending(self) -> None:
+        """Raise KeyboardInterrupt if the run that has just returned was abandoned."""
+        if self.pending:
+            self.pending = False
+            raise KeyboardInterrupt
+
+
+abandoned = Abandoned()
+
+
 @contextlib.contextmanager
 def repeated_interrupt() -> Iterator[Callable[[], None]]:
     """Yield a function that raises KeyboardInterrupt once more if Ctrl-C was pressed since its last call.

@@ -38,6 +38,7 @@ from .workbench import THOROUGH, Fitted, Workbench, refine_steps
 
 CHECKED_ABOVE = 4e-4  # mean square error up to which signs and units are not checked
 CHECKS, CHECKED = "checks and refit", 6  # the stage's name, and the number of its parts that are reported
+LEAST_REFIT = 10.0  # seconds for the first refit in any case
 OBSERVER_GAINS = (1.0, 0.3, 0.1, 0.03, 0.01)  # gains of the observer, in turn
 
 
@@ -115,8 +116,9 @@ class _Checks:
 
     def run(self, bench: Workbench, part: float) -> Checked:
         """Refit, and correct one fault after the other; `part` is the unit of shifts in samples, see `timing`."""
-        now = self._report(2, find_wrong_start(Checked(bench, refitted(bench), self.gates)))
-        bench = replace(now.bench, deadline=self.until)  # the first refit is carried out in any case
+        patient = replace(bench, deadline=max(self.until, time.perf_counter() + LEAST_REFIT))
+        now = self._report(2, find_wrong_start(Checked(patient, refitted(patient), self.gates)))
+        bench = replace(now.bench, deadline=self.until)
         now = replace(now, bench=bench)
         if now.cost > max(NEAR_NOISE_RATIO**2 * now.noise2, CHECKED_ABOVE):
             found = self._slips(now, part)

@@ -36,7 +36,7 @@ import casadi as ca
 import numpy as np
 from platformdirs import user_cache_path
 
-from .._base import InputError, one_at_a_time
+from .._base import InputError, abandoned, one_at_a_time
 from ..models import Model
 from ..simulators import calls_external
 from .external import bind, entry_point, external_names, fill_gaps, suppress_gap_warnings
@@ -382,7 +382,9 @@ class Compiled:
     def _call(self, name: str, *arguments: Any) -> None:
         if self.programs:
             bind(self.library, self.programs, build)
-        if getattr(self.loops, name)(self.model, *arguments):
+        failed = getattr(self.loops, name)(self.model, *arguments)
+        abandoned.raise_pending()
+        if failed:
             raise MemoryError("the compiled model found no memory for its slopes")
 
     def _arguments(self, u: np.ndarray, p: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -24,7 +24,7 @@ from typing import Any, Protocol
 import casadi as ca
 import numpy as np
 
-from .._base import one_at_a_time
+from .._base import abandoned, one_at_a_time
 from ..models import Model
 from ..simulators import calls_external
 
@@ -220,6 +220,7 @@ class VirtualMachine:
                     buffer.set_arg(2 + i, before.data)
                     buffer.set_res(len(out) + i, after.data)
                 evaluate()
+                abandoned.raise_pending()
                 carried, following = following, carried
                 at += length
         return carried

@@ -26,7 +26,7 @@ from typing import NamedTuple, Protocol
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, handled_interrupt, unwrapped_interrupt
+from .._base import InputError, abandoned, handled_interrupt, unwrapped_interrupt
 from ..models import Neighbours
 from .constraints import FEASIBILITY_TOLERANCE
 from .solution import Iteration, IterationCallback, Solution, Status, check_solver_options
@@ -387,6 +387,8 @@ class _Run:
                     status = self._iterate()
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
+        finally:
+            abandoned.pending = False
         continues = unfinished and status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT)
         if not continues and self.best.beats(self.cost, self.penalty.violation(self.theta)):
             status = Status.SOLVER_FAILED if self._has_strayed(status) else status
@@ -409,7 +411,7 @@ class _Run:
         self.history.append(Iteration(self.tried, self.cost, seconds, length, self.damping.value))
 
     def _interrupt(self) -> None:
-        self.interrupted = True
+        self.interrupted = abandoned.pending = True
 
     def _iterate(self) -> Status:
         problem, options = self.problem, self.options

@@ -21,6 +21,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from .._base import abandoned
 from .fmu_instance import FmuFile
 
 RELATIVE_STEP = float(np.sqrt(np.finfo(float).eps))  # at this step rounding and curvature disturb a difference equally
@@ -145,10 +146,14 @@ class PythonFunction(ca.Callback):
         return [ca.DM(self.evaluate([a.full().ravel() for a in arguments]))]
 
     def evaluate(self, arguments: list[np.ndarray]) -> np.ndarray:
-        """Call the function; a failed point is a failed trial, not the end."""
+        """Call the function; a failed point is a failed trial, not the end. Code that calls it cannot end at Ctrl-C."""
+        if abandoned.pending:
+            return np.full(self.size, np.nan)
         self.calls += 1
         try:
             return self.function(*arguments)
+        except KeyboardInterrupt:
+            abandoned.pending = True
         except Exception as error:
             self.failure = self.failure or error
-            return np.full(self.size, np.nan)
+        return np.full(self.size, np.nan)

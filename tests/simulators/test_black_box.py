@@ -1,6 +1,7 @@
 """Functions that are called with numbers: values and derivatives equal their equations; a failure fails one trial."""
 
 import re
+import signal
 
 import cloudpickle
 import numpy as np
@@ -115,3 +116,40 @@ def test_it_survives_another_process():
     again = cloudpickle.loads(cloudpickle.dumps(made))
     assert again.kinematic == {"pos"} and "called 0 times" in str(again)
     assert np.array_equal(sensitivities(again, "vm")[1], sensitivities(made, "vm")[1])
+
+
+class Interrupted:
+    """The swing, during whose run Ctrl-C is pressed once, after so many calls."""
+
+    def __init__(self):
+        self.left = self.calls = 0
+
+    def __call__(self, t, x, u, p):
+        self.calls += 1
+        self.left -= 1
+        if self.left == 0:
+            signal.raise_signal(signal.SIGINT)
+        return swing(t, x, u, p)
+
+
+@pytest.mark.parametrize("engine", ["vm", pytest.param("c", marks=needs_compiler)])
+def test_an_interrupt_ends_a_run_of_slow_calls_without_a_word(engine, capfd):
+    called = Interrupted()
+    made = from_function(called, "pos", numeric=Numeric(), **SWING)
+    u = 20 * np.sin(0.05 * np.arange(120))[:, None]
+    given = Recording(u, np.zeros((120, 1)), 0.01, ("force",), ("pos",), initial="zero", hold="zero")
+    given = given.with_(y=made.simulate(given))
+    fit(made.with_parameters({"k": 80.0}), given, engine=engine)
+    whole = called.calls
+    called.calls, called.left = 0, whole // 2
+    found = fit(made.with_parameters({"k": 80.0}), given, engine=engine)
+    assert found.status.name == "INTERRUPTED" and called.calls < 0.8 * whole
+    assert "Traceback" not in capfd.readouterr().err
+    model, one = discretise(made, 0.01, "zero", 1), called.calls
+    run = make_engine(model, engine)
+    called.left = 40
+    with pytest.raises(KeyboardInterrupt):
+        run.simulate(model.drive(given), model.parameters.start, np.zeros(2))
+    assert called.calls - one < 200 and "Traceback" not in capfd.readouterr().err
+    y = run.simulate(model.drive(given), model.parameters.start, np.zeros(2))[0]
+    assert np.all(np.isfinite(y)) and np.any(y)
