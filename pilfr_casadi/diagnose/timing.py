@@ -166,6 +166,7 @@ def _interpolant(r: Recording, v: np.ndarray, wraps: bool, smooth: bool) -> _Cur
     return lambda at: np.asarray(spline(np.clip(at, r.t[0], r.t[-1])))
 
 
+@np.errstate(invalid="ignore")  # an infinite remainder has no parabola through it
 def _minimise(left: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
     """Find the minimum of the remainder between two values; return its place and its value."""
     from scipy.optimize import minimize_scalar
