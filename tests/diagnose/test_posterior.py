@@ -189,3 +189,17 @@ def test_a_strength_that_may_be_zero_names_nothing(tiny):
     assert significance(bench, fitted, ["a.k_3"]) > 0.999
     idle = replace(fitted, values={**fitted.values, "a.k_3": np.array(0.0)})
     assert significance(bench, idle, ["a.k_3"]) < 0.01
+
+
+def test_an_effect_that_does_not_act_in_another_fit_of_its_laws_is_not_sure(search, trial, monkeypatch):
+    """As a law that was found in predictions and is idle in a free run."""
+    two = trial(DRY, ("b", CubicStiffness))
+    found = posterior(search(two, trial(DRY, left=0.1)))
+    acts = {"a.F_c": 1.0, "b.k_3": 0.2}
+    monkeypatch.setitem(posterior.__globals__, "significance", lambda _, __, names: acts[names[0]])
+    there = found.acting(search(two), two)
+    before = sure_of(found)
+    assert sure_of(there) == {name: pytest.approx(c * (1.0 if name == DRY_NAME else 0.2)) for name, c in before.items()}
+    assert there.named == pytest.approx(found.named)
+    acts["a.F_c"] = 0.1
+    assert found.acting(search(two), two).named == pytest.approx(0.2 * found.named)
