@@ -338,6 +338,11 @@ class Hypotheses:
         self.out_of_time = self.out_of_time or time.perf_counter() > self.until
         return not self.out_of_time
 
+    def cut_short_with(self, other: Hypotheses) -> None:
+        """Note that another search of the same diagnosis was interrupted or ran out of time."""
+        self.interrupted = self.interrupted or other.interrupted
+        self.out_of_time = self.out_of_time or other.out_of_time
+
     def keep(self, trial: Trial) -> None:
         """Put a trial into the memo, unless the same hypothesis fits better there."""
         if trial.information is None:

@@ -35,8 +35,9 @@ the laws that are found there are refitted in free run (`_name_in_predictions`).
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -183,18 +184,17 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
     if search.interrupted or not search.other_hold_fits_better():
         return ready, search
     hold = search.bench.with_other_hold().hold
-    found: tuple[Prepared, Search] | None = None
+    held = replace(request, hold=hold, say=request.say.under("other hold: "))
     try:
-        with search.until_interrupted():
-            found = _search(replace(request, hold=hold, say=request.say.under("other hold: ")))
+        found = _again(search, partial(_search, held))
     except InputError:  # the simulator cannot be run with this hold
         return ready, search.resume(request.most_effects)
-    if found is None:  # interrupted before the other search began
+    if found is None:
         return ready, search
     other, again = found
     only_refitted = again.interrupted and len(again.memo) < 2
     if again.best.mean_square > search.best.mean_square or only_refitted:
-        search.interrupted = again.interrupted
+        search.cut_short_with(again)
         return ready, search.resume(request.most_effects)
     # the laws that were found since may have been what the hold had made up for
     if not again.interrupted and again.prefers_other_hold():
@@ -216,13 +216,13 @@ def _search(request: Request) -> tuple[Prepared, Search]:
     leads = any(isinstance(g, TimeShift) and g.leads for g in ready.gates)
     if not leads or search.interrupted or search.out_of_time or not search.can_improve(search.best):
         return ready, search
-    found = _search_again(search, request, shift_early=False)
+    found = _again(search, partial(_search_once, request, shift_early=False))
     if found is None:
         return ready, search
     other, again = found
     if again.best.mean_square < AS_GIVEN_RATIO * search.best.mean_square:
         return other, again
-    search.interrupted = again.interrupted
+    search.cut_short_with(again)
     return ready, search
 
 
@@ -234,23 +234,22 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
     recordings = tuple(shift.change(r) if shift.change else r for r in request.recordings)
     moved = replace(request, recordings=recordings, aligned=True, say=request.say.under("shifted: "))
     search.shift, search.aligned = None, True
-    found = _search_again(search, moved, shift_early=True)
+    found = _again(search, partial(_search_once, moved, shift_early=True))
     if found is None:
         return ready, search
     other, again = found
     if again.can_improve(again.best) and not (again.interrupted or again.out_of_time):
         search.run(request.most_effects)
     if search.best.mean_square < AS_GIVEN_RATIO * again.best.mean_square:
-        search.interrupted = search.interrupted or again.interrupted
-        search.out_of_time = search.out_of_time or again.out_of_time
+        search.cut_short_with(again)
         return ready, search
     return replace(other, nominal=ready.nominal, gates=(shift, *other.gates)), again
 
 
-def _search_again(search: Search, request: Request, shift_early: bool) -> tuple[Prepared, Search] | None:
+def _again(search: Search, prepare_and_search: Callable[[], tuple[Prepared, Search]]) -> tuple[Prepared, Search] | None:
     """Prepare and search once more; None if an interrupt came before that search began."""
     with search.until_interrupted():
-        return _search_once(request, shift_early)
+        return prepare_and_search()
     return None
 
 
@@ -395,7 +394,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
         leading = _search(replace(request, simulator=led, hold=hold, focus="prediction", say=say))[1]
     except InputError:
         return found
-    search.interrupted = leading.interrupted
+    search.cut_short_with(leading)
     if leading.interrupted:
         return found
     named, answer = _concluded(leading, ()), posterior(leading)
