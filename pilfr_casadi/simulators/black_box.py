@@ -86,8 +86,8 @@ class BlackBox:
     @property
     def note(self) -> str:
         """Number of calls and first failure, in words."""
-        source = "differences" if self.slope is None else f"its Jacobian, called {self.slope.calls} times"
-        text = f"{self.called}: called {self.leaf.calls} times; derivatives by {source}"
+        source = "finite differences" if self.slope is None else f"the given Jacobian, called {self.slope.calls} times"
+        text = f"{self.called}: called {self.leaf.calls} times; its derivatives come from {source}"
         return text if self.leaf.failure is None else f"{text}; it failed first with {self.leaf.failure!r}"
 
     def __call__(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
