@@ -28,6 +28,7 @@ the second half of every recording is also predicted, from a fit to the first ha
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -39,7 +40,7 @@ from ..laws import Law
 from ..optimise import GaussNewton, Problem
 from ..simulators import MECHANICAL, PARAMETER, SENSOR, UNKNOWN, Placed, kind_of
 from .floor import effective_size
-from .workbench import DIVERGED, Fitted, Workbench
+from .workbench import DIVERGED, RUNAWAY, Fitted, Workbench
 
 # The priors and thresholds on which every answer of a search rests. Elsewhere are those of the noise (`floor`), of
 # faults (`gates`, `channel_faults`, `offsets`, `timing`, `lost_samples`, `recording_faults`), the memories of an
@@ -179,6 +180,31 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
         return np.inf
     as_recorded, now = _enlargement(bench, fitted), _enlargement(bench.on(smaller), fitted)
     return found / max(now / as_recorded, 1.0) if 0 < as_recorded < np.inf and now < np.inf else found
+
+
+def runs_away(bench: Workbench, fitted: Fitted, refitted: Fitted) -> bool:
+    """Tell whether a simulator runs away where an input stays at an end of its range, and the refitted one does not.
+
+    The recordings may visit that level for so short a time that they do not show it, as with a stiffness that varies
+    with an input and is negative there. Such a simulator predicts nothing for other inputs.
+    """
+    if bench.simulator.observer is not None:
+        return False
+    k = int(np.argmax([len(r) for r in bench.recordings]))
+    r, inputs = bench.recordings[k], np.concatenate([r.u for r in bench.recordings])
+    rest, ends = np.mean(inputs, axis=0), (np.min(inputs, axis=0), np.max(inputs, axis=0))
+
+    def reach(one: Fitted, u: np.ndarray) -> float:
+        held = r.with_(u=np.tile(u, (len(r), 1)))
+        with np.errstate(all="ignore"):
+            y = one.engine.simulate(one.model.drive(held), one.vector, one.initial[k])[0]
+            return float(np.max(np.abs(y - np.mean(r.y, axis=0)) / bench.scale))
+
+    for i, end in itertools.product(range(len(rest)), ends):
+        u = np.where(np.arange(len(rest)) == i, end, rest)
+        if not reach(fitted, u) <= RUNAWAY * max(reach(refitted, u), 1.0):
+            return True
+    return False
 
 
 def _enlargement(bench: Workbench, fitted: Fitted) -> float:

@@ -9,8 +9,17 @@ from diagnosis_rig import OFF, recordings, rig
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.evidence import WRONG_MODEL_SAMPLES, Sample, information, log_evidence, log_prior, spread
+from pilfr_casadi.diagnose.evidence import (
+    WRONG_MODEL_SAMPLES,
+    Sample,
+    information,
+    log_evidence,
+    log_prior,
+    runs_away,
+    spread,
+)
 from pilfr_casadi.diagnose.verdict import share_named
+from pilfr_casadi.engine import make_engine
 from pilfr_casadi.optimise import Problem
 
 NONE = np.zeros(0)
@@ -160,3 +169,29 @@ def test_derivatives_that_overflow_give_no_information(monkeypatch):
     square = np.full((size, size), 1e200) - 2e200 * np.eye(size)
     monkeypatch.setattr(Problem, "normal", lambda self, theta: (1.0, np.zeros(size), square))
     assert np.all(np.isinf(information(bench, fitted, fitted.last_elements(1))))
+
+
+@pytest.mark.parametrize(("stiffness", "away"), [(0.0, False), (300.0, False), (-700.0, True)])
+def test_a_stiffness_that_is_negative_at_a_level_of_an_input_runs_away_there(stiffness, away):
+    """The recording visits the level for a moment only, and is followed."""
+    simulator = pilfr.Simulator(
+        lambda x, u, p: {"pos": x.vel, "vel": u.force - 400.0 * x.pos - p.d * x.vel},
+        lambda x: {"pos": x.pos},
+        states=("pos", "vel"),
+        inputs=("force", "heat"),
+        parameters={"d": pilfr.Parameter(4.0, bounds=(0, 20))},
+        ports=pilfr.Port("ground", {"vel": -1.0}, lambda x: x.pos, lambda x: x.vel, "N", "m"),
+    )
+    rng = np.random.default_rng(1)
+    heat = (np.arange(600) // 5 == 60).astype(float)
+    u = np.column_stack([np.convolve(rng.standard_normal(600), np.ones(8) / 8, "same"), heat])
+    r = pilfr.Recording(u, u[:, :1], 0.01, ("force", "heat"), ("pos",), initial="zero")
+    r = r.with_(y=simulator.simulate(r))
+    bench = Workbench.of(simulator, [r], "zero")
+    refitted = bench.fit(simulator)
+    shape = {"k_1": 0.0, "k_1_high": stiffness, "low": 0.0, "high": 1.0}
+    varied = simulator.with_element("ground", laws.scheduled(laws.LinearStiffness, "heat")().at(shape))
+    model = bench.model(varied)
+    values = model.parameters.unpack(model.parameters.start)
+    found = bench.result(varied, values, refitted.initial, make_engine(model), model)
+    assert found.cost < 0.1 and runs_away(bench, found, refitted) == away
