@@ -34,6 +34,7 @@ from .evidence import (
     COLOURED_NOISE_RATIO,
     CONTENDING_NATS,
     DISTURBANCE_WEIGHT,
+    DOUBTFUL_PRIOR,
     EXPLAINED_NOISE,
     EXPLAINED_QUIET_NOISE,
     FAR_RATIO,
@@ -168,14 +169,14 @@ def share_left(
     return float(np.clip((mean_square - noise2) / excess, 0.0, 1.0))
 
 
-def share_named(s: float, strained: bool = False) -> float:
+def share_named(s: float, odds: float = 1.0) -> float:
     """Compute the probability that a law which leaves the share s is the physics.
 
-    `strained` tells that a parameter of the simulator is at a bound then (`Fitted.strained`).
+    `odds` tells how much likelier what is seen beside that is of a wrong law than of the right one (`_odds_against`).
     """
     law = (1 - OUTSIDE_CATALOGUE) * 2 / (np.pi * FORMULA_ERROR * (1 + (s / FORMULA_ERROR) ** 2))
     other = OUTSIDE_CATALOGUE / (max(s, FORMULA_ERROR) * (1 - np.log(FORMULA_ERROR)))
-    return float(law / (law + other * (STRAINED_ODDS if strained else 1.0)))
+    return float(law / (law + other * odds))
 
 
 def posterior(search: Hypotheses) -> Posterior:
@@ -196,7 +197,7 @@ def posterior(search: Hypotheses) -> Posterior:
         if least.confidence > SURE or fewer not in by_names or not fewer:
             break
         said = fewer
-    named = share_named(explainable_remainder(search, best), strained(search, best))
+    named = share_named(explainable_remainder(search, best), _odds_against(search, best, best.effects))
     effects = (replace(e, confidence=_named_beside(search, best, e) * e.confidence) for e in found)
     strongest_first = sorted(effects, key=lambda e: -(_without(search, best, e) or search.root).mean_square)
     answer = Posterior(best, named, tuple(strongest_first), by_names.get(frozenset(), 0.0))
@@ -210,7 +211,13 @@ def _named_beside(search: Hypotheses, best: Trial, effect: NamedEffect) -> float
     one, and so it has to explain its part as well as that one does.
     """
     remainder = explainable_remainder(search, best, _without(search, best, effect))
-    return share_named(remainder, strained(search, best))
+    return share_named(remainder, _odds_against(search, best, [effect.element]))
+
+
+def _odds_against(search: Hypotheses, trial: Trial, elements: Sequence[Placed]) -> float:
+    """Compute how much likelier the fitted values are of wrong laws: at a bound, or where every law degenerates."""
+    degenerate = all(e.law.doubtful(e.own(trial.fitted.values)) for e in elements)
+    return (STRAINED_ODDS if strained(search, trial) else 1.0) * (float(np.exp(-DOUBTFUL_PRIOR)) if degenerate else 1.0)
 
 
 def _acts(search: Hypotheses, best: Trial, element: Placed) -> float:

@@ -18,7 +18,7 @@ LONGEST_TIME = 2.0  # largest time constant of a relaxation, in durations of the
 # largest ratio of a slow part of a signal to what follows at once: in the longest time constant, as much again follows
 # within the recordings; beyond that it is a lag
 MOST_CREEP = 1 / (1 - np.exp(-1 / LONGEST_TIME))
-NO_PEAK = 0.5**0.5  # damping ratio above which a second-order response has no peak
+MOST_DAMPED_MODE = 0.2  # largest damping ratio of a machine's mode; most are below 0.1 (Ewins 2000, Modal Testing)
 
 
 @dataclass(frozen=True)
@@ -232,8 +232,11 @@ class Mode(Resonance):
         return p.c_1 * q[0] + p.c_2 * q[1]
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """Tell whether it has no peak, like two lags that imitate anything linear, or is too fast to be visible."""
-        return bool(values["D"] > NO_PEAK or values["W"] >= self.parameters()["W"].bounds[1])
+        """Tell whether it is damped more than modes of machines are, or too fast to be visible.
+
+        With strengths of either sign it then imitates nearly anything linear.
+        """
+        return bool(values["D"] > MOST_DAMPED_MODE or values["W"] >= self.parameters()["W"].bounds[1])
 
 
 class SprungMass:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pilfr_casadi.diagnose.evidence import significance
+from pilfr_casadi.diagnose.evidence import STRAINED_ODDS, significance
 from pilfr_casadi.diagnose.offsets import Offset
 from pilfr_casadi.diagnose.verdict import closest_law, explainable_remainder, posterior, share_named
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Delay, DirectionalFriction, QuadraticDrag
@@ -170,8 +170,8 @@ def test_a_value_that_the_user_has_excluded_makes_a_law_less_sure(search, trial,
     values = {**at_bound.fitted.values, name: np.array(p.bounds[1])}
     strained = replace(at_bound, fitted=replace(at_bound.fitted, values=values))
     assert strained.fitted.strained([name]) and not at_bound.fitted.strained([name])
-    assert sure_of(posterior(search(strained)))[DRY_NAME] == pytest.approx(share_named(0.0, strained=True))
-    assert 0.75 < share_named(0.0, strained=True) < 0.9
+    assert sure_of(posterior(search(strained)))[DRY_NAME] == pytest.approx(share_named(0.0, STRAINED_ODDS))
+    assert 0.75 < share_named(0.0, STRAINED_ODDS) < 0.9
 
 
 def test_a_refit_worse_than_a_constant_lends_a_law_no_confidence(search, trial):
@@ -203,3 +203,13 @@ def test_an_effect_that_does_not_act_in_another_fit_of_its_laws_is_not_sure(sear
     assert there.named == pytest.approx(found.named)
     acts["a.F_c"] = 0.1
     assert found.acting(search(two), two).named == pytest.approx(0.2 * found.named)
+
+
+def test_a_law_that_degenerates_at_its_values_names_nothing_however_well_it_follows(search, trial, monkeypatch):
+    two = trial(DRY, ("b", CubicStiffness))
+    given = two, trial(DRY, left=0.1)
+    assert posterior(search(*given)).sure > 0.9
+    monkeypatch.setattr(CubicStiffness, "doubtful", lambda *_: True)
+    found = posterior(search(*given))
+    assert sure_of(found)[("b", "cubic_stiffness")] < 0.5 < sure_of(found)[DRY_NAME] and found.named > 0.9
+    assert posterior(search(trial(CUBIC))).named < 0.5
