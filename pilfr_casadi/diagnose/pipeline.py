@@ -9,7 +9,8 @@ How an answer comes about:
    (`evidence`, which lists the numbers on which an answer rests).
 3. `posterior` turns the evidences into probabilities. An effect's confidence is the probability of all hypotheses that
    have it, times the probability that its law is the physics (`share_named`): a rest that a flexible force could
-   explain lowers it. Of forms of a law that follow alike, the plainest is stated.
+   explain lowers it, as do values at a bound or at which the law degenerates. Of forms of a law that follow alike, the
+   plainest is stated.
 4. `judge` chooses the verdict. It is a recording fault if its correction removed the mismatch; missing physics if the
    law of the likeliest hypothesis is more likely than not the physics; complete if the refit's residual can be noise;
    else unexplained.
