@@ -21,7 +21,7 @@ import numpy as np
 from .._base import InputError
 from ..laws import CATALOGUE
 from ..simulators import Placed, name_at
-from .evidence import FORMULA_ERROR, NEAR_RATIO, SURE, HeldOut
+from .evidence import FORMULA_ERROR, NEAR_RATIO, SURE, HeldOut, runs_away
 from .hypotheses import likeliest
 from .learned import Learned, LearnedForce, describe_learned, refit_learned
 from .search import Search
@@ -193,14 +193,18 @@ def _named_hypotheses(search: Search, answer: Posterior) -> list[Trial]:
 
 
 def _hypotheses_with_laws(search: Search) -> list[Trial]:
-    """List the hypotheses with laws that may correct: the likeliest, and of those not yet polished only a few."""
+    """List the hypotheses with laws that may correct: the likeliest, and of those not yet polished only a few.
+
+    Those that run away at a held input are left out, though their laws may be right in the range of the recordings.
+    """
     found, recurring = list[Trial](), [t for t in search.memo.values() if _may_recur(search, t)]
     likely = sorted(likeliest(recurring, search.optimistic_evidence), key=search.evidence, reverse=True)
     for i, trial in enumerate(t for t in likely if t.laws):
         if trial.thorough or i < FEW:
             with suppress(InputError):
                 found.append(search.thorough(trial))
-    return [t for t in found if np.isfinite(t.mean_square)]
+    finite = (t for t in found if np.isfinite(t.mean_square))
+    return [t for t in finite if not runs_away(search.bench, t.fitted, search.without)]
 
 
 def _make_candidate(search: Search, trial: Trial) -> _Candidate:

@@ -33,7 +33,6 @@ from .evidence import (
     log_occam,
     log_prior,
     log_prior_of_states,
-    runs_away,
     spread,
 )
 from .floor import FEWEST, Floor, effective_size, white_part
@@ -222,12 +221,7 @@ class Hypotheses:
         return replace(held_out_errors(self.bench, fitted, self.workers), spread=spread)
 
     def spread(self, fitted: Fitted, laws: Sequence[Placed]) -> float:
-        """Compute the mean square uncertainty of a fitted simulator's predictions for other inputs.
-
-        It is infinite if the simulator runs away where an input stays at an end of its range.
-        """
-        if laws and runs_away(self.bench, fitted, self.without):
-            return np.inf
+        """Compute the mean square uncertainty of a fitted simulator's predictions for other inputs."""
         own = Sample(self.floor2, count_samples(fitted, self.bench))
         return spread(self.bench, fitted, laws, fitted.cost + self.tolerance, own.effective(0.0))
 

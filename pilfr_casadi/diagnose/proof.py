@@ -31,9 +31,9 @@ VISIBLE_DIFFERENCE = 0.01  # difference of two answers over the noise, above whi
 
 
 def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
-    """Compute the NRMSE averaged over outputs and recordings."""
+    """Compute the NRMSE averaged over outputs and recordings; where an output rests, its deviation over all counts."""
     pairs = zip(fitted.residual, bench.recordings, strict=True)
-    return float(np.mean([nrmse(r.y, r.y + e, skip=r.skip) for e, r in pairs]))
+    return float(np.mean([nrmse(r.y, r.y + e, skip=r.skip, resting=bench.scale) for e, r in pairs]))
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,8 @@ def compare_errors(bench: Workbench, models: Models[K], *, whole: bool = False) 
         first = max((skip for _, skip in runs.values()), default=0)
         scored.append((r, first))
         for name, (y, _) in runs.items():
-            errors[name].append(nrmse(r.y, y, skip=first) if np.all(np.isfinite(y)) else np.inf)
+            finite = np.all(np.isfinite(y))
+            errors[name].append(nrmse(r.y, y, skip=first, resting=bench.scale) if finite else np.inf)
     return Comparison({name: float(np.mean(each)) for name, each in errors.items()}, tuple(scored))
 
 

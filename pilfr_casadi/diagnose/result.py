@@ -246,10 +246,12 @@ class Diagnosis:
         """Compute the NRMSE (Eq. 27) of the corrected simulator, averaged over outputs and recordings.
 
         Samples from which an initial state was estimated are not scored; otherwise see `simulate`. The error is
-        infinite if the simulation diverges.
+        infinite if the simulation diverges. Where an output rests, its deviation over the training recordings counts.
         """
         runs = [self.run(recording) for recording in as_recordings(recordings)]
-        return float(np.mean([nrmse(r.y, y, skip=k) if np.all(np.isfinite(y)) else np.inf for r, y, k in runs]))
+        scale = np.std(np.concatenate([r.y[r.skip :] for r in self.train]), axis=0)
+        errors = [nrmse(r.y, y, k, scale) if np.all(np.isfinite(y)) else np.inf for r, y, k in runs]
+        return float(np.mean(errors))
 
     def plot(self, recording: Recording) -> Any:
         """Draw a recording beside the refitted and the corrected simulator.

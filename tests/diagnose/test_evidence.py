@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from diagnosis_rig import OFF, recordings, rig
@@ -195,3 +196,25 @@ def test_a_stiffness_that_is_negative_at_a_level_of_an_input_runs_away_there(sti
     values = model.parameters.unpack(model.parameters.start)
     found = bench.result(varied, values, refitted.initial, make_engine(model), model)
     assert found.cost < 0.1 and runs_away(bench, found, refitted) == away
+
+
+def test_a_pendulum_that_turns_over_at_a_held_torque_does_not_run_away():
+    arm = pilfr.Simulator(
+        lambda x, u, p: {"angle": x.speed, "speed": (u.torque - p.d * x.speed - ca.sin(x.angle)) / 0.02},
+        lambda x: {"angle": x.angle},
+        states=("angle", "speed"),
+        inputs=("torque",),
+        parameters={"d": pilfr.Parameter(0.03, bounds=(0, 1))},
+    )
+    torque = np.clip(0.5 * np.repeat(np.random.default_rng(5).standard_normal(80), 10), -0.65, 0.65)
+    r = pilfr.Recording(torque, np.zeros(800), 0.01, ("torque",), ("angle",), hold="zero", initial="zero")
+    r = r.with_(y=arm.simulate(r))
+    bench = Workbench.of(arm, [r], "zero")
+    refitted = bench.fit(arm)
+    stronger = arm.with_element("actuator:torque", laws.PowerWithGain().at({"a": 0.0, "n": 0.5, "b": 0.3}))
+    model = bench.model(stronger)
+    values = model.parameters.unpack(model.parameters.start)
+    found = bench.result(stronger, values, refitted.initial, make_engine(model), model)
+    held = r.with_(u=np.full((800, 1), 0.65))
+    assert np.max(np.abs(arm.simulate(held))) < 4 < 50 < np.max(np.abs(stronger.simulate(held)))
+    assert not runs_away(bench, found, refitted)

@@ -243,3 +243,12 @@ def test_parts_of_a_diagnosis_print_briefly():
     d = example()
     for part in (d.correction, d.effects, dict(d.evidence)):
         assert len(repr(part)) < 1500
+
+
+def test_a_recording_in_which_the_machine_rests_is_scored_by_the_others(diagnosed):
+    found, test, _ = diagnosed
+    still = replace(test, u=0 * test.u, y=0 * test.y, initial="zero")
+    assert found.nrmse(still) == pytest.approx(0.0, abs=1e-9)
+    bench = Workbench.of(rig(), [test, still], "zero")
+    errors = compare_errors(bench, {"": (bench.model(HIDDEN), ())}).errors[""]
+    assert 0 < errors < 0.01
