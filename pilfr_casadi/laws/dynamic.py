@@ -18,7 +18,7 @@ LONGEST_TIME = 2.0  # largest time constant of a relaxation, in durations of the
 # largest ratio of a slow part of a signal to what follows at once: in the longest time constant, as much again follows
 # within the recordings; beyond that it is a lag
 MOST_CREEP = 1 / (1 - np.exp(-1 / LONGEST_TIME))
-MOST_DAMPED_MODE = 0.2  # damping ratio from which a mode counts as doubtful; a judgement, lightly damped modes have a peak
+MOST_DAMPED_MODE = 0.2  # damping ratio from which a mode is doubtful: a judgement, not from a source
 
 
 @dataclass(frozen=True)
