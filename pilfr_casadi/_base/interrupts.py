@@ -31,21 +31,24 @@ def deferred_interrupt(again: bool = True) -> Iterator[list[bool]]:
 
 @contextlib.contextmanager
 def unwrapped_interrupt() -> Iterator[None]:
-    """Raise KeyboardInterrupt if an extension module turns Ctrl-C into a SystemError.
+    """Raise KeyboardInterrupt if an extension module turns Ctrl-C into another error.
 
     A C function that continues with a pending exception ends in `SystemError: ... returned a result with an exception
-    set`, whose cause is the KeyboardInterrupt; casadi's `DM.__array__` is an example.
+    set`, whose cause is the KeyboardInterrupt; casadi's `DM.__array__` is an example. A buffer of casadi raises a
+    RuntimeError of that name for one in a callback.
     """
     try:
         yield
-    except SystemError as error:
+    except (SystemError, RuntimeError) as error:
         if not is_interrupt(error):
             raise
         raise KeyboardInterrupt from error
 
 
 def is_interrupt(error: BaseException | None) -> bool:
-    """Tell whether an exception is a KeyboardInterrupt, or a SystemError that one caused in an extension module."""
+    """Tell whether an exception is a KeyboardInterrupt, or an error that one caused in an extension module."""
+    if isinstance(error, RuntimeError):
+        return str(error) == KeyboardInterrupt.__name__
     while isinstance(error, SystemError):
         error = error.__cause__ or error.__context__
     return isinstance(error, KeyboardInterrupt)

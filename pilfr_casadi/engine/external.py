@@ -21,6 +21,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
+from .._base import abandoned
 from ..simulators import FmuInstance, PythonFunction, leaves, units
 
 ENTRY = "_ZN6casadi21_function_buffer_evalEPv"  # casadi::_function_buffer_eval(void*), as compilers of Unix name it
@@ -152,7 +153,10 @@ def _make_python_buffer(function: PythonFunction) -> tuple[_External, list[objec
     result = np.zeros(function.size)
 
     def evaluate(_: int | None) -> None:
-        result[:] = function.evaluate(arguments)
+        try:
+            result[:] = function.evaluate(arguments)
+        except KeyboardInterrupt:  # C cannot raise it; the engine does after the run
+            result[:], abandoned.pending = np.nan, True
 
     callback = ctypes.CFUNCTYPE(None, ctypes.c_void_p)(evaluate)
     address = ctypes.cast(callback, ctypes.c_void_p).value

@@ -24,7 +24,7 @@ from typing import Any, Protocol
 import casadi as ca
 import numpy as np
 
-from .._base import abandoned, one_at_a_time
+from .._base import abandoned, one_at_a_time, unwrapped_interrupt
 from ..models import Model
 from ..simulators import calls_external
 
@@ -219,7 +219,8 @@ class VirtualMachine:
                 for i, (before, after) in enumerate(zip(carried, following, strict=True)):
                     buffer.set_arg(2 + i, before.data)
                     buffer.set_res(len(out) + i, after.data)
-                evaluate()
+                with unwrapped_interrupt():
+                    evaluate()
                 abandoned.raise_pending()
                 carried, following = following, carried
                 at += length

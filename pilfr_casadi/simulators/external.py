@@ -146,14 +146,12 @@ class PythonFunction(ca.Callback):
         return [ca.DM(self.evaluate([a.full().ravel() for a in arguments]))]
 
     def evaluate(self, arguments: list[np.ndarray]) -> np.ndarray:
-        """Call the function; a failed point is a failed trial, not the end. Code that calls it cannot end at Ctrl-C."""
+        """Call the function; a failed point is a failed trial, not the end. In an abandoned run it is not called."""
         if abandoned.pending:
             return np.full(self.size, np.nan)
         self.calls += 1
         try:
             return self.function(*arguments)
-        except KeyboardInterrupt:
-            abandoned.pending = True
         except Exception as error:
             self.failure = self.failure or error
-        return np.full(self.size, np.nan)
+            return np.full(self.size, np.nan)

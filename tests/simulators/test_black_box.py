@@ -9,7 +9,7 @@ import pytest
 
 from pilfr_casadi import InputError, Parameter, Recording, fit
 from pilfr_casadi.engine import compiler, make_engine
-from pilfr_casadi.simulators import Numeric, discretise, from_function
+from pilfr_casadi.simulators import Numeric, PythonFunction, discretise, from_function
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 
@@ -153,3 +153,13 @@ def test_an_interrupt_ends_a_run_of_slow_calls_without_a_word(engine, capfd):
     assert called.calls - one < 200 and "Traceback" not in capfd.readouterr().err
     y = run.simulate(model.drive(given), model.parameters.start, np.zeros(2))[0]
     assert np.all(np.isfinite(y)) and np.any(y)
+
+
+def test_an_interrupt_outside_a_run_is_raised_and_leaves_no_numbers_wrong():
+    called = Interrupted()
+    leaf = PythonFunction(lambda z: np.array(called(0.0, z[:2], z[2:], {"k": 90.0, "d": 1.0})), (3,), 2)
+    z, called.left = np.ones(3), 2
+    first = leaf(z).full()
+    with pytest.raises((KeyboardInterrupt, RuntimeError)):
+        leaf(z)
+    assert np.array_equal(leaf(z).full(), first) and np.all(np.isfinite(first))
