@@ -155,23 +155,17 @@ def _factors(unit: str) -> list[tuple[str, float]] | None:
 
 def _parse(unit: str) -> tuple[float, tuple[int, ...]] | None:
     """Return a unit's size in SI and its exponents; None if it is empty or not known."""
-    size, total, in_denominator = 1.0, [0, 0, 0, 0, 0, 0], False
-    plain = unit.translate(_SUPERSCRIPTS)
-    if re.search(r"\([^)]*/", plain):  # a quotient in brackets
+    factors = _factors(unit)
+    if factors is None or not (factors or "1" in unit):
         return None
-    tokens = re.findall(r"[^\s*/·^()]+(?:\^\(?-?\d+\)?)?|/", plain)
-    for token in tokens:
-        if token == "/":
-            in_denominator = True
-            continue
-        symbol, _, power = token.partition("^")
+    size, total = 1.0, np.zeros(6, int)
+    for symbol, power in factors:
         found = _split_prefix(symbol)
-        if found is None:
+        if found is None or not power.is_integer():
             return None
-        exponent = int(power.strip("()") or 1) * (-1 if in_denominator else 1)
-        size *= found[1] ** exponent
-        total = [a + exponent * b for a, b in zip(total, _UNITS[found[0]][1], strict=True)]
-    return (size, tuple(total)) if tokens else None
+        size *= found[1] ** int(power)
+        total = total + int(power) * np.array(_UNITS[found[0]][1])
+    return size, tuple(total.tolist())
 
 
 def _split_prefix(symbol: str) -> tuple[str, float] | None:

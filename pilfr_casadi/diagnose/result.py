@@ -145,12 +145,16 @@ class Diagnosis:
 
     @property
     def summary(self) -> str:
-        """The verdict's sentence, with a warning if the search was cut short or the correction fails the test."""
+        """The verdict's sentence, with a warning if the search was cut short or the correction fails the test.
+
+        It also says if no test recording shows what the correction is worth.
+        """
         errors, said = self.errors.get("test"), self.sentence
         if self.effects and (self.interrupted or self.out_of_time):
             said += " The search was cut short, so that a further effect may not have been tried."
         if not errors:
-            return said
+            untested = " This correction is not tested yet: give a recording of another experiment as test."
+            return said + untested if self._changed else said
         given, before, after = (_percent(errors[k]) for k in ("nominal", "before", "after"))
         if self.outcome == "same":
             said += f" On the test recordings it makes no difference: {before} before, {after} after."
