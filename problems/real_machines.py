@@ -130,7 +130,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", choices=[*NAMES, []], help="machines; all by default")
     parser.add_argument("--print", action="store_true", help="print each diagnosis as well")
-    parser.add_argument("--time-limit", type=float, default=None, metavar="SECONDS", help="of each diagnosis")
+    parser.add_argument("--time-limit", type=float, default=600.0, metavar="SECONDS", help="of each diagnosis")
     parser.add_argument("--workers", type=int, default=None)
     parser.add_argument("--out", type=Path, help="a JSON line for each machine goes there as well")
     options = parser.parse_args(arguments)

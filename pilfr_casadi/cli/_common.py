@@ -56,10 +56,10 @@ def whole(text: str, least: int, most: int, default: int | None = None, metavar:
     return _parsing_option(int, lambda value: least <= value <= most, wanted, default, metavar, text)
 
 
-def seconds(text: str) -> Any:
+def seconds(text: str, default: float | None = None) -> Any:
     """Make an option that takes a time above zero."""
     wanted = "a number of seconds above zero"
-    return _parsing_option(float, lambda value: 0 < value < math.inf, wanted, None, "SECONDS", text)
+    return _parsing_option(float, lambda value: 0 < value < math.inf, wanted, default, "SECONDS", text)
 
 
 def _parsing_option(

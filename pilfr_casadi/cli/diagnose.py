@@ -57,8 +57,8 @@ class DiagnoseOptions(SimulatorOptions):
     workers: int | None = whole(
         "Number of parallel fits (default: one per processor, at most four).", 1, LARGEST_SIZE["workers"]
     )
-    time_limit: float | None = seconds(
-        "End the search after about this time, with the best answer so far (default: no limit)."
+    time_limit: float = seconds(
+        "End the search after about this time, with the best answer so far (default: 600).", 600.0
     )
     focus: Literal["simulation", "prediction"] | None = option(
         "Errors of a free run, or of predictions one sample ahead (default: a free run, if the simulator can)."

@@ -85,7 +85,7 @@ def diagnose(
     workers: int | None = None,
     engine: str = "auto",
     stand_in_error: float = 0.0,
-    time_limit: float | None = None,
+    time_limit: float | None = 600.0,
     focus: str | None = None,
     search_samples: int | None = None,
     progress: Progress | bool | None = None,
@@ -116,7 +116,8 @@ def diagnose(
     stand_in_error : float
         NRMSE between a surrogate and the simulation that it stands for; it counts as noise.
     time_limit : float, optional
-        Seconds after which the search ends; the answer then rests on what was fitted until then.
+        Seconds after which the search ends, by default ten minutes; the answer then rests on what was fitted until
+        then, and says so. None sets no limit.
     focus : {"simulation", "prediction"}, optional
         Errors to minimise: of a free run, or of predictions one sample ahead by an observer, as for an unstable machine
         in closed loop. By default a free run, and predictions if the simulator is unstable and runs away.

@@ -36,7 +36,10 @@ MOST_PRINTED = 8  # parameters and blind spots that are printed at most
 GRAVEST_SPOTS = 2  # blind spots that are printed right after the verdict
 NEAR_CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
-OUT_OF_TIME = "The time limit ended the search: the answer rests on the fits made until then."
+OUT_OF_TIME = (
+    "The time limit ended the search: the answer rests on the fits made until then. A longer one (time_limit, "
+    "--time-limit) may find more."
+)
 
 
 @dataclass(frozen=True, eq=False)
