@@ -259,7 +259,10 @@ class FirstOrder:
         """Subtract what parameters and initial states can follow, of all rows, or of the known ones (R,) alone."""
         if known is None or np.all(known):
             return project_off(columns, self.base)
-        return project_off(columns[known], np.linalg.qr(self.base[known])[0])
+        columns, base, unknown = columns[known], self.base[known], self.base[~known]
+        products = np.eye(base.shape[1]) - unknown.T @ unknown  # of the base with itself; mostly few rows are unknown
+        inverse = np.linalg.pinv(products, rcond=1e-10, hermitian=True)
+        return np.asarray(columns - base @ (inverse @ (base.T @ columns)))
 
     def response(self, ports: Sequence[str], forces: Sequence[np.ndarray]) -> np.ndarray:
         """Compute the stacked outputs' changes (R, n) by forces at ports, (M, n_k) a recording; see `propagate`."""

@@ -80,7 +80,8 @@ from .timing import TimeShift
 from .verdict import Posterior, Verdict, judge, names, posterior
 from .workbench import RunsAway, converge
 
-SEARCH_SHARE = 0.7  # share of the remaining time for preparation and search; the rest is for the correction
+# shares of the remaining time for the preparation, and for preparation and search; the rest is for the correction
+PREPARATION_SHARE, SEARCH_SHARE = 0.35, 0.7
 
 
 @one_blas_thread
@@ -257,7 +258,7 @@ def _again(search: Search, prepare_and_search: Callable[[], tuple[Prepared, Sear
 def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]:
     """Check and correct the recordings, refit the simulator, measure the noise, and search from there."""
     began = time.perf_counter()
-    until = began + SEARCH_SHARE * (request.deadline - began)
+    left = request.deadline - began
     ready = prepare(
         request.simulator,
         request.recordings,
@@ -266,7 +267,7 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         request.workers,
         early=shift_early,
         say=request.say,
-        until=until,
+        until=began + PREPARATION_SHARE * left,
     )
     if request.focus is None:  # an unstable simulator may stay within bounds and still not follow
         ready.bench.check_followed(ready.without, USELESS_FIT)
@@ -282,9 +283,8 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         hold_said=request.hold_said,
         aligned=request.aligned,
         stand_in_error=request.stand_in_error,
-        until=until,
+        until=began + SEARCH_SHARE * left,
         times={CHECKS: time.perf_counter() - began},
-        out_of_time=time.perf_counter() > until,  # then checks were left out
     )
     return ready, search.run(request.most_effects)
 

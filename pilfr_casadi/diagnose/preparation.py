@@ -39,6 +39,10 @@ from .workbench import THOROUGH, Fitted, Workbench, refine_steps
 CHECKED_ABOVE = 4e-4  # mean square error up to which signs and units are not checked
 CHECKS, CHECKED = "checks and refit", 6  # the stage's name, and the number of its parts that are reported
 LEAST_REFIT = 10.0  # seconds for the first refit in any case
+UNCHECKED = (
+    "There was no time left for some checks of the recordings: a shift, a gap or an offset of a channel may have been "
+    "missed."
+)
 OBSERVER_GAINS = (1.0, 0.3, 0.1, 0.03, 0.01)  # gains of the observer, in turn
 
 
@@ -76,7 +80,7 @@ def prepare(
     """Correct faults of the recordings, refit from the user's values, and measure the noise.
 
     Without `early`, an early channel counts as a fault only where nothing else is wrong. No check begins after `until`
-    (a time of `time.perf_counter`), and the fits of checks end then.
+    (a time of `time.perf_counter`), and the fits of checks end then; a note tells if checks were left out.
     """
     say = say or Stages(lambda *_: None)
     say(CHECKS, 0, CHECKED)
@@ -94,14 +98,15 @@ def prepare(
     now = checks.run(bench, 1.0 if said else 0.5)
     if not said and any(g.fault for g in now.gates[len(gates) :]):  # on faulty data the better hold says nothing
         now, held = _with_better_hold(checks, now, bench, held)
-    bench, without = now.bench, now.fitted
+    bench, without, late = now.bench, now.fitted, time.perf_counter() > until
     if now.gates or held:  # values and states from faulty data may be in a wrong minimum
         led = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
         without = min(led, bench.fit(bench.simulator, [{}, led.values], solver=THOROUGH), key=lambda f: f.cost)
     bench.check_followed(without)
     bench = replace(bench, typical=sample_run(bench, without))
     say(CHECKS, CHECKED, CHECKED, without.cost**0.5)
-    return Prepared(bench, without, nominal, (*now.gates, *held), Checked(bench, without).floor)
+    unchecked = [Gate("recordings", "unchecked", None, UNCHECKED, corrected=False)] if late else []
+    return Prepared(bench, without, nominal, (*now.gates, *held, *unchecked), Checked(bench, without).floor)
 
 
 @dataclass(frozen=True)
