@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
@@ -26,7 +27,7 @@ from ..optimise import GaussNewton
 from ..simulators import Simulator
 from .floor import FEWEST, Floor, effective_size, noise_floor
 from .linearise import Probe, Run, linearise_runs
-from .screen import followed, moved, project_off
+from .screen import block_diagonal, in_deviations, moved, orthonormal, project_off
 from .workbench import QUICK, Fitted, Workbench
 
 Change = Callable[[Recording], Recording]
@@ -231,29 +232,41 @@ def _satisfies_rule(now: Checked, after: Checked, fault: Gate) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class FirstOrder:
-    """The refitted simulator linearised along its runs, to screen edits to first order.
-
-    Attributes
-    ----------
-    base : array, shape (R, n)
-        Orthonormal directions of the stacked outputs that parameters and initial states can follow.
-    error : array, shape (R,)
-        The stacked error in units of the outputs' deviation.
-    """
+    """A fitted simulator linearised along its runs, to screen edits to first order."""
 
     bench: Workbench
-    probe: Probe
-    runs: list[Run]
-    base: np.ndarray
-    error: np.ndarray
+    fitted: Fitted
 
-    @classmethod
-    def of(cls, bench: Workbench, fitted: Fitted) -> FirstOrder:
-        """Linearise a fit."""
-        probe, runs = linearise_runs(bench, fitted)
-        skips = [r.skip for r in bench.recordings]
-        error = [(one.error / bench.scale)[skip:].ravel() for one, skip in zip(runs, skips, strict=True)]
-        return cls(bench, probe, runs, followed(bench, runs, skips), np.concatenate(error))
+    @cached_property
+    def error(self) -> np.ndarray:
+        """The stacked error in units of the outputs' deviation, (R,)."""
+        f, bench = self.fitted, self.bench
+        found = bench.result(f.simulator, f.values, f.initial, f.engine, f.model)
+        return np.asarray((np.concatenate(bench.scored(found.residual)) / bench.scale).ravel())
+
+    @cached_property
+    def base(self) -> np.ndarray:
+        """Orthonormal directions of the stacked outputs that parameters and initial states can follow, (R, n)."""
+        f, n = self.fitted, self.fitted.model.n_state
+        free = f.model.parameters.free
+        n_free = int(free.sum())
+        seed = np.hstack([np.zeros((n, n_free)), np.eye(n)])
+        columns, blocks = np.where(free, np.cumsum(free) - 1, -1), list[np.ndarray]()
+        for r, state in zip(self.bench.recordings, f.initial, strict=True):
+            with np.errstate(over="ignore", invalid="ignore"):
+                changes = f.engine.sensitivity(f.model.drive(r), f.vector, state, seed, columns)[1]
+            blocks.append(in_deviations(self.bench, changes[r.skip :]))
+        return orthonormal(block_diagonal(blocks, n_free))
+
+    @cached_property
+    def linearised(self) -> tuple[Probe, list[Run]]:
+        """The open ports and the linearised runs, which responses to forces need."""
+        return linearise_runs(self.bench, self.fitted)
+
+    @property
+    def runs(self) -> list[Run]:
+        """The linearised runs."""
+        return self.linearised[1]
 
     def left(self, columns: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
         """Subtract what parameters and initial states can follow, of all rows, or of the known ones (R,) alone."""
@@ -268,7 +281,7 @@ class FirstOrder:
         """Compute the stacked outputs' changes (R, n) by forces at ports, (M, n_k) a recording; see `propagate`."""
         out = []
         for run, r, force in zip(self.runs, self.bench.recordings, forces, strict=True):
-            at = [(self.probe.ports.index(name), force) for name in ports]
+            at = [(self.linearised[0].ports.index(name), force) for name in ports]
             out.append(moved(self.bench, run, at, r.skip)[:, -len(ports) * force.shape[1] :])
         return np.concatenate(out)
 

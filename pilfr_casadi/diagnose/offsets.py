@@ -32,7 +32,7 @@ from .gates import (
     refit,
     settle,
 )
-from .screen import lengths
+from .screen import block_diagonal, lengths
 from .workbench import FEW, THOROUGH, Fitted, Workbench
 
 KEPT_OFFSET = 0.1  # share of its first value that an offset must keep beside effects to be reported
@@ -173,7 +173,7 @@ class VaryingOffset(Gate):
 
     def relocate(self, now: Checked, after: Checked) -> VaryingOffset:
         """Return the constants that follow best to first order at the corrected refit."""
-        first = FirstOrder.of(after.bench, after.fitted)
+        first = FirstOrder(after.bench, after.fitted)
         return self.at(np.add(self.value, _constants_of_each(first, self.port)[1]))
 
     def at(self, values: np.ndarray) -> VaryingOffset:
@@ -186,10 +186,11 @@ class VaryingOffset(Gate):
 
 def _constants_of_each(first: FirstOrder, port: str) -> tuple[float, np.ndarray]:
     """Compute the share of the mean square that a constant of each recording's own removes, and the constants."""
-    n = len(first.runs)
-    forces = [np.tile(one, (len(r), 1)) for one, r in zip(np.eye(n), first.bench.recordings, strict=True)]
-    rest, seen = _visible(first, first.response([port], forces))
-    found = np.zeros(n)
+    recordings = first.bench.recordings
+    ends = np.cumsum([r.y[r.skip :].size for r in recordings])
+    response = first.response([port], [np.ones((len(r), 1)) for r in recordings])
+    rest, seen = _visible(first, block_diagonal(np.split(response, ends[:-1]), 0))
+    found = np.zeros(len(recordings))
     found[seen] = np.linalg.lstsq(rest[:, seen], first.error, rcond=1e-8)[0]
     left = first.left(first.error)
     share = 1 - np.sum((left - rest @ found) ** 2) / max(left @ left, 1e-300)
@@ -209,7 +210,7 @@ def find_varying_offset(now: Checked) -> Checked:
     """
     if len(now.bench.recordings) < 2:
         return now
-    first = FirstOrder.of(now.bench, now.fitted)
+    first = FirstOrder(now.bench, now.fitted)
     found = {port: _constants_of_each(first, port) for port in _channels(now.bench.simulator)}
     likely = sorted(found, key=lambda port: -found[port][0])[:FEW]
     faults = (VaryingOffset(split_port(p)[1], "offset", (), port=p).at(found[p][1]) for p in likely)
@@ -229,7 +230,7 @@ def _channels(simulator: Simulator) -> list[str]:
 
 def share_of_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[str, float]:
     """Compute the share of the mean square that a constant at each port removes, to first order."""
-    first = FirstOrder.of(bench, fitted)
+    first = FirstOrder(bench, fitted)
     rest, seen = _visible(first, first.response(ports, [np.ones((len(r), 1)) for r in bench.recordings]))
     along = np.where(seen, rest.T @ first.error / np.maximum(lengths(rest), 1e-150), 0.0)
     return dict(zip(ports, (along**2 / max(first.error @ first.error, 1e-300)).tolist(), strict=True))

@@ -165,9 +165,13 @@ def moved(bench: Workbench, r: Run, forces: Sequence[tuple[int, np.ndarray]] = (
     The first `skip` samples are left out; see `propagate` for the forces.
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        y = propagate(r, forces)[skip:]
-        y /= bench.scale[:, None]
-    y = y.reshape(-1, y.shape[2])
+        return in_deviations(bench, propagate(r, forces)[skip:])
+
+
+def in_deviations(bench: Workbench, changes: np.ndarray) -> np.ndarray:
+    """Stack changes of the outputs (M, n_y, n) in units of their deviation, (R, n); diverging ones become zero."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        y = (changes / bench.scale[:, None]).reshape(-1, changes.shape[2])
     y[:, ~((y.max(axis=0) < HUGE) & (y.min(axis=0) > -HUGE))] = 0.0  # a diverging response carries no information
     return y
 

@@ -113,12 +113,13 @@ class Search(Hypotheses):
         """Add effects while that pays; return False as soon as the other hold, or a channel's shift, proves better.
 
         A parameter that varies can imitate many laws. So hypotheses with one are a basis for more only if `varied`.
+        The first law is fitted even if the preparation took all the time.
         """
         while (
             self.can_improve(self.best)
             and len((parent := self._parent(varied)).effects) < effects
             and self._pays(parent)
-            and self.in_time()
+            and (self.in_time() or not self.steps)
         ):
             self.add(parent)
             if not parent.laws and self.in_time() and self._escape_local_minimum():

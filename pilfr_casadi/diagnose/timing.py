@@ -129,7 +129,7 @@ class TimeShift(Gate):
     def relocate(self, now: Checked, after: Checked) -> Self:
         """Return the fault at the value with the smallest remainder nearby."""
         width = now.bench.dt if self.finding == "alignment" else abs(self.value)
-        first = FirstOrder.of(replace(now.bench, scale=after.bench.scale), after.fitted)
+        first = FirstOrder(replace(now.bench, scale=after.bench.scale), after.fitted)
         value = _minimise(self.remainder(first, after.fitted), self.value - width, self.value + width)[0]
         return self if abs(value - self.value) < 2e-3 * width else self.at(value, now.bench.dt)
 
@@ -250,7 +250,7 @@ def _screen_shifts(bench: Workbench, plain: Fitted, also_given: bool = True) -> 
     found = list[tuple[float, TimeShift]]()
     given = [run_as_given(bench, plain)] if also_given else []
     for reference in (plain, *(one for one in given if one.cost < RUNAWAY**2)):
-        first = FirstOrder.of(bench, reference)
+        first = FirstOrder(bench, reference)
         for kind, columns, name in channels:
             for finding, values in (("alignment", bench.dt * SHIFTS), ("clock", RATES)):
                 fault = TimeShift(name, finding, 0.0, kind=kind, columns=columns)

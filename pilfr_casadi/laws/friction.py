@@ -186,7 +186,6 @@ class ViscousDamping(Law):
     sentences: ClassVar[Mapping[str, str]] = {
         "thermal": "a heat capacity: a heat flow in proportion to the rate of the temperature"
     }
-    absent: ClassVar[tuple[str, ...]] = ()
     units = {"c_1": "w*s/z"}
     dissipative = True
 
