@@ -117,12 +117,18 @@ def find_offsets(now: Checked) -> Checked:
     begin, ports = now, _channels(now.bench.simulator)
     while ports:
         share = share_of_constants(now.bench, now.fitted, ports)
-        port = max(share, key=lambda name: share[name])
-        if share[port] < EXCEPTION_SHARE:
+        largest = max(share.values())
+        if largest < EXCEPTION_SHARE:
             break
-        after = correct(now, describe_constant(port), [now.fitted.values], now.fitted.initial, THOROUGH)
-        if after is None:
+        alike = [name for name in ports if np.isclose(share[name], largest)]  # as at an input and an output behind it
+        tried = [
+            (name, correct(now, describe_constant(name), [now.fitted.values], now.fitted.initial, THOROUGH))
+            for name in alike
+        ]
+        settled = [(name, found) for name, found in tried if found is not None]
+        if not settled:
             break
+        port, after = min(settled, key=lambda pair: pair[1].cost)
         name = f"{after.bench.simulator.elements[-1].prefix}w_0"
         before, now = now, accept(now, after, describe_constant(port, float(after.fitted.values[name]), name))
         if now.bench is before.bench:

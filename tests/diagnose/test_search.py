@@ -71,7 +71,7 @@ def test_an_interrupt_leaves_what_there_is(monkeypatch):
 
 def test_at_the_time_limit_the_search_answers_from_what_it_has():
     found = searching(rubbing(), until=0.0).run(2)
-    assert found.out_of_time and list(found.memo) == [frozenset()]
+    assert found.out_of_time and len(found.steps) == 1  # the first law is fitted in any case
     (r,) = rubbing()
     diagnosis = pilfr.diagnose(rig(OFF), r.slice(0, 800), laws=TRIED, time_limit=1e-3)
     assert diagnosis.evidence["search"].bench.deadline == np.inf  # what is fitted later, as by `refine`, has time
