@@ -8,7 +8,7 @@ from test_slips import DT, recorded, tanks
 from pilfr_casadi import Parameter, Recording, Simulator, multisine
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.gates import Checked
-from pilfr_casadi.diagnose.offsets import find_offsets, list_offsets, update_offsets
+from pilfr_casadi.diagnose.offsets import find_offsets, list_offsets, share_of_constants, update_offsets
 from pilfr_casadi.diagnose.preparation import prepare, refitted
 from pilfr_casadi.diagnose.proof import mean_nrmse
 from pilfr_casadi.laws import AsymmetricSaturation
@@ -60,6 +60,26 @@ def test_a_constant_of_a_sensor_is_found_and_kept():
     (told,) = update_offsets([gate], fitted, {gate.parameter: np.array(0.03)}, False, False)
     assert "may be a part of that" in told.sentence
     assert not update_offsets([gate], fitted, {gate.parameter: np.array(0.3)}, False, False)  # it may be none
+
+
+@pytest.mark.parametrize("initial", ["zero", "estimate"])
+def test_constants_that_look_alike_to_first_order_are_told_apart_by_their_refits(initial):
+    """A constant input acts like a constant of the sensor behind it, but not at the known start."""
+    r = of_tanks(recorded()[1] + [0, 0.3]).with_(initial=initial)
+    bench = Workbench.of(tanks(1.15), [r], "zero")
+    ready = refitted(bench)
+    share = share_of_constants(bench, ready, ["actuator:q2", "sensor:lower"])
+    assert share["actuator:q2"] == pytest.approx(share["sensor:lower"])
+    channels = [g.channel for g in find_offsets(Checked(bench, ready)).gates]
+    assert channels == ["lower"] if initial == "zero" else len(channels) == 1
+
+
+def test_checks_that_the_time_limit_left_out_are_told():
+    r = of_tanks(recorded()[1] + [0, 0.3])
+    found = prepare(tanks(1.15), [r], "zero", "auto", until=0.0)
+    assert [g.finding for g in found.gates] == ["unchecked"] and not found.gates[0].fault
+    assert found.without.cost < 1  # the first refit is made in any case
+    assert "unchecked" not in [g.finding for g in prepare(tanks(1.15), [r], "zero", "auto").gates]
 
 
 @pytest.mark.parametrize(("side", "channel"), [("u", "force"), ("y", "x2")])

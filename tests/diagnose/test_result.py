@@ -144,6 +144,16 @@ def test_an_effect_that_the_test_recordings_do_not_need_is_told():
     assert told in both.summary and "rests on the training" not in d.summary
 
 
+def test_a_correction_that_no_test_recording_tried_says_so():
+    d = with_test_errors(0.5, 0.1, 0.9)
+    untested = replace(d, errors={**d.errors, "test": None})
+    assert untested.summary == f"{d.sentence} This correction is not tested yet: give a recording of another " + (
+        "experiment as test."
+    )
+    assert "not tested" not in d.summary
+    assert "not tested" not in replace(untested, effects=(), correction=None).summary
+
+
 def test_a_search_that_was_cut_short_says_so_first():
     d = with_test_errors(0.5, 0.1, 0.9)
     for how in ("interrupted", "out_of_time"):
