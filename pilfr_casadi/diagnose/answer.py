@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,7 +23,7 @@ from .evidence import SURE, deviations
 from .gates import Gate
 from .identifiability import port_units
 from .mismatch_map import mismatch
-from .offsets import Offset, remove_zero_offsets, update_offsets
+from .offsets import Offset, remove_idle_offsets, update_offsets
 from .preparation import Prepared
 from .proof import (
     free_run_errors,
@@ -81,6 +81,8 @@ class FinalFits:
         NRMSE at the user's values.
     drawn : tuple of Fitted
         Both along the recordings of the search's bench.
+    to_all : callable
+        Fits a simulator of the search to the recordings of `bench`.
     """
 
     bench: Workbench
@@ -88,6 +90,7 @@ class FinalFits:
     after: Fitted
     nominal: float
     drawn: tuple[Fitted, Fitted]
+    to_all: Callable[[Fitted], Fitted] = lambda fitted: fitted
 
 
 def build_diagnosis(
@@ -137,7 +140,9 @@ def build_diagnosis(
             "source": floor.source,
             "white": search.least_floor.nrmse(bench.scale),
         },
-        corrected=replace(remove_zero_offsets(after.corrected()), substeps=after.model.substeps),
+        corrected=replace(
+            remove_idle_offsets(after.corrected(), len(request.simulator.elements)), substeps=after.model.substeps
+        ),
         refitted=replace(without.corrected(), substeps=without.model.substeps),
         hold=bench.hold,
         train=bench.recordings,
@@ -169,7 +174,7 @@ def _compute_errors(
         "test": None,
     }
     if tests:
-        each = _without_each_effect(search, found)
+        each = {e: final.to_all(f) for e, f in _without_each_effect(search, found).items()}
         fits = {"before": without, "after": after, **{f"without {i}": f for i, f in enumerate(each.values())}}
         compared = test_errors(bench, tests, found.gates, fits, bench.on(tests).model(request.simulator))
         on_tests, resting = compared.errors, compared.find_resting()
@@ -315,7 +320,9 @@ def _design_experiment(
     for effect in effects:
         if effect.alike:
             name, other = next(iter(effect.alike.items()))
-            one = max((t for t in search.memo.values() if effect.name in names(t)), key=search.evidence)
+            stated = [t for t in search.memo.values() if names(t) == {e.name for e in effects}]
+            having = stated or [t for t in search.memo.values() if effect.name in names(t)]
+            one = max(having, key=search.evidence)
             rivals = in_words([name_at(*pair, brief=True) for pair in (effect.name, name)])
             best = next_experiment(search.bench, one.fitted, other.fitted, search.floor.deviation, limits, rivals)
             tied = [list(effect.name), list(name)]

@@ -131,11 +131,11 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     best_laws = answer.best
     if named and (search.interrupted or _is_settled(search, answer)):
         return named_correction(search, best_laws.fitted), best_laws.fitted
-    refitted = _predict(search, [_make_candidate(search, search.root)], [])
+    refitted = [] if search.past_deadline else _predict(search, [_make_candidate(search, search.root)], [])
     tried = _named_hypotheses(search, answer) if named else _hypotheses_with_laws(search)
     candidates = [_make_candidate(search, t) for t in tried]
-    predicted = _predict(search, candidates, refitted)
-    if len(predicted) == 1 and search.past_deadline:  # without a comparison the named laws stay, or what is far better
+    predicted = _predict(search, candidates, refitted) if refitted else []
+    if len(predicted) < 2 and search.past_deadline:  # without a comparison the named laws stay, or what is far better
         stays = tried[0] if named else _far_better(search, candidates)
         return replace(named_correction(search, stays.fitted), late=not named), stays.fitted
     chosen = _choose(predicted)[0].base

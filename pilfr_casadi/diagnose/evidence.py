@@ -289,7 +289,7 @@ def _covariance_root(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.n
     known = values > LEAST_KNOWN * values[-1:]
     root = vectors[:, known] / np.sqrt(values[known])
     root[np.sum(vectors[:, ~known] ** 2, axis=1) > UNKNOWN_SHARE] = np.nan
-    own, n = kept < problem.n_free, max(effective_size(fitted.residual), 10.0)
+    own, n = kept < problem.n_free, max(effective_size(bench.scored(fitted.residual)), 10.0)
     return np.flatnonzero(problem.free)[kept[own]], root[own] * np.sqrt(fitted.cost / n) / size[own][:, None]
 
 

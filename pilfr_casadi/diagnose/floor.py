@@ -63,6 +63,10 @@ class Floor:
         """Return the floor with another independent error added, such as a surrogate's."""
         return replace(self, deviation=np.hypot(self.deviation, deviation))
 
+    def mean_square(self, scale: np.ndarray) -> float:
+        """Compute the mean square noise, each output in units of its deviation."""
+        return float(np.mean((self.deviation / scale) ** 2))
+
     def nrmse(self, scale: np.ndarray) -> float:
         """Compute the noise over the outputs' deviation, averaged over outputs."""
         return float(np.mean(self.deviation / scale))

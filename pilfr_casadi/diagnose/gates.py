@@ -28,7 +28,7 @@ from ..simulators import Simulator
 from .floor import FEWEST, Floor, effective_size, noise_floor
 from .linearise import Probe, Run, linearise_runs
 from .screen import block_diagonal, in_deviations, moved, orthonormal, project_off
-from .workbench import QUICK, Fitted, Workbench
+from .workbench import QUICK, Fitted, Workbench, output_deviation
 
 Change = Callable[[Recording], Recording]
 
@@ -86,17 +86,20 @@ class Gate:
         keys = ("channel", "finding", "value", "sentence", "corrected")
         return {k: getattr(self, k) for k in keys}
 
+    def edit(self, r: Recording) -> Recording:
+        """Return a recording corrected, or as it is if the correction does not change recordings."""
+        return self.change(r) if self.change is not None else r
+
     def apply(self, bench: Workbench) -> Workbench:
         """Return the bench with changed recordings; errors are in units of the outputs' new deviation."""
-        recordings = tuple(self.change(r) if self.change else r for r in bench.recordings)
+        recordings = tuple(map(self.edit, bench.recordings))
         if recordings[0].dt != bench.dt:
             return bench.renewed(recordings)
-        scale = np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
-        return replace(bench, recordings=recordings, scale=scale)
+        return replace(bench, recordings=recordings, scale=output_deviation(recordings))
 
     def apply_to_whole(self, whole: list[Recording], places: Sequence[tuple[int, int]]) -> list[Recording]:
         """Return the recordings corrected of which stretches were checked, each from (recording, sample) on."""
-        return list(map(self.change, whole)) if self.change is not None and self.corrected else whole
+        return list(map(self.edit, whole)) if self.corrected else whole
 
     def begin(self, previous: Fitted) -> Sequence[np.ndarray]:
         """Return guesses of the initial states of the corrected recordings."""
@@ -124,14 +127,19 @@ class Checked:
         return self.fitted.cost
 
     @property
+    def residuals(self) -> list[np.ndarray]:
+        """The scored residual of each recording, (M, n_y)."""
+        return self.bench.scored(self.fitted.residual)
+
+    @property
     def floor(self) -> Floor:
         """The noise, measured or estimated from the refit."""
-        return noise_floor(self.bench.recordings, self.fitted.residual)
+        return noise_floor(self.bench.recordings, self.residuals)
 
     @property
     def noise2(self) -> float:
         """Mean square of the noise in units of the outputs' variance."""
-        return float(np.mean((self.floor.deviation / self.bench.scale) ** 2))
+        return self.floor.mean_square(self.bench.scale)
 
     def then(self, bench: Workbench, fitted: Fitted, *gates: Gate) -> Checked:
         """Return the next state: another bench and refit, with further findings added."""
@@ -141,9 +149,12 @@ class Checked:
 # the one rule
 
 
-def gain(before: float, after: float, residual: Sequence[np.ndarray], parameters: int = 1) -> float:
-    """Compute the gain in log evidence, nats, of a fit with more parameters, by BIC on its effective samples."""
-    n = max(effective_size(residual), FEWEST)
+def gain(before: float, after: float, residuals: Sequence[np.ndarray], parameters: int = 1) -> float:
+    """Compute the gain in log evidence, nats, of a fit with more parameters, by BIC on its effective samples.
+
+    `residuals` (M, n_y) are its scored samples in each recording.
+    """
+    n = max(effective_size(residuals), FEWEST)
     return float(0.5 * n * np.log(before / max(after, 1e-300)) - 0.5 * parameters * np.log(n))
 
 
@@ -226,7 +237,7 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
 
 
 def _satisfies_rule(now: Checked, after: Checked, fault: Gate) -> bool:
-    gained = gain(now.cost, after.cost, after.fitted.residual, fault.parameters)
+    gained = gain(now.cost, after.cost, after.residuals, fault.parameters)
     return gained > LEAST_GAIN and after.cost < min(fault.most_left * now.cost, USELESS_FIT)
 
 

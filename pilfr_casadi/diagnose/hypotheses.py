@@ -138,7 +138,7 @@ class Hypotheses:
     @property
     def floor2(self) -> float:
         """Mean square of the noise in units of the outputs' variance."""
-        return float(np.mean((self.floor.deviation / self.bench.scale) ** 2))
+        return self.floor.mean_square(self.bench.scale)
 
     @property
     def tolerance(self) -> float:
@@ -313,13 +313,13 @@ class Hypotheses:
         """Lower limit of the noise: the measured noise, or the white part of the best residual."""
         if self.floor.source != "estimated":
             return self.floor
-        white = np.hypot(white_part(self.best.fitted.residual), self.stand_in_error * self.bench.scale)
+        white = np.hypot(white_part(self.scored_residuals(self.best)), self.stand_in_error * self.bench.scale)
         return Floor(white, self.floor.source)
 
     @property
     def least_noise2(self) -> float:
         """Mean square of the least floor, in units of the outputs' variance."""
-        return float(np.mean((self.least_floor.deviation / self.bench.scale) ** 2))
+        return self.least_floor.mean_square(self.bench.scale)
 
     def can_improve(self, trial: Trial, noise2: float | None = None) -> bool:
         """Tell whether a further law would be worth its prior if it left only the noise."""
@@ -376,7 +376,7 @@ class Hypotheses:
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
         share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
         rest = np.minimum(np.sqrt(share) * self.rms(best), LOUDEST_NOISE * self.bench.scale)
-        known, white = self.stand_in_error * self.bench.scale, white_part(best.fitted.residual)
+        known, white = self.stand_in_error * self.bench.scale, white_part(self.scored_residuals(best))
         noise = np.minimum(np.hypot(np.maximum(white, rest), known), self.rms(nearest))
         self.floor = Floor(noise, "estimated")
 

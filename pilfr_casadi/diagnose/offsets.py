@@ -59,7 +59,7 @@ def find_wrong_start(now: Checked) -> Checked:
     words = "The initial states are not as stated"
     fault = WrongStart("initial state", "start", stated[0][0].begins, words, change=_with_unknown_start)
     after = correct(now, fault, [now.fitted.values, {}])
-    if after is None or gain(now.cost, after.cost, after.fitted.residual, unknown) < LEAST_GAIN:
+    if after is None or gain(now.cost, after.cost, after.residuals, unknown) < LEAST_GAIN:
         return now
     found = accept(now, after, fault)
     return found if found.cost * EQUAL_RATIO < find_offsets(now).cost else now
@@ -142,7 +142,7 @@ def find_offsets(now: Checked) -> Checked:
         return shared
     each = find_varying_offset(begin)
     more = len(begin.bench.recordings) - len(shared.gates) + len(begin.gates)
-    return each if gain(shared.cost, each.cost, each.fitted.residual, more) > LEAST_GAIN else shared
+    return each if gain(shared.cost, each.cost, each.residuals, more) > LEAST_GAIN else shared
 
 
 @dataclass(frozen=True)
@@ -259,14 +259,15 @@ def fix_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
         simulator = fitted.simulator.with_parameters({**fitted.simulator.parameters, name: zero})
         start = {k: v for k, v in fitted.values.items() if k != name}
         found = refit(bench, [start], simulator, states=fitted.initial, solver=THOROUGH)
-        if found is not None and gain(found.cost, fitted.cost, fitted.residual) <= LEAST_GAIN:
+        if found is not None and gain(found.cost, fitted.cost, bench.scored(fitted.residual)) <= LEAST_GAIN:
             fitted = found
     return fitted
 
 
-def remove_zero_offsets(simulator: Simulator) -> Simulator:
-    """Return a simulator without the offsets that are fixed at zero."""
-    for i, e in reversed(list(enumerate(simulator.elements))):
+def remove_idle_offsets(simulator: Simulator, own: int) -> Simulator:
+    """Return a simulator without the offsets that `fix_idle_offsets` has fixed; the first `own` elements are kept."""
+    for i in reversed(range(own, len(simulator.elements))):
+        e = simulator.elements[i]
         if isinstance(e.law, Offset) and np.all(simulator.parameters[f"{e.prefix}w_0"].fixed):
             simulator = simulator.without_element(i)
     return simulator
@@ -283,8 +284,8 @@ def update_offsets(
             out.append(gate)
             continue
         remaining = fitted[gate.parameter]
-        certain = abs(remaining.value) > CERTAIN_ERRORS * float(std[gate.parameter])
-        if not (certain and abs(remaining.value) > KEPT_OFFSET * abs(gate.value)):
+        uncertain = abs(remaining.value) <= CERTAIN_ERRORS * float(std[gate.parameter])  # an unknown error says nothing
+        if uncertain or not abs(remaining.value) > KEPT_OFFSET * abs(gate.value):
             continue
         sentence = remaining.sentence if effects else gate.sentence  # the value before the effects says little
         if not sure:

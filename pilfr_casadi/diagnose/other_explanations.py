@@ -88,7 +88,10 @@ def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameter
         name = min(gained, key=lambda n: gained[n].cost)
         freed, best = (*freed, name), gained[name]
         # any value equals a law that hardly explains anything
-        if best.cost <= enough and gain(without.cost, best.cost, best.residual, len(freed)) > LEAST_GAIN:
+        if (
+            best.cost <= enough
+            and gain(without.cost, best.cost, search.bench.scored(best.residual), len(freed)) > LEAST_GAIN
+        ):
             return PinnedParameters(freed, best, _describe_pinned(search, freed, best, named))
     return None
 
@@ -255,7 +258,7 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
     cost = float(np.average([f.cost for f in fits], weights=sizes))
     more_starts = sum(len(part.recordings) for part in benches) - len(bench.recordings)
     more = whole.model.parameters.free.sum() * (len(fits) - 1) + len(whole.initial[0]) * more_starts
-    residual = [e for f in fits for e in f.residual]
+    residual = [e for part, f in zip(benches, fits, strict=True) for e in part.scored(f.residual)]
     if cost > CURED_SHARE * whole.cost or gain(whole.cost, max(cost, search.floor2), residual, more) < LEAST_GAIN:
         return None
     values = _clearest_differences(whole, fits, benches)

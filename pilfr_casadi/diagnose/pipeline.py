@@ -233,7 +233,10 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
 
     Missing physics can look like a lead.
     """
-    recordings = tuple(shift.change(r) if shift.change else r for r in request.recordings)
+    edits = [g for g in ready.gates if g.corrected and g.change is not None]  # the shift is one of corrected channels
+    recordings = request.recordings
+    for gate in (*edits, shift):
+        recordings = tuple(map(gate.edit, recordings))
     moved = replace(request, recordings=recordings, aligned=True, say=request.say.under("shifted: "))
     search.shift, search.aligned = None, True
     found = _again(search, partial(_search_once, moved, shift_early=True))
@@ -245,7 +248,7 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
     if search.best.mean_square < AS_GIVEN_RATIO * again.best.mean_square:
         search.cut_short_with(again)
         return ready, search
-    return replace(other, nominal=ready.nominal, gates=(shift, *other.gates)), again
+    return replace(other, nominal=ready.nominal, gates=(*edits, shift, *other.gates)), again
 
 
 def _again(search: Search, prepare_and_search: Callable[[], tuple[Prepared, Search]]) -> tuple[Prepared, Search] | None:
@@ -442,4 +445,4 @@ def _final_fits(
         to_all = [everything.fit(search, one) for one in pair]
         drawn = [back_on_stretches(bench, f, one.initial) for f, one in zip(to_all, pair, strict=True)]
         nominal = errors_of(whole, whole.model(request.simulator), whole=True)
-    return FinalFits(whole, to_all[0], to_all[1], nominal, (drawn[0], drawn[1]))
+    return FinalFits(whole, to_all[0], to_all[1], nominal, (drawn[0], drawn[1]), partial(everything.fit, search))

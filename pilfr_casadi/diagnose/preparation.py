@@ -168,9 +168,10 @@ def _with_better_hold(
     except InputError:
         return now, held
     costs = [_comparable_cost(found) for found in both]
-    now = both[int(costs[1] < costs[0])]
     ratio = (max(costs) / max(min(costs), 1e-300)) ** 0.5
-    held = [hold_note(now.bench.simulator, now.bench.hold, ratio)] if ratio > EQUAL_RATIO else []
+    if ratio > EQUAL_RATIO:
+        now = both[int(costs[1] < costs[0])]
+        held = [hold_note(now.bench.simulator, now.bench.hold, ratio)]
     if any(s.delay > 0 and not in_steps(s.value, now.bench.dt) for s in _shifts(now)):  # a delay is physics
         now = checks.run(replace(bench, hold=now.bench.hold), 1.0)
     return now, held

@@ -228,7 +228,7 @@ def _noise2(bench: Workbench, residuals: Sequence[np.ndarray]) -> float:
     """Return the mean square noise in units of the outputs' variance: measured, else by third differences."""
     measured = measured_floor(bench.recordings)
     if measured is not None:
-        return float(np.mean((measured.deviation / bench.scale) ** 2))
+        return measured.mean_square(bench.scale)
     return float(np.mean(np.concatenate([third_differences(e) for e in residuals]) ** 2))
 
 
@@ -236,7 +236,7 @@ def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ..
     """Compute the log evidence with the laws minus the log evidence of the simulator as given."""
     tolerance = FORMULA_ERROR * max(plain.cost - noise2, 0.0)
     costs = plain.cost + tolerance, after.cost + tolerance
-    n = Sample(noise2 + tolerance, max(effective_size(after.residual), 1.0)).effective(min(costs))
+    n = Sample(noise2 + tolerance, max(effective_size(bench.scored(after.residual)), 1.0)).effective(min(costs))
     known = information(bench, after, laws)
     return log_evidence(costs[1], known, log_prior(laws, {}), n) - log_evidence(costs[0], np.zeros(0), 0.0, n)
 

@@ -27,7 +27,7 @@ from .learned import Learned
 from .offsets import Offset
 from .proof import starts_of
 from .refinement import Refinement, refine
-from .workbench import Fitted
+from .workbench import Fitted, output_deviation
 
 VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
@@ -256,7 +256,7 @@ class Diagnosis:
         infinite if the simulation diverges. Where an output rests, its deviation over the training recordings counts.
         """
         runs = [self.run(recording) for recording in as_recordings(recordings)]
-        scale = np.std(np.concatenate([r.y[r.skip :] for r in self.train]), axis=0)
+        scale = output_deviation(self.train)
         errors = [nrmse(r.y, y, k, scale) if np.all(np.isfinite(y)) else np.inf for r, y, k in runs]
         return float(np.mean(errors))
 
@@ -327,11 +327,11 @@ class Diagnosis:
         """
         simulator = simulator or self.corrected
         r, dt = match_channels(simulator, recording), self.train[0].dt
-        if abs(r.dt / dt - 1) > SAME_STEP:
-            raise InputError(f"The recording's step is {r.dt:g} s, the training's {dt:g} s; resample it.")
         if not any(recording is known for known in self.train):  # training recordings are corrected already
             for gate in self.gates:
-                r = gate.change(r) if gate.change is not None else r
+                r = gate.edit(r)
+        if abs(r.dt / dt - 1) > SAME_STEP:
+            raise InputError(f"The recording's step is {r.dt:g} s, the training's {dt:g} s; resample it.")
         fitted = self.evidence.get("after" if simulator is self.corrected else "without")
         substeps = fitted.model.substeps if fitted is not None else self.substeps
         model = discretise(simulator, dt, self.hold, substeps)

@@ -41,7 +41,7 @@ from .linearise import Probe, loudest_stretch, run
 from .screen import Remainder, Surface, Task, orthonormal
 from .search import Search
 from .trials import Trial
-from .workbench import DIVERGED, FEW, Fitted, Workbench
+from .workbench import DIVERGED, FEW, Fitted, Workbench, output_deviation
 
 SEARCHED_SAMPLES = 60_000  # samples of the training recordings up to which everything is searched: effort
 STRETCH_SHARE, MOST_STRETCHES = 2 / 3, 10  # share of these samples in all stretches together, and their largest number
@@ -107,8 +107,7 @@ class Stretches:
         recordings, places = list(self.recordings), [(s.recording, s.begin) for s in self.chosen]
         for gate in gates:
             recordings = gate.apply_to_whole(recordings, places)
-        scale = np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
-        return replace(bench.on(recordings), scale=scale)
+        return replace(bench.on(recordings), scale=output_deviation(recordings))
 
 
 def choose_stretches(

@@ -330,11 +330,11 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
             "Nothing is seen that the simulation lacks: refitted, what stands for it follows the recordings to "
             f"{off:.3g} of the outputs' deviation, and the simulation itself to {search.stand_in_error:.3g}.",
         )
-    faults = [g for g in gates if g.fault]
-    cured = min((g.left for g in faults), default=1.0) < FORMULA_ERROR
+    fault = min((g for g in gates if g.fault), key=lambda g: g.left, default=None)
+    cured = fault is not None and fault.left < FORMULA_ERROR
     # beside the fault, an effect is negligible
-    if cured and search.root.mean_square < FAR_RATIO**2 * found.best.mean_square:
-        return Verdict("recording-fault", faults[0].sentence)
+    if fault and cured and search.root.mean_square < FAR_RATIO**2 * found.best.mean_square:
+        return Verdict("recording-fault", fault.sentence)
     if found.effects and found.named > SURE:
         return Verdict("missing-physics", _describe_effects(search, found))
     shares = search.flexible(search.root)
@@ -351,8 +351,8 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
     measured = unnamed and search.floor.may_be(quiet * search.rms(search.root))
     noise = unnamed and (measured or _is_noise(search, quiet, explained, mode))
     noise = noise and (measured or share < LEAST_EXPLAINED)
-    if faults and (noise or cured):
-        return Verdict("recording-fault", faults[0].sentence)
+    if fault and (noise or cured):
+        return Verdict("recording-fault", fault.sentence)
     if noise:
         beside = f" but a steady tone in {' and '.join(g.channel for g in steady)}" if steady else ""
         rest = "no force at any port explains any of the rest"
@@ -397,8 +397,7 @@ def _times_white(search: Hypotheses) -> float:
     """Compute the ratio of the refit's error to the noise: measured, or the white noise in its residual."""
     if search.floor.source == "estimated":
         return max(times_white(e / search.bench.scale) for e in search.scored_residuals(search.root))
-    noise2 = np.mean((search.floor.deviation / search.bench.scale) ** 2)
-    return search.root.error / max(float(np.sqrt(noise2)), 1e-300)
+    return search.root.error / max(float(np.sqrt(search.floor2)), 1e-300)
 
 
 def _is_noise(search: Hypotheses, quiet: float, explained: bool, mode: float | None) -> bool:

@@ -158,9 +158,8 @@ class Workbench:
         if steps != {1.0}:
             given = ", ".join(f"{r.dt:g} s" for r in ordered)
             raise InputError(f"The recordings have different steps ({given}); resample them to one.")
-        scale = np.std(np.concatenate([r.y[r.skip :] for r in ordered]), axis=0)
         chosen = choose_substeps(simulator, ordered)
-        return cls(simulator, ordered, hold, chosen, scale, engine, chosen=chosen)
+        return cls(simulator, ordered, hold, chosen, output_deviation(ordered), engine, chosen=chosen)
 
     @property
     def dt(self) -> float:
@@ -177,7 +176,8 @@ class Workbench:
 
     def renewed(self, recordings: Sequence[Recording]) -> Workbench:
         """Return a bench for other recordings, with sub-steps and the unit of errors chosen for them."""
-        return replace(Workbench.of(self.simulator, recordings, self.hold, self.engine), deadline=self.deadline)
+        bench = Workbench.of(self.simulator, recordings, self.hold, self.engine)
+        return replace(bench, deadline=self.deadline, interrupted_fits=self.interrupted_fits)
 
     @one_at_a_time
     def model(self, simulator: Simulator, gain: np.ndarray | None = None) -> Model:
@@ -417,6 +417,11 @@ class Workbench:
         return Fitted(simulator, model, engine, values, initial, residual, cost)
 
 
+def output_deviation(recordings: Sequence[Recording]) -> np.ndarray:
+    """Compute the standard deviation of each output over the scored samples of all recordings, (n_y,)."""
+    return np.asarray(np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0))
+
+
 def start_vector(model: Model, start: Mapping[str, Any]) -> np.ndarray:
     """Return the parameter vector at start values by name, clipped to the bounds; unknown names are ignored."""
     p = model.parameters
@@ -425,7 +430,7 @@ def start_vector(model: Model, start: Mapping[str, Any]) -> np.ndarray:
 
 def refine_steps(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
     """Refine the steps until their error is less than the noise; return the bench and the fit there."""
-    noise2 = max(float(np.mean((white_part(fitted.residual) / bench.scale) ** 2)), LEAST_NOISE**2)
+    noise2 = max(float(np.mean((white_part(bench.scored(fitted.residual)) / bench.scale) ** 2)), LEAST_NOISE**2)
     most, steps = min(FINER_STEPS**2 * bench.chosen, MOST_SUBSTEPS), fitted.model.substeps
     while FINER_STEPS * steps <= most and not fitted.simulator.discrete:
         steps = FINER_STEPS * steps

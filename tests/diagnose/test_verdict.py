@@ -1,5 +1,7 @@
 """The verdict in words, and offsets beside it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from cart import cart
@@ -11,7 +13,8 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import Recording, multisine
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.correction import Correction
-from pilfr_casadi.diagnose.offsets import Offset, fix_idle_offsets
+from pilfr_casadi.diagnose.evidence import deviations
+from pilfr_casadi.diagnose.offsets import Offset, fix_idle_offsets, list_offsets, update_offsets
 from pilfr_casadi.laws import CoulombFriction, CubicDamping, Power as StaticPower, Relaxation
 
 
@@ -142,3 +145,65 @@ def test_a_refit_that_was_compared_with_nothing_is_not_said_to_predict_best():
     assert "nothing that was tried" in Correction((), shares, before=0.1, after=0.1).sentence
     untested = Correction((("guide", "coulomb_friction", "smooth"),), {**shares, "named": 0.8}, late=True).sentence
     assert "far better" in untested and "no time left to test" in untested
+
+
+def of_cart(seed, simulator=None, dt=0.05, **changes):
+    """A noisy recording of a cart."""
+    rng = np.random.default_rng(seed)
+    u = 10 * multisine(600, f_max=3.0, fs=20.0, rng=rng)
+    blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
+    y = (simulator or cart()).simulate(blank)
+    return blank.with_(y=y + 1e-3 * np.std(y) * rng.standard_normal(y.shape), dt=dt, **changes)
+
+
+def test_of_several_faults_the_one_that_was_the_mismatch_is_told():
+    r = of_cart(1)
+    y = -r.y
+    y[300] += 5.0
+    found = pilfr.diagnose(cart(), r.with_(y=y), laws=(CoulombFriction,), effects=1, workers=1)
+    assert found.verdict == "recording-fault" and "wrong sign" in found.sentence
+    assert {g.finding for g in found.gates if g.fault} >= {"sign", "glitch"}
+
+
+def test_recordings_of_a_logger_with_a_wrong_unit_of_time_are_corrected_before_their_step_is_checked():
+    slow, other = (of_cart(seed, dt=50.0) for seed in (1, 2))  # in ms
+    found = pilfr.diagnose(cart(), slow, test=other, laws=(CoulombFriction,), effects=1, workers=1)
+    assert found.verdict == "recording-fault" and [g.finding for g in found.gates] == ["time-unit"]
+    assert found.nrmse(other) == pytest.approx(found.errors["test"]["after"], rel=1e-9)
+    assert found.nrmse(other) < 0.002
+
+
+def test_a_known_offset_of_the_user_stays_in_the_corrected_simulator():
+    offset = cart().with_element("sensor:pos", Offset().at({"w_0": 2.0}))
+    name = f"{offset.elements[-1].prefix}w_0"
+    known = offset.with_parameters({**offset.parameters, name: replace(offset.parameters[name], fixed=True)})
+    train, test = of_cart(1, known), of_cart(2, known)
+    found = pilfr.diagnose(known, train, test=test, laws=(CoulombFriction,), effects=1, workers=1)
+    assert (
+        found.verdict == "complete"
+        and found.corrected.elements[-1].own(found.corrected.parameter_set.unpack(found.corrected.parameter_set.start))[
+            "w_0"
+        ]
+        == 2.0
+    )
+    assert found.nrmse(test) == pytest.approx(found.errors["test"]["after"], rel=1e-9)
+    assert found.nrmse(test) < 0.002 and "pos" in str(found)
+
+
+def test_samples_that_do_not_count_do_not_make_a_value_more_certain():
+    r = of_cart(1)
+    errors = []
+    for counted in (r.with_(skip=400), r.slice(400).with_(initial="estimate")):
+        bench = Workbench.of(cart(), [counted], "zero")
+        errors.append(deviations(bench, bench.fit(bench.simulator)))
+    for name in ("d", "k"):
+        assert errors[0][name] == pytest.approx(errors[1][name], rel=0.3)
+
+
+def test_an_offset_whose_error_is_unknown_stays_told():
+    offset = cart().with_element("sensor:pos", Offset().at({"w_0": 0.5}))
+    bench = Workbench.of(offset, [of_cart(1, offset)], "zero")
+    fitted = bench.fit(offset, [{}])
+    (gate,) = list_offsets(fitted.simulator.elements, fitted.values)
+    for error, told in ((np.nan, 1), (0.3, 0), (1e-3, 1)):
+        assert len(update_offsets([gate], fitted, {gate.parameter: np.array(error)}, True, True)) == told
