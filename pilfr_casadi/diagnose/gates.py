@@ -279,8 +279,8 @@ class FirstOrder:
         """The linearised runs."""
         return self.linearised[1]
 
-    def left(self, columns: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
-        """Subtract what parameters and initial states can follow, of all rows, or of the known ones (R,) alone."""
+    def project_off(self, columns: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
+        """Project off what parameters and initial states can follow, in all rows or in the known ones (R,) alone."""
         if known is None or np.all(known):
             return project_off(columns, self.base)
         columns, base, unknown = columns[known], self.base[known], self.base[~known]

@@ -190,7 +190,7 @@ def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
     if not simulator.kinematic:
         return None
     first = FirstOrder(bench, fitted)
-    error = first.left(first.error)
+    error = first.project_off(first.error)
     total = max(float(error @ error), 1e-300)
     moved = [i for i, name in enumerate(simulator.states) if name not in simulator.kinematic]
     best, best_size = Jump(", ".join([*simulator.inputs, *simulator.output_names]), "gap", None), np.zeros(0)
@@ -374,7 +374,7 @@ def find_output_gap(bench: Workbench, fitted: Fitted) -> OutputGap | None:
     """Find the gap of some outputs with the least error, to first order; None if a shift is about as good."""
     first, names = FirstOrder(bench, fitted), bench.simulator.output_names
     groups = [(i,) for i in range(len(names))] + ([tuple(range(len(names)))] if len(names) > 1 else [])
-    whole = float(np.mean(first.left(first.error) ** 2))
+    whole = float(np.mean(first.project_off(first.error) ** 2))
     best: OutputGap | None = None
     for i, r, rows in _long_recordings(bench, 2 * SHORTEST_PIECE + LARGEST_SHIFT):
         sums = _Sums.of(first, rows, r.y[r.skip :] / bench.scale)

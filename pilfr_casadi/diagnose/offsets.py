@@ -186,7 +186,10 @@ class VaryingOffset(Gate):
         """Return it with other constants."""
         value = [float(f"{v:.6g}") for v in values]
         listed_values = ", ".join(f"{v:.3g}" for v in value)
-        words = f"{self.channel} has an offset that differs between the recordings, {listed_values}, and may in others"
+        words = (
+            f"{self.channel} has an offset that differs between the recordings, {listed_values}, and may be another in "
+            "further ones"
+        )
         return replace(self, value=value, sentence=words)
 
 
@@ -198,14 +201,14 @@ def _constants_of_each(first: FirstOrder, port: str) -> tuple[float, np.ndarray]
     rest, seen = _visible(first, block_diagonal(np.split(response, ends[:-1]), 0))
     found = np.zeros(len(recordings))
     found[seen] = np.linalg.lstsq(rest[:, seen], first.error, rcond=1e-8)[0]
-    left = first.left(first.error)
+    left = first.project_off(first.error)
     share = 1 - np.sum((left - rest @ found) ** 2) / max(left @ left, 1e-300)
     return float(share), found if kind_of(port) == ACTUATOR else -found
 
 
 def _visible(first: FirstOrder, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the parts of responses that parameters and initial states cannot follow, and mark the visible ones."""
-    rest = first.left(columns)
+    rest = first.project_off(columns)
     return rest, lengths(rest) > VISIBLE_SHARE * lengths(columns)
 
 

@@ -278,8 +278,8 @@ def _explained_beyond(bench: Workbench, without: Fitted, fault: Clipping) -> flo
     signs = [(v, 1.0 if v == fault.high else -1.0) for v in fault.value]
     inputs = [r.u[:, fault.column] for r in bench.recordings]
     beyond = [np.column_stack([sign * _beyond_limit(u, v) for v, sign in signs]) for u in inputs]
-    left = first.left(first.error)
-    columns = first.left(first.response([port_name(ACTUATOR, fault.channel)], beyond))
+    left = first.project_off(first.error)
+    columns = first.project_off(first.response([port_name(ACTUATOR, fault.channel)], beyond))
     # a positive coefficient would put the input inside its limit
     if np.any(np.linalg.lstsq(columns, left, rcond=1e-8)[0] > 0):
         return 0.0

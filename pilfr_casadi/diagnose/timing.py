@@ -119,7 +119,7 @@ class TimeShift(Gate):
             known = np.concatenate([np.repeat(k[other.skip :], len(bench.scale)) for k, other in inside])
             if np.mean(known) < LEAST_RECORDED:
                 return np.inf
-            mean = float(np.mean(first.left(error, known) ** 2))
+            mean = float(np.mean(first.project_off(error, known) ** 2))
             return mean if np.isfinite(mean) else np.inf
 
         curves = list(map(self.curves, bench.recordings))

@@ -160,9 +160,10 @@ def share_left(
 ) -> float:
     """Compute the share that a mean square error is of a hypothesis' error above the noise.
 
-    The hypothesis is by default the refit, and the noise the floor. What nothing explains may have passed for noise
-    there; the white noise is the least. An error above the outputs' variance counts as that, which a constant leaves:
-    in a free run errors may accumulate without end, and to have removed them says little of a law.
+    The hypothesis is by default the refit, and the noise the floor. The estimated floor may contain physics that
+    nothing explains; the white noise is a lower limit of the noise. An error above the outputs' variance counts as
+    that, which a constant leaves: in a free run errors may accumulate without end, and to have removed them says little
+    of a law.
     """
     noise2 = search.floor2 if noise2 is None else noise2
     excess = max(min((before or search.root).mean_square, 1.0) - noise2, 1e-300)
