@@ -146,7 +146,7 @@ class DataOptions:
         """Return the column of each name in a file; of several columns for a name, choose the one that the file has."""
         given: dict[str, list[str]] = {}
         for text in self.column:
-            for name, column in pairs([text], "--column").items():
+            for name, column in pairs([text], "--column", "COLUMN").items():
                 given.setdefault(name, []).append(column)
         if all(len(columns) == 1 for columns in given.values()):
             return {name: columns[0] for name, columns in given.items()}
@@ -255,15 +255,16 @@ class SimulatorOptions(DataOptions):
         from ..simulators import CoSimulation, fmu_signals, from_fmu
 
         ports = {}
-        for name, text in pairs(self.port, "--port").items():
+        for name, text in pairs(self.port, "--port", "INTO:ACROSS").items():
             parts = text.split(":")
             if not 2 <= len(parts) <= 3 or not all(parts):
                 raise InputError(f"--port {name}={text} was given; write --port NAME=INTO:ACROSS or INTO:ACROSS:RATE.")
             ports[name] = dict(zip(("into", "across", "rate"), parts, strict=False))
         bounds = bounds_of(self.bound)
-        columns, recorded = self.columns(self.train[0]), set(column_names(self.train[0]))
-        kept = []
-        for role, names in zip(("input", "output"), fmu_signals(path), strict=True):
+        columns, signals = self.columns(self.train[0]), fmu_signals(path)
+        wanted = [columns.get(name, name) for names in signals for name in names]
+        recorded, kept = set(column_names(self.train[0], wanted)), []
+        for role, names in zip(("input", "output"), signals, strict=True):
             kept.append(tuple(name for name in names if columns.get(name, name) in recorded))
             forces = {port["into"] for port in ports.values()}
             missing = [name for name in names if name not in kept[-1] and name not in forces]
@@ -282,7 +283,7 @@ class SimulatorOptions(DataOptions):
 def bounds_of(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
     """Parse each `NAME=LOW:HIGH`; a missing end is infinite."""
     out = {}
-    for name, value in pairs(texts, "--bound").items():
+    for name, value in pairs(texts, "--bound", "LOW:HIGH").items():
         low, sign, high = value.partition(":")
         given = f"--bound {name}={value}"
         if not sign:
@@ -304,13 +305,13 @@ def name_list(text: str, option: str) -> tuple[str, ...]:
     return names
 
 
-def pairs(texts: Sequence[str], option: str) -> dict[str, str]:
+def pairs(texts: Sequence[str], option: str, value_name: str = "VALUE") -> dict[str, str]:
     """Parse each `NAME=VALUE`."""
     out: dict[str, str] = {}
     for text in texts:
         name, sign, value = text.partition("=")
         if not (name and sign and value):
-            raise InputError(f"{option} {text!r} was given; write {option} NAME=VALUE.")
+            raise InputError(f"{option} {text!r} was given; write {option} NAME={value_name}.")
         if name in out:
             raise InputError(f"{option} is given twice for {name}; leave one out.")
         out[name] = value

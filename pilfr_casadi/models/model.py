@@ -125,9 +125,9 @@ class Model:
             return np.zeros(self.n_state)
         given = np.asarray(recording.initial, dtype=float).ravel()
         if given.size not in (len(self.states), self.n_state):
-            raise InputError(
-                f"An initial state of {given.size} numbers was given; expected {len(self.states)} or {self.n_state}."
-            )
+            expected = " or ".join(map(str, dict.fromkeys((len(self.states), self.n_state))))
+            numbers = "1 number" if given.size == 1 else f"{given.size} numbers"
+            raise InputError(f"An initial state of {numbers} was given; expected {expected}.")
         return self.rest_at(given, recording.u[0], self.parameters.start)
 
     @cached_property

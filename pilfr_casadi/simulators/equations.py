@@ -247,7 +247,7 @@ class Equations:
         found = call(port.into, name, x=x, u=u, p=p, t=t) if callable(port.into) else port.into
         if not isinstance(found, Mapping) or not found:
             raise InputError(f"The {name} must be a dict {{state or output: factor}}; got {found!r}.")
-        known = (*self.states, *self.output_names)
+        known = tuple(dict.fromkeys((*self.states, *self.output_names)))
         for target in found:
             if target not in known:
                 raise InputError(f"Port {port.name!r} goes into {target!r}; there are {', '.join(known)}.")

@@ -135,9 +135,11 @@ class SteppedUnit:
             return None
         if given:
             return unit
-        z, read = unit.points(2)[0], (*kept, *unit.outputs)
-        rows = np.tile(z, (1 + len(kept), 1))
-        rows[1:, : len(kept)] += np.diag(np.maximum(np.abs(z[: len(kept)]), NOMINAL))
+        z, read, n = unit.points(2)[0], (*kept, *unit.outputs), len(kept)
+        # by as much as a step changes them: 1 Pa of a hydraulic pressure changes nothing that one would see
+        stepped, _ = unit.steps(unit.set_names, z[None], self.dt, kept)
+        rows = np.tile(z, (1 + n, 1))
+        rows[1:, :n] += np.diag(np.max([np.abs(z[:n]), np.abs(stepped[0] - z[:n]), np.full(n, NOMINAL)], axis=0))
         found, _ = unit.steps(unit.set_names, rows, self.dt, read)
         moved = np.any(np.abs(found[1:] - found[0]) > REPEATED * np.abs(found[0]), axis=1)
         return replace(unit, states=tuple(n for n, m in zip(kept, moved, strict=True) if m)) if np.any(moved) else None

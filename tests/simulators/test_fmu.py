@@ -210,7 +210,7 @@ def test_what_calls_a_unit_cannot_become_a_file(tmp_path, units):
 def write_table(path, given):
     columns = np.column_stack([np.arange(len(given)) * given.dt, given.u, given.y])
     rows = "\n".join(",".join(map(repr, row)) for row in columns.tolist())
-    path.write_text(f"t,force,pos1,pos2\n{rows}\n")
+    path.write_text(f"t,force [N],pos1 [m],pos2\n{rows}\n")
     return path
 
 

@@ -121,6 +121,16 @@ def test_a_unit_without_such_equations_is_stepped(built):
         unit.simulate(given.with_(dt=2 * DT))
 
 
+def test_a_state_far_larger_than_one_is_found(built):
+    """A pressure in Pa: a change by 1 Pa is not seen."""
+    body = """
+    self.pos += h * (1e9 * self.torque - 10 * self.pos)
+    self.vel += h * (1e-6 * self.pos - self.vel)
+    """
+    unit = from_fmu(built(body), cosimulation=CoSimulation(dt=DT))
+    assert unit.states == ("pos", "vel")
+
+
 def test_outputs_count_from_zero_where_states_begin_elsewhere(built):
     unit = from_fmu(
         built(SWING, STATES + "\n        self.pos = 0.3"), ports=PORT, outputs=("pos",), cosimulation=CoSimulation(DT)
