@@ -539,8 +539,9 @@ class Diagnosis:
         for name in moved[:MOST_PRINTED]:
             p = free[name]
             std = "" if p["std"] is None else f" ± {float(p['std']):.2g}"
-            value, nominal = float(p["refit_with"]), float(p["nominal"])
-            lines.append(f"  {name} = {value:.5g}{std} {p['unit']}".rstrip() + f", given as {nominal:.5g}")
+            value, nominal, (low, high) = float(p["refit_with"]), float(p["nominal"]), own[name].bounds
+            bound = "" if low < value < high else ", at its bound"
+            lines.append(f"  {name} = {value:.5g}{std} {p['unit']}".rstrip() + f", given as {nominal:.5g}{bound}")
         more = [f"  and {len(moved) - MOST_PRINTED} more"] if len(moved) > MOST_PRINTED else []
         for e in (e for e in self.corrected.elements if e.law.id == "offset"):
             value, unit = float(own[f"{e.prefix}w_0"].value), self.corrected.port(e.port).unit

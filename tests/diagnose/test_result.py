@@ -57,6 +57,16 @@ def test_the_verbs_tell_what_the_diagnosis_told(diagnosed):
     assert step.n_in() == 2
 
 
+def test_a_value_at_its_bound_says_so(diagnosed):
+    found, _, _ = diagnosed
+    own = found.corrected.parameters
+    name = next(k for k, p in own.items() if not p.fixed and k in found.parameters)
+    tight = replace(own[name], bounds=(own[name].bounds[0], float(own[name].value)))
+    held = replace(found, corrected=found.corrected.with_parameters({**own, name: tight}))
+    (line,) = [line for line in str(held).splitlines() if line.startswith(f"  {name} = ")]
+    assert line.endswith(", at its bound") and "at its bound" not in str(found)
+
+
 def test_a_recording_is_corrected_before_it_is_simulated():
     flipped = [recorded(rig(), s, samples=400) for s in (0, 1)]
     flipped = [r.with_(y=-r.y) for r in flipped]
