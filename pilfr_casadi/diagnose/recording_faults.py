@@ -298,23 +298,18 @@ def _beyond_limit(u: np.ndarray, limit: float) -> np.ndarray:
 
 
 def find_clipping(recordings: Sequence[Recording], kind: str) -> list[Clipping]:
-    """Find inputs (`kind` "u") or outputs ("y") that repeat their extremes exactly over several samples.
-
-    Such samples at the beginning or the end of a recording do not count: there a machine may be at rest.
-    """
+    """Find inputs (`kind` "u") or outputs ("y") that repeat their extremes exactly over several samples."""
     out = []
     for i, name in enumerate(recordings[0].inputs if kind == "u" else recordings[0].outputs):
-        channels = [getattr(r, kind)[:, i] for r in recordings]
-        y = np.concatenate(channels)
+        y = np.concatenate([getattr(r, kind)[:, i] for r in recordings])
         if np.mean(np.diff(y) == 0) >= DISTINCT_SHARE:
             continue
         limits, count = [-np.inf, np.inf], 0
         for j, extreme in enumerate((y.min(), y.max())):
-            stretches = [(b, e, len(c)) for c in channels for b, e in find_stretches(c == extreme)]
-            runs = np.array([e - b for b, e, length in stretches if b > 0 and e < length])
-            often = np.sum(runs) > CHANCE_FACTOR * _share_at_level(y) * len(y)
-            if max(runs, default=0) >= 3 and np.sum(runs > 1) > 1 and often:
-                limits[j], count = float(extreme), count + int(np.sum(runs))
+            at = y == extreme
+            runs = np.diff(find_stretches(at)).ravel()
+            if runs.max() >= 3 and np.sum(runs > 1) > 1 and at.mean() > CHANCE_FACTOR * _share_at_level(y):
+                limits[j], count = float(extreme), count + int(at.sum())
         if count:
             finite = [v for v in limits if np.isfinite(v)]
             at_limits = " and ".join(f"{v:.6g}" for v in finite)

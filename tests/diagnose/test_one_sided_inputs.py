@@ -109,12 +109,3 @@ def test_a_parameter_at_its_bound_is_said():
     u = levels(3)
     d = pilfr.diagnose(tight.with_parameters(bound), recorded(u, moved(u), 4), laws=())
     assert "k (54) came out at its bound" in str(d)
-
-
-def test_a_machine_at_rest_before_and_after_it_moves_is_not_clipped():
-    moving = np.clip(np.abs(swinging()), 0, 9)
-    rest = np.zeros(100)
-    stalled = Recording(dt=DT, u=np.ones(100), y=rest, inputs=("drive",), outputs=("place",))
-    y = np.concatenate([rest, moving, rest])
-    run = Recording(dt=DT, u=np.ones(len(y)), y=y, inputs=("drive",), outputs=("place",))
-    assert [c.value for c in find_clipping([run, stalled], "y")] == [[9.0]]
