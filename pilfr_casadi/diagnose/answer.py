@@ -20,7 +20,7 @@ from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction
 from .effect import Effect
 from .evidence import SURE, deviations
-from .gates import Gate
+from .gates import Gate, edited
 from .identifiability import port_units
 from .mismatch_map import mismatch
 from .offsets import Offset, remove_idle_offsets, update_offsets
@@ -181,7 +181,8 @@ def _compute_errors(
         fewer = {e: on_tests[f"without {i}"] for i, e in enumerate(each)}
         errors["test"] = {name: on_tests[name] for name in ("nominal", "before", "after")}
     if bench.simulator.observer is not None:
-        errors["free_run"] = free_run_errors(bench, tests or bench.recordings, request.simulator, without, after)
+        free = edited(tests, found.gates) or bench.recordings
+        errors["free_run"] = free_run_errors(bench, free, request.simulator, without, after)
     return errors, fewer, resting
 
 

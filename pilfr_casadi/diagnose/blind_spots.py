@@ -291,7 +291,8 @@ def check(
             if again.cost * BETTER_RATIO**2 < fitted.cost:
                 bench, fitted = other, again
     bench.check_followed(fitted)
-    return assess_recordings(bench, fitted, noise_floor(recordings, fitted.residual), stated or "", laws)
+    floor = noise_floor(bench.recordings, bench.scored(fitted.residual))
+    return assess_recordings(bench, fitted, floor, stated or "", laws)
 
 
 def assess_recordings(

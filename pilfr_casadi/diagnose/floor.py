@@ -82,7 +82,7 @@ def measured_floor(recordings: Sequence[Recording]) -> Floor | None:
     groups: dict[bytes, list[Recording]] = {}
     for r in recordings:
         groups.setdefault(r.u.tobytes(), []).append(r)
-    alike = [np.stack([r.y[_settled(g) :] for r in g]) for g in groups.values() if len(g) > 1]
+    alike = [np.stack([r.y[_settled(g) :] for r in g]) for g in groups.values() if len(g) > 1 and _repeat(g)]
     periods = [folded for folded in map(_fold, recordings) if folded is not None]
     repeated = periods or alike
     if not repeated:
@@ -111,8 +111,19 @@ def _sensor_steps(recordings: Sequence[Recording]) -> np.ndarray:
 def _settled(group: Sequence[Recording]) -> int:
     """Return the first compared sample of recordings of one input: late if their initial states may differ."""
     first = max(r.skip for r in group)
-    alike = all(r.begins in ("zero", "periodic") for r in group)
-    return first if alike else max(first, len(group[0]) // 2)
+    return first if _begin_alike(group) else max(first, len(group[0]) // 2)
+
+
+def _begin_alike(group: Sequence[Recording]) -> bool:
+    return all(r.begins in ("zero", "periodic") for r in group)
+
+
+def _repeat(group: Sequence[Recording]) -> bool:
+    """Tell whether recordings of one input repeat an experiment.
+
+    Where the input rests, as in free decays from different heights, their unknown initial states decide what follows.
+    """
+    return _begin_alike(group) or bool(np.any(np.ptp(group[0].u[_settled(group) :], axis=0) > 0))
 
 
 def _fold(r: Recording) -> np.ndarray | None:
@@ -131,8 +142,12 @@ def third_differences(residual: np.ndarray) -> np.ndarray:
 
 
 def white_part(residuals: Sequence[np.ndarray]) -> np.ndarray:
-    """Estimate the white noise inside residuals, (n_y,): third differences, the smallest over recordings."""
-    return np.asarray(np.min([np.sqrt(np.mean(third_differences(e) ** 2, axis=0)) for e in residuals], axis=0))
+    """Estimate the white noise inside residuals, (n_y,): third differences, the smallest over recordings.
+
+    Recordings with too few samples for such a difference say nothing, unless there are no others.
+    """
+    long = [third_differences(e) for e in residuals if len(e) > 3] or residuals
+    return np.asarray(np.min([np.sqrt(np.mean(e**2, axis=0)) for e in long], axis=0))
 
 
 def times_white(residual: np.ndarray) -> float:
@@ -148,7 +163,7 @@ def effective_size(residuals: Sequence[np.ndarray]) -> float:
         for column in (e - e.mean(axis=0)).T:
             n = len(column)
             spectrum = np.abs(np.fft.rfft(column, 2 * n)) ** 2
-            rho = np.fft.irfft(spectrum)[: min(LONGEST, n // 4)]
+            rho = np.fft.irfft(spectrum)[: min(LONGEST, max(n // 4, 1))]
             rho = rho / rho[0] if rho[0] > 0 else np.zeros(1)
             total += n / (1 + 2 * float(np.sum(rho[1:] ** 2)))
     return total

@@ -14,7 +14,7 @@ faults that a refit can confirm take the same steps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Self, TypeVar
@@ -92,7 +92,7 @@ class Gate:
 
     def apply(self, bench: Workbench) -> Workbench:
         """Return the bench with changed recordings; errors are in units of the outputs' new deviation."""
-        recordings = tuple(map(self.edit, bench.recordings))
+        recordings = edited(bench.recordings, [self])
         if recordings[0].dt != bench.dt:
             return bench.renewed(recordings)
         return replace(bench, recordings=recordings, scale=output_deviation(recordings))
@@ -108,6 +108,13 @@ class Gate:
     def relocate(self, now: Checked, after: Checked) -> Self | None:
         """Return the fault at its best value to first order at the corrected refit, or None if there is none."""
         return self
+
+
+def edited(recordings: Sequence[Recording], gates: Iterable[Gate]) -> tuple[Recording, ...]:
+    """Return recordings with the corrections of gates, one after the other."""
+    for gate in gates:
+        recordings = [gate.edit(r) for r in recordings]
+    return tuple(recordings)
 
 
 G = TypeVar("G", bound=Gate)

@@ -167,20 +167,33 @@ def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[tu
     open_ = search.bench.simulator.with_ports(ports)
     bench = replace(search.bench, simulator=open_)
     forces = [law for law in search.laws if "parallel" in law.places]  # actuators and sensors were already searched
+    other: Search | None = None
     try:
         with search.until_interrupted():
             without = bench.fit(open_, [search.root.fitted.values], states=search.root.fitted.begin)
-            there = Search(bench, without, search.floor, forces, search.workers, search.say, until=search.until)
+            there = Search(
+                bench,
+                without,
+                search.floor,
+                forces,
+                search.workers,
+                search.say,
+                aligned=True,
+                stand_in_error=search.stand_in_error,
+                until=search.until,
+            )
             there.alternatives |= {port: laws for port, laws in search.alternatives.items() if in_series(port)}
             for trial in search.memo.values():
                 if trial.laws and all(in_series(e.port) for e in trial.laws):
                     known = replace(trial.fitted, simulator=trial.fitted.simulator.with_ports(ports))
                     there.memo[trial.key] = replace(trial, fitted=known)
             other = there.run(1)
-            search.interrupted = other.interrupted
     except InputError:
         return nothing
-    if search.interrupted:
+    if other is None:
+        return nothing
+    search.cut_short_with(other)
+    if other.interrupted:
         return nothing
     found = posterior(other)
     if found.sure <= SURE or not found.effects[0].name[0].startswith("equation:"):

@@ -37,6 +37,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -60,7 +61,7 @@ from .arguments import (
 from .correction import find_correction, named_correction
 from .evidence import AS_GIVEN_RATIO, SURE
 from .floor import Floor, measured_floor
-from .gates import EQUAL_RATIO, USELESS_FIT, Gate
+from .gates import EQUAL_RATIO, USELESS_FIT, Gate, edited
 from .offsets import Offset, fix_idle_offsets, list_offsets
 from .other_explanations import (
     find_pinned_parameters,
@@ -187,12 +188,9 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
         return ready, search
     hold = search.bench.with_other_hold().hold
     held = replace(request, hold=hold, say=request.say.under("other hold: "))
-    try:
-        found = _again(search, partial(_search, held))
-    except InputError:  # the simulator cannot be run with this hold
-        return ready, search.resume(request.most_effects)
+    found = _again(search, partial(_search, held))
     if found is None:
-        return ready, search
+        return ready, search.resume(request.most_effects)
     other, again = found
     only_refitted = again.interrupted and len(again.memo) < 2
     if again.best.mean_square > search.best.mean_square or only_refitted:
@@ -200,6 +198,7 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
         return ready, search.resume(request.most_effects)
     # the laws that were found since may have been what the hold had made up for
     if not again.interrupted and again.prefers_other_hold():
+        search.adopt(again.best)
         resumed = search.resume(request.most_effects)
         if resumed.best.mean_square < again.best.mean_square:
             return ready, resumed
@@ -234,9 +233,7 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
     Missing physics can look like a lead.
     """
     edits = [g for g in ready.gates if g.corrected and g.change is not None]  # the shift is one of corrected channels
-    recordings = request.recordings
-    for gate in (*edits, shift):
-        recordings = tuple(map(gate.edit, recordings))
+    recordings = edited(request.recordings, (*edits, shift))
     moved = replace(request, recordings=recordings, aligned=True, say=request.say.under("shifted: "))
     search.shift, search.aligned = None, True
     found = _again(search, partial(_search_once, moved, shift_early=True))
@@ -252,8 +249,8 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
 
 
 def _again(search: Search, prepare_and_search: Callable[[], tuple[Prepared, Search]]) -> tuple[Prepared, Search] | None:
-    """Prepare and search once more; None if an interrupt came before that search began."""
-    with search.until_interrupted():
+    """Prepare and search once more; None if an interrupt came before that search began, or the simulator diverges."""
+    with search.until_interrupted(), suppress(InputError):
         return prepare_and_search()
     return None
 
@@ -341,7 +338,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
             verdict = judge(search, answer, gates)
         if verdict.kind == "missing-physics":
             said = f"{verdict.sentence} {correction.sentence}" if correction.learned else verdict.sentence
-            zeros = list_offsets(answer.best.laws, answer.best.fitted.values)
+            zeros = list_offsets(fitted.simulator.elements[len(search.bench.simulator.elements) :], fitted.values)
             notes = (*gates, *elsewhere, *zeros)
             return Conclusion(Verdict(verdict.kind, said), notes, fitted, correction, answer.effects)
     if verdict.kind == "unexplained" and finished:

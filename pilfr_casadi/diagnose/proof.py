@@ -15,7 +15,7 @@ from ..laws import Law
 from ..models import Model
 from ..simulators import Simulator, discretise
 from .evidence import BETTER_RATIO
-from .gates import Gate
+from .gates import Gate, edited
 from .linearise import linearise_runs
 from .screen import RIDGES, Remainder, held_out
 from .workbench import Fitted, Workbench
@@ -103,20 +103,16 @@ def test_errors(
     """
     models = {name: (one.fitted_model, starts_of(one)) for name, one in fits.items()}
     nominal: Models[str] = {"nominal": (given, ())}
-    edits = [g.change for g in gates if g.change is not None]
-    if not edits:
+    if all(g.change is None for g in gates):
         return compare_errors(bench.on(tests), {**nominal, **models})
-    edited = list(tests)
-    for change in edits:
-        edited = [change(r) for r in edited]
-    found = compare_errors(bench.on(edited), models)
+    found = compare_errors(bench.on(edited(tests, gates)), models)
     return replace(found, errors={**compare_errors(bench.on(tests), nominal).errors, **found.errors})
 
 
 def free_run_errors(
     bench: Workbench, recordings: Sequence[Recording], simulator: Simulator, without: Fitted, after: Fitted
 ) -> dict[str, float]:
-    """Compute the NRMSEs without an observer, on recordings as they are."""
+    """Compute the NRMSEs without an observer, on corrected recordings."""
     models = {}
     for name, fitted in {"nominal": without, "before": without, "after": after}.items():
         led = simulator if name == "nominal" else fitted.corrected()

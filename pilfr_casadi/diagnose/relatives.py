@@ -2,9 +2,9 @@
 
 A relative is a pair of port and law with its own start values:
 
-- a special case of the best law, and a law that the best one refines;
+- a law with further terms than one that came near, and the law that it refines, from its values;
 - another form of a law that came near, and a form that shares a shape with the best law but stayed behind it;
-- a law with one more term than one that came near, from its values;
+- a special case of the best law;
 - a resonance of known frequency: as a mass attached at another port, or in place of a delay or a lag;
 - a law of a signal with its own time scale, at the other end of a nearly linear simulator;
 - a simple law whose force is most like that of a flexible law along its port's own signal.
@@ -78,14 +78,14 @@ def relatives(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored
     found = [
         entry
         for some in (
+            _extended_laws,  # first those that begin at values of a fitted law, because a step fits only so many
+            _simpler_laws,
+            _forms_of_the_best,
             _special_cases,
             _other_forms,
-            _forms_of_the_best,
             _attached_masses,
             _damped_resonances,
             _other_end,
-            _extended_laws,
-            _simpler_laws,
         )
         for entry in some(trials, scored)
     ]
@@ -183,8 +183,8 @@ def _extended_laws(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Sc
             wider = s.port == t.port and isinstance(s.law, type(t.law)) and type(s.law) is not type(t.law)
             worse = s.pair not in least or least[s.pair] > t.error
             if wider and worse and s.pair not in out:
-                start = s.law.starts_as(t.law, t.own)
-                out |= {s.pair: replace(s, starts=(start,))} if start else {}
+                starts = tuple(filter(None, (s.law.starts_as(t.law, t.own, shape) for shape in s.starts)))
+                out |= {s.pair: replace(s, starts=starts, beside=t.fitted.values)} if starts else {}
     return list(out.values())
 
 

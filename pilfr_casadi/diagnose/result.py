@@ -22,7 +22,7 @@ from .correction import Correction
 from .effect import Effect
 from .evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, SURE
 from .floor import ABOVE_NOISE
-from .gates import Gate
+from .gates import Gate, edited
 from .learned import Learned
 from .offsets import Offset
 from .proof import starts_of
@@ -328,8 +328,7 @@ class Diagnosis:
         simulator = simulator or self.corrected
         r, dt = match_channels(simulator, recording), self.train[0].dt
         if not any(recording is known for known in self.train):  # training recordings are corrected already
-            for gate in self.gates:
-                r = gate.edit(r)
+            (r,) = edited([r], self.gates)
         if abs(r.dt / dt - 1) > SAME_STEP:
             raise InputError(f"The recording's step is {r.dt:g} s, the training's {dt:g} s; resample it.")
         fitted = self.evidence.get("after" if simulator is self.corrected else "without")
@@ -400,7 +399,8 @@ class Diagnosis:
     def with_fit(self, fitted: Fitted) -> Diagnosis:
         """Copy with another fitted simulator as the corrected one."""
         evidence = {**self.evidence, "after": fitted}
-        return replace(self, corrected=fitted.corrected(), evidence=evidence, substeps=fitted.model.substeps)
+        corrected = replace(fitted.corrected(), substeps=fitted.model.substeps)
+        return replace(self, corrected=corrected, evidence=evidence, substeps=fitted.model.substeps)
 
     def warnings(self) -> list[str]:
         """List the reasons for doubt: an interrupt, parameters at their bounds, errors that stay large."""

@@ -99,6 +99,11 @@ class Search(Hypotheses):
         self.hold_said = True
         return self if self.interrupted else self.run(effects)
 
+    def adopt(self, other: Trial) -> None:
+        """Fit the laws of another search's hypothesis to these recordings, from its values, and keep the fit."""
+        with self.until_interrupted():
+            self.keep(self.fits.polish(self.run_laws(other.laws, other)))
+
     @property
     def passes(self) -> list[Step]:
         """The moves, those from one hypothesis together, with the best fit of each trial once, smallest error first."""
@@ -264,12 +269,25 @@ class Search(Hypotheses):
         enough: float,
         again: bool,
     ) -> list[Trial]:
-        """Fit some of the pairs screened, then those to which these fits point."""
-        trials = self._fitted(parent, selected, gain, enough, again)
+        """Fit some of the pairs screened, then those to which the best fits of these hypotheses point."""
+        found = self._fitted(parent, selected, gain, enough, again)
+        trials = sorted(map(self._best_known, found), key=lambda t: t.error)
         more = relatives(self.bench, trials, scored) if self.in_time() else []
         if more:
             trials = sorted([*trials, *self._fitted(parent, more, gain, enough, again)], key=lambda t: t.error)
         return trials
+
+    def _best_known(self, trial: Trial) -> Trial:
+        """Return the best fit of a trial's hypothesis, whose laws may have been found in another order."""
+        known = self.memo.get(trial.key, trial)
+        if not known.error < trial.error:
+            return trial
+        last = [e for e in known.laws if (e.port, type(e.law)) == trial.pair]
+        return (
+            known
+            if known.pair == trial.pair
+            else self.run_laws([*(e for e in known.laws if e not in last), *last], known)
+        )
 
     def _record(self, parent: Trial, scored: Sequence[Scored], trials: Sequence[Trial]) -> None:
         """Keep the trials of a move, and note the move."""

@@ -44,7 +44,7 @@ from .trials import Trial
 from .workbench import DIVERGED, FEW, Fitted, Workbench, output_deviation
 
 SEARCHED_SAMPLES = 60_000  # samples of the training recordings up to which everything is searched: effort
-STRETCH_SHARE, MOST_STRETCHES = 2 / 3, 10  # share of these samples in all stretches together, and their largest number
+STRETCH_SHARE, LONG_STRETCHES = 2 / 3, 10  # share of these samples in all stretches together, and number of long ones
 SHORTEST_STRETCH = 500  # least length of a stretch in samples: a law with memory needs some history
 MOST_LINEARISED = 300  # stretches that are linearised at most
 LINEARISED_SAMPLES = 1000  # samples of each that are linearised
@@ -125,9 +125,10 @@ def choose_stretches(
     most : int
         Samples up to which everything would be searched; the stretches have two thirds of it together at most.
     """
-    length = max(int(STRETCH_SHARE * most) // MOST_STRETCHES, SHORTEST_STRETCH)
-    count = int(np.clip(int(STRETCH_SHARE * most) // length, 1, MOST_STRETCHES))
+    length = max(int(STRETCH_SHARE * most) // LONG_STRETCHES, SHORTEST_STRETCH)
     stretches = [s for i, r in enumerate(recordings) for s in divide(i, len(r), r.skip, length)]
+    usual = float(np.mean([s.end - s.begin for s in stretches]))  # shorter than asked for where the recordings are
+    count = max(int(STRETCH_SHARE * most / usual), 1)
     signals = signal_features(recordings, stretches)
     if len(stretches) > MOST_LINEARISED:
         kept = spread_out(signals, MOST_LINEARISED, int(np.argmax(np.sum(signals**2, axis=1))))

@@ -152,12 +152,8 @@ class Workbench:
 
     @classmethod
     def of(cls, simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str = "auto") -> Workbench:
-        """Check that simulator and recordings fit each other, and choose the sub-steps."""
+        """Put the recordings' channels into the simulator's order, and choose the sub-steps."""
         ordered = tuple(match_channels(simulator, r) for r in recordings)
-        steps = {round(r.dt / ordered[0].dt, 4) for r in ordered}
-        if steps != {1.0}:
-            given = ", ".join(f"{r.dt:g} s" for r in ordered)
-            raise InputError(f"The recordings have different steps ({given}); resample them to one.")
         chosen = choose_substeps(simulator, ordered)
         return cls(simulator, ordered, hold, chosen, output_deviation(ordered), engine, chosen=chosen)
 

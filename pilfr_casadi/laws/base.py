@@ -329,11 +329,14 @@ class Law:
         """Tell whether the law degenerates at its fitted values, so that its sentence is hardly true."""
         return False
 
-    def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
-        """Start values at which it equals a plainer law with the values `own`; empty if it does not refine that law."""
-        more = [name for name in self.units if name not in plain.units]
-        refines = plain.strength and plain.units.items() <= self.units.items() and set(more) <= set(self.strength)
-        return {**dict.fromkeys(more, 0.0), **own} if more and refines else {}
+    def starts_as(self, plain: Law, own: Mapping[str, Any], shape: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """Start values at which it equals a plainer law with the values `own`; empty if it does not refine that law.
+
+        `shape` has values of the shape parameters of its further terms, which have no strength yet.
+        """
+        more = [name for name in self.strength if name not in plain.units]
+        refines = plain.strength and plain.units.items() <= self.units.items()
+        return {**(shape or {}), **dict.fromkeys(more, 0.0), **own} if more and refines else {}
 
     @classmethod
     def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:

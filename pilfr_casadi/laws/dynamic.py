@@ -111,7 +111,7 @@ class _TwoStages(Law):
     def flow(self, z: Any, q: Any, p: Any) -> Any:
         return ca.vertcat((z - q[0]) / p.T_1, (z - q[1]) / p.T_2)
 
-    def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
+    def starts_as(self, plain: Law, own: Mapping[str, Any], shape: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """Start as two parts about as fast as the single part, together as strong."""
         if type(plain) is not self.one_stage:
             return {}

@@ -11,8 +11,7 @@ import numpy as np
 from ..models import play
 from .base import Law, Local
 
-KNEE = 0.15  # width of the reversal over the speed at which friction has fallen; above it they are indistinguishable
-FALL = 0.05  # smallest excess of friction at rest over dry friction
+FALL = 0.05  # smallest excess of the peak of a falling friction over the friction that is left at high speed
 SPRINGY = 0.08  # threshold of presliding over half the travel; above it the element is a stop of a hysteresis
 MAX_THRESHOLD = 0.6  # largest threshold tried, over half the travel
 SHARP = 2e-3  # narrowest reversal that is tried at any steps, over the speed
@@ -133,8 +132,10 @@ class StribeckFriction(CoulombFriction):
         }
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """Tell whether the reversal is as wide as the range of the fall, or the fall is negligible."""
-        return bool(values["v_0"] > KNEE * values["v_s"]) or _hardly_falls(self, values)
+        """Tell whether the friction hardly falls with speed from its peak beyond the reversal."""
+        speed = np.linspace(0.0, 3.0 * float(values["v_s"]), 300)[1:]
+        falling = abs(float(values["F_c"])) + abs(float(values["F_e"])) * np.exp(-((speed / float(values["v_s"])) ** 2))
+        return _hardly_falls(self, values, float(np.max(falling * np.tanh(speed / float(values["v_0"])))))
 
 
 class PreslidingStribeckFriction(PreslidingFriction):
@@ -156,7 +157,8 @@ class PreslidingStribeckFriction(PreslidingFriction):
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether the contact springs back over much of the travel, or the fall is negligible."""
-        return super().doubtful(values) or _hardly_falls(self, values)
+        most = abs(float(values["k_t"])) + abs(float(values["k_e"]))
+        return super().doubtful(values) or _hardly_falls(self, values, most)
 
 
 def _narrowest_reversal(law: Law, local: Local) -> float:
@@ -170,10 +172,10 @@ def _narrowest_reversal(law: Law, local: Local) -> float:
     return float(np.clip(followed, SHARPEST_REVERSAL * local.speed, SHARP * local.speed))
 
 
-def _hardly_falls(law: Law, values: Mapping[str, Any]) -> bool:
-    """Tell whether the fall is slight, spans all speeds, or ends at once: then it is dry friction."""
-    (low, high), (dry, more) = law.parameters()["v_s"].bounds, (abs(float(values[k])) for k in law.strength[:2])
-    return bool(not low < values["v_s"] < high or more < FALL * dry)
+def _hardly_falls(law: Law, values: Mapping[str, Any], peak: float) -> bool:
+    """Tell whether the fall from a peak is slight, spans all speeds, or ends at once: then it is dry friction."""
+    (low, high), dry = law.parameters()["v_s"].bounds, abs(float(values[law.strength[0]]))
+    return bool(not low < values["v_s"] < high or peak < (1 + FALL) * dry)
 
 
 class ViscousDamping(Law):

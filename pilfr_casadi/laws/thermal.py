@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
@@ -63,6 +64,11 @@ class Convection(Law):
     restoring = True
     starts = {"n": ("", 1.25, 4 / 3)}
     ranges = {"n": ("", 1.1, 1.5)}
+
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """Tell whether the power is at a bound, which no free convection has."""
+        low, high = self.parameters()["n"].bounds
+        return not low < float(values["n"]) < high
 
     def force(self, z: Any, p: Any) -> Any:
         return p.h * ca.sign(z) * size_to_power(z, p.n)

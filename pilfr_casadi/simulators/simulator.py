@@ -222,15 +222,19 @@ class Simulator(Equations):
 
 
 def unit_notes(simulator: Simulator, recording: Recording) -> dict[str, str]:
-    """Describe, by channel, the conversions of a recording's values to the simulator's units."""
+    """Describe, by channel, the conversions of a recording's values to the simulator's units, and unknown units."""
     out = {}
     for name in (n for n in (*simulator.inputs, *simulator.output_names) if n in recording.units):
-        factor = unit_factor(simulator, recording, name)
+        unit, wanted, factor = (
+            recording.units[name],
+            simulator.units.get(name, ""),
+            unit_factor(simulator, recording, name),
+        )
+        said = f"{name} is recorded in {unit}, and the simulator has it in {wanted}"
         if factor != 1:
-            out[name] = (
-                f"{name} is recorded in {recording.units[name]}, and the simulator has it in {simulator.units[name]}: "
-                f"its values were multiplied by {factor:g}."
-            )
+            out[name] = f"{said}: its values were multiplied by {factor:g}."
+        elif wanted and unit != wanted and conversion(unit, wanted) is None:
+            out[name] = f"{said}; no conversion is known, so that its values were taken as they are."
     return out
 
 

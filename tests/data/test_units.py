@@ -9,6 +9,7 @@ from cart import cart
 import pilfr_casadi as pilfr
 from pilfr_casadi.data import conversion, dimension, insert_units, revolution_in
 from pilfr_casadi.laws import CoulombFriction
+from pilfr_casadi.simulators import unit_notes
 
 
 @pytest.mark.parametrize(
@@ -75,6 +76,16 @@ def test_the_conversion_of_a_recording_is_reported(recorded):
     notes = [g.sentence for g in found.gates if g.finding == "conversion"]
     assert "pos is recorded in mm, and the simulator has it in m: its values were multiplied by 0.001." in notes
     assert found.nrmse(recorded) == pytest.approx(found.errors["train"]["after"], rel=1e-6)
+
+
+def test_an_unknown_unit_is_reported(recorded):
+    """Nothing converts it, so that the values may be far off."""
+    stated = replace(cart(), units={"force": "N", "pos": "furlong"})
+    notes = unit_notes(stated, recorded)
+    assert notes["pos"] == (
+        "pos is recorded in mm, and the simulator has it in furlong; no conversion is known, so that its values were "
+        "taken as they are."
+    )
 
 
 def test_a_unit_of_something_else_is_refused(recorded):

@@ -349,3 +349,12 @@ def test_its_name_stays_a_function():
 )
 def test_a_tie_is_called_by_its_kind(only_as, said):
     assert Tie(("Cm", "Cw"), (only_as,)).sentence == f"Cm and Cw can be identified only as {said}."
+
+
+def test_unscored_samples_are_no_noise():
+    """What a recording leaves out may be anything."""
+    given = record(MASS, noise_like(1)).with_(skip=20)
+    wild = given.y.copy()
+    wild[:20] += np.random.default_rng(0).standard_normal((20, wild.shape[1])) * np.ptp(wild)
+    told, quiet = (check(MASS, r).noise["share"] for r in (given.with_(y=wild), given))
+    assert told == pytest.approx(quiet, rel=1e-3)

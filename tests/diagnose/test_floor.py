@@ -93,3 +93,20 @@ def test_an_error_that_swells_with_a_signal_is_no_noise(kind):
     error = rng.standard_normal(m) * (1.0 if kind == "steady" else loud)
     signals = np.column_stack([rng.standard_normal(m), signal])
     assert swells_with([error[:, None]], [signals]) is (kind == "swells")
+
+
+@pytest.mark.parametrize("last", [0, 100])
+def test_where_the_input_rests_other_initial_states_are_no_repeats(last):
+    """Free decays from two heights, or after one step, differ by more than noise; known equal states make repeats."""
+    t, u = np.arange(2000), np.zeros((2000, 1))
+    u[:last] = 1.0
+    decays = [Recording(u, (a * np.exp(-t / 4000.0))[:, None], 0.01) for a in (1.0, 0.5)]
+    assert measured_floor(decays) is None
+    assert measured_floor([r.with_(initial="zero") for r in decays]) is not None
+
+
+def test_a_recording_of_few_samples_says_nothing_about_noise():
+    rng = np.random.default_rng(0)
+    long, short = rng.standard_normal((1000, 1)), np.zeros((2, 1))
+    assert white_part([long, short]) == pytest.approx(white_part([long]))
+    assert effective_size([long, short]) == pytest.approx(effective_size([long]), abs=2.0)

@@ -32,6 +32,7 @@ from pilfr_casadi.laws import (
     Settling,
     SoftSaturation,
     StopHysteresis,
+    StribeckFriction,
 )
 from pilfr_casadi.simulators import discretise
 
@@ -177,3 +178,17 @@ def test_a_rate_that_is_no_number_is_compared_with_nothing(level, compared):
     best = Trials(on, 1).make_trial(on.run(tank.with_element("outlet", loop), {}, [np.array([level])]), 1)
     found = relatives(on, [best], [Scored("outlet", CubicStiffness(), 0.1, ({},), local)])
     assert bool(found) is compared
+
+
+def test_a_law_with_a_further_term_starts_as_the_fitted_one_with_the_shapes_of_the_screen(asked_for, entry):
+    """At no strength of the further term it is the fitted law; how fast that falls, the screen has tried."""
+    scored = [
+        entry("a", CoulombFriction),
+        entry("a", StribeckFriction, *({"v_s": v, "v_0": 0.1 * v} for v in (2.0, 5.0))),
+    ]
+    own = {"F_c": 3.0, "v_0": 0.01}
+    found = [s for s in asked_for([("a", CoulombFriction, 0.1, own)], scored) if s.pair == ("a", StribeckFriction)]
+    assert [dict(start) for start in found[0].starts] == [
+        {"F_c": 3.0, "F_e": 0.0, "v_s": v, "v_0": 0.01} for v in (2.0, 5.0)
+    ]
+    assert found[0].beside["a.F_c"] == 3.0  # all parameters begin where that fit has them

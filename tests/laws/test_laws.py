@@ -226,12 +226,20 @@ def test_creep_at_its_longest_time_constant_is_doubtful(T, doubtful):
         ({"F_c": 1.0, "F_e": 0.02, "v_s": 0.1, "v_0": 0.002}, True),  # a fall that is slight
         ({"F_c": 1.0, "F_e": 0.4, "v_s": 0.01, "v_0": 0.001}, True),  # is over at once
         ({"F_c": 1.0, "F_e": 0.4, "v_s": 1.0, "v_0": 0.002}, True),  # goes on over all speeds
-        ({"F_c": 1.0, "F_e": 0.4, "v_s": 0.1, "v_0": 0.05}, True),  # is as narrow as the knee
+        ({"F_c": 1.0, "F_e": 0.4, "v_s": 0.1, "v_0": 0.1}, True),  # is as narrow as the knee
+        ({"F_c": 1.0, "F_e": 0.4, "v_s": 0.1, "v_0": 0.02}, False),  # begins beyond the knee, a tenth above F_c
+        ({"F_c": 1.0, "F_e": 0.1, "v_s": 0.1, "v_0": 0.05}, True),  # begins at the knee, which hides it
     ],
 )
 def test_friction_that_hardly_falls_is_no_stribeck_friction(values, doubtful):
     law = laws.StribeckFriction().at(values, {"v_s": (0.01, 1.0)})
     assert law.doubtful(values) is doubtful
+
+
+@pytest.mark.parametrize(("n", "doubtful"), [(1.3, False), (1.5, True), (1.1, True)])
+def test_no_free_convection_has_a_power_at_the_bounds(n, doubtful):
+    law = laws.Convection().at({}, {"n": (1.1, 1.5)})
+    assert law.doubtful({"h": 1.0, "n": n}) is doubtful
 
 
 def test_plays_beside_a_bend_that_does_it_all_are_hardly_a_hysteresis():
