@@ -19,13 +19,14 @@ from .arguments import Request
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction
 from .effect import Effect
-from .evidence import SURE, deviations
+from .evidence import NEAR_RATIO, SURE, deviations
 from .gates import Gate, edited
 from .identifiability import port_units
 from .mismatch_map import mismatch
 from .offsets import Offset, remove_idle_offsets, update_offsets
 from .preparation import Prepared
 from .proof import (
+    UNEDITED,
     free_run_errors,
     mean_nrmse,
     next_experiment,
@@ -108,7 +109,7 @@ def build_diagnosis(
     request.say("proof", 0, 1)
     bench, without, after = final.bench, final.without, final.after
     std = deviations(bench, after)
-    errors, fewer, resting = _compute_errors(request, search, found, final, tests)
+    errors, fewer, test_notes = _compute_errors(request, search, found, final, tests)
     effects = tuple(_make_effect(search, e, after, std, fewer.get(e, np.nan)) for e in found.effects)
     floor = search.least_floor if found.verdict.kind == "unexplained" else search.floor
     settled = found.verdict.kind in ("complete", "recording-fault") or (
@@ -128,7 +129,7 @@ def build_diagnosis(
         gates=(
             *_surrogate_note(request.stand_in_error),
             *_convergence_note(after),
-            *_resting_notes(resting),
+            *test_notes,
             *_combination_note(after, std, blind_spots),
             *update_offsets(found.gates, after, std, bool(effects), settled),
         ),
@@ -162,13 +163,10 @@ def build_diagnosis(
 
 def _compute_errors(
     request: Request, search: Search, found: Conclusion, final: FinalFits, tests: tuple[Recording, ...]
-) -> tuple[dict[str, dict[str, float] | None], dict[NamedEffect, float], list[tuple[str, int]]]:
-    """Compute the table of errors (see `Diagnosis`) and the test errors without each of several effects.
-
-    Also return the tests that `Comparison.find_resting` lists.
-    """
+) -> tuple[dict[str, dict[str, float] | None], dict[NamedEffect, float], tuple[Gate, ...]]:
+    """Compute the table of errors (see `Diagnosis`), the test errors without each of several effects, and notes."""
     bench, without, after, fewer = final.bench, final.without, final.after, dict[NamedEffect, float]()
-    resting = list[tuple[str, int]]()
+    notes = tuple[Gate, ...]()
     errors: dict[str, dict[str, float] | None] = {
         "train": {"nominal": final.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
         "test": None,
@@ -177,13 +175,14 @@ def _compute_errors(
         each = {e: final.to_all(f) for e, f in _without_each_effect(search, found).items()}
         fits = {"before": without, "after": after, **{f"without {i}": f for i, f in enumerate(each.values())}}
         compared = test_errors(bench, tests, found.gates, fits, bench.on(tests).model(request.simulator))
-        on_tests, resting = compared.errors, compared.find_resting()
+        on_tests = compared.errors
+        notes = (*_resting_notes(compared.find_resting()), *_edit_notes(on_tests))
         fewer = {e: on_tests[f"without {i}"] for i, e in enumerate(each)}
         errors["test"] = {name: on_tests[name] for name in ("nominal", "before", "after")}
     if bench.simulator.observer is not None:
         free = edited(tests, found.gates) or bench.recordings
         errors["free_run"] = free_run_errors(bench, free, request.simulator, without, after)
-    return errors, fewer, resting
+    return errors, fewer, notes
 
 
 def _surrogate_note(error: float) -> tuple[Gate, ...]:
@@ -214,6 +213,18 @@ def _resting_notes(resting: Sequence[tuple[str, int]]) -> Iterator[Gate]:
             "large. Give its initial state, or a longer test recording."
         )
         yield Gate("simulation", "resting test", first, words, False)
+
+
+def _edit_notes(on_tests: Mapping[str, float]) -> Iterator[Gate]:
+    """Note that the test recordings hardly have the faults for which they were corrected as the training data were."""
+    given, corrected = on_tests.get(UNEDITED, np.inf), on_tests["after"]
+    if given * NEAR_RATIO < corrected:
+        words = (
+            "The test recordings were corrected as the training recordings were, and that does not suit them: the "
+            f"error there is {100 * corrected:.3g} %, and {100 * given:.3g} % if they are left as given. Check whether "
+            "they have the same faults."
+        )
+        yield Gate("recordings", "test correction", None, words, False)
 
 
 def _combination_note(

@@ -27,6 +27,7 @@ AMPLITUDES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
 SINES, TRIANGLES = 12, 5  # frequencies that are tried
 LONGEST_EXPERIMENT = 3000  # longest simulated experiment, in samples
 LEAST_MOTION = 0.5  # deviation of an output's scored samples over that of all, below which it hardly moves
+UNEDITED = "after, on test recordings as given"  # a key of `test_errors`
 VISIBLE_DIFFERENCE = 0.01  # difference of two answers over the noise, above which a recording shows it
 
 
@@ -98,15 +99,16 @@ def test_errors(
 ) -> Comparison[str]:
     """Compute the errors of fits, on the sub-steps that they were fitted on, and of the `given` model as "nominal".
 
-    The fits see the test recordings with the gates' edits, the given model as they are. All are scored on the same
-    samples, unless an edit changes these.
+    The fits see the test recordings with the gates' edits, the given model as they are; so does the fit "after" once
+    more, as UNEDITED. All are scored on the same samples, unless an edit changes these.
     """
     models = {name: (one.fitted_model, starts_of(one)) for name, one in fits.items()}
     nominal: Models[str] = {"nominal": (given, ())}
     if all(g.change is None for g in gates):
         return compare_errors(bench.on(tests), {**nominal, **models})
     found = compare_errors(bench.on(edited(tests, gates)), models)
-    return replace(found, errors={**compare_errors(bench.on(tests), nominal).errors, **found.errors})
+    unedited = compare_errors(bench.on(tests), {**nominal, UNEDITED: models["after"]}).errors
+    return replace(found, errors={**unedited, **found.errors})
 
 
 def free_run_errors(

@@ -49,6 +49,20 @@ def test_exchanged_channels_are_told(exchanged):
     assert found.errors["train"]["after"] < 0.01 and "are exchanged" in found.sentence
 
 
+@pytest.mark.parametrize("alike", [True, False])
+def test_a_correction_that_does_not_suit_the_test_recordings_is_told(alike):
+    """The test recordings are corrected as the training recordings were, though they may be right as they are."""
+    u, y = recorded()
+    right = Recording(u, y, DT, ("q1", "q2"), ("upper", "lower"), hold="zero")
+    wrong, half = right.with_(y=y[:, ::-1]), len(u) // 2
+    test = (wrong if alike else right).slice(half, len(u))
+    found = pilfr.diagnose(tanks(1.15), wrong.slice(0, half), test=test, laws=())
+    told = [g.sentence for g in found.gates if g.finding == "test correction"]
+    assert len(told) == (not alike)
+    if told:
+        assert "Check whether they have the same faults." in told[0]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("moved", "verdict"), [(0.3, "recording-fault"), (1e-3, "complete")])
 def test_an_offset_that_was_the_mismatch_is_a_fault(moved, verdict):
