@@ -428,11 +428,15 @@ class Hypotheses:
         KeyboardInterrupt
             If a fit was interrupted. Such a fit has returned its best result so far.
         """
+        self._raise_if_interrupted()
         self.say(name, 0, 1, self.without.cost**0.5)
         began = time.perf_counter()
         yield
         self.times[name] = self.times.get(name, 0.0) + time.perf_counter() - began
         self.say(name, 1, 1, self.best.error)
+        self._raise_if_interrupted()
+
+    def _raise_if_interrupted(self) -> None:
         if self.bench.interrupted_fits and not self.interrupted:
             raise KeyboardInterrupt
 

@@ -13,8 +13,9 @@ from functools import partial
 
 import numpy as np
 
-from .._base import InputError, Stages
+from .._base import InputError, Stages, is_interrupt
 from ..data import Recording
+from ..optimise import Status
 from ..simulators import Simulator, unit_factor, unit_notes
 from .arguments import stated_hold
 from .channel_faults import find_slips, open_bench
@@ -40,8 +41,8 @@ CHECKED_ABOVE = 4e-4  # mean square error up to which signs and units are not ch
 CHECKS, CHECKED = "checks and refit", 6  # the stage's name, and the number of its parts that are reported
 LEAST_REFIT = 10.0  # seconds for the first refit in any case
 UNCHECKED = (
-    "There was no time left for some checks of the recordings: a shift, a gap or an offset of a channel may have been "
-    "missed."
+    "Some checks of the recordings were left out, because the time was over or somebody interrupted them: a shift, a "
+    "gap or an offset of a channel may have been missed."
 )
 OBSERVER_GAINS = (1.0, 0.3, 0.1, 0.03, 0.01)  # gains of the observer, in turn
 
@@ -96,16 +97,18 @@ def prepare(
     say(CHECKS, 1, CHECKED)
     checks = _Checks(gates, workers, early, say, until)
     now = checks.run(bench, 1.0 if said else 0.5)
-    if not said and any(g.fault for g in now.gates[len(gates) :]):  # on faulty data the better hold says nothing
+    faulty = any(g.fault for g in now.gates[len(gates) :])
+    if not said and faulty and not bench.interrupted_fits:  # on faulty data the better hold says nothing
         now, held = _with_better_hold(checks, now, bench, held)
-    bench, without, late = now.bench, now.fitted, time.perf_counter() > until
-    if now.gates or held:  # values and states from faulty data may be in a wrong minimum
+    bench, without, complete = now.bench, now.fitted, checks.may_go_on(now)
+    corrected = bool(now.gates or held)  # values and states from faulty data may be in a wrong minimum
+    if corrected and not bench.interrupted_fits:
         led = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
         without = min(led, bench.fit(bench.simulator, [{}, led.values], solver=THOROUGH), key=lambda f: f.cost)
     bench.check_followed(without)
     bench = replace(bench, typical=sample_run(bench, without))
     say(CHECKS, CHECKED, CHECKED, without.cost**0.5)
-    unchecked = [Gate("recordings", "unchecked", None, UNCHECKED, corrected=False)] if late else []
+    unchecked = [Gate("recordings", "unchecked", None, UNCHECKED, corrected=False)] if not complete else []
     return Prepared(bench, without, nominal, (*now.gates, *held, *unchecked), Checked(bench, without).floor)
 
 
@@ -122,38 +125,64 @@ class _Checks:
     def run(self, bench: Workbench, part: float) -> Checked:
         """Refit, and correct one fault after the other; `part` is the unit of shifts in samples, see `timing`."""
         patient = replace(bench, deadline=max(self.until, time.perf_counter() + LEAST_REFIT))
-        now = self._report(2, find_wrong_start(Checked(patient, refitted(patient), self.gates)))
-        bench = replace(now.bench, deadline=self.until)
-        now = replace(now, bench=bench)
-        if now.cost > max(NEAR_NOISE_RATIO**2 * now.noise2, CHECKED_ABOVE):
-            found = self._slips(now, part)
-            if len(found.gates) > len(now.gates):
-                bench = bench.renewed(found.bench.recordings)
-                starts = [found.fitted.values, {}]
-                found = found.then(bench, bench.fit(bench.simulator, starts, solver=THOROUGH))
-            now = found
-        now = self._in_time(self._report(3, now), unclip, mend_stale_samples, find_gaps)
-        now = now.then(*refine_steps(now.bench, self._report(4, now).fitted))
-        now = self._in_time(now, partial(find_time_shift, part=part, early=self.early), find_output_gaps)
-        return self._in_time(self._report(5, now), find_offsets)
+        first = Checked(patient, refitted(patient), self.gates)
+        now = self._in_turn(first, find_wrong_start, in_any_case=True)
+        now = replace(now, bench=replace(now.bench, deadline=self.until))
+        slips, shift = partial(self._correct_slips, part=part), partial(find_time_shift, part=part, early=self.early)
+        now = self._in_turn(now, self._report(2), slips, in_any_case=True)
+        now = self._in_turn(now, self._report(3), unclip, mend_stale_samples, find_gaps)
+        now = self._in_turn(now, self._report(4), _refine_steps, in_any_case=True)
+        return self._in_turn(now, shift, find_output_gaps, self._report(5), find_offsets)
 
-    def _in_time(self, now: Checked, *checks: Callable[[Checked], Checked]) -> Checked:
-        """Carry out checks one after the other until the time is over."""
+    def may_go_on(self, now: Checked) -> bool:
+        """Tell whether the time is not over, and nobody has interrupted a fit."""
+        return time.perf_counter() < self.until and not now.bench.interrupted_fits
+
+    def _in_turn(self, now: Checked, *checks: Callable[[Checked], Checked], in_any_case: bool = False) -> Checked:
+        """Carry out checks one after the other, until an interrupt comes, or the time is over, unless `in_any_case`."""
         for check in checks:
-            now = check(now) if time.perf_counter() < self.until else now
+            if now.bench.interrupted_fits or not (in_any_case or self.may_go_on(now)):
+                break
+            try:
+                now = check(now)
+            except BaseException as error:
+                if not is_interrupt(error):
+                    raise
+                now.bench.interrupted_fits.append(Status.INTERRUPTED)
+                self.say.interrupted()
         return now
 
-    def _report(self, done: int, now: Checked) -> Checked:
-        self.say(CHECKS, done, CHECKED, now.cost**0.5)
-        return now
+    def _report(self, done: int) -> Callable[[Checked], Checked]:
+        """Make a step that only reports how many checks are done."""
 
-    def _slips(self, now: Checked, part: float) -> Checked:
+        def report(now: Checked) -> Checked:
+            self.say(CHECKS, done, CHECKED, now.cost**0.5)
+            return now
+
+        return report
+
+    def _correct_slips(self, now: Checked, part: float) -> Checked:
+        """Correct wrong signs, units and exchanged channels if the refit is not at the noise, and refit."""
+        if now.cost <= max(NEAR_NOISE_RATIO**2 * now.noise2, CHECKED_ABOVE):
+            return now
+        found = self._find_slips(now, part)
+        if len(found.gates) == len(now.gates):
+            return found
+        bench = now.bench.renewed(found.bench.recordings)
+        starts = [found.fitted.values, {}]
+        return found.then(bench, bench.fit(bench.simulator, starts, solver=THOROUGH))
+
+    def _find_slips(self, now: Checked, part: float) -> Checked:
         """Find wrong signs, units and exchanged channels; or a shift, because half a period late looks like a sign."""
         found = find_slips(now, self.workers)
         if len(found.gates) == len(now.gates) or found.cost <= POOR_FIT:
             return found
         late = find_time_shift(now, part, self.early)
         return late if late.cost < CURED_SHARE * found.cost else found
+
+
+def _refine_steps(now: Checked) -> Checked:
+    return now.then(*refine_steps(now.bench, now.fitted))
 
 
 def _with_better_hold(
