@@ -27,6 +27,7 @@ AMPLITUDES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
 SINES, TRIANGLES = 12, 5  # frequencies that are tried
 LONGEST_EXPERIMENT = 3000  # longest simulated experiment, in samples
 LEAST_MOTION = 0.5  # deviation of an output's scored samples over that of all, below which it hardly moves
+VISIBLE_LEVEL = 0.1  # mean of an input over its amplitude, above which a sentence states it
 UNEDITED = "after, on test recordings as given"  # a key of `test_errors`
 VISIBLE_DIFFERENCE = 0.01  # difference of two answers over the noise, above which a recording shows it
 
@@ -155,14 +156,14 @@ def next_experiment(
     noise : array, shape (n_y,)
         Deviation of the outputs' noise.
     limits : mapping, optional
-        Largest amplitude of each input; by default what was recorded.
+        Largest amplitude of each input; by default the input stays within its recorded range.
 
     Returns
     -------
     dict or None
-        `input`, `waveform`, `amplitude`, `frequency` (Hz), `separation` (rms difference over the noise), `recorded`
-        (the separation in the recordings) and `sentence`; None if nothing within the limits separates them better than
-        the recordings do.
+        `input`, `waveform`, `level` (its mean), `amplitude`, `frequency` (Hz), `separation` (rms difference over the
+        noise), `recorded` (the separation in the recordings) and `sentence`; None if nothing within the limits
+        separates them better than the recordings do.
     """
     u = np.concatenate([r.u for r in bench.recordings])
     m = min(max(map(len, bench.recordings)), LONGEST_EXPERIMENT)
@@ -182,17 +183,22 @@ def next_experiment(
         return value if np.isfinite(value) else 0.0
 
     for i, name in enumerate(bench.simulator.inputs):
-        most = (limits or {}).get(name, float(np.max(np.abs(u[:, i] - rest[i]))))
+        low, high = float(np.min(u[:, i])), float(np.max(u[:, i]))
+        most = (limits or {}).get(name, (high - low) / 2)
         for waveform, f, wave in _waves(m, bench.dt):
             for share in AMPLITUDES:
-                drive = np.tile(rest, (m, 1))
-                drive[:, i] += share * most * wave
+                amplitude, drive = share * most, np.tile(rest, (m, 1))
+                # near its usual value, but within what was recorded: many inputs, such as a heater's, have one sign
+                least, largest = sorted((low + amplitude, high - amplitude))
+                level = float(np.clip(rest[i], least, largest))
+                drive[:, i] = level + amplitude * wave
                 value = separation(drive)
                 if best is None or value > BETTER_RATIO * best["separation"]:
                     best = {
                         "input": name,
                         "waveform": waveform,
-                        "amplitude": share * most,
+                        "level": level,
+                        "amplitude": amplitude,
                         "frequency": f,
                         "separation": value,
                     }
@@ -217,9 +223,11 @@ def _describe_experiment(bench: Workbench, best: Mapping[str, Any], recorded: fl
     """Describe an experiment; `recorded` is the separation in the recordings."""
     unit = {**bench.simulator.units, **bench.recordings[0].units}.get(best["input"], "")
     so_far = f"by {recorded:.2g} times" if recorded > VISIBLE_DIFFERENCE else "not at all"
+    about = abs(best["level"]) > VISIBLE_LEVEL * best["amplitude"]
+    level = f" about {best['level']:.3g}{' ' + unit if unit else ''}" if about else ""
     return (
         f"A {best['waveform']} of {best['frequency']:.3g} Hz with amplitude {best['amplitude']:.3g}"
-        f"{' ' + unit if unit else ''} at {best['input']} separates {rivals} best: their outputs then differ by "
+        f"{' ' + unit if unit else ''}{level} at {best['input']} separates {rivals} best: their outputs then differ by "
         f"{best['separation']:.3g} times the noise (in these recordings {so_far})."
     )
 

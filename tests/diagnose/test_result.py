@@ -225,6 +225,19 @@ def test_the_next_experiment_has_a_unit_that_the_simulator_knows():
     assert " N at force separates the two best" in found["sentence"]
 
 
+def test_the_next_experiment_stays_within_the_recorded_range():
+    """An input of one sign, such as a heater's, may not be able to have the other."""
+    r = recorded(HIDDEN, 0, samples=200)
+    pushed = r.with_(u=(r.u - np.min(r.u)) ** 4 / np.ptp(r.u) ** 3)  # most of the time near zero
+    bench = Workbench.of(rig(), [pushed], "zero")
+    stiffening = rig().with_element("ground", CubicStiffness().at({"k_3": 2.0e4}))
+    both = [bench.run(s, {k: p.value for k, p in s.parameters.items()}, [np.zeros(2)]) for s in (rig(), stiffening)]
+    found = next_experiment(bench, *both, noise=1e-3 * bench.scale)
+    assert found["level"] - found["amplitude"] > -1e-9 * np.ptp(pushed.u)
+    assert found["level"] + found["amplitude"] < np.max(pushed.u) * (1 + 1e-9)
+    assert f"about {found['level']:.3g}" in found["sentence"]
+
+
 def test_simulators_are_compared_on_the_same_samples():
     """A law with memory takes longer to start; the simulator without it is scored from there on as well."""
     r = recorded(HIDDEN, 0).with_(initial="estimate")
