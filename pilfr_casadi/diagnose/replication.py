@@ -160,7 +160,7 @@ def replicate(
         by_recording=values,
         widths=_widths(after),
         nrmse_before=mean_nrmse(bench, plain),
-        nrmse_after=float(np.mean(np.sqrt(np.mean(np.concatenate(residuals) ** 2, axis=0)))),
+        nrmse_after=mean_nrmse(bench, replace(after, residual=alone)),
         noise=float(np.sqrt(noise2)),
         remainder=float(0.5 * np.log(max(square, 1e-300) / max(noise2, 1e-300))),
         remainder_error=float(np.sqrt(variance)),

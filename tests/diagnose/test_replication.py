@@ -40,3 +40,13 @@ def test_without_laws_the_rest_is_told(days):
     assert found.gain == 0.0 and found.remainder > 2 and len(found.residuals) == 2
     with pytest.raises(InputError, match="hold"):
         replicate(rig(), days, hold="cubic")
+
+
+def test_errors_before_and_after_are_comparable():
+    """In a recording with small signals, relative errors are large; without laws hardly anything changes."""
+    rng, large = np.random.default_rng(0), recording(1300.0, 0, friction=0.0)
+    small = large.with_(
+        u=0.02 * large.u, y=0.02 * large.y + 3e-3 * np.std(large.y) * rng.standard_normal(large.y.shape)
+    )
+    found = replicate(rig(), [large, small])
+    assert found.nrmse_after == pytest.approx(found.nrmse_before, rel=0.05)
