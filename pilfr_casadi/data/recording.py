@@ -50,6 +50,9 @@ class Recording:
         Leading samples that are simulated but not scored.
     name : str
         Name for messages, tables and figures.
+    start : float
+        Time of the first sample in seconds, for equations and laws that read the time; a piece cut out of a recording
+        keeps that recording's time.
 
     Raises
     ------
@@ -68,6 +71,7 @@ class Recording:
     hold: str | None = None
     skip: int = 0
     name: str = ""
+    start: float = 0.0
 
     def __post_init__(self) -> None:
         u, inputs = _channels(self.u, self.inputs, "u", "input", self.label)
@@ -126,6 +130,11 @@ class Recording:
         """Time of the samples from zero on, (M,), in seconds."""
         return np.arange(len(self)) * self.dt
 
+    @property
+    def clock(self) -> np.ndarray:
+        """Time of the samples from `start` on, (M,), in seconds, which equations and laws read."""
+        return self.start + self.t
+
     def __len__(self) -> int:
         return len(self.u)
 
@@ -177,7 +186,15 @@ class Recording:
         period = self.period if (self.period or 0) <= last - first - skip else None
         keeps_initial = period is not None if self.begins == "periodic" else first == 0
         initial = self.initial if keeps_initial else "estimate"
-        return replace(self, u=self.u[first:last], y=self.y[first:last], period=period, skip=skip, initial=initial)
+        return replace(
+            self,
+            u=self.u[first:last],
+            y=self.y[first:last],
+            period=period,
+            skip=skip,
+            initial=initial,
+            start=self.start + first * self.dt,
+        )
 
     def split(self, fraction: float) -> tuple[Self, Self]:
         """Cut in two: the first `fraction` (between 0 and 1) of the samples, and the rest; see :meth:`slice`."""
@@ -455,8 +472,10 @@ def _initial_state(values: Any, label: str) -> np.ndarray:
 
 
 def _check_options(r: Recording, m: int) -> None:
-    """Check the step, `hold`, `initial`, `skip` and `period` of a recording of `m` samples."""
+    """Check the step, `start`, `hold`, `initial`, `skip` and `period` of a recording of `m` samples."""
     positive(r.dt, f"{r.label}: dt", "the seconds from one sample to the next")
+    if not (is_number(r.start) and np.isfinite(r.start)):
+        raise InputError(f"start of {r.label} is {r.start!r}; give the time of its first sample in seconds.")
     if not (r.hold is None or isinstance(r.hold, str)) or r.hold not in HOLDS:
         raise InputError(f"hold of {r.label} is {r.hold!r}; give 'zero', 'linear' or None.")
     if isinstance(r.initial, str) and r.initial not in INITIALS:

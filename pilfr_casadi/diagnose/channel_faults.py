@@ -58,7 +58,7 @@ def exchange_channels(kind: str, names: Sequence[str], one: int, other: int) -> 
 def scale_time(factor: float) -> Gate:
     """Return the fault that a factor on the time corrects."""
     words = f"In the recordings the time is {_describe_factor(factor)}"
-    return Gate("time", "time-unit", factor, words, change=lambda r: r.with_(dt=r.dt * factor))
+    return Gate("time", "time-unit", factor, words, change=lambda r: r.with_(dt=r.dt * factor, start=r.start * factor))
 
 
 def _describe_factor(correction: float, more: str = "") -> str:

@@ -1,6 +1,8 @@
 """The noise floor: from repeated periods, from repeated recordings, or estimated from a residual.
 
-What repeats is rounded alike, so that a measured floor is at least the error of rounding to the sensor's steps.
+What repeats is rounded alike, so that a measured floor is at least the error of rounding to the sensor's steps. A
+machine that wears, warms up or is set otherwise does not repeat: then the input drives the differences between the
+repeats, which are no noise.
 
 The estimate takes third differences of the residual (normalised by √20): they remove slow model error and keep white
 noise. They underestimate coloured noise. If a fit's residual cannot be told from noise (no local signal explains any of
@@ -9,7 +11,7 @@ it on held-out data), the residual itself is the floor.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,6 +25,8 @@ FEWEST = 30.0  # effective samples that a residual has at least
 LONGEST = 400  # longest correlation of a residual, in samples
 DISTINCT_SHARE = 0.5  # share of the samples with distinct values above which a signal is not quantised
 FEWEST_LEVELS = 10  # of a quantised signal; one with fewer is a switch
+DRIVEN = 0.5  # share of the differences between repeats that the input explains, above which they are no noise
+RESPONSE, COMPARED = 150, 6000  # length of the response to the input that is tried, and most samples, in samples
 SAME_LEVEL = 1e-9  # distance of two values, over the range, below which they are one level
 
 
@@ -82,9 +86,9 @@ def measured_floor(recordings: Sequence[Recording]) -> Floor | None:
     groups: dict[bytes, list[Recording]] = {}
     for r in recordings:
         groups.setdefault(r.u.tobytes(), []).append(r)
-    alike = [np.stack([r.y[_settled(g) :] for r in g]) for g in groups.values() if len(g) > 1 and _repeat(g)]
+    alike = [(g[0].u[first:], np.stack([r.y[first:] for r in g])) for g, first in _repeats(groups.values())]
     periods = [folded for folded in map(_fold, recordings) if folded is not None]
-    repeated = periods or alike
+    repeated = [y for u, y in periods or alike if not _is_driven(y - np.mean(y, axis=0), u)]
     if not repeated:
         return None
     square = np.mean(np.concatenate([np.var(y, axis=0, ddof=1) for y in repeated]), axis=0)
@@ -108,6 +112,29 @@ def _sensor_steps(recordings: Sequence[Recording]) -> np.ndarray:
     return out
 
 
+def _repeats(groups: Iterable[Sequence[Recording]]) -> Iterator[tuple[Sequence[Recording], int]]:
+    """List the groups that repeat an experiment, each with the first sample that is compared."""
+    return ((g, _settled(g)) for g in groups if len(g) > 1 and _repeat(g))
+
+
+def _is_driven(differences: np.ndarray, u: np.ndarray) -> bool:
+    """Tell whether the input u (N, n_u) drives the differences (P, N, n_y) of repeats from their mean.
+
+    The response of each output to the input is fitted to the first half of each repeat, and must explain most of the
+    second half. Noise has no such response.
+    """
+    every = max(len(u) // COMPARED, 1)  # long repeats: of every few samples, with all samples of the input before them
+    lags = range(0, min(RESPONSE, len(u) // 8) * every, every)
+    columns = np.hstack([np.vstack([np.zeros((k, u.shape[1])), u[: len(u) - k]]) for k in lags])
+    columns = columns[::every] - np.mean(columns[::every], axis=0)
+    half, left, total = len(columns) // 2, 0.0, 0.0
+    for e in differences[:, ::every] - np.mean(differences[:, ::every], axis=1, keepdims=True):
+        response = np.linalg.lstsq(columns[:half], e[:half], rcond=1e-6)[0]
+        left = left + np.sum((e[half:] - columns[half:] @ response) ** 2, axis=0)
+        total = total + np.sum(e[half:] ** 2, axis=0)
+    return bool(np.any(left < (1 - DRIVEN) * np.asarray(total)))
+
+
 def _settled(group: Sequence[Recording]) -> int:
     """Return the first compared sample of recordings of one input: late if their initial states may differ."""
     first = max(r.skip for r in group)
@@ -126,14 +153,14 @@ def _repeat(group: Sequence[Recording]) -> bool:
     return _begin_alike(group) or bool(np.any(np.ptp(group[0].u[_settled(group) :], axis=0) > 0))
 
 
-def _fold(r: Recording) -> np.ndarray | None:
-    """Stack the outputs' periods, (P, N, n_y); None if there are not two."""
+def _fold(r: Recording) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the input of a period (N, n_u), and the outputs' periods (P, N, n_y); None if there are not two."""
     n = r.period
     if not n or r.begins != "periodic":
         return None
     y = r.y[r.skip :]
     count = len(y) // n
-    return y[: count * n].reshape(count, n, -1) if count > 1 else None
+    return (r.u[r.skip :][:n], y[: count * n].reshape(count, n, -1)) if count > 1 else None
 
 
 def third_differences(residual: np.ndarray) -> np.ndarray:

@@ -214,7 +214,7 @@ def law_signals(bench: Workbench, fitted: Fitted, number: int, i: int) -> tuple[
     x, s, u, v, t = (ca.SX.sym(k, m) for k, m in (("x", n_x), ("s", n_s), ("u", n_u), ("v", n_u), ("t", 1)))
     found = equations.evaluate(Instant(x, s, u, v, t))[3][number]
     function = ca.Function("law", [ca.vertcat(x, s), u, v, t, vector], [ca.vertcat(*map(ca.SX, found))])
-    (rows,) = map_points(function, states, r.u, input_slope(bench, r), r.t[:, None], fitted.vector)
+    (rows,) = map_points(function, states, r.u, input_slope(bench, r), r.clock[:, None], fitted.vector)
     return rows[:, 0, 0], rows[:, 1, 0], rows[:, 2, 0]
 
 

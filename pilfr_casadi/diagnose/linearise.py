@@ -218,7 +218,7 @@ def local_signals(
 
     `local` is the function of `simulators.signals`.
     """
-    found = map_points(local, states, r.u, input_slope(bench, r), r.t[:, None], p)
+    found = map_points(local, states, r.u, input_slope(bench, r), r.clock[:, None], p)
     return tuple(v[:, :, 0] for v in found)
 
 

@@ -382,7 +382,9 @@ class Workbench:
 
     def signals_of(self, inputs: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
         """Return the time `t` and the inputs by name along all recordings, from the inputs (M, n_u) of each."""
-        time = np.concatenate([self.dt * np.arange(len(u)) for u in inputs])
+        time = np.concatenate(
+            [r.start + self.dt * np.arange(len(u)) for r, u in zip(self.recordings, inputs, strict=True)]
+        )
         return {"t": time, **dict(zip(self.simulator.inputs, np.concatenate(inputs).T, strict=True))}
 
     def run(self, simulator: Simulator, values: Mapping[str, Any], states: Sequence[np.ndarray]) -> Fitted:

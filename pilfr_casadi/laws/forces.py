@@ -44,11 +44,12 @@ def unit_forces(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.
     names = [name for name in p if name not in law.strength]
     table = [np.ravel(shape.get(n, p[n].value)) for shape in shapes for n in names]
     vector = np.concatenate([*table, [local.dt]])
-    found, begin = [], 0
+    found, begin, clock = [], 0, local.inputs.get("t")
     for i, m in enumerate(local.lengths):
         zs, dzs = local.z[begin : begin + m], local.dz[begin : begin + m]
         following = (np.append(values[1:], values[-1]) for values in (zs, dzs))
-        rows = np.column_stack([zs, dzs, local.dt * np.arange(m), *following])
+        time = local.dt * np.arange(m) if clock is None else clock[begin : begin + m]
+        rows = np.column_stack([zs, dzs, time, *following])
         begin += m
         if step.size1_in(0):
             same = np.broadcast_to(vector, (m, len(vector)))

@@ -82,7 +82,7 @@ class Model:
         """Collect the signals that the step reads along a recording, (M * substeps, n_u), in the order of `reads`.
 
         `u` is the input at the start of a sub-step and `next` at its end (both interpolated between samples; `u` alone
-        is held over the sample), `t` the time in s since the recording's first sample, `y` the measured output, and
+        is held over the sample), `t` the time in s (see `Recording.start`), `y` the measured output, and
         `sampled` one where a sample is taken and zero in the sub-steps after it.
         """
         n, m = self.substeps, len(recording)
@@ -90,7 +90,8 @@ class Model:
         columns = []
         for signal in self.reads:
             if signal == "t":
-                columns.append((np.repeat(np.arange(m), n) + share)[:, None] * recording.dt)
+                since = (np.repeat(np.arange(m), n) + share)[:, None] * recording.dt
+                columns.append(recording.start + since)
             elif signal == "sampled":
                 columns.append((share == 0)[:, None].astype(float))
             elif signal == "u" and "next" not in self.reads:

@@ -4,11 +4,13 @@ import pickle
 
 import numpy as np
 import pytest
+from cart import cart
 from hypothesis import given, strategies as st
 from scipy.sparse import csc_array
 
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording, as_recordings, check_for_identification
+from pilfr_casadi.laws import Drift
 
 
 def recording(m=20, n_u=1, n_y=1, **options):
@@ -216,3 +218,19 @@ def test_nothing_to_identify():
     with pytest.raises(InputError, match="output 'y2' never changes"):
         check_for_identification(r.with_(y=r.y * [1.0, 0.0]))
     assert check_for_identification(r.with_(u=r.u * [0.0, 1.0]))
+
+
+def test_a_piece_keeps_the_time_of_its_recording():
+    """What drifts over a day goes on drifting in the afternoon."""
+    drifting = cart().with_element("sensor:pos", Drift(values={"a": 0.3, "b": 0.02}))
+    whole = Recording(np.ones(400), np.zeros(400), 0.1, ("force",), ("pos",), initial="zero", hold="zero")
+    late = whole.slice(100).slice(50, 200).with_(initial="zero")
+    assert late.start == pytest.approx(15.0) and late.t[0] == 0.0 and late.clock[0] == pytest.approx(15.0)
+    alone = cart().simulate(late)
+    np.testing.assert_allclose(drifting.simulate(late)[:, 0] - alone[:, 0], 0.3 * late.clock + 0.02 * late.clock**2)
+
+
+@pytest.mark.parametrize("start", [np.nan, "noon", None])
+def test_the_start_is_a_time(start):
+    with pytest.raises(InputError, match=r"start of the recording is .*; give the time of its first sample in seconds"):
+        Recording(np.ones(4), np.zeros(4), 0.1, start=start)

@@ -49,7 +49,8 @@ def test_an_error_that_repeats_is_told_from_measured_noise(pole, repeats):
     for seed in range(20):
         rng = np.random.default_rng(seed)
         noise = lfilter([1], [1, -pole], rng.standard_normal(repeats * 4 * N + 500))[500:, None]
-        blank = Recording(noise, noise, 0.01, ("u",), ("a",), initial="periodic", period=4 * N)
+        drive = np.tile(rng.standard_normal(4 * N), repeats)
+        blank = Recording(drive, noise, 0.01, ("u",), ("a",), initial="periodic", period=4 * N)
         floor = measured_floor([blank])
         sine = 1.5 * floor.deviation * np.sin(0.5 * np.arange(len(noise)))[:, None]
         alone, both = (np.std(e, axis=0) for e in (noise, noise + sine))
@@ -110,3 +111,19 @@ def test_a_recording_of_few_samples_says_nothing_about_noise():
     long, short = rng.standard_normal((1000, 1)), np.zeros((2, 1))
     assert white_part([long, short]) == pytest.approx(white_part([long]))
     assert effective_size([long, short]) == pytest.approx(effective_size([long]), abs=2.0)
+
+
+@pytest.mark.parametrize(("wear", "source"), [(0.0, "repeats"), (0.02, None)])
+@pytest.mark.parametrize("noise", ["white", "slow"])
+def test_a_machine_that_changes_from_run_to_run_repeats_nothing(wear, source, noise):
+    """The input drives the difference between a new and a worn machine; it does not drive noise of any colour."""
+    rng = np.random.default_rng(3)
+    u = rng.standard_normal((4000, 1))
+    errors = 1e-3 * rng.standard_normal((3, 4000, 1))
+    errors = errors if noise == "white" else lfilter([0.1], [1.0, -0.99], errors, axis=1)
+    runs = [
+        Recording(u, lfilter([1.0], [1.0, -0.9 - wear * k], u, axis=0) + e, 0.01, initial="zero")
+        for k, e in enumerate(errors)
+    ]
+    found = measured_floor(runs)
+    assert (found.source if found else None) == source
