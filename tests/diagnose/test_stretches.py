@@ -206,3 +206,18 @@ def test_after_an_interrupt_everything_has_the_values_of_the_stretches():
     search.interrupted = False
     moved = Everything.of(search, stretches, ()).fit(search, fitted)
     assert moved.cost < kept.cost
+
+
+@pytest.mark.slow
+def test_wear_over_a_long_record_is_named():
+    """The pieces have the same periodic input, and are no repeats; each knows when it was recorded."""
+    rng = np.random.default_rng(0)
+    u = np.tile(10 * np.ravel(pilfr.multisine(1000, f_max=3.0, fs=20.0, rng=rng)), 15)
+    blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
+    worn = laws.scheduled(laws.ViscousDamping, "t")().at({"c_1": 1.0, "c_1_high": 4.0, "low": 0.0, "high": 750.0})
+    y = cart().with_element("ground", worn).simulate(blank)
+    train = blank.with_(y=y + 2e-3 * np.std(y) * rng.standard_normal(y.shape))
+    found = pilfr.diagnose(cart(), train, laws=(laws.ViscousDamping,), search_samples=6000, workers=1)
+    (effect,) = found.effects
+    assert (effect.port, effect.law, effect.form) == ("ground", "viscous_damping", "scheduled by t")
+    assert found.errors["train"]["after"] < 2.5e-3 and found.floor["source"] == "estimated"
