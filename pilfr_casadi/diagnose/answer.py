@@ -267,12 +267,11 @@ def _blind_spots(request: Request, ready: Prepared, search: Search) -> tuple[Bli
 
 def _without_each_effect(search: Search, found: Conclusion) -> dict[NamedEffect, Fitted]:
     """Fit the corrected simulator without each of several named effects; empty beside a learned force."""
-    laws = found.fitted.last_elements(len(found.correction.elements))
     if len(found.effects) < 2 or found.correction.learned or search.interrupted:
         return {}
-    joint, out = Trial(laws, found.fitted, found.fitted.cost, found.fitted.cost), dict[NamedEffect, Fitted]()
+    joint, out = Trial.of(found.fitted, len(found.correction.elements)), dict[NamedEffect, Fitted]()
     for effect in found.effects:
-        rest = search.leave_out(joint, [e for e in laws if (e.port, e.law.id) == effect.name])
+        rest = search.leave_out(joint, [e for e in joint.laws if (e.port, e.law.id) == effect.name])
         if rest is not None:
             out[effect] = rest.fitted
     return out

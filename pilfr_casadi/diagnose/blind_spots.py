@@ -418,7 +418,7 @@ def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) ->
     """Say what to record next, from the gravest blind spot that a recording can remove."""
     names = {b.kind: b.names for b in reversed(found.blind_spots)}
     if "rough" in names:
-        return "None before the simulator follows these better: check its values and units, the start and the hold."
+        return "First let the simulator follow these recordings better: check its values and units, the start and the hold."
     if "constant-input" in names:
         return f"One in which {in_words(names['constant-input'])} varies."
     drive = inputs[0] if inputs else "the input"
@@ -443,7 +443,7 @@ def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) ->
         return "One that begins at rest, with initial='zero'."
     if found.ties:
         return f"No further record of these signals helps: measure {found.ties[0].names[0]} separately and fix it."
-    return "None is pressing; for the test take amplitudes that the training recordings do not have."
+    return "These recordings tell most things. For the test, take amplitudes that the training recordings do not have."
 
 
 def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator[Excitation]:

@@ -400,7 +400,7 @@ class Hypotheses:
             named |= simulator.elements[-1].named(e.own(joint.fitted.values))
         bench = replace(self.bench, at_least=max(self.bench.at_least, joint.fitted.model.substeps))
         fitted = bench.run(simulator, named, joint.fitted.begin)
-        return Trial(fitted.last_elements(len(laws)), fitted, fitted.cost, fitted.cost)
+        return Trial.of(fitted, len(laws))
 
     def leave_out(self, joint: Trial, elements: Sequence[Placed]) -> Trial | None:
         """Fit a hypothesis without some of its laws to convergence; None if it diverges.

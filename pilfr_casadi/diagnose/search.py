@@ -81,7 +81,7 @@ class Search(Hypotheses):
 
     def run(self, effects: float) -> Search:
         """Search for up to `effects` effects; an interrupt ends the search with the present results."""
-        self.keep(Trial((), self.without, self.without.cost, self.without.cost, True))
+        self.keep(Trial.of(self.without, 0, thorough=True))
         with self.until_interrupted():
             self.estimate_noise()
             if self._grow(effects) and self._name_rest(effects):
@@ -523,7 +523,7 @@ class Search(Hypotheses):
             return False
         self.without, self.memo, self.steps = alone, {}, []
         self.findings.clear()
-        self.keep(Trial((), alone, alone.cost, alone.cost, True))
+        self.keep(Trial.of(alone, 0, thorough=True))
         return True
 
 

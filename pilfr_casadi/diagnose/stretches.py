@@ -314,7 +314,7 @@ class Everything:
             return None
         there = replace(search, bench=whole, memo={}, steps=[], findings=defaultdict(Findings))
         for trial, fitted in zip(trials, fits, strict=True):
-            there.keep(Trial(trial.laws, fitted, fitted.cost, fitted.cost, True))
+            there.keep(Trial.of(fitted, len(trial.laws), thorough=True))
         best = max(there.memo.values(), key=there.evidence)
         there.count = count_samples(best.fitted, whole)
         kept = {t.key for t in likeliest(list(there.memo.values()), there.evidence)} | {search.root.key}

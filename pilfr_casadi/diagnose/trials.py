@@ -69,6 +69,11 @@ class Trial:
     thorough: bool = False
     information: np.ndarray | None = None
 
+    @classmethod
+    def of(cls, fitted: Fitted, count: int, thorough: bool = False) -> Trial:
+        """Make the trial of a fit to all recordings, whose last `count` elements are the hypothesis' laws."""
+        return cls(fitted.last_elements(count), fitted, fitted.cost, fitted.cost, thorough)
+
     @property
     def key(self) -> Key:
         """Ports and classes of the laws; equal keys mean the same hypothesis."""
@@ -198,14 +203,14 @@ class Trials:
             fitted = bench.fit(placed, starts, states=states, solver=THOROUGH, model=model, engine=engine)
         except InputError:
             return replace(trial, mean_square=np.inf, thorough=True)
-        return Trial(fitted.last_elements(len(trial.laws)), fitted, fitted.cost, fitted.cost, thorough=True)
+        return Trial.of(fitted, len(trial.laws), thorough=True)
 
     def sharpen(self, trial: Trial) -> Trial:
         """Refit a converged trial on steps that are fine enough for its knee, if it has one."""
         if not trial.knee or not trial.mean_square < DIVERGED or time.perf_counter() > self.bench.deadline:
             return trial
         fitted = refit_on_finer_steps(self.bench, trial.fitted, trial.knee)
-        return Trial(fitted.last_elements(len(trial.laws)), fitted, fitted.cost, fitted.cost, thorough=True)
+        return Trial.of(fitted, len(trial.laws), thorough=True)
 
     def fit_pairs(
         self,
