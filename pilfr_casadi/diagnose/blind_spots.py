@@ -418,7 +418,7 @@ def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) ->
     """Say what to record next, from the gravest blind spot that a recording can remove."""
     names = {b.kind: b.names for b in reversed(found.blind_spots)}
     if "rough" in names:
-        return "First let the simulator follow these recordings better: check its values and units, the start and the hold."
+        return "First let the simulator follow these better: check its values and units, the start and the hold."
     if "constant-input" in names:
         return f"One in which {in_words(names['constant-input'])} varies."
     drive = inputs[0] if inputs else "the input"
