@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import pilfr_casadi
-from pilfr_casadi._base import LATER_VERBS, later
+from pilfr_casadi._base import later
 
 PACKAGE = Path(pilfr_casadi.__file__).parent
 ORDER = [
@@ -100,14 +100,14 @@ def calls_forward():
                         yield name.partition("/")[0], ast.literal_eval(call.args[0]), body
 
 
-def test_what_reaches_forward_is_a_verb_in_one_line_and_in_the_table():
+def test_what_reaches_forward_is_a_verb_in_one_line():
     found = list(calls_forward())
-    assert {verb for _, verb, _ in found} == set(LATER_VERBS)
+    assert found
     for folder, verb, body in found:
-        there = LATER_VERBS[verb]
+        there, name = verb.split(".")
         assert ORDER.index(folder) <= ORDER.index(there), verb
         assert len(body) == 1 and isinstance(body[0], ast.Return), verb
-        assert later(verb) is getattr(importlib.import_module(f"pilfr_casadi.{there}"), verb)
+        assert later(verb) is getattr(importlib.import_module(f"pilfr_casadi.{there}"), name)
 
 
 def circles(graph):

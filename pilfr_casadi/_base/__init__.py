@@ -46,7 +46,7 @@ if TYPE_CHECKING:
         time_limit as time_limit,
         unwrapped_interrupt as unwrapped_interrupt,
     )
-    from .lazy import LATER_VERBS as LATER_VERBS, later as later
+    from .lazy import later as later
     from .progress import (
         Progress as Progress,
         Stages as Stages,

@@ -12,8 +12,7 @@ A face lists its names once, under ``TYPE_CHECKING``; type checkers, editors and
         __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
 
 A folder imports only folders before it. Methods such as `recording.plot()` or `fit.report()`, whose work is done in a
-later folder, call `later("plot_recording")(self)`, which imports the folder when a user calls the method. `LATER_VERBS`
-lists all these functions.
+later folder, call `later("plots.plot_recording")(self)`, which imports the folder when a user calls the method.
 """
 
 from __future__ import annotations
@@ -54,21 +53,7 @@ def lazy_face(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[
     return load, lambda: sorted({*vars(sys.modules[package]), *origins}), listed
 
 
-LATER_VERBS = {  # function: the folder whose face exports it
-    "compare": "identify",
-    "diagnosis_card": "report",
-    "diagnosis_report": "report",
-    "fit_card": "report",
-    "fit_report": "report",
-    "comparison_card": "report",
-    "plot_recording": "plots",
-    "recording_card": "report",
-    "simulator_card": "report",
-    "simulator_nrmse": "identify",
-}
-
-
 def later(verb: str) -> Callable[..., Any]:
-    """Return a function of a later folder's face, by its name in `LATER_VERBS`."""
-    folder = importlib.import_module(f"..{LATER_VERBS[verb]}", __package__)
-    return getattr(folder, verb)
+    """Return a function of a later folder's face, by folder and name, such as "report.fit_card"."""
+    folder, name = verb.split(".")
+    return getattr(importlib.import_module(f"..{folder}", __package__), name)

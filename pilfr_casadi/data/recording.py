@@ -157,10 +157,10 @@ class Recording:
         -------
         matplotlib.figure.Figure
         """
-        return later("plot_recording")(self)
+        return later("plots.plot_recording")(self)
 
     def _repr_html_(self) -> str:
-        return str(later("recording_card")(self))
+        return str(later("report.recording_card")(self))
 
     def with_(self, **changes: Any) -> Self:
         """Return a copy with some fields replaced; it is checked again."""

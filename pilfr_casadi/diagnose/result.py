@@ -365,7 +365,7 @@ class Diagnosis:
 
     def report(self, folder: str | os.PathLike[str]) -> Path:
         """Write report.html, diagnosis.json and figures into a folder; return the page's path."""
-        return Path(later("diagnosis_report")(self, folder))
+        return Path(later("report.diagnosis_report")(self, folder))
 
     def refine(self, operators: int = 12, kind: str | None = None, *, port: str | None = None) -> Refinement:
         """Identify a Prandtl-Ishlinskii layer in the port where hysteresis was found; see `refinement`.
@@ -489,7 +489,7 @@ class Diagnosis:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        return str(later("diagnosis_card")(self))
+        return str(later("report.diagnosis_card")(self))
 
     def _error_lines(self) -> list[str]:
         """Format the errors as a table, with the noise floor below it."""

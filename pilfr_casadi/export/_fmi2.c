@@ -64,30 +64,6 @@ EXPORT fmi2Status fmi2SetInteger(fmi2Component c, REFERENCES, const fmi2Integer 
 EXPORT fmi2Status fmi2SetBoolean(fmi2Component c, REFERENCES, const fmi2Boolean value[]) { return NOT_SUPPORTED(c, n); }
 EXPORT fmi2Status fmi2SetString(fmi2Component c, REFERENCES, const fmi2String value[]) { return NOT_SUPPORTED(c, n); }
 
-EXPORT fmi2Status fmi2GetFMUstate(fmi2Component c, void **state) { return status(save_state(c, state)); }
-EXPORT fmi2Status fmi2SetFMUstate(fmi2Component c, void *state) {
-  memcpy(&((model_t *)c)->now, state, sizeof(values_t));
-  return fmi2OK;
-}
-EXPORT fmi2Status fmi2FreeFMUstate(fmi2Component c, void **state) {
-  free(*state);
-  *state = NULL;
-  return fmi2OK;
-}
-EXPORT fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, void *state, size_t *size) {
-  *size = sizeof(values_t);
-  return fmi2OK;
-}
-EXPORT fmi2Status fmi2SerializeFMUstate(fmi2Component c, void *state, char bytes[], size_t size) {
-  if (size < sizeof(values_t)) return fmi2Error;
-  memcpy(bytes, state, sizeof(values_t));
-  return fmi2OK;
-}
-EXPORT fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const char bytes[], size_t size, void **state) {
-  if (size != sizeof(values_t) || save_state(c, state)) return fmi2Error;
-  memcpy(*state, bytes, size);
-  return fmi2OK;
-}
 EXPORT fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference unknown[], size_t n_unknown,
                                                const fmi2ValueReference known[], size_t n_known, const double seed[],
                                                double sensitivity[]) {

@@ -86,31 +86,6 @@ EXPORT fmi3Status fmi3GetVariableDependencies(fmi3Instance c, fmi3ValueReference
   return NOT_SUPPORTED(c, 1);
 }
 
-EXPORT fmi3Status fmi3GetFMUState(fmi3Instance c, void **state) { return status(save_state(c, state)); }
-EXPORT fmi3Status fmi3SetFMUState(fmi3Instance c, void *state) {
-  memcpy(&((model_t *)c)->now, state, sizeof(values_t));
-  return fmi3OK;
-}
-EXPORT fmi3Status fmi3FreeFMUState(fmi3Instance c, void **state) {
-  free(*state);
-  *state = NULL;
-  return fmi3OK;
-}
-EXPORT fmi3Status fmi3SerializedFMUStateSize(fmi3Instance c, void *state, size_t *size) {
-  *size = sizeof(values_t);
-  return fmi3OK;
-}
-EXPORT fmi3Status fmi3SerializeFMUState(fmi3Instance c, void *state, uint8_t bytes[], size_t size) {
-  if (size < sizeof(values_t)) return fmi3Error;
-  memcpy(bytes, state, sizeof(values_t));
-  return fmi3OK;
-}
-EXPORT fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const uint8_t bytes[], size_t size, void **state) {
-  if (size != sizeof(values_t) || save_state(c, state)) return fmi3Error;
-  memcpy(*state, bytes, size);
-  return fmi3OK;
-}
-
 #define DERIVATIVE                                                                                              \
   (fmi3Instance c, const fmi3ValueReference unknowns[], size_t n_unknowns, const fmi3ValueReference knowns[],   \
    size_t n_knowns, const double seed[], size_t n_seed, double sensitivity[], size_t n_sensitivity) {           \

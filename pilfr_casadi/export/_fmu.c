@@ -170,4 +170,35 @@ static int save_state(model_t *m, void **state) {
   return 0;
 }
 
-{% include "_fmi2.c" if fmi == "2.0" else "_fmi3.c" %}
+{% if fmi == "2.0" %}
+{% set prefix, state, deserialize, byte = "fmi2", "FMUstate", "DeSerialize", "char" %}
+{% include "_fmi2.c" %}
+{% else %}
+{% set prefix, state, deserialize, byte = "fmi3", "FMUState", "Deserialize", "uint8_t" %}
+{% include "_fmi3.c" %}
+{% endif %}
+
+EXPORT {{ prefix }}Status {{ prefix }}Get{{ state }}(void *c, void **state) { return status(save_state(c, state)); }
+EXPORT {{ prefix }}Status {{ prefix }}Set{{ state }}(void *c, void *state) {
+  memcpy(&((model_t *)c)->now, state, sizeof(values_t));
+  return {{ prefix }}OK;
+}
+EXPORT {{ prefix }}Status {{ prefix }}Free{{ state }}(void *c, void **state) {
+  free(*state);
+  *state = NULL;
+  return {{ prefix }}OK;
+}
+EXPORT {{ prefix }}Status {{ prefix }}Serialized{{ state }}Size(void *c, void *state, size_t *size) {
+  *size = sizeof(values_t);
+  return {{ prefix }}OK;
+}
+EXPORT {{ prefix }}Status {{ prefix }}Serialize{{ state }}(void *c, void *state, {{ byte }} bytes[], size_t size) {
+  if (size < sizeof(values_t)) return {{ prefix }}Error;
+  memcpy(bytes, state, sizeof(values_t));
+  return {{ prefix }}OK;
+}
+EXPORT {{ prefix }}Status {{ prefix }}{{ deserialize }}{{ state }}(void *c, const {{ byte }} bytes[], size_t size, void **state) {
+  if (size != sizeof(values_t) || save_state(c, state)) return {{ prefix }}Error;
+  memcpy(*state, bytes, size);
+  return {{ prefix }}OK;
+}

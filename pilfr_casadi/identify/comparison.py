@@ -111,7 +111,7 @@ class Comparison:
         return "\n".join([*lines, self.note])
 
     def _repr_html_(self) -> str:
-        return str(later("comparison_card")(self))
+        return str(later("report.comparison_card")(self))
 
 
 def _format_error(error: float) -> str:

@@ -344,7 +344,7 @@ class Fit:
         test: Recording | Sequence[Recording] = (),
     ) -> Path:
         """Write report.html and model.json into a folder; return the page's path. See `report.fit_report`."""
-        return Path(later("fit_report")(self, train, test, folder))
+        return Path(later("report.fit_report")(self, train, test, folder))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the fit as JSON, atomically: an existing file stays as it is until the new one is complete on disk.
@@ -424,7 +424,7 @@ class Fit:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        return str(later("fit_card")(self))
+        return str(later("report.fit_card")(self))
 
 
 def match_channels(simulator: Simulator, recording: Recording) -> Recording:

@@ -39,7 +39,7 @@ smallest order `n` whose error on the held-out part is within a margin `m` of th
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -164,18 +164,17 @@ class Matrices(NamedTuple):
 
 
 class RangeSpace(NamedTuple):
-    """Range of an extended observability matrix, with as many columns as singular values."""
+    """Range of an extended observability matrix; the columns belong to falling singular values."""
 
     rows: Array  # without the last block row
     shifted: Array  # the same shifted by one step, with the same weights
     C: Array  # the first block row, for outputs divided by `y_scale`
-    values: Array  # singular values
 
 
 class SubspaceProblem:
     """Turn range spaces into models and keep the best over a few numbers of block rows.
 
-    A subclass supplies the attributes, :meth:`range_space` and :meth:`triangular_factors`.
+    A subclass supplies the attributes and the two methods.
     """
 
     dt: float
@@ -185,14 +184,8 @@ class SubspaceProblem:
     affordable_rows: float
     size: float  # sum of squares of the (weighted) data
     too_few: str
-
-    def range_space(self, r: int) -> RangeSpace:
-        """Return the range space of `r` block rows."""
-        raise NotImplementedError
-
-    def triangular_factors(self, A: Array, C: Array) -> list[Array]:
-        """Return triangular factors ``[K y]`` of the problems ``K theta = y`` for `B` and `D`, by input."""
-        raise NotImplementedError
+    range_space: Callable[[int], RangeSpace]  # of `r` block rows
+    triangular_factors: Callable[[Array, Array], list[Array]]  # `[K y]` of `K theta = y` for `B` and `D`, by input
 
     def least_rows(self, nx: int) -> int:
         """Return the fewest block rows that determine a model of order `nx`."""
@@ -232,7 +225,7 @@ class SubspaceProblem:
                 progress("subspace", k, len(steps), min((error for _, error in trials), default=np.nan))
             if r not in spaces:
                 spaces[r] = self.range_space(r)
-            rows, shifted, C = (x[:, :nx] for x in spaces[r][:3])
+            rows, shifted, C = (x[:, :nx] for x in spaces[r])
             A = np.linalg.lstsq(rows, shifted, rcond=None)[0]
             trials.append(self.complete(reflect_poles(A), C))
         best, error = min(trials, key=lambda trial: trial[1])
@@ -298,7 +291,7 @@ class FrequencyProblem(SubspaceProblem):
         self.too_few = f"{F} frequencies are too few"
 
     def range_space(self, r: int) -> RangeSpace:
-        """See :meth:`SubspaceProblem.range_space`."""
+        """Return the range space of `r` block rows."""
         F, n_y, n_u = self.G.shape
         P, H = _orthonormal_polynomials(self.z, r)
         Q = P * np.sqrt(np.mean(1 / self.var, axis=(1, 2)))
@@ -312,14 +305,14 @@ class FrequencyProblem(SubspaceProblem):
                 covariance = ((Q * self.var[:, i].sum(axis=1)) @ Q.conj().T).real
                 K[i::n_y, i::n_y] = np.linalg.cholesky(covariance)
             T = np.linalg.solve(K, T)
-        left, values, _ = np.linalg.svd(_triangle(T.T).T)
+        left, _, _ = np.linalg.svd(_triangle(T.T).T)
         basis = (K @ left).reshape(r, n_y, -1)
         shifted = np.einsum("ij,iok->jok", H, basis).reshape((r - 1) * n_y, -1)
         m = len(shifted)
-        return RangeSpace(left[:m], np.linalg.solve(K[:m, :m], shifted), basis[0] / P[0, 0].real, values)
+        return RangeSpace(left[:m], np.linalg.solve(K[:m, :m], shifted), basis[0] / P[0, 0].real)
 
     def triangular_factors(self, A: Array, C: Array) -> list[Array]:
-        """See :meth:`SubspaceProblem.triangular_factors`."""
+        """Return triangular factors ``[K y]`` of the problems ``K theta = y`` for `B` and `D`, by input."""
         return _response_problems(A, C, self.z, self.G, self.var)
 
     def complete(self, A: Array, C: Array) -> tuple[Matrices, float]:
@@ -354,7 +347,7 @@ class TimeProblem(SubspaceProblem):
         self.too_few = f"{lengths.sum()} samples in {len(lengths)} recording(s) are too few"
 
     def range_space(self, r: int) -> RangeSpace:
-        """See :meth:`SubspaceProblem.range_space`."""
+        """Return the range space of `r` block rows."""
         n_u, n_y = len(self.u_scale), len(self.y_scale)
         R = None
         for u, y in self.records:
@@ -375,11 +368,11 @@ class TimeProblem(SubspaceProblem):
                 R = _fold_qr(R, np.concatenate(rows, axis=1))
         assert R is not None
         past = r * (2 * n_u + n_y)
-        left, values, _ = np.linalg.svd(R[r * n_u : past, past:].T)
-        return RangeSpace(left[:-n_y], left[n_y:], left[:n_y], values)
+        left, _, _ = np.linalg.svd(R[r * n_u : past, past:].T)
+        return RangeSpace(left[:-n_y], left[n_y:], left[:n_y])
 
     def triangular_factors(self, A: Array, C: Array) -> list[Array]:
-        """See :meth:`SubspaceProblem.triangular_factors`."""
+        """Return triangular factors ``[K y]`` of the problems ``K theta = y`` for `B` and `D`, by input."""
         n_u, n_y, nx = len(self.u_scale), len(self.y_scale), len(A)
         free = nx + n_y * self.offset  # initial state and offset, eliminated recording by recording
         total = None
@@ -505,8 +498,6 @@ class OrderSelection:
         Smallest order whose validation error is within `margin` of the best.
     margin : float
         The margin, as a share of the best error.
-    singular_values : array
-        Singular values of the training part, largest first; they drop at the order of the system.
     """
 
     orders: tuple[int, ...]
@@ -514,7 +505,6 @@ class OrderSelection:
     validation: Array
     recommended: int
     margin: float
-    singular_values: Array
 
     def __repr__(self) -> str:
         rows = [f"{'order':>5}  {'train':>10}  {'validation':>10}"]
@@ -582,5 +572,4 @@ def select_order(
     train_error, error = (np.array([part.error(m) for m in models]) for part in (train, validation))
     good_enough = max((1 + margin) * np.min(error), ROUNDING)
     recommended = next(n for n, e in zip(tried, error, strict=True) if e <= good_enough)
-    values = train.range_space(min(20, train.most_rows)).values
-    return OrderSelection(tuple(tried), train_error, error, recommended, margin, values)
+    return OrderSelection(tuple(tried), train_error, error, recommended, margin)

@@ -102,18 +102,12 @@ def traces(
     recording: Recording,
     *,
     output: int = 0,
-    between: tuple[float, float] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw measured and simulated output `between` two times in s, by default a few swings around the largest."""
+    """Draw measured and simulated output over a few swings around the largest."""
     ax, y = axes_or_new(ax), _select_signal(recording.y, output, "output")
-    begin, end = between or find_largest_swings(y - np.mean(y), recording)
+    begin, end = find_largest_swings(y - np.mean(y), recording)
     part = slice(*np.clip(np.round(np.array([begin, end]) / recording.dt).astype(int), 0, len(y)))
-    if part.stop - part.start < 2:
-        raise InputError(
-            f"There are no two samples from {begin:g} to {end:g} s; give times within the {len(y) * recording.dt:g} s "
-            "of the recording."
-        )
     unit = _unit(fit, recording, recording.outputs[output])
     size, label = scale_axis(recording.outputs[output], y[part], unit)
     line(ax, recording.t, y / size, "measured", BLUE, part=part, linewidth=3.2, alpha=0.55)

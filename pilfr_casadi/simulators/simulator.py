@@ -117,7 +117,7 @@ class Simulator(Equations):
         InputError
             As `simulate`, and if the recording lacks an output of the simulator.
         """
-        return later("simulator_nrmse")(self, recordings)
+        return later("identify.simulator_nrmse")(self, recordings)
 
     def plot(self, recording: Recording) -> Any:
         """Draw simulated and recorded outputs: a row for each output, the largest swing and all residuals.
@@ -128,10 +128,10 @@ class Simulator(Equations):
         -------
         matplotlib.figure.Figure
         """
-        return later("compare")(recording, self).plot()
+        return later("identify.compare")(recording, self).plot()
 
     def _repr_html_(self) -> str:
-        return str(later("simulator_card")(self))
+        return str(later("report.simulator_card")(self))
 
     def __repr__(self) -> str:
         lines = [

@@ -217,15 +217,6 @@ def test_from_recording_to_model_through_the_bla():
 # --- order ------------------------------------------------------------------------------------------------------------
 
 
-def test_singular_values_drop_at_the_order():
-    rng = np.random.default_rng(11)
-    true = random_system(5, 2, 2, rng)
-    for data in (records(true, [500], rng), exact_bla(true, np.linspace(0.01, 4.99, 200))):
-        values = select_order(data, [5]).singular_values
-        assert np.all(np.diff(values) <= 0)
-        assert values[4] > 1e6 * values[5]
-
-
 @pytest.mark.parametrize("n_records", [1, 3])
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_select_order_finds_the_order(n_records, noise):

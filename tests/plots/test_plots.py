@@ -395,7 +395,6 @@ def test_studies(fitted):
         (lambda f, d: plots.time(f, d, output=1), "The output 1 was given"),
         (lambda f, d: plots.loop(f, d, channel=1), "Channel 1 of the element"),
         (lambda f, d: plots.loop(replace(f, model=f.linear), d), "Channel 0 of the element"),
-        (lambda f, d: plots.traces(f, d, between=(30.0, 31.0)), "no two samples"),
         (lambda f, d: plots.linear_simulation(replace(f, linear=None), d), "no linear model"),
     ],
 )
