@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         path_text as path_text,
         short as short,
         to_json as to_json,
+        with_nan as with_nan,
         write_atomically as write_atomically,
     )
     from .interrupts import (

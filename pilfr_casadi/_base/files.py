@@ -129,3 +129,10 @@ def to_json(value: Any, infinite: str | None = None) -> Any:
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else infinite if value > 0 else None
     return value
+
+
+def with_nan(content: Any) -> Any:
+    """Replace null of JSON by nan."""
+    if isinstance(content, Mapping):
+        return {k: with_nan(v) for k, v in content.items()}
+    return np.nan if content is None else content

@@ -51,7 +51,9 @@ if TYPE_CHECKING:
         SAME_STEP as SAME_STEP,
         Recording as Recording,
         as_recordings as as_recordings,
+        as_tuple as as_tuple,
         check_for_identification as check_for_identification,
+        default_names as default_names,
         fingerprint as fingerprint,
     )
     from .tables import STACK_SUFFIXES as STACK_SUFFIXES, TABLE_SUFFIXES as TABLE_SUFFIXES, read_stack as read_stack

@@ -13,7 +13,7 @@ import numpy as np
 
 from .._base import InputError, is_number, listed, positive
 from .preprocessing import sample_at
-from .recording import SAME_STEP, Recording, as_names
+from .recording import SAME_STEP, Recording, as_tuple
 
 Names = Sequence[str] | str | None
 
@@ -62,8 +62,8 @@ def merge(
     for r, offset in ((first, 0.0), (second, start)):
         values = sample_at(np.hstack([r.u, r.y]), r.dt, times - offset, step)
         signals |= dict(zip((*r.inputs, *r.outputs), values.T, strict=True))
-    u = first.inputs + second.inputs if inputs is None else as_names(inputs)
-    y = first.outputs + second.outputs if outputs is None else as_names(outputs)
+    u = first.inputs + second.inputs if inputs is None else as_tuple(inputs)
+    y = first.outputs + second.outputs if outputs is None else as_tuple(outputs)
     for name in (*u, *y):
         if name not in signals:
             raise InputError(f"the two recordings have no channel {name!r}; they have {listed(list(signals))}.")

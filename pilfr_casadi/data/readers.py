@@ -15,7 +15,7 @@ import numpy as np
 
 from .._base import InputError, listed, positive
 from .preprocessing import even_grid
-from .recording import Recording, as_names
+from .recording import Recording, as_tuple
 from .tables import ArrayTable, CsvTable, frame_table, open_table
 
 PathLike = str | Path
@@ -294,7 +294,7 @@ def _read_unit(column: str) -> str:
 
 
 def _check_names(given: Any, role: str) -> tuple[str, ...]:
-    names = as_names(given)
+    names = as_tuple(given)
     if not all(isinstance(name, str) for name in names):
         raise InputError(f"{role}={given!r} was given; give the names of the columns.")
     return names

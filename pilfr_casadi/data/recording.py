@@ -320,16 +320,24 @@ class Recording:
 
     def _select(self, channels: Sequence[str] | str | None) -> tuple[str, ...]:
         """Return the given channels as a tuple of names; None stands for all of them."""
-        return (*self.inputs, *self.outputs) if channels is None else as_names(channels)
+        return (*self.inputs, *self.outputs) if channels is None else as_tuple(channels)
 
     def _hold_after_smoothing(self, channels: Sequence[str] | str | None) -> str | None:
         """Return the hold after some channels were smoothed: a stated hold becomes linear if they include inputs."""
         return "linear" if self.hold and set(self._select(channels)) & set(self.inputs) else self.hold
 
 
-def as_names(given: Any) -> tuple[Any, ...]:
-    """Return one name or several as a tuple."""
-    return (given,) if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
+def as_tuple(given: Any) -> tuple[Any, ...]:
+    """Return one object or several as a tuple; a text is one object."""
+    try:
+        return (given,) if isinstance(given, str) else tuple(given)
+    except TypeError:
+        return (given,)
+
+
+def default_names(letter: str, n: int) -> tuple[str, ...]:
+    """Return the names of n signals that have none, such as ("u",) or ("u1", "u2")."""
+    return (letter,) if n == 1 else tuple(f"{letter}{i + 1}" for i in range(n))
 
 
 def as_recordings(data: "Recording | Iterable[Recording]") -> tuple[Recording, ...]:
@@ -423,9 +431,9 @@ def _channels(
         raise InputError(
             f"{letter} of {label} has the shape {array.shape}; give an array of shape (samples, channels)."
         )
-    names = as_names(names)
+    names = as_tuple(names)
     if not names and n:
-        names = (letter,) if n == 1 else tuple(f"{letter}{i + 1}" for i in range(n))
+        names = default_names(letter, n)
     if len(names) != n:
         raise InputError(f"{label} has {n} {role} column(s) but {len(names)} name(s) {listed(names)}; give one each.")
     if not all(isinstance(name, str) and name for name in names) or len(set(names)) != n:

@@ -26,7 +26,7 @@ import numpy as np
 
 from .._base import side_by_side
 from ..data import Recording
-from ..laws import Creep, Law, Local, PlayHysteresis, Relaxation, StopHysteresis, count_columns, unit_forces
+from ..laws import Creep, Law, Local, PlayHysteresis, Relaxation, StopHysteresis, chebyshev, count_columns, unit_forces
 from ..models import Parameter
 from ..simulators import EQUATION, PARAMETER, SENSOR, Port, kind_of, port_name
 from .coloured_noise import whiten, whitening_filters
@@ -457,14 +457,6 @@ def _gain(phi: np.ndarray, left: np.ndarray, law: Law, sense: int) -> tuple[floa
     return share, coefficients / size
 
 
-def chebyshev(x: Any) -> list[Any]:
-    """Compute the Chebyshev polynomials of the first kind, from degree 0 to DEGREE."""
-    out = [1.0, x]
-    for _ in range(DEGREE - 1):
-        out.append(2 * x * out[-1] - out[-2])
-    return out
-
-
 class Surface(Law):
     """A smooth force of the local coordinate and its rate."""
 
@@ -476,7 +468,7 @@ class Surface(Law):
 
     def force(self, z: Any, dz: Any, p: Any) -> Any:
         """Compute the sum of Chebyshev terms."""
-        a, b = chebyshev((z - p.z_m) / p.z_s), chebyshev(dz / p.v_s)
+        a, b = chebyshev((z - p.z_m) / p.z_s, DEGREE), chebyshev(dz / p.v_s, DEGREE)
         return sum(p.c[k] * a[i] * b[j] for k, (i, j) in enumerate(TERMS))
 
     def parameters(self) -> dict[str, Parameter]:

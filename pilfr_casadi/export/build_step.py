@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import LARGEST, InputError, is_number, numbers, positive, whole
-from ..data import Recording
+from ..data import SAME_STEP, Recording
 from ..engine import make_engine
 from ..models import Model, PrandtlIshlinskii
 from ..optimise import estimate_initial_state
@@ -18,7 +18,6 @@ from .c_code import check_name, make_unique
 from .smoothing import smooth_kinks
 from .step import Exported
 
-DT_TOLERANCE = 1e-4  # relative difference of two equal steps that rounding in files may cause
 REST_SAMPLES = 400  # samples of a recording at rest, for the choice of a simulator's sub-steps
 TIME, NEXT = "time", "_next"
 
@@ -196,7 +195,7 @@ def _check_recording(model: Model, step: Exported, recording: Recording) -> None
             f"The recording has {', '.join((*recording.inputs, *recording.outputs))}, the model "
             f"{', '.join((*model.inputs, *model.outputs))}; they must be the same, in this order."
         )
-    if abs(recording.dt / step.dt - 1) > DT_TOLERANCE:
+    if abs(recording.dt / step.dt - 1) > SAME_STEP:
         raise InputError(f"The recording's step is {recording.dt:g} s, the export's {step.dt:g} s; use the same.")
 
 

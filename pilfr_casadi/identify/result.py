@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, is_number, later, listed
-from ..data import NOTHING_SENTENCE, Recording, as_recordings, explains_nothing, fingerprint, nrmse
+from ..data import NOTHING_SENTENCE, SAME_STEP, Recording, as_recordings, explains_nothing, fingerprint, nrmse
 from ..engine import Engine, make_engine
 from ..export import FitContent, exported, read_model_file, write_model_file
 from ..linear import LinearPart, any_bla, linear_parts
@@ -198,18 +198,18 @@ class Fit:
     def _engine(self) -> Engine:
         return make_engine(self.model, self.engine)
 
-    def initial_state(self, recording: Recording, samples: int | None = None) -> np.ndarray:
+    def initial_state(self, recording: Recording) -> np.ndarray:
         """Find the state with memory at a recording's first sample, as its `initial` says.
 
         An estimated state of a training recording comes from the fit. For any other recording it is fitted to the first
-        `samples` samples (default: ten per state, at least 50) at the model's parameters. Later samples are not used,
-        and `nrmse` does not score the first ones.
+        samples (ten per state, at least 50) at the model's parameters. Later samples are not used, and `nrmse` does not
+        score the first ones.
         """
         recording = self.matched(recording)
         known = self.initial.get(fingerprint(recording))
         if known is not None:
             return known
-        return estimate_initial_state(self.model, self._engine, recording, samples, state_prior=True)
+        return estimate_initial_state(self.model, self._engine, recording, state_prior=True)
 
     def simulate(self, recording: Recording) -> np.ndarray:
         """Simulate the outputs for a recording's inputs, shape (M, n_y).
@@ -282,7 +282,7 @@ class Fit:
                 f"The recording has {recording.n_u} inputs and {recording.n_y} outputs, "
                 f"the model {n_u} and {n_y}; they must match."
             )
-        if abs(recording.dt / self.dt - 1) > 1e-4:
+        if abs(recording.dt / self.dt - 1) > SAME_STEP:
             raise InputError(
                 f"The recording's step is {recording.dt:g} s, the model's {self.dt:g} s; resample the recording."
             )

@@ -64,6 +64,7 @@ if TYPE_CHECKING:
         Saturation as Saturation,
         SkewSaturation as SkewSaturation,
         SoftSaturation as SoftSaturation,
+        chebyshev as chebyshev,
     )
     from .dynamic import (
         Attached as Attached,

@@ -192,7 +192,7 @@ class FreeCurve(Law):
     degrees = tuple(range(2, 10))  # an offset and a slope are parameters of the simulator; nine follow a narrow knee
 
     def force(self, z: Any, p: Any) -> Any:
-        terms, at_zero = (_chebyshev((at - p.z_m) / p.z_h, max(self.degrees)) for at in (z, 0.0))
+        terms, at_zero = (chebyshev((at - p.z_m) / p.z_h, max(self.degrees)) for at in (z, 0.0))
         return sum(p.c[k] * (terms[i] - at_zero[i]) for k, i in enumerate(self.degrees))
 
     def parameters(self) -> dict[str, Parameter]:
@@ -206,8 +206,8 @@ class FreeCurve(Law):
         yield {"z_m": (low + high) / 2, "z_h": max((high - low) / 2, 1e-300)}
 
 
-def _chebyshev(x: Any, degree: int) -> list[Any]:
-    """Chebyshev polynomials of the first kind, from degree 0 to `degree`."""
+def chebyshev(x: Any, degree: int) -> list[Any]:
+    """Compute the Chebyshev polynomials of the first kind, from degree 0 to `degree`."""
     out = [1.0, x]
     for _ in range(degree - 1):
         out.append(2 * x * out[-1] - out[-2])

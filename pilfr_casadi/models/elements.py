@@ -115,7 +115,9 @@ class PrandtlIshlinskii:
         )
         if self.rounded:
             own = own | {"eps": Parameter(0.0, bounds=(0.0, np.inf), fixed=True)}
-        return own | self.operator.parameters(self.channels)
+        if isinstance(self.operator, GeneralizedPlay):
+            own = own | self.operator.parameters(self.channels)
+        return own
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
         """Compute one step; the memory is stacked channel by channel."""

@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError
-from ..data import Recording
+from ..data import Recording, default_names
 from .elements import Element
 from .parameters import Parameter, ParameterSet
 
@@ -29,9 +29,9 @@ StepExpression = Callable[[Any, Any, Any, dict[str, Any]], tuple[Any, Any]]
 PortExpression = Callable[[Any, Any, dict[str, Any]], Any]
 
 
-def _default_names(names: tuple[str, ...], n: int, letter: str) -> tuple[str, ...]:
+def _check_names(names: tuple[str, ...], n: int, letter: str) -> tuple[str, ...]:
     if not names:
-        return (letter,) if n == 1 else tuple(f"{letter}{i + 1}" for i in range(n))
+        return default_names(letter, n)
     if len(names) != n:
         raise InputError(f"{len(names)} names were given for {n} signals ({', '.join(names)}); give one name each.")
     return tuple(names)
@@ -250,9 +250,9 @@ def open_model(
         **model_functions(x, u, w, vector, [x_next, y], z, [z_in, s, ca.SX(n_w, 1), s]),
         parameters=parameters,
         element=None,
-        states=_default_names(states, n_x, "x"),
-        inputs=_default_names(inputs, n_u, "u"),
-        outputs=_default_names(outputs, int(y.shape[0]), "y"),
+        states=_check_names(states, n_x, "x"),
+        inputs=_check_names(inputs, n_u, "u"),
+        outputs=_check_names(outputs, int(y.shape[0]), "y"),
     )
 
 

@@ -75,16 +75,8 @@ def generalized_play(
     return fmax(low, fmin(high, q, eps), eps)
 
 
-class _Plain:
-    """An operator without parameters beyond its threshold."""
-
-    def parameters(self, channels: int) -> ParameterSet:
-        """Return an empty set."""
-        return ParameterSet()
-
-
 @dataclass(frozen=True)
-class Play(_Plain):
+class Play:
     """The play operator, Eq. 5; `v = q_next`."""
 
     name = "play"
@@ -96,7 +88,7 @@ class Play(_Plain):
 
 
 @dataclass(frozen=True)
-class Stop(_Plain):
+class Stop:
     """The stop operator, Eq. 3 and 9; the memory is the play state `z - v`."""
 
     name = "stop"

@@ -100,11 +100,10 @@ class LogRadius:
     """`log_norm_of_power` of a square matrix of the named parameters; a class, because it has to be pickled."""
 
     matrix: Callable[[Mapping[str, Any]], Any] = linear_part
-    squarings: int = 20
 
     def __call__(self, p: Mapping[str, Any]) -> Any:
         """Return the expression for named parameters p."""
-        return log_norm_of_power(self.matrix(p), self.squarings)
+        return log_norm_of_power(self.matrix(p))
 
 
 @dataclass(frozen=True)
@@ -124,24 +123,21 @@ def stable(
     radius: float = 1.0,
     matrix: Callable[[Mapping[str, Any]], Any] = linear_part,
     name: str = "spectral radius",
-    slack: float = SLACK,
     exact: bool = False,
 ) -> Constraint:
     """Bound the spectral radius of `A` (or of another square expression of the parameters) by `radius`.
 
-    The bound is `radius (1 + slack)`: without slack no solver could meet a limit of 1 at a double integrator. With
+    The bound is `radius (1 + SLACK)`: without slack no solver could meet a limit of 1 at a double integrator. With
     `exact` it is the radius itself, checked on the eigenvalues of the result, which may stop up to three digits inside.
 
     Raises
     ------
     InputError
-        If the radius is not positive, or the slack negative.
+        If the radius is not positive.
     """
-    if not slack >= 0:
-        raise InputError(f"The bound on the spectral radius has a slack of {slack}; give zero or more.")
     if not radius > 0:
         raise InputError(f"A bound of {radius} on the spectral radius was given; give a number above zero.")
-    limit = float(np.log(radius) + (-LOG_RADIUS_MARGIN if exact else np.log1p(slack)))
+    limit = float(np.log(radius) + (-LOG_RADIUS_MARGIN if exact else np.log1p(SLACK)))
     check = RadiusExcess(radius, matrix) if exact else None
     return Constraint(
         LogRadius(matrix), upper=limit, name=f"{name} <= {radius:.12g}", unit=LOG_RADIUS_UNIT, exact=exact, check=check

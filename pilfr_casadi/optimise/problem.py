@@ -478,13 +478,10 @@ class Problem:
         pairs = zip(self.recordings, self.simulate(theta), strict=True)
         return [nrmse(r.y, y, r.skip, self.scale) for r, y in pairs]
 
-    def to_nlp(self, periods: int | None = None) -> Horizon:
+    def to_nlp(self) -> Horizon:
         """Write the problem as CasADi expressions over the whole horizon; you can add costs and constraints to them.
 
-        Parameters
-        ----------
-        periods : int, optional
-            Periods simulated before a recording in periodic steady state; by default until the start model settles.
+        A recording in periodic steady state follows as many periods as the start model needs to settle.
 
         Returns
         -------
@@ -500,7 +497,7 @@ class Problem:
         for part in self._placed:
             first, r = part.first, part.recording
             state = ca.MX(ca.DM(part.state)) if first is None else theta[first : first + model.n_state]
-            warm_up = np.tile(part.drive[: part.period], (self._periods_before(part, periods), 1))
+            warm_up = np.tile(part.drive[: part.period], (self._periods_before(part), 1))
             u = np.concatenate([warm_up, part.drive])
             _, y = model.closed.mapaccum("run", len(u))(state, u.T, ca.repmat(p, 1, len(u)))
             y = y[:, len(warm_up) :: model.substeps]
@@ -527,10 +524,10 @@ class Problem:
             parameters=model.parameters.symbols(p),
         )
 
-    def _periods_before(self, part: PlacedRecording, periods: int | None) -> int:
-        """Return the number of periods before a recording in steady state, by default until the start model settles."""
-        if not part.steady or periods is not None:
-            return (periods or 0) * part.steady
+    def _periods_before(self, part: PlacedRecording) -> int:
+        """Return the number of periods until the start model settles, before a recording in steady state."""
+        if not part.steady:
+            return 0
         p, state = self.model.parameters.start, part.state
         for count in range(1, MOST_WRITTEN_PERIODS + 1):
             before, state = state, self.engine.simulate(part.drive[: part.period], p, state)[1]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .. import laws
-from .._base import to_json
+from .._base import to_json, with_nan
 from ..diagnose import ERROR_NAMES, Diagnosis, Effect, Fitted, Workbench, law_signals, learned_force
 from ..identify import RUN_AWAY
 from ..laws import VaryingParameter, display_name, heated, readable_unit, scaled, scheduled, short_name, varying
@@ -163,11 +163,11 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
     if worth := diagnosis.worth(e):
         out.append(Text(f"{worth[0].upper()}{worth[1:]}."))
     rows = [
-        [name, uncertain_text(p["value"], float(_as_floats(p["std"]))), p["unit"] or "–"]
+        [name, uncertain_text(p["value"], with_nan(p["std"])), p["unit"] or "–"]
         for name, p in (e.defined | e.parameters).items()
     ]
     if rows:
-        given = any(np.isfinite(float(_as_floats(p["std"]))) for p in e.parameters.values())
+        given = any(np.isfinite(with_nan(p["std"])) for p in e.parameters.values())
         note = "± one standard deviation." if given else ""
         out.append(Table(["parameter", "value", "unit"], rows, note=note))
     if e.indistinguishable:
@@ -176,10 +176,6 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
     else:
         out.append(Text("No other law comes close on these recordings."))
     return out
-
-
-def _as_floats(value: Any) -> np.ndarray:
-    return np.asarray(np.nan if value is None else value, dtype=float)
 
 
 def candidates_by_pass(diagnosis: Diagnosis) -> list[tuple[list[dict[str, Any]], Any]]:
@@ -276,7 +272,7 @@ def parameter_table(diagnosis: Diagnosis) -> Table:
         known = ParameterSet({name: Parameter(p["nominal"])})
         shape = np.shape(p["nominal"])
         given, without, after, std = (
-            np.ravel(np.broadcast_to(_as_floats(p[k]), shape), order="F")
+            np.ravel(np.broadcast_to(np.asarray(with_nan(p[k]), dtype=float), shape), order="F")
             for k in ("nominal", "refit_without", "refit_with", "std")
         )
         for i, label in enumerate(known.labels):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .. import plots
+from .._base import with_nan
 from .page import Block, Link, Page, Picture, Section, Table, Text, uncertain_text
 
 Column = tuple[str, str, np.ndarray, np.ndarray]  # name, unit, values and standard errors of the machines
@@ -155,7 +156,7 @@ def _values(content: Mapping[str, Any]) -> Table:
     rows = []
     for v in content["values"]:
         population = v["population"]
-        mean = uncertain_text(_number(population["mean"]), _number(population["mean_error"]))
+        mean = uncertain_text(with_nan(population["mean"]), with_nan(population["mean_error"]))
         drifting = sum((m["trends"].get(v["name"], {}).get("probability") or 0) > 0.5 for m in content["machines"])
         rows.append([v["name"], v["unit"], mean, population["deviation"], population["varies"], v["kind"], drifting])
     columns = ["value", "unit", "mean", "between machines", "probability that it varies", "kind", "machines that drift"]
@@ -163,15 +164,11 @@ def _values(content: Mapping[str, Any]) -> Table:
     return Table(columns, rows, note=note, digits=3)
 
 
-def _number(value: float | None) -> float:
-    return np.nan if value is None else value
-
-
 def _table(content: Mapping[str, Any], machines: Sequence[Mapping[str, Any]], folded: bool) -> Table:
     labels = [v["name"] for v in content["values"]]
     rows = []
     for m in machines:
-        values = [uncertain_text(_number(m["values"].get(k)), _number(m["errors"].get(k))) for k in labels]
+        values = [uncertain_text(with_nan(m["values"].get(k)), with_nan(m["errors"].get(k))) for k in labels]
         numbers = [m[k] for k in ("probability", "nrmse_before", "nrmse_after", "noise", "gain")]
         rows.append([_name(m), *numbers, *values])
     columns = ["machine", "differs", "refitted", "with the common physics", "noise", "log evidence", *labels]

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError
-from ..data import Recording
+from ..data import Recording, default_names
 from ..models import Model, Parameter
 from .equations import Named
 from .simulator import Simulator
@@ -174,7 +174,7 @@ def _choose_names(labels: Sequence[str], letter: str, recorded: tuple[str, ...])
         return own
     if len(recorded) == len(own) and recorded:
         return recorded
-    return (letter,) if len(own) == 1 else tuple(f"{letter}{i + 1}" for i in range(len(own)))
+    return default_names(letter, len(own))
 
 
 def load_simulator(path: str | os.PathLike[str]) -> Simulator:

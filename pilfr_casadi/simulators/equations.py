@@ -19,6 +19,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, listed, whole
+from ..data import as_tuple
 from ..models import Named, Parameter, ParameterSet
 from .domains import MECHANICAL, UNKNOWN, common_domain, is_motion, may_be_speed
 from .external import calls_external
@@ -561,7 +562,7 @@ def check_parameters(given: Any) -> ParameterSet:
 
 def check_names(given: Any, kind: str) -> tuple[str, ...]:
     """Return one name or several as a tuple; refuse anything else, and repeated names."""
-    names = _as_tuple(given, str)
+    names = as_tuple(given)
     if not all(isinstance(name, str) and name for name in names):
         raise InputError(f"The simulator's {kind} are {given!r}; give their names, such as ('pos', 'vel').")
     if len(set(names)) != len(names):
@@ -570,7 +571,7 @@ def check_names(given: Any, kind: str) -> tuple[str, ...]:
 
 
 def _check_ports(given: Any) -> tuple[Port, ...]:
-    ports = _as_tuple(given, Port)
+    ports = as_tuple(given)
     if not all(isinstance(port, Port) for port in ports):
         raise InputError(f"The simulator's ports are {given!r}; give Port(name, into, across) or a tuple of several.")
     names = [port.name for port in ports]
@@ -583,11 +584,3 @@ def _check_ports(given: Any) -> tuple[Port, ...]:
                 f"({', '.join(f'{kind}:' for kind in BUILT_IN)}), which need no declaration; call it something else."
             )
     return ports
-
-
-def _as_tuple(given: Any, kind: type) -> tuple[Any, ...]:
-    """Return one object of a kind, or several, as a tuple; `(None,)` for anything else."""
-    try:
-        return (given,) if isinstance(given, kind) else tuple(given)
-    except TypeError:
-        return (None,)

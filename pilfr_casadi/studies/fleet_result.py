@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, csv_text, json_text, make_folder, read_bytes, to_json, write_atomically
+from .._base import InputError, csv_text, json_text, make_folder, read_bytes, to_json, with_nan, write_atomically
 from ..data import Recording
 from ..diagnose import SURE, check_laws, replicate
 from ..laws import Law
 from ..simulators import as_simulator, name_at
 from .machines import DONE, PAGE, RESIDUAL, LawAt, MachineWork, measured_entry
-from .population import Population, combine, estimate_population, slope, with_nan
+from .population import Population, combine, estimate_population, slope
 
 CONTENT, TABLE = "fleet.json", "fleet.csv"
 SCHEMA = 1

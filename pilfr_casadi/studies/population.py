@@ -25,6 +25,8 @@ from typing import Any
 
 import numpy as np
 
+from .._base import with_nan
+
 # Prior of the share of machines that differ, Beta(a, b): one in twenty, worth as much as twenty machines
 DIFFERING, REGULAR = 1.0, 19.0
 MAX_ITERATIONS = 200  # of expectation maximisation
@@ -72,13 +74,6 @@ class Population:
     def of(cls, content: Mapping[str, Any]) -> Population:
         """Make a population from the numbers of `to_dict`, with None for nan."""
         return cls(**with_nan(content), differs=np.zeros(0))
-
-
-def with_nan(content: Any) -> Any:
-    """Replace null of JSON by nan."""
-    if isinstance(content, Mapping):
-        return {k: with_nan(v) for k, v in content.items()}
-    return np.nan if content is None else content
 
 
 def estimate_population(

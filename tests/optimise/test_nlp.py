@@ -38,7 +38,8 @@ def four_periods_before(r):
 
 @pytest.mark.parametrize("operator", [Play, Stop])
 @pytest.mark.parametrize("kind", ["zero", "given", "estimate", "periodic", "several"])
-def test_same_numbers_as_the_recursion(kind, operator):
+def test_same_numbers_as_the_recursion(kind, operator, monkeypatch):
+    monkeypatch.setattr("pilfr_casadi.optimise.problem.MOST_WRITTEN_PERIODS", 4)
     sizes = dict(n_u=2, n_y=2, n_w=2)
     priors = {"A": (0.1, 0.5), "w": (0.2, 0.3)}
     structure, values = random_lfr(5, nx=3, n=3, operator=operator, priors=priors, fixed={"D_yu": 0.0}, **sizes)
@@ -47,7 +48,7 @@ def test_same_numbers_as_the_recursion(kind, operator):
     weights = 1.0 + np.arange(len(records))
     options = dict(constraints=limits, l1={"w": 0.01}, noise=0.1, weights=weights)
     model = structure.model(2, 2, values)
-    nlp = Problem(model, records, **options).to_nlp(periods=4)
+    nlp = Problem(model, records, **options).to_nlp()
     problem = Problem(model, [four_periods_before(r) for r in records], **options)
     f = ca.Function("f", [nlp.x], [nlp.f, ca.gradient(nlp.f, nlp.x), nlp.residual, nlp.g, *nlp.simulated])
     rng = np.random.default_rng(0)
