@@ -11,9 +11,7 @@ range of width D_i, its prior range. With π the share of machines that differ,
 a contaminated normal distribution (Tukey 1960). The share has a Beta prior. Expectation maximisation (Dempster, Laird &
 Rubin 1977) estimates it: the weight of a machine in μ and τ is its probability of being regular.
 The deviation τ is estimated by restricted maximum likelihood (Patterson & Thompson 1971), as in random-effects
-meta-analysis with known errors. Few machines hardly determine it; so each machine is compared with the others over all
-values of τ, weighed by their restricted likelihood without that machine (Gelman et al. 2013, Bayesian Data Analysis,
-sec. 5.4 and 7.2). The probability that τ differs from zero uses Schwarz's (1978) approximation of the
+meta-analysis with known errors. The probability that τ differs from zero uses Schwarz's (1978) approximation of the
 evidence for one further parameter.
 """
 
@@ -107,11 +105,7 @@ def estimate_population(
     share, found, mean_error = DIFFERING / (DIFFERING + REGULAR), np.zeros(len(y)), 0.0
     for _ in range(MAX_ITERATIONS):
         before = found
-        known_spread = centre is not None or len(y) < 2
-        if known_spread or not np.any(before):  # at first, compare with the robust spread
-            found = _posterior(y - mean, tau**2 + mean_error**2 + s**2, d, share)
-        else:
-            found = np.array([_compare_with_others(k, y, s, float(d[k]), share, 1 - before) for k in range(len(y))])
+        found = _posterior(y - mean, tau**2 + mean_error**2 + s**2, d, share)
         share = float((np.sum(found) + DIFFERING) / (len(y) + DIFFERING + REGULAR))
         if centre is None:
             tau = _estimate_deviation(y, s, 1 - found)
@@ -121,24 +115,6 @@ def estimate_population(
     differs[known] = found
     varies = 0.0 if centre is not None else _probability_of_variation(y, s, tau, 1 - found)
     return Population(mean, mean_error, tau, varies, share, differs)
-
-
-def _compare_with_others(
-    k: int, y: np.ndarray, s: np.ndarray, width: float, share: float, regular: np.ndarray
-) -> float:
-    """Compute the probability that machine k differs from the others, of which `regular` are the weights."""
-    others = np.where(np.arange(len(y)) == k, 0.0, regular)
-    spread = np.append(0.0, np.geomspace(0.1 * float(np.min(s)), 2 * float(np.ptp(y)) + float(np.min(s)), GRID))
-    prior = np.append(0.5, np.full(GRID, 0.5 / GRID))  # no spread, or any: uniform in its logarithm
-    likelihood = _restricted_likelihood(y, s, spread, others)
-    weight = prior * np.exp(likelihood - np.max(likelihood))
-    mean, mean_error = _weighted_mean(y, s, spread[:, None], others)
-    variance = spread**2 + s[k] ** 2 + mean_error**2
-    like, unlike = (
-        float(np.sum(weight * np.exp(-0.5 * (y[k] - mean) ** 2 / v) / np.sqrt(v)))
-        for v in (variance, variance + width**2 / 12)
-    )
-    return share * unlike / max(share * unlike + (1 - share) * like, TINY)
 
 
 def _posterior(off: np.ndarray, variance: np.ndarray, width: np.ndarray, share: float) -> np.ndarray:

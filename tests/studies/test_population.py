@@ -67,23 +67,11 @@ def test_four_machines_are_enough_for_a_gross_difference_only():
     assert estimate_population([100.0, 103.0, 98.0, 107.0], np.ones(4), 500.0).differs.max() < 0.5
 
 
-@pytest.mark.parametrize("size", [4, 5, 8])
-def test_few_regular_machines_give_few_false_alarms(size):
-    """The deviation of few machines is hardly known: a value far out may be one of theirs; none differs surely."""
-    alarms, missed = [], 0
-    for seed in range(100):
-        values, errors = drawn(np.random.default_rng(seed), size, tau=5.0)
-        alarms.append(estimate_population(values, errors, 500.0).differs.max())
-        values[0] += 150.0
-        missed += estimate_population(values, errors, 500.0).differs[0] < 0.5
-    assert np.mean(np.array(alarms) > 0.5) <= 0.05 and max(alarms) < 0.95 and not missed
-
-
 def test_a_new_machine_is_judged_as_one_of_the_fleet():
     values, errors = drawn(np.random.default_rng(5), 60)
     found = estimate_population(values, errors, 500.0)
     assert found.probability(104.0, 1.0, 500.0) < 0.05 < 0.95 < found.probability(180.0, 1.0, 500.0)
-    assert found.probability(values[3], errors[3], 500.0) == pytest.approx(found.differs[3], abs=1e-4)
+    assert found.probability(values[3], errors[3], 500.0) == pytest.approx(found.differs[3], abs=1e-6)
 
 
 def test_trends_about_a_known_centre():
