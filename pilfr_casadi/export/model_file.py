@@ -16,6 +16,7 @@ import json
 import math
 import os
 import sys
+import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from math import comb
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
 
 FORMAT = "pilfr_casadi model"
 VERSION = 2
+VERSION_WITHOUT_DIGEST = 1  # read with a warning
 LARGEST_FILE = 200_000_000  # bytes; a model with 500 states takes 20 million
 MOST_PARTS = 100  # combined elements, and largest degree of products; more would only exhaust the memory
 HISTORY = ("number", "cost", "seconds", "step", "damping")  # columns of a solver's history
@@ -70,6 +72,7 @@ class FitContent:
 
     Fields are named as in `Fit`; `structure` is None for a model of the user's own equations. The keys of `initial` and
     `weights` are the recordings' fingerprints. `noise` is the noise level that weights the data against priors.
+    `limits` is None for files of the first releases, which did not store them.
     """
 
     model: Model
@@ -85,7 +88,7 @@ class FitContent:
     linear_nrmse: tuple[float, ...] = ()
     seconds: float = 0.0
     active: tuple[str, ...] = ()
-    limits: tuple[Limit, ...] = ()
+    limits: tuple[Limit, ...] | None = ()
     noise: float | None = None
     weights: Mapping[str, float] | None = None
     candidates: tuple[Candidate, ...] = ()
@@ -108,7 +111,7 @@ def model_text(content: FitContent) -> str:
 
 def _make_tables(fit: FitContent) -> dict[str, Any]:
     model, solution = fit.model, fit.solution
-    limited = len(solution.theta) + sum(limit.kind == "constraint" for limit in fit.limits)
+    limited = len(solution.theta) + sum(limit.kind == "constraint" for limit in fit.limits or ())
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -139,7 +142,7 @@ def _make_tables(fit: FitContent) -> dict[str, Any]:
             "active": fit.active,
             "limits": [
                 {key: _to_json(v, "inf") if key in LIMIT_NUMBERS else v for key, v in asdict(limit).items()}
-                for limit in fit.limits
+                for limit in fit.limits or ()
             ],
             "solve": _make_solve_table(solution),
             "variables": dict(zip(fit.labels, _to_json(solution.theta), strict=True)),
@@ -221,6 +224,12 @@ def read_model_file(path: str | os.PathLike[str], model: Model | PILFR | None = 
     text = _read_text(name)
     try:
         content = _check_content(_parse(text))
+        if content.pop("sha256", None) is None:
+            warnings.warn(
+                f"The file {short(name)} carries no digest (it has version {content['version']} of the model format), "
+                "so changes made to it after it was written cannot be noticed; save the model again to give it one.",
+                stacklevel=3,
+            )
         return _build_content(read_tables(content), model)
     except _Unusable as error:
         fault = str(error)
@@ -278,22 +287,24 @@ def _parse(text: str) -> Any:
 
 
 def _check_content(content: Any) -> dict[str, Any]:
-    """Check format, version and digest of a model file; return its content without the digest."""
+    """Check format, version and digest of a model file; return its content."""
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise _Unusable(f"is not a model file (its format is not {FORMAT!r}); give a file that `save` wrote")
     version = content.get("version")
-    if type(version) is not int or version != VERSION:
+    if type(version) is not int or version not in (VERSION_WITHOUT_DIGEST, VERSION):
         raise _Unusable(
-            f"has version {json.dumps(version)[:20]} of the model format and this release reads version {VERSION}; "
-            "save the model again with this release, or use the release that wrote it"
+            f"has version {json.dumps(version)[:20]} of the model format and this release reads versions "
+            f"{VERSION_WITHOUT_DIGEST} and {VERSION}; save the model again with this release, or use the release "
+            "that wrote it"
         )
-    tables = {key: value for key, value in content.items() if key != "sha256"}
-    if content.get("sha256") != ordered_digest(tables):
+    written = content.get("sha256")
+    found = ordered_digest({key: value for key, value in content.items() if key != "sha256"})
+    if written != found and (version == VERSION or written is not None):
         raise _Unusable(
             "was changed after it was written (its content does not have the SHA-256 that it was written with); "
             "restore it, or save the model again"
         )
-    return tables
+    return content
 
 
 def _build_content(tables: schema.ModelTables, given: Model | PILFR | None) -> FitContent:
@@ -301,7 +312,7 @@ def _build_content(tables: schema.ModelTables, given: Model | PILFR | None) -> F
     training = tables.training
     structure, start = _build_model(tables, given)
     model = _restore_values(tables, start, structure)
-    limits = tuple(Limit(**dict(row)) for row in training.limits)
+    limits = None if training.limits is None else tuple(Limit(**dict(row)) for row in training.limits)
     return FitContent(
         model=model,
         structure=structure,
@@ -446,11 +457,12 @@ def _set_values(model: Model, values: Mapping[str, np.ndarray]) -> Model:
     return model.with_parameters(model.parameters.change(**{name: {"value": v} for name, v in values.items()}))
 
 
-def _build_trained_solution(training: schema.Training, limits: tuple[Limit, ...]) -> Solution:
+def _build_trained_solution(training: schema.Training, limits: tuple[Limit, ...] | None) -> Solution:
     """Build the solution with its history and multipliers: one for each variable and constraint, or none."""
     theta, multipliers = (np.array(list(v), float) for v in (training.variables.values(), training.multipliers))
-    n = len(theta) + sum(limit.kind == "constraint" for limit in limits)
-    if multipliers.size not in (0, n):
+    n = len(theta) + sum(limit.kind == "constraint" for limit in limits or ())
+    # the first files did not name the constraints
+    if multipliers.size not in (0, n) and not (limits is None and multipliers.size > n):
         raise InputError(f"it has {multipliers.size} multipliers of {n} variables and constraints")
     columns = [getattr(training.history, key) for key in HISTORY]
     history = tuple(Iteration(int(number), *row) for number, *row in zip(*columns, strict=True))

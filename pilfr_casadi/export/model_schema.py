@@ -188,18 +188,18 @@ class History(Table):
 
 
 class Training(Table):
-    """Results of the training."""
+    """Results of the training; files of the first releases have no limits, noise, weights and linear errors."""
 
     status: Ending
-    sentence: str
+    sentence: str = ""
     message: str
-    nrmse: list[OrInfinite]
-    noise: Positive | None
-    weights: dict[str, Positive] | None
-    linear_nrmse: list[OrInfinite]
+    nrmse: list[OrInfinite] = []
+    noise: Positive | None = None
+    weights: dict[str, Positive] | None = None
+    linear_nrmse: list[OrInfinite] = []
     seconds: Finite
     active: list[str]
-    limits: list[LimitRow]
+    limits: list[LimitRow] | None = None
     solve: Solve
     variables: dict[str, Finite]
     multipliers: list[OrNan]

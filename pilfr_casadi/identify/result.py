@@ -472,8 +472,10 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
     """
     content = read_model_file(path, model)
     shared = {f.name: getattr(content, f.name) for f in fields(content) if f.name in Fit.__dataclass_fields__}
-    options = options_from_limits(content.limits, content.structure, noise=content.noise, weights=content.weights)
-    return Fit(**shared, options=options)
+    options = FitOptions()  # files of the first versions have none
+    if content.limits is not None:
+        options = options_from_limits(content.limits, content.structure, noise=content.noise, weights=content.weights)
+    return Fit(**{**shared, "limits": content.limits or ()}, options=options)
 
 
 def _format_error(error: float) -> str:

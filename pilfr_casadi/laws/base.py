@@ -95,6 +95,10 @@ class Local:
     revolution: float = np.nan
     term: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
 
+    # old spellings, which laws of users may name in `starts` and `ranges`
+    stiffest = property(lambda self: self.max_stiffness)
+    firmest = property(lambda self: self.max_damping)
+
     @cached_property
     def low(self) -> float:
         """Smallest z, without the outermost 0.1 %."""
@@ -269,6 +273,9 @@ class Law:
     limits: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
 
     def __init_subclass__(cls) -> None:
+        own = vars(cls)
+        if "applies" in own and "why_not" not in own:  # the old name of the method
+            cls.why_not = own["applies"]  # type: ignore[method-assign]
         if "units" in vars(cls) and "strength" not in vars(cls):
             cls.strength = tuple(name for name, unit in cls.units.items() if re.match(r"w\b", unit))
 

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import warnings
 from dataclasses import replace
 
 import casadi as ca
@@ -162,7 +161,7 @@ def test_written_files_follow_links_and_the_users_mask(tmp_path):
 
 DAMAGE = {
     "format": (("format",), "other", "not a model file"),
-    "version": (("version",), 3, "version 3 .* reads version 2"),
+    "version": (("version",), 3, "version 3 .* reads versions 1 and 2"),
     "no version": (("version",), ..., "version null"),
     "operator": (
         ("structure", "element", "operator"),
@@ -403,6 +402,7 @@ def test_a_changed_number_is_said_to_be_one(written):
         changed(content, ("parameters", "A", "value", 0, 0), 0.123),
         changed(content, ("sha256",), "0" * 64),
         changed(content, ("sha256",), ...),
+        changed(changed(content, ("version",), 1), ("parameters", "A", "value", 0, 0), 0.123),
     ):
         written.with_name("other.json").write_text(json.dumps(altered))
         with pytest.raises(InputError, match=CHANGED) as error:
@@ -423,22 +423,31 @@ def test_the_order_of_the_variables_counts(written):
     assert not loads_the_same_or_refuses(written, json.dumps(altered).encode())
 
 
+def test_files_from_before_the_digest_are_read(written):
+    content = changed(changed(json.loads(written.read_text()), ("sha256",), ...), ("version",), 1)
+    says = r"carries no digest \(it has version 1 .*changes made to it .* cannot be noticed; save the model again"
+    with pytest.warns(UserWarning, match=says):
+        assert loads_the_same_or_refuses(written, json.dumps(content).encode())
+    older = changed(changed(content, ("training", "limits"), ...), ("training", "linear_nrmse"), ...)
+    with pytest.warns(UserWarning, match=says):
+        assert loads_the_same_or_refuses(written, json.dumps(older).encode())
+
+
 @pytest.mark.filterwarnings("default")
-def test_a_command_prints_a_warning_in_one_line(written, capsys, monkeypatch):
-    def load_and_warn(path):
-        warnings.warn("The file is old;\nsave it again.", stacklevel=2)
-        return load(path)
+def test_a_command_warns_of_a_file_without_a_digest_in_one_line(written, capsys):
+    content = changed(changed(json.loads(written.read_text()), ("sha256",), ...), ("version",), 1)
+    path = written.with_name("older.json")
+    path.write_text(json.dumps(content))
+    assert main(["export", str(path), "--out", str(path.with_name("older.casadi"))]) == 0
+    said = capsys.readouterr().err
+    assert said.startswith("pilfr: warning: The file ") and "carries no digest" in said and said.count("\n") == 1
 
-    monkeypatch.setattr("pilfr_casadi.cli.models.load", load_and_warn)
-    assert main(["export", str(written), "--out", str(written.with_name("function.casadi"))]) == 0
-    assert capsys.readouterr().err == "pilfr: warning: The file is old; save it again.\n"
 
-
-@pytest.mark.parametrize("version", [True, 1.0, 2.0, "2", None, [2], {}, 3, 1, 0, -1, 10**400])
+@pytest.mark.parametrize("version", [True, 1.0, 2.0, "2", None, [2], {}, 3, 0, -1, 10**400])
 def test_versions_that_are_none(written, version):
     content = signed(changed(json.loads(written.read_text()), ("version",), version))
     written.with_name("other.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match=r"has version .* reads version 2") as error:
+    with pytest.raises(InputError, match=r"has version .* reads versions 1 and 2") as error:
         load(written.with_name("other.json"))
     one_sentence(error)
 

@@ -380,6 +380,24 @@ def test_the_examples_in_docstrings_run(name):
     assert found.attempted > 0 and found.failed == 0
 
 
+def test_old_spellings_in_a_law_of_ones_own_work():
+    class Wall(laws.Law):
+        id = "wall"
+        equation = "w = k z"
+        units = {"k": "w/z"}
+        ranges = {"k": ("stiffest", 0.0, 0.5)}
+
+        def force(self, z, p):
+            return p.k * z
+
+        def applies(self, local):
+            return "never"
+
+    local = laws.Local(np.linspace(-1, 1, 5), np.ones(5), 0.1, (5,), max_stiffness=8.0)
+    assert Wall().why_not(local) == "never"
+    assert Wall().bounds(local) == {"k": (0.0, 4.0)}
+
+
 def test_a_rectifying_sensor_sees_no_signs():
     law, z = laws.Rectified(), np.linspace(-2.0, 2.0, 9)
     both, one = (Local(z=signal, dz=np.ones(9), dt=0.1, lengths=(9,)) for signal in (z, np.abs(z)))
