@@ -79,6 +79,7 @@ def merge(
         outputs=y,
         units={name: unit for name, unit in {**second.units, **first.units}.items() if name in {*u, *y}},
         period=None,
+        start=first.start + begin,
         initial=first.initial if keeps_initial else "estimate",
         hold=first.hold if as_sampled or not first.hold else "linear",
         skip=min(max(int(np.ceil((first.skip * first.dt - begin) / step - SAME_STEP)), 0), len(times) - 1),

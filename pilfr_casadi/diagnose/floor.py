@@ -11,8 +11,9 @@ it on held-out data), the residual itself is the floor.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -26,7 +27,8 @@ LONGEST = 400  # longest correlation of a residual, in samples
 DISTINCT_SHARE = 0.5  # share of the samples with distinct values above which a signal is not quantised
 FEWEST_LEVELS = 10  # of a quantised signal; one with fewer is a switch
 DRIVEN = 0.5  # share of the differences between repeats that the input explains, above which they are no noise
-RESPONSE, COMPARED = 150, 6000  # length of the response to the input that is tried, and most samples, in samples
+RESPONSE, SPANS, COMPARED = 150, 30, 6000  # lags of the input that are tried one by one, longer spans, and samples
+NARROW_BAND, LEAST_RANK = 1e-3, 4  # least share of a direction of the input, and the directions of a sine or a ramp
 SAME_LEVEL = 1e-9  # distance of two values, over the range, below which they are one level
 
 
@@ -86,9 +88,9 @@ def measured_floor(recordings: Sequence[Recording]) -> Floor | None:
     groups: dict[bytes, list[Recording]] = {}
     for r in recordings:
         groups.setdefault(r.u.tobytes(), []).append(r)
-    alike = [(g[0].u[first:], np.stack([r.y[first:] for r in g])) for g, first in _repeats(groups.values())]
-    periods = [folded for folded in map(_fold, recordings) if folded is not None]
-    repeated = [y for u, y in periods or alike if not _is_driven(y - np.mean(y, axis=0), u)]
+    periods = [y for r in recordings if (y := _fold(r)) is not None]
+    alike = [y for g in groups.values() if len(g) > 1 and _repeat(g) and (y := _stack(g)) is not None]
+    repeated = periods or alike
     if not repeated:
         return None
     square = np.mean(np.concatenate([np.var(y, axis=0, ddof=1) for y in repeated]), axis=0)
@@ -112,27 +114,36 @@ def _sensor_steps(recordings: Sequence[Recording]) -> np.ndarray:
     return out
 
 
-def _repeats(groups: Iterable[Sequence[Recording]]) -> Iterator[tuple[Sequence[Recording], int]]:
-    """List the groups that repeat an experiment, each with the first sample that is compared."""
-    return ((g, _settled(g)) for g in groups if len(g) > 1 and _repeat(g))
-
-
-def _is_driven(differences: np.ndarray, u: np.ndarray) -> bool:
+def _is_driven(differences: np.ndarray, u: np.ndarray, before: np.ndarray) -> bool:
     """Tell whether the input u (N, n_u) drives the differences (P, N, n_y) of repeats from their mean.
 
-    The response of each output to the input is fitted to the first half of each repeat, and must explain most of the
-    second half. Noise has no such response.
+    The response of each output to the input, and to the inputs `before`, is fitted to the first half of each repeat. It
+    has to explain most of the second half. Noise has no such response; but an input like a sine cannot be told from
+    noise of that frequency, and shows nothing.
     """
-    every = max(len(u) // COMPARED, 1)  # long repeats: of every few samples, with all samples of the input before them
-    lags = range(0, min(RESPONSE, len(u) // 8) * every, every)
-    columns = np.hstack([np.vstack([np.zeros((k, u.shape[1])), u[: len(u) - k]]) for k in lags])
-    columns = columns[::every] - np.mean(columns[::every], axis=0)
+    every = max(len(u) // COMPARED, 1)
+    columns = _responses(np.vstack([before, u]))[len(before) :: every]
+    columns = columns - np.mean(columns, axis=0)
     half, left, total = len(columns) // 2, 0.0, 0.0
+    settled = columns[half // 2 : half]  # all lags are within the recording there
+    if not settled.size or np.linalg.matrix_rank(settled, NARROW_BAND * np.linalg.norm(settled)) <= LEAST_RANK:
+        return False
     for e in differences[:, ::every] - np.mean(differences[:, ::every], axis=1, keepdims=True):
         response = np.linalg.lstsq(columns[:half], e[:half], rcond=1e-6)[0]
         left = left + np.sum((e[half:] - columns[half:] @ response) ** 2, axis=0)
         total = total + np.sum(e[half:] ** 2, axis=0)
     return bool(np.any(left < (1 - DRIVEN) * np.asarray(total)))
+
+
+def _responses(u: np.ndarray) -> np.ndarray:
+    """Compute sums of the input (N, n_u), (N, n): over each of the last samples, and over ever longer spans before."""
+    n, n_u = u.shape
+    single = min(RESPONSE, n // (16 * n_u))
+    spans = np.geomspace(max(single, 1), max(n / 4, 2.0), min(SPANS, n // (32 * n_u)) + 1)
+    edges = np.unique(np.append(np.arange(single + 1), spans.astype(int)))
+    total = np.vstack([np.zeros((1, n_u)), np.cumsum(u, axis=0)])
+    until = [total[np.maximum(np.arange(1, n + 1) - edge, 0)] for edge in edges]
+    return np.hstack([a - b for a, b in pairwise(until)]) if len(edges) > 1 else np.zeros((n, 0))
 
 
 def _settled(group: Sequence[Recording]) -> int:
@@ -153,14 +164,24 @@ def _repeat(group: Sequence[Recording]) -> bool:
     return _begin_alike(group) or bool(np.any(np.ptp(group[0].u[_settled(group) :], axis=0) > 0))
 
 
-def _fold(r: Recording) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the input of a period (N, n_u), and the outputs' periods (P, N, n_y); None if there are not two."""
+def _stack(group: Sequence[Recording]) -> np.ndarray | None:
+    """Stack the outputs of recordings of one input, (P, N, n_y); None if the input drives their differences."""
+    first = _settled(group)
+    y, u = np.stack([r.y[first:] for r in group]), group[0].u
+    return None if _is_driven(y - np.mean(y, axis=0), u[first:], u[:first]) else y
+
+
+def _fold(r: Recording) -> np.ndarray | None:
+    """Stack the outputs' periods, (P, N, n_y); None if there are not two, or the input drives their differences."""
     n = r.period
     if not n or r.begins != "periodic":
         return None
-    y = r.y[r.skip :]
+    y, u = r.y[r.skip :], r.u[r.skip :][:n]
     count = len(y) // n
-    return (r.u[r.skip :][:n], y[: count * n].reshape(count, n, -1)) if count > 1 else None
+    if count < 2:
+        return None
+    folded = y[: count * n].reshape(count, n, -1)
+    return None if _is_driven(folded - np.mean(folded, axis=0), u, u) else folded
 
 
 def third_differences(residual: np.ndarray) -> np.ndarray:

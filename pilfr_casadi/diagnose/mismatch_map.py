@@ -178,7 +178,7 @@ def _over_time(r: Recording, e: np.ndarray, y: np.ndarray) -> dict[str, Any]:
     centred = y - np.mean(y, axis=0)
     return {
         "name": r.name,
-        "t": [float((r.skip + (p.start + p.stop - 1) / 2) * r.dt) for p in pieces],
+        "t": [float(r.start + (r.skip + (p.start + p.stop - 1) / 2) * r.dt) for p in pieces],
         "rms": [float(np.sqrt(np.mean(e[p] ** 2))) for p in pieces],
         "output": [float(np.sqrt(np.mean(centred[p] ** 2))) for p in pieces],
     }

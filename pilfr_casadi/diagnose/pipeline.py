@@ -238,7 +238,7 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
     search.shift, search.aligned = None, True
     found = _again(search, partial(_search_once, moved, shift_early=True))
     if found is None:
-        return ready, search
+        return ready, search if search.interrupted else search.run(request.most_effects)
     other, again = found
     if again.can_improve(again.best) and not (again.interrupted or again.out_of_time):
         search.run(request.most_effects)

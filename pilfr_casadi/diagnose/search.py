@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -101,8 +102,10 @@ class Search(Hypotheses):
 
     def adopt(self, other: Trial) -> None:
         """Fit the laws of another search's hypothesis to these recordings, from its values, and keep the fit."""
-        with self.until_interrupted():
-            self.keep(self.fits.polish(self.run_laws(other.laws, other)))
+        with self.until_interrupted(), suppress(InputError):
+            there = self.run_laws(other.laws, other)
+            if there.mean_square < DIVERGED:
+                self.keep(self.fits.polish(there))
 
     @property
     def passes(self) -> list[Step]:

@@ -45,6 +45,7 @@ from .workbench import DIVERGED, FEW, Fitted, Workbench, output_deviation
 
 SEARCHED_SAMPLES = 60_000  # samples of the training recordings up to which everything is searched: effort
 STRETCH_SHARE, LONG_STRETCHES = 2 / 3, 10  # share of these samples in all stretches together, and number of long ones
+MOST_STRETCHES = 100  # stretches that are searched at most: each has an initial state of its own to estimate
 SHORTEST_STRETCH = 500  # least length of a stretch in samples: a law with memory needs some history
 MOST_LINEARISED = 300  # stretches that are linearised at most
 LINEARISED_SAMPLES = 1000  # samples of each that are linearised
@@ -128,7 +129,7 @@ def choose_stretches(
     length = max(int(STRETCH_SHARE * most) // LONG_STRETCHES, SHORTEST_STRETCH)
     stretches = [s for i, r in enumerate(recordings) for s in divide(i, len(r), r.skip, length)]
     usual = float(np.mean([s.end - s.begin for s in stretches]))  # shorter than asked for where the recordings are
-    count = max(int(STRETCH_SHARE * most / usual), 1)
+    count = int(np.clip(STRETCH_SHARE * most / usual, 1, MOST_STRETCHES))
     signals = signal_features(recordings, stretches)
     if len(stretches) > MOST_LINEARISED:
         kept = spread_out(signals, MOST_LINEARISED, int(np.argmax(np.sum(signals**2, axis=1))))
