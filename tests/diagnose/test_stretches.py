@@ -208,6 +208,15 @@ def test_after_an_interrupt_everything_has_the_values_of_the_stretches():
     assert moved.cost < kept.cost
 
 
+def test_many_short_recordings_are_searched_as_long_as_few_long_ones():
+    u = 10 * np.random.default_rng(0).standard_normal(60 * 250)
+    blank = Recording(u, u, 0.05, ("force",), ("pos",), hold="zero")
+    record = blank.with_(y=cart(k=50.0).simulate(blank.with_(initial="zero")))
+    short = [record.slice(k, k + 250) for k in range(0, len(u), 250)]
+    chosen = choose_stretches(cart(), short, "zero", most=6000)
+    assert 3000 <= sum(map(len, chosen)) <= 4000
+
+
 @pytest.mark.slow
 def test_wear_over_a_long_record_is_named():
     """The pieces have the same periodic input, and are no repeats; each knows when it was recorded."""
