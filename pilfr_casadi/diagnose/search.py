@@ -285,12 +285,9 @@ class Search(Hypotheses):
         known = self.memo.get(trial.key, trial)
         if not known.error < trial.error:
             return trial
-        last = [e for e in known.laws if (e.port, type(e.law)) == trial.pair]
-        return (
-            known
-            if known.pair == trial.pair
-            else self.run_laws([*(e for e in known.laws if e not in last), *last], known)
-        )
+        if known.pair == trial.pair:
+            return known
+        return self.run_laws(sorted(known.laws, key=lambda e: (e.port, type(e.law)) == trial.pair), known)
 
     def _record(self, parent: Trial, scored: Sequence[Scored], trials: Sequence[Trial]) -> None:
         """Keep the trials of a move, and note the move."""

@@ -227,7 +227,7 @@ def test_creep_at_its_longest_time_constant_is_doubtful(T, doubtful):
         ({"F_c": 1.0, "F_e": 0.4, "v_s": 0.01, "v_0": 0.001}, True),  # is over at once
         ({"F_c": 1.0, "F_e": 0.4, "v_s": 1.0, "v_0": 0.002}, True),  # goes on over all speeds
         ({"F_c": 1.0, "F_e": 0.4, "v_s": 0.1, "v_0": 0.1}, True),  # is as narrow as the knee
-        ({"F_c": 1.0, "F_e": 0.4, "v_s": 0.1, "v_0": 0.02}, False),  # begins beyond the knee, a tenth above F_c
+        ({"F_c": 1.0, "F_e": 0.4, "v_s": 0.1, "v_0": 0.02}, False),  # peaks beyond the knee, 30 % above F_c
         ({"F_c": 1.0, "F_e": 0.1, "v_s": 0.1, "v_0": 0.05}, True),  # begins at the knee, which hides it
     ],
 )
