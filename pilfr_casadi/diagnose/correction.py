@@ -22,6 +22,7 @@ from .._base import InputError
 from ..laws import CATALOGUE
 from ..simulators import Placed, name_at
 from .evidence import FORMULA_ERROR, NEAR_RATIO, SURE, HeldOut, runs_away
+from .floor import Floor
 from .hypotheses import likeliest
 from .learned import Learned, LearnedForce, describe_learned, refit_learned
 from .search import Search
@@ -145,8 +146,7 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     candidate, held_out = _choose(_predict(search, learned, predicted))
     fitted, base = candidate.fitted, candidate.base
     # without a name, the floor may contain error that no law explains; only the least noise is then certain
-    noise2 = search.floor2 if named else search.least_noise2
-    shares = _shares(search, base.fitted, fitted, noise2)
+    shares = _shares(search, base.fitted, fitted, search.floor if named else search.least_floor)
     elements: tuple[Learned, ...] = ()
     if fitted is not base.fitted:
         laws = dict.fromkeys((*CATALOGUE, *search.laws))
@@ -232,7 +232,7 @@ def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()
 
 def named_correction(search: Search, fitted: Fitted) -> Correction:
     """Describe a simulator without a learned element, which was not compared with others."""
-    return Correction(_describe_elements(search, fitted), _shares(search, fitted, fitted, search.floor2))
+    return Correction(_describe_elements(search, fitted), _shares(search, fitted, fitted, search.floor))
 
 
 def _may_recur(search: Search, trial: Trial) -> bool:
@@ -240,11 +240,11 @@ def _may_recur(search: Search, trial: Trial) -> bool:
     return len(search.bench.recordings) > 1 or not any("t" in e.law.reads() for e in trial.laws)
 
 
-def _shares(search: Search, named: Fitted, whole: Fitted, noise2: float) -> dict[str, float]:
+def _shares(search: Search, named: Fitted, whole: Fitted, floor: Floor) -> dict[str, float]:
     """Compute the shares of the refit's mean square error above the noise; all are zero if there is none."""
-    if not search.root.mean_square > noise2:
+    if not search.root.mean_square > search.bench.pool(floor.squares(search.bench.scale)):
         return {"named": 0.0, "learned": 0.0, "left": 0.0}
-    beside_names, left = (share_left(search, f.cost, noise2=noise2) for f in (named, whole))
+    beside_names, left = (share_left(search, f, floor=floor) for f in (named, whole))
     left = min(beside_names, left)
     return {"named": 1 - beside_names, "learned": beside_names - left, "left": left}
 

@@ -437,9 +437,8 @@ def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldO
     folds = [[(b >= 0) & (b % FOLDS == fold) for b in blocks] for fold in range(FOLDS)]
     later = [b >= FOLDS * ROUNDS // 2 for b in blocks]
     *squares, second = side_by_side(lambda left: _sum_of_squares(bench, fitted, left), [*folds, later], workers)
-    scored = bench.recordings[0].y.shape[1] * sum(int(np.sum(b >= 0)) for b in blocks)
-    ahead = bench.recordings[0].y.shape[1] * sum(int(np.sum(left)) for left in later)
-    return HeldOut(sum(squares) / max(scored, 1), second / max(ahead, 1))
+    scored, ahead = (max(sum(int(np.sum(mask)) for mask in masks), 1) for masks in ([b >= 0 for b in blocks], later))
+    return HeldOut(bench.pool(np.sum(squares, axis=0) / scored), bench.pool(second / ahead))
 
 
 def _at_prior_means(fitted: Fitted) -> Fitted:
@@ -449,8 +448,12 @@ def _at_prior_means(fitted: Fitted) -> Fitted:
     return replace(fitted, values={**fitted.values, **values})
 
 
-def _sum_of_squares(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]) -> float:
-    """Refit without scoring the samples in `left`; return the sum of squares there, infinite if that diverges."""
+def _sum_of_squares(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]) -> np.ndarray:
+    """Refit without scoring the samples in `left`; return each output's sum of squares there, (n_y,).
+
+    It is infinite if the run diverges.
+    """
+    infinite = np.full(len(bench.scale), np.inf)
     residual: Sequence[np.ndarray] = fitted.residual
     if np.any(fitted.model.parameters.free) or any(r.begins == "estimate" for r in bench.recordings):
         problem, theta = bench.problem_at(_at_prior_means(fitted), [~mask for mask in left])
@@ -458,8 +461,9 @@ def _sum_of_squares(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]
             with np.errstate(all="ignore"):
                 simulated = problem.simulate(solve_within_bounds(problem, theta, REFIT).theta)
         except (InputError, RuntimeError, FloatingPointError, np.linalg.LinAlgError):
-            return np.inf
+            return infinite
         residual = [y - r.y for y, r in zip(simulated, bench.recordings, strict=True)]
     with np.errstate(over="ignore", invalid="ignore"):
-        value = float(sum(np.sum((e / bench.scale)[here] ** 2) for e, here in zip(residual, left, strict=True)))
-    return value if value < DIVERGED else np.inf
+        pairs = zip(residual, left, strict=True)
+        total = np.sum([np.sum((e / bench.scale)[here] ** 2, axis=0) for e, here in pairs], axis=0)
+    return total if np.sum(total) < DIVERGED else infinite

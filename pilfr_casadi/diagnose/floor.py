@@ -29,6 +29,7 @@ FEWEST_LEVELS = 10  # of a quantised signal; one with fewer is a switch
 DRIVEN = 0.5  # share of the differences between repeats that the input explains, above which they are no noise
 RESPONSE, SPANS, COMPARED = 150, 30, 6000  # lags of the input that are tried one by one, longer spans, and samples
 NARROW_BAND, LEAST_RANK = 1e-3, 4  # least share of a direction of the input, and the directions of a sine or a ramp
+MODEL_ERRORS = 200  # sizes of the model error that are tried where outputs with unequal noise are pooled
 SAME_LEVEL = 1e-9  # distance of two values, over the range, below which they are one level
 
 
@@ -69,13 +70,33 @@ class Floor:
         """Return the floor with another independent error added, such as a surrogate's."""
         return replace(self, deviation=np.hypot(self.deviation, deviation))
 
-    def mean_square(self, scale: np.ndarray) -> float:
-        """Compute the mean square noise, each output in units of its deviation."""
-        return float(np.mean((self.deviation / scale) ** 2))
+    def squares(self, scale: np.ndarray) -> np.ndarray:
+        """Compute each output's mean square noise in units of its variance, (n_y,)."""
+        return np.asarray((self.deviation / scale) ** 2)
 
     def nrmse(self, scale: np.ndarray) -> float:
         """Compute the noise over the outputs' deviation, averaged over outputs."""
         return float(np.mean(self.deviation / scale))
+
+
+def pool(squares: np.ndarray, noise2: np.ndarray | None) -> tuple[float, np.ndarray]:
+    """Pool mean square errors of the outputs (n_y,): return one mean square, and what variances it rests on.
+
+    A wrong model is about as wrong in all outputs, in units of their deviation; noise is not. So the errors e have
+    variances in proportion to noise2 + m, with a model error m common to the outputs; the variances, b, are scaled to
+    the geometric mean 1. The pooled mean square is the mean of e² / b at the likeliest m: with -n/2 times its logarithm
+    as log likelihood, it is the determinant criterion (Bard 1974, Nonlinear Parameter Estimation, sec. 4-9) for
+    variances of this form. For one output, equal noise, or unknown noise, it is the mean.
+    """
+    plain = float(np.mean(squares)), np.ones(len(squares))
+    if noise2 is None or np.ptp(noise2) <= 0 or not 0 < plain[0] < np.inf:
+        return plain
+    common = np.append(0.0, np.geomspace(1e-3 * np.min(noise2) + 1e-300, 1e3 * max(*noise2, *squares), MODEL_ERRORS))
+    variances = np.maximum(noise2 + common[:, None], 1e-300)
+    balances = variances / np.exp(np.mean(np.log(variances), axis=1, keepdims=True))
+    pooled = np.mean(squares / balances, axis=1)
+    k = int(np.argmin(pooled))
+    return (float(pooled[k]), balances[k]) if pooled[k] < plain[0] else plain
 
 
 def noise_floor(recordings: Sequence[Recording], residuals: Sequence[np.ndarray]) -> Floor:

@@ -146,7 +146,7 @@ class Checked:
     @property
     def noise2(self) -> float:
         """Mean square of the noise in units of the outputs' variance."""
-        return self.floor.mean_square(self.bench.scale)
+        return self.bench.pool(self.floor.squares(self.bench.scale))
 
     def then(self, bench: Workbench, fitted: Fitted, *gates: Gate) -> Checked:
         """Return the next state: another bench and refit, with further findings added."""

@@ -138,7 +138,7 @@ class Hypotheses:
     @property
     def floor2(self) -> float:
         """Mean square of the noise in units of the outputs' variance."""
-        return self.floor.mean_square(self.bench.scale)
+        return self.bench.pool(self.floor.squares(self.bench.scale))
 
     @property
     def tolerance(self) -> float:
@@ -319,7 +319,7 @@ class Hypotheses:
     @property
     def least_noise2(self) -> float:
         """Mean square of the least floor, in units of the outputs' variance."""
-        return self.least_floor.mean_square(self.bench.scale)
+        return self.bench.pool(self.least_floor.squares(self.bench.scale))
 
     def can_improve(self, trial: Trial, noise2: float | None = None) -> bool:
         """Tell whether a further law would be worth its prior if it left only the noise."""

@@ -155,6 +155,7 @@ class Start:
 
 def linear_starts(bench: Workbench, base: Fitted, port_names: Sequence[str]) -> list[Start]:
     """Solve the linear problem at each port, also with each input that may scale the force; best first."""
+    bench = bench.balanced(base)
     probe, runs = linearise_runs(bench, base)
     rest = Remainder.of(bench, probe, runs, (LearnedForce,))
     samples = sum(len(r) - r.skip for r in bench.recordings) * len(bench.scale)

@@ -228,7 +228,7 @@ def _noise2(bench: Workbench, residuals: Sequence[np.ndarray]) -> float:
     """Return the mean square noise in units of the outputs' variance: measured, else by third differences."""
     measured = measured_floor(bench.recordings)
     if measured is not None:
-        return measured.mean_square(bench.scale)
+        return bench.pool(measured.squares(bench.scale))
     return float(np.mean(np.concatenate([third_differences(e) for e in residuals]) ** 2))
 
 

@@ -369,6 +369,7 @@ def screen(
     workers : int
         Ports processed in parallel.
     """
+    bench = bench.balanced(fitted)
     probe, runs = linearise_runs(bench, fitted)
     gain = observer_gain(probe, runs, noise)
     observed = [run(bench, probe, fitted, i, gain) for i in range(len(runs))] if gain.any() else []
@@ -517,6 +518,7 @@ def innovation_share(bench: Workbench, fitted: Fitted) -> float:
 
 
 def _remainder_for_flexible_forces(bench: Workbench, fitted: Fitted) -> Remainder:
+    bench = bench.balanced(fitted)
     size = max(fitted.model.n_state, 1) ** 2  # hundreds of states if a law holds a long delay
     most = max(MOST_WORK // size, min(LEAST_SAMPLES, MOST_MEMORY // size)) // len(bench.recordings)
     if any(len(r) > most for r in bench.recordings):

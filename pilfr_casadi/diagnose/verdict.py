@@ -52,12 +52,13 @@ from .evidence import (
     WHITE_NOISE_RATIO,
     significance,
 )
-from .floor import ABOVE_NOISE, swells_with, times_white, white_part
+from .floor import ABOVE_NOISE, Floor, swells_with, times_white, white_part
 from .gates import Gate
 from .hypotheses import Hypotheses
 from .proof import mean_nrmse
 from .recording_faults import find_ringing_mode
 from .trials import Trial
+from .workbench import Fitted
 
 Name = tuple[str, str]  # port and law id
 
@@ -150,24 +151,25 @@ def explainable_remainder(search: Hypotheses, trial: Trial, before: Trial | None
     (LEAST_MODEL_ERROR), so that a mismatch below the noise hardly shows what explains it.
     """
     share = float(np.clip(max(search.flexible(trial).values(), default=0.0), 0.0, 1.0))
-    least = (1 + LEAST_MODEL_ERROR) * search.floor2
-    left = share_left(search, max(trial.mean_square, least), before)
+    left = share_left(search, trial.fitted, before, least=1 + LEAST_MODEL_ERROR)
     return left * (share + DISTURBANCE_WEIGHT * (1 - share))
 
 
 def share_left(
-    search: Hypotheses, mean_square: float, before: Trial | None = None, noise2: float | None = None
+    search: Hypotheses, fitted: Fitted, before: Trial | None = None, floor: Floor | None = None, least: float = 0.0
 ) -> float:
-    """Compute the share that a mean square error is of a hypothesis' error above the noise.
+    """Compute the share that a fit leaves of a hypothesis' mean square error above the noise.
 
-    The hypothesis is by default the refit, and the noise the floor. The estimated floor may contain physics that
-    nothing explains; the white noise is a lower limit of the noise. An error above the outputs' variance counts as
-    that, which a constant leaves: in a free run errors may accumulate without end, and to have removed them says little
-    of a law.
+    The hypothesis is by default the refit, and the noise the floor, of which at least `least` counts as left. The
+    estimated floor may contain physics that nothing explains; the white noise is a lower limit of the noise. An error
+    above the outputs' variance counts as that, which a constant leaves: in a free run errors may accumulate without
+    end, and to have removed them says little of a law.
     """
-    noise2 = search.floor2 if noise2 is None else noise2
-    excess = max(min((before or search.root).mean_square, 1.0) - noise2, 1e-300)
-    return float(np.clip((mean_square - noise2) / excess, 0.0, 1.0))
+    bench, one = search.bench, (before or search.root).fitted
+    squares = (floor or search.floor).squares(bench.scale), *(bench.squares(f.residual) for f in (fitted, one)), 1.0
+    noise, left, whole, most = (float(np.mean(v / np.asarray(fitted.balance))) for v in squares)
+    excess = max(min(whole, most) - noise, 1e-300)
+    return float(np.clip((max(left, least * noise) - noise) / excess, 0.0, 1.0))
 
 
 def share_named(s: float, odds: float = 1.0) -> float:
@@ -461,7 +463,7 @@ def _describe_vanished(search: Hypotheses, found: Posterior) -> str:
 def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, float], mode: float | None) -> str:
     root, share = search.root, max(shares.values(), default=0.0)
     where = max(shares, key=lambda k: shares[k], default="")
-    laws, left = closest.effects, share_left(search, closest.mean_square, noise2=search.least_noise2)
+    laws, left = closest.effects, share_left(search, closest.fitted, floor=search.least_floor)
     if not laws or 1 - left < LEAST_EXPLAINED:
         rings = (
             f" The rest swings at the simulator's own {mode:.3g} Hz, as from a force that was not recorded or a value "

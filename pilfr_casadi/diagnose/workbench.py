@@ -37,7 +37,7 @@ from ..simulators import (
     needed_substeps,
     rate_at_start,
 )
-from .floor import white_part
+from .floor import pool, white_part
 
 # Solvers: of the fits that results are based on; of other fits; of the first fit of a law, to rank the laws
 THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
@@ -53,6 +53,12 @@ STEP_ERROR = 0.3  # least change by finer steps, over the noise, for which they 
 LEAST_NOISE = 3e-4  # least noise, over the outputs' deviation, that the steps are compared with
 COST_CHANGE = 0.1  # share by which finer steps may change the mean square
 SHARP_KNEE = 0.05  # share of the widest knee that is tried, below which a knee is sharp
+
+# Fits of outputs with unequal noise
+MOST_BALANCES, NEAR_BALANCE = (
+    4,
+    1.2,
+)  # fits one after the other with other weights, and the ratio of weights that counts as equal
 
 # Diverging runs
 HUGE, DIVERGED = 1e6, 1e20  # bounds: output over the largest measured value, and mean square error
@@ -78,7 +84,9 @@ class Fitted:
     residual : list of array, shape (M, n_y)
         Simulated minus measured outputs of each recording, unscored samples included.
     cost : float
-        Mean square of the scored residuals, each output in units of its deviation.
+        Mean square of the scored residuals, each output in units of its deviation; see `floor.pool`.
+    balance : array, shape (n_y,), or float
+        Relative variances of the outputs' errors, with which they were pooled.
     status : Status
         How the fit ended; a run at given values counts as converged.
     """
@@ -90,6 +98,7 @@ class Fitted:
     initial: list[np.ndarray]
     residual: list[np.ndarray]
     cost: float
+    balance: np.ndarray | float = 1.0
     status: Status = Status.CONVERGED
 
     @property
@@ -136,7 +145,12 @@ class Fitted:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Workbench:
-    """The data of one diagnosis, with the settings for running and fitting simulators on it."""
+    """The data of one diagnosis, with the settings for running and fitting simulators on it.
+
+    The outputs' errors are in units of `scale`, their deviation. With `noise2`, the mean square noise of each output in
+    units of its variance, errors are pooled and fits are weighted as `floor.pool` tells; otherwise all outputs are
+    alike.
+    """
 
     simulator: Simulator
     recordings: tuple[Recording, ...]
@@ -149,6 +163,7 @@ class Workbench:
     chosen: int = 1  # sub-steps first chosen for the simulator, on which limits are based
     interrupted_fits: list[Status] = field(default_factory=list)  # one entry for each fit that an interrupt has ended
     deadline: float = np.inf  # time (of `time.perf_counter`) at which every fit ends
+    noise2: np.ndarray | None = None
 
     @classmethod
     def of(cls, simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str = "auto") -> Workbench:
@@ -173,7 +188,19 @@ class Workbench:
     def renewed(self, recordings: Sequence[Recording]) -> Workbench:
         """Return a bench for other recordings, with sub-steps and the unit of errors chosen for them."""
         bench = Workbench.of(self.simulator, recordings, self.hold, self.engine)
-        return replace(bench, deadline=self.deadline, interrupted_fits=self.interrupted_fits)
+        return replace(bench, deadline=self.deadline, interrupted_fits=self.interrupted_fits, noise2=self.noise2)
+
+    def squares(self, residual: Sequence[np.ndarray]) -> np.ndarray:
+        """Compute the mean square of each output's scored residual, in units of its variance, (n_y,)."""
+        return np.asarray(np.mean((np.concatenate(self.scored(residual)) / self.scale) ** 2, axis=0))
+
+    def pool(self, squares: np.ndarray) -> float:
+        """Pool mean square errors of the outputs (n_y,), in units of their variance; see `floor.pool`."""
+        return pool(squares, self.noise2)[0]
+
+    def balanced(self, fitted: Fitted) -> Workbench:
+        """Return the bench with outputs in units in which the errors of a fit are about alike."""
+        return replace(self, scale=self.scale * np.sqrt(fitted.balance), noise2=None)
 
     @one_at_a_time
     def model(self, simulator: Simulator, gain: np.ndarray | None = None) -> Model:
@@ -205,13 +232,22 @@ class Workbench:
             least = min(least, FINER_STEPS * self.chosen)
         return int(np.clip(wanted, least, max(FINER_STEPS * self.chosen, least)))
 
-    def problem(self, model: Model, engine: Engine, scored: Sequence[np.ndarray] | None = None) -> Problem:
-        """Make the simulation-error problem of a model; `scored` marks the samples that count, all by default."""
-        return Problem(model, self.recordings, engine=engine, scale=self.scale, scored=scored)
+    def problem(
+        self,
+        model: Model,
+        engine: Engine,
+        scored: Sequence[np.ndarray] | None = None,
+        balance: np.ndarray | float = 1.0,
+    ) -> Problem:
+        """Make the simulation-error problem of a model.
+
+        `scored` marks the samples that count, all by default; `balance` are relative variances of the outputs' errors.
+        """
+        return Problem(model, self.recordings, engine=engine, scale=self.scale * np.sqrt(balance), scored=scored)
 
     def problem_at(self, fitted: Fitted, scored: Sequence[np.ndarray] | None = None) -> tuple[Problem, np.ndarray]:
         """Make the simulation-error problem of a fitted simulator; return it and its variables at the fitted values."""
-        problem = self.problem(fitted.fitted_model, fitted.engine, scored)
+        problem = self.problem(fitted.fitted_model, fitted.engine, scored, fitted.balance)
         states = [s for r, s in zip(self.recordings, fitted.initial, strict=True) if r.begins == "estimate"]
         return problem, np.concatenate([problem.start[: problem.n_free], *states])
 
@@ -329,22 +365,42 @@ class Workbench:
                 if gamma == 0.0 and not path:
                     return None
                 continue
-            try:
-                timed = replace(solver, time_limit=min(solver.time_limit, self.deadline - time.perf_counter()))
-                with np.errstate(all="ignore"):
-                    solution = solve_within_bounds(problem, theta, timed)
-            except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
-                continue
-            status = solution.status
-            if status is Status.INTERRUPTED:
-                self.interrupted_fits.append(status)
-            if np.all(np.isfinite(solution.theta)):
-                vector, states = problem.parameters(solution.theta), solution.theta[n_free:]
+            problem, theta, status = self._solve(problem, theta, solver)
+            if np.all(np.isfinite(theta)):
+                vector, states = problem.parameters(theta), theta[n_free:]
         if problem is None:
             return None
         theta = np.concatenate([vector[problem.free], states if states is not None else problem.start[n_free:]])
         cost = problem.cost(theta)
         return (cost, theta, problem, status) if cost < DIVERGED else None
+
+    def _solve(self, problem: Problem, theta: np.ndarray, solver: GaussNewton) -> tuple[Problem, np.ndarray, Status]:
+        """Solve a problem, and again while its outputs are out of balance (iteratively reweighted least squares)."""
+        status, before = Status.SOLVER_FAILED, np.ones(len(self.scale))
+        for done in range(MOST_BALANCES):
+            balance = self._balance(problem, theta, before)
+            differs = np.max(np.abs(np.log(balance / before))) > 2 * np.log(NEAR_BALANCE)
+            if done and (not differs or status is not Status.CONVERGED):
+                break
+            if differs:
+                problem, before = self.problem(problem.model, problem.engine, balance=balance), balance
+            try:
+                timed = replace(solver, time_limit=min(solver.time_limit, self.deadline - time.perf_counter()))
+                with np.errstate(all="ignore"):
+                    solution = solve_within_bounds(problem, theta, timed)
+            except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
+                break
+            theta, status = solution.theta, solution.status
+            if status is Status.INTERRUPTED:
+                self.interrupted_fits.append(status)
+        return problem, theta, status
+
+    def _balance(self, problem: Problem, theta: np.ndarray, now: np.ndarray) -> np.ndarray:
+        """Compute the balance of the outputs at some variables of a problem, in which it is `now`."""
+        if self.noise2 is None or len(now) == 1:
+            return now
+        squares = np.mean(problem.residual(theta).reshape(-1, len(now)) ** 2, axis=0)
+        return pool(squares * now, self.noise2)[1]
 
     def initial_states(self, model: Model, vector: np.ndarray, states: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Complete initial states (n_state,) from their first entries; laws begin at rest at the first inputs."""
@@ -411,8 +467,8 @@ class Workbench:
         with np.errstate(over="ignore", invalid="ignore"):  # a diverging run has an infinite cost
             runs = zip(self.recordings, initial, strict=True)
             residual = [engine.simulate(model.drive(r), vector, state)[0] - r.y for r, state in runs]
-            cost = float(np.mean((np.concatenate(self.scored(residual)) / self.scale) ** 2))
-        return Fitted(simulator, model, engine, values, initial, residual, cost)
+            cost, balance = pool(self.squares(residual), self.noise2)
+        return Fitted(simulator, model, engine, values, initial, residual, cost, balance)
 
 
 def output_deviation(recordings: Sequence[Recording]) -> np.ndarray:
@@ -428,14 +484,15 @@ def start_vector(model: Model, start: Mapping[str, Any]) -> np.ndarray:
 
 def refine_steps(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
     """Refine the steps until their error is less than the noise; return the bench and the fit there."""
-    noise2 = max(float(np.mean((white_part(bench.scored(fitted.residual)) / bench.scale) ** 2)), LEAST_NOISE**2)
+    noise = np.maximum(white_part(bench.scored(fitted.residual)), LEAST_NOISE * bench.scale)
     most, steps = min(FINER_STEPS**2 * bench.chosen, MOST_SUBSTEPS), fitted.model.substeps
     while FINER_STEPS * steps <= most and not fitted.simulator.discrete:
         steps = FINER_STEPS * steps
         tried = replace(bench, substeps=steps)
         try:
             there = tried.run(fitted.simulator, fitted.values, fitted.begin)
-            if _difference2(bench, there, fitted) < STEP_ERROR**2 * noise2:
+            moved = [(a - b) / noise for a, b in zip(there.residual, fitted.residual, strict=True)]
+            if np.mean(np.concatenate(bench.scored(moved)) ** 2) < STEP_ERROR**2:
                 break
             fitted = tried.fit(
                 fitted.simulator,
@@ -449,12 +506,6 @@ def refine_steps(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
             break
         bench = tried
     return bench, fitted
-
-
-def _difference2(bench: Workbench, one: Fitted, other: Fitted) -> float:
-    """Compute the mean square of the difference of two runs."""
-    moved = [a - b for a, b in zip(one.residual, other.residual, strict=True)]
-    return float(np.mean((np.concatenate(bench.scored(moved)) / bench.scale) ** 2))
 
 
 def converge(bench: Workbench, fitted: Fitted, seconds: float) -> Fitted:
