@@ -130,6 +130,9 @@ class _Draw(Draw):
         said = self.hold if rng.random() < 0.6 or rig.hold else None
         said = self._other_hold() if fault and fault.kind == "hold" else said
         level = relative * motions[0].y[items[0][2] :].std(axis=0)
+        if self.plan.noisy:
+            least, most = np.log(self.plan.noisy)
+            level[int(rng.integers(len(level)))] *= float(np.exp(rng.uniform(least, most))) / relative
         records, floor = [], 0.0
         for i, (item, motion) in enumerate(zip(items, motions, strict=True)):
             _, u, warm, period = item

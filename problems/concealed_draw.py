@@ -41,6 +41,8 @@ class Plan:
         Range of the refit's NRMSE that the strength of an effect is set for.
     loudest : float
         Largest noise over the signal.
+    noisy : tuple of float
+        Range of the noise over the signal of one output of several; empty if all are as noisy.
     pole : float
         Pole of AR(1) noise; 0 draws the kind of noise.
     start : str
@@ -61,6 +63,7 @@ class Plan:
     visible: tuple[float, float] = (LEAST, MOST)
     target: tuple[float, float] = (0.01, 0.2)
     loudest: float = dull.LOUDEST
+    noisy: tuple[float, float] | tuple[()] = ()
     pole: float = 0.0
     start: str = ""
     pairs: Callable[[Draw], list[tuple[str, str]]] | None = None

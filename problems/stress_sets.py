@@ -9,6 +9,7 @@
     faults          every kind of fault, at inputs and at outputs
     one-sided       friction in one direction, constant loads, and these beside a law
     in-place        a law in place of a spring, and two laws one behind the other
+    noisy-sensor    one output of several with noise of 1 to 5 % of its signal; nothing missing, one effect, or two
 
 A case is drawn by the generator of the concealed cases (`concealed_case.planned`) with a plan, from the seed
 `100000 n + index` of the n-th set, and its expected answer is put right here. Where several answers say the same, each
@@ -104,6 +105,11 @@ def _in_place() -> list[Entry]:
     return [*[Entry("one", place)] * 14, *[Entry("two", series)] * 10]
 
 
+def _noisy_sensor() -> list[Entry]:
+    plan = Plan(rigs=SEVERAL_OUTPUTS, noisy=(0.01, 0.05))
+    return [Entry(kind, plan) for kind in ("one", "one", "two", "none") for _ in range(6)]
+
+
 def wrong_value(case: Case) -> Case:
     """A linear law at the port of a wrong spring or damper is the same as another value of it."""
     rig = next(r for r in RIGS if r in case.tags)
@@ -172,6 +178,7 @@ def sets() -> dict[str, list[Entry]]:
         "faults": _faults(),
         "one-sided": _one_sided(),
         "in-place": _in_place(),
+        "noisy-sensor": _noisy_sensor(),
     }
 
 
