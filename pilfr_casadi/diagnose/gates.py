@@ -25,10 +25,11 @@ from .._base import InputError
 from ..data import Recording
 from ..optimise import GaussNewton
 from ..simulators import Simulator
-from .floor import FEWEST, Floor, effective_size, noise_floor
+from .evidence import FORMULA_ERROR
+from .floor import FEWEST, Floor, effective_size, noise_floor, pool
 from .linearise import Probe, Run, linearise_runs
 from .screen import block_diagonal, in_deviations, moved, orthonormal, project_off
-from .workbench import QUICK, Fitted, Workbench, output_deviation
+from .workbench import QUICK, THOROUGH, Fitted, Workbench, near_balance, output_deviation
 
 Change = Callable[[Recording], Recording]
 
@@ -148,6 +149,21 @@ class Checked:
         """Mean square of the noise in units of the outputs' variance."""
         return self.bench.pool(self.floor.squares(self.bench.scale))
 
+    def weighted(self, floor: Floor | None = None) -> Checked:
+        """Weigh the outputs by their noise, by default the present one, and refit if that changes their weights.
+
+        What formulas may leave of the mismatch counts as noise.
+        """
+        bench, squares = self.bench, self.bench.squares(self.fitted.residual)
+        noise2 = (floor or self.floor).squares(bench.scale)
+        bench = replace(bench, noise2=noise2 + FORMULA_ERROR * max(float(np.mean(squares - noise2)), 0.0))
+        cost, balance = pool(squares, bench.noise2)
+        fitted = replace(self.fitted, cost=cost, balance=balance)
+        if not near_balance(balance, self.fitted.balance):
+            again = refit(bench, [fitted.values], states=fitted.initial, solver=THOROUGH, like=fitted)
+            fitted = again or fitted
+        return replace(self, bench=bench, fitted=fitted)
+
     def then(self, bench: Workbench, fitted: Fitted, *gates: Gate) -> Checked:
         """Return the next state: another bench and refit, with further findings added."""
         return Checked(bench, fitted, (*self.gates, *gates))
@@ -250,10 +266,14 @@ def _satisfies_rule(now: Checked, after: Checked, fault: Gate) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class FirstOrder:
-    """A fitted simulator linearised along its runs, to screen edits to first order."""
+    """A fitted simulator linearised along its runs, to screen edits to first order, the outputs in balance."""
 
     bench: Workbench
     fitted: Fitted
+
+    def __post_init__(self) -> None:
+        """Bring the outputs into balance."""
+        object.__setattr__(self, "bench", self.bench.balanced(self.fitted))
 
     @cached_property
     def error(self) -> np.ndarray:

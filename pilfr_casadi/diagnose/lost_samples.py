@@ -196,7 +196,8 @@ def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
     best, best_size = Jump(", ".join([*simulator.inputs, *simulator.output_names]), "gap", None), np.zeros(0)
     for i, r, rows in _long_recordings(bench, 2 * SHORTEST_PIECE):
         read = np.column_stack([first.base, error])[rows].reshape(-1, r.n_y, first.base.shape[1] + 1)
-        shares, rivals, sizes = _jump_shares(first.runs[i], bench.scale, read, r.skip, len(simulator.states), moved)
+        run, scale = first.runs[i], first.bench.scale
+        shares, rivals, sizes = _jump_shares(run, scale, read, r.skip, len(simulator.states), moved)
         shares, rivals = shares / total, rivals / total
         shares[: r.skip + SHORTEST_PIECE] = shares[len(r) - SHORTEST_PIECE :] = 0.0
         k = int(np.argmax(shares))
@@ -377,7 +378,7 @@ def find_output_gap(bench: Workbench, fitted: Fitted) -> OutputGap | None:
     whole = float(np.mean(first.project_off(first.error) ** 2))
     best: OutputGap | None = None
     for i, r, rows in _long_recordings(bench, 2 * SHORTEST_PIECE + LARGEST_SHIFT):
-        sums = _Sums.of(first, rows, r.y[r.skip :] / bench.scale)
+        sums = _Sums.of(first, rows, r.y[r.skip :] / first.bench.scale)
         for columns in groups:
             for lost, left in sums.left(columns):
                 k = SHORTEST_PIECE + int(np.argmin(left[SHORTEST_PIECE:]))

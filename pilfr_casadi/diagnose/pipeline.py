@@ -59,9 +59,9 @@ from .arguments import (
     stated_hold,
 )
 from .correction import find_correction, named_correction
-from .evidence import AS_GIVEN_RATIO, FORMULA_ERROR, SURE
-from .floor import Floor, measured_floor, pool
-from .gates import EQUAL_RATIO, USELESS_FIT, Gate, edited
+from .evidence import AS_GIVEN_RATIO, SURE
+from .floor import Floor, measured_floor
+from .gates import EQUAL_RATIO, USELESS_FIT, Checked, Gate, edited
 from .offsets import Offset, fix_idle_offsets, list_offsets
 from .other_explanations import (
     find_pinned_parameters,
@@ -79,7 +79,7 @@ from .search import Search
 from .stretches import SEARCHED_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
 from .timing import TimeShift
 from .verdict import Posterior, Verdict, judge, names, posterior
-from .workbench import THOROUGH, Fitted, RunsAway, Workbench, converge
+from .workbench import RunsAway, converge
 
 # shares of the remaining time for the preparation, and for preparation and search; the rest is for the correction
 PREPARATION_SHARE, SEARCH_SHARE = 0.35, 0.7
@@ -272,8 +272,8 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
     if request.focus is None:  # an unstable simulator may stay within bounds and still not follow
         ready.bench.check_followed(ready.without, USELESS_FIT)
     ready = replace(ready, bench=replace(ready.bench, deadline=request.deadline), floor=_noise(request, ready))
-    bench, without = _with_unequal_noise(ready)
-    ready = replace(ready, bench=bench, without=without)
+    now = Checked(ready.bench, ready.without).weighted(ready.floor)
+    ready = replace(ready, bench=now.bench, without=now.fitted)
     search = Search(
         ready.bench,
         ready.without,
@@ -288,20 +288,6 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         times={CHECKS: time.perf_counter() - began},
     )
     return ready, search.run(request.most_effects)
-
-
-def _with_unequal_noise(ready: Prepared) -> tuple[Workbench, Fitted]:
-    """Let the bench know each output's noise, and refit the simulator if that changes the outputs' weights.
-
-    What formulas may leave of the mismatch counts as noise.
-    """
-    bench, without, noise2 = ready.bench, ready.without, ready.floor.squares(ready.bench.scale)
-    bench = replace(bench, noise2=noise2 + FORMULA_ERROR * max(without.cost - float(np.mean(noise2)), 0.0))
-    if np.ptp(pool(bench.squares(without.residual), bench.noise2)[1]) > 0:
-        model, engine, states = without.model, without.engine, without.initial
-        own = without.simulator
-        without = bench.fit(own, [without.values], states=states, solver=THOROUGH, model=model, engine=engine)
-    return bench, without
 
 
 def _noise(request: Request, ready: Prepared) -> Floor:

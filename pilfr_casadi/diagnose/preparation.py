@@ -125,7 +125,7 @@ class _Checks:
     def run(self, bench: Workbench, part: float) -> Checked:
         """Refit, and correct one fault after the other; `part` is the unit of shifts in samples, see `timing`."""
         patient = replace(bench, deadline=max(self.until, time.perf_counter() + LEAST_REFIT))
-        first = Checked(patient, refitted(patient), self.gates)
+        first = Checked(patient, refitted(patient), self.gates).weighted()
         now = self._in_turn(first, find_wrong_start, in_any_case=True)
         now = replace(now, bench=replace(now.bench, deadline=self.until))
         slips, shift = partial(self._correct_slips, part=part), partial(find_time_shift, part=part, early=self.early)
@@ -144,7 +144,8 @@ class _Checks:
             if now.bench.interrupted_fits or not (in_any_case or self.may_go_on(now)):
                 break
             try:
-                now = check(now)
+                now, before = check(now), now
+                now = now if now.fitted is before.fitted else now.weighted()
             except BaseException as error:
                 if not is_interrupt(error):
                     raise

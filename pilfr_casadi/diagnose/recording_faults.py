@@ -373,7 +373,8 @@ def find_tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
             f"{name} holds a steady tone of {f:.4g} Hz, amplitude {amplitude:.3g}{f' {unit}' if unit else ''}, that is "
             "in no input, as from mains hum or a fan: shield or filter it, or record what causes it."
         )
-        share = amplitude**2 / 2 / bench.scale[i] ** 2 / len(bench.scale) / fitted.cost
+        scale = bench.balanced(fitted).scale
+        share = amplitude**2 / 2 / scale[i] ** 2 / len(scale) / fitted.cost
         found.append(Gate(name, "tone", f, sentence, corrected=False, left=1 - min(share, 1.0)))
     return found
 

@@ -379,10 +379,10 @@ class Workbench:
         status, before = Status.SOLVER_FAILED, np.ones(len(self.scale))
         for done in range(MOST_BALANCES):
             balance = self._balance(problem, theta, before)
-            differs = np.max(np.abs(np.log(balance / before))) > 2 * np.log(NEAR_BALANCE)
-            if done and (not differs or status is not Status.CONVERGED):
+            near = near_balance(balance, before)
+            if done and (near or status is not Status.CONVERGED):
                 break
-            if differs:
+            if not near:
                 problem, before = self.problem(problem.model, problem.engine, balance=balance), balance
             try:
                 timed = replace(solver, time_limit=min(solver.time_limit, self.deadline - time.perf_counter()))
@@ -469,6 +469,11 @@ class Workbench:
             residual = [engine.simulate(model.drive(r), vector, state)[0] - r.y for r, state in runs]
             cost, balance = pool(self.squares(residual), self.noise2)
         return Fitted(simulator, model, engine, values, initial, residual, cost, balance)
+
+
+def near_balance(one: np.ndarray, other: np.ndarray | float) -> bool:
+    """Tell whether two balances of the outputs give fits about the same weights."""
+    return bool(np.max(np.abs(np.log(one / other))) < 2 * np.log(NEAR_BALANCE))
 
 
 def output_deviation(recordings: Sequence[Recording]) -> np.ndarray:
