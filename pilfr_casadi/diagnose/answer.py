@@ -356,7 +356,7 @@ def _candidate_row(search: Search, t: Trial, parent: Trial) -> dict[str, Any]:
         "port": added.port,
         "law": added.law.id,
         "form": added.law.form,
-        "nrmse_train": t.error,
-        "nrmse_validation": held_out.error if held_out and np.isfinite(held_out.error) else None,
+        "nrmse_train": search.bench.rms(t.fitted),
+        "nrmse_validation": held_out.rms if held_out and np.isfinite(held_out.rms) else None,
         "delta_bic": -2 * gain,
     }

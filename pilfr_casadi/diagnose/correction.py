@@ -151,7 +151,7 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     if fitted is not base.fitted:
         laws = dict.fromkeys((*CATALOGUE, *search.laws))
         elements = (describe_learned(search.bench, fitted, shares["learned"], laws),)
-    errors = refitted[0][1].error, held_out.error
+    errors = refitted[0][1].rms, held_out.rms
     return Correction(_describe_elements(search, fitted), shares, elements, *errors, base), fitted
 
 

@@ -403,11 +403,14 @@ class HeldOut:
         On held-out blocks, and on the second halves; infinite if the simulation diverges.
     spread : float
         Mean square uncertainty of predictions for other inputs; see `evidence.spread`.
+    rms : float
+        Root of the larger of the two errors if all outputs count alike, whatever their noise; reports state it.
     """
 
     blocks: float
     ahead: float
     spread: float = 0.0
+    rms: float = np.nan
 
     @property
     def mean_square(self) -> float:
@@ -438,7 +441,8 @@ def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldO
     later = [b >= FOLDS * ROUNDS // 2 for b in blocks]
     *squares, second = side_by_side(lambda left: _sum_of_squares(bench, fitted, left), [*folds, later], workers)
     scored, ahead = (max(sum(int(np.sum(mask)) for mask in masks), 1) for masks in ([b >= 0 for b in blocks], later))
-    return HeldOut(bench.pool(np.sum(squares, axis=0) / scored), bench.pool(second / ahead))
+    both = np.sum(squares, axis=0) / scored, second / ahead
+    return HeldOut(*map(bench.pool, both), rms=float(np.sqrt(max(map(np.mean, both)))))
 
 
 def _at_prior_means(fitted: Fitted) -> Fitted:

@@ -182,8 +182,8 @@ def gain(before: float, after: float, residuals: Sequence[np.ndarray], parameter
 
 
 def describe_fall(before: float, after: float) -> str:
-    """Describe by how much an edit reduces the mean square error."""
-    return f"the refitted error falls from {before**0.5:.3g} to {after**0.5:.3g} of the outputs' deviation"
+    """Describe by how much an edit reduces the rms error."""
+    return f"the refitted error falls from {before:.3g} to {after:.3g} of the outputs' deviation"
 
 
 def refit(
@@ -251,7 +251,7 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
     back = refit(now.bench, [after.fitted.values], states=now.fitted.initial, like=now.fitted)
     if back is not None and not _satisfies_rule(now.then(now.bench, back), after, fault):
         return now.then(now.bench, back)
-    sentence = f"{fault.sentence}; {fault.remedy} {describe_fall(now.cost, after.cost)}"
+    sentence = f"{fault.sentence}; {fault.remedy} {describe_fall(now.bench.rms(now.fitted), after.bench.rms(after.fitted))}"
     noises = (after.cost / max(now.noise2, 1e-300)) ** 0.5
     if noises > NEAR_NOISE_RATIO:
         sentence += f", still {noises:.2g} times the noise: more is wrong"

@@ -126,7 +126,7 @@ def _went_beyond(search: Search, names: Sequence[str], found: Fitted) -> bool:
 
 
 def _describe_pinned(search: Search, names: Sequence[str], found: Fitted, named: Sequence[Placed]) -> str:
-    without = search.root.fitted
+    without, errors = search.root.fitted, map(search.bench.rms, (search.root.fitted, found))
     parts = []
     for name in names:
         p, value = search.bench.simulator.parameters[name], float(found.values[name])
@@ -139,7 +139,7 @@ def _describe_pinned(search: Search, names: Sequence[str], found: Fitted, named:
         ("a value", "it", "its", "value is") if len(names) == 1 else ("values", "them", "their", "values are")
     )
     return (
-        f"Nothing is missing but {what}: with {', and '.join(parts)}, {describe_fall(without.cost, found.cost)}{like}; "
+        f"Nothing is missing but {what}: with {', and '.join(parts)}, {describe_fall(*errors)}{like}; "
         f"free {it}, or widen {its} bounds. If the given {given} right, physics that acts like another is missing."
     )
 
@@ -204,7 +204,7 @@ def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[tu
     sentence = (
         f"No declared port {'may ' * bool(named)}reach{'' if named else 'es'} it: in the equation of {state}, "
         f"{display_name(law)} explains it{' as well' * bool(named)} (refitted with it, the error is "
-        f"{found.best.error:.3g} of the outputs' deviation). Declare the port that it acts through."
+        f"{other.bench.rms(found.best.fitted):.3g} of the outputs' deviation). Declare the port that it acts through."
     )
     gate = Gate(state, "undeclared", law.replace("_", " "), sentence, corrected=False)
     ahead = other.log_prior(found.best) - search.log_prior(found.best)  # as many samples count in both
@@ -268,7 +268,8 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
         fits.append(fitted)
         benches.append(part)
     sizes = [sum(len(r) - r.skip for r in part.recordings) for part in benches]
-    cost = float(np.average([f.cost for f in fits], weights=sizes))
+    squares = np.average([p.squares(f.residual) for p, f in zip(benches, fits, strict=True)], weights=sizes, axis=0)
+    cost = bench.pool(squares)
     more_starts = sum(len(part.recordings) for part in benches) - len(bench.recordings)
     more = whole.model.parameters.free.sum() * (len(fits) - 1) + len(whole.initial[0]) * more_starts
     residual = [e for part, f in zip(benches, fits, strict=True) for e in part.scored(f.residual)]
@@ -280,8 +281,8 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
     listed = "; ".join(f"{name}: {' / '.join(f'{v:.4g}' for v in found)}" for name, found in values)
     names = " / ".join(name for name, *_ in groups)
     sentence = (
-        f"With values of their own, {where} ({names}) are followed to {cost**0.5:.3g} of the outputs' deviation "
-        f"instead of {whole.cost**0.5:.3g} ({listed}): something differs between them, such as a setting, a "
+        f"With values of their own, {where} ({names}) are followed to {np.mean(squares)**0.5:.3g} of the outputs' deviation "
+        f"instead of {bench.rms(whole):.3g} ({listed}): something differs between them, such as a setting, a "
         "temperature or a level that the simulator does not know."
     )
     return Gate(", ".join(name for name, _ in values), "varying", [v for _, v in values], sentence, corrected=False)

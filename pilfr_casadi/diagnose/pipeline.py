@@ -409,10 +409,10 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
         before, after = search.held_out(search.root), search.held_out(trial)
     answer = replace(answer, effects=named.effects).acting(search, trial)
     verdict = judge(leading, answer, ())
-    predicts = after.error < before.error and not after.error > EQUAL_RATIO * found.correction.after
+    predicts = after.error < before.error and not after.rms > EQUAL_RATIO * found.correction.after
     if verdict.kind != "missing-physics" or not predicts:
         return found
-    correction = replace(named_correction(search, trial.fitted), before=before.error, after=after.error, closest=trial)
+    correction = replace(named_correction(search, trial.fitted), before=before.rms, after=after.rms, closest=trial)
     note = drift_note(request.simulator, memory, " and ".join(display_name(law) for _, law in sorted(names(trial))))
     return replace(
         found,

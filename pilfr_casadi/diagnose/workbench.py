@@ -194,6 +194,10 @@ class Workbench:
         """Compute the mean square of each output's scored residual, in units of its variance, (n_y,)."""
         return np.asarray(np.mean((np.concatenate(self.scored(residual)) / self.scale) ** 2, axis=0))
 
+    def rms(self, fitted: Fitted) -> float:
+        """Compute a fit's rms error in units of the outputs' deviation, all outputs alike, whatever their noise."""
+        return float(np.sqrt(np.mean(self.squares(fitted.residual))))
+
     def pool(self, squares: np.ndarray) -> float:
         """Pool mean square errors of the outputs (n_y,), in units of their variance; see `floor.pool`."""
         return pool(squares, self.noise2)[0]
