@@ -251,7 +251,8 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
     back = refit(now.bench, [after.fitted.values], states=now.fitted.initial, like=now.fitted)
     if back is not None and not _satisfies_rule(now.then(now.bench, back), after, fault):
         return now.then(now.bench, back)
-    sentence = f"{fault.sentence}; {fault.remedy} {describe_fall(now.bench.rms(now.fitted), after.bench.rms(after.fitted))}"
+    errors = now.bench.rms(now.fitted), after.bench.rms(after.fitted)
+    sentence = f"{fault.sentence}; {fault.remedy} {describe_fall(*errors)}"
     noises = (after.cost / max(now.noise2, 1e-300)) ** 0.5
     if noises > NEAR_NOISE_RATIO:
         sentence += f", still {noises:.2g} times the noise: more is wrong"

@@ -280,9 +280,10 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
         return None
     listed = "; ".join(f"{name}: {' / '.join(f'{v:.4g}' for v in found)}" for name, found in values)
     names = " / ".join(name for name, *_ in groups)
+    errors = bench.rms(whole), float(np.sqrt(np.mean(squares)))
     sentence = (
-        f"With values of their own, {where} ({names}) are followed to {np.mean(squares)**0.5:.3g} of the outputs' deviation "
-        f"instead of {bench.rms(whole):.3g} ({listed}): something differs between them, such as a setting, a "
+        f"With values of their own, {where} ({names}) are followed to {errors[1]:.3g} of the outputs' deviation "
+        f"instead of {errors[0]:.3g} ({listed}): something differs between them, such as a setting, a "
         "temperature or a level that the simulator does not know."
     )
     return Gate(", ".join(name for name, _ in values), "varying", [v for _, v in values], sentence, corrected=False)
