@@ -441,8 +441,9 @@ def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldO
     later = [b >= FOLDS * ROUNDS // 2 for b in blocks]
     *squares, second = side_by_side(lambda left: _sum_of_squares(bench, fitted, left), [*folds, later], workers)
     scored, ahead = (max(sum(int(np.sum(mask)) for mask in masks), 1) for masks in ([b >= 0 for b in blocks], later))
-    both = np.sum(squares, axis=0) / scored, second / ahead
-    return HeldOut(*map(bench.pool, both), rms=float(np.sqrt(max(map(np.mean, both)))))
+    blockwise, second = np.sum(squares, axis=0) / scored, second / ahead
+    rms = float(np.sqrt(max(np.mean(blockwise), np.mean(second))))
+    return HeldOut(bench.pool(blockwise), bench.pool(second), rms=rms)
 
 
 def _at_prior_means(fitted: Fitted) -> Fitted:

@@ -31,6 +31,12 @@ def tiny():
     return bench, bench.fit(simulator)
 
 
+def at_error(bench, fitted, error):
+    """A fit that is off by an rms error, now up and now down."""
+    residual = [error * bench.scale * np.resize([[1.0], [-1.0]], e.shape) for e in fitted.residual]
+    return replace(fitted, cost=error**2, residual=residual)
+
+
 @pytest.fixture(scope="session")
 def hypothesis(tiny):
     """Make a hypothesis of (port, class of law), with a stated rms error and stated values of the last law."""
@@ -45,7 +51,7 @@ def hypothesis(tiny):
         return bench.run(simulator, {}, refit.begin)
 
     def make(*laws, error, **own):
-        fitted = replace(run(*laws), cost=error**2)
+        fitted = at_error(bench, run(*laws), error)
         if own:
             fitted = replace(fitted, values={**fitted.values, **fitted.simulator.elements[-1].named(own)})
         return Trial(fitted.last_elements(len(laws)), fitted, error**2, error**2, True, np.zeros(0))
@@ -64,7 +70,7 @@ def hypotheses(tiny):
     def put(*trials):
         floor = Floor(NOISE2**0.5 * bench.scale, "repeats")
         found = Hypotheses(bench, refit, floor, (), 1, Stages(lambda *_: None), count=400.0)
-        for trial in (Trial((), refit, 1.0, 1.0, True, np.zeros(0)), *trials):
+        for trial in (Trial((), at_error(bench, refit, 1.0), 1.0, 1.0, True, np.zeros(0)), *trials):
             found.keep(trial)
             found.findings[trial.key] = Findings(flexible={"a": 0.0, "b": 0.0})
         return found

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from pilfr_casadi import Recording
-from pilfr_casadi.diagnose.floor import Floor, effective_size, measured_floor, swells_with, white_part
+from pilfr_casadi.diagnose.floor import Floor, effective_size, measured_floor, pool, swells_with, white_part
 
 N, DEVIATION = 200, (0.02, 0.5)
 
@@ -148,3 +148,36 @@ def test_inputs_before_the_compared_half_count():
         for p in (0.9, 0.93)
     ]
     assert measured_floor(runs) is None
+
+
+QUIET, NOISY = 1e-8, 1e-3
+
+
+@pytest.mark.parametrize("noise2", [None, (1e-4, 1e-4)])
+def test_outputs_alike_in_noise_are_pooled_by_their_mean(noise2):
+    pooled, balance = pool(np.array([0.5, 1e-6]), None if noise2 is None else np.array(noise2))
+    assert pooled == 0.5 * (0.5 + 1e-6)
+    assert balance.tolist() == [1.0, 1.0]
+
+
+@pytest.mark.parametrize("quiet", [1e-8, 1e-6, 1e-4])
+def test_a_noisy_output_does_not_hide_what_a_quiet_one_shows(quiet):
+    """An error in the quiet output alone counts as if the noisy one were not there, for one half of the samples."""
+    noise2 = np.array([QUIET, NOISY])
+    before, after = (pool(np.array([v, NOISY]), noise2)[0] for v in (quiet, QUIET))
+    assert before / after == pytest.approx((quiet / QUIET) ** 0.5, rel=0.1)
+
+
+def test_a_wrong_model_weighs_the_outputs_alike_and_noise_as_the_outputs_have_it():
+    noise2 = np.array([QUIET, NOISY])
+    assert pool(np.array([0.1, 0.1]), noise2)[1] == pytest.approx([1, 1], rel=0.02)
+    pooled, balance = pool(3 * noise2, noise2)
+    assert balance == pytest.approx(noise2 / (QUIET * NOISY) ** 0.5)
+    assert pooled == pytest.approx(3 * (QUIET * NOISY) ** 0.5)
+
+
+def test_no_error_and_no_finite_error_are_pooled_as_they_are():
+    noise2 = np.array([QUIET, NOISY])
+    assert pool(np.zeros(2), noise2)[0] == 0
+    assert pool(np.array([np.inf, 1.0]), noise2)[0] == np.inf
+    assert pool(np.array([1e-6, 1e-6]), np.zeros(2))[0] == pytest.approx(1e-6)
