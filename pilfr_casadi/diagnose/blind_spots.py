@@ -304,7 +304,7 @@ def assess_recordings(
     began, inputs, outputs = time.perf_counter(), bench.simulator.inputs, bench.simulator.output_names
     noise = np.maximum(floor.deviation, SENSOR_RESOLUTION * bench.scale)
     probe, runs = linearise_runs(bench, fitted)
-    quiet = replace(bench, scale=noise)  # from here on, the noise is the unit of all outputs
+    quiet = replace(bench, scale=noise, noise2=None)  # from here on, the noise is the unit of all outputs
     response = Sensitivity.of(quiet, fitted, runs)
     parameters, ties = assess_parameters(response)
     rows, classes = assess_laws(quiet, fitted, probe, runs, laws, response.names)

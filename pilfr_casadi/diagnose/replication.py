@@ -27,6 +27,7 @@ from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
 from .arguments import match_recordings, stated_hold
 from .evidence import FORMULA_ERROR, Sample, deviations, information, log_evidence, log_prior, prior_width
 from .floor import effective_size, measured_floor, third_differences
+from .gates import Checked
 from .linearise import sample_run
 from .proof import mean_nrmse
 from .trials import Trials
@@ -141,15 +142,15 @@ def replicate(
         On Ctrl-C.
     """
     bench = _bench(simulator, recordings, hold, engine)
-    plain = bench.fit(bench.simulator, [{}, *starts], solver=THOROUGH)
-    bench = replace(bench, typical=sample_run(bench, plain))
+    refit = Checked(bench, bench.fit(bench.simulator, [{}, *starts], solver=THOROUGH)).weighted()
+    bench, plain = replace(refit.bench, typical=sample_run(refit.bench, refit.fitted)), refit.fitted
     after = _fit_with_laws(bench, plain, laws, starts) if laws else plain
     after = _refine_steps(bench, after)
     alone, values = _fit_each_recording(bench, after)
     _raise_if_interrupted(bench)
     residuals = tuple(e / bench.scale for e in bench.scored(alone))
     noise2 = _noise2(bench, residuals)
-    square = float(np.mean(np.concatenate(residuals) ** 2))
+    square = bench.pool(np.mean(np.concatenate(residuals) ** 2, axis=0))
     total = sum(e.size for e in residuals)
     # repeats and periods determine the noise at least as well as third differences
     variance = 0.5 / max(effective_size(residuals), 1.0) + 0.5 * THIRD_DIFFERENCES / total
@@ -229,7 +230,7 @@ def _noise2(bench: Workbench, residuals: Sequence[np.ndarray]) -> float:
     measured = measured_floor(bench.recordings)
     if measured is not None:
         return bench.pool(measured.squares(bench.scale))
-    return float(np.mean(np.concatenate([third_differences(e) for e in residuals]) ** 2))
+    return bench.pool(np.mean(np.concatenate([third_differences(e) for e in residuals]) ** 2, axis=0))
 
 
 def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ...], noise2: float) -> float:
