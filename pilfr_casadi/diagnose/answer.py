@@ -28,7 +28,6 @@ from .preparation import Prepared
 from .proof import (
     UNEDITED,
     free_run_errors,
-    mean_nrmse,
     next_experiment,
     parameter_table,
     placebo,
@@ -168,7 +167,7 @@ def _compute_errors(
     bench, without, after, fewer = final.bench, final.without, final.after, dict[NamedEffect, float]()
     notes = tuple[Gate, ...]()
     errors: dict[str, dict[str, float] | None] = {
-        "train": {"nominal": final.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
+        "train": {"nominal": final.nominal, "before": bench.nrmse(without), "after": bench.nrmse(after)},
         "test": None,
     }
     if tests:
@@ -356,7 +355,7 @@ def _candidate_row(search: Search, t: Trial, parent: Trial) -> dict[str, Any]:
         "port": added.port,
         "law": added.law.id,
         "form": added.law.form,
-        "nrmse_train": search.bench.rms(t.fitted),
+        "nrmse_train": search.bench.nrmse(t.fitted),
         "nrmse_validation": held_out.rms if held_out and np.isfinite(held_out.rms) else None,
         "delta_bic": -2 * gain,
     }

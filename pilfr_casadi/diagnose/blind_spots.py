@@ -37,7 +37,6 @@ from .identifiability import (
     port_units,
 )
 from .linearise import Probe, Run, linearise_runs
-from .proof import mean_nrmse
 from .workbench import Fitted, Workbench
 
 SENSOR_RESOLUTION = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
@@ -320,7 +319,7 @@ def assess_recordings(
             "deviation": dict(zip(outputs, noise.tolist(), strict=True)),
             "share": dict(zip(outputs, (noise / bench.scale).tolist(), strict=True)),
         },
-        error=mean_nrmse(bench, fitted),
+        error=bench.nrmse(fitted),
         hold=stated,
         hold_taken=bench.hold,
         starts=tuple(START_WORDS[r.begins] for r in bench.recordings),

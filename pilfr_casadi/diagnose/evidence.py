@@ -401,16 +401,16 @@ class HeldOut:
     ----------
     blocks, ahead : float
         On held-out blocks, and on the second halves; infinite if the simulation diverges.
+    squares : array, shape (n_y,)
+        The larger of the two, of each output.
     spread : float
         Mean square uncertainty of predictions for other inputs; see `evidence.spread`.
-    rms : float
-        Root of the larger of the two errors if all outputs count alike, whatever their noise; reports state it.
     """
 
     blocks: float
     ahead: float
+    squares: np.ndarray
     spread: float = 0.0
-    rms: float = np.nan
 
     @property
     def mean_square(self) -> float:
@@ -421,6 +421,11 @@ class HeldOut:
     def error(self) -> float:
         """Root of the larger of the two errors."""
         return float(np.sqrt(max(self.blocks, self.ahead)))
+
+    @property
+    def rms(self) -> float:
+        """The error with all outputs alike, whatever their noise, as reports state it."""
+        return float(np.sqrt(np.mean(self.squares)))
 
 
 def blocks_of(bench: Workbench) -> list[np.ndarray]:
@@ -441,9 +446,9 @@ def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldO
     later = [b >= FOLDS * ROUNDS // 2 for b in blocks]
     *squares, second = side_by_side(lambda left: _sum_of_squares(bench, fitted, left), [*folds, later], workers)
     scored, ahead = (max(sum(int(np.sum(mask)) for mask in masks), 1) for masks in ([b >= 0 for b in blocks], later))
-    blockwise, second = np.sum(squares, axis=0) / scored, second / ahead
-    rms = float(np.sqrt(max(np.mean(blockwise), np.mean(second))))
-    return HeldOut(bench.pool(blockwise), bench.pool(second), rms=rms)
+    both = np.sum(squares, axis=0) / scored, second / ahead
+    pooled = bench.pool(both[0]), bench.pool(both[1])
+    return HeldOut(*pooled, both[int(pooled[1] > pooled[0])])
 
 
 def _at_prior_means(fitted: Fitted) -> Fitted:

@@ -154,7 +154,7 @@ class Checked:
 
         What formulas may leave of the mismatch counts as noise.
         """
-        bench, squares = self.bench, self.bench.squares(self.fitted.residual)
+        bench, squares = self.bench, self.fitted.squares
         noise2 = (floor or self.floor).squares(bench.scale)
         bench = replace(bench, noise2=noise2 + FORMULA_ERROR * max(float(np.mean(squares - noise2)), 0.0))
         cost, balance = pool(squares, bench.noise2)
@@ -251,7 +251,7 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
     back = refit(now.bench, [after.fitted.values], states=now.fitted.initial, like=now.fitted)
     if back is not None and not _satisfies_rule(now.then(now.bench, back), after, fault):
         return now.then(now.bench, back)
-    errors = now.bench.rms(now.fitted), after.bench.rms(after.fitted)
+    errors = now.bench.nrmse(now.fitted), after.bench.nrmse(after.fitted)
     sentence = f"{fault.sentence}; {fault.remedy} {describe_fall(*errors)}"
     noises = (after.cost / max(now.noise2, 1e-300)) ** 0.5
     if noises > NEAR_NOISE_RATIO:

@@ -104,7 +104,8 @@ class Hypotheses:
     out_of_time : bool
         Whether the time limit ended the search.
     mismatch2 : float, optional
-        Mean square of the mismatch; formulas of laws may leave a share of it. By default the error of the refit.
+        Mean square of the mismatch, all outputs alike; formulas of laws may leave a share of it. By default the error
+        of the refit.
     """
 
     bench: Workbench
@@ -133,7 +134,7 @@ class Hypotheses:
     @property
     def samples(self) -> float:
         """Effective samples, shared by all hypotheses."""
-        return self.sample.effective(min(t.mean_square for t in self.memo.values()) + self.tolerance)
+        return self.sample.effective(min(map(self._tolerant, self.memo.values())))
 
     @property
     def floor2(self) -> float:
@@ -142,14 +143,22 @@ class Hypotheses:
 
     @property
     def tolerance(self) -> float:
-        """Mean square error that any law may leave, because no machine follows a formula exactly."""
-        mismatch2 = self.root.mean_square if self.mismatch2 is None else self.mismatch2
-        return FORMULA_ERROR * max(mismatch2 - self.floor2, 0.0)
+        """Mean square error that any law may leave in any output, because no machine follows a formula exactly."""
+        mismatch2 = float(np.mean(self.root.fitted.squares)) if self.mismatch2 is None else self.mismatch2
+        return FORMULA_ERROR * max(mismatch2 - float(np.mean(self.floor.squares(self.bench.scale))), 0.0)
+
+    def _tolerant(self, trial: Trial) -> float:
+        """Compute the mean square error of a hypothesis and what its formulas may leave."""
+        return self.bench.pool(trial.fitted.squares + self.tolerance) if np.isfinite(trial.mean_square) else np.inf
+
+    def may_leave(self, floor: Floor | None = None) -> float:
+        """Compute the mean square of a noise, by default the floor, and what the right formulas may leave."""
+        return self.bench.pool((floor or self.floor).squares(self.bench.scale) + self.tolerance)
 
     @property
     def sample(self) -> Sample:
         """Noise and number of samples of the recordings."""
-        return Sample(self.floor2 + self.tolerance, self.count)
+        return Sample(self.may_leave(), self.count)
 
     @property
     def root(self) -> Trial:
@@ -163,16 +172,17 @@ class Hypotheses:
 
     def optimistic_evidence(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis with as many effective samples as at the noise level."""
-        return self._log_evidence(trial, trial.mean_square, self.sample.effective(0.0))
+        return self._log_evidence(trial, self._tolerant(trial), self.sample.effective(0.0))
 
     def evidence(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis, from its error on held-out blocks if that is known.
 
         Where all models are wrong, the spread of predictions for other inputs counts as an error.
         """
-        known = self.findings[trial.key].held_out
-        v = known.error**2 if known else trial.mean_square * self._held_out_ratio()
-        v += known.spread if known and self._all_wrong else 0.0
+        known, v = self.findings[trial.key].held_out, np.inf
+        if known or np.isfinite(trial.mean_square):
+            squares = known.squares if known else trial.fitted.squares * self._held_out_ratio()
+            v = self.bench.pool(squares + self.tolerance) + (known.spread if known and self._all_wrong else 0.0)
         return self._log_evidence(trial, v, self.samples)
 
     def _held_out_ratio(self) -> float:
@@ -185,7 +195,7 @@ class Hypotheses:
         return float(np.quantile(ratios, 0.5, method="lower")) if ratios else 1.0
 
     def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
-        return log_evidence(v + self.tolerance, trial.information, self.log_prior(trial), n)
+        return log_evidence(v, trial.information, self.log_prior(trial), n)
 
     def log_prior(self, trial: Trial) -> float:
         """Compute the log prior probability of a hypothesis."""
@@ -223,7 +233,7 @@ class Hypotheses:
     def spread(self, fitted: Fitted, laws: Sequence[Placed]) -> float:
         """Compute the mean square uncertainty of a fitted simulator's predictions for other inputs."""
         own = Sample(self.floor2, count_samples(fitted, self.bench))
-        return spread(self.bench, fitted, laws, fitted.cost + self.tolerance, own.effective(0.0))
+        return spread(self.bench, fitted, laws, self.bench.pool(fitted.squares + self.tolerance), own.effective(0.0))
 
     @property
     def _all_wrong(self) -> bool:
@@ -321,11 +331,9 @@ class Hypotheses:
         """Mean square of the least floor, in units of the outputs' variance."""
         return self.bench.pool(self.least_floor.squares(self.bench.scale))
 
-    def can_improve(self, trial: Trial, noise2: float | None = None) -> bool:
-        """Tell whether a further law would be worth its prior if it left only the noise."""
-        noise2 = self.floor2 if noise2 is None else noise2
-        left, noise = (v + self.tolerance for v in (trial.mean_square, noise2))
-        most = 0.5 * self.sample.effective(0.0) * np.log(max(left / noise, 1.0))
+    def can_improve(self, trial: Trial, noise: Floor | None = None) -> bool:
+        """Tell whether a further law would be worth its prior if it left only the noise, by default the floor."""
+        most = 0.5 * self.sample.effective(0.0) * np.log(max(self._tolerant(trial) / self.may_leave(noise), 1.0))
         return bool(most > np.log(max(len(self.alternatives), 1)) - EFFECT_PRIOR)
 
     @property

@@ -126,7 +126,7 @@ def _went_beyond(search: Search, names: Sequence[str], found: Fitted) -> bool:
 
 
 def _describe_pinned(search: Search, names: Sequence[str], found: Fitted, named: Sequence[Placed]) -> str:
-    without, errors = search.root.fitted, map(search.bench.rms, (search.root.fitted, found))
+    without, errors = search.root.fitted, map(search.bench.nrmse, (search.root.fitted, found))
     parts = []
     for name in names:
         p, value = search.bench.simulator.parameters[name], float(found.values[name])
@@ -204,7 +204,7 @@ def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[tu
     sentence = (
         f"No declared port {'may ' * bool(named)}reach{'' if named else 'es'} it: in the equation of {state}, "
         f"{display_name(law)} explains it{' as well' * bool(named)} (refitted with it, the error is "
-        f"{other.bench.rms(found.best.fitted):.3g} of the outputs' deviation). Declare the port that it acts through."
+        f"{other.bench.nrmse(found.best.fitted):.3g} of the outputs' deviation). Declare the port that it acts through."
     )
     gate = Gate(state, "undeclared", law.replace("_", " "), sentence, corrected=False)
     ahead = other.log_prior(found.best) - search.log_prior(found.best)  # as many samples count in both
@@ -268,7 +268,7 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
         fits.append(fitted)
         benches.append(part)
     sizes = [sum(len(r) - r.skip for r in part.recordings) for part in benches]
-    squares = np.average([p.squares(f.residual) for p, f in zip(benches, fits, strict=True)], weights=sizes, axis=0)
+    squares = np.average([f.squares for f in fits], weights=sizes, axis=0)
     cost = bench.pool(squares)
     more_starts = sum(len(part.recordings) for part in benches) - len(bench.recordings)
     more = whole.model.parameters.free.sum() * (len(fits) - 1) + len(whole.initial[0]) * more_starts
@@ -280,7 +280,7 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
         return None
     listed = "; ".join(f"{name}: {' / '.join(f'{v:.4g}' for v in found)}" for name, found in values)
     names = " / ".join(name for name, *_ in groups)
-    errors = bench.rms(whole), float(np.sqrt(np.mean(squares)))
+    errors = np.sqrt(np.mean(whole.squares)), np.sqrt(np.mean(squares))
     sentence = (
         f"With values of their own, {where} ({names}) are followed to {errors[1]:.3g} of the outputs' deviation "
         f"instead of {errors[0]:.3g} ({listed}): something differs between them, such as a setting, a "

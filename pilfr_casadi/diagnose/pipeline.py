@@ -72,7 +72,7 @@ from .other_explanations import (
 )
 from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
 from .preparation import CHECKS, Prepared, conversions, hold_note, prepare
-from .proof import errors_of, mean_nrmse
+from .proof import errors_of
 from .recording_faults import find_clipped_input, find_tones, open_unsettled, remove_glitches
 from .result import Diagnosis
 from .search import Search
@@ -349,7 +349,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     if interrupted and verdict.kind != "recording-fault":
         sentence = (
             "The search was interrupted before it came to an answer; refitted, the simulator is off by "
-            f"{mean_nrmse(search.bench, refitted):.3g} of the outputs' deviation."
+            f"{search.bench.nrmse(refitted):.3g} of the outputs' deviation."
         )
         verdict = Verdict(verdict.kind, sentence)
     elif verdict.kind == "unexplained" and not search.interrupted:

@@ -32,12 +32,6 @@ UNEDITED = "after, on test recordings as given"  # a key of `test_errors`
 VISIBLE_DIFFERENCE = 0.01  # difference of two answers over the noise, above which a recording shows it
 
 
-def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
-    """Compute the NRMSE averaged over outputs and recordings; where an output rests, its deviation over all counts."""
-    pairs = zip(fitted.residual, bench.recordings, strict=True)
-    return float(np.mean([nrmse(r.y, r.y + e, skip=r.skip, resting=bench.scale) for e, r in pairs]))
-
-
 @dataclass(frozen=True)
 class Comparison(Generic[K]):
     """NRMSEs of models, averaged over recordings, and the recordings with the first sample that is scored in each."""

@@ -38,7 +38,6 @@ from ..simulators import Placed, Simulator, discretise, in_series, on_grid
 from .evidence import HeldOut, Sample, held_out_errors, spread
 from .floor import effective_size
 from .learned import signals_along
-from .proof import mean_nrmse
 from .search import Search
 from .workbench import THOROUGH, Fitted, Workbench
 
@@ -370,7 +369,7 @@ def _build_refinement(
     values, port = element.own(fitted.values), element.port
     refined = diagnosis.with_fit(fitted)
     errors: dict[str, dict[str, float] | None] = {
-        "train": {DIAGNOSED: mean_nrmse(bench, after), "refined": mean_nrmse(bench, fitted)},
+        "train": {DIAGNOSED: bench.nrmse(after), "refined": bench.nrmse(fitted)},
         "test": None,
     }
     if diagnosis.test:

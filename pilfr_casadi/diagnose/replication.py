@@ -29,7 +29,6 @@ from .evidence import FORMULA_ERROR, Sample, deviations, information, log_eviden
 from .floor import effective_size, measured_floor, third_differences
 from .gates import Checked
 from .linearise import sample_run
-from .proof import mean_nrmse
 from .trials import Trials
 from .workbench import FINER_STEPS, THOROUGH, Fitted, Workbench
 
@@ -99,7 +98,7 @@ def refit_error(simulator: Any, recordings: Any, *, hold: str | None = None, eng
     bench = _bench(simulator, recordings, hold, engine)
     fitted = bench.fit(bench.simulator, solver=THOROUGH)
     _raise_if_interrupted(bench)
-    return mean_nrmse(bench, fitted)
+    return bench.nrmse(fitted)
 
 
 def _raise_if_interrupted(bench: Workbench) -> None:
@@ -160,8 +159,8 @@ def replicate(
         estimate=_values(bench, after),
         by_recording=values,
         widths=_widths(after),
-        nrmse_before=mean_nrmse(bench, plain),
-        nrmse_after=mean_nrmse(bench, replace(after, residual=alone)),
+        nrmse_before=bench.nrmse(plain),
+        nrmse_after=bench.nrmse(replace(after, residual=alone)),
         noise=float(np.sqrt(noise2)),
         remainder=float(0.5 * np.log(max(square, 1e-300) / max(noise2, 1e-300))),
         remainder_error=float(np.sqrt(variance)),

@@ -161,10 +161,10 @@ class Search(Hypotheses):
         """
         base, least = self.best, LEAST_FORMULA_ERROR * self.root.mean_square
         is_noise = base.mean_square < ABOVE_NOISE**2 * self.least_noise2 + least
-        if not base.laws or is_noise or base.mean_square > self.floor2 + self.tolerance or not self.in_time():
+        if not base.laws or is_noise or base.mean_square > self.may_leave() or not self.in_time():
             return
         noise = self.floor, self.count
-        self.mismatch2, found = base.mean_square, False
+        self.mismatch2, found = float(np.mean(base.fitted.squares)), False
         try:
             if self.can_improve(base):
                 self.add(base, again=True)
@@ -332,7 +332,7 @@ class Search(Hypotheses):
         kept = [self.memo[t.key] for t in added]  # perhaps found before, with these laws added in another order
         step = [new if known.pair != new.pair else known for new, known in zip(added, kept, strict=True)]
         # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
-        if step and self.can_improve(self.best, self.least_noise2) and self.in_time():
+        if step and self.can_improve(self.best, self.least_floor) and self.in_time():
             likeliest = max(step, key=self.optimistic_evidence)
             forms = [t for t in step if t.law.id == likeliest.law.id]
             self._vary([likeliest], ("z", *self._entry(likeliest).local.inputs))
@@ -403,7 +403,7 @@ class Search(Hypotheses):
 
     def vary_parameters(self, base: Trial) -> None:
         """Let parameters of the simulator vary with a signal beside a hypothesis: fit those that explain most."""
-        formulas_leave = self.floor2 + self.tolerance  # no machine follows one exactly
+        formulas_leave = self.may_leave()  # no machine follows one exactly
         known = self.findings[base.key]
         if VaryingParameter not in self.laws or self.best.mean_square < formulas_leave or known.varied:
             return
@@ -428,7 +428,7 @@ class Search(Hypotheses):
         """Let the parameter that varies in the best hypothesis follow a curve of higher degree."""
         best = self.best
         # what the curve misses is in no force at a port, so that it may have passed for noise
-        if not (self.can_improve(best, self.least_noise2) and self.in_time()):
+        if not (self.can_improve(best, self.least_floor) and self.in_time()):
             return
         law = varying(best.law.scheduled_by, VARIATIONS[-1])()
         finer = [replace(s, law=law, starts=(law.starts_as(best.law, best.own),)) for s in entries]

@@ -201,7 +201,8 @@ def force_features(
     if not all(np.all(np.isfinite(state)) for _, state in pieces):
         return None
     values = {name: p.value for name, p in model.parameters.items()}
-    fitted = Fitted(simulator, model, runner, values, [], [], np.nan)
+    alike = np.ones(len(bench.scale))
+    fitted = Fitted(simulator, model, runner, values, [], [], np.nan, np.nan * alike, alike)
     probe = Probe.of(bench, fitted)
 
     def explained(piece: tuple[Recording, np.ndarray]) -> dict[tuple[str, str], float]:

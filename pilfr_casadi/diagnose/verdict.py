@@ -55,7 +55,6 @@ from .evidence import (
 from .floor import ABOVE_NOISE, Floor, swells_with, times_white, white_part
 from .gates import Gate
 from .hypotheses import Hypotheses
-from .proof import mean_nrmse
 from .recording_faults import find_ringing_mode
 from .trials import Trial
 from .workbench import Fitted
@@ -165,9 +164,8 @@ def share_left(
     above the outputs' variance counts as that, which a constant leaves: in a free run errors may accumulate without
     end, and to have removed them says little of a law.
     """
-    bench, one = search.bench, (before or search.root).fitted
-    squares = (floor or search.floor).squares(bench.scale), *(bench.squares(f.residual) for f in (fitted, one)), 1.0
-    noise, left, whole, most = (float(np.mean(v / np.asarray(fitted.balance))) for v in squares)
+    one, noise2 = (before or search.root).fitted, (floor or search.floor).squares(search.bench.scale)
+    noise, left, whole, most = (float(np.mean(v / fitted.balance)) for v in (noise2, fitted.squares, one.squares, 1.0))
     excess = max(min(whole, most) - noise, 1e-300)
     return float(np.clip((max(left, least * noise) - noise) / excess, 0.0, 1.0))
 
@@ -326,7 +324,7 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
 
     `closest` is the hypothesis that an unexplained mismatch is compared with, by default the most promising with a law.
     """
-    off = mean_nrmse(search.bench, search.root.fitted)
+    off = search.bench.nrmse(search.root.fitted)
     if search.stand_in_error and off < NEAR_RATIO * search.stand_in_error:
         return Verdict(
             "complete",
@@ -480,7 +478,7 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
         least = "at least" if search.floor.source == "estimated" else "about"
         return (
             "Physics is missing, and no law of the catalogue explains it. The refitted simulator is off by "
-            f"{100 * mean_nrmse(search.bench, root.fitted):.3g} % of the outputs' deviation; the noise is {least} "
+            f"{100 * search.bench.nrmse(root.fitted):.3g} % of the outputs' deviation; the noise is {least} "
             f"{100 * noise:.3g} %.{at}{rings}"
         )
     port = where if shares.get(laws[0].port, 0.0) < 0.5 * share else laws[0].port

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, one_at_a_time
-from ..data import Recording
+from ..data import Recording, nrmse
 from ..engine import Engine, make_engine
 from ..identify import match_channels, solve_within_bounds
 from ..laws import Local
@@ -85,8 +85,10 @@ class Fitted:
         Simulated minus measured outputs of each recording, unscored samples included.
     cost : float
         Mean square of the scored residuals, each output in units of its deviation; see `floor.pool`.
-    balance : array, shape (n_y,), or float
-        Relative variances of the outputs' errors, with which they were pooled.
+    squares : array, shape (n_y,)
+        The same of each output.
+    balance : array, shape (n_y,)
+        Relative variances of the outputs' errors, with which they are pooled.
     status : Status
         How the fit ended; a run at given values counts as converged.
     """
@@ -98,7 +100,8 @@ class Fitted:
     initial: list[np.ndarray]
     residual: list[np.ndarray]
     cost: float
-    balance: np.ndarray | float = 1.0
+    squares: np.ndarray
+    balance: np.ndarray
     status: Status = Status.CONVERGED
 
     @property
@@ -190,13 +193,13 @@ class Workbench:
         bench = Workbench.of(self.simulator, recordings, self.hold, self.engine)
         return replace(bench, deadline=self.deadline, interrupted_fits=self.interrupted_fits, noise2=self.noise2)
 
-    def squares(self, residual: Sequence[np.ndarray]) -> np.ndarray:
-        """Compute the mean square of each output's scored residual, in units of its variance, (n_y,)."""
-        return np.asarray(np.mean((np.concatenate(self.scored(residual)) / self.scale) ** 2, axis=0))
+    def nrmse(self, fitted: Fitted) -> float:
+        """Compute the NRMSE averaged over outputs and recordings.
 
-    def rms(self, fitted: Fitted) -> float:
-        """Compute a fit's rms error in units of the outputs' deviation, all outputs alike, whatever their noise."""
-        return float(np.sqrt(np.mean(self.squares(fitted.residual))))
+        Where an output rests in a recording, its deviation over all recordings counts.
+        """
+        pairs = zip(fitted.residual, self.recordings, strict=True)
+        return float(np.mean([nrmse(r.y, r.y + e, skip=r.skip, resting=self.scale) for e, r in pairs]))
 
     def pool(self, squares: np.ndarray) -> float:
         """Pool mean square errors of the outputs (n_y,), in units of their variance; see `floor.pool`."""
@@ -471,11 +474,12 @@ class Workbench:
         with np.errstate(over="ignore", invalid="ignore"):  # a diverging run has an infinite cost
             runs = zip(self.recordings, initial, strict=True)
             residual = [engine.simulate(model.drive(r), vector, state)[0] - r.y for r, state in runs]
-            cost, balance = pool(self.squares(residual), self.noise2)
-        return Fitted(simulator, model, engine, values, initial, residual, cost, balance)
+            squares = np.mean((np.concatenate(self.scored(residual)) / self.scale) ** 2, axis=0)
+            cost, balance = pool(squares, self.noise2)
+        return Fitted(simulator, model, engine, values, initial, residual, cost, squares, balance)
 
 
-def near_balance(one: np.ndarray, other: np.ndarray | float) -> bool:
+def near_balance(one: np.ndarray, other: np.ndarray) -> bool:
     """Tell whether two balances of the outputs give fits about the same weights."""
     return bool(np.max(np.abs(np.log(one / other))) < 2 * np.log(NEAR_BALANCE))
 

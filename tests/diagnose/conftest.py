@@ -34,7 +34,7 @@ def tiny():
 def at_error(bench, fitted, error):
     """A fit that is off by an rms error, now up and now down."""
     residual = [error * bench.scale * np.resize([[1.0], [-1.0]], e.shape) for e in fitted.residual]
-    return replace(fitted, cost=error**2, residual=residual)
+    return replace(fitted, cost=error**2, squares=np.array([error**2]), residual=residual)
 
 
 @pytest.fixture(scope="session")

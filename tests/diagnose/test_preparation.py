@@ -10,7 +10,6 @@ from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.gates import Checked
 from pilfr_casadi.diagnose.offsets import find_offsets, list_offsets, share_of_constants, update_offsets
 from pilfr_casadi.diagnose.preparation import prepare, refitted
-from pilfr_casadi.diagnose.proof import mean_nrmse
 from pilfr_casadi.laws import AsymmetricSaturation
 
 
@@ -120,4 +119,4 @@ def test_the_error_as_given_compares_with_that_of_the_refit():
     y[10:50] += 0.5 * np.std(y) * np.sin(np.linspace(0, 12 * np.pi, 40))[:, None]
     started = Recording(r.u[:500], y, r.dt, r.inputs, r.outputs, initial="estimate", hold="zero")
     found = prepare(rig(), [started], "zero", "vm")
-    assert mean_nrmse(found.bench, found.without) <= found.nominal < 0.2
+    assert found.bench.nrmse(found.without) <= found.nominal < 0.2
