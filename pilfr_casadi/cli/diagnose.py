@@ -197,6 +197,8 @@ def _announce(simulator: Simulator, name: str, train: dict[str, Recording], test
     free = sum(not bool(np.all(p.fixed)) for p in simulator.parameters.values())
     counts = f"{len(simulator.states)} states, {len(simulator.parameters)} parameters ({free} free)"
     print_line(f"{name}, {counts}; ports {ports}")
+    if simulator.discrete and (note := getattr(simulator.dynamics, "note", "")):
+        print_line(f"  {note}")
     print_recordings("training", train)
     print_recordings("test", tests)
 

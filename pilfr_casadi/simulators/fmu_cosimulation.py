@@ -6,8 +6,9 @@ the unit has memory that cannot be set, and no simulation could be repeated.
 
 A diagnosis needs some ten million evaluations, which take an hour of a unit's steps. So its equations are looked for
 first: polynomials (`polynomial_equations`) are fitted to the derivatives `lim (Φ_h(x) - x) / h`, extrapolated from
-halved steps (Richardson). If they agree with the unit, they are the simulator, in continuous time. Otherwise the
-simulator is in discrete time and steps the unit at every sample, with differences as Jacobians.
+halved steps (Richardson), shorter ones if the unit is stiff. If they agree with the unit, they are the simulator, in
+continuous time. Otherwise the simulator is in discrete time and steps the unit at every sample, with differences as
+Jacobians.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ from .fmu_slave import Slave
 from .polynomial_equations import find_polynomials
 
 LEVELS = 5  # halvings of a step from which a derivative is extrapolated
-CONVERGED = 1e-5  # relative change by the last halving
+CONVERGED = 1e-5  # change by the last halving, over the largest derivative, above which there is none
+SHORTER_STEPS = (2.0**-5, 2.0**-10, 2.0**-15)  # shares of the step that are tried for a stiff unit
+EXACT = 1e-8  # relative change by the last halving below which no shorter step is tried
 REPEATED = 1e-4  # relative difference that a restart of the unit's solver may cause
 DECADES = (-3.0, 1.0)  # range of the powers of ten of states and inputs at which equations are checked
 PROBED_POINTS = 4  # points at which the memory of a unit and the forces in its ports are checked
@@ -238,7 +241,12 @@ class SteppedEquations:
     def note(self) -> str:
         """Origin of the equations, in words."""
         if self.discrete:
-            return f"steps of {self.unit.dt:g} s; {self._box.note}"
+            why = "no equations were found" if self.unit.variable_steps else "the length of its steps cannot be changed"
+            return (
+                f"steps of {self.unit.dt:g} s, because {why}: it is called at every sample, with which a diagnosis may "
+                f"take hours. Equations are polynomials in states, inputs and parameters; nominal values in the file "
+                f"help to find them. {self._box.note}"
+            )
         return (
             f"{self.unit.path.name}: equations found from its steps, at states and inputs up to ten times their "
             "nominal size (1 where the file gives none); it is not called any more"
@@ -284,20 +292,33 @@ class SteppedEquations:
         return out - np.append(self._start[:n], np.zeros(len(self.others)))
 
     def _derivatives(self, z: np.ndarray) -> np.ndarray:
-        """Extrapolate derivatives and outputs to steps of length zero; NaN without convergence."""
+        """Extrapolate derivatives and outputs to steps of length zero; NaN without convergence.
+
+        Where a step is too long for a stiff unit, shorter ones are tried, and the best is used.
+        """
+        best, error = self._extrapolated(z, self.unit.dt)
+        for shorter in SHORTER_STEPS:
+            rows = np.any(~(error <= EXACT * np.abs(best)), axis=1)
+            if not np.any(rows):
+                break
+            found, its_error = self._extrapolated(z[rows], shorter * self.unit.dt)
+            better = its_error < np.nan_to_num(error[rows], nan=np.inf)
+            best[rows] = np.where(better, found, best[rows])
+            error[rows] = np.where(better, its_error, error[rows])
+        return np.where(error <= CONVERGED * np.max(np.abs(best), axis=0), best, np.nan)
+
+    def _extrapolated(self, z: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+        """Extrapolate derivatives and outputs from halved steps; return them, and their change by the last halving."""
         n, table = len(self.unit.states), list[np.ndarray]()
         for k in range(LEVELS):
-            h = self.unit.dt / 2**k
+            h = step / 2**k
             found = self._results(z, h)
-            if not np.all(np.isfinite(found)):
-                return found
             table.append(np.hstack([(found[:, :n] - z[:, :n]) / h, found[:, n:]]))
         before = table[-1]
         for order in range(1, LEVELS):
             before = table[-1]
             table = [(2**order * b - a) / (2**order - 1) for a, b in pairwise(table)]
-        best = table[0]
-        return np.where(np.abs(best - before) <= CONVERGED * np.max(np.abs(best), axis=0), best, np.nan)
+        return table[0], np.abs(table[0] - before)
 
     def _step(self, z: np.ndarray) -> np.ndarray:
         """Step from one point z = (t, x, u, p)."""
