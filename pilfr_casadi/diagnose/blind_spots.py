@@ -23,6 +23,7 @@ from ..simulators import ACTUATOR, in_series, kind_of, split_port
 from .arguments import check_laws, match_recordings, stated_hold
 from .evidence import BETTER_RATIO
 from .floor import ABOVE_NOISE, Floor, noise_floor
+from .gates import USELESS_FIT
 from .identifiability import (
     SMALL_SHARE,
     LawRow,
@@ -40,9 +41,6 @@ from .linearise import Probe, Run, linearise_runs
 from .workbench import Fitted, Workbench
 
 SENSOR_RESOLUTION = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
-# mean square error over the outputs' power above which the linearisation may be far from the machine, because the
-# simulator explains less of the outputs than it misses
-ROUGH = 0.5
 SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
 
 IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the blind spot
@@ -180,7 +178,7 @@ class Check:
             return
         rows = []
         for p in self.parameters:
-            std = "-" if p.std is None else f"{p.std:.2g} {p.unit}"
+            std = "-" if p.std is None or p.at_bound else f"{p.std:.2g} {p.unit}"
             answer = IDENTIFIABLE[p.status][0] + ", at its bound" * p.at_bound
             rows.append((p.name, f"{p.value:.4g} {p.unit}", std, answer))
         yield from _table(("parameter", "refitted", "std. error (noise only)", "identifiable"), rows)
@@ -357,7 +355,7 @@ def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) 
         if names:
             yield BlindSpot(kind, tuple(names), sentence.format(in_words(names)))
 
-    rough = found.error**2 > ROUGH  # then the simulated motion is not the machine's
+    rough = found.error**2 > USELESS_FIT  # then the simulated motion is not the machine's
     if rough:
         left = f"{100 * found.error:.3g} % of the outputs' deviation"
         yield BlindSpot("rough", (), f"The refitted simulator leaves {left}, so all of this is rough.")
@@ -384,7 +382,7 @@ def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) 
     yield from spot("hidden-port", dark, "No law of the catalogue is detectable at {}.")
     for port in ports:
         yield from _followed_laws(found, port)
-    for group in _alike_ports(found):
+    for group in () if rough else _alike_ports(found):
         yield from spot("alike-ports", group, "A law looks the same at {}.")
 
 
