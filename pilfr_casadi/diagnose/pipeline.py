@@ -184,7 +184,7 @@ def _search_with_focus(request: Request) -> tuple[Request, Prepared, Search]:
 def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
     """Search; if nobody stated the hold of the inputs and it matters, use the hold with the smaller error."""
     ready, search = _search(request)
-    if search.interrupted or not search.other_hold_fits_better():
+    if search.hold_said or not _prefers_other_hold(search):
         return ready, search
     hold = search.bench.with_other_hold().hold
     held = replace(request, hold=hold, say=request.say.under("other hold: "))
@@ -197,13 +197,20 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
         search.cut_short_with(again)
         return ready, search.resume(request.most_effects)
     # the laws that were found since may have been what the hold had made up for
-    if not again.interrupted and again.prefers_other_hold():
+    if _prefers_other_hold(again):
         search.adopt(again.best)
         resumed = search.resume(request.most_effects)
         if resumed.best.mean_square < again.best.mean_square:
             return ready, resumed
     ratio = float(np.sqrt(search.best.mean_square / max(again.best.mean_square, 1e-300)))
     return replace(other, gates=(*other.gates, hold_note(request.simulator, hold, ratio))), again
+
+
+def _prefers_other_hold(search: Search) -> bool:
+    """Tell whether a search that nobody has interrupted would be better with the other hold."""
+    with search.until_interrupted():
+        return search.prefers_other_hold()
+    return False
 
 
 def _search(request: Request) -> tuple[Prepared, Search]:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, one_at_a_time
+from .._base import InputError, Interrupt, one_at_a_time
 from ..data import Recording
 from ..engine import Engine, make_engine
 from ..identify import match_channels, solve_within_bounds
@@ -147,7 +147,7 @@ class Workbench:
     at_least: int = 1  # sub-steps of simulators with laws
     typical: tuple[np.ndarray, np.ndarray] | None = None  # states and inputs along the refitted run
     chosen: int = 1  # sub-steps first chosen for the simulator, on which limits are based
-    interrupted_fits: list[Status] = field(default_factory=list)  # one entry for each fit that an interrupt has ended
+    interrupt: Interrupt = field(default_factory=Interrupt)  # shared by all benches of a search
     deadline: float = np.inf  # time (of `time.perf_counter`) at which every fit ends
 
     @classmethod
@@ -173,7 +173,7 @@ class Workbench:
     def renewed(self, recordings: Sequence[Recording]) -> Workbench:
         """Return a bench for other recordings, with sub-steps and the unit of errors chosen for them."""
         bench = Workbench.of(self.simulator, recordings, self.hold, self.engine)
-        return replace(bench, deadline=self.deadline, interrupted_fits=self.interrupted_fits)
+        return replace(bench, deadline=self.deadline, interrupt=self.interrupt)
 
     @one_at_a_time
     def model(self, simulator: Simulator, gain: np.ndarray | None = None) -> Model:
@@ -272,8 +272,11 @@ class Workbench:
         return ""
 
     def check_followed(self, fitted: Fitted, most: float = RUNAWAY**2) -> None:
-        """Refuse a fit of an unstable simulator that leaves more than `most` of the mean square."""
-        if fitted.cost > most and (why := self._describe_instability(self.simulator)):
+        """Refuse a fit of an unstable simulator that leaves more than `most` of the mean square.
+
+        A fit that an interrupt may have ended is not refused.
+        """
+        if fitted.cost > most and not self.interrupt.pressed and (why := self._describe_instability(self.simulator)):
             off = f"{fitted.cost**0.5:.3g} times the outputs' deviation"
             raise RunsAway(f"Refitted, the simulation runs away from the recordings, by {off}; {why}")
 
@@ -337,7 +340,7 @@ class Workbench:
                 continue
             status = solution.status
             if status is Status.INTERRUPTED:
-                self.interrupted_fits.append(status)
+                self.interrupt.pressed = True
             if np.all(np.isfinite(solution.theta)):
                 vector, states = problem.parameters(solution.theta), solution.theta[n_free:]
         if problem is None:

@@ -10,13 +10,13 @@ from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
-from pilfr_casadi._base import Stages
+from pilfr_casadi._base import Interrupt, Stages
 from pilfr_casadi.diagnose import Workbench, correction, preparation
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.trials import Trial, Trials
 from pilfr_casadi.diagnose.verdict import posterior
-from pilfr_casadi.optimise import GaussNewton, Status
+from pilfr_casadi.optimise import GaussNewton
 
 FRICTION = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
 TRIED = (laws.CoulombFriction, laws.CubicStiffness, laws.ViscousDamping)
@@ -133,21 +133,21 @@ def test_after_the_deadline_and_ctrl_c_the_correction_fits_nothing_more(monkeypa
     unsure = replace(answer, effects=tuple(replace(e, confidence=0.4) for e in answer.effects))
     assert correction.find_correction(found, unsure, named=True)[0].elements  # no comparison has refuted the name
     assert not fitted
-    found.bench, found.interrupted = replace(found.bench, deadline=np.inf), True
+    found.bench = replace(found.bench, deadline=np.inf, interrupt=Interrupt(True, True))
     with monkeypatch.context() as patch:  # after Ctrl-C not even the parts that a comparison needs
         patch.setattr(type(found), "held_out_errors", lambda *_: pytest.fail("a comparison after Ctrl-C"))
         assert correction.find_correction(found, unsure, named=True)[0].elements
-    found.interrupted = False
+    found.bench = replace(found.bench, interrupt=Interrupt())
     correction.find_correction(found, posterior(found))
     assert fitted
 
 
 def test_an_answer_that_rests_on_an_interrupted_fit_is_concluded():
     search = searching(rubbing()).run(1)
-    search.bench.interrupted_fits.append(Status.INTERRUPTED)
+    search.bench.interrupt.pressed = True
     with pytest.raises(KeyboardInterrupt), search.stage("fits"):
         pass
-    search.interrupted = True
+    search.bench.interrupt.handle()
     with search.stage("conclusion"):
         assert posterior(search).effects
 
