@@ -384,11 +384,14 @@ class Workbench:
         return Local(z, dz, self.dt, lengths, inputs=inputs, from_zero=rest)
 
     def signals_of(self, inputs: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the time `t` and the inputs by name along all recordings, from the inputs (M, n_u) of each."""
+        """Return the inputs and the time `t`, also if an input has its name, along all recordings.
+
+        `inputs` holds those (M, n_u) of each recording.
+        """
         time = np.concatenate(
             [r.start + self.dt * np.arange(len(u)) for r, u in zip(self.recordings, inputs, strict=True)]
         )
-        return {"t": time, **dict(zip(self.simulator.inputs, np.concatenate(inputs).T, strict=True))}
+        return {**dict(zip(self.simulator.inputs, np.concatenate(inputs).T, strict=True)), "t": time}
 
     def run(self, simulator: Simulator, values: Mapping[str, Any], states: Sequence[np.ndarray]) -> Fitted:
         """Run a simulator at values by name, from the simulator's own initial states."""
