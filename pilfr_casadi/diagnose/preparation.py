@@ -253,8 +253,6 @@ def conversions(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[
 def hold_note(simulator: Simulator, hold: str, ratio: float) -> Gate:
     """Note that the hold was chosen from the data; the other's error is `ratio` times as large."""
     words = {"zero": "held over each sample", "linear": "interpolated between samples"}[hold]
-    sentence = (
-        f"The recordings do not say what inputs do between samples; {words} fits better (error {ratio:.3g} times "
-        "smaller) and is used."
-    )
+    how = f"fits better (error {ratio:.3g} times smaller)" if ratio > EQUAL_RATIO else "fits no worse"
+    sentence = f"The recordings do not say what inputs do between samples; {words} {how} and is used."
     return Gate(", ".join(simulator.inputs), "hold", hold, sentence)
