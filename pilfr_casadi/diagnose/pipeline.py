@@ -329,7 +329,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     """
     answer, interrupted = posterior(search), search.interrupted
     finished, elsewhere = not (interrupted or search.out_of_time), tuple[Gate, ...]()
-    gates = (*gates, *find_tones(search.bench, answer.best.fitted))
+    given, gates = gates, with_tones(search, answer, gates)
     verdict = judge(search, answer, gates)
     if verdict.kind in ("missing-physics", "unexplained") and not (interrupted or search.past_deadline):
         found = _without_a_law(search, answer, verdict, gates)
@@ -338,6 +338,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     if verdict.kind == "missing-physics":
         correction, fitted = find_correction(search, answer, named=True)
         answer = answer.within({(port, law) for port, law, _ in correction.elements}, correction.shares["learned"])
+        gates = with_tones(search, answer, given)
         verdict = judge(search, answer, gates)
         if verdict.kind == "missing-physics" and finished and may_act_elsewhere(search, answer.best):
             elsewhere, odds = find_undeclared_port(search, answer.best)
@@ -366,6 +367,12 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
         verdict = Verdict(verdict.kind, f"{said} {correction.sentence}")
         return Conclusion(verdict, gates, fitted, correction)
     return Conclusion(verdict, gates, refitted, named_correction(search, refitted))
+
+
+def with_tones(search: Search, answer: Posterior, gates: Sequence[Gate]) -> tuple[Gate, ...]:
+    """Add the steady tones that the named laws leave, or the refit if nothing has a name."""
+    fitted = answer.best.fitted if answer.effects else search.root.fitted
+    return (*gates, *find_tones(search.bench, fitted))
 
 
 def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: Sequence[Gate]) -> Conclusion | None:
