@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     )
     from .interrupts import (
         Clock as Clock,
+        Interrupt as Interrupt,
+        UntilInterrupted as UntilInterrupted,
         abandoned as abandoned,
         deferred_interrupt as deferred_interrupt,
         handled_interrupt as handled_interrupt,

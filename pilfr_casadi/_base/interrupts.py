@@ -10,6 +10,7 @@ import contextlib
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 
@@ -52,6 +53,50 @@ def is_interrupt(error: BaseException | None) -> bool:
     while isinstance(error, SystemError):
         error = error.__cause__ or error.__context__
     return isinstance(error, KeyboardInterrupt)
+
+
+@dataclass(eq=False)
+class Interrupt:
+    """The first Ctrl-C during some work; what the work has found until then stays.
+
+    A fit that is interrupted returns its best result so far, so it only marks that (`pressed`). The work then ends at
+    its next call of `raise_pending`, and the context `UntilInterrupted` around it goes on from there.
+    """
+
+    pressed: bool = False
+    handled: bool = False
+
+    def handle(self) -> None:
+        """Mark that Ctrl-C was pressed, and that the work has ended because of it."""
+        self.pressed = self.handled = True
+
+    def raise_pending(self) -> None:
+        """Raise KeyboardInterrupt if Ctrl-C was pressed and the work still goes on."""
+        if self.pressed and not self.handled:
+            raise KeyboardInterrupt
+
+
+@dataclass(frozen=True)
+class UntilInterrupted:
+    """A context that an interrupt ends; it calls `report` then, and the code after it goes on.
+
+    It is a class because type checkers know by the `bool` of `__exit__` that code after the context is reached.
+    """
+
+    interrupt: Interrupt
+    report: Callable[[], None]
+
+    def __enter__(self) -> None:
+        """Do nothing."""
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
+        """Catch an interrupt, and nothing else."""
+        caught = is_interrupt(error)
+        if caught or self.interrupt.pressed:
+            self.interrupt.handle()
+        if caught:
+            self.report()
+        return caught
 
 
 @contextlib.contextmanager

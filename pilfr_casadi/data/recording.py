@@ -363,9 +363,10 @@ def as_recordings(data: "Recording | Iterable[Recording]") -> tuple[Recording, .
 
 
 def fingerprint(recording: Recording) -> str:
-    """Return a short digest of a recording's numbers and its initial state."""
+    """Return a short digest of a recording's numbers, its initial state, and the time at which it starts."""
     initial = recording.initial
     kind = f"{initial} {recording.period}".encode() if isinstance(initial, str) else np.asarray(initial).tobytes()
+    kind += f" {recording.start!r}".encode() if recording.start else b""
     return hashlib.sha256(recording.u.tobytes() + recording.y.tobytes() + kind).hexdigest()[:16]
 
 

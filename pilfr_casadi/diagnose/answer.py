@@ -26,7 +26,7 @@ from .mismatch_map import mismatch
 from .offsets import Offset, remove_idle_offsets, update_offsets
 from .preparation import Prepared
 from .proof import (
-    UNEDITED,
+    Comparison,
     free_run_errors,
     next_experiment,
     parameter_table,
@@ -175,7 +175,7 @@ def _compute_errors(
         fits = {"before": without, "after": after, **{f"without {i}": f for i, f in enumerate(each.values())}}
         compared = test_errors(bench, tests, found.gates, fits, bench.on(tests).model(request.simulator))
         on_tests = compared.errors
-        notes = (*_resting_notes(compared.find_resting()), *_edit_notes(on_tests))
+        notes = (*_resting_notes(compared.find_resting()), *_edit_notes(compared))
         fewer = {e: on_tests[f"without {i}"] for i, e in enumerate(each)}
         errors["test"] = {name: on_tests[name] for name in ("nominal", "before", "after")}
     if bench.simulator.observer is not None:
@@ -214,9 +214,9 @@ def _resting_notes(resting: Sequence[tuple[str, int]]) -> Iterator[Gate]:
         yield Gate("simulation", "resting test", first, words, False)
 
 
-def _edit_notes(on_tests: Mapping[str, float]) -> Iterator[Gate]:
+def _edit_notes(compared: Comparison[str]) -> Iterator[Gate]:
     """Note that the test recordings hardly have the faults for which they were corrected as the training data were."""
-    given, corrected = on_tests.get(UNEDITED, np.inf), on_tests["after"]
+    given, corrected = compared.unedited, compared.errors["after"]
     if given * NEAR_RATIO < corrected:
         words = (
             "The test recordings were corrected as the training recordings were, and that does not suit them: the "

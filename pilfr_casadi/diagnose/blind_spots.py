@@ -287,8 +287,7 @@ def check(
             again = other.fit(simulator)
             if again.cost * BETTER_RATIO**2 < fitted.cost:
                 bench, fitted = other, again
-    if bench.interrupted_fits:  # half a fit would tell wrong things
-        raise KeyboardInterrupt
+    bench.interrupt.raise_pending()  # half a fit would tell wrong things
     bench.check_followed(fitted)
     floor = noise_floor(bench.recordings, bench.scored(fitted.residual))
     return assess_recordings(bench, fitted, floor, stated or "", laws)

@@ -62,7 +62,8 @@ def scale_time(factor: float) -> Gate:
 
 
 def _describe_factor(correction: float, more: str = "") -> str:
-    return f"off by a factor of {1 / correction:.4g}{more}, as from a wrong unit"
+    size, factor = ("small", correction) if correction > 1 else ("large", 1 / correction)
+    return f"too {size} by a factor of {factor:.4g}{more}, as from a wrong unit"
 
 
 def open_bench(simulator: Any, recordings: Sequence[Recording], hold: str, engine: str) -> tuple[Workbench, list[Gate]]:

@@ -156,7 +156,7 @@ class HiddenForce:
 
     port: str
     recording: str
-    t: np.ndarray  # s
+    t: np.ndarray  # s, on the recording's clock
     z: np.ndarray  # local coordinate
     dz: np.ndarray  # its rate
     force: np.ndarray
@@ -198,7 +198,7 @@ def hidden_force(
     z, dz = (v[:-1] if instant else (v[1:] + v[:-1]) / 2 for v in (z, dz))
     empty = np.zeros(0)
     law_z, law_dz, law_force = (empty, empty, empty) if law is None else (v[window] for v in law)
-    return HiddenForce(port, r.name, r.t[window][:-1], z, dz, force, std, law_z, law_dz, law_force, instant)
+    return HiddenForce(port, r.name, r.clock[window][:-1], z, dz, force, std, law_z, law_dz, law_force, instant)
 
 
 def law_signals(bench: Workbench, fitted: Fitted, number: int, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

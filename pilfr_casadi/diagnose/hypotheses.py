@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from .._base import Stages, is_interrupt
+from .._base import Stages, UntilInterrupted
 from ..laws import Law
 from ..simulators import Placed, Simulator
 from .coloured_noise import log_likelihood
@@ -121,7 +121,6 @@ class Hypotheses:
     alternatives: dict[str, tuple[Law, ...]] = field(default_factory=dict)
     findings: defaultdict[Key, Findings] = field(default_factory=lambda: defaultdict(Findings))
     times: dict[str, float] = field(default_factory=dict)
-    interrupted: bool = False
     out_of_time: bool = False
     count: float = FEWEST
     mismatch2: float | None = None
@@ -129,7 +128,12 @@ class Hypotheses:
     @cached_property
     def fits(self) -> Trials:
         """Fits of hypotheses, with the bench, workers and time limit of the search."""
-        return Trials(self.bench, self.workers, self.until)
+        return Trials(self.bench, self.workers, self.until, self.without.residual)
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C was pressed: nothing more is fitted, and the answer says so."""
+        return self.bench.interrupt.pressed
 
     @property
     def samples(self) -> float:
@@ -348,7 +352,8 @@ class Hypotheses:
 
     def cut_short_with(self, other: Hypotheses) -> None:
         """Note that another search of the same diagnosis was interrupted or ran out of time."""
-        self.interrupted = self.interrupted or other.interrupted
+        if other.interrupted:
+            self.bench.interrupt.handle()
         self.out_of_time = self.out_of_time or other.out_of_time
 
     def keep(self, trial: Trial) -> None:
@@ -379,7 +384,7 @@ class Hypotheses:
         best, nearest = self.best, min(self.memo.values(), key=lambda t: t.mean_square)
         best = nearest if FAR_RATIO * nearest.error < best.error else best
         self.count = count_samples(best.fitted, self.bench)
-        if self.floor.source != "estimated":
+        if self.floor.source != "estimated" or self.interrupted:
             return
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
         share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
@@ -436,42 +441,17 @@ class Hypotheses:
         KeyboardInterrupt
             If a fit was interrupted. Such a fit has returned its best result so far.
         """
-        self._raise_if_interrupted()
+        self.bench.interrupt.raise_pending()
         self.say(name, 0, 1, self.without.cost**0.5)
         began = time.perf_counter()
         yield
         self.times[name] = self.times.get(name, 0.0) + time.perf_counter() - began
         self.say(name, 1, 1, self.best.error)
-        self._raise_if_interrupted()
-
-    def _raise_if_interrupted(self) -> None:
-        if self.bench.interrupted_fits and not self.interrupted:
-            raise KeyboardInterrupt
+        self.bench.interrupt.raise_pending()
 
     def until_interrupted(self) -> UntilInterrupted:
         """Make a context that an interrupt ends, so that the answer rests on what was found before it."""
-        return UntilInterrupted(self)
-
-
-@dataclass(frozen=True)
-class UntilInterrupted:
-    """A context that an interrupt ends; it then marks the search as interrupted.
-
-    It is a class because type checkers know by the `bool` of `__exit__` that code after the context is reached.
-    """
-
-    hypotheses: Hypotheses
-
-    def __enter__(self) -> None:
-        """Do nothing."""
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
-        """Catch an interrupt, and nothing else."""
-        caught = is_interrupt(error)
-        if caught:
-            self.hypotheses.interrupted = True
-            self.hypotheses.say.interrupted()
-        return caught
+        return UntilInterrupted(self.bench.interrupt, self.say.interrupted)
 
 
 def likeliest(trials: Sequence[Trial], evidence: Callable[[Trial], float]) -> list[Trial]:

@@ -379,7 +379,8 @@ def own_signals(simulator: Simulator, values: np.ndarray) -> list[dict[str, np.n
 def parameter_signals(bench: Workbench, value: float, x: Sequence[np.ndarray], u: Sequence[np.ndarray]) -> Local:
     """Return the signals that a parameter may vary with: states (M, n_x) and inputs (M, n_u) of each run, and time."""
     states = zip(bench.simulator.states, np.concatenate(x).T, strict=True)
-    signals = {**bench.signals_of(u), **dict(states)}
+    signals = bench.signals_of(u)
+    signals = {**signals, **dict(states), "t": signals["t"]}
     z = np.full(len(signals["t"]), value)
     return Local(z, np.zeros_like(z), bench.dt, tuple(map(len, u)), inputs=signals)
 

@@ -47,6 +47,7 @@ MOST_GAPS = 3  # gaps that are sought at most
 SHORTEST_PIECE = 40  # samples of a piece at least
 RIVAL_DISTANCE = 5  # samples around a jump at which rivals are tried, and at which a drift would explain as much
 SHOCK_DELAYS = (-0.5, 0.0, 0.5)  # delays of a shock that are tried, in samples
+BLOCK = 500  # samples whose matrices are held at a time
 RIDGE = 1e-6  # on the normal equations, against jumps that initial states can follow
 
 
@@ -232,23 +233,27 @@ def _jump_shares(
     (M,), (M,) and (M, n_x). Forces that stay constant from a sample on are further states.
     """
     m, _, n = run.c.shape
-    forces = run.b[:, :, run.n_free :]
-    full, n_b = n + forces.shape[2], read.shape[2] - 1
-    a = np.tile(np.eye(full), (m, 1, 1))
-    a[:, :n, :n], a[:, :n, n:] = run.a, forces
-    c = np.concatenate([run.c, run.d[:, :, run.n_free :]], axis=2) / scale[:, None]
-    s, g = np.zeros((full, full)), np.zeros((full, n_b + 1))
-    size2, left, along = np.zeros((m, full, full)), np.zeros((m, full, full)), np.zeros((m, full))
-    for k in range(m - 1, skip - 1, -1):
-        s = c[k].T @ c[k] + a[k].T @ s @ a[k]
-        g = c[k].T @ read[k - skip] + a[k].T @ g
-        size2[k], left[k], along[k] = s, s - g[:, :n_b] @ g[:, :n_b].T, g[:, n_b]
-    unit, shock = np.eye(full), np.eye(full)[:, list(moved)]
-    removed, size = _solve_jumps(left, size2, along, unit[:, :n_x])
-    later = a - np.eye(full)
-    later[:, :, n:] = 0.0
-    rivals = [shock + part * later @ shock for part in SHOCK_DELAYS] + [unit[:, [j]] for j in range(n, full)]
-    return removed, np.max([_solve_jumps(left, size2, along, rival)[0] for rival in rivals], axis=0), size
+    full, n_b = n + run.b.shape[2] - run.n_free, read.shape[2] - 1
+    unit, s, g = np.eye(full), np.zeros((full, full)), np.zeros((full, n_b + 1))
+    shock = unit[:, list(moved)]
+    removed, rivals, sizes = np.zeros(m), np.zeros(m), np.zeros((m, n_x))
+    for stop in range(m, skip, -BLOCK):  # from the last block on, because the matrices of all samples would be large
+        now = slice(max(stop - BLOCK, skip), stop)
+        forces, feedthrough = run.b[now, :, run.n_free :], run.d[now, :, run.n_free :]
+        a = np.tile(unit, (len(forces), 1, 1))
+        a[:, :n, :n], a[:, :n, n:] = run.a[now], forces
+        c = np.concatenate([run.c[now], feedthrough], axis=2) / scale[:, None]
+        size2, left, along = np.empty_like(a), np.empty_like(a), np.empty(a.shape[:2])
+        for k in reversed(range(len(a))):
+            s = c[k].T @ c[k] + a[k].T @ s @ a[k]
+            g = c[k].T @ read[now.start - skip + k] + a[k].T @ g
+            size2[k], left[k], along[k] = s, s - g[:, :n_b] @ g[:, :n_b].T, g[:, n_b]
+        removed[now], sizes[now] = _solve_jumps(left, size2, along, unit[:, :n_x])
+        later = a - unit
+        later[:, :, n:] = 0.0
+        tried = [shock + part * later @ shock for part in SHOCK_DELAYS] + [unit[:, [j]] for j in range(n, full)]
+        rivals[now] = np.max([_solve_jumps(left, size2, along, rival)[0] for rival in tried], axis=0)
+    return removed, rivals, sizes
 
 
 def _solve_jumps(

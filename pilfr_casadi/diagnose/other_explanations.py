@@ -114,7 +114,6 @@ def _free(search: Search, names: Sequence[str], start: Fitted, enough: float) ->
         found = refit(bench, starts, simulator, states=start.initial)
         if found is not None and found.cost < NEAR_RATIO**2 * enough:
             found = refit(bench, [found.values], simulator, states=found.initial, solver=THOROUGH, like=found)
-    search.interrupted = search.interrupted or bool(bench.interrupted_fits)
     return None if search.interrupted else found
 
 

@@ -184,7 +184,7 @@ def _search_with_focus(request: Request) -> tuple[Request, Prepared, Search]:
 def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
     """Search; if nobody stated the hold of the inputs and it matters, use the hold with the smaller error."""
     ready, search = _search(request)
-    if search.interrupted or not search.other_hold_fits_better():
+    if search.hold_said or not _prefers_other_hold(search):
         return ready, search
     hold = search.bench.with_other_hold().hold
     held = replace(request, hold=hold, say=request.say.under("other hold: "))
@@ -197,13 +197,20 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
         search.cut_short_with(again)
         return ready, search.resume(request.most_effects)
     # the laws that were found since may have been what the hold had made up for
-    if not again.interrupted and again.prefers_other_hold():
+    if _prefers_other_hold(again):
         search.adopt(again.best)
         resumed = search.resume(request.most_effects)
         if resumed.best.mean_square < again.best.mean_square:
             return ready, resumed
     ratio = float(np.sqrt(search.best.mean_square / max(again.best.mean_square, 1e-300)))
     return replace(other, gates=(*other.gates, hold_note(request.simulator, hold, ratio))), again
+
+
+def _prefers_other_hold(search: Search) -> bool:
+    """Tell whether a search that nobody has interrupted would be better with the other hold."""
+    with search.until_interrupted():
+        return search.prefers_other_hold()
+    return False
 
 
 def _search(request: Request) -> tuple[Prepared, Search]:
@@ -323,7 +330,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     """
     answer, interrupted = posterior(search), search.interrupted
     finished, elsewhere = not (interrupted or search.out_of_time), tuple[Gate, ...]()
-    gates = (*gates, *find_tones(search.bench, answer.best.fitted))
+    given, gates = gates, with_tones(search, answer, gates)
     verdict = judge(search, answer, gates)
     if verdict.kind in ("missing-physics", "unexplained") and not (interrupted or search.past_deadline):
         found = _without_a_law(search, answer, verdict, gates)
@@ -332,6 +339,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     if verdict.kind == "missing-physics":
         correction, fitted = find_correction(search, answer, named=True)
         answer = answer.within({(port, law) for port, law, _ in correction.elements}, correction.shares["learned"])
+        gates = with_tones(search, answer, given)
         verdict = judge(search, answer, gates)
         if verdict.kind == "missing-physics" and finished and may_act_elsewhere(search, answer.best):
             elsewhere, odds = find_undeclared_port(search, answer.best)
@@ -360,6 +368,12 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
         verdict = Verdict(verdict.kind, f"{said} {correction.sentence}")
         return Conclusion(verdict, gates, fitted, correction)
     return Conclusion(verdict, gates, refitted, named_correction(search, refitted))
+
+
+def with_tones(search: Search, answer: Posterior, gates: Sequence[Gate]) -> tuple[Gate, ...]:
+    """Add the steady tones that the named laws leave, or the refit if nothing has a name."""
+    fitted = answer.best.fitted if answer.effects else search.root.fitted
+    return (*gates, *find_tones(search.bench, fitted))
 
 
 def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: Sequence[Gate]) -> Conclusion | None:

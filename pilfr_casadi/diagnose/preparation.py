@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
-from .._base import InputError, Stages, is_interrupt
+from .._base import InputError, Stages, UntilInterrupted
 from ..data import Recording
-from ..optimise import Status
 from ..simulators import Simulator, unit_factor, unit_notes
 from .arguments import stated_hold
 from .channel_faults import find_slips, open_bench
@@ -98,29 +97,31 @@ def prepare(
     checks = _Checks(gates, workers, early, say, until)
     now = checks.run(bench, 1.0 if said else 0.5)
     faulty = any(g.fault for g in now.gates[len(gates) :])
-    if not said and faulty and not bench.interrupted_fits:  # on faulty data the better hold says nothing
+    if not said and faulty and not bench.interrupt.pressed:  # on faulty data the better hold says nothing
         now, held = _with_better_hold(checks, now, bench, held)
-    bench, without, complete = now.bench, now.fitted, checks.may_go_on(now)
+    bench, without = now.bench, now.fitted
+    cut_short = checks.left_out or bench.interrupt.pressed
     corrected = bool(now.gates or held)  # values and states from faulty data may be in a wrong minimum
-    if corrected and not bench.interrupted_fits:
+    if corrected and not bench.interrupt.pressed:
         led = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
         without = min(led, bench.fit(bench.simulator, [{}, led.values], solver=THOROUGH), key=lambda f: f.cost)
     bench.check_followed(without)
     bench = replace(bench, typical=sample_run(bench, without))
     say(CHECKS, CHECKED, CHECKED, without.cost**0.5)
-    unchecked = [Gate("recordings", "unchecked", None, UNCHECKED, corrected=False)] if not complete else []
+    unchecked = [Gate("recordings", "unchecked", None, UNCHECKED, corrected=False)] if cut_short else []
     return Prepared(bench, without, nominal, (*now.gates, *held, *unchecked), Checked(bench, without).floor)
 
 
 @dataclass(frozen=True)
 class _Checks:
-    """The checks of recordings in their order."""
+    """The checks of recordings in their order; `left_out` receives those that were not begun."""
 
     gates: tuple[Gate, ...]
     workers: int
     early: bool
     say: Stages
     until: float
+    left_out: list[Callable[[Checked], Checked]] = field(default_factory=list)
 
     def run(self, bench: Workbench, part: float) -> Checked:
         """Refit, and correct one fault after the other; `part` is the unit of shifts in samples, see `timing`."""
@@ -134,23 +135,15 @@ class _Checks:
         now = self._in_turn(now, self._report(4), _refine_steps, in_any_case=True)
         return self._in_turn(now, shift, find_output_gaps, self._report(5), find_offsets)
 
-    def may_go_on(self, now: Checked) -> bool:
-        """Tell whether the time is not over, and nobody has interrupted a fit."""
-        return time.perf_counter() < self.until and not now.bench.interrupted_fits
-
     def _in_turn(self, now: Checked, *checks: Callable[[Checked], Checked], in_any_case: bool = False) -> Checked:
         """Carry out checks one after the other, until an interrupt comes, or the time is over, unless `in_any_case`."""
         for check in checks:
-            if now.bench.interrupted_fits or not (in_any_case or self.may_go_on(now)):
+            if now.bench.interrupt.pressed or not (in_any_case or time.perf_counter() < self.until):
+                self.left_out.append(check)
                 break
-            try:
-                now, before = check(now), now
+            with UntilInterrupted(now.bench.interrupt, self.say.interrupted):
+                before, now = now, check(now)
                 now = now if now.fitted is before.fitted else now.weighted()
-            except BaseException as error:
-                if not is_interrupt(error):
-                    raise
-                now.bench.interrupted_fits.append(Status.INTERRUPTED)
-                self.say.interrupted()
         return now
 
     def _report(self, done: int) -> Callable[[Checked], Checked]:
@@ -261,8 +254,6 @@ def conversions(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[
 def hold_note(simulator: Simulator, hold: str, ratio: float) -> Gate:
     """Note that the hold was chosen from the data; the other's error is `ratio` times as large."""
     words = {"zero": "held over each sample", "linear": "interpolated between samples"}[hold]
-    sentence = (
-        f"The recordings do not say what inputs do between samples; {words} fits better (error {ratio:.3g} times "
-        "smaller) and is used."
-    )
+    how = f"fits better (error {ratio:.3g} times smaller)" if ratio > EQUAL_RATIO else "fits no worse"
+    sentence = f"The recordings do not say what inputs do between samples; {words} {how} and is used."
     return Gate(", ".join(simulator.inputs), "hold", hold, sentence)

@@ -28,16 +28,19 @@ SINES, TRIANGLES = 12, 5  # frequencies that are tried
 LONGEST_EXPERIMENT = 3000  # longest simulated experiment, in samples
 LEAST_MOTION = 0.5  # deviation of an output's scored samples over that of all, below which it hardly moves
 VISIBLE_LEVEL = 0.1  # mean of an input over its amplitude, above which a sentence states it
-UNEDITED = "after, on test recordings as given"  # a key of `test_errors`
 VISIBLE_DIFFERENCE = 0.01  # difference of two answers over the noise, above which a recording shows it
 
 
 @dataclass(frozen=True)
 class Comparison(Generic[K]):
-    """NRMSEs of models, averaged over recordings, and the recordings with the first sample that is scored in each."""
+    """NRMSEs of models, averaged over recordings, and the recordings with the first sample that is scored in each.
+
+    `unedited` is the error of the corrected simulator on test recordings as given, if edits were compared with that.
+    """
 
     errors: dict[K, float]
     scored: tuple[tuple[Recording, int], ...]
+    unedited: float = np.inf
 
     def find_resting(self) -> list[tuple[str, int]]:
         """List (name, first scored sample) of the recordings that hardly move from there on.
@@ -95,15 +98,15 @@ def test_errors(
     """Compute the errors of fits, on the sub-steps that they were fitted on, and of the `given` model as "nominal".
 
     The fits see the test recordings with the gates' edits, the given model as they are; so does the fit "after" once
-    more, as UNEDITED. All are scored on the same samples, unless an edit changes these.
+    more (`unedited`). All are scored on the same samples, unless an edit changes these.
     """
     models = {name: (one.fitted_model, starts_of(one)) for name, one in fits.items()}
     nominal: Models[str] = {"nominal": (given, ())}
     if all(g.change is None for g in gates):
         return compare_errors(bench.on(tests), {**nominal, **models})
     found = compare_errors(bench.on(edited(tests, gates)), models)
-    unedited = compare_errors(bench.on(tests), {**nominal, UNEDITED: models["after"]}).errors
-    return replace(found, errors={**unedited, **found.errors})
+    as_given = compare_errors(bench.on(tests), {**nominal, "after": models["after"]}).errors
+    return replace(found, errors={**as_given, **found.errors}, unedited=as_given["after"])
 
 
 def free_run_errors(

@@ -171,9 +171,9 @@ def mend_stale_samples(now: Checked) -> Checked:
             words = f"{repeated:.0%} of the samples of {name} repeat the one before, as from lost or stale samples"
             fault = Stale(name, "stale", repeated, words, change=partial(_interpolate_repeats, side=side, column=i))
             found = accept(now, correct(now, fault, [{}, now.fitted.values], now.fitted.begin), fault)
-            if found is now and side == "y":
+            if len(found.gates) == len(now.gates) and side == "y":
                 words = f"{words}; the error that this causes counts as noise: record again, or leave them out."
-                found = now.then(now.bench, now.fitted, Gate(name, "stale", repeated, words, False))
+                found = found.then(found.bench, found.fitted, Gate(name, "stale", repeated, words, False))
             now = found
     return now
 

@@ -97,14 +97,8 @@ def refit_error(simulator: Any, recordings: Any, *, hold: str | None = None, eng
     """
     bench = _bench(simulator, recordings, hold, engine)
     fitted = bench.fit(bench.simulator, solver=THOROUGH)
-    _raise_if_interrupted(bench)
+    bench.interrupt.raise_pending()
     return bench.nrmse(fitted)
-
-
-def _raise_if_interrupted(bench: Workbench) -> None:
-    """Raise KeyboardInterrupt if Ctrl-C has ended a fit, which then returned its best values so far."""
-    if bench.interrupted_fits:
-        raise KeyboardInterrupt
 
 
 def _bench(simulator: Any, recordings: Any, hold: str | None, engine: str) -> Workbench:
@@ -146,7 +140,7 @@ def replicate(
     after = _fit_with_laws(bench, plain, laws, starts) if laws else plain
     after = _refine_steps(bench, after)
     alone, values = _fit_each_recording(bench, after)
-    _raise_if_interrupted(bench)
+    bench.interrupt.raise_pending()
     residuals = tuple(e / bench.scale for e in bench.scored(alone))
     noise2 = _noise2(bench, residuals)
     square = bench.pool(np.mean(np.concatenate(residuals) ** 2, axis=0))

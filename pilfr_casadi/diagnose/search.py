@@ -85,7 +85,7 @@ class Search(Hypotheses):
         self.keep(Trial.of(self.without, 0, thorough=True))
         with self.until_interrupted():
             self.estimate_noise()
-            if self._grow(effects) and self._name_rest(effects):
+            if not self.interrupted and self._grow(effects) and self._name_rest(effects):
                 if len(self.best.effects) < effects:
                     self._grow_to_noise()
                 self._every_sensor()
@@ -208,7 +208,7 @@ class Search(Hypotheses):
     def prefers_other_hold(self) -> bool:
         """Tell whether the best hypothesis follows the recordings better with the other hold of the inputs."""
         best = self.best.fitted
-        if not self.in_time():
+        if self.interrupted or not self.in_time():
             return False
         try:
             other = self.bench.with_other_hold().fit(
@@ -216,7 +216,7 @@ class Search(Hypotheses):
             )
         except InputError:
             return False
-        return other.cost * BETTER_RATIO**2 < best.cost
+        return not self.interrupted and other.cost * BETTER_RATIO**2 < best.cost
 
     def _finds_shift(self) -> bool:
         """Look beside each of the first laws for an output that comes before its cause; their absence may hide it.
@@ -301,8 +301,7 @@ class Search(Hypotheses):
         stage = f"fits, effect {len(parent.laws) + 1}" if parent.laws else "fits"
         trials = self.fits.fit_pairs(parent, scored, gain, enough, partial(self.say, stage), again)
         self.times["fits"] = self.times.get("fits", 0.0) + time.perf_counter() - began
-        if self.bench.interrupted_fits:
-            raise KeyboardInterrupt
+        self.bench.interrupt.raise_pending()
         return trials
 
     def _keep_all(self, trials: Sequence[Trial]) -> None:

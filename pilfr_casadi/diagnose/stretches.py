@@ -311,7 +311,6 @@ class Everything:
         with search.until_interrupted():
             fits = side_by_side(lambda t: fit_to_all(whole, t.fitted, limit), trials, search.workers)
         fits = fits or [fit_to_all(whole, t.fitted, 0.0) for t in trials]
-        search.interrupted = search.interrupted or bool(whole.interrupted_fits)
         if not fits[0].cost < DIVERGED:
             return None
         there = replace(search, bench=whole, memo={}, steps=[], findings=defaultdict(Findings))
@@ -328,8 +327,10 @@ class Everything:
     def fit(self, search: Search, fitted: Fitted) -> Fitted:
         """Return the fit to everything of a simulator fitted to the stretches."""
         if fitted not in self.fits:
-            self.fits[fitted] = fit_to_all(self.bench, fitted, _seconds_left(search))
-            search.interrupted = search.interrupted or bool(self.bench.interrupted_fits)
+            with search.until_interrupted():
+                self.fits[fitted] = fit_to_all(self.bench, fitted, _seconds_left(search))
+        if fitted not in self.fits:
+            self.fits[fitted] = fit_to_all(self.bench, fitted, 0.0)
         return self.fits[fitted]
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, one_at_a_time
+from .._base import InputError, Interrupt, one_at_a_time
 from ..data import Recording, nrmse
 from ..engine import Engine, make_engine
 from ..identify import match_channels, solve_within_bounds
@@ -164,7 +164,7 @@ class Workbench:
     at_least: int = 1  # sub-steps of simulators with laws
     typical: tuple[np.ndarray, np.ndarray] | None = None  # states and inputs along the refitted run
     chosen: int = 1  # sub-steps first chosen for the simulator, on which limits are based
-    interrupted_fits: list[Status] = field(default_factory=list)  # one entry for each fit that an interrupt has ended
+    interrupt: Interrupt = field(default_factory=Interrupt)  # shared by all benches of a search
     deadline: float = np.inf  # time (of `time.perf_counter`) at which every fit ends
     noise2: np.ndarray | None = None
 
@@ -191,7 +191,7 @@ class Workbench:
     def renewed(self, recordings: Sequence[Recording]) -> Workbench:
         """Return a bench for other recordings, with sub-steps and the unit of errors chosen for them."""
         bench = Workbench.of(self.simulator, recordings, self.hold, self.engine)
-        return replace(bench, deadline=self.deadline, interrupted_fits=self.interrupted_fits, noise2=self.noise2)
+        return replace(bench, deadline=self.deadline, interrupt=self.interrupt, noise2=self.noise2)
 
     def nrmse(self, fitted: Fitted) -> float:
         """Compute the NRMSE averaged over outputs and recordings.
@@ -315,8 +315,11 @@ class Workbench:
         return ""
 
     def check_followed(self, fitted: Fitted, most: float = RUNAWAY**2) -> None:
-        """Refuse a fit of an unstable simulator that leaves more than `most` of the mean square."""
-        if fitted.cost > most and (why := self._describe_instability(self.simulator)):
+        """Refuse a fit of an unstable simulator that leaves more than `most` of the mean square.
+
+        A fit that an interrupt may have ended is not refused.
+        """
+        if fitted.cost > most and not self.interrupt.pressed and (why := self._describe_instability(self.simulator)):
             off = f"{fitted.cost**0.5:.3g} times the outputs' deviation"
             raise RunsAway(f"Refitted, the simulation runs away from the recordings, by {off}; {why}")
 
@@ -399,7 +402,7 @@ class Workbench:
                 break
             theta, status = solution.theta, solution.status
             if status is Status.INTERRUPTED:
-                self.interrupted_fits.append(status)
+                self.interrupt.pressed = True
         return problem, theta, status
 
     def _balance(self, problem: Problem, theta: np.ndarray, now: np.ndarray) -> np.ndarray:
@@ -444,11 +447,14 @@ class Workbench:
         return Local(z, dz, self.dt, lengths, inputs=inputs, from_zero=rest)
 
     def signals_of(self, inputs: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the time `t` and the inputs by name along all recordings, from the inputs (M, n_u) of each."""
+        """Return the inputs and the time `t`, also if an input has its name, along all recordings.
+
+        `inputs` holds those (M, n_u) of each recording.
+        """
         time = np.concatenate(
             [r.start + self.dt * np.arange(len(u)) for r, u in zip(self.recordings, inputs, strict=True)]
         )
-        return {"t": time, **dict(zip(self.simulator.inputs, np.concatenate(inputs).T, strict=True))}
+        return {**dict(zip(self.simulator.inputs, np.concatenate(inputs).T, strict=True)), "t": time}
 
     def run(self, simulator: Simulator, values: Mapping[str, Any], states: Sequence[np.ndarray]) -> Fitted:
         """Run a simulator at values by name, from the simulator's own initial states."""

@@ -157,7 +157,7 @@ class _LawsAtInstant:
     ) -> Any:
         """Evaluate the force or the signal w of a law at the local coordinate z and its rate dz."""
         e = self.equations.simulator.elements[i]
-        p, u = self.equations.law_values(e), Named("input", {"t": self.t, **self.u, **(port_signals or {})})
+        p, u = self.equations.law_values(e), Named("input", {**self.u, **(port_signals or {}), "t": self.t})
         have = {"z": z, "dz": dz, "q": self.q[i], "p": p, "t": self.t, "x": self.x, "u": u, "term": term}
         if hasattr(e.law, "step"):
             read = {k: have[k] for k in ("dz", "u") if k in inspect.signature(e.law.step).parameters}

@@ -150,8 +150,8 @@ class Port:
                 f"`signals` {what} are {self.signals!r}; give functions by name, {{'load': lambda x: ...}}."
             )
         for name in self.signals:
-            if not isinstance(name, str) or not name.isidentifier() or name == "z":
-                raise InputError(f"A signal {what} is named {name!r}; give a name like 'load' (z is the coordinate).")
+            if not isinstance(name, str) or not name.isidentifier() or name in ("z", "t"):
+                raise InputError(f"A signal {what} is named {name!r}; give a name like 'load' (z and t are taken).")
         if self.domain not in ("", *DOMAINS, UNKNOWN):
             raise InputError(f"The domain {what} is {self.domain!r}; give {', '.join(DOMAINS)} or {UNKNOWN}.")
         object.__setattr__(self, "domain", self.domain or infer_domain(self.unit, self.across_unit))

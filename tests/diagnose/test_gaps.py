@@ -1,7 +1,9 @@
 """Samples lost within a recording, its time renumbered."""
 
 import json
+import tracemalloc
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from test_timing import shaken, spring
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
-from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose import Workbench, lost_samples
 from pilfr_casadi.diagnose.gates import CURED_SHARE, Checked
 from pilfr_casadi.diagnose.lost_samples import OutputGap, find_gaps, find_jump, find_output_gaps, settle_jump
 from pilfr_casadi.diagnose.preparation import prepare, refitted
@@ -214,3 +216,19 @@ def test_a_shock_that_no_input_explains_is_no_gap_of_an_output():
     noise = 5e-3 * np.std(y, axis=0) * np.random.default_rng(4).standard_normal(y.shape)
     made = Workbench.of(rings(lambda u: 0 * u.kick), [r.with_(y=y + noise)], "zero")
     assert not find_output_gaps(Checked(made, refitted(made))).gates
+
+
+def test_jumps_are_tried_with_the_matrices_of_a_few_samples_at_a_time(monkeypatch):
+    """With those of all samples, a long recording of many states took gigabytes."""
+    rng, m, n, found = np.random.default_rng(0), 1500, 12, []
+    shapes = {"a": (m, n, n), "b": (m, n, 7), "c": (m, 2, n), "d": (m, 2, 7)}
+    run = SimpleNamespace(n_free=3, **{name: 0.05 * rng.standard_normal(shape) for name, shape in shapes.items()})
+    read = rng.standard_normal((m - 50, 2, 6))
+    for samples in (m, 50):
+        monkeypatch.setattr(lost_samples, "BLOCK", samples)
+        tracemalloc.start()
+        found.append(lost_samples._jump_shares(run, np.ones(2), read, 50, 8, [1, 3]))
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak < 0.5 * run.a.nbytes
+    assert all(np.array_equal(one, other) for one, other in zip(*found, strict=True))

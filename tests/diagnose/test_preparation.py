@@ -1,12 +1,15 @@
 """Dull faults beside an unsaid hold, and constants: what the search starts from is right again."""
 
+import time
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from diagnosis_rig import OFF, recordings, rig
 from test_slips import DT, recorded, tanks
 
 from pilfr_casadi import Parameter, Recording, Simulator, multisine
-from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose import Workbench, preparation
 from pilfr_casadi.diagnose.gates import Checked
 from pilfr_casadi.diagnose.offsets import find_offsets, list_offsets, share_of_constants, update_offsets
 from pilfr_casadi.diagnose.preparation import prepare, refitted
@@ -79,6 +82,28 @@ def test_checks_that_the_time_limit_left_out_are_told():
     assert [g.finding for g in found.gates] == ["unchecked"] and not found.gates[0].fault
     assert found.without.cost < 1  # the first refit is made in any case
     assert "unchecked" not in [g.finding for g in prepare(tanks(1.15), [r], "zero", "auto").gates]
+
+
+def test_no_check_is_left_out_where_the_time_ends_with_the_last_one(monkeypatch):
+    until, begun = time.perf_counter() + 1e4, []
+    monkeypatch.setattr(preparation, "find_offsets", lambda now: begun.append(now) or now)
+    clock = SimpleNamespace(perf_counter=lambda: np.inf if begun else time.perf_counter())
+    monkeypatch.setattr(preparation, "time", clock)
+    assert not prepare(tanks(1.15), [of_tanks(recorded()[1])], "zero", "auto", until=until).gates and begun
+
+
+@pytest.mark.parametrize("pressed_by", ["fit", "check"])
+def test_checks_that_an_interrupt_left_out_are_told(monkeypatch, pressed_by):
+    def press(now):
+        if pressed_by == "check":
+            raise KeyboardInterrupt
+        now.bench.interrupt.pressed = True
+        return now
+
+    monkeypatch.setattr(preparation, "find_wrong_start", press)
+    monkeypatch.setattr(preparation, "find_offsets", lambda now: pytest.fail("a check after Ctrl-C"))
+    found = prepare(tanks(1.15), [of_tanks(recorded()[1] + [0, 0.3])], "zero", "auto")
+    assert [g.finding for g in found.gates] == ["unchecked"] and found.bench.interrupt.pressed
 
 
 @pytest.mark.parametrize(("side", "channel"), [("u", "force"), ("y", "x2")])

@@ -6,7 +6,7 @@ from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
-from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose import Workbench, recording_faults
 from pilfr_casadi.diagnose.floor import measured_floor
 from pilfr_casadi.diagnose.gates import Checked
 from pilfr_casadi.diagnose.preparation import refitted
@@ -111,7 +111,10 @@ def test_repeats_of_a_coarse_sensor_whose_record_was_resampled_are_not_stale():
     assert share_of_repeats([resampled]) == 0
 
 
-def test_stale_samples_beside_missing_physics_are_noted():
+@pytest.mark.parametrize("led", [False, True], ids=["as it was", "led to a better refit"])
+def test_stale_samples_beside_missing_physics_are_noted(monkeypatch, led):
+    if led:  # the correction only led the refit out of a local minimum
+        monkeypatch.setattr(recording_faults, "accept", lambda now, after, fault: now.then(now.bench, now.fitted))
     (r,) = recordings(laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01}), count=1)
     bench = Workbench.of(rig(OFF), [lost(r, 0.1)], "zero")
     (gate,) = mend_stale_samples(Checked(bench, refitted(bench))).gates

@@ -6,6 +6,7 @@ from cart import cart
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
+from pilfr_casadi.diagnose.channel_faults import scale_channels, scale_time
 from pilfr_casadi.diagnose.preparation import prepare
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import discretise
@@ -47,6 +48,13 @@ def test_exchanged_channels_are_told(exchanged):
     assert found.verdict == "recording-fault"
     assert [(g.channel, g.finding, g.value) for g in found.gates] == [(", ".join(channels), "exchange", channels)]
     assert found.errors["train"]["after"] < 0.01 and "are exchanged" in found.sentence
+
+
+def test_a_wrong_unit_is_said_in_words():
+    (small, large) = (scale_channels("y", ("a", "b"), [1], factor).sentence for factor in (1e3, 1e-3))
+    assert small == "In the recordings b is too small by a factor of 1000, as from a wrong unit"
+    assert "b is too large by a factor of 1000" in large
+    assert "the time is too large by a factor of 60," in scale_time(1 / 60).sentence
 
 
 @pytest.mark.parametrize("alike", [True, False])

@@ -12,7 +12,7 @@ from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Recording, laws
-from pilfr_casadi._base import Stages
+from pilfr_casadi._base import Interrupt, Stages
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.channel_faults import scale_channels
 from pilfr_casadi.diagnose.floor import noise_floor
@@ -188,7 +188,7 @@ def test_a_simulation_that_runs_away_over_a_whole_recording_leaves_the_answer_to
     unstable = bench.run(spring(k=100.0, d=-1.5, least_damping=-3.0), {}, [np.zeros(2)])
     search = Search(bench, unstable, noise_floor(bench.recordings, unstable.residual), (), 1, Stages(lambda *_: None))
     search.keep(Trial((), unstable, unstable.cost, unstable.cost, True))
-    search.interrupted = True  # values stay as they are
+    search.bench.interrupt.handle()  # values stay as they are
     assert Everything.of(search, stretches, ()) is None
     assert "values and errors are those of the stretches" in stretches.note(False).sentence
 
@@ -200,10 +200,10 @@ def test_after_an_interrupt_everything_has_the_values_of_the_stretches():
     fitted = bench.fit(spring())
     search = Search(bench, fitted, noise_floor(bench.recordings, fitted.residual), (), 1, Stages(lambda *_: None))
     search.keep(Trial((), fitted, fitted.cost, fitted.cost, True))
-    search.interrupted = True
+    search.bench.interrupt.handle()
     kept = Everything.of(search, stretches, ()).fit(search, fitted)
     assert kept.values == fitted.values and [len(e) for e in kept.residual] == [3000]
-    search.interrupted = False
+    search.bench = replace(search.bench, interrupt=Interrupt())
     moved = Everything.of(search, stretches, ()).fit(search, fitted)
     assert moved.cost < kept.cost
 

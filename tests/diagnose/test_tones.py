@@ -7,7 +7,14 @@ from scipy.signal import lfilter
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
-from pilfr_casadi.diagnose.recording_faults import find_tone
+from pilfr_casadi._base import Stages
+from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose.floor import Floor
+from pilfr_casadi.diagnose.pipeline import with_tones
+from pilfr_casadi.diagnose.recording_faults import find_tone, find_tones
+from pilfr_casadi.diagnose.search import Search
+from pilfr_casadi.diagnose.trials import Trial
+from pilfr_casadi.diagnose.verdict import Posterior, judge
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import discretise
 
@@ -70,6 +77,22 @@ def test_hum_on_a_sensor_is_told_where_nothing_is_missing():
     (gate,) = found.gates
     assert (gate.channel, gate.finding, gate.corrected, gate.fault) == ("x2", "tone", False, False)
     assert gate.value == pytest.approx(49.97, abs=0.02)
+
+
+def test_hum_explains_nothing_of_physics_that_has_lost_its_name():
+    """It was most of what the withdrawn law had left, and hardly anything of what the refit leaves."""
+    friction = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
+    (r,) = recordings(friction, count=1)
+    hum = 0.03 * np.std(r.y) * np.sin(2 * np.pi * 49.97 * r.t)
+    bench = Workbench.of(rig(OFF), [r.with_(y=r.y + hum[:, None])], "zero")
+    refit, named = bench.fit(rig(OFF)), bench.fit(rig(OFF).with_element("ground-m1", friction))
+    floor = Floor(0.02 * bench.scale, "periods", 4, np.full(1, 100.0))
+    search = Search(bench, refit, floor, [laws.CoulombFriction], 1, Stages(lambda *_: None))
+    for fitted, count in ((refit, 0), (named, 1)):
+        search.keep(Trial.of(fitted, count, thorough=True))
+    withdrawn = Posterior(search.best, 0.0, (), 0.0)
+    assert search.best.laws and find_tones(bench, named)
+    assert judge(search, withdrawn, with_tones(search, withdrawn, ())).kind == "unexplained"
 
 
 @pytest.mark.slow

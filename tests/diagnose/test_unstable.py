@@ -9,6 +9,7 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
 from pilfr_casadi._base import InputError
+from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.preparation import prepare
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import discretise
@@ -63,6 +64,15 @@ def balanced():
 def test_what_an_unstable_simulator_is_far_from_is_refused():
     with pytest.raises(InputError, match=r"runs away .* times the outputs' deviation; it is unstable .* put the contr"):
         pilfr.check(pendulum(), balanced())
+
+
+def test_a_fit_that_an_interrupt_has_ended_is_not_refused():
+    bench = Workbench.of(pendulum(), [balanced()], "zero")
+    half = bench.run(pendulum(), {"d": 0.1}, [np.array([0.1, 0.0])])
+    with pytest.raises(InputError, match="runs away"):
+        bench.check_followed(half)
+    bench.interrupt.pressed = True
+    bench.check_followed(half)
 
 
 def test_what_a_simulator_swings_about_or_a_stable_one_is_far_from_is_not_refused():

@@ -6,7 +6,7 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
-from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose import Workbench, port_signals
 from pilfr_casadi.diagnose.evidence import log_prior
 from pilfr_casadi.diagnose.proof import placebo
 from pilfr_casadi.laws import (
@@ -227,3 +227,28 @@ def test_the_placebo_of_a_variation_with_time_has_another_time():
 def test_a_variation_that_no_search_tried_has_a_finite_prior():
     """Replications and predictions weigh laws without the list of a search."""
     assert np.isfinite(log_prior(motor().with_element("parameter:R", varying("w")()).elements, {}))
+
+
+@pytest.mark.parametrize("named", ["input", "state"])
+def test_a_law_that_varies_with_time_does_so_also_where_a_signal_has_the_name_t(named):
+    def tank(flow, height):
+        return pilfr.Simulator(
+            lambda x, u, p: {height: u[flow] - p.a * x[height]},
+            lambda x: {"level": x[height]},
+            (height,),
+            (flow,),
+            {"a": pilfr.Parameter(1.0)},
+        )
+
+    own = ("t", "h") if named == "input" else ("q", "t")
+    law = varying("t")().at({"c": 0.5, "low": 0.0, "high": 10.0})
+    blank = pilfr.Recording(
+        np.sin(np.arange(200)), np.zeros(200), 0.05, ("q",), ("level",), initial="zero", hold="zero"
+    )
+    usual = tank("q", "h").with_element("parameter:a", law).simulate(blank)
+    r = blank.with_(inputs=own[:1])
+    true = tank(*own).with_element("parameter:a", law)
+    assert np.allclose(true.simulate(r), usual)
+    bench = Workbench.of(tank(*own), [r.with_(y=usual)], "zero")
+    fitted = bench.run(true, {}, [np.zeros(1)])
+    assert np.allclose(port_signals(bench, fitted, "parameter:a").inputs["t"], r.clock)

@@ -8,7 +8,7 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import fingerprint
-from pilfr_casadi.identify import thin_operators
+from pilfr_casadi.identify import FitOptions, thin_operators
 from problems.constrained import three_plays
 
 WEIGHTS = (1.0, 8.0)
@@ -84,6 +84,12 @@ def test_weights_belong_to_recordings_in_any_order(records, weighted):
         pilfr.fit(weighted, [records[0], other])
     with pytest.raises(InputError, match="3 weights"):
         pilfr.prune(weighted, records, weights=(1, 2, 3))
+
+
+def test_recordings_that_differ_in_their_time_have_weights_of_their_own(records):
+    earlier, later = records[0], records[0].with_(start=5.0)
+    weights = FitOptions().updated(weights=(1.0, 3.0), train=[earlier, later]).weights
+    assert list(weights.values()) == [1.0, 3.0]
 
 
 def test_noise_can_be_estimated_again(records, weighted):
