@@ -117,7 +117,7 @@ def headline(diagnosis: Diagnosis) -> str:
     text += f", {percent(errors.get('before'))} refitted"
     if what := correction_words(diagnosis):
         text += f", {percent(errors.get('after'))} {what}"
-    return f"{text}; the noise floor is {percent(diagnosis.floor['nrmse'])}."
+    return f"{text}; the noise floor is {percent(diagnosis.noise_on_tests['nrmse'])}."
 
 
 def facts(diagnosis: Diagnosis) -> dict[str, str]:
@@ -125,7 +125,7 @@ def facts(diagnosis: Diagnosis) -> dict[str, str]:
     role, errors = judged_errors(diagnosis)
     out = {f"{role} error, {name}": percent(errors.get(k)) for k, name in _name_errors(diagnosis).items()}
     kind = {"periods": "from periods", "repeats": "from repeats"}.get(diagnosis.floor["source"], "estimated")
-    out[f"noise floor, {kind}"] = percent(diagnosis.floor["nrmse"])
+    out[f"noise floor, {kind}"] = percent(diagnosis.noise_on_tests["nrmse"])
     if diagnosis.effects:
         out["confidence"] = " / ".join(f"{e.confidence:.2f}" for e in diagnosis.effects)
     return out
@@ -139,7 +139,8 @@ def error_table(diagnosis: Diagnosis) -> Table:
     for kind, name in (("train", "training"), ("test", "test (held out)"), ("free_run", "the same, free run")):
         errors = diagnosis.errors.get(kind)
         if errors:
-            rows.append([name, *(percent(errors.get(k)) for k in steps), percent(diagnosis.floor["nrmse"])])
+            noise = diagnosis.floor if kind == "train" else diagnosis.noise_on_tests
+            rows.append([name, *(percent(errors.get(k)) for k in steps), percent(noise["nrmse"])])
     note = (
         f"Rms error of {'the predictions one sample ahead' if predicted else 'the free-run simulation'} divided by the "
         "standard deviation of the measured output, averaged over outputs."
