@@ -477,11 +477,12 @@ class Diagnosis:
         return out
 
     def __str__(self) -> str:
-        lines = [self.summary, *self.gravest_blind_spots()]
+        lines = [self.summary, *self.corrections_made(), *self.gravest_blind_spots()]
         for e in self.effects:
             lines += [str(e), f"  {self.worth(e)}"] if self.worth(e) else [str(e)]
         lines += [*self._nameless_lines(), *self._value_lines(), *self._error_lines(), *self._blind_lines()]
-        lines += [f"note: {text}" for text in (*(g.sentence for g in self.gates), *self.warnings())]
+        further = [g.sentence for g in self.gates if g.sentence not in self.corrected_faults]
+        lines += [f"note: {text}" for text in (*further, *self.warnings())]
         if self.next_experiment:
             lines.append(f"next experiment: {self.next_experiment['sentence']}")
         lines.append(f"computed in {self.seconds:.{1 if self.seconds < 10 else 0}f} s")
@@ -511,6 +512,15 @@ class Diagnosis:
         if self.verdict == "unexplained" and self.floor["source"] == "estimated":
             return f"at least {_error_text(most)}"
         return f"{_error_text(white)} to {_error_text(most)}" if most > NEAR_RATIO * white else _error_text(most)
+
+    @property
+    def corrected_faults(self) -> list[str]:
+        """Faults that were corrected in the recordings; the corrected simulator belongs to corrected recordings."""
+        return [g.sentence for g in self.gates if g.fault and g.corrected and not g.parameter]
+
+    def corrections_made(self) -> list[str]:
+        """Tell which faults were corrected in the recordings, besides one that is the verdict."""
+        return [f"The recordings were corrected: {text}" for text in self.corrected_faults if text != self.sentence]
 
     def gravest_blind_spots(self) -> list[str]:
         """Describe the gravest facts that the recordings cannot reveal, one a line."""

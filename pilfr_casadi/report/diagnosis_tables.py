@@ -113,6 +113,7 @@ def headline(diagnosis: Diagnosis) -> str:
     summary = diagnosis.summary
     if diagnosis.nameless:  # a section of the page describes the correction
         summary = summary.replace(f" {diagnosis.nameless.sentence}", "")
+    summary = " ".join([summary, *diagnosis.corrections_made()])
     text = f"{summary.rstrip('. ')}. {on} the error{ahead} is {percent(errors.get('nominal'))} as given"
     text += f", {percent(errors.get('before'))} refitted"
     if what := correction_words(diagnosis):
