@@ -44,6 +44,8 @@ def test_every_verdict_has_its_files(verdict, tmp_path, without_drawing):
     assert len(figures) == len(reader.all("img")) > 8
     assert all(f.read_bytes()[:4] == b"\x89PNG" for f in figures)
     assert all(i["alt"] for i in reader.all("img"))
+    words = re.sub(r"<pre.*?</pre>|<(script|style).*?</\1>", "", path.read_text(), flags=re.S)
+    assert not re.search(r"[,;:]\.|\.\.|,,", words)
     assert not list(path.parent.rglob("*.tmp"))
     tone = {"missing-physics": "good", "complete": "good", "unexplained": "warning"}.get(verdict, "bad")
     assert f'class="status {tone}"' in path.read_text()
