@@ -15,11 +15,12 @@ from ..diagnose import ERROR_NAMES, Diagnosis, Effect, Fitted, Workbench, law_si
 from ..identify import RUN_AWAY
 from ..laws import VaryingParameter, display_name, heated, readable_unit, scaled, scheduled, short_name, varying
 from ..models import Parameter, ParameterSet
-from ..simulators import PARAMETER, kind_of, name_at, name_at_any
+from ..simulators import MECHANICAL, PARAMETER, kind_of, name_at, name_at_any
 from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
 BAR_MARGIN = 1.03  # smallest error over the left end of the bars' scale
+OPPOSING_MOTION = ("friction", "damping", "drag")  # ends of the names of laws that have no stiffness
 OPEN_ROWS = 12  # candidates in the open table; a folded table holds the others
 
 
@@ -358,7 +359,8 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
     """Measure the force of element `number` along the training recordings; None without one, or if its run diverges.
 
     The equivalent stiffness k and damping c minimise the rms of w - k z - c dz/dt (equivalent linearisation, Krylov &
-    Bogoliubov 1943); a cycle is one upward crossing of the mean of z. If z is a speed, only the damping is measured.
+    Bogoliubov 1943); a cycle is one upward crossing of the mean of z. If z is a speed, only the damping is measured;
+    a friction has no stiffness. Outside mechanics, where force times motion is no energy, neither has a meaning.
     """
     if number is None:
         return None
@@ -370,20 +372,22 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
         return None
     largest = f"{number_text(float(np.max(np.abs(w))), 3)}\u00a0{port.unit}".strip()
     of = "parameter" if kind_of(port.name) == PARAMETER else "signal"
-    what = f"largest change of the {of}" if port.series else "largest force"
+    mechanical = port.domain == MECHANICAL and not port.series
+    what = f"largest change of the {of}" if port.series else "largest force" + " or flow" * (not mechanical)
     rows = [[what, float(np.max(np.abs(w))), port.unit]]
     unit = readable_unit("w*s/z", port.unit, port.position_unit)
-    if port.is_speed:
+    if mechanical and port.is_speed:
         damping = (w - np.mean(w)) @ z / (z @ z)
         rows += [["equivalent damping", float(damping), unit if port.unit and port.across_unit else ""]]
-    elif not port.series:
+    elif mechanical:
         (stiffness, damping), *_ = np.linalg.lstsq(np.column_stack([z, dz]), w - np.mean(w), rcond=None)
         taken = sum(float(np.sum((f[1:] + f[:-1]) / 2 * np.diff(x))) for x, _, f in runs)
         cycles = sum(int(np.sum(np.diff(np.signbit(x - np.mean(x)).astype(int)) < 0)) for x, _, _ in runs)
         units = [readable_unit(u, port.unit, port.across_unit) for u in ("w*z", "w/z")]
         known = bool(port.unit and port.across_unit)
         rows += [["energy taken per cycle, mean", taken / cycles, units[0] if known else ""]] if cycles else []
-        rows += [["equivalent stiffness", float(stiffness), units[1] if known else ""]]
+        if not effect.law.endswith(OPPOSING_MOTION):
+            rows += [["equivalent stiffness", float(stiffness), units[1] if known else ""]]
         rows += [["equivalent damping", float(damping), unit if known else ""]]
     return Action(largest, Table(["how it acts in the training recordings", "value", "unit"], rows, digits=3))
 
