@@ -436,7 +436,7 @@ def _print_error(recording: Recording, y: np.ndarray, scored_from: Callable[[Rec
     except InputError as reason:
         print(f"no NRMSE on {recording.name}: {reason}")
         return []
-    print(f"NRMSE on {recording.name}: {error:.4f}")
+    print(f"NRMSE on {recording.name}: {error:.3g}")
     return [error]
 
 

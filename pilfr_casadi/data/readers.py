@@ -241,6 +241,8 @@ class _Request:
                 hint = (
                     f"map it, as in columns={{'{role}': '{like}'}}" if len(names) > 1 else "separate columns by commas"
                 )
+                if role in self.outputs and len(names) > 1:
+                    hint += "; without such a sensor, remove it from the outputs, also from the simulator's"
                 raise InputError(f"{source} has no column {column!r}; it has {listed(names) or 'none'}: {hint}.")
         for name in [*wanted, time] if time else wanted:
             if list(names).count(name) > 1:

@@ -108,9 +108,10 @@ def build_diagnosis(
     request.say("proof", 0, 1)
     bench, without, after = final.bench, final.without, final.after
     std = deviations(bench, after)
-    errors, fewer, test_notes = _compute_errors(request, search, found, final, tests)
+    errors, fewer, compared, test_notes = _compute_errors(request, search, found, final, tests)
     effects = tuple(_make_effect(search, e, after, std, fewer.get(e, np.nan)) for e in found.effects)
     floor = search.least_floor if found.verdict.kind == "unexplained" else search.floor
+    floors = {"nrmse": floor, "white": search.least_floor}
     settled = found.verdict.kind in ("complete", "recording-fault") or (
         min((e.confidence for e in effects), default=0) > SURE
     )
@@ -136,9 +137,9 @@ def build_diagnosis(
         parameters=parameter_table(request.simulator, without, after, std),
         errors=errors,
         floor={
-            "nrmse": floor.nrmse(bench.scale),
+            **{name: f.nrmse(bench.scale) for name, f in floors.items()},
             "source": floor.source,
-            "white": search.least_floor.nrmse(bench.scale),
+            "test": compared and {name: compared.noise(f.deviation, bench.scale) for name, f in floors.items()},
         },
         corrected=replace(
             remove_idle_offsets(after.corrected(), len(request.simulator.elements)), substeps=after.model.substeps
@@ -162,10 +163,13 @@ def build_diagnosis(
 
 def _compute_errors(
     request: Request, search: Search, found: Conclusion, final: FinalFits, tests: tuple[Recording, ...]
-) -> tuple[dict[str, dict[str, float] | None], dict[NamedEffect, float], tuple[Gate, ...]]:
-    """Compute the table of errors (see `Diagnosis`), the test errors without each of several effects, and notes."""
+) -> tuple[dict[str, dict[str, float] | None], dict[NamedEffect, float], Comparison[str] | None, tuple[Gate, ...]]:
+    """Compute the table of errors (see `Diagnosis`), the test errors without each of several effects, and notes.
+
+    Also returns the comparison on the test recordings, if there are any.
+    """
     bench, without, after, fewer = final.bench, final.without, final.after, dict[NamedEffect, float]()
-    notes = tuple[Gate, ...]()
+    notes, compared = tuple[Gate, ...](), None
     errors: dict[str, dict[str, float] | None] = {
         "train": {"nominal": final.nominal, "before": bench.nrmse(without), "after": bench.nrmse(after)},
         "test": None,
@@ -181,7 +185,7 @@ def _compute_errors(
     if bench.simulator.observer is not None:
         free = edited(tests, found.gates) or bench.recordings
         errors["free_run"] = free_run_errors(bench, free, request.simulator, without, after)
-    return errors, fewer, notes
+    return errors, fewer, compared, notes
 
 
 def _surrogate_note(error: float) -> tuple[Gate, ...]:

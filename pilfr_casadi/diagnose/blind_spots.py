@@ -19,7 +19,7 @@ import numpy as np
 from .._base import InputError, in_words, one_blas_thread, to_json
 from ..data import Recording
 from ..laws import LINEAR, Law, display_name
-from ..simulators import ACTUATOR, in_series, kind_of, split_port
+from ..simulators import ACTUATOR, SENSOR, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings, stated_hold
 from .evidence import BETTER_RATIO
 from .floor import ABOVE_NOISE, Floor, noise_floor
@@ -218,7 +218,9 @@ class Check:
         yield from _table(("local coordinate", "travel", "reversals", "amplitudes", "rests"), rows)
 
     def _circumstances(self) -> Iterator[str]:
-        noise = ", ".join(f"{name} {value:.2g}" for name, value in self.noise["deviation"].items())
+        units = {e.port: e.unit for e in self.excitation}
+        each = ((f"{name} {value:.2g}", port_name(SENSOR, name)) for name, value in self.noise["deviation"].items())
+        noise = ", ".join(f"{text} {units.get(port, '')}".rstrip() for text, port in each)
         yield f"noise ({self.noise['source']}): {noise}"
         floor = float(np.mean(list(self.noise["share"].values())))
         times = self.error / max(floor, 1e-300)

@@ -183,7 +183,7 @@ def gain(before: float, after: float, residuals: Sequence[np.ndarray], parameter
 
 def describe_fall(before: float, after: float) -> str:
     """Describe by how much an edit reduces the rms error."""
-    return f"the refitted error falls from {before:.3g} to {after:.3g} of the outputs' deviation"
+    return f"the refitted error falls from {before:.3g} to {after:.3g} times the outputs' deviation"
 
 
 def refit(

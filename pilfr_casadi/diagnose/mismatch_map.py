@@ -233,7 +233,7 @@ def _describe(found: dict[str, Any]) -> str:
     if growth is not None and growth > 1.4:
         parts.append("grows faster than the motion and is worst at large amplitude")
     elif growth is not None and growth < 0.6:
-        parts.append("grows less than the motion does, as friction does")
+        parts.append("grows less than the motion does, as an effect of constant size does")
     elif growth is not None:
         parts.append("grows in proportion to the motion, as a wrong value does")
     speed = _ratio(found["rate"])

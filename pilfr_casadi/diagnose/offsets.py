@@ -99,12 +99,12 @@ class Constant(Gate):
         return replace(bench, simulator=bench.simulator.with_element(self.port, Offset()))
 
 
-def describe_constant(port: str, value: float = 0.0, parameter: str = "") -> Constant:
+def describe_constant(port: str, value: float = 0.0, parameter: str = "", unit: str = "") -> Constant:
     """Return the fault that a channel has a constant offset."""
     kind, name = split_port(port)
     alike = ", or a constant load acts like one, as do dry friction and a dead zone while the input keeps its sign"
     where, load = ("input", alike) if kind == ACTUATOR else ("output", "")
-    words = f"The {where} {name} has a constant offset of about {value:.3g}{load}"
+    words = f"The {where} {name} has a constant offset of about {f'{value:.3g} {unit}'.rstrip()}{load}"
     return Constant(name, "offset", value, words, parameter=parameter, port=port)
 
 
@@ -130,7 +130,8 @@ def find_offsets(now: Checked) -> Checked:
             break
         port, after = min(settled, key=lambda pair: pair[1].cost)
         name = f"{after.bench.simulator.elements[-1].prefix}w_0"
-        before, now = now, accept(now, after, describe_constant(port, float(after.fitted.values[name]), name))
+        value, unit = float(after.fitted.values[name]), now.bench.simulator.port(port).unit
+        before, now = now, accept(now, after, describe_constant(port, value, name, unit))
         if now.bench is before.bench:
             break
         ports.remove(port)
@@ -245,10 +246,11 @@ def share_of_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -
     return dict(zip(ports, (along**2 / max(first.error @ first.error, 1e-300)).tolist(), strict=True))
 
 
-def list_offsets(elements: Sequence[Any], values: Mapping[str, Any]) -> list[Gate]:
-    """List the offsets among fitted laws as findings."""
+def list_offsets(elements: Sequence[Any], values: Mapping[str, Any], simulator: Simulator | None = None) -> list[Gate]:
+    """List the offsets among fitted laws as findings, with the units that the simulator knows."""
     placed = [(e.port, f"{e.prefix}w_0") for e in elements if isinstance(e.law, Offset)]
-    found = [describe_constant(port, float(values[name]), name) for port, name in placed]
+    units = {port: simulator.port(port).unit if simulator else "" for port, _ in placed}
+    found = [describe_constant(port, float(values[name]), name, units[port]) for port, name in placed]
     return [replace(c, sentence=f"{c.sentence}; it is a parameter of the corrected simulator.") for c in found]
 
 
@@ -280,7 +282,7 @@ def update_offsets(
     gates: Sequence[Gate], after: Fitted, std: Mapping[str, np.ndarray], effects: bool, sure: bool
 ) -> tuple[Gate, ...]:
     """Return the findings with the offsets at their fitted values; drop offsets that the effects have replaced."""
-    fitted = {g.parameter: g for g in list_offsets(after.simulator.elements, after.values)}
+    fitted = {g.parameter: g for g in list_offsets(after.simulator.elements, after.values, after.simulator)}
     out = []
     for gate in gates:
         if not gate.parameter:

@@ -49,6 +49,10 @@ class Comparison(Generic[K]):
         """
         return [(r.name, first) for r, first in self.scored if _rests_after(r, first)]
 
+    def noise(self, deviation: np.ndarray, resting: np.ndarray) -> float:
+        """Compute the NRMSE of noise with the deviations (n_y,); `resting` is the scale of an output that rests."""
+        return float(np.mean([nrmse(r.y, r.y + deviation, first, resting) for r, first in self.scored]))
+
 
 def _rests_after(recording: Recording, first: int) -> bool:
     whole, scored = (np.std(recording.y[k:], axis=0) for k in (recording.skip, first))

@@ -87,7 +87,8 @@ class Diagnosis:
         `train`, `test` -> `nominal`, `before`, `after`: NRMSE averaged over outputs. With an observer these are errors
         of predictions; `free_run` then has the errors without it, on the test recordings if there are any.
     floor : dict
-        `nrmse` and `source` of the noise, and its `white` part; the rest of an estimate may be physics as well.
+        `nrmse` and `source` of the noise, and its `white` part; the rest of an estimate may be physics as well. `test`
+        has the same noise relative to the test recordings, `nrmse` and `white`.
     out_of_time : bool
         Whether the time limit ended the search.
     substeps : int
@@ -421,7 +422,7 @@ class Diagnosis:
             )
         if train and self.effects:
             out += self._remaining_error(train["after"])
-        far = test and train and test["after"] > FAR_RATIO * max(train["after"], self.floor["nrmse"])
+        far = test and train and test["after"] > FAR_RATIO * max(train["after"], self.noise_on_tests["nrmse"])
         if far and self.outcome != "worse":
             out.append(
                 "The test error is far above the training error: the model is only near the truth, or the test "
@@ -431,7 +432,7 @@ class Diagnosis:
 
     def _remaining_error(self, after: float) -> Iterator[str]:
         """Generate a note if the corrected simulator does not follow to the noise, or only to an uncertain one."""
-        noise, white = (max(value, 1e-300) for value in (self.floor["nrmse"], self._white_noise))
+        noise, white = (max(value, 1e-300) for value in (self.floor["nrmse"], _white(self.floor)))
         if after > ABOVE_NOISE * noise:
             yield f"The remaining error is {after / noise:.2g} times the noise: more is missing, or a law is only near."
         elif after > FAR_RATIO * white:
@@ -441,9 +442,9 @@ class Diagnosis:
             )
 
     @property
-    def _white_noise(self) -> float:
-        """The white part of the noise, or all of it where it is not known apart."""
-        return float(self.floor.get("white", self.floor["nrmse"]))
+    def noise_on_tests(self) -> Mapping[str, float]:
+        """The noise relative to the test recordings, `nrmse` and `white`; without these, to the training recordings."""
+        return self.floor.get("test") or self.floor
 
     def _doubtful_offsets(self) -> Iterator[str]:
         """Generate a note on each offset that is larger than its signal ever was."""
@@ -476,11 +477,12 @@ class Diagnosis:
         return out
 
     def __str__(self) -> str:
-        lines = [self.summary, *self.gravest_blind_spots()]
+        lines = [self.summary, *self.corrections_made(), *self.gravest_blind_spots()]
         for e in self.effects:
             lines += [str(e), f"  {self.worth(e)}"] if self.worth(e) else [str(e)]
         lines += [*self._nameless_lines(), *self._value_lines(), *self._error_lines(), *self._blind_lines()]
-        lines += [f"note: {text}" for text in (*(g.sentence for g in self.gates), *self.warnings())]
+        further = [g.sentence for g in self.gates if g.sentence not in self.corrected_faults]
+        lines += [f"note: {text}" for text in (*further, *self.warnings())]
         if self.next_experiment:
             lines.append(f"next experiment: {self.next_experiment['sentence']}")
         lines.append(f"computed in {self.seconds:.{1 if self.seconds < 10 else 0}f} s")
@@ -499,12 +501,26 @@ class Diagnosis:
             if errors:
                 shown = (_error_text(errors[k]) for k in ERROR_NAMES)
                 lines.append(f"  {kind.replace('_', ' '):<10}" + "".join(f"{text:>11}" for text in shown))
-        noise = _error_text(self.floor["nrmse"])
+        noise = f"{self._noise_text(self.floor)} ({self.floor['source']})"
+        if self.floor.get("test"):
+            noise += f", on the test recordings {self._noise_text(self.noise_on_tests)}"
+        return [*lines, f"  noise floor {noise}"]
+
+    def _noise_text(self, noise: Mapping[str, float]) -> str:
+        """Write a noise floor as far as it is known."""
+        most, white = noise["nrmse"], _white(noise)
         if self.verdict == "unexplained" and self.floor["source"] == "estimated":
-            noise = f"at least {noise}"
-        elif self.floor["nrmse"] > NEAR_RATIO * self._white_noise:
-            noise = f"{_error_text(self._white_noise)} to {noise}"
-        return [*lines, f"  noise floor {noise} ({self.floor['source']})"]
+            return f"at least {_error_text(most)}"
+        return f"{_error_text(white)} to {_error_text(most)}" if most > NEAR_RATIO * white else _error_text(most)
+
+    @property
+    def corrected_faults(self) -> list[str]:
+        """Faults that were corrected in the recordings; the corrected simulator belongs to corrected recordings."""
+        return [g.sentence for g in self.gates if g.fault and g.corrected and not g.parameter]
+
+    def corrections_made(self) -> list[str]:
+        """Tell which faults were corrected in the recordings, besides one that is the verdict."""
+        return [f"The recordings were corrected: {text}" for text in self.corrected_faults if text != self.sentence]
 
     def gravest_blind_spots(self) -> list[str]:
         """Describe the gravest facts that the recordings cannot reveal, one a line."""
@@ -554,6 +570,11 @@ def _error_text(nrmse: float) -> str:
     if not nrmse < RUN_AWAY:
         return "runs away"
     return f"{nrmse:.4f}" if nrmse >= 1e-3 or nrmse == 0 else f"{nrmse:.2g}"
+
+
+def _white(noise: Mapping[str, float]) -> float:
+    """Return the white part of a noise floor, or all of it where it is not known apart."""
+    return noise.get("white", noise["nrmse"])
 
 
 def _percent(value: float) -> str:

@@ -454,8 +454,8 @@ def _describe_vanished(search: Hypotheses, found: Posterior) -> str:
     names = [k for k in simulator.parameters if not k.startswith(offsets)]
     before, after = search.root.fitted.values, found.best.fitted.values
     gone = [k for k in names if np.any(before[k]) and not np.any(after[k])]
-    beside = "them" if len(found.effects) > 1 else "it"
-    return f" Beside {beside}, {' and '.join(gone)} {'come' if gone[1:] else 'comes'} out as zero." if gone else ""
+    come = "come out as zero: they are replaced" if gone[1:] else "comes out as zero: it is replaced"
+    return f" The simulator's own {' and '.join(gone)} {come}." if gone else ""
 
 
 def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, float], mode: float | None) -> str:

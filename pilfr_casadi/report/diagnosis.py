@@ -392,6 +392,6 @@ def _usage_title(d: Diagnosis) -> str:
 
 
 def _usage(d: Diagnosis) -> list[Block]:
-    kind = "with the correction, at the fitted values," if d.effects or d.nameless else "refitted"
+    kind = "with the correction and the fitted values" if d.effects or d.nameless else "with the refitted values"
     text = f"In the session that made the diagnosis, diagnosis.corrected is the simulator {kind}. Anywhere else, run:"
     return [Text(text), Code(tables.usage(d))]

@@ -15,11 +15,12 @@ from ..diagnose import ERROR_NAMES, Diagnosis, Effect, Fitted, Workbench, law_si
 from ..identify import RUN_AWAY
 from ..laws import VaryingParameter, display_name, heated, readable_unit, scaled, scheduled, short_name, varying
 from ..models import Parameter, ParameterSet
-from ..simulators import PARAMETER, kind_of, name_at, name_at_any
+from ..simulators import MECHANICAL, PARAMETER, kind_of, name_at, name_at_any
 from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
 BAR_MARGIN = 1.03  # smallest error over the left end of the bars' scale
+OPPOSING_MOTION = ("friction", "damping", "drag")  # ends of the names of laws that have no stiffness
 OPEN_ROWS = 12  # candidates in the open table; a folded table holds the others
 
 
@@ -113,11 +114,12 @@ def headline(diagnosis: Diagnosis) -> str:
     summary = diagnosis.summary
     if diagnosis.nameless:  # a section of the page describes the correction
         summary = summary.replace(f" {diagnosis.nameless.sentence}", "")
+    summary = " ".join([summary, *diagnosis.corrections_made()])
     text = f"{summary.rstrip('. ')}. {on} the error{ahead} is {percent(errors.get('nominal'))} as given"
     text += f", {percent(errors.get('before'))} refitted"
     if what := correction_words(diagnosis):
         text += f", {percent(errors.get('after'))} {what}"
-    return f"{text}; the noise floor is {percent(diagnosis.floor['nrmse'])}."
+    return f"{text}; the noise floor is {percent(diagnosis.noise_on_tests['nrmse'])}."
 
 
 def facts(diagnosis: Diagnosis) -> dict[str, str]:
@@ -125,7 +127,7 @@ def facts(diagnosis: Diagnosis) -> dict[str, str]:
     role, errors = judged_errors(diagnosis)
     out = {f"{role} error, {name}": percent(errors.get(k)) for k, name in _name_errors(diagnosis).items()}
     kind = {"periods": "from periods", "repeats": "from repeats"}.get(diagnosis.floor["source"], "estimated")
-    out[f"noise floor, {kind}"] = percent(diagnosis.floor["nrmse"])
+    out[f"noise floor, {kind}"] = percent(diagnosis.noise_on_tests["nrmse"])
     if diagnosis.effects:
         out["confidence"] = " / ".join(f"{e.confidence:.2f}" for e in diagnosis.effects)
     return out
@@ -139,7 +141,8 @@ def error_table(diagnosis: Diagnosis) -> Table:
     for kind, name in (("train", "training"), ("test", "test (held out)"), ("free_run", "the same, free run")):
         errors = diagnosis.errors.get(kind)
         if errors:
-            rows.append([name, *(percent(errors.get(k)) for k in steps), percent(diagnosis.floor["nrmse"])])
+            noise = diagnosis.floor if kind == "train" else diagnosis.noise_on_tests
+            rows.append([name, *(percent(errors.get(k)) for k in steps), percent(noise["nrmse"])])
     note = (
         f"Rms error of {'the predictions one sample ahead' if predicted else 'the free-run simulation'} divided by the "
         "standard deviation of the measured output, averaged over outputs."
@@ -356,7 +359,8 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
     """Measure the force of element `number` along the training recordings; None without one, or if its run diverges.
 
     The equivalent stiffness k and damping c minimise the rms of w - k z - c dz/dt (equivalent linearisation, Krylov &
-    Bogoliubov 1943); a cycle is one upward crossing of the mean of z. If z is a speed, only the damping is measured.
+    Bogoliubov 1943); a cycle is one upward crossing of the mean of z. If z is a speed, only the damping is measured;
+    a friction has no stiffness. Outside mechanics, where force times motion is no energy, neither has a meaning.
     """
     if number is None:
         return None
@@ -368,20 +372,22 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
         return None
     largest = f"{number_text(float(np.max(np.abs(w))), 3)}\u00a0{port.unit}".strip()
     of = "parameter" if kind_of(port.name) == PARAMETER else "signal"
-    what = f"largest change of the {of}" if port.series else "largest force"
+    mechanical = port.domain == MECHANICAL and not port.series
+    what = f"largest change of the {of}" if port.series else "largest force" + " or flow" * (not mechanical)
     rows = [[what, float(np.max(np.abs(w))), port.unit]]
     unit = readable_unit("w*s/z", port.unit, port.position_unit)
-    if port.is_speed:
+    if mechanical and port.is_speed:
         damping = (w - np.mean(w)) @ z / (z @ z)
         rows += [["equivalent damping", float(damping), unit if port.unit and port.across_unit else ""]]
-    elif not port.series:
+    elif mechanical:
         (stiffness, damping), *_ = np.linalg.lstsq(np.column_stack([z, dz]), w - np.mean(w), rcond=None)
         taken = sum(float(np.sum((f[1:] + f[:-1]) / 2 * np.diff(x))) for x, _, f in runs)
         cycles = sum(int(np.sum(np.diff(np.signbit(x - np.mean(x)).astype(int)) < 0)) for x, _, _ in runs)
         units = [readable_unit(u, port.unit, port.across_unit) for u in ("w*z", "w/z")]
         known = bool(port.unit and port.across_unit)
         rows += [["energy taken per cycle, mean", taken / cycles, units[0] if known else ""]] if cycles else []
-        rows += [["equivalent stiffness", float(stiffness), units[1] if known else ""]]
+        if not effect.law.endswith(OPPOSING_MOTION):
+            rows += [["equivalent stiffness", float(stiffness), units[1] if known else ""]]
         rows += [["equivalent damping", float(damping), unit if known else ""]]
     return Action(largest, Table(["how it acts in the training recordings", "value", "unit"], rows, digits=3))
 

@@ -1,6 +1,7 @@
 """`pilfr check`: a whole run from files, and one plain sentence with exit status 2 for what cannot be used."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -26,6 +27,7 @@ def test_findings_are_printed_and_written(capsys, files):
     assert status == 0 and not err
     for words in ("parameter", "k2", "detectable from (rms)", "ground-m1", "reversals", "noise", "next record: "):
         assert words in out
+    assert re.search(r"noise \(.*\): x2 \S+ m\n", out)
     found = json.loads((files / "out" / "check.json").read_text(encoding="utf-8"))
     assert found["hold"] == "zero" and found["starts"] == ["at zero"]
     assert {p["name"] for p in found["parameters"]} == {"k1", "k2", "d1", "d2"}

@@ -60,6 +60,11 @@ def test_fit_simulate_and_export_run_end_to_end(capsys, tmp_path, fitted):
     assert table.dtype.names == ("t", "u", "y")
     assert np.sqrt(np.mean((table["y"] - truth["y"]) ** 2)) / np.std(truth["y"]) == pytest.approx(nrmse, abs=1e-4)
     assert nrmse < 0.05
+    near = tmp_path / "near.csv"
+    rows = np.column_stack([table["t"], table["u"], table["y"] * (1 + 2e-5)])
+    np.savetxt(near, rows, delimiter=",", header="t,u,y", comments="", fmt="%.12g")
+    _, out, _ = run(capsys, "simulate", model, near, "--initial", "zero", "--out", tmp_path / "again.csv")
+    assert re.search(r"NRMSE on near: 2(\.\d\d?)?e-05\n", out)
     status, _, _ = run(capsys, "export", model, "--out", tmp_path / "model.casadi")
     assert status == 0
     f = ca.Function.load(str(tmp_path / "model.casadi"))

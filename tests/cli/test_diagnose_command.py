@@ -159,7 +159,10 @@ BAD_SIMULATORS = {
     "state without derivative": (("pos=x.vel, ", ""), ("derivative", "'pos'")),
     "port into an unknown state": (("dict(vel=-1", "dict(speed=-1"), ("'ground-mass'", "'speed'")),
     "recording lacks an input": (('("force",)', '("force", "heat")'), ("'heat'", "--column heat=COLUMN")),
-    "recording lacks an output": (("dict(position=x.pos)", "dict(place=x.pos)"), ("'place'", "--column place=COLUMN")),
+    "recording lacks an output": (
+        ("dict(position=x.pos)", "dict(place=x.pos)"),
+        ("'place'", "--column place=COLUMN; without such a sensor"),
+    ),
     "diverging simulator": (
         ("- p.d * x.vel", "+ 1e3 * x.vel"),
         ("diverges", "position is out", "s into", "it is unstable", "put the controller into the simulator"),

@@ -208,6 +208,7 @@ def test_bad_columns_and_options_are_refused(write):
     for options, words in [
         (dict(columns={"forc": "u"}), "none of the inputs force"),
         (dict(columns={"t": "clock"}), "no column 'clock' for the time"),
+        (dict(columns={"x2": "y"}), "without such a sensor, remove it from the outputs, also from the simulator's"),
         (dict(columns={"force": "u"}), "no column 'u'; .*as in columns={'force': 'COLUMN'}"),
         (dict(dt=0.0), "above zero"),
         (dict(dt=float("nan")), "above zero"),

@@ -1,6 +1,8 @@
 """Dull faults beside an unsaid hold, and constants: what the search starts from is right again."""
 
+import re
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -47,20 +49,24 @@ def test_a_wrong_sign_beside_another_zero_is_told():
     y = recorded()[1] * [-1, 1] + [3.0, 0]
     found = prepare(tanks(1.15), [of_tanks(y)], "zero", "auto")
     assert [(g.channel, g.finding) for g in found.gates] == [("upper", "sign"), ("upper", "offset")]
+    assert re.search(r"error falls from \S+ to \S+ times the outputs' deviation", found.gates[0].sentence)
     assert found.without.values["sensor:upper.w_0"] == pytest.approx(-3.0, rel=0.01)
     assert found.without.cost < 0.01**2
 
 
 def test_a_constant_of_a_sensor_is_found_and_kept():
-    bench = Workbench.of(tanks(1.15), [of_tanks(recorded()[1] + [0, 0.3])], "zero")
+    known = replace(tanks(1.15), units={"lower": "m"})
+    bench = Workbench.of(known, [of_tanks(recorded()[1] + [0, 0.3])], "zero")
     found = find_offsets(Checked(bench, refitted(bench)))
     fitted, (gate,) = found.fitted, found.gates
     assert (gate.channel, gate.finding, gate.fault) == ("lower", "offset", True)
-    assert gate.value == pytest.approx(0.3, rel=0.02)
+    assert gate.value == pytest.approx(0.3, rel=0.02) and f"offset of about {gate.value:.3g} m;" in gate.sentence
     (again,) = list_offsets(fitted.simulator.elements, fitted.values)
     assert again.value == gate.value and "parameter of the corrected simulator" in again.sentence
     (told,) = update_offsets([gate], fitted, {gate.parameter: np.array(0.03)}, False, False)
-    assert "may be a part of that" in told.sentence
+    assert "may be a part of that" in told.sentence and " m;" in told.sentence
+    (told,) = update_offsets([gate], fitted, {gate.parameter: np.array(0.03)}, True, False)
+    assert f"offset of about {gate.value:.3g} m;" in told.sentence
     assert not update_offsets([gate], fitted, {gate.parameter: np.array(0.3)}, False, False)  # it may be none
 
 

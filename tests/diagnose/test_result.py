@@ -57,6 +57,17 @@ def test_the_verbs_tell_what_the_diagnosis_told(diagnosed):
     assert step.n_in() == 2
 
 
+@pytest.mark.usefixtures("blank_figures")
+def test_the_noise_is_told_relative_to_each_recording(diagnosed, tmp_path):
+    found, test, _ = diagnosed
+    noise = found.floor["test"]["nrmse"]
+    assert noise == pytest.approx(found.evidence["noise"][0] / np.std(test.y)) and noise != found.floor["nrmse"]
+    quiet = replace(found, floor={**found.floor, "test": {"nrmse": 0.1, "white": 0.1}})
+    assert "(estimated), on the test recordings 0.1000" in str(quiet)
+    page = diagnosis_report(quiet, tmp_path).read_text()
+    assert "the noise floor is 10\xa0%." in page and page.count(">10\xa0%<") == 2  # figures of merit, table of errors
+
+
 def test_a_value_at_its_bound_says_so(diagnosed):
     found, _, _ = diagnosed
     own = found.corrected.parameters

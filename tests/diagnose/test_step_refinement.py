@@ -118,7 +118,7 @@ def test_what_takes_the_place_of_the_simulators_own_is_told():
     damped = carriage(lambda v, p: 6.2 * v + p.c * v, mass=1.7, c=pilfr.Parameter(2.0, unit="N s/m", bounds=(0, 9)))
     held = {**damped.parameters, "d": replace(damped.parameters["d"], value=0.0, fixed=True)}
     found = pilfr.diagnose(damped.with_parameters(held), ran(0, 1e-3), laws=(CoulombFriction,))
-    assert found.sentence.endswith(" Beside it, c comes out as zero."), str(found)
+    assert found.sentence.endswith(" The simulator's own c comes out as zero: it is replaced."), str(found)
 
 
 def test_a_sharp_knee_gets_finer_steps_whatever_its_sharpness():

@@ -27,7 +27,8 @@ def test_a_value_of_the_simulator_that_a_law_replaces_is_told_to_come_out_as_zer
     r = blank.with_(y=y + 1e-3 * np.std(y) * np.random.default_rng(2).standard_normal(y.shape))
     found = pilfr.diagnose(cart(), r, laws=(CubicDamping,), effects=1, workers=1)
     assert found.parameters["d"]["refit_without"] > 1
-    assert found.sentence == "The simulator leaves out cubic damping at ground. Beside it, d comes out as zero."
+    replaced = "The simulator's own d comes out as zero: it is replaced."
+    assert found.sentence == f"The simulator leaves out cubic damping at ground. {replaced}"
 
 
 def test_slow_noise_that_two_periods_show_is_no_missing_physics():

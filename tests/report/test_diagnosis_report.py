@@ -16,7 +16,7 @@ from test_report import EVIL, Reader, own_scripts_alone
 
 from pilfr_casadi._base import InputError
 from pilfr_casadi.diagnose import Gate, Workbench
-from pilfr_casadi.report import diagnosis_report, diagnosis_report as same, usage
+from pilfr_casadi.report import corrected_file, diagnosis_report, diagnosis_report as same, usage
 
 
 def test_the_checker_can_fail():
@@ -44,6 +44,8 @@ def test_every_verdict_has_its_files(verdict, tmp_path, without_drawing):
     assert len(figures) == len(reader.all("img")) > 8
     assert all(f.read_bytes()[:4] == b"\x89PNG" for f in figures)
     assert all(i["alt"] for i in reader.all("img"))
+    words = re.sub(r"<pre.*?</pre>|<(script|style).*?</\1>", "", path.read_text(), flags=re.S)
+    assert not re.search(r"[,;:]\.|\.\.|,,", words)
     assert not list(path.parent.rglob("*.tmp"))
     tone = {"missing-physics": "good", "complete": "good", "unexplained": "warning"}.get(verdict, "bad")
     assert f'class="status {tone}"' in path.read_text()
@@ -113,6 +115,21 @@ def test_a_test_that_gets_worse_a_refit_that_follows_nothing_and_an_interrupt_ar
     text = Reader((tmp_path / "report.html").read_text()).text
     assert written["interrupted"] and written["notes"] == found.warnings()
     assert all(note in text and note in str(found) for note in found.warnings())
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_faults_that_were_corrected_stand_right_after_the_verdict_and_in_the_corrected_simulator(tmp_path):
+    fault = Gate("pos", "exchanged", "vel", "In the recordings pos and vel are exchanged;\nexec('1/0')", fault=True)
+    d = replace(example(), gates=(fault, Gate("force", "hold", "linear", "Interpolated fits better.")))
+    told = f"The recordings were corrected: {fault.sentence}"
+    assert str(d).startswith(f"{d.sentence}\n{told}\n") and str(d).count(fault.sentence) == 1
+    assert f"{d.sentence} {told}. On held-out" in diagnosis_report(d, tmp_path).read_text().replace("&#39;", "'")
+    source = corrected_file(d, "rig.py")
+    lines = source.splitlines()
+    at = lines.index("# In the recordings pos and vel are exchanged;")
+    assert "corrected" in lines[at - 1] and lines[at + 1] == "#   exec('1/0')" and "Interpolated" not in source
+    assert "belongs to" not in corrected_file(example(), "rig.py")
+    compile(source, "corrected.py", "exec")
 
 
 @pytest.mark.usefixtures("blank_figures")
