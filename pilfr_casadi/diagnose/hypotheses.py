@@ -127,7 +127,7 @@ class Hypotheses:
     @cached_property
     def fits(self) -> Trials:
         """Fits of hypotheses, with the bench, workers and time limit of the search."""
-        return Trials(self.bench, self.workers, self.until)
+        return Trials(self.bench, self.workers, self.until, self.without.residual)
 
     @property
     def interrupted(self) -> bool:

@@ -29,7 +29,7 @@ from .._base import InputError, side_by_side
 from ..laws import POSITION_GAINS, SCALABLE, Law, Local, display_name, likely_profiles, scaled, scheduled, unit_forces
 from ..models import Parameter, play
 from .force_recovery import law_signals
-from .linearise import linearise_runs, port_signals
+from .linearise import linearise_runs, loudest_stretch, port_signals
 from .screen import Remainder, Task, fit_shapes, held_out_squares, lengths, ridge_solution, start_values, usable
 from .workbench import COMPARED_SAMPLES, FEW, Fitted, Workbench
 
@@ -374,14 +374,17 @@ def nearest_to_learned(bench: Workbench, fitted: Fitted, laws: Collection[type[L
 def nearest_laws(local: Local, force: np.ndarray, laws: Sequence[type[Law]]) -> tuple[NearLaw, ...]:
     """Find the laws nearest to a force along z and dz/dt: strengths by least squares, shapes on their grids.
 
-    A constant is free, because the zero of z is arbitrary. Of several forms of a law, the best one counts.
+    A constant is free, because the zero of z is arbitrary. Of several forms of a law, the best one counts. Of long
+    recordings the stretches are compared in which the force varies most.
     """
     most = max(COMPARED_SAMPLES // len(local.lengths), 1)
-    ends = np.cumsum((0, *local.lengths))
-    kept = np.concatenate([np.arange(a, min(b, a + most)) for a, b in pairwise(ends)])
+    power, ends = (force - np.mean(force)) ** 2, np.cumsum((0, *local.lengths))
+    windows = [loudest_stretch(power[a:b], most, 0) for a, b in pairwise(ends)]
+    kept = np.concatenate([np.arange(a + w.start, a + w.stop) for a, w in zip(ends[:-1], windows, strict=True)])
     part = Local(
-        local.z[kept], local.dz[kept], local.dt, tuple(min(n, most) for n in local.lengths),
-        inputs={k: v[kept] for k, v in local.inputs.items()}, from_zero=local.from_zero,
+        local.z[kept], local.dz[kept], local.dt, tuple(w.stop - w.start for w in windows),
+        inputs={k: v[kept] for k, v in local.inputs.items()},
+        from_zero=tuple(z and not w.start for z, w in zip(local.from_zero, windows, strict=False)),
     )  # fmt: skip
     centred = force[kept] - np.mean(force[kept])
     deviation = max(float(np.std(force[kept])), 1e-300)

@@ -517,8 +517,16 @@ def innovation_share(bench: Workbench, fitted: Fitted) -> float:
 
 
 def _remainder_for_flexible_forces(bench: Workbench, fitted: Fitted) -> Remainder:
+    """Project the error along the stretches of the recordings with the largest error that memory and time allow."""
     size = max(fitted.model.n_state, 1) ** 2  # hundreds of states if a law holds a long delay
     most = max(MOST_WORK // size, min(LEAST_SAMPLES, MOST_MEMORY // size)) // len(bench.recordings)
     if any(len(r) > most for r in bench.recordings):
-        bench = bench.on([r.slice(0, max(most, r.skip + LEAST_SAMPLES // 10)) for r in bench.recordings])
+        pieces, states = list[Recording](), list[np.ndarray]()
+        for r, e, state in zip(bench.recordings, fitted.residual, fitted.initial, strict=True):
+            part = loudest_stretch(np.sum((e / bench.scale) ** 2, axis=1), max(most, LEAST_SAMPLES // 10), r.skip)
+            begin = part.start if part.start > r.skip else 0
+            pieces.append(r.slice(begin, part.stop))
+            before = fitted.model.drive(r)[: begin * fitted.model.substeps]
+            states.append(fitted.engine.simulate(before, fitted.vector, state)[1] if begin else state)
+        bench, fitted = bench.on(pieces), replace(fitted, initial=states)
     return Remainder.of(bench, *linearise_runs(bench, fitted), FLEXIBLE)

@@ -40,6 +40,7 @@ from .workbench import (
 # Effort: pairs of each list of the screen that are fitted, besides the best of each port; the same if `again`
 BEST, BEST_AGAIN = 10, 4
 MOST_REFINED = 8  # pairs fitted from several starts; only FEW if `again`
+QUIET_SHARE = 0.5  # of the residual power in the loudest stretch, with which the head of a recording says enough
 LEAST_SHARE = 0.01  # share over the largest of the same run below which start values are not used
 Key = frozenset[Pair]
 
@@ -146,12 +147,14 @@ class Trial:
 class Trials:
     """Fits of hypotheses to the recordings of a bench, in parallel.
 
-    No fit begins after `until` (a time of `time.perf_counter`), and all end at the deadline of the bench.
+    No fit begins after `until` (a time of `time.perf_counter`), and all end at the deadline of the bench. `residual` is
+    that of the refit, by recording; without it, brief fits use the head of each recording in any case.
     """
 
     bench: Workbench
     workers: int
     until: float = np.inf
+    residual: Sequence[np.ndarray] | None = None
 
     @property
     def over(self) -> bool:
@@ -162,7 +165,11 @@ class Trials:
     def part(self) -> Workbench:
         """The bench with the part of the recordings that brief fits use."""
         share = COMPARED_SAMPLES / sum(map(len, self.bench.recordings))
-        return self.bench if share >= 1 else self.bench.on([_head(r, share) for r in self.bench.recordings])
+        if share >= 1:
+            return self.bench
+        residual = self.residual or [np.zeros_like(r.y) for r in self.bench.recordings]
+        powers = [np.sum((e / self.bench.scale) ** 2, axis=1) for e in residual]
+        return self.bench.on([_head(r, share, p) for r, p in zip(self.bench.recordings, powers, strict=True)])
 
     def fit(
         self, simulator: Simulator, starts: Sequence[Mapping[str, Any]], count: int, **options: Any
@@ -345,9 +352,17 @@ def _agree(found: Sequence[Trial | None]) -> bool:
     return len(costs) > 2 and costs[2] < EQUAL_RATIO * costs[0]
 
 
-def _head(r: Recording, share: float) -> Recording:
-    """Return the first part of a recording."""
+def _head(r: Recording, share: float, power: np.ndarray) -> Recording:
+    """Return the first part of a recording, up to the end of the first stretch whose residual is not far quieter.
+
+    A recording may begin at rest, where most laws do not act. The part begins with the recording, so that laws with
+    memory start as they do there.
+    """
     cut = max(int(share * len(r)), min(len(r), r.skip + 20))
+    if cut < len(r):
+        energy = np.cumsum(np.append(0.0, power))
+        held = energy[cut:] - energy[:-cut]
+        cut += int(np.argmax(held >= QUIET_SHARE * np.max(held)))
     return r if cut >= len(r) else open_start(r.slice(0, cut))
 
 

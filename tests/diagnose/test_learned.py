@@ -14,7 +14,7 @@ from diagnosis_example import LAWS, NOISE, recorded, rig
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.evidence import held_out_errors
-from pilfr_casadi.diagnose.learned import LearnedForce, learn_forces
+from pilfr_casadi.diagnose.learned import LearnedForce, learn_forces, nearest_laws
 from pilfr_casadi.laws import Backlash, CubicStiffness, Law, Local
 from pilfr_casadi.models import play
 from pilfr_casadi.report import diagnosis_report, usage
@@ -138,3 +138,13 @@ def test_held_out_samples_have_no_say_in_what_predicts_them(nameless):
     there, here = (held_out_errors(bench, f) for f in (elsewhere, fitted))
     assert (there.blocks, there.ahead) == (here.blocks, here.ahead)
     assert here.error > fitted.cost**0.5
+
+
+def test_laws_are_compared_with_a_force_where_it_acts():
+    """Not in the first samples alone, where a machine may be at rest."""
+    t = 0.01 * np.arange(9000)
+    z = np.append(np.zeros(9000), 0.1 * np.sin(t))
+    local = Local(z, np.gradient(z, 0.01), 0.01, (len(z),), inputs={"t": 0.01 * np.arange(len(z))})
+    nearest = nearest_laws(local, 2e3 * z**3, [CubicStiffness])
+    assert [near.law for near in nearest] == ["cubic_stiffness"] and nearest[0].error < 1e-6
+    assert nearest[0].start["k_3"] == pytest.approx(2e3)

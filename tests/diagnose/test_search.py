@@ -13,6 +13,7 @@ from pilfr_casadi import laws
 from pilfr_casadi._base import Interrupt, Stages
 from pilfr_casadi.diagnose import Workbench, correction, preparation
 from pilfr_casadi.diagnose.floor import Floor
+from pilfr_casadi.diagnose.screen import flexible_shares
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.trials import Trial, Trials
 from pilfr_casadi.diagnose.verdict import posterior
@@ -160,6 +161,33 @@ def test_a_hypothesis_fitted_to_a_part_is_judged_on_everything(monkeypatch):
     (whole,) = search.bench.recordings
     assert [len(e) for e in trial.fitted.residual] == [len(whole)]
     assert trial.mean_square == trial.fitted.cost != trial.part_mean_square
+
+
+def at_rest_first(samples):
+    """The recording with friction, with so many samples at rest before it."""
+    (r,) = rubbing()
+    still = np.zeros((samples, 1))
+    return r.with_(u=np.vstack([still, r.u]), y=np.vstack([still + r.y[0], r.y]))
+
+
+def test_brief_fits_see_more_than_a_long_rest_before_the_motion(monkeypatch):
+    """They used the head of a recording, where no friction slips."""
+    monkeypatch.setitem(vars(sys.modules[Trials.__module__]), "COMPARED_SAMPLES", 600)
+    search = searching([at_rest_first(600)])
+    placed, begin = rig(OFF).with_element("ground-m1", FRICTION.at({"F_c": 5.0})), search.without.begin
+    trial = search.fits.fit(placed, [search.without.values], 1, states=begin)
+    assert trial.mean_square < 1e-3 * search.without.cost
+    assert 800 < len(search.fits.part.recordings[0]) < 1200
+    assert len(searching(rubbing()).fits.part.recordings[0]) < 800  # the head says as much as the rest
+
+
+def test_a_flexible_force_is_looked_for_where_the_error_is(monkeypatch):
+    """With many states a part of a long recording has to do."""
+    screen = sys.modules[flexible_shares.__module__]
+    monkeypatch.setattr(screen, "MOST_WORK", 0)
+    monkeypatch.setattr(screen, "LEAST_SAMPLES", 400)
+    search = searching([at_rest_first(600)])
+    assert max(flexible_shares(search.bench, search.without).values()) > 0.9
 
 
 def test_a_law_that_only_led_the_simulator_out_of_a_dead_end_is_no_physics():
