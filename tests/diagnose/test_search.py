@@ -178,9 +178,7 @@ def test_brief_fits_see_more_than_a_long_rest_before_the_motion(monkeypatch):
     trial = search.fits.fit(placed, [search.without.values], 1, states=begin)
     assert trial.mean_square < 1e-3 * search.without.cost
     assert 800 < len(search.fits.part.recordings[0]) < 1200
-    assert (
-        len(searching(rubbing()).fits.part.recordings[0]) < 800
-    )  # nothing more where the head says as much as the rest
+    assert len(searching(rubbing()).fits.part.recordings[0]) < 800  # the head says as much as the rest
 
 
 def test_a_flexible_force_is_looked_for_where_the_error_is(monkeypatch):
