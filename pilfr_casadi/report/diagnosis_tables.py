@@ -15,7 +15,7 @@ from ..diagnose import ERROR_NAMES, Diagnosis, Effect, Fitted, Workbench, law_si
 from ..identify import RUN_AWAY
 from ..laws import VaryingParameter, display_name, heated, readable_unit, scaled, scheduled, short_name, varying
 from ..models import Parameter, ParameterSet
-from ..simulators import MECHANICAL, PARAMETER, kind_of, name_at, name_at_any
+from ..simulators import MECHANICAL, PARAMETER, UNKNOWN, kind_of, name_at, name_at_any
 from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
@@ -372,7 +372,7 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
         return None
     largest = f"{number_text(float(np.max(np.abs(w))), 3)}\u00a0{port.unit}".strip()
     of = "parameter" if kind_of(port.name) == PARAMETER else "signal"
-    mechanical = port.domain == MECHANICAL and not port.series
+    mechanical = port.domain in (MECHANICAL, UNKNOWN) and not port.series
     what = f"largest change of the {of}" if port.series else "largest force" + " or flow" * (not mechanical)
     rows = [[what, float(np.max(np.abs(w))), port.unit]]
     unit = readable_unit("w*s/z", port.unit, port.position_unit)
