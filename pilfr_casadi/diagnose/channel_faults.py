@@ -26,6 +26,7 @@ FACTORS = tuple(f for unit in UNITS for f in (unit, 1 / unit))  # each unit by m
 FAHRENHEIT = (1.8, 1 / 1.8)  # Fahrenheit's zero differs as well: this unit comes with an offset
 # factors on the time: ms, minutes, µs, hours, and the reverse of the first two
 TIME_UNITS = (1e-3, 1 / 60, 1e-6, 1 / 3600, 60.0, 1e3)
+IN_RECORDINGS = "In the recordings "
 SIZE_RATIO = 6.0  # a factor is tried if it brings the simulated size within this ratio of the measured one
 MOST_AT_BOUNDS = 0.3  # share of the parameters at their bounds above which a refit does not confirm a unit of time
 # first refit of each trial, only to discard hopeless ones
@@ -34,7 +35,7 @@ FIRST_REFIT = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
 
 def map_channels(kind: str, matrix: np.ndarray, channel: str, finding: str, value: Any, words: str) -> Gate:
     """Return the fault that inputs ("u") or outputs ("y") times a matrix (n, n) correct."""
-    sentence = f"In the recordings {channel if finding != 'exchange' else ' and '.join(value)} {words}"
+    sentence = f"{IN_RECORDINGS}{channel if finding != 'exchange' else ' and '.join(value)} {words}"
     return Gate(channel, finding, value, sentence, change=lambda r: r.with_(**{kind: getattr(r, kind) @ matrix}))
 
 
@@ -57,7 +58,7 @@ def exchange_channels(kind: str, names: Sequence[str], one: int, other: int) -> 
 
 def scale_time(factor: float) -> Gate:
     """Return the fault that a factor on the time corrects."""
-    words = f"In the recordings the time is {_describe_factor(factor)}"
+    words = f"{IN_RECORDINGS}the time is {_describe_factor(factor)}"
     return Gate("time", "time-unit", factor, words, change=lambda r: r.with_(dt=r.dt * factor, start=r.start * factor))
 
 
@@ -142,14 +143,27 @@ def _near(now: Checked, errors: Sequence[np.ndarray]) -> Callable[[str, Sequence
 
 
 def _accept_best(now: Checked, faults: Sequence[Gate], workers: int) -> Checked:
-    """Accept the fault whose correction leaves the smallest error, if the rule accepts it."""
+    """Accept the fault whose correction leaves the smallest error, if the rule accepts it.
+
+    For a linear simulator, a unit of all outputs is equivalent to a unit of its input, or of its only output. Then the
+    sentence tells the others.
+    """
+    tried = zip(faults, side_by_side(partial(_try, now), faults, workers), strict=True)
+    found = [(fault, after) for fault, after in tried if after is not None]
     best: tuple[Gate, Checked] | None = None
-    for fault, after in zip(faults, side_by_side(partial(_try, now), faults, workers), strict=True):
-        # for a linear simulator, a unit of all outputs is equivalent to a unit of its input, or of its only output
+    for fault, after in found:
         joint = fault.finding == "unit" and "," in fault.channel
-        if after is not None and (best is None or after.cost < (CLEARLY_BETTER if joint else 1 - 1e-6) * best[1].cost):
+        if best is None or after.cost < (CLEARLY_BETTER if joint else 1 - 1e-6) * best[1].cost:
             best = fault, after
-    return now if best is None else accept(now, best[1], best[0])
+    if best is None:
+        return now
+    fault, after = best
+    rest = [one for one in found if one[0] is not fault and one[0].finding == fault.finding == "unit"]
+    equal = [f.sentence.removeprefix(IN_RECORDINGS) for f, a in rest if CLEARLY_BETTER * a.cost < after.cost]
+    if equal:
+        said = f"{fault.sentence}; or else {'; or '.join(equal)}: these recordings do not tell which"
+        fault = replace(fault, sentence=said)
+    return accept(now, after, fault)
 
 
 def _try(now: Checked, fault: Gate) -> Checked | None:

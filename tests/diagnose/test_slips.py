@@ -57,6 +57,17 @@ def test_a_wrong_unit_is_said_in_words():
     assert "the time is too large by a factor of 60," in scale_time(1 / 60).sentence
 
 
+def test_equal_explanations_of_a_wrong_unit_are_told():
+    """All outputs of a linear simulator in another unit are as if its input was in another."""
+    u = pilfr.multisine(M, f_max=1.5, fs=1 / DT, rng=np.random.default_rng(0))
+    r = Recording(u, u, DT, ("force",), ("pos",), initial="zero", hold="zero")
+    y = cart().simulate(r) + 1e-4 * np.random.default_rng(1).standard_normal((M, 1))
+    (fault,) = prepare(cart(50.0, 1.2), [r.with_(y=1e3 * y)], "zero", "auto").gates
+    assert (fault.channel, fault.finding) == ("pos", "unit")
+    assert "pos is too large by a factor of 1000, as from a wrong unit; or else force is too small" in fault.sentence
+    assert "these recordings do not tell which" in fault.sentence
+
+
 @pytest.mark.parametrize("alike", [True, False])
 def test_a_correction_that_does_not_suit_the_test_recordings_is_told(alike):
     """The test recordings are corrected as the training recordings were, though they may be right as they are."""
