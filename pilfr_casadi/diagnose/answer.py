@@ -359,7 +359,7 @@ def _candidate_row(search: Search, t: Trial, parent: Trial) -> dict[str, Any]:
         "port": added.port,
         "law": added.law.id,
         "form": added.law.form,
-        "nrmse_train": search.bench.nrmse(t.fitted),
+        "nrmse_train": search.bench.nrmse(t.fitted) if np.isfinite(t.mean_square) else np.inf,
         "nrmse_validation": held_out.rms if held_out and np.isfinite(held_out.rms) else None,
         "delta_bic": -2 * gain,
     }

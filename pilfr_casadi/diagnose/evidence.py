@@ -427,6 +427,11 @@ class HeldOut:
         """The error with all outputs alike, whatever their noise, as reports state it."""
         return float(np.sqrt(np.mean(self.squares)))
 
+    @property
+    def expected(self) -> float:
+        """The same with the spread for other inputs."""
+        return float(np.hypot(self.rms, np.sqrt(self.spread)))
+
 
 def blocks_of(bench: Workbench) -> list[np.ndarray]:
     """Return the number of each sample's block, (M,) for each recording; -1 for samples in no block."""

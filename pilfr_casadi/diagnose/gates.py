@@ -182,7 +182,7 @@ def gain(before: float, after: float, residuals: Sequence[np.ndarray], parameter
 
 
 def describe_fall(before: float, after: float) -> str:
-    """Describe by how much an edit reduces the rms error."""
+    """Describe by how much an edit reduces the NRMSE."""
     return f"the refitted error falls from {before:.3g} to {after:.3g} times the outputs' deviation"
 
 

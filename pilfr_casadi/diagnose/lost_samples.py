@@ -181,7 +181,7 @@ def _describe_gaps(jump: Jump, origins: Sequence[tuple[Recording, int]]) -> Gate
 def _quiet_noise2(now: Checked) -> float:
     """Estimate the mean square of white noise from third differences, not disturbed by a few jumps."""
     thirds = np.concatenate([third_differences(e) for e in now.fitted.residual])
-    return float(np.mean((robust_deviation(thirds) / now.bench.scale) ** 2))
+    return now.bench.pool((robust_deviation(thirds) / now.bench.scale) ** 2)
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -192,17 +192,18 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
     if found is None:
         return ready, search.resume(request.most_effects)
     other, again = found
-    only_refitted = again.interrupted and len(again.memo) < 2
-    if again.best.mean_square > search.best.mean_square or only_refitted:
+    only_refitted, before2, after2 = again.interrupted and len(again.memo) < 2, *_comparable(search, again)
+    if after2 > before2 or only_refitted:
         search.cut_short_with(again)
         return ready, search.resume(request.most_effects)
     # the laws that were found since may have been what the hold had made up for
     if _prefers_other_hold(again):
         search.adopt(again.best)
         resumed = search.resume(request.most_effects)
-        if resumed.best.mean_square < again.best.mean_square:
+        before2, after2 = _comparable(resumed, again)
+        if before2 < after2:
             return ready, resumed
-    ratio = float(np.sqrt(search.best.mean_square / max(again.best.mean_square, 1e-300)))
+    ratio = float(np.sqrt(before2 / max(after2, 1e-300)))
     return replace(other, gates=(*other.gates, hold_note(request.simulator, hold, ratio))), again
 
 
@@ -211,6 +212,11 @@ def _prefers_other_hold(search: Search) -> bool:
     with search.until_interrupted():
         return search.prefers_other_hold()
     return False
+
+
+def _comparable(one: Search, other: Search) -> tuple[float, float]:
+    """Compute the mean square errors of the best hypotheses of two searches, with the noise of the first."""
+    return one.best.mean_square, one.bench.pool(other.best.fitted.squares)
 
 
 def _search(request: Request) -> tuple[Prepared, Search]:
@@ -228,7 +234,8 @@ def _search(request: Request) -> tuple[Prepared, Search]:
     if found is None:
         return ready, search
     other, again = found
-    if again.best.mean_square < AS_GIVEN_RATIO * search.best.mean_square:
+    before2, after2 = _comparable(search, again)
+    if after2 < AS_GIVEN_RATIO * before2:
         return other, again
     search.cut_short_with(again)
     return ready, search
@@ -249,7 +256,8 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
     other, again = found
     if again.can_improve(again.best) and not (again.interrupted or again.out_of_time):
         search.run(request.most_effects)
-    if search.best.mean_square < AS_GIVEN_RATIO * again.best.mean_square:
+    before2, after2 = _comparable(search, again)
+    if before2 < AS_GIVEN_RATIO * after2:
         search.cut_short_with(again)
         return ready, search
     return replace(other, nominal=ready.nominal, gates=(*edits, shift, *other.gates)), again

@@ -18,7 +18,7 @@ from ..data import Recording
 from ..simulators import Simulator, unit_factor, unit_notes
 from .arguments import stated_hold
 from .channel_faults import find_slips, open_bench
-from .floor import Floor, white_part
+from .floor import Floor, pool, white_part
 from .gates import (
     CURED_SHARE,
     EQUAL_RATIO,
@@ -157,7 +157,7 @@ class _Checks:
 
     def _correct_slips(self, now: Checked, part: float) -> Checked:
         """Correct wrong signs, units and exchanged channels if the refit is not at the noise, and refit."""
-        if now.cost <= max(NEAR_NOISE_RATIO**2 * now.noise2, CHECKED_ABOVE):
+        if now.cost <= NEAR_NOISE_RATIO**2 * now.noise2 or np.mean(now.fitted.squares) <= CHECKED_ABOVE:
             return now
         found = self._find_slips(now, part)
         if len(found.gates) == len(now.gates):
@@ -190,7 +190,8 @@ def _with_better_hold(
         both = now, checks.run(bench.with_other_hold(), 0.5)
     except InputError:
         return now, held
-    costs = [_comparable_cost(found) for found in both]
+    noise2 = np.min([found.floor.squares(found.bench.scale) for found in both], axis=0)
+    costs = [_comparable_cost(found, noise2) for found in both]
     ratio = (max(costs) / max(min(costs), 1e-300)) ** 0.5
     if ratio > EQUAL_RATIO:
         now = both[int(costs[1] < costs[0])]
@@ -204,10 +205,11 @@ def _shifts(found: Checked) -> list[TimeShift]:
     return [g for g in found.gates if isinstance(g, TimeShift) and g.finding == "alignment"]
 
 
-def _comparable_cost(found: Checked) -> float:
+def _comparable_cost(found: Checked, noise2: np.ndarray) -> float:
     """Compute the mean square error without the noise reduction by interpolating a channel between its samples."""
+    cost = pool(found.fitted.squares, noise2)[0]
     between = any(not in_steps(s.value, found.bench.dt) for s in _shifts(found))
-    return found.cost / (AVERAGED_NOISE if between else 1)
+    return cost / (AVERAGED_NOISE if between else 1)
 
 
 def refitted(bench: Workbench) -> Fitted:

@@ -108,7 +108,7 @@ class Refinement:
     def sentence(self) -> str:
         """Say whether the layer replaces the diagnosed law, and why."""
         what = f"A layer of {len(self.weights)} {self.kind.replace('_', ' ')}s at {self.port}"
-        before, after = (f"{100 * self.held_out[k].mean_square ** 0.5:.3g} %" for k in (DIAGNOSED, self.kind))
+        before, after = (f"{100 * self.held_out[k].expected:.3g} %" for k in (DIAGNOSED, self.kind))
         errors = f"the expected error is {after} of the outputs' deviation with the layer and {before} with the law"
         if self.improves:
             return f"{what} takes the place of {self._law}: by held-out training data {errors}."
@@ -157,7 +157,7 @@ class Refinement:
                 lines.append(f"  {kind:<10}" + "".join(f"{errors[k]:>11.4g}" for k in (DIAGNOSED, "refined")))
         lines.append(f"{'held-out training data':<24}{'error':>9}{'expected':>11}  (with the spread for other inputs)")
         for name, found in self.held_out.items():
-            lines.append(f"  {name.replace('_', ' '):<22}{found.error:>9.4g}{found.mean_square**0.5:>11.4g}")
+            lines.append(f"  {name.replace('_', ' '):<22}{found.rms:>9.4g}{found.expected:>11.4g}")
         port = self.layer.port(self.port)
         unit = f" [{port.across_unit}]" if port.across_unit else ""
         used = self.weights > PRINTED_WEIGHT * np.max(self.weights)

@@ -108,7 +108,9 @@ class Stretches:
         recordings, places = list(self.recordings), [(s.recording, s.begin) for s in self.chosen]
         for gate in gates:
             recordings = gate.apply_to_whole(recordings, places)
-        return replace(bench.on(recordings), scale=output_deviation(recordings))
+        scale = output_deviation(recordings)
+        noise2 = None if bench.noise2 is None else bench.noise2 * (bench.scale / scale) ** 2
+        return replace(bench.on(recordings), scale=scale, noise2=noise2)
 
 
 def choose_stretches(

@@ -343,7 +343,7 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
     slow = share > EXPLAINED_NOISE and may_be_coloured_noise(search)
     if slow:  # a force always seems to explain some of slow noise
         share = search.innovation_share(search.root)
-    matters = not slow and search.root.mean_square > NEGLIGIBLE_ERROR**2
+    matters = not slow and np.mean(search.root.fitted.squares) > NEGLIGIBLE_ERROR**2
     explained = share > (EXPLAINED_NOISE if matters else EXPLAINED_QUIET_NOISE)
     unnamed = not found.effects
     steady = [g for g in gates if g.finding == "tone" and unnamed]
@@ -386,7 +386,7 @@ def may_be_coloured_noise(search: Hypotheses, quiet: float = 1.0) -> bool:
     `quiet` is the share of its rms that is left without steady tones. Measured noise has its colour already.
     """
     most = COLOURED_NOISE_RATIO if search.floor.source == "estimated" else ABOVE_NOISE
-    return search.root.mean_square < LOUDEST_NOISE**2 and quiet * _times_white(search) < most
+    return np.max(search.root.fitted.squares) < LOUDEST_NOISE**2 and quiet * _times_white(search) < most
 
 
 def _is_slow_noise(search: Hypotheses) -> bool:

@@ -55,10 +55,8 @@ COST_CHANGE = 0.1  # share by which finer steps may change the mean square
 SHARP_KNEE = 0.05  # share of the widest knee that is tried, below which a knee is sharp
 
 # Fits of outputs with unequal noise
-MOST_BALANCES, NEAR_BALANCE = (
-    4,
-    1.2,
-)  # fits one after the other with other weights, and the ratio of weights that counts as equal
+MOST_BALANCES = 4  # fits with other weights at most
+NEAR_BALANCE = 1.2  # ratio of two weights that counts as equal
 
 # Diverging runs
 HUGE, DIVERGED = 1e6, 1e20  # bounds: output over the largest measured value, and mean square error
@@ -207,6 +205,8 @@ class Workbench:
 
     def balanced(self, fitted: Fitted) -> Workbench:
         """Return the bench with outputs in units in which the errors of a fit are about alike."""
+        if np.all(fitted.balance == 1):
+            return self
         return replace(self, scale=self.scale * np.sqrt(fitted.balance), noise2=None)
 
     @one_at_a_time
@@ -381,21 +381,23 @@ class Workbench:
         if problem is None:
             return None
         theta = np.concatenate([vector[problem.free], states if states is not None else problem.start[n_free:]])
+        if self.noise2 is not None:  # starts are compared with the weights of where they end
+            problem = self.problem(problem.model, engine, balance=self._balance(problem, theta))
         cost = problem.cost(theta)
         return (cost, theta, problem, status) if cost < DIVERGED else None
 
     def _solve(self, problem: Problem, theta: np.ndarray, solver: GaussNewton) -> tuple[Problem, np.ndarray, Status]:
         """Solve a problem, and again while its outputs are out of balance (iteratively reweighted least squares)."""
-        status, before = Status.SOLVER_FAILED, np.ones(len(self.scale))
+        status, until = Status.SOLVER_FAILED, min(time.perf_counter() + solver.time_limit, self.deadline)
         for done in range(MOST_BALANCES):
-            balance = self._balance(problem, theta, before)
-            near = near_balance(balance, before)
+            balance = self._balance(problem, theta)
+            near = near_balance(balance, (problem.scale / self.scale) ** 2)
             if done and (near or status is not Status.CONVERGED):
                 break
             if not near:
-                problem, before = self.problem(problem.model, problem.engine, balance=balance), balance
+                problem = self.problem(problem.model, problem.engine, balance=balance)
             try:
-                timed = replace(solver, time_limit=min(solver.time_limit, self.deadline - time.perf_counter()))
+                timed = replace(solver, time_limit=until - time.perf_counter())
                 with np.errstate(all="ignore"):
                     solution = solve_within_bounds(problem, theta, timed)
             except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
@@ -405,8 +407,9 @@ class Workbench:
                 self.interrupt.pressed = True
         return problem, theta, status
 
-    def _balance(self, problem: Problem, theta: np.ndarray, now: np.ndarray) -> np.ndarray:
-        """Compute the balance of the outputs at some variables of a problem, in which it is `now`."""
+    def _balance(self, problem: Problem, theta: np.ndarray) -> np.ndarray:
+        """Compute the balance of the outputs at some variables of a problem."""
+        now = (problem.scale / self.scale) ** 2
         if self.noise2 is None or len(now) == 1:
             return now
         squares = np.mean(problem.residual(theta).reshape(-1, len(now)) ** 2, axis=0)

@@ -243,9 +243,9 @@ class SteppedEquations:
         if self.discrete:
             why = "no equations were found" if self.unit.variable_steps else "the length of its steps cannot be changed"
             return (
-                f"steps of {self.unit.dt:g} s, because {why}: it is called at every sample, with which a diagnosis may "
-                f"take hours. Equations are polynomials in states, inputs and parameters; nominal values in the file "
-                f"help to find them. {self._box.note}"
+                f"steps of {self.unit.dt:g} s, because {why}; so the unit is called at every sample, and a diagnosis "
+                "may take hours. Equations are polynomials in states, inputs and parameters; nominal values in the "
+                f"file help to find them. {self._box.note}"
             )
         return (
             f"{self.unit.path.name}: equations found from its steps, at states and inputs up to ten times their "
