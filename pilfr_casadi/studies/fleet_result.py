@@ -348,21 +348,26 @@ def judge_entry(
     values: Sequence[FleetValue],
     remainder: Population,
     times: Sequence[float] | None,
+    place: int | None = None,
 ) -> Machine:
-    """Judge the manifest entry of a machine by the distributions over the fleet."""
+    """Judge the manifest entry of a machine by the distributions over the fleet, in which it may have a `place`."""
+
+    def compare(population: Population, *estimate: float) -> float:
+        return population.probability(*estimate) if place is None else float(population.differs[place])
+
     found = {v.name: trend_of(entry, v.name, times) for v in values}
     trends = {
-        v.name: Trend(*found[v.name][:2], v.trends.probability(*found[v.name]))
+        v.name: Trend(*found[v.name][:2], compare(v.trends, *found[v.name]))
         for v in values
         if np.isfinite(found[v.name][0])
     }
     estimates = estimates_of(entry, any(t.probability > SURE for t in trends.values()))
     above = entry["remainder"] > remainder.mean
-    width = remainder_width(entry)
-    beyond = remainder.probability(entry["remainder"], entry["remainder_error"], width) if above else 0.0
+    left = entry["remainder"], entry["remainder_error"], remainder_width(entry)
+    beyond = compare(remainder, *left) if above else 0.0
     # the values of a machine that lacks more make up for that, and say nothing of the machine
     differs = {
-        v.name: v.population.probability(*estimates[v.name], float(entry["widths"][v.name]))
+        v.name: compare(v.population, *estimates[v.name], float(entry["widths"][v.name]))
         for v in values
         if beyond <= SURE and np.all(np.isfinite(estimates.get(v.name, np.nan))) and np.isfinite(v.population.mean)
     }

@@ -246,9 +246,10 @@ class _FleetExecution:
         values, remainder = distributions(entries, self._units(common.laws), times)
         if not values and not np.isfinite(remainder.mean):
             raise NoModel(f"No machine could be fitted; {entries[next(iter(entries))]['sentence']}")
+        places = {name: i for i, name in enumerate(n for n, e in entries.items() if e["status"] == DONE)}
         judged = {
-            name: judge_entry(name, e, values, remainder, times.get(name))
-            if e["status"] == DONE
+            name: judge_entry(name, e, values, remainder, times.get(name), places[name])
+            if name in places
             else Machine(name, failed=e["sentence"])
             for name, e in entries.items()
         }

@@ -1,9 +1,12 @@
 """Statistics over machines: what varies, and which machines differ, on drawn populations."""
 
+import json
+
 import numpy as np
 import pytest
 
-from pilfr_casadi.studies import estimate_population, slope
+from pilfr_casadi._base import json_text, to_json
+from pilfr_casadi.studies import Population, estimate_population, slope
 
 
 def drawn(rng, n, mean=100.0, tau=5.0, error=1.0):
@@ -67,11 +70,60 @@ def test_four_machines_are_enough_for_a_gross_difference_only():
     assert estimate_population([100.0, 103.0, 98.0, 107.0], np.ones(4), 500.0).differs.max() < 0.5
 
 
+@pytest.mark.parametrize("size", [4, 5, 8, 20])
+def test_few_regular_machines_give_few_false_alarms(size):
+    """The deviation of few machines is hardly known: a value far out may be one of theirs."""
+    alarms = []
+    for seed in range(100):
+        values, errors = drawn(np.random.default_rng(seed), size)
+        alarms.append(estimate_population(values, errors, 500.0).differs.max())
+        values[0] += 150.0
+        assert estimate_population(values, errors, 500.0).differs[0] > 0.5
+    assert np.mean(np.array(alarms) > 0.5) <= 0.05 and max(alarms) < 0.95
+
+
 def test_a_new_machine_is_judged_as_one_of_the_fleet():
-    values, errors = drawn(np.random.default_rng(5), 60)
-    found = estimate_population(values, errors, 500.0)
-    assert found.probability(104.0, 1.0, 500.0) < 0.05 < 0.95 < found.probability(180.0, 1.0, 500.0)
-    assert found.probability(values[3], errors[3], 500.0) == pytest.approx(found.differs[3], abs=1e-6)
+    for size, outlier in ((60, 0.0), (6, 0.0), (6, 60.0), (4, 150.0), (4, 1e6)):
+        values, errors = drawn(np.random.default_rng(5), size)
+        values[3] += outlier
+        found = estimate_population(values, errors, 500.0)
+        others = np.arange(size) != 3
+        rest = estimate_population(values[others], errors[others], 500.0)
+        assert rest.probability(values[3], errors[3], 500.0) == pytest.approx(found.differs[3], abs=0.02)
+        assert (found.differs[3] > 0.5) == (outlier > 0)
+        mean = np.mean(values[others])
+        assert rest.probability(mean, 1.0, 500.0) < 0.05 < 0.5 < rest.probability(mean + 150, 1.0, 500.0)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("width", [0.0, 1e-200, 1e-9, 1e-3, 1.0])
+@pytest.mark.parametrize("error", [0.0, 1e-9, 1.0])
+def test_widths_may_be_narrow(width, error):
+    """Within such a width, a machine that differs looks as a regular one does; the prior of the share is left."""
+    for size in (1, 2, 5, 20):
+        values, errors = drawn(np.random.default_rng(size), size, error=error)
+        found = estimate_population(values, errors, width)
+        assert np.all((found.differs >= 0) & (found.differs <= 1)) and 0 <= found.probability(1e3, error, width) <= 1
+        if size > 4:
+            assert found.differs.max() < 0.1
+
+
+def test_a_population_is_read_from_its_file():
+    found = estimate_population(*drawn(np.random.default_rng(2), 5), 500.0)
+    content = json.loads(json_text(to_json(found.to_dict())))
+    estimates = [(110.0, 1.0, 500.0), (150.0, 0.0, 500.0), (300.0, 1.0, 500.0), (1e9, 1.0, 1e-3)]
+    read = Population.of(content)
+    assert [read.probability(*e) for e in estimates] == [found.probability(*e) for e in estimates]
+    del content["spread"]  # as older files: only the most probable deviation is known
+    old, (value, error, width) = Population.of(content), estimates[0]
+    v = found.deviation**2 + found.mean_error**2 + error**2
+    ratio = np.sqrt(v / (v + width**2 / 12)) * np.exp(
+        0.5 * (value - found.mean) ** 2 * (1 / v - 1 / (v + width**2 / 12))
+    )
+    odds = ratio * found.share / (1 - found.share)
+    assert old.probability(value, error, width) == pytest.approx(odds / (1 + odds), rel=1e-9)
+    nothing = Population.of(json.loads(json_text(to_json(estimate_population([np.nan], [1.0], 1.0).to_dict()))))
+    assert np.isnan(nothing.mean) and np.isnan(nothing.probability(1.0, 1.0, 1.0))
 
 
 def test_trends_about_a_known_centre():
@@ -81,6 +133,7 @@ def test_trends_about_a_known_centre():
     found = estimate_population(slopes, errors, 5.0, centre=0.0)
     assert np.all(found.differs[:5] > 0.9) and np.sum(found.differs[5:] > 0.5) == 0
     assert found.mean == 0.0 and found.deviation == 0.0
+    assert found.probability(0.3, 0.02, 5.0) > 0.9 and found.probability(0.02, 0.02, 5.0) < 0.1
 
 
 def test_the_slope_has_an_honest_error():
