@@ -40,7 +40,7 @@ from .workbench import (
 # Effort: pairs of each list of the screen that are fitted, besides the best of each port; the same if `again`
 BEST, BEST_AGAIN = 10, 4
 MOST_REFINED = 8  # pairs fitted from several starts; only FEW if `again`
-QUIET_SHARE = 0.1  # of the residual power in the loudest stretch, with which the head of a recording says enough
+QUIET_SHARE = 0.1  # of the residual power in the loudest stretch, below which the head of a recording says too little
 LEAST_SHARE = 0.01  # share over the largest of the same run below which start values are not used
 Key = frozenset[Pair]
 
@@ -353,16 +353,17 @@ def _agree(found: Sequence[Trial | None]) -> bool:
 
 
 def _head(r: Recording, share: float, power: np.ndarray) -> Recording:
-    """Return the first part of a recording, up to the end of the first stretch whose residual is not far quieter.
+    """Return the first part of a recording, longer if its residual is far quieter than later.
 
-    A recording may begin at rest, where most laws do not act. The part begins with the recording, so that laws with
-    memory start as they do there.
+    A recording may begin at rest, where most laws do not act. Then the part ends with the first loud stretch. It begins
+    with the recording, so that laws with memory start as they do there.
     """
     cut = max(int(share * len(r)), min(len(r), r.skip + 20))
     if cut < len(r):
         energy = np.cumsum(np.append(0.0, np.where(np.arange(len(power)) < r.skip, 0.0, power)))
         held = energy[cut:] - energy[:-cut]
-        cut += int(np.argmax(held >= QUIET_SHARE * np.max(held)))
+        if held[0] < QUIET_SHARE * np.max(held):
+            cut += int(np.argmax(held >= 0.5 * np.max(held)))
     return r if cut >= len(r) else open_start(r.slice(0, cut))
 
 
