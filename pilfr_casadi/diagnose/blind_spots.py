@@ -22,7 +22,7 @@ from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings, stated_hold
 from .evidence import BETTER_RATIO
-from .floor import ABOVE_NOISE, Floor, noise_floor
+from .floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor, noise_floor
 from .gates import USELESS_FIT
 from .identifiability import (
     SMALL_SHARE,
@@ -40,7 +40,6 @@ from .identifiability import (
 from .linearise import Probe, Run, linearise_runs
 from .workbench import Fitted, Workbench
 
-SENSOR_RESOLUTION = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
 SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
 
 IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the blind spot

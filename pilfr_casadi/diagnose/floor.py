@@ -29,8 +29,8 @@ FEWEST_LEVELS = 10  # of a quantised signal; one with fewer is a switch
 DRIVEN = 0.5  # share of the differences between repeats that the input explains, above which they are no noise
 RESPONSE, SPANS, COMPARED = 150, 30, 6000  # lags of the input that are tried one by one, longer spans, and samples
 NARROW_BAND, LEAST_RANK = 1e-3, 4  # least share of a direction of the input, and the directions of a sine or a ramp
-LEAST_NOISE2 = 1e-12  # least mean square noise, over an output's variance: that of a 20-bit sensor
-HUGE2 = 1e20  # the same of a run that diverges
+SENSOR_RESOLUTION = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
+HUGE2 = 1e20  # mean square error, over an output's variance, of a run that diverges
 MODEL_ERRORS = 200  # sizes of the model error that are tried where outputs with unequal noise are pooled
 SAME_LEVEL = 1e-9  # distance of two values, over the range, below which they are one level
 
@@ -93,7 +93,7 @@ def pool(squares: np.ndarray, noise2: np.ndarray | None) -> tuple[float, np.ndar
     plain = float(np.mean(squares)), np.ones(len(squares))
     if noise2 is None or np.ptp(noise2) <= 0 or not 0 < plain[0] < HUGE2:
         return plain
-    noise2 = np.maximum(noise2, LEAST_NOISE2)
+    noise2 = np.maximum(noise2, SENSOR_RESOLUTION**2)
     common = np.append(0.0, np.geomspace(1e-3 * np.min(noise2), 1e3 * max(*noise2, *squares), MODEL_ERRORS))
     variances = noise2 + common[:, None]
     balances = variances / np.exp(np.mean(np.log(variances), axis=1, keepdims=True))

@@ -114,7 +114,7 @@ def prepare(
 
 @dataclass(frozen=True)
 class _Checks:
-    """The checks of recordings in their order; `left_out` receives those that were not begun."""
+    """The checks of recordings in their order; `left_out` receives the first of each run that was not begun."""
 
     gates: tuple[Gate, ...]
     workers: int

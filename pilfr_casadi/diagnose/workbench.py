@@ -381,9 +381,10 @@ class Workbench:
         if problem is None:
             return None
         theta = np.concatenate([vector[problem.free], states if states is not None else problem.start[n_free:]])
-        if self.noise2 is not None:  # starts are compared with the weights of where they end
-            problem = self.problem(problem.model, engine, balance=self._balance(problem, theta))
-        cost = problem.cost(theta)
+        balance = self._balance(problem, theta)
+        if not near_balance(balance, (problem.scale / self.scale) ** 2):
+            problem = self.problem(problem.model, engine, balance=balance)
+        cost = problem.cost(theta)  # starts are compared with the weights of where they end
         return (cost, theta, problem, status) if cost < DIVERGED else None
 
     def _solve(self, problem: Problem, theta: np.ndarray, solver: GaussNewton) -> tuple[Problem, np.ndarray, Status]:

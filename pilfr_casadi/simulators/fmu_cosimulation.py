@@ -291,6 +291,7 @@ class SteppedEquations:
             out[usable] = self.unit.steps(self.unit.set_names, np.stack(all_of, axis=1)[usable], h, self.rows)[0]
         return out - np.append(self._start[:n], np.zeros(len(self.others)))
 
+    @np.errstate(over="ignore", invalid="ignore")  # a step may fail or diverge
     def _derivatives(self, z: np.ndarray) -> np.ndarray:
         """Extrapolate derivatives and outputs to steps of length zero; NaN without convergence.
 

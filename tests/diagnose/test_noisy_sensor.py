@@ -8,7 +8,7 @@ from pilfr_casadi import Parameter, Port, Recording, Simulator, multisine
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.evidence import deviations
 from pilfr_casadi.diagnose.gates import Checked
-from pilfr_casadi.diagnose.workbench import BRIEF, THOROUGH
+from pilfr_casadi.diagnose.workbench import THOROUGH
 from pilfr_casadi.laws import CoulombFriction
 
 DT, SAMPLES = 5e-3, 2000
@@ -66,12 +66,11 @@ def test_units_do_not_change_a_weighted_fit(recorded):
     assert other.fitted.values["k"] == pytest.approx(float(one.fitted.values["k"]), rel=1e-6)
 
 
-def test_starts_are_compared_with_the_weights_of_where_they_end(recorded):
+def test_a_fit_from_a_poor_start_weighs_the_outputs_anew(recorded):
+    """At the start the outputs are about equally wrong; at the end each leaves its noise."""
     found = checked(mass(1000.0, 10.0), recorded())
-    start = {"k": 2500.0, "d": 60.0}
-    alone = found.bench.fit(mass(), [start], solver=BRIEF)
-    best = found.bench.fit(mass(), [start, {"k": 700.0, "d": 12.0}], solver=BRIEF)
-    assert best.cost <= alone.cost * (1 + 1e-9)
+    fitted = found.bench.fit(mass(), [{"k": 2500.0, "d": 60.0}], solver=THOROUGH)
+    assert np.sqrt(fitted.squares) == pytest.approx([QUIET, NOISY], rel=0.1)
 
 
 def test_a_small_effect_in_the_quiet_sensor_is_named(recorded):
