@@ -21,6 +21,7 @@ from ..data import Recording
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings, stated_hold
+from .channel_faults import correct_gross_slip
 from .evidence import BETTER_RATIO
 from .floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor, noise_floor
 from .gates import USELESS_FIT
@@ -281,6 +282,7 @@ def check(
     check_laws(laws)
     stated = stated_hold(simulator, recordings, hold)
     bench = Workbench.of(simulator, recordings, stated or "zero", engine)
+    bench, faults = correct_gross_slip(bench, lambda b: b.fit(simulator))
     fitted = bench.fit(simulator)
     if not stated:
         with suppress(InputError):
@@ -291,7 +293,12 @@ def check(
     bench.interrupt.raise_pending()  # half a fit would tell wrong things
     bench.check_followed(fitted)
     floor = noise_floor(bench.recordings, bench.scored(fitted.residual))
-    return assess_recordings(bench, fitted, floor, stated or "", laws)
+    found = assess_recordings(bench, fitted, floor, stated or "", laws)
+    if not faults:
+        return found
+    told = tuple(BlindSpot("recording-fault", (f.channel,), f"{f.sentence} Below, it is corrected.") for f in faults)
+    first = "Correct the recordings first, and compare the channel with its sensor's settings."
+    return replace(found, blind_spots=(*told, *found.blind_spots), next_record=first)
 
 
 def assess_recordings(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from itertools import combinations
+from itertools import combinations, compress
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from ..optimise import GaussNewton
 from ..simulators import SENSOR, port_name
 from .gates import CLEARLY_BETTER, CURED_SHARE, POOR_FIT, USELESS_FIT, Checked, Gate, accept, correct
 from .offsets import describe_constant
-from .workbench import Workbench
+from .workbench import Fitted, Workbench
 
 # metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
 UNITS = (1e3, 1e6, 1e2, 180 / np.pi, 9.80665, 30 / np.pi, 3.6, 1e5, 60.0, 4.4482216, 25.4, 1 / 0.0254, 6894.757)
@@ -89,6 +90,53 @@ def open_bench(simulator: Any, recordings: Sequence[Recording], hold: str, engin
         raise error
 
 
+def correct_gross_slip(
+    bench: Workbench, fit: Callable[[Workbench], Fitted], workers: int = 1
+) -> tuple[Workbench, tuple[Gate, ...]]:
+    """Correct a wrong sign or unit or an exchange that shows at the user's values; return the bench and the fault.
+
+    The run at these values has to be off by more than its own size, and with the channel corrected by less. Then the
+    rule of `gates` decides. `fit` fits the simulator to the recordings as given, in half of the time until the bench's
+    deadline: a slow simulator is not fitted at length to what it cannot follow.
+    """
+    given = Checked(bench, bench.run_given(bench.simulator))
+    before = _unfollowed(bench, given.fitted.residual)
+    if not before > 1:
+        return bench, ()
+    slips = _possible_slips(given, given.fitted.residual, known=True)
+    left = np.array([_run_corrected(given, fault) for fault in slips])
+    near = (left < min(CURED_SHARE * before, 1.0)) & (CURED_SHARE * left <= np.min(left))
+    if not np.any(near):
+        return bench, ()
+    now, plain = time.perf_counter(), given.fitted
+    with suppress(InputError):  # the simulation diverges
+        plain = fit(replace(bench, deadline=now + (bench.deadline - now) / 2))
+    found = _accept_best(given.then(bench, plain), list(compress(slips, near)), workers)
+    return (bench, ()) if bench.interrupt.pressed else (found.bench, found.gates)
+
+
+def _run_corrected(given: Checked, fault: Gate) -> float:
+    """Return what a run at the given values does not follow once a fault is corrected; see `_unfollowed`."""
+    bench, now = fault.apply(given.bench), given.fitted
+    pairs = list(zip(given.bench.recordings, bench.recordings, strict=True))
+    if any(was.u is not r.u for was, r in pairs):
+        return _unfollowed(bench, bench.run_given(now.simulator, now.model, now.engine).residual)
+    return _unfollowed(bench, [e + was.y - r.y for e, (was, r) in zip(now.residual, pairs, strict=True)])
+
+
+def _unfollowed(bench: Workbench, residual: Sequence[np.ndarray]) -> float:
+    """Compute the outputs' mean square error, apart from levels, over the product of simulated and measured deviation.
+
+    So an output that is simulated much too small counts as one that is simulated much too large.
+    """
+    with np.errstate(all="ignore"):
+        errors = np.concatenate([e - np.mean(e, axis=0) for e in bench.scored(residual)])
+        measured = np.concatenate([r.y[r.skip :] - np.mean(r.y[r.skip :], axis=0) for r in bench.recordings])
+        sizes = np.std(measured, axis=0) * np.std(measured + errors, axis=0)
+        share = float(np.mean(np.mean(errors**2, axis=0) / sizes))
+    return share if np.isfinite(share) else np.inf
+
+
 def find_slips(now: Checked, workers: int) -> Checked:
     """Find wrong signs and units, exchanged channels and a wrong unit of time, with `workers` trials at a time.
 
@@ -102,7 +150,7 @@ def find_slips(now: Checked, workers: int) -> Checked:
         level = correct(now, offset, [{}, now.fitted.values], now.fitted.begin)
         if level is None:
             continue
-        near = _near(level, level.fitted.residual)
+        near = _near(level, level.fitted.residual, level.cost <= 1)
         factors = [f for f in (-1.0, *FACTORS, *FAHRENHEIT) if f < 0 or near("y", [i], f)]
         faults = [scale_channels("y", bench.simulator.output_names, [i], f, " and an offset") for f in factors]
         beside = _accept_best(level, faults, workers)
@@ -111,9 +159,13 @@ def find_slips(now: Checked, workers: int) -> Checked:
     return found
 
 
-def _possible_slips(now: Checked, errors: Sequence[np.ndarray]) -> list[Gate]:
-    """List the faults of sign, unit, exchange and unit of time that the outputs' sizes allow."""
-    near, faults = _near(now, errors), list[Gate]()
+def _possible_slips(now: Checked, errors: Sequence[np.ndarray], known: bool = False) -> list[Gate]:
+    """List the faults of sign, unit, exchange and unit of time that the outputs' sizes in a run allow.
+
+    `known` tells that the simulator's values are taken as they are: then the sizes count however large the errors are,
+    and the time, with which the simulator changes, as right.
+    """
+    near, faults = _near(now, errors, known or now.cost <= 1), list[Gate]()
     channels = {"y": now.bench.simulator.output_names, "u": now.bench.simulator.inputs}
     for kind, names in channels.items():
         for i in range(len(names)):
@@ -124,18 +176,21 @@ def _possible_slips(now: Checked, errors: Sequence[np.ndarray]) -> list[Gate]:
     faults += [scale_channels("y", channels["y"], every, f) for f in joint]
     for kind, names in channels.items():
         faults += [exchange_channels(kind, names, i, j) for i, j in combinations(range(len(names)), 2)]
-    return [*faults, *(map(scale_time, TIME_UNITS) if now.cost > POOR_FIT else ())]
+    return [*faults, *(map(scale_time, TIME_UNITS) if now.cost > POOR_FIT and not known else ())]
 
 
-def _near(now: Checked, errors: Sequence[np.ndarray]) -> Callable[[str, Sequence[int], float], bool]:
-    """Return a test whether a factor on channels lets the outputs of a run have about the measured size."""
+def _near(now: Checked, errors: Sequence[np.ndarray], sized: bool) -> Callable[[str, Sequence[int], float], bool]:
+    """Return a test whether a factor on channels lets the outputs of a run have about the measured size.
+
+    Unless `sized`, every factor is allowed: the size of a diverging run says nothing.
+    """
     with np.errstate(all="ignore"):
         y = np.concatenate([e + r.y for e, r in zip(errors, now.bench.recordings, strict=True)])
         sizes = now.bench.scale / np.std(y, axis=0)
 
     def near(kind: str, columns: Sequence[int], factor: float) -> bool:
         ratios = factor * sizes[columns] if kind == "y" else sizes / factor
-        unknown = ~np.isfinite(ratios) | (ratios == 0) | (now.cost > 1)  # the size of a diverging run says nothing
+        unknown = ~np.isfinite(ratios) | (ratios == 0) | (not sized)
         close = unknown | ((ratios > 1 / SIZE_RATIO) & (ratios < SIZE_RATIO))
         return bool(np.all(close) if kind == "y" else np.any(close))
 

@@ -17,7 +17,7 @@ from .._base import InputError, Stages, UntilInterrupted
 from ..data import Recording
 from ..simulators import Simulator, unit_factor, unit_notes
 from .arguments import stated_hold
-from .channel_faults import find_slips, open_bench
+from .channel_faults import correct_gross_slip, find_slips, open_bench
 from .floor import Floor, pool, white_part
 from .gates import (
     CURED_SHARE,
@@ -88,11 +88,15 @@ def prepare(
     recordings, transients = open_unsettled(recordings)
     said = stated_hold(simulator, recordings, hold)
     bench, times = open_bench(simulator, recordings, said or "zero", engine)
-    gates = (*spikes, *transients, *times)
+    as_given = bench
+    patient = replace(bench, deadline=max(until, time.perf_counter() + LEAST_REFIT))
+    patient, slips = correct_gross_slip(patient, refitted, workers)
+    bench = replace(patient, deadline=bench.deadline)
+    gates = (*spikes, *transients, *times, *slips)
     held: Sequence[Gate] = ()
     if not said:
         bench, held = _choose_hold(bench)
-    nominal = errors_of(bench, bench.model(simulator), whole=True)
+    nominal = errors_of(replace(as_given, hold=bench.hold), bench.model(simulator), whole=True)
     say(CHECKS, 1, CHECKED)
     checks = _Checks(gates, workers, early, say, until)
     now = checks.run(bench, 1.0 if said else 0.5)

@@ -334,12 +334,21 @@ class Workbench:
             "focus 'prediction' of a diagnosis."
         )
 
+    def run_given(self, simulator: Simulator, model: Model | None = None, engine: Engine | None = None) -> Fitted:
+        """Run a simulator as it stands, with the states in which a fit begins; the cost of a diverging run is infinite.
+
+        A model or an engine that is not given is made.
+        """
+        model = model or self.model(simulator)
+        engine = engine or make_engine(model, self.engine)
+        freed = model.parameters.change(**{name: {"fixed": False} for name in model.parameters})
+        problem = self.problem(model.with_parameters(freed), engine)  # which needs variables
+        values = {k: p.value for k, p in model.parameters.items()}
+        return self.result(simulator, values, problem.first_states(problem.start), engine, model)
+
     def _run_fixed(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:
         """Run the simulator as it stands, because there is nothing to estimate."""
-        freed = model.parameters.change(**{name: {"fixed": False} for name in model.parameters})
-        problem = self.problem(model.with_parameters(freed), engine)
-        values = {k: p.value for k, p in model.parameters.items()}
-        found = self.result(simulator, values, problem.first_states(problem.start), engine, model)
+        found = self.run_given(simulator, model, engine)
         if not np.isfinite(found.cost):
             raise InputError("The simulation diverges at the given values; check the parameters' values and units.")
         return found

@@ -1,13 +1,17 @@
 """Channels that were exchanged, moved, or late by half a swing."""
 
+import time
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from cart import cart
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
-from pilfr_casadi.diagnose.channel_faults import scale_channels, scale_time
+from pilfr_casadi.diagnose.channel_faults import correct_gross_slip, scale_channels, scale_time
 from pilfr_casadi.diagnose.preparation import prepare
+from pilfr_casadi.diagnose.workbench import Workbench
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import discretise
 from problems.concealed import case
@@ -15,11 +19,11 @@ from problems.concealed import case
 DT, M = 0.05, 1200
 
 
-def tanks(off=1.0):
-    """Two lags in a row, each with an input of its own."""
+def tanks(off=1.0, unit=1.0):
+    """Two lags in a row, each with an input of its own; the second is measured in another unit."""
     return Simulator(
         lambda x, u, p: {"h1": (u.q1 - x.h1) / p.T1, "h2": (x.h1 + u.q2 - x.h2) / p.T2},
-        lambda x: {"upper": x.h1, "lower": x.h2},
+        lambda x: {"upper": x.h1, "lower": unit * x.h2},
         states=("h1", "h2"),
         inputs=("q1", "q2"),
         parameters={"T1": Parameter(0.5 * off, bounds=(0.1, 5)), "T2": Parameter(1.3 * off, bounds=(0.1, 5))},
@@ -66,6 +70,44 @@ def test_equal_explanations_of_a_wrong_unit_are_told():
     assert (fault.channel, fault.finding) == ("pos", "unit")
     assert "pos is too large by a factor of 1000, as from a wrong unit; or else force is too small" in fault.sentence
     assert "these recordings do not tell which" in fault.sentence
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ("small", "lower is too small by a factor of 1000,"),
+        ("exchanged", "upper and lower are exchanged"),
+        ("", ""),
+    ],
+)
+def test_a_check_tells_gross_faults_of_channels_and_assesses_corrected_recordings(fault, told):
+    """Without a fit at length; a time constant that is off by 3.6 is no unit."""
+    u, y = recorded()
+    levels = y * [1.0, 100.0]  # the lower one in cm
+    wrong = {"small": levels * [1.0, 1e-3], "exchanged": levels[:, ::-1], "": levels}[fault]
+    rig = tanks(3.6 if not fault else 1.15, unit=100.0)
+    found = pilfr.check(rig, Recording(u, wrong, DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero"))
+    faults = [spot.sentence for spot in found.blind_spots if spot.kind == "recording-fault"]
+    assert len(faults) == bool(fault) and all(told in sentence for sentence in faults)
+    assert found.error < 0.02 and {p.name: p.value for p in found.parameters} == pytest.approx(
+        {"T1": 0.5, "T2": 1.3}, rel=0.01
+    )
+    assert found.next_record.startswith("Correct the recordings first") == bool(fault)
+
+
+def test_half_of_the_time_is_left_to_try_gross_faults():
+    """A slow simulator was fitted to exchanged channels until the time was over."""
+    u, y = recorded()
+    r = Recording(u, y * [1e3, 1.0], DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero")
+    bench, given = replace(Workbench.of(tanks(1.15), [r], "zero"), deadline=time.perf_counter() + 100), []
+
+    def fit(one):
+        given.append(one.deadline - time.perf_counter())
+        return one.fit(one.simulator)
+
+    corrected, faults = correct_gross_slip(bench, fit)
+    assert [g.value for g in faults] == [1e-3] and 40 < given[0] < 51
+    assert np.allclose(corrected.recordings[0].y, y) and corrected.deadline == bench.deadline
 
 
 @pytest.mark.parametrize("alike", [True, False])
