@@ -27,11 +27,14 @@ from ..simulators import (
     SENSOR,
     ClosedEquations,
     Instant,
+    Named,
     Simulator,
     discretise,
     kind_of,
     on_grid,
     signals,
+    split_port,
+    stack,
     states_along,
 )
 from .linearise import Constant, compose_substeps, input_slope, local_signals, loudest_stretch, simulate_states
@@ -42,6 +45,7 @@ SMOOTHED_SAMPLES = 4000  # longest stretch of a recording that is smoothed: the 
 PASSES = 3  # linearisations at most
 # random steps of the force that are tried, in units of the force that explains the residual
 RANDOM_STEPS = np.logspace(-4.0, 0.5, 10)
+SAME_CHANGE = 1e-6  # share of the change of the derivatives up to which a force acts as a parameter does
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,6 +220,34 @@ def law_signals(bench: Workbench, fitted: Fitted, number: int, i: int) -> tuple[
     function = ca.Function("law", [ca.vertcat(x, s), u, v, t, vector], [ca.vertcat(*map(ca.SX, found))])
     (rows,) = map_points(function, states, r.u, input_slope(bench, r), r.clock[:, None], fitted.vector)
     return rows[:, 0, 0], rows[:, 1, 0], rows[:, 2, 0]
+
+
+def forces_of_change(bench: Workbench, fitted: Fitted, port: str, change: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the forces (M,) by port that act as a change (M,) of a parameter (`parameter:<name>`) along the runs.
+
+    Ports at which no force acts alike are left out.
+    """
+    simulator, (_, name) = bench.simulator, split_port(port)
+    x, u, p, t = simulator.symbols()
+    step = ca.SX.sym("step")
+    moved = Named("parameter", {k: p[k] + step if k == name else p[k] for k in p})
+    change_of = simulator.derivatives(x, u, moved, t) - simulator.derivatives(x, u, p, t)
+    ports = [one for one in simulator.all_ports() if not one.series]
+    factors = [ca.densify(simulator.state_factors(simulator.into(one, x, u, p, t))) for one in ports]
+    arguments = [stack(x), stack(u), stack(p), t, step]
+    function = ca.Function("change", arguments, [ca.densify(change_of), *factors])
+    runs = zip(bench.recordings, fitted.initial, strict=True)
+    states = np.concatenate([simulate_states(fitted, r, state)[:, : len(simulator.states)] for r, state in runs])
+    inputs, clock = (np.concatenate(part) for part in zip(*((r.u, r.clock) for r in bench.recordings), strict=True))
+    values = simulator.parameter_set.pack({k: v for k, v in fitted.values.items() if k in simulator.parameter_set})
+    total, *by_port = map_points(function, states, inputs, values, clock[:, None], change[:, None])
+    found = {}
+    for one, factor in zip(ports, by_port, strict=True):
+        size = np.sum(factor**2, axis=(1, 2))
+        force = np.sum(total * factor, axis=(1, 2)) / np.where(size > 0, size, 1.0)
+        if np.sum((total - force[:, None, None] * factor) ** 2) < SAME_CHANGE**2 * np.sum(total**2):
+            found[one.name] = force
+    return found
 
 
 def _remove_element(fitted: Fitted, number: int | None, start: np.ndarray, h: float) -> tuple[Simulator, np.ndarray]:

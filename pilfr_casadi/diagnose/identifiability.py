@@ -27,7 +27,7 @@ from .._base import in_words, one_at_a_time
 from ..data import Recording
 from ..laws import CATALOGUE, Law, readable_unit
 from ..models import map_points
-from ..simulators import ACTUATOR, EQUATION, Named, Port, Simulator, port_name, split_port
+from ..simulators import ACTUATOR, EQUATION, Port, Simulator, port_name, split_port, stack
 from .evidence import prior_width
 from .linearise import Probe, Run, sample_run
 from .screen import Remainder, Task, lengths, orthonormal, own_changes, project_off
@@ -191,16 +191,11 @@ def assess_parameters(response: Sensitivity) -> tuple[tuple[ParameterRow, ...], 
 def _read_by_ports_alone(simulator: Simulator) -> np.ndarray:
     """Mark the free entries of parameters that ports read and no equation does, shape (n,), bool."""
     symbols = simulator.symbols()
-    parameters = stack_symbols(symbols[2])
+    parameters = stack(symbols[2])
     equations = ca.vertcat(simulator.derivatives(*symbols), *simulator.measured(*symbols).values())
     factors = ca.vertcat(ca.SX(0, 1), *(f for port in simulator.ports for f in simulator.into(port, *symbols).values()))
     own, ports = (np.array(ca.which_depends(e, parameters), dtype=bool) for e in (equations, factors))
     return np.asarray((ports & ~own)[simulator.parameter_set.free])
-
-
-def stack_symbols(symbols: Named) -> ca.SX:
-    """Stack symbols into one column."""
-    return ca.vertcat(ca.SX(0, 1), *(ca.vec(symbols[name]) for name in symbols))
 
 
 def _find_ties(scaled: np.ndarray) -> list[list[int]]:
@@ -513,7 +508,7 @@ def _local_levels(bench: Workbench, fitted: Fitted, runs: list[Run]) -> list[flo
     own = simulator.parameter_set
     values = own.pack({k: v for k, v in fitted.values.items() if k in own})
     symbols = x, u, p, _ = (*simulator.symbols()[:3], ca.SX(0))
-    vectors = stack_symbols(x), stack_symbols(u), stack_symbols(p)
+    vectors = stack(x), stack(u), stack(p)
     changes = ca.vertsplit(simulator.derivatives(*symbols)) if simulator.states else []
     equations = {**simulator.measured(*symbols), **dict(zip(simulator.states, changes, strict=True))}
     found: list[float | None] = []

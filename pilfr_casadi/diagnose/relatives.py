@@ -7,7 +7,8 @@ A relative is a pair of port and law with its own start values:
 - a special case of the best law;
 - a resonance of known frequency: as a mass attached at another port, or in place of a delay or a lag;
 - a law of a signal with its own time scale, at the other end of a nearly linear simulator;
-- a simple law whose force is most like that of a flexible law along its port's own signal.
+- a simple law whose force is most like that of a flexible law along its port's own signal, or like that of a law or of
+  a parameter that varies with a signal.
 
 Two effects may hide each other, so that neither law explains enough alone. Then every pair of laws at two ports is
 scored along the refitted simulation. Let Q_a and Q_b be orthonormal columns of the output changes by small doses of the
@@ -20,15 +21,16 @@ of it. The best pairs are fitted.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ..laws import DRAGS, DRY, SMALL_AND_LARGE, Attached, Delay, Lag, Law, Local, Resonance, SprungMass, unit_forces
-from ..simulators import in_series
+from ..simulators import PARAMETER, in_series, kind_of
 from .evidence import FAR_RATIO, NEAR_RATIO
+from .force_recovery import forces_of_change
 from .linearise import port_signals
 from .screen import HUGE, Dose, Pair, Remainder, Scored, fit_shapes, held_out, orthonormal, start_values
 from .trials import Trial, Trials, place_law
@@ -153,9 +155,12 @@ def _damped_resonances(trials: Sequence[Trial], scored: Sequence[Scored]) -> lis
 
 
 def _other_end(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Select the best law, if it has its own time scale, at every actuator and sensor where it did not come near."""
+    """Select the best law at every actuator and sensor where it did not come near.
+
+    Only a law with its own time scale, or one of the time alone, acts alike at both ends.
+    """
     best, near = trials[0], _near(trials)
-    if not in_series(best.port) or not (best.law.order or best.law.shifts):
+    if not in_series(best.port) or not (best.law.order or best.law.shifts or best.law.reads() == {"t"}):
         return []
     times = {k: best.own[k] for k, unit in best.law.units.items() if unit in ("s", "rad/s", "")}
     same = (s for s in scored if type(s.law) is type(best.law) and in_series(s.port))
@@ -212,16 +217,44 @@ def _matching_forces(bench: Workbench, trials: Sequence[Trial], scored: Sequence
         return []
     there = (s for s in scored if s.port == best.port and s.pair not in near)
     entries = _first_of_pairs(s for s in there if s.law.size(s.starts[0]) < best.law.size(best.own))
-    local = port_signals(bench, best.fitted, best.port)
-    # also excludes nan, for example from the root of a negative number
-    if not entries or not np.all(np.abs([local.z, local.dz]) < HUGE):
-        return []
-    values, law = best.own, best.law
+    return _most_alike(bench, best, entries, {best.port: _last_force(bench, best)}) if entries else []
+
+
+def in_place_of_variation(bench: Workbench, best: Trial, scored: Sequence[Scored]) -> list[Scored]:
+    """Select laws with constant parameters, at most as many, whose force is most like that of a law that varies.
+
+    The last law of the best hypothesis varies with a signal. If it is a parameter, its change acts at some ports as a
+    force: a stiffness that varies with its own deflection is a stiffening spring.
+    """
+    force, most = _last_force(bench, best), best.law.size(best.own)
+    forces = (
+        forces_of_change(bench, best.fitted, best.port, force)
+        if kind_of(best.port) == PARAMETER
+        else {best.port: force}
+    )
+    plain = (s for s in scored if s.port in forces and not (s.law.flexible or s.law.scheduled_by or s.law.scaled_by))
+    return _most_alike(bench, best, _first_of_pairs(s for s in plain if s.law.size(s.starts[0]) <= most), forces)
+
+
+def _last_force(bench: Workbench, trial: Trial) -> np.ndarray:
+    """Compute the force, or the change of a parameter, by the last law of a hypothesis along its runs, (M,)."""
+    values, law = trial.own, trial.law
     shape = {k: v for k, v in values.items() if k not in law.strength}
     strengths = np.concatenate([np.ravel(values[k]) for k in law.strength]) if law.strength else np.ones(1)
-    force = unit_forces(law.at(values), local, [shape])[:, 0] @ strengths
+    local = port_signals(bench, trial.fitted, trial.port)
     with np.errstate(over="ignore", invalid="ignore"):
-        found = [(*_match_force(s.law, local, force), s) for s in entries]
+        return np.asarray(unit_forces(law.at(values), local, [shape])[:, 0] @ strengths)
+
+
+def _most_alike(
+    bench: Workbench, best: Trial, entries: Iterable[Scored], forces: Mapping[str, np.ndarray]
+) -> list[Scored]:
+    """Select the entries whose laws are most like the force at their port, starting there; `best` gives the rest."""
+    local = {port: port_signals(bench, best.fitted, port) for port in forces}
+    # also excludes nan, for example from the root of a negative number
+    bounded = {k for k, v in local.items() if np.all(np.abs([v.z, v.dz, forces[k]]) < HUGE)}
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = [(*_match_force(s.law, local[s.port], forces[s.port]), s) for s in entries if s.port in bounded]
     ranked = sorted((f for f in found if f[0] < 1), key=lambda f: f[0])[:FEW]
     return [replace(s, starts=(start, *s.starts), beside=best.fitted.values) for _, start, s in ranked]
 

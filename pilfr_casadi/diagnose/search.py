@@ -40,7 +40,7 @@ from .gates import CLEARLY_BETTER, Checked, Gate
 from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
 from .linearise import linearise_runs
-from .relatives import choose_pairs, complements, fit_pair, relatives
+from .relatives import choose_pairs, complements, fit_pair, in_place_of_variation, relatives
 from .screen import Remainder, Scored, screen, usable
 from .timing import TimeShift, find_time_shift
 from .trials import Key, Trial, place_law
@@ -343,6 +343,7 @@ class Search(Hypotheses):
         if by and "parallel" in best.law.places and self.in_time():
             kind = constant(type(best.law))
             self._refine(best, [scheduled(kind, by, p) for p in likely_profiles(kind) if p != best.law.profile])
+        self._replace_variation(parent)
 
     def _vary(self, trials: Sequence[Trial], signals: Sequence[str]) -> None:
         """Fit hypotheses with the strength of their last law varying with each signal."""
@@ -419,9 +420,19 @@ class Search(Hypotheses):
         if not entries:
             return
         self._record(base, entries, self._fitted(base, entries, gain, float(np.sqrt(self.floor2)), True))
+        self._replace_variation(base)
         last = self.best.laws[-1] if self.best.laws else None
         if last and kind_of(last.port) == PARAMETER and last.law.scheduled_by:
             self._curve(base, [s for s in entries if s.pair == (last.port, type(last.law))], gain)
+
+    def _replace_variation(self, base: Trial) -> None:
+        """Fit laws with constant parameters whose force is like that of the best hypothesis' last law, which varies."""
+        best = self.best
+        if len(best.laws) != len(base.laws) + 1 or not best.law.scheduled_by or not self.in_time():
+            return
+        entries = in_place_of_variation(self.bench, best, self._standing(base)[0])
+        if entries:
+            self._record(base, entries, self._fitted(base, entries, None, float(np.sqrt(self.floor2)), True))
 
     def _curve(self, base: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> None:
         """Let the parameter that varies in the best hypothesis follow a curve of higher degree."""

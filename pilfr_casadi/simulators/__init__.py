@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         UNKNOWN as UNKNOWN,
         infer_domain as infer_domain,
     )
-    from .equations import Named as Named
+    from .equations import Named as Named, stack as stack
     from .external import (
         PythonFunction as PythonFunction,
         calls_external as calls_external,

@@ -1,5 +1,7 @@
 """Hypotheses that what came out best asks for: special cases, the same at another place, one term more, its shape."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -8,9 +10,10 @@ from cart import cart
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator
 from pilfr_casadi.diagnose import Workbench, port_signals
-from pilfr_casadi.diagnose.relatives import relatives
+from pilfr_casadi.diagnose.force_recovery import forces_of_change
+from pilfr_casadi.diagnose.relatives import in_place_of_variation, relatives
 from pilfr_casadi.diagnose.screen import Scored
-from pilfr_casadi.diagnose.trials import Trials
+from pilfr_casadi.diagnose.trials import Trial, Trials
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
     Backlash,
@@ -27,12 +30,16 @@ from pilfr_casadi.laws import (
     PlayHysteresis,
     PreslidingFriction,
     PreslidingStribeckFriction,
+    ProgressiveStiffness,
+    QuadraticStiffness,
     Resonance,
     Saturation,
     Settling,
     SoftSaturation,
     StopHysteresis,
     StribeckFriction,
+    scheduled,
+    varying,
 )
 from pilfr_casadi.simulators import discretise
 
@@ -79,6 +86,48 @@ def test_a_delay_is_tried_at_the_other_end_as_well(asked_for, entry):
     (more,) = asked_for([late], scored)
     assert more.port == "actuator:force" and [start["T"] for start in more.starts] == [0.02, 0.05]
     assert asked_for([late, ("actuator:force", Delay, 0.11, {"T": 0.02})], scored) == []
+
+
+def test_a_trend_in_time_is_tried_at_the_other_end_as_well(asked_for, entry):
+    """A sensor that warms up looks like a force that dies away, and the screen had fitted that alone."""
+    settling = ("actuator:force", Settling, 0.1, {"a": -0.4, "b": 0.0, "T": 4.0})
+    scored = [entry(port, Settling, {"T": 1.0}) for port in ("actuator:force", "sensor:pos", "a")]
+    (more,) = [s for s in asked_for([settling], scored) if s.port == "sensor:pos"]
+    assert [start["T"] for start in more.starts] == [4.0, 1.0]
+
+
+def varied(bench, refit, law, port="parameter:k"):
+    """The hypothesis that a law of given values acts on the tiny machine."""
+    fitted = bench.run(bench.simulator.with_element(port, law), {}, refit.begin)
+    return Trial.of(fitted, 1)
+
+
+def test_a_parameter_that_varies_with_its_own_coordinate_is_a_force_at_that_port(tiny, entry):
+    """A stiffness that varies with its deflection was named, where a spring that stiffens is the same force."""
+    bench, refit = tiny
+    law = varying("pos", "bend")().at({"c": -6.0, "c_high": 10.0, "low": -1.0, "high": 1.0})  # k + 8 z + 2 z^2
+    z = port_signals(*tiny, "a").z
+    forces = forces_of_change(bench, refit, "parameter:k", np.full(len(z), 2.0))
+    assert sorted(forces) == ["a", "b", "c"]
+    assert all(np.allclose(force, 2.0 * z) for force in forces.values())
+    best = varied(bench, refit, law)
+    local = port_signals(bench, best.fitted, "a")
+    plain = (QuadraticStiffness, ProgressiveStiffness, CubicStiffness, CoulombFriction)
+    scored = [Scored("a", kind(), 0.1, ({},), local) for kind in (*plain, scheduled(CubicStiffness, "t"))]
+    found = in_place_of_variation(bench, best, scored)
+    assert [type(s.law) for s in found][:2] == [ProgressiveStiffness, QuadraticStiffness]
+    assert found[0].starts[0]["k_2"] == pytest.approx(8.0, rel=0.3)
+    assert in_place_of_variation(bench, best, [replace(s, port="elsewhere") for s in scored]) == []
+
+
+def test_a_law_that_varies_is_compared_with_laws_of_its_own_port(tiny):
+    bench, refit = tiny
+    kind = scheduled(LinearStiffness, "z", "linear")
+    best = varied(bench, refit, kind().at({"k_1": -4.0, "k_1_high": 4.0, "low": -1.0, "high": 1.0}), "b")
+    local = port_signals(bench, best.fitted, "b")
+    scored = [Scored(port, QuadraticStiffness(), 0.1, ({},), local) for port in ("a", "b")]
+    (found,) = in_place_of_variation(bench, best, scored)
+    assert found.port == "b" and found.starts[0]["k_2"] == pytest.approx(4.0)
 
 
 def test_a_law_with_one_more_term_than_one_that_came_near_is_no_worse_and_so_is_fitted_again(asked_for, entry):
