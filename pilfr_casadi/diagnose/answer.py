@@ -313,6 +313,7 @@ def _make_effect(
         form=law.form,
         placebo={"own": own, "unrelated": unrelated},
         test_without=test_without,
+        at_port=named.at_port,
     )
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..simulators import EQUATION, PARAMETER, in_series, name_at, split_port
+from .evidence import SURE
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,6 +19,8 @@ class Effect:
 
     Attributes
     ----------
+    at_port : float
+        Confidence that a law of the catalogue acts at its port, if not this one; nan if unknown.
     test_without : float, optional
         NRMSE on the test recordings of the corrected simulator without this effect, the others refitted; nan if there
         is no other.
@@ -33,11 +36,18 @@ class Effect:
     form: str = ""
     placebo: Mapping[str, float] = field(default_factory=dict)
     test_without: float = np.nan
+    at_port: float = np.nan
 
     @property
     def name(self) -> str:
         """The law and its port in words."""
         return name_at(self.port, self.law, self.form)
+
+    @property
+    def place(self) -> str:
+        """Tell how sure it is that any law acts at the port, if that is surer than the law."""
+        surer = self.at_port > SURE > self.confidence
+        return f"; confidence {self.at_port:.2f} that a law acts there" if surer else ""
 
     @property
     def defined(self) -> dict[str, dict[str, Any]]:
@@ -68,6 +78,8 @@ class Effect:
             out["form"] = self.form
         if self.placebo:
             out["placebo"] = dict(self.placebo)
+        if not np.isnan(self.at_port):
+            out["confidence_at_port"] = self.at_port
         if not np.isnan(self.test_without):
             out["test_without"] = self.test_without
         return out
@@ -83,7 +95,7 @@ class Effect:
             what = f"subtracted from the derivative of {of}" if kind == EQUATION else "the force or flow"
             symbols = f"where w is {what} and {local} at the port"
         lines = [
-            f"{self.name}, confidence {self.confidence:.2f}",
+            f"{self.name}, confidence {self.confidence:.2f}{self.place}",
             f"  {self.sentence}: {self.equation}",
             f"  {symbols}",
         ]

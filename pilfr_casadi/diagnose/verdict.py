@@ -72,16 +72,24 @@ class NamedEffect:
         Probability that it is included, or the same law elsewhere if the recordings cannot tell the place.
     alike : dict
         Port and law id of indistinguishable effects in its place -> the hypothesis, the likeliest first.
+    share_at_port : float
+        Probability that it is this law, given that one of the catalogue acts at its port.
     """
 
     element: Placed
     confidence: float
     alike: dict[Name, Trial]
+    share_at_port: float = 1.0
 
     @property
     def name(self) -> Name:
         """Port and law id."""
         return self.element.port, self.element.law.id
+
+    @property
+    def at_port(self) -> float:
+        """Probability that a law of the catalogue acts at its port, if not this one."""
+        return min(self.confidence / self.share_at_port, 1.0)
 
     @property
     def words(self) -> str:
@@ -256,7 +264,9 @@ def _make_effect(
         (element.port, element.law.id),
         *(n for name in twins if name[1] == element.law.id for n in _single_effects(name)),
     }
-    return NamedEffect(element, sum(w for n, w in by_names.items() if n & same), twins)
+    included = sum(w for n, w in by_names.items() if n & same)
+    at_port = sum(w for n, w in by_names.items() if element.port in {port for port, _ in n})
+    return NamedEffect(element, included, twins, min(included / max(at_port, 1e-300), 1.0))
 
 
 def _weights(search: Hypotheses, trials: Sequence[Trial]) -> np.ndarray:
@@ -435,14 +445,17 @@ def _describe_effects(search: Hypotheses, found: Posterior) -> str:
         " and ".join(e.words for e in found.effects if (e.confidence > SURE) is known) for known in (True, False)
     )
     names_are = "names are" if " and " in unsure else "name is"
+    there = "laws act" if " and " in unsure else "a law acts"
+    placed = all(e.confidence > SURE or e.at_port > SURE for e in found.effects)
+    certain = f"not certain, only that {there} there" if placed else "not certain"
     if not unsure:
         said = f"The simulator leaves out {sure}."
     elif not sure:
         the = "these" if " and " in unsure else "the"
-        said = f"The simulator most likely leaves out {unsure}; {the} {names_are} not certain."
+        said = f"The simulator most likely leaves out {unsure}; {the} {names_are} {certain}."
     else:
         these = "these" if " and " in unsure else "this"
-        more = f"More acts beside that, most likely {unsure}; {these} {names_are} not certain."
+        more = f"More acts beside that, most likely {unsure}; {these} {names_are} {certain}."
         said = f"The simulator leaves out {sure}. {more}"
     return said + _describe_vanished(search, found)
 

@@ -158,7 +158,7 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
     e = diagnosis.effects[number]
     name = name_at(e.port, e.law, e.form)
     out: list[Block] = [
-        Text(f"{name[0].upper()}{name[1:]}. In words: {e.sentence}. Confidence {e.confidence:.2f} of 1."),
+        Text(f"{name[0].upper()}{name[1:]}. In words: {e.sentence}. Confidence {e.confidence:.2f} of 1{e.place}."),
         Code(e.equation),
     ]
     if action:

@@ -7,7 +7,7 @@ import pytest
 
 from pilfr_casadi.diagnose.evidence import STRAINED_ODDS, significance
 from pilfr_casadi.diagnose.offsets import Offset
-from pilfr_casadi.diagnose.verdict import closest_law, explainable_remainder, posterior, share_named
+from pilfr_casadi.diagnose.verdict import closest_law, explainable_remainder, judge, posterior, share_named
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Delay, DirectionalFriction, QuadraticDrag
 
 SURE = share_named(0.0)  # of a law that leaves nothing: 0.98
@@ -49,6 +49,18 @@ def test_two_laws_that_tie_share_the_confidence(search, trial, behind, share):
     assert found.named == pytest.approx(SURE) and found.nothing < 1e-6
     assert sure_of(found) == {DRY_NAME: pytest.approx(SURE * share, rel=1e-3)}
     assert list(found.effects[0].alike) == ([CUBIC_NAME] if behind < 3 else [])
+
+
+@pytest.mark.parametrize(("port", "at_port"), [("a", SURE), ("b", SURE / 3)])
+def test_a_port_is_sure_where_only_the_law_is_not(search, trial, port, at_port):
+    """Three laws at one port, or at three."""
+    tied = (trial(DRY), trial((port, CubicStiffness)), trial(("c" if port == "b" else "a", QuadraticDrag)))
+    found = posterior(search(*((t, 0.0) for t in tied)))
+    (effect,) = found.effects
+    assert effect.confidence == pytest.approx(SURE / 3, rel=1e-3)
+    assert effect.at_port == pytest.approx(at_port, rel=1e-3)
+    said = judge(search(*((t, 0.0) for t in tied)), found, ()).sentence
+    assert ("not certain, only that a law acts there." in said) == (port == "a")
 
 
 def test_an_effect_keeps_its_name_only_in_the_corrected_simulator(search, trial):

@@ -11,7 +11,7 @@ from diagnosis_example import example, recorded, rig
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
 from pilfr_casadi.data import nrmse
-from pilfr_casadi.diagnose import BlindSpot, Workbench
+from pilfr_casadi.diagnose import BlindSpot, Effect, Workbench
 from pilfr_casadi.diagnose.offsets import Offset
 from pilfr_casadi.diagnose.proof import compare_errors, next_experiment
 from pilfr_casadi.engine import make_engine
@@ -163,6 +163,14 @@ def test_an_effect_that_the_test_recordings_do_not_need_is_told():
     both = replace(d, effects=(replace(d.effects[0], test_without=0.4), drag))
     told = "followed as well without quadratic drag at ground; its name rests on the training recordings alone."
     assert told in both.summary and "rests on the training" not in d.summary
+
+
+@pytest.mark.parametrize(("confidence", "at_port", "told"), [(0.27, 0.9, True), (0.27, 0.4, False), (0.9, 0.95, False)])
+def test_a_port_that_is_surer_than_the_law_is_told(confidence, at_port, told):
+    effect = Effect("outlet", "static_curve", confidence, "", "", {}, at_port=at_port)
+    first = str(effect).splitlines()[0]
+    assert first.endswith(f"{confidence:.2f}; confidence {at_port:.2f} that a law acts there") == told
+    assert effect.to_dict()["confidence_at_port"] == at_port
 
 
 def test_a_correction_that_no_test_recording_tried_says_so():
