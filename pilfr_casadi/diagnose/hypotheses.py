@@ -336,9 +336,13 @@ class Hypotheses:
         return self.bench.pool(self.least_floor.squares(self.bench.scale))
 
     def can_improve(self, trial: Trial, noise: Floor | None = None) -> bool:
-        """Tell whether a further law would be worth its prior if it left only the noise, by default the floor."""
-        most = 0.5 * self.sample.effective(0.0) * np.log(max(self._tolerant(trial) / self.may_leave(noise), 1.0))
-        return bool(most > np.log(max(len(self.alternatives), 1)) - EFFECT_PRIOR)
+        """Tell whether a further law would be worth its prior if it left only the noise, by default the floor.
+
+        An error no larger than what the formulas of the present laws may leave asks for no further law.
+        """
+        limit = self.may_leave(noise)
+        most = 0.5 * self.sample.effective(0.0) * np.log(max(self._tolerant(trial) / limit, 1.0))
+        return trial.mean_square > limit and bool(most > np.log(max(len(self.alternatives), 1)) - EFFECT_PRIOR)
 
     @property
     def past_deadline(self) -> bool:

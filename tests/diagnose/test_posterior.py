@@ -63,6 +63,13 @@ def test_a_port_is_sure_where_only_the_law_is_not(search, trial, port, at_port):
     assert ("not certain, only that a law acts there." in said) == (port == "a")
 
 
+@pytest.mark.parametrize(("left", "more"), [(9e-4, False), (2e-3, True)])
+def test_what_formulas_may_leave_asks_for_no_further_law(search, trial, left, more):
+    """The formula of a law may leave a thousandth of the mismatch; the quiet one of two sensors shows even that."""
+    one = trial(DRY, left=left)
+    assert search(one).can_improve(one) == more
+
+
 def test_an_effect_keeps_its_name_only_in_the_corrected_simulator(search, trial):
     found = posterior(search(trial(DRY, ("b", CubicStiffness)), trial(DRY, left=0.1)))
     assert len(found.effects) == 2
