@@ -497,11 +497,12 @@ def flexible_shares(bench: Workbench, fitted: Fitted) -> dict[str, float]:
 
 
 def innovation_share(bench: Workbench, fitted: Fitted) -> float:
-    """Compute the largest held-out share that a force at any port explains of the residual's innovations.
+    """Compute the largest held-out share that a force at any port explains of the innovations of any output's residual.
 
     A force seems to explain slow noise on held-out blocks, because a block is known from its neighbours. The
     innovations have no such neighbours; see `coloured_noise`. The noise is what the force leaves (Cochrane & Orcutt
-    1949): a filter made for the whole residual would also predict slow physics.
+    1949): a filter made for the whole residual would also predict slow physics. Each output counts in units of its own
+    noise, so that a noisy sensor does not hide what a quiet one shows.
     """
     rest, n_y = _remainder_for_flexible_forces(bench, fitted), bench.recordings[0].n_y
     sizes = [len(r.z) for r in rest.runs]
@@ -511,9 +512,13 @@ def innovation_share(bench: Workbench, fitted: Fitted) -> float:
         noise = _held_out_rest(phi, rest.left, rest.odd, RIDGES)
         noise = noise if noise @ noise < rest.left @ rest.left else rest.left
         filters = whitening_filters(np.split(noise.reshape(-1, n_y), np.cumsum(sizes)[:-1]))
+        unit = lengths(whiten(noise[:, None], filters, sizes).reshape(-1, n_y))
+        filters = [taps / max(size, 1e-300) for taps, size in zip(filters, unit, strict=True)]
         base = orthonormal(whiten(rest.base, filters, sizes))
         left, phi = (project_off(whiten(a, filters, sizes), base) for a in (rest.left[:, None], phi))
-        found.append(held_out(phi, left[:, 0], rest.odd, RIDGES))
+        after = _held_out_rest(phi, left[:, 0], rest.odd, RIDGES)
+        ratios = lengths(after.reshape(-1, n_y)) / np.maximum(lengths(left.reshape(-1, n_y)), 1e-300)
+        found.append(float(1 - np.min(ratios) ** 2))
     return max(found)
 
 

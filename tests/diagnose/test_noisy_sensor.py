@@ -8,6 +8,7 @@ from pilfr_casadi import Parameter, Port, Recording, Simulator, multisine
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.evidence import deviations
 from pilfr_casadi.diagnose.gates import Checked
+from pilfr_casadi.diagnose.screen import innovation_share
 from pilfr_casadi.diagnose.workbench import THOROUGH
 from pilfr_casadi.laws import CoulombFriction
 
@@ -71,6 +72,16 @@ def test_a_fit_from_a_poor_start_weighs_the_outputs_anew(recorded):
     found = checked(mass(1000.0, 10.0), recorded())
     fitted = found.bench.fit(mass(), [{"k": 2500.0, "d": 60.0}], solver=THOROUGH)
     assert np.sqrt(fitted.squares) == pytest.approx([QUIET, NOISY], rel=0.1)
+
+
+@pytest.mark.parametrize("friction", [True, False])
+def test_a_noisy_sensor_does_not_hide_whether_a_force_explains_the_innovations(recorded, friction):
+    """These tell slow noise from missing physics."""
+    shares = []
+    for outputs in (("position", "speed"), ("position",)):
+        found = checked(mass(1000.0, 10.0, outputs), recorded(friction, outputs))
+        shares.append(innovation_share(found.bench, found.fitted))
+    assert shares[0] == pytest.approx(shares[1], abs=0.05) and (shares[0] > 0.5) == friction
 
 
 def test_a_small_effect_in_the_quiet_sensor_is_named(recorded):
