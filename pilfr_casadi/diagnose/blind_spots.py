@@ -72,7 +72,7 @@ SOURCES = {
 
 @dataclass(frozen=True)
 class BlindSpot:
-    """A fact that the recordings cannot reveal: its kind, the names concerned, and a sentence."""
+    """A fact that the recordings cannot reveal, or a fault of theirs: its kind, the names concerned, and a sentence."""
 
     kind: str
     names: tuple[str, ...]
@@ -297,7 +297,7 @@ def check(
     if not faults:
         return found
     told = tuple(BlindSpot("recording-fault", (f.channel,), f"{f.sentence} Below, it is corrected.") for f in faults)
-    first = "Correct the recordings first, and compare the channel with its sensor's settings."
+    first = f"Correct the recordings first: check wiring, sign and unit of {in_words([f.channel for f in faults])}."
     return replace(found, blind_spots=(*told, *found.blind_spots), next_record=first)
 
 

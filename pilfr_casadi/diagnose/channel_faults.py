@@ -103,23 +103,32 @@ def correct_gross_slip(
     before = _unfollowed(bench, given.fitted.residual)
     if not before > 1:
         return bench, ()
-    slips = _possible_slips(given, given.fitted.residual, known=True)
-    left = np.array([_run_corrected(given, fault) for fault in slips])
+    slips = _possible_slips(given, given.fitted.residual, trust_values=True)
+    left = np.array(side_by_side(partial(_run_corrected, given), slips, workers))
     near = (left < min(CURED_SHARE * before, 1.0)) & (CURED_SHARE * left <= np.min(left))
     if not np.any(near):
         return bench, ()
     now, plain = time.perf_counter(), given.fitted
     with suppress(InputError):  # the simulation diverges
         plain = fit(replace(bench, deadline=now + (bench.deadline - now) / 2))
+    if bench.interrupt.pressed:
+        return bench, ()
     found = _accept_best(given.then(bench, plain), list(compress(slips, near)), workers)
-    return (bench, ()) if bench.interrupt.pressed else (found.bench, found.gates)
+    if bench.interrupt.pressed or not found.gates:
+        return bench, ()
+    return bench.renewed(found.bench.recordings), found.gates
 
 
 def _run_corrected(given: Checked, fault: Gate) -> float:
-    """Return what a run at the given values does not follow once a fault is corrected; see `_unfollowed`."""
+    """Return what a run at the given values does not follow once a fault is corrected; see `_unfollowed`.
+
+    It is infinite after the bench's deadline.
+    """
+    if time.perf_counter() > given.bench.deadline:
+        return np.inf
     bench, now = fault.apply(given.bench), given.fitted
     pairs = list(zip(given.bench.recordings, bench.recordings, strict=True))
-    if any(was.u is not r.u for was, r in pairs):
+    if now.simulator.observer is not None or any(not np.array_equal(was.u, r.u) for was, r in pairs):
         return _unfollowed(bench, bench.run_given(now.simulator, now.model, now.engine).residual)
     return _unfollowed(bench, [e + was.y - r.y for e, (was, r) in zip(now.residual, pairs, strict=True)])
 
@@ -127,13 +136,15 @@ def _run_corrected(given: Checked, fault: Gate) -> float:
 def _unfollowed(bench: Workbench, residual: Sequence[np.ndarray]) -> float:
     """Compute the outputs' mean square error, apart from levels, over the product of simulated and measured deviation.
 
-    So an output that is simulated much too small counts as one that is simulated much too large.
+    So an output that is simulated much too small counts as one that is simulated much too large. An output that stands
+    still in the simulation says nothing.
     """
     with np.errstate(all="ignore"):
         errors = np.concatenate([e - np.mean(e, axis=0) for e in bench.scored(residual)])
         measured = np.concatenate([r.y[r.skip :] - np.mean(r.y[r.skip :], axis=0) for r in bench.recordings])
         sizes = np.std(measured, axis=0) * np.std(measured + errors, axis=0)
-        share = float(np.mean(np.mean(errors**2, axis=0) / sizes))
+        moves = sizes != 0  # also if the run diverges
+        share = float(np.mean((np.mean(errors**2, axis=0) / sizes)[moves])) if np.any(moves) else np.inf
     return share if np.isfinite(share) else np.inf
 
 
@@ -159,13 +170,12 @@ def find_slips(now: Checked, workers: int) -> Checked:
     return found
 
 
-def _possible_slips(now: Checked, errors: Sequence[np.ndarray], known: bool = False) -> list[Gate]:
+def _possible_slips(now: Checked, errors: Sequence[np.ndarray], trust_values: bool = False) -> list[Gate]:
     """List the faults of sign, unit, exchange and unit of time that the outputs' sizes in a run allow.
 
-    `known` tells that the simulator's values are taken as they are: then the sizes count however large the errors are,
-    and the time, with which the simulator changes, as right.
+    With `trust_values` the sizes count however large the errors are, and the unit of time counts as right.
     """
-    near, faults = _near(now, errors, known or now.cost <= 1), list[Gate]()
+    near, faults = _near(now, errors, trust_values or now.cost <= 1), list[Gate]()
     channels = {"y": now.bench.simulator.output_names, "u": now.bench.simulator.inputs}
     for kind, names in channels.items():
         for i in range(len(names)):
@@ -176,7 +186,7 @@ def _possible_slips(now: Checked, errors: Sequence[np.ndarray], known: bool = Fa
     faults += [scale_channels("y", channels["y"], every, f) for f in joint]
     for kind, names in channels.items():
         faults += [exchange_channels(kind, names, i, j) for i, j in combinations(range(len(names)), 2)]
-    return [*faults, *(map(scale_time, TIME_UNITS) if now.cost > POOR_FIT and not known else ())]
+    return [*faults, *(map(scale_time, TIME_UNITS) if now.cost > POOR_FIT and not trust_values else ())]
 
 
 def _near(now: Checked, errors: Sequence[np.ndarray], sized: bool) -> Callable[[str, Sequence[int], float], bool]:

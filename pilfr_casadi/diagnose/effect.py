@@ -20,7 +20,7 @@ class Effect:
     Attributes
     ----------
     at_port : float
-        Confidence that a law of the catalogue acts at its port, if not this one; nan if unknown.
+        Confidence that this law or another of the catalogue acts at its port; nan if unknown.
     test_without : float, optional
         NRMSE on the test recordings of the corrected simulator without this effect, the others refitted; nan if there
         is no other.

@@ -223,9 +223,9 @@ def law_signals(bench: Workbench, fitted: Fitted, number: int, i: int) -> tuple[
 
 
 def forces_of_change(bench: Workbench, fitted: Fitted, port: str, change: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the forces (M,) by port that act as a change (M,) of a parameter (`parameter:<name>`) along the runs.
+    """Return the forces (M,) by port that change the derivatives as a change (M,) of a parameter does along the runs.
 
-    Ports at which no force acts alike are left out.
+    `port` is that of the parameter (`parameter:<name>`). Ports at which no force acts alike are left out.
     """
     simulator, (_, name) = bench.simulator, split_port(port)
     x, u, p, t = simulator.symbols()

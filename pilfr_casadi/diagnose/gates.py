@@ -183,6 +183,8 @@ def gain(before: float, after: float, residuals: Sequence[np.ndarray], parameter
 
 def describe_fall(before: float, after: float) -> str:
     """Describe by how much an edit reduces the NRMSE."""
+    if not np.isfinite(before):
+        return f"the refitted error is {after:.3g} times the outputs' deviation, where the simulation diverged before"
     return f"the refitted error falls from {before:.3g} to {after:.3g} times the outputs' deviation"
 
 

@@ -64,6 +64,8 @@ class Findings:
         Its errors on held-out data.
     varied : bool
         Whether variations of parameters were tried beside it.
+    replaced : bool
+        Whether laws with constant parameters were tried in place of its last law, which varies.
     """
 
     screened: tuple[list[Scored], np.ndarray | None] | None = None
@@ -73,6 +75,7 @@ class Findings:
     learned: list[Fitted] | None = None
     held_out: HeldOut | None = None
     varied: bool = False
+    replaced: bool = False
 
 
 @dataclass(eq=False, repr=False)

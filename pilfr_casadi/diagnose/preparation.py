@@ -90,7 +90,9 @@ def prepare(
     bench, times = open_bench(simulator, recordings, said or "zero", engine)
     as_given = bench
     patient = replace(bench, deadline=max(until, time.perf_counter() + LEAST_REFIT))
-    patient, slips = correct_gross_slip(patient, refitted, workers)
+    slips: tuple[Gate, ...] = ()
+    with UntilInterrupted(bench.interrupt, say.interrupted):
+        patient, slips = correct_gross_slip(patient, refitted, workers)
     bench = replace(patient, deadline=bench.deadline)
     gates = (*spikes, *transients, *times, *slips)
     held: Sequence[Gate] = ()

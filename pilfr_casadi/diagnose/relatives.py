@@ -6,7 +6,7 @@ A relative is a pair of port and law with its own start values:
 - another form of a law that came near, and a form that shares a shape with the best law but stayed behind it;
 - a special case of the best law;
 - a resonance of known frequency: as a mass attached at another port, or in place of a delay or a lag;
-- a law of a signal with its own time scale, at the other end of a nearly linear simulator;
+- a law of a signal with its own time scale, or a trend in time, at the other end of a nearly linear simulator;
 - a simple law whose force is most like that of a flexible law along its port's own signal, or like that of a law or of
   a parameter that varies with a signal.
 
@@ -163,8 +163,8 @@ def _other_end(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored
     if not in_series(best.port) or not (best.law.order or best.law.shifts or best.law.reads() == {"t"}):
         return []
     times = {k: best.own[k] for k, unit in best.law.units.items() if unit in ("s", "rad/s", "")}
-    same = (s for s in scored if type(s.law) is type(best.law) and in_series(s.port))
-    return _with_starts((s for s in same if s.pair not in near), [times])
+    same = (s for s in scored if type(s.law) is type(best.law) and in_series(s.port) and s.pair not in near)
+    return _with_starts(same, [times]) if times else _first_of_pairs(same)
 
 
 def _with_starts(entries: Iterable[Scored], starts: Sequence[dict[str, Any]]) -> list[Scored]:
@@ -221,7 +221,7 @@ def _matching_forces(bench: Workbench, trials: Sequence[Trial], scored: Sequence
 
 
 def in_place_of_variation(bench: Workbench, best: Trial, scored: Sequence[Scored]) -> list[Scored]:
-    """Select laws with constant parameters, at most as many, whose force is most like that of a law that varies.
+    """Select laws with constant parameters, no more of them, whose force is most like that of a law that varies.
 
     The last law of the best hypothesis varies with a signal. If it is a parameter, its change acts at some ports as a
     force: a stiffness that varies with its own deflection is a stiffening spring.

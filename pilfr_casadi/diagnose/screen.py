@@ -513,12 +513,13 @@ def innovation_share(bench: Workbench, fitted: Fitted) -> float:
         noise = noise if noise @ noise < rest.left @ rest.left else rest.left
         filters = whitening_filters(np.split(noise.reshape(-1, n_y), np.cumsum(sizes)[:-1]))
         unit = lengths(whiten(noise[:, None], filters, sizes).reshape(-1, n_y))
-        filters = [taps / max(size, 1e-300) for taps, size in zip(filters, unit, strict=True)]
+        filters = [taps / (size or 1.0) for taps, size in zip(filters, unit, strict=True)]
         base = orthonormal(whiten(rest.base, filters, sizes))
         left, phi = (project_off(whiten(a, filters, sizes), base) for a in (rest.left[:, None], phi))
         after = _held_out_rest(phi, left[:, 0], rest.odd, RIDGES)
-        ratios = lengths(after.reshape(-1, n_y)) / np.maximum(lengths(left.reshape(-1, n_y)), 1e-300)
-        found.append(float(1 - np.min(ratios) ** 2))
+        if after @ after < left[:, 0] @ left[:, 0]:
+            whole, rest_of = (lengths(e.reshape(-1, n_y)) for e in (left, after))
+            found.append(float(1 - np.min(rest_of[whole > 0] / whole[whole > 0]) ** 2))
     return max(found)
 
 

@@ -225,7 +225,8 @@ class Search(Hypotheses):
         """
         if self.aligned or not self.can_improve(self.best):
             return False
-        kept = [self.memo[t.key] for t in self.steps[-1].trials]
+        first_move = {t.key for s in self.steps if not s.parent.laws for t in s.trials}
+        kept = [self.memo[key] for key in first_move]
         plain = [t for t in kept if not (t.law.order or t.law.memory)]
         first = dict[tuple[str, str], Trial]()  # of each law the likeliest form, the likeliest laws first
         for trial in sorted(plain, key=self.optimistic_evidence, reverse=True):
@@ -428,8 +429,12 @@ class Search(Hypotheses):
     def _replace_variation(self, base: Trial) -> None:
         """Fit laws with constant parameters whose force is like that of the best hypothesis' last law, which varies."""
         best = self.best
-        if len(best.laws) != len(base.laws) + 1 or not best.law.scheduled_by or not self.in_time():
+        known = self.findings[best.key]
+        if known.replaced or not best.laws or best.key - base.key != {best.pair} or base.key - best.key:
             return
+        if not best.law.scheduled_by or not self.in_time():
+            return
+        known.replaced = True
         entries = in_place_of_variation(self.bench, best, self._standing(base)[0])
         if entries:
             self._record(base, entries, self._fitted(base, entries, None, float(np.sqrt(self.floor2)), True))

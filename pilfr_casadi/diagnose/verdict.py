@@ -27,6 +27,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .._base import in_words
 from ..simulators import SENSOR, Placed, name_at, name_at_any, port_name
 from .evidence import (
     AT_NOISE_RATIO,
@@ -73,7 +74,8 @@ class NamedEffect:
     alike : dict
         Port and law id of indistinguishable effects in its place -> the hypothesis, the likeliest first.
     share_at_port : float
-        Probability that it is this law, given that one of the catalogue acts at its port.
+        Probability that it is this law, given that one of the catalogue acts at its port, or at one where the same law
+        looks alike.
     """
 
     element: Placed
@@ -88,7 +90,7 @@ class NamedEffect:
 
     @property
     def at_port(self) -> float:
-        """Probability that a law of the catalogue acts at its port, if not this one."""
+        """Probability that this law or another of the catalogue acts at its port."""
         return min(self.confidence / self.share_at_port, 1.0)
 
     @property
@@ -265,7 +267,8 @@ def _make_effect(
         *(n for name in twins if name[1] == element.law.id for n in _single_effects(name)),
     }
     included = sum(w for n, w in by_names.items() if n & same)
-    at_port = sum(w for n, w in by_names.items() if element.port in {port for port, _ in n})
+    ports = {port for port, _ in same}
+    at_port = sum(w for n, w in by_names.items() if ports & {port for port, _ in n})
     return NamedEffect(element, included, twins, min(included / max(at_port, 1e-300), 1.0))
 
 
@@ -445,9 +448,9 @@ def _describe_effects(search: Hypotheses, found: Posterior) -> str:
         " and ".join(e.words for e in found.effects if (e.confidence > SURE) is known) for known in (True, False)
     )
     names_are = "names are" if " and " in unsure else "name is"
-    there = "laws act" if " and " in unsure else "a law acts"
     placed = all(e.confidence > SURE or e.at_port > SURE for e in found.effects)
-    certain = f"not certain, only that {there} there" if placed else "not certain"
+    there = in_words(list(dict.fromkeys(e.element.port for e in found.effects if not e.confidence > SURE)))
+    certain = f"not certain, only that something acts at {there}" if placed else "not certain"
     if not unsure:
         said = f"The simulator leaves out {sure}."
     elif not sure:

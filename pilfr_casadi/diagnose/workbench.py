@@ -495,6 +495,7 @@ class Workbench:
             residual = [engine.simulate(model.drive(r), vector, state)[0] - r.y for r, state in runs]
             squares = np.mean((np.concatenate(self.scored(residual)) / self.scale) ** 2, axis=0)
             cost, balance = pool(squares, self.noise2)
+        cost = cost if np.isfinite(cost) else np.inf
         return Fitted(simulator, model, engine, values, initial, residual, cost, squares, balance)
 
 

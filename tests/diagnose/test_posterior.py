@@ -60,7 +60,7 @@ def test_a_port_is_sure_where_only_the_law_is_not(search, trial, port, at_port):
     assert effect.confidence == pytest.approx(SURE / 3, rel=1e-3)
     assert effect.at_port == pytest.approx(at_port, rel=1e-3)
     said = judge(search(*((t, 0.0) for t in tied)), found, ()).sentence
-    assert ("not certain, only that a law acts there." in said) == (port == "a")
+    assert ("not certain, only that something acts at a." in said) == (port == "a")
 
 
 @pytest.mark.parametrize(("left", "more"), [(9e-4, False), (2e-3, True)])

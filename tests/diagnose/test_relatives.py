@@ -116,6 +116,7 @@ def test_a_parameter_that_varies_with_its_own_coordinate_is_a_force_at_that_port
     scored = [Scored("a", kind(), 0.1, ({},), local) for kind in (*plain, scheduled(CubicStiffness, "t"))]
     found = in_place_of_variation(bench, best, scored)
     assert [type(s.law) for s in found][:2] == [ProgressiveStiffness, QuadraticStiffness]
+    assert not any(s.law.scheduled_by for s in found)
     assert found[0].starts[0]["k_2"] == pytest.approx(8.0, rel=0.3)
     assert in_place_of_variation(bench, best, [replace(s, port="elsewhere") for s in scored]) == []
 

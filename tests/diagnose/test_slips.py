@@ -81,7 +81,7 @@ def test_equal_explanations_of_a_wrong_unit_are_told():
     ],
 )
 def test_a_check_tells_gross_faults_of_channels_and_assesses_corrected_recordings(fault, told):
-    """Without a fit at length; a time constant that is off by 3.6 is no unit."""
+    """A time constant that is off by 3.6 is no unit."""
     u, y = recorded()
     levels = y * [1.0, 100.0]  # the lower one in cm
     wrong = {"small": levels * [1.0, 1e-3], "exchanged": levels[:, ::-1], "": levels}[fault]
@@ -108,6 +108,38 @@ def test_half_of_the_time_is_left_to_try_gross_faults():
     corrected, faults = correct_gross_slip(bench, fit)
     assert [g.value for g in faults] == [1e-3] and 40 < given[0] < 51
     assert np.allclose(corrected.recordings[0].y, y) and corrected.deadline == bench.deadline
+
+
+def with_still_output(wrong):
+    """The tanks and a third output, whose gain is zero at the given values; the second one is 1000 times too large."""
+    u, y = recorded()
+    base = tanks(1.15)
+    rig = replace(
+        base,
+        outputs=lambda x, u, p: {"upper": x.h1, "lower": x.h2, "third": p.gain * x.h1},
+        parameters={**base.parameters, "gain": Parameter(0.0, bounds=(0, 5))},
+    )
+    y = np.column_stack([y * [1.0, 1e3 if wrong else 1.0], 0.5 * y[:, 0]])
+    r = Recording(u, y, DT, ("q1", "q2"), ("upper", "lower", "third"), initial="zero", hold="zero")
+    return Workbench.of(rig, [r], "zero")
+
+
+@pytest.mark.parametrize("wrong", [True, False])
+def test_an_output_that_stands_still_hides_no_gross_fault(wrong):
+    bench = with_still_output(wrong)
+    faults = correct_gross_slip(bench, lambda b: b.fit(b.simulator))[1]
+    assert [(g.channel, g.value) for g in faults] == [("lower", 1e-3)] * wrong
+
+
+def test_an_interrupt_in_the_first_fit_leaves_the_recordings_as_they_are():
+    bench = with_still_output(wrong=True)
+
+    def fit(one):
+        one.interrupt.pressed = True
+        return one.fit(one.simulator)
+
+    corrected, faults = correct_gross_slip(bench, fit)
+    assert faults == () and corrected is bench
 
 
 @pytest.mark.parametrize("alike", [True, False])
