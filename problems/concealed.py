@@ -100,7 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark, or write its files."""
     parser = argparse.ArgumentParser(prog="python -m problems.concealed", description="Concealed cases.")
     parser.add_argument("--cases", type=int, default=200)
-    parser.add_argument("--first-seed", type=int, default=5207)
+    parser.add_argument("--first-seed", type=int, default=5256)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, help="results go here as they come; what is there is not run again")
     parser.add_argument("--only", default="", help="cases with this tag: a rig, a law, a kind, a noise")
