@@ -344,7 +344,7 @@ class Search(Hypotheses):
         if by and "parallel" in best.law.places and self.in_time():
             kind = constant(type(best.law))
             self._refine(best, [scheduled(kind, by, p) for p in likely_profiles(kind) if p != best.law.profile])
-        self._replace_variation(parent)
+        self.replace_variation(parent)
 
     def _vary(self, trials: Sequence[Trial], signals: Sequence[str]) -> None:
         """Fit hypotheses with the strength of their last law varying with each signal."""
@@ -421,12 +421,12 @@ class Search(Hypotheses):
         if not entries:
             return
         self._record(base, entries, self._fitted(base, entries, gain, float(np.sqrt(self.floor2)), True))
-        self._replace_variation(base)
+        self.replace_variation(base)
         last = self.best.laws[-1] if self.best.laws else None
         if last and kind_of(last.port) == PARAMETER and last.law.scheduled_by:
             self._curve(base, [s for s in entries if s.pair == (last.port, type(last.law))], gain)
 
-    def _replace_variation(self, base: Trial) -> None:
+    def replace_variation(self, base: Trial) -> None:
         """Fit laws with constant parameters whose force is like that of the best hypothesis' last law, which varies."""
         best = self.best
         known = self.findings[best.key]

@@ -63,6 +63,14 @@ def test_a_port_is_sure_where_only_the_law_is_not(search, trial, port, at_port):
     assert ("not certain, only that something acts at a." in said) == (port == "a")
 
 
+def test_ports_that_are_not_told_apart_count_together(search, trial):
+    """Friction at a or at b, or another law at b."""
+    tied = (trial(DRY), trial(("b", CoulombFriction)), trial(("b", CubicStiffness)))
+    (effect,) = posterior(search(*((t, 0.0) for t in tied))).effects
+    assert effect.confidence == pytest.approx(2 / 3 * SURE, rel=1e-3)
+    assert effect.at_port == pytest.approx(SURE, rel=1e-3)
+
+
 @pytest.mark.parametrize(("left", "more"), [(9e-4, False), (2e-3, True)])
 def test_what_formulas_may_leave_asks_for_no_further_law(search, trial, left, more):
     """The formula of a law may leave a thousandth of the mismatch; the quiet one of two sensors shows even that."""

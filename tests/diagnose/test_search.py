@@ -49,6 +49,25 @@ def test_a_law_is_found_and_no_hypothesis_is_kept_twice():
     assert found.evidence(found.best) > found.evidence(found.root) + 10
 
 
+def test_laws_in_place_of_one_that_varies_are_looked_for_once(monkeypatch):
+    """Only beside the hypothesis that it was added to."""
+    found, asked = searching(rubbing()), list[int]()
+    kind = laws.scheduled(laws.CoulombFriction, "t", "linear")
+    fits = [found.without]
+    for law in (kind(), laws.CubicStiffness()):
+        fits.append(found.bench.fit(found.bench.simulator.with_element("ground-m1", law)))
+    root, varied, other = (Trial.of(f, len(f.simulator.elements), thorough=True) for f in fits)
+    for trial in (root, varied, other):
+        found.keep(trial)
+    assert found.best.key == varied.key
+    monkeypatch.setattr(
+        sys.modules["pilfr_casadi.diagnose.search"], "in_place_of_variation", lambda *_: asked.append(1) or []
+    )
+    for base, times in ((other, 0), (root, 1), (root, 1)):
+        found.replace_variation(base)
+        assert len(asked) == times
+
+
 @pytest.mark.parametrize("source", ["estimated", "repeats"])
 def test_an_estimated_noise_is_no_larger_than_what_a_fit_leaves(source):
     found = searching(rubbing())
