@@ -3,6 +3,7 @@
 import numpy as np
 
 from pilfr_casadi.data import Recording
+from pilfr_casadi.diagnose.preparation import first_refit, with_observer
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.models import Parameter
 from pilfr_casadi.simulators import Port, Simulator, choose_substeps, discretise
@@ -18,6 +19,11 @@ def _dynamics(x, u, p):
         "p2": x.v2,
         "v2": (spring + damper) / p.m2,
     }
+
+
+def refitted(bench):
+    """The simulator of a workbench, refitted as a diagnosis begins."""
+    return with_observer(first_refit(bench))
 
 
 def rig(factors=(1.0, 1.0, 1.0, 1.0)):

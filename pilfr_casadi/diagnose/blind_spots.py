@@ -10,21 +10,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from .._base import InputError, in_words, one_blas_thread, to_json
+from .._base import in_words, one_blas_thread, to_json
 from ..data import Recording
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings, stated_hold
-from .channel_faults import correct_gross_slip
-from .evidence import BETTER_RATIO
+from .channel_faults import accept_best, find_gross_slips, refit_corrected
 from .floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor, noise_floor
-from .gates import USELESS_FIT
+from .gates import USELESS_FIT, Checked
 from .identifiability import (
     SMALL_SHARE,
     LawRow,
@@ -39,7 +37,8 @@ from .identifiability import (
     port_units,
 )
 from .linearise import Probe, Run, linearise_runs
-from .workbench import Fitted, Workbench
+from .preparation import choose_hold
+from .workbench import QUICK, Fitted, Workbench
 
 SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
 
@@ -282,14 +281,13 @@ def check(
     check_laws(laws)
     stated = stated_hold(simulator, recordings, hold)
     bench = Workbench.of(simulator, recordings, stated or "zero", engine)
-    bench, faults = correct_gross_slip(bench, lambda b: b.fit(simulator))
-    fitted = bench.fit(simulator)
+    slips = find_gross_slips(bench)
+    now = accept_best(Checked(bench, bench.fit(simulator)), slips)
+    if now.gates:
+        now = refit_corrected(now)
     if not stated:
-        with suppress(InputError):
-            other = bench.with_other_hold()
-            again = other.fit(simulator)
-            if again.cost * BETTER_RATIO**2 < fitted.cost:
-                bench, fitted = other, again
+        now = choose_hold(now, QUICK)[0]
+    bench, fitted, faults = now.bench, now.fitted, now.gates
     bench.interrupt.raise_pending()  # half a fit would tell wrong things
     bench.check_followed(fitted)
     floor = noise_floor(bench.recordings, bench.scored(fitted.residual))
@@ -343,8 +341,7 @@ def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[Param
     doubtful = [p.name for p in parameters if p.status in ("dead", "flat")]
     if not doubtful:
         return ()
-    values = {k: p.value for k, p in fitted.model.parameters.items()}
-    given = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model)
+    given = bench.run_given(fitted.simulator, fitted.model, fitted.engine)
     if not np.isfinite(given.cost):
         return ()
     response = Sensitivity.of(bench, given, linearise_runs(bench, given)[1])

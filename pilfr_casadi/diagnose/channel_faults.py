@@ -14,12 +14,11 @@ import numpy as np
 
 from .._base import InputError, side_by_side
 from ..data import Recording
-from ..engine import make_engine
 from ..optimise import GaussNewton
 from ..simulators import SENSOR, port_name
 from .gates import CLEARLY_BETTER, CURED_SHARE, POOR_FIT, USELESS_FIT, Checked, Gate, accept, correct
 from .offsets import describe_constant
-from .workbench import Fitted, Workbench
+from .workbench import THOROUGH, Workbench
 
 # metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
 UNITS = (1e3, 1e6, 1e2, 180 / np.pi, 9.80665, 30 / np.pi, 3.6, 1e5, 60.0, 4.4482216, 25.4, 1 / 0.0254, 6894.757)
@@ -90,33 +89,19 @@ def open_bench(simulator: Any, recordings: Sequence[Recording], hold: str, engin
         raise error
 
 
-def correct_gross_slip(
-    bench: Workbench, fit: Callable[[Workbench], Fitted], workers: int = 1
-) -> tuple[Workbench, tuple[Gate, ...]]:
-    """Correct a wrong sign or unit or an exchange that shows at the user's values; return the bench and the fault.
+def find_gross_slips(bench: Workbench, workers: int = 1) -> list[Gate]:
+    """Find wrong signs and units and exchanges that show at the user's values, without a fit.
 
-    The run at these values has to be off by more than its own size, and with the channel corrected by less. Then the
-    rule of `gates` decides. `fit` fits the simulator to the recordings as given, in half of the time until the bench's
-    deadline: a slow simulator is not fitted at length to what it cannot follow.
+    The run at these values has to be off by more than its own size, and with the channel corrected by less.
     """
     given = Checked(bench, bench.run_given(bench.simulator))
     before = _unfollowed(bench, given.fitted.residual)
     if not before > 1:
-        return bench, ()
+        return []
     slips = _possible_slips(given, given.fitted.residual, trust_values=True)
     left = np.array(side_by_side(partial(_run_corrected, given), slips, workers))
     near = (left < min(CURED_SHARE * before, 1.0)) & (CURED_SHARE * left <= np.min(left))
-    if not np.any(near):
-        return bench, ()
-    now, plain = time.perf_counter(), given.fitted
-    with suppress(InputError):  # the simulation diverges
-        plain = fit(replace(bench, deadline=now + (bench.deadline - now) / 2))
-    if bench.interrupt.pressed:
-        return bench, ()
-    found = _accept_best(given.then(bench, plain), list(compress(slips, near)), workers)
-    if bench.interrupt.pressed or not found.gates:
-        return bench, ()
-    return bench.renewed(found.bench.recordings), found.gates
+    return list(compress(slips, near))
 
 
 def _run_corrected(given: Checked, fault: Gate) -> float:
@@ -154,8 +139,9 @@ def find_slips(now: Checked, workers: int) -> Checked:
     If the error stays large, try each output with an offset as well; `find_offsets` reports the offset and keeps it.
     """
     bench = now.bench
+    given = bench.run_given(bench.simulator, now.fitted.model, now.fitted.engine).residual
     # with an offset there is a working point, which a run from rest would have to reach first
-    found = _accept_best(now, _possible_slips(now, _from_rest(bench)), workers)
+    found = accept_best(now, _possible_slips(now, given), workers)
     for i, name in enumerate(bench.simulator.output_names if found.cost > POOR_FIT else ()):
         offset = describe_constant(port_name(SENSOR, name))
         level = correct(now, offset, [{}, now.fitted.values], now.fitted.begin)
@@ -164,10 +150,17 @@ def find_slips(now: Checked, workers: int) -> Checked:
         near = _near(level, level.fitted.residual, level.cost <= 1)
         factors = [f for f in (-1.0, *FACTORS, *FAHRENHEIT) if f < 0 or near("y", [i], f)]
         faults = [scale_channels("y", bench.simulator.output_names, [i], f, " and an offset") for f in factors]
-        beside = _accept_best(level, faults, workers)
+        beside = accept_best(level, faults, workers)
         if len(beside.gates) > len(now.gates) and beside.cost < CURED_SHARE * found.cost:
             found = replace(beside, bench=replace(beside.bench, simulator=bench.simulator))
     return found
+
+
+def refit_corrected(now: Checked) -> Checked:
+    """Refit from the user's values too, with sub-steps chosen for recordings whose channels were corrected."""
+    bench = now.bench.renewed(now.bench.recordings)
+    fitted = bench.fit(bench.simulator, [now.fitted.values, {}], solver=THOROUGH)
+    return replace(now, bench=bench, fitted=fitted)
 
 
 def _possible_slips(now: Checked, errors: Sequence[np.ndarray], trust_values: bool = False) -> list[Gate]:
@@ -207,7 +200,7 @@ def _near(now: Checked, errors: Sequence[np.ndarray], sized: bool) -> Callable[[
     return near
 
 
-def _accept_best(now: Checked, faults: Sequence[Gate], workers: int) -> Checked:
+def accept_best(now: Checked, faults: Sequence[Gate], workers: int = 1) -> Checked:
     """Accept the fault whose correction leaves the smallest error, if the rule accepts it.
 
     For a linear simulator, a unit of all outputs is equivalent to a unit of its input, or of its only output. Then the
@@ -239,12 +232,3 @@ def _try(now: Checked, fault: Gate) -> Checked | None:
     after = correct(now, fault, [{}, glanced.fitted.values], glanced.fitted.begin)
     bent = fault.finding == "time-unit" and after is not None and after.fitted.at_bounds > MOST_AT_BOUNDS
     return None if bent else after
-
-
-def _from_rest(bench: Workbench) -> list[np.ndarray]:
-    """Compute the errors of the simulator at the user's values, run from rest."""
-    model = bench.model(bench.simulator)
-    engine = make_engine(model, bench.engine)
-    start, n = model.parameters.start, model.n_state
-    with np.errstate(all="ignore"):
-        return [engine.simulate(model.drive(r), start, np.zeros(n))[0] - r.y for r in bench.recordings]

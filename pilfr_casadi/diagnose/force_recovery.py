@@ -225,10 +225,13 @@ def law_signals(bench: Workbench, fitted: Fitted, number: int, i: int) -> tuple[
 def forces_of_change(bench: Workbench, fitted: Fitted, port: str, change: np.ndarray) -> dict[str, np.ndarray]:
     """Return the forces (M,) by port that change the derivatives as a change (M,) of a parameter does along the runs.
 
-    `port` is that of the parameter (`parameter:<name>`). Ports at which no force acts alike are left out.
+    `port` is that of the parameter (`parameter:<name>`). Ports at which no force acts alike are left out: all of them
+    if an output reads the parameter.
     """
     simulator, (_, name) = bench.simulator, split_port(port)
     x, u, p, t = simulator.symbols()
+    if ca.depends_on(ca.vertcat(*simulator.measured(x, u, p, t).values()), p[name]):
+        return {}
     step = ca.SX.sym("step")
     moved = Named("parameter", {k: p[k] + step if k == name else p[k] for k in p})
     change_of = simulator.derivatives(x, u, moved, t) - simulator.derivatives(x, u, p, t)

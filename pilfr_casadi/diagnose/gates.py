@@ -269,14 +269,15 @@ def _satisfies_rule(now: Checked, after: Checked, fault: Gate) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class FirstOrder:
-    """A fitted simulator linearised along its runs, to screen edits to first order, the outputs in balance."""
+    """A fitted simulator linearised along its runs, to screen edits to first order; see `of`."""
 
     bench: Workbench
     fitted: Fitted
 
-    def __post_init__(self) -> None:
-        """Bring the outputs into balance."""
-        object.__setattr__(self, "bench", self.bench.balanced(self.fitted))
+    @classmethod
+    def of(cls, bench: Workbench, fitted: Fitted) -> FirstOrder:
+        """Linearise a fit, with the outputs in balance."""
+        return cls(bench.balanced(fitted), fitted)
 
     @cached_property
     def error(self) -> np.ndarray:

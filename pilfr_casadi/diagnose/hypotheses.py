@@ -406,7 +406,7 @@ class Hypotheses:
 
     def rms(self, trial: Trial) -> np.ndarray:
         """Compute the rms error of each output, (n_y,)."""
-        return np.asarray(np.sqrt(np.mean(np.concatenate(self.scored_residuals(trial)) ** 2, axis=0)))
+        return np.asarray(self.bench.scale * np.sqrt(trial.fitted.squares))
 
     def run_laws(self, laws: Sequence[Placed], joint: Trial) -> Trial:
         """Run some laws of a hypothesis, perhaps of another search, at its values, and return them as a trial.

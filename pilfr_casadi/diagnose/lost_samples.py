@@ -190,7 +190,7 @@ def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
     simulator = bench.simulator
     if not simulator.kinematic:
         return None
-    first = FirstOrder(bench, fitted)
+    first = FirstOrder.of(bench, fitted)
     error = first.project_off(first.error)
     total = max(float(error @ error), 1e-300)
     moved = [i for i, name in enumerate(simulator.states) if name not in simulator.kinematic]
@@ -378,7 +378,7 @@ def _place(now: Checked, gap: OutputGap, after: Checked) -> tuple[OutputGap, Che
 @np.errstate(over="ignore", invalid="ignore")
 def find_output_gap(bench: Workbench, fitted: Fitted) -> OutputGap | None:
     """Find the gap of some outputs with the least error, to first order; None if a shift is about as good."""
-    first, names = FirstOrder(bench, fitted), bench.simulator.output_names
+    first, names = FirstOrder.of(bench, fitted), bench.simulator.output_names
     groups = [(i,) for i in range(len(names))] + ([tuple(range(len(names)))] if len(names) > 1 else [])
     whole = float(np.mean(first.project_off(first.error) ** 2))
     best: OutputGap | None = None

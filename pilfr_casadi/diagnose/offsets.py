@@ -180,7 +180,7 @@ class VaryingOffset(Gate):
 
     def relocate(self, now: Checked, after: Checked) -> VaryingOffset:
         """Return the constants that follow best to first order at the corrected refit."""
-        first = FirstOrder(after.bench, after.fitted)
+        first = FirstOrder.of(after.bench, after.fitted)
         return self.at(np.add(self.value, _constants_of_each(first, self.port)[1]))
 
     def at(self, values: np.ndarray) -> VaryingOffset:
@@ -220,7 +220,7 @@ def find_varying_offset(now: Checked) -> Checked:
     """
     if len(now.bench.recordings) < 2:
         return now
-    first = FirstOrder(now.bench, now.fitted)
+    first = FirstOrder.of(now.bench, now.fitted)
     found = {port: _constants_of_each(first, port) for port in _channels(now.bench.simulator)}
     likely = sorted(found, key=lambda port: -found[port][0])[:FEW]
     faults = (VaryingOffset(split_port(p)[1], "offset", (), port=p).at(found[p][1]) for p in likely)
@@ -240,7 +240,7 @@ def _channels(simulator: Simulator) -> list[str]:
 
 def share_of_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[str, float]:
     """Compute the share of the mean square that a constant at each port removes, to first order."""
-    first = FirstOrder(bench, fitted)
+    first = FirstOrder.of(bench, fitted)
     rest, seen = _visible(first, first.response(ports, [np.ones((len(r), 1)) for r in bench.recordings]))
     along = np.where(seen, rest.T @ first.error / np.maximum(lengths(rest), 1e-150), 0.0)
     return dict(zip(ports, (along**2 / max(first.error @ first.error, 1e-300)).tolist(), strict=True))

@@ -15,9 +15,10 @@ import numpy as np
 
 from .._base import InputError, Stages, UntilInterrupted
 from ..data import Recording
+from ..optimise import GaussNewton, Status
 from ..simulators import Simulator, unit_factor, unit_notes
 from .arguments import stated_hold
-from .channel_faults import correct_gross_slip, find_slips, open_bench
+from .channel_faults import accept_best, find_gross_slips, find_slips, open_bench, refit_corrected
 from .floor import Floor, pool, white_part
 from .gates import (
     CURED_SHARE,
@@ -33,7 +34,7 @@ from .lost_samples import find_gaps, find_output_gaps
 from .offsets import find_offsets, find_wrong_start
 from .proof import errors_of
 from .recording_faults import mend_stale_samples, open_unsettled, remove_glitches, unclip
-from .timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps, run_as_given
+from .timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps
 from .workbench import THOROUGH, Fitted, Workbench, refine_steps
 
 CHECKED_ABOVE = 4e-4  # mean square error up to which signs and units are not checked
@@ -88,23 +89,17 @@ def prepare(
     recordings, transients = open_unsettled(recordings)
     said = stated_hold(simulator, recordings, hold)
     bench, times = open_bench(simulator, recordings, said or "zero", engine)
-    as_given = bench
-    patient = replace(bench, deadline=max(until, time.perf_counter() + LEAST_REFIT))
-    slips: tuple[Gate, ...] = ()
-    with UntilInterrupted(bench.interrupt, say.interrupted):
-        patient, slips = correct_gross_slip(patient, refitted, workers)
-    bench = replace(patient, deadline=bench.deadline)
-    gates = (*spikes, *transients, *times, *slips)
+    checks = _Checks(workers, early, say, until)
+    first = checks.begin(bench, (*spikes, *transients, *times))
     held: Sequence[Gate] = ()
     if not said:
-        bench, held = _choose_hold(bench)
-    nominal = errors_of(replace(as_given, hold=bench.hold), bench.model(simulator), whole=True)
+        first, held = choose_hold(first)
+    nominal = errors_of(replace(bench, hold=first.bench.hold), first.fitted.model, whole=True)
     say(CHECKS, 1, CHECKED)
-    checks = _Checks(gates, workers, early, say, until)
-    now = checks.run(bench, 1.0 if said else 0.5)
-    faulty = any(g.fault for g in now.gates[len(gates) :])
+    now = checks.run(first, 1.0 if said else 0.5)
+    faulty = any(g.fault for g in now.gates[len(first.gates) :])
     if not said and faulty and not bench.interrupt.pressed:  # on faulty data the better hold says nothing
-        now, held = _with_better_hold(checks, now, bench, held)
+        now, held = _with_better_hold(checks, now, first, held)
     bench, without = now.bench, now.fitted
     cut_short = checks.left_out or bench.interrupt.pressed
     corrected = bool(now.gates or held)  # values and states from faulty data may be in a wrong minimum
@@ -122,18 +117,40 @@ def prepare(
 class _Checks:
     """The checks of recordings in their order; `left_out` receives the first of each run that was not begun."""
 
-    gates: tuple[Gate, ...]
     workers: int
     early: bool
     say: Stages
     until: float
     left_out: list[Callable[[Checked], Checked]] = field(default_factory=list)
 
-    def run(self, bench: Workbench, part: float) -> Checked:
-        """Refit, and correct one fault after the other; `part` is the unit of shifts in samples, see `timing`."""
+    def begin(self, bench: Workbench, gates: tuple[Gate, ...]) -> Checked:
+        """Refit from the user's values; correct a fault of a channel that shows at these values."""
+        slips = list[Gate]()
         patient = replace(bench, deadline=max(self.until, time.perf_counter() + LEAST_REFIT))
-        first = Checked(patient, refitted(patient), self.gates).weighted()
-        now = self._in_turn(first, find_wrong_start, in_any_case=True)
+        with UntilInterrupted(bench.interrupt, self.say.interrupted):
+            slips = find_gross_slips(patient, self.workers)
+        found = self._correct_gross_slip(patient, slips, gates) if slips else None
+        return found or first_refit(patient, gates)
+
+    def _correct_gross_slip(self, bench: Workbench, slips: Sequence[Gate], gates: tuple[Gate, ...]) -> Checked | None:
+        """Correct the likeliest fault if the rule accepts it; None if the first refit was cut short for nothing.
+
+        That refit gets half of the time: a slow simulator is not fitted at length to what it cannot follow.
+        """
+        brief = replace(bench, deadline=(time.perf_counter() + bench.deadline) / 2)
+        as_given = refit(brief, solver=THOROUGH) or brief.run_given(brief.simulator)
+        now = Checked(bench, as_given, gates)
+        found = self._in_turn(now, partial(accept_best, faults=slips, workers=self.workers), in_any_case=True)
+        if bench.interrupt.pressed:
+            found = now
+        elif len(found.gates) > len(gates):
+            return refit_corrected(found)
+        cut_short = as_given.status is Status.TIME_LIMIT and not bench.interrupt.pressed
+        return found if np.isfinite(found.cost) and not cut_short else None
+
+    def run(self, first: Checked, part: float) -> Checked:
+        """Correct one fault after the other from the first refit on; `part` is the unit of shifts, see `timing`."""
+        now = self._in_turn(with_observer(first).weighted(), find_wrong_start, in_any_case=True)
         now = replace(now, bench=replace(now.bench, deadline=self.until))
         slips, shift = partial(self._correct_slips, part=part), partial(find_time_shift, part=part, early=self.early)
         now = self._in_turn(now, self._report(2), slips, in_any_case=True)
@@ -166,11 +183,7 @@ class _Checks:
         if now.cost <= NEAR_NOISE_RATIO**2 * now.noise2 or np.mean(now.fitted.squares) <= CHECKED_ABOVE:
             return now
         found = self._find_slips(now, part)
-        if len(found.gates) == len(now.gates):
-            return found
-        bench = now.bench.renewed(found.bench.recordings)
-        starts = [found.fitted.values, {}]
-        return found.then(bench, bench.fit(bench.simulator, starts, solver=THOROUGH))
+        return found if len(found.gates) == len(now.gates) else refit_corrected(found)
 
     def _find_slips(self, now: Checked, part: float) -> Checked:
         """Find wrong signs, units and exchanged channels; or a shift, because half a period late looks like a sign."""
@@ -186,14 +199,15 @@ def _refine_steps(now: Checked) -> Checked:
 
 
 def _with_better_hold(
-    checks: _Checks, now: Checked, bench: Workbench, held: Sequence[Gate]
+    checks: _Checks, now: Checked, first: Checked, held: Sequence[Gate]
 ) -> tuple[Checked, Sequence[Gate]]:
     """Repeat the checks with the other hold, and keep the one with the smaller error; return the note about it.
 
     If inputs are taken as held but were interpolated, a late channel is late by half a sample more or less.
     """
+    other = first.bench.with_other_hold()
     try:
-        both = now, checks.run(bench.with_other_hold(), 0.5)
+        both = now, checks.run(_on(other, first), 0.5)
     except InputError:
         return now, held
     noise2 = np.min([found.floor.squares(found.bench.scale) for found in both], axis=0)
@@ -203,7 +217,7 @@ def _with_better_hold(
         now = both[int(costs[1] < costs[0])]
         held = [hold_note(now.bench.simulator, now.bench.hold, ratio)]
     if any(s.delay > 0 and not in_steps(s.value, now.bench.dt) for s in _shifts(now)):  # a delay is physics
-        now = checks.run(replace(bench, hold=now.bench.hold), 1.0)
+        now = checks.run(first if now.bench.hold == first.bench.hold else _on(other, first), 1.0)
     return now, held
 
 
@@ -218,35 +232,49 @@ def _comparable_cost(found: Checked, noise2: np.ndarray) -> float:
     return cost / (AVERAGED_NOISE if between else 1)
 
 
-def refitted(bench: Workbench) -> Fitted:
-    """Fit the simulator from the user's values; if the error stays large, use an observer as well."""
-    plain = bench.fit(bench.simulator, solver=THOROUGH)
-    if plain.cost < POOR_FIT:
-        return plain
-    probe, runs = linearise_runs(bench, run_as_given(bench, plain))
-    gain = observer_gain(probe, runs, white_part(plain.residual))
+def first_refit(bench: Workbench, gates: tuple[Gate, ...] = ()) -> Checked:
+    """Refit the simulator from the user's values."""
+    return Checked(bench, bench.fit(bench.simulator, solver=THOROUGH), gates)
+
+
+def with_observer(now: Checked) -> Checked:
+    """If the error of a refit is large, refit with an observer as well, from the user's values."""
+    if now.cost < POOR_FIT:
+        return now
+    bench = now.bench
+    given = bench.run_given(bench.simulator, now.fitted.model, now.fitted.engine)
+    probe, runs = linearise_runs(bench, given)
+    gain = observer_gain(probe, runs, white_part(now.fitted.residual))
     if not gain.any():
-        return plain
+        return now
     try:
         led = bench.fit(bench.simulator, anneal=OBSERVER_GAINS, model=bench.model(bench.simulator, gain))
         found = bench.fit(bench.simulator, [led.values], states=led.begin, solver=THOROUGH)
     except (InputError, np.linalg.LinAlgError):
-        return plain
-    return found if found.cost < plain.cost else plain
+        return now
+    return replace(now, fitted=found) if found.cost < now.cost else now
 
 
 # hold of the inputs between samples
 
 
-def _choose_hold(bench: Workbench) -> tuple[Workbench, Sequence[Gate]]:
-    """Choose the hold whose refit has the smaller error, and note it; keep the bench's own if the errors are equal."""
-    both = bench, bench.with_other_hold()
-    costs = [np.inf if (found := refit(b)) is None else found.cost for b in both]
+def choose_hold(first: Checked, solver: GaussNewton = THOROUGH) -> tuple[Checked, Sequence[Gate]]:
+    """Choose the hold whose refit has the smaller error, and note it; keep the first one if the errors are equal."""
+    try:
+        other = _on(first.bench.with_other_hold(), first, solver)
+    except InputError:
+        return first, ()
+    costs = first.cost, other.cost
     ratio = float(np.sqrt(max(costs) / max(min(costs), 1e-300)))
     if not ratio >= EQUAL_RATIO:
-        return bench, ()
-    best = both[int(costs[1] < costs[0])]
-    return best, [hold_note(best.simulator, best.hold, ratio)]
+        return first, ()
+    best = other if other.cost < first.cost else first
+    return best, [hold_note(best.bench.simulator, best.bench.hold, ratio)]
+
+
+def _on(bench: Workbench, first: Checked, solver: GaussNewton = THOROUGH) -> Checked:
+    """Repeat the first refit on another bench."""
+    return replace(first, bench=bench, fitted=bench.fit(bench.simulator, [{}, first.fitted.values], solver=solver))
 
 
 def conversions(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Gate, ...]:

@@ -274,7 +274,7 @@ def find_clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gat
 
 def _explained_beyond(bench: Workbench, without: Fitted, fault: Clipping) -> float:
     """Compute the held-out share of the error that an input's continuation beyond its limits explains."""
-    first = FirstOrder(bench, without)
+    first = FirstOrder.of(bench, without)
     signs = [(v, 1.0 if v == fault.high else -1.0) for v in fault.value]
     inputs = [r.u[:, fault.column] for r in bench.recordings]
     beyond = [np.column_stack([sign * _beyond_limit(u, v) for v, sign in signs]) for u in inputs]

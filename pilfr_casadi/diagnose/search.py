@@ -132,7 +132,7 @@ class Search(Hypotheses):
             self.add(parent)
             if not parent.laws and self.in_time() and self._escape_local_minimum():
                 self.add(self.root)
-            if self.other_hold_fits_better() or (not parent.laws and self._finds_shift()):
+            if (not self.hold_said and self.prefers_other_hold()) or (not parent.laws and self._finds_shift()):
                 return False
             if not parent.laws and self.can_improve(self.best) and self.in_time():
                 self.vary_parameters(self.root)
@@ -201,22 +201,15 @@ class Search(Hypotheses):
         fewer = [t for t in self.memo.values() if t.laws and len(t.effects) < len(trial.effects)]
         return len(trial.effects) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
 
-    def other_hold_fits_better(self) -> bool:
-        """Tell whether nobody stated the hold, and the best hypothesis follows better with the other one."""
-        return not self.hold_said and self.prefers_other_hold()
-
     def prefers_other_hold(self) -> bool:
         """Tell whether the best hypothesis follows the recordings better with the other hold of the inputs."""
-        best = self.best.fitted
+        best, cost = self.best.fitted, np.inf
         if self.interrupted or not self.in_time():
             return False
-        try:
-            other = self.bench.with_other_hold().fit(
-                best.simulator, [best.values], states=best.initial, solver=THOROUGH
-            )
-        except InputError:
-            return False
-        return not self.interrupted and other.cost * BETTER_RATIO**2 < best.cost
+        with suppress(InputError):
+            held = self.bench.with_other_hold()
+            cost = held.fit(best.simulator, [best.values], states=best.initial, solver=THOROUGH).cost
+        return not self.interrupted and cost * BETTER_RATIO**2 < best.cost
 
     def _finds_shift(self) -> bool:
         """Look beside each of the first laws for an output that comes before its cause; their absence may hide it.

@@ -129,7 +129,7 @@ class TimeShift(Gate):
     def relocate(self, now: Checked, after: Checked) -> Self:
         """Return the fault at the value with the smallest remainder nearby."""
         width = now.bench.dt if self.finding == "alignment" else abs(self.value)
-        first = FirstOrder(replace(now.bench, scale=after.bench.scale), after.fitted)
+        first = FirstOrder.of(replace(now.bench, scale=after.bench.scale), after.fitted)
         value = _minimise(self.remainder(first, after.fitted), self.value - width, self.value + width)[0]
         return self if abs(value - self.value) < 2e-3 * width else self.at(value, now.bench.dt)
 
@@ -227,14 +227,6 @@ def _is_lag(now: Checked, after: Checked, fault: TimeShift) -> bool:
     return lagging is not None and lagging.cost < after.cost
 
 
-def run_as_given(bench: Workbench, plain: Fitted) -> Fitted:
-    """Run the simulator at the user's values, because a refit to shifted channels may be in a wrong minimum."""
-    values = {name: p.value for name, p in bench.simulator.parameters.items()}
-    unknown = [r.begins == "estimate" for r in bench.recordings]
-    initial = [0 * state if u else state for u, state in zip(unknown, plain.initial, strict=True)]
-    return bench.result(bench.simulator, values, initial, plain.engine, plain.model)
-
-
 def _screen_shifts(bench: Workbench, plain: Fitted, also_given: bool = True) -> list[TimeShift]:
     """List the shifts and clock rates that clearly reduce the remainder, best first, a few at most.
 
@@ -248,9 +240,9 @@ def _screen_shifts(bench: Workbench, plain: Fitted, also_given: bool = True) -> 
     if len(inputs) > 1:
         channels += [("u", (i,), name) for i, name in enumerate(inputs)]
     found = list[tuple[float, TimeShift]]()
-    given = [run_as_given(bench, plain)] if also_given else []
+    given = [bench.run_given(bench.simulator, plain.model, plain.engine)] if also_given else []
     for reference in (plain, *(one for one in given if one.cost < RUNAWAY**2)):
-        first = FirstOrder(bench, reference)
+        first = FirstOrder.of(bench, reference)
         for kind, columns, name in channels:
             for finding, values in (("alignment", bench.dt * SHIFTS), ("clock", RATES)):
                 fault = TimeShift(name, finding, 0.0, kind=kind, columns=columns)

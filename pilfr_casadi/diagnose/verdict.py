@@ -73,25 +73,23 @@ class NamedEffect:
         Probability that it is included, or the same law elsewhere if the recordings cannot tell the place.
     alike : dict
         Port and law id of indistinguishable effects in its place -> the hypothesis, the likeliest first.
-    share_at_port : float
-        Probability that it is this law, given that one of the catalogue acts at its port, or at one where the same law
-        looks alike.
+    at_port : float
+        Probability that this law or another of the catalogue acts at its port, or at one where it looks alike.
     """
 
     element: Placed
     confidence: float
     alike: dict[Name, Trial]
-    share_at_port: float = 1.0
+    at_port: float
 
     @property
     def name(self) -> Name:
         """Port and law id."""
         return self.element.port, self.element.law.id
 
-    @property
-    def at_port(self) -> float:
-        """Probability that this law or another of the catalogue acts at its port."""
-        return min(self.confidence / self.share_at_port, 1.0)
+    def times(self, probability: float) -> NamedEffect:
+        """Weigh the effect by the probability of something else that it rests on."""
+        return replace(self, confidence=probability * self.confidence, at_port=probability * self.at_port)
 
     @property
     def words(self) -> str:
@@ -133,17 +131,17 @@ class Posterior:
         effects = [e for e in self.effects if e.name in elements]
         named = min(self.named, share_named(learned if effects else 1.0))
         ratio = named / max(self.named, 1e-300)
-        return replace(self, named=named, effects=tuple(replace(e, confidence=ratio * e.confidence) for e in effects))
+        return replace(self, named=named, effects=tuple(e.times(ratio) for e in effects))
 
     def acting(self, search: Hypotheses, trial: Trial) -> Posterior:
         """Weigh the effects by the probability that their strengths are not zero in a fit of the same laws."""
         acts = {(e.port, e.law.id): _acts(search, trial, e) for e in trial.effects}
-        effects = tuple(replace(e, confidence=acts[e.name] * e.confidence) for e in self.effects)
+        effects = tuple(e.times(acts[e.name]) for e in self.effects)
         return replace(self, named=max(acts.values()) * self.named, effects=effects)
 
     def against(self, odds: float) -> Posterior:
         """Weigh the effects against another explanation of given odds."""
-        effects = tuple(replace(e, confidence=e.confidence / (1 + odds)) for e in self.effects)
+        effects = tuple(e.times(1 / (1 + odds)) for e in self.effects)
         return replace(self, named=self.named / (1 + odds), effects=effects)
 
 
@@ -209,7 +207,7 @@ def posterior(search: Hypotheses) -> Posterior:
             break
         said = fewer
     named = share_named(explainable_remainder(search, best), _odds_against(search, best, best.effects))
-    effects = (replace(e, confidence=_named_beside(search, best, e) * e.confidence) for e in found)
+    effects = (e.times(_named_beside(search, best, e)) for e in found)
     strongest_first = sorted(effects, key=lambda e: -(_without(search, best, e) or search.root).mean_square)
     answer = Posterior(best, named, tuple(strongest_first), by_names.get(frozenset(), 0.0))
     return answer.acting(search, best)
@@ -269,7 +267,7 @@ def _make_effect(
     included = sum(w for n, w in by_names.items() if n & same)
     ports = {port for port, _ in same}
     at_port = sum(w for n, w in by_names.items() if ports & {port for port, _ in n})
-    return NamedEffect(element, included, twins, min(included / max(at_port, 1e-300), 1.0))
+    return NamedEffect(element, included, twins, at_port)
 
 
 def _weights(search: Hypotheses, trials: Sequence[Trial]) -> np.ndarray:

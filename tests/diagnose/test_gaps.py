@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from diagnosis_contract import SCHEMA, problems
-from diagnosis_rig import OFF, recordings, rig
+from diagnosis_rig import OFF, recordings, refitted, rig
 from test_timing import shaken, spring
 
 import pilfr_casadi as pilfr
@@ -16,7 +16,7 @@ from pilfr_casadi import laws
 from pilfr_casadi.diagnose import Workbench, lost_samples
 from pilfr_casadi.diagnose.gates import CURED_SHARE, Checked
 from pilfr_casadi.diagnose.lost_samples import OutputGap, find_gaps, find_jump, find_output_gaps, settle_jump
-from pilfr_casadi.diagnose.preparation import prepare, refitted
+from pilfr_casadi.diagnose.preparation import prepare
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import discretise
 
@@ -33,7 +33,7 @@ def lost(r, *places, count=25):
 
 def bench(*train):
     made = Workbench.of(rig(OFF), train, "zero")
-    return made, refitted(made)
+    return made, refitted(made).fitted
 
 
 def looked(*train):
@@ -157,7 +157,7 @@ def behind(r, columns, k, count):
 
 def looked_at_outputs(r):
     made = Workbench.of(spring(), [r], "zero")
-    return find_output_gaps(Checked(made, refitted(made)))
+    return find_output_gaps(refitted(made))
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,7 @@ def test_a_shock_that_no_input_explains_is_no_gap_of_an_output():
     y = rings(lambda u: u.kick).simulate(r)
     noise = 5e-3 * np.std(y, axis=0) * np.random.default_rng(4).standard_normal(y.shape)
     made = Workbench.of(rings(lambda u: 0 * u.kick), [r.with_(y=y + noise)], "zero")
-    assert not find_output_gaps(Checked(made, refitted(made))).gates
+    assert not find_output_gaps(refitted(made)).gates
 
 
 def test_jumps_are_tried_with_the_matrices_of_a_few_samples_at_a_time(monkeypatch):

@@ -85,7 +85,7 @@ def test_no_value_is_told_in_place_of_a_law_that_explains_nothing():
     right = machine()
     held = right.with_parameters({**right.parameters, "k": Parameter(20.0, fixed=True)})
     search = searched(held, recorded(20.0, 0)[0])
-    named = NamedEffect(Placed("equation:vel", laws.CubicStiffness(), "equation:vel."), 0.9, {})
+    named = NamedEffect(Placed("equation:vel", laws.CubicStiffness(), "equation:vel."), 0.9, {}, 0.9)
     assert find_pinned_parameters(search, Posterior(search.root, 1.0, (named,), 0.0)) is None
 
 

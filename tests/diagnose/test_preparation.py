@@ -7,14 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from diagnosis_rig import OFF, recordings, rig
+from diagnosis_rig import OFF, recordings, refitted, rig
 from test_slips import DT, recorded, tanks
 
 from pilfr_casadi import Parameter, Recording, Simulator, multisine
 from pilfr_casadi.diagnose import Workbench, preparation
-from pilfr_casadi.diagnose.gates import Checked
 from pilfr_casadi.diagnose.offsets import find_offsets, list_offsets, share_of_constants, update_offsets
-from pilfr_casadi.diagnose.preparation import prepare, refitted
+from pilfr_casadi.diagnose.preparation import prepare
 from pilfr_casadi.laws import AsymmetricSaturation
 
 
@@ -57,7 +56,7 @@ def test_a_wrong_sign_beside_another_zero_is_told():
 def test_a_constant_of_a_sensor_is_found_and_kept():
     known = replace(tanks(1.15), units={"lower": "m"})
     bench = Workbench.of(known, [of_tanks(recorded()[1] + [0, 0.3])], "zero")
-    found = find_offsets(Checked(bench, refitted(bench)))
+    found = find_offsets(refitted(bench))
     fitted, (gate,) = found.fitted, found.gates
     assert (gate.channel, gate.finding, gate.fault) == ("lower", "offset", True)
     assert gate.value == pytest.approx(0.3, rel=0.02) and f"offset of about {gate.value:.3g} m;" in gate.sentence
@@ -76,9 +75,9 @@ def test_constants_that_look_alike_to_first_order_are_told_apart_by_their_refits
     r = of_tanks(recorded()[1] + [0, 0.3]).with_(initial=initial)
     bench = Workbench.of(tanks(1.15), [r], "zero")
     ready = refitted(bench)
-    share = share_of_constants(bench, ready, ["actuator:q2", "sensor:lower"])
+    share = share_of_constants(bench, ready.fitted, ["actuator:q2", "sensor:lower"])
     assert share["actuator:q2"] == pytest.approx(share["sensor:lower"])
-    channels = [g.channel for g in find_offsets(Checked(bench, ready)).gates]
+    channels = [g.channel for g in find_offsets(ready).gates]
     assert channels == ["lower"] if initial == "zero" else len(channels) == 1
 
 
@@ -117,7 +116,7 @@ def test_offsets_that_differ_between_recordings_are_subtracted(side, channel):
     size = {"u": 20.0, "y": 0.02}[side]
     both = zip(recordings(count=2), (size, -size / 2), strict=True)
     bench = Workbench.of(rig(OFF), [r.with_(**{side: getattr(r, side) + v}) for r, v in both], "zero")
-    found = find_offsets(Checked(bench, refitted(bench)))
+    found = find_offsets(refitted(bench))
     (gate,) = found.gates
     assert gate.finding == "offset" and gate.fault and found.cost < 0.01**2
     assert gate.channel == channel and gate.value == pytest.approx([size, -size / 2], rel=0.02)
@@ -139,7 +138,7 @@ def test_a_mean_force_of_missing_physics_is_no_offset():
         y = axis.with_element("actuator:force", AsymmetricSaturation().at({"low": -2.0, "high": 1.2})).simulate(blank)
         train.append(blank.with_(y=y + 1e-3 * np.std(y) * rng.standard_normal(y.shape)))
     bench = Workbench.of(axis, train, "zero")
-    found = find_offsets(Checked(bench, refitted(bench)))
+    found = find_offsets(refitted(bench))
     assert not any(isinstance(gate.value, list) for gate in found.gates)
 
 

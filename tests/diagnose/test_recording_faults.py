@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
-from diagnosis_rig import OFF, recordings, rig
+from diagnosis_rig import OFF, recordings, refitted, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
 from pilfr_casadi.diagnose import Workbench, recording_faults
 from pilfr_casadi.diagnose.floor import measured_floor
-from pilfr_casadi.diagnose.gates import Checked
-from pilfr_casadi.diagnose.preparation import refitted
 from pilfr_casadi.diagnose.recording_faults import (
     find_glitches,
     mend,
@@ -95,7 +93,7 @@ def lost(r, share, side="y", seed=0):
 def test_stale_samples_are_interpolated(side, channel):
     (r,) = recordings(count=1)
     bench = Workbench.of(rig(OFF), [lost(r, 0.1, side)], "zero")
-    found = mend_stale_samples(Checked(bench, refitted(bench)))
+    found = mend_stale_samples(refitted(bench))
     (gate,) = found.gates
     assert (gate.channel, gate.finding, gate.corrected, gate.fault) == (channel, "stale", True, True)
     assert gate.value == pytest.approx(0.1, abs=0.02)
@@ -117,7 +115,7 @@ def test_stale_samples_beside_missing_physics_are_noted(monkeypatch, led):
         monkeypatch.setattr(recording_faults, "accept", lambda now, after, fault: now.then(now.bench, now.fitted))
     (r,) = recordings(laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01}), count=1)
     bench = Workbench.of(rig(OFF), [lost(r, 0.1)], "zero")
-    (gate,) = mend_stale_samples(Checked(bench, refitted(bench))).gates
+    (gate,) = mend_stale_samples(refitted(bench)).gates
     assert (gate.channel, gate.finding, gate.corrected, gate.fault) == ("x2", "stale", False, False)
 
 

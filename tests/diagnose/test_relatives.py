@@ -121,6 +121,13 @@ def test_a_parameter_that_varies_with_its_own_coordinate_is_a_force_at_that_port
     assert in_place_of_variation(bench, best, [replace(s, port="elsewhere") for s in scored]) == []
 
 
+def test_no_force_acts_as_a_parameter_that_an_output_reads(tiny):
+    bench, refit = tiny
+    simulator = bench.simulator
+    read = replace(bench, simulator=replace(simulator, outputs=lambda x, p: {"pos": x.pos * (1 + p.k)}))
+    assert forces_of_change(read, refit, "parameter:k", np.full(len(bench.recordings[0]), 2.0)) == {}
+
+
 def test_a_law_that_varies_is_compared_with_laws_of_its_own_port(tiny):
     bench, refit = tiny
     kind = scheduled(LinearStiffness, "z", "linear")

@@ -13,6 +13,7 @@ from pilfr_casadi import laws
 from pilfr_casadi._base import Interrupt, Stages
 from pilfr_casadi.diagnose import Workbench, correction, preparation
 from pilfr_casadi.diagnose.floor import Floor
+from pilfr_casadi.diagnose.gates import Checked
 from pilfr_casadi.diagnose.screen import flexible_shares
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.trials import Trial, Trials
@@ -223,10 +224,10 @@ def test_a_law_that_only_led_the_simulator_out_of_a_dead_end_is_no_physics():
 def stuck_refit(monkeypatch):
     """Recordings that lack nothing, of a simulator whose refit stays in a local minimum."""
 
-    def stuck(bench):
-        return bench.fit(bench.simulator, solver=GaussNewton(max_iterations=1))
+    def stuck(bench, gates=()):
+        return Checked(bench, bench.fit(bench.simulator, solver=GaussNewton(max_iterations=1)), gates)
 
-    monkeypatch.setattr(preparation, "refitted", stuck)
+    monkeypatch.setattr(preparation, "first_refit", stuck)
     return recordings(None, count=1)
 
 

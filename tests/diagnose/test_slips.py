@@ -9,8 +9,8 @@ from cart import cart
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
-from pilfr_casadi.diagnose.channel_faults import correct_gross_slip, scale_channels, scale_time
-from pilfr_casadi.diagnose.preparation import prepare
+from pilfr_casadi.diagnose.channel_faults import accept_best, find_gross_slips, scale_channels, scale_time
+from pilfr_casadi.diagnose.preparation import first_refit, prepare
 from pilfr_casadi.diagnose.workbench import Workbench
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import discretise
@@ -95,19 +95,20 @@ def test_a_check_tells_gross_faults_of_channels_and_assesses_corrected_recording
     assert found.next_record.startswith("Correct the recordings first") == bool(fault)
 
 
-def test_half_of_the_time_is_left_to_try_gross_faults():
+def test_half_of_the_time_is_left_to_try_gross_faults(monkeypatch):
     """A slow simulator was fitted to exchanged channels until the time was over."""
     u, y = recorded()
     r = Recording(u, y * [1e3, 1.0], DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero")
-    bench, given = replace(Workbench.of(tanks(1.15), [r], "zero"), deadline=time.perf_counter() + 100), []
+    given, fit = [], Workbench.fit
 
-    def fit(one):
-        given.append(one.deadline - time.perf_counter())
-        return one.fit(one.simulator)
+    def timed(bench, *args, **options):
+        given.append(bench.deadline - time.perf_counter())
+        return fit(bench, *args, **options)
 
-    corrected, faults = correct_gross_slip(bench, fit)
-    assert [g.value for g in faults] == [1e-3] and 40 < given[0] < 51
-    assert np.allclose(corrected.recordings[0].y, y) and corrected.deadline == bench.deadline
+    monkeypatch.setattr(Workbench, "fit", timed)
+    found = prepare(tanks(1.15), [r], "zero", "auto", until=time.perf_counter() + 100)
+    assert [g.value for g in found.gates if g.fault] == [1e-3] and 40 < given[0] < 51 and given[1] > 90
+    assert np.allclose(found.bench.recordings[0].y, y)
 
 
 def with_still_output(wrong):
@@ -127,7 +128,7 @@ def with_still_output(wrong):
 @pytest.mark.parametrize("wrong", [True, False])
 def test_an_output_that_stands_still_hides_no_gross_fault(wrong):
     bench = with_still_output(wrong)
-    faults = correct_gross_slip(bench, lambda b: b.fit(b.simulator))[1]
+    faults = accept_best(first_refit(bench), find_gross_slips(bench)).gates
     assert [(g.channel, g.value) for g in faults] == [("lower", 1e-3)] * wrong
 
 
@@ -138,15 +139,16 @@ def test_the_cost_of_a_run_that_diverges_is_infinite():
     assert bench.run_given(bench.simulator).cost == np.inf
 
 
-def test_an_interrupt_in_the_first_fit_leaves_the_recordings_as_they_are():
-    bench = with_still_output(wrong=True)
+def test_an_interrupt_in_the_first_fit_leaves_the_recordings_as_they_are(monkeypatch):
+    given, fit = with_still_output(wrong=True), Workbench.fit
 
-    def fit(one):
-        one.interrupt.pressed = True
-        return one.fit(one.simulator)
+    def pressed(bench, *args, **options):
+        bench.interrupt.pressed = True
+        return fit(bench, *args, **options)
 
-    corrected, faults = correct_gross_slip(bench, fit)
-    assert faults == () and corrected is bench
+    monkeypatch.setattr(Workbench, "fit", pressed)
+    found = prepare(given.simulator, given.recordings, "zero", "auto")
+    assert [g.finding for g in found.gates] == ["unchecked"] and found.bench.recordings == given.recordings
 
 
 @pytest.mark.parametrize("alike", [True, False])
