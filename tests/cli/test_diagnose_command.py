@@ -375,7 +375,7 @@ def test_the_demonstration_finds_what_its_rig_hides(capsys, tmp_path, catalogue)
 def test_an_interrupted_diagnosis_says_so(files):
     code = "import sys; from pilfr_casadi.cli import main; sys.exit(main(sys.argv[1:]))"
     process = subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, arguments(files))],
+        [sys.executable, "-c", code, *map(str, arguments(files, "--hold", "zero", "--initial", "zero"))],
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -383,7 +383,7 @@ def test_an_interrupted_diagnosis_says_so(files):
     )
     try:
         assert "simulator:" in process.stdout.readline()
-        time.sleep(2.0)
+        time.sleep(1.0)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
     finally:

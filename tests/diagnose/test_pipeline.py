@@ -11,6 +11,7 @@ from test_timing import shaken, spring
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator, laws
+from pilfr_casadi.diagnose.preparation import prepare
 
 
 def diagnosed(simulator, r, tried=(), press="", after="", **options):
@@ -32,11 +33,16 @@ def diagnosed(simulator, r, tried=(), press="", after="", **options):
     return found, stages
 
 
-@pytest.mark.parametrize("said", [None, "zero"])
+@pytest.mark.parametrize("said", [None, pytest.param("zero", marks=pytest.mark.slow)])
 def test_how_inputs_are_held_is_asked_of_the_data_unless_it_is_said(said):
-    found = pilfr.diagnose(spring(), shaken("linear", m=1200), hold=said, laws=())
+    found = pilfr.diagnose(spring(), shaken("linear", m=500), hold=said, laws=(), workers=1)
     assert found.hold == (said or "linear")
     assert (found.errors["train"]["after"] < 1e-3) is (said is None)
+
+
+def test_a_hold_that_is_said_is_not_asked_of_the_data():
+    found = prepare(spring(), [shaken("linear", m=500)], "zero", "auto")
+    assert found.bench.hold == "zero" and found.without.cost > 1e-3**2
 
 
 def stiffened(k_3, m, **options):

@@ -97,7 +97,7 @@ def test_hysteresis_of_an_actuator():
     r, w = np.linspace(0.05, 0.8, 16), np.linspace(0.12, 0.0, 16)
 
     def measured(seed):
-        rng, t = np.random.default_rng(seed), np.arange(900) * 0.01
+        rng, t = np.random.default_rng(seed), np.arange(500) * 0.01
         u = sum(np.sin(2 * np.pi * f * t + p) for f, p in zip((0.3, 0.7, 1.1), rng.uniform(0, 6, 3), strict=True)) / 2
         memory, y = np.zeros(16), []
         for value in u:

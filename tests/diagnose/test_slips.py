@@ -43,8 +43,8 @@ def recorded():
 def test_exchanged_channels_are_told(exchanged):
     u, y = recorded()
     u, y = (u[:, ::-1] if exchanged == "inputs" else u), (y[:, ::-1] if exchanged == "outputs" else y)
-    r = Recording(u, y, DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero")
-    found = pilfr.diagnose(tanks(1.15), r, laws=None if exchanged == "nothing" else ())
+    r = Recording(u[:600], y[:600], DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero")
+    found = pilfr.diagnose(tanks(1.15), r, laws=None if exchanged == "nothing" else (), workers=1)
     if exchanged == "nothing":
         assert found.verdict == "complete" and not found.gates
         return

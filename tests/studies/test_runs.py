@@ -418,7 +418,7 @@ def test_starts_at_the_best_linear_approximation(capsys, folder):
 
 
 def test_regularization_in_a_run(folder):
-    text = RUN.replace("[0, 1, 2]", "0").replace("operators = 3", "operators = 6")
+    text = RUN.replace("[0, 1, 2]", "0").replace("operators = 3", "operators = 4")
     (folder / "rig.toml").write_text(text + "\n[regularization]\npath = [1e-4, 1e-3]\n")
     sparse = pilfr.run(folder / "rig.toml")
     assert 1 <= sparse.manifest["jobs"]["seed-0"]["operators_used"] <= 3
