@@ -57,6 +57,8 @@ WRITTEN = {
 }
 LONG = {
     "combined_elements",
+    "known_blocks",
+    "ordered_thresholds",
     "mpc_piezo",
     "baselines",
     "own_law",

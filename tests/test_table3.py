@@ -38,6 +38,7 @@ def small(realizations=3, **options):
     return measure(800.0, realizations=realizations, n_period=1024, **{"platform": SMALL, **options})
 
 
+@pytest.mark.slow
 def test_the_platform_is_in_steady_state_and_hysteretic():
     u = np.array([10 * np.sin(2 * np.pi * np.arange(256) / 256)])
     one, two = (SMALL.steady(u, settle=n) for n in (6, 8))

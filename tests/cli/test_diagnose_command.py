@@ -320,6 +320,7 @@ def test_a_column_missing_in_the_recordings_is_reported(capsys, files, truth, mo
     assert status == 130 and seen["outputs"] == ("position", "speed"), err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_a_saved_model_is_diagnosed_to_the_end(capsys, files, truth, catalogue):
     """A fitted PI-LFR in place of a simulator file: its matrices are parameters of the simulator."""

@@ -104,6 +104,7 @@ def findings(r, off=1.15):
     return [(g.channel, g.finding) for g in prepare(tank(off), [r], "zero", "auto").gates]
 
 
+@pytest.mark.slow
 def test_a_lag_is_not_taken_for_a_late_recorder():
     lagging, r = tank().with_element("sensor:lower", Lag().at({"T": 8 * DT})), recorded(30.0)
     r = r.with_(initial=[30.0, 30.0])

@@ -68,6 +68,7 @@ def test_a_wrong_capacity_is_told_in_place_of_a_curve_of_the_inflow():
     assert found.parameters["area"]["refit_with"] == pytest.approx(1.3, rel=0.02)
 
 
+@pytest.mark.slow
 def test_two_wrong_values_are_told_in_place_of_a_gain_of_the_torque_and_a_curve_of_the_angle():
     arm = Simulator(
         lambda x, u, p: {"angle": x.speed, "speed": (u.torque - p.d * x.speed - p.weight * ca.sin(x.angle)) / p.J},

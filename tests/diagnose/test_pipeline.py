@@ -106,7 +106,9 @@ def test_a_channel_that_is_early_beside_something_unexplained_stays_shifted():
     assert [(g.channel, g.finding, g.value) for g in found.gates] == [("pos, vel", "alignment", -0.12)]
 
 
-@pytest.mark.parametrize(("after", "answered"), [("conclusion", True), ("checks and refit", False)])
+@pytest.mark.parametrize(
+    ("after", "answered"), [pytest.param("conclusion", True, marks=pytest.mark.slow), ("checks and refit", False)]
+)
 def test_an_answer_that_is_there_outlives_an_interrupt_of_what_adds_to_it(leaking, after, answered):
     """In the conclusion, other ports are searched where no law at a declared one explains the mismatch."""
     r = leaking.with_(u=leaking.u[::-1])  # no shift explains it
@@ -154,7 +156,11 @@ def recordings_of(placed):
 
 
 @pytest.mark.parametrize(
-    "missing", [(), (laws.CoulombFriction().at({"F_c": 40.0, "v_0": 0.02}),)], ids=["none", "friction"]
+    "missing",
+    [
+        pytest.param((), id="none"),
+        pytest.param((laws.CoulombFriction().at({"F_c": 40.0, "v_0": 0.02}),), id="friction", marks=pytest.mark.slow),
+    ],
 )
 def test_a_simulator_without_a_free_parameter_is_diagnosed(missing):
     held = rig()

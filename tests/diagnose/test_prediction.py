@@ -15,7 +15,7 @@ from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness
 from pilfr_casadi.simulators import discretise
 
-DT, SAMPLES = 0.01, 900
+DT, SAMPLES = 0.01, 1500
 GAINS = 60.0, 8.0  # of the controller, which the simulator does not know
 
 

@@ -39,7 +39,7 @@ def recorded():
     return u, y + 2e-3 * rng.standard_normal(y.shape)
 
 
-@pytest.mark.parametrize("exchanged", ["outputs", "inputs", "nothing"])
+@pytest.mark.parametrize("exchanged", ["outputs", pytest.param("inputs", marks=pytest.mark.slow), "nothing"])
 def test_exchanged_channels_are_told(exchanged):
     u, y = recorded()
     u, y = (u[:, ::-1] if exchanged == "inputs" else u), (y[:, ::-1] if exchanged == "outputs" else y)

@@ -84,7 +84,7 @@ def slow_and_late(late):
     return simulator, Recording(u[late:, None], y[:-late], 0.02, ("force",), ("pos",))
 
 
-@pytest.mark.parametrize("late", [16, 22])
+@pytest.mark.parametrize("late", [16, pytest.param(22, marks=pytest.mark.slow)])
 def test_a_late_output_is_found_though_the_refit_follows_it_by_wrong_values(late):
     simulator, recording = slow_and_late(late)
     bench = Workbench.of(simulator, [recording], "zero")
@@ -161,7 +161,7 @@ def test_a_search_finds_a_shift_beside_its_first_law():
     assert found.shift.sentence.endswith("(beside Coulomb friction (smooth) at ground).")
 
 
-def two_motors(m=1500, late=0, seed=5):
+def two_motors(m=800, late=0, seed=5):
     """A body that two motors drive with their own gains; the second input is recorded so many samples late."""
     simulator = Simulator(
         lambda x, u, p: {"v": p.a * u.left + p.b * u.right - p.d * x.v},

@@ -6,9 +6,12 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
+from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench, port_signals
 from pilfr_casadi.diagnose.evidence import log_prior
+from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.proof import placebo
+from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.laws import (
     VARIATIONS,
     CoulombFriction,
@@ -20,7 +23,7 @@ from pilfr_casadi.laws import (
     varying,
 )
 
-DT, SAMPLES = 5e-3, 800
+DT, SAMPLES = 5e-3, 1500
 R, L, K, J, C = 1.3, 0.04, 0.08, 2e-3, 6e-3
 
 
@@ -149,6 +152,7 @@ def diagnosis():
     return pilfr.diagnose(motor(), train, test=test, laws=tried, effects=1, hold="zero", workers=1)
 
 
+@pytest.mark.slow
 def test_the_parameter_and_its_signal_are_named(diagnosis):
     """The answer says what varies with what, by how much, and predicts the test to the noise."""
     (effect,) = diagnosis.effects
@@ -164,6 +168,7 @@ def test_the_parameter_and_its_signal_are_named(diagnosis):
     assert effect.placebo["own"] > 0.5 > effect.placebo["unrelated"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_the_corrected_simulator_is_exported_and_reported(diagnosis, tmp_path):
     """It is an exported step like any other, and the report draws the parameter over its signal."""
@@ -177,6 +182,20 @@ def test_the_corrected_simulator_is_exported_and_reported(diagnosis, tmp_path):
     assert "How R varies with temperature." in page
     assert "variation of R with temperature" in page
     assert "varying(&#39;temperature&#39;, &#39;tilt&#39;)" in page or "varying('temperature', 'tilt')" in page
+
+
+def test_a_search_finds_the_parameter_and_its_signal():
+    bench = Workbench.of(motor(), [recorded(3, (20, 80))], "zero")
+    floor = Floor(0.01 * bench.scale, "estimated")
+    tried = (CoulombFriction, VaryingParameter)
+    found = Search(bench, bench.fit(motor()), floor, tried, 1, Stages(lambda *_: None), aligned=True).run(1)
+    (placed,) = found.best.laws
+    assert (placed.port, placed.law.id, placed.law.form) == (
+        "parameter:R",
+        "varying_parameter",
+        "scheduled by temperature",
+    )
+    assert found.best.mean_square**0.5 < 0.011
 
 
 def test_a_curve_starts_as_the_variation_that_it_refines():

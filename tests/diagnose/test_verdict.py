@@ -103,7 +103,9 @@ def test_slow_physics_outside_the_catalogue_is_no_slow_noise(seed):
     assert found.verdict == "unexplained", found.sentence
 
 
-@pytest.mark.parametrize(("k", "T", "share", "load"), [(1.0, 20.0, 0.002, 40.0), (4.0, 30.0, 0.01, 30.0)])
+@pytest.mark.parametrize(
+    ("k", "T", "share", "load"), [(1.0, 20.0, 0.002, 40.0), pytest.param(4.0, 30.0, 0.01, 30.0, marks=pytest.mark.slow)]
+)
 def test_creep_under_a_load_before_the_recording_is_no_slow_noise(k, T, share, load):
     """The law begins at a state that the recorded inputs never bring about."""
     u = 10 * np.asarray(multisine(1200, f_max=2.0, fs=20.0, rng=np.random.default_rng(2))).reshape(-1, 1)
