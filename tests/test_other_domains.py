@@ -54,6 +54,7 @@ def test_answers_are_judged():
     assert judge("complete coil", "complete", []) == "right"
 
 
+@pytest.mark.slow
 def test_the_same_number_draws_the_same_rig():
     (_, train, test), (_, again, _) = (recorded("valve", 0) for _ in range(2))
     assert np.array_equal(train.y, again.y) and not np.array_equal(train.y, test.y)

@@ -81,7 +81,7 @@ def truth():
 
 @pytest.fixture
 def catalogue(monkeypatch):
-    """Shorten the catalogue to some laws; the README's snippet and many slow tests search the whole one."""
+    """Shorten the catalogue to some laws; many slow tests search the whole one."""
 
     def shorten(*laws):
         monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.arguments"), "CATALOGUE", laws)

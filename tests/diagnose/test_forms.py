@@ -29,6 +29,7 @@ def test_loops_that_stiffen_are_told_from_those_that_soften():
     assert errors["after"] < 0.1 * errors["before"]
 
 
+@pytest.mark.slow
 def test_a_spring_that_hardens_and_differs_between_the_directions_is_one_law():
     """Neither a cubic nor a quadratic force alone, nor a clearance that is off centre."""
     true = rig().with_element("ground", AsymmetricCubicStiffness().at({"k_3": 3e4, "b": -0.04}))

@@ -51,6 +51,7 @@ def test_a_value_that_cannot_go_where_it_should_is_told(known):
     assert found.parameters["k"]["refit_with"] == pytest.approx(400, rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_wrong_capacity_is_told_in_place_of_a_curve_of_the_inflow():
     tank = Simulator(
         lambda x, u, p: {"level": (u.inflow - p.a * x.level) / p.area},

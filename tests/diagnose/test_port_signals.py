@@ -63,7 +63,8 @@ def test_a_law_varies_with_a_signal_of_its_port(loaded, name):
     assert np.std(simulated - loaded.y) < 0.01 * np.std(loaded.y)
 
 
-@pytest.mark.parametrize("name", ["gear", pytest.param("angle", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["gear", "angle"])
 def test_friction_that_grows_with_the_load_is_named(loaded, name):
     found = diagnose(servo(name), loaded, laws=(CoulombFriction, ViscousDamping), effects=1, workers=1)
     (effect,) = found.effects

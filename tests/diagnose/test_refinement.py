@@ -61,6 +61,7 @@ def test_weights_and_thresholds_are_bounded_below_by_zero(refined):
     assert len(refined.weights) == 12 and np.all(np.diff(refined.thresholds) >= 0)
 
 
+@pytest.mark.slow
 def test_the_loading_curve_is_recovered(many):
     refined = many.refine(operators=12, kind="stop")
     z, w = refined.loading_curve
@@ -83,6 +84,7 @@ def test_it_is_exported_and_drawn(many, refined):
     figure.canvas.draw()
 
 
+@pytest.mark.slow
 def test_where_three_operators_suffice_the_diagnosed_law_stays():
     three = StopHysteresis().at({"w": [150.0, 100.0, 60.0, 0, 0, 0], "r": [0.006, 0.02, 0.05, 1, 1, 1]})
     diagnosis = diagnosed(three, seeds=(0,))
