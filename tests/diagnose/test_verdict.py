@@ -85,7 +85,7 @@ def drifted(seed, laws, **options):
 
 def test_the_drift_of_a_sensor_is_not_called_missing_physics():
     """Its few independent samples follow any force a little, and neighbouring blocks are alike."""
-    assert drifted(1, (StaticPower,), effects=1) == "complete"
+    assert drifted(3, (StaticPower,), effects=1) == "complete"
 
 
 @pytest.mark.slow
