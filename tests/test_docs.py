@@ -57,6 +57,8 @@ WRITTEN = {
 }
 LONG = {
     "combined_elements",
+    "known_blocks",
+    "ordered_thresholds",
     "mpc_piezo",
     "baselines",
     "own_law",
@@ -203,19 +205,28 @@ def test_links_lead_somewhere(name):
             assert "://" in link or (ROOT / name).parent.joinpath(link).exists(), link
 
 
+@pytest.fixture
+def few_laws(monkeypatch):
+    """Shorten the catalogue to two laws."""
+    few = (pilfr.laws.CubicStiffness, pilfr.laws.PreslidingFriction)
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.arguments"), "CATALOGUE", few)
+
+
 @pytest.mark.usefixtures("blank_figures")
-def test_python_of_the_readme(folder, script):
+@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_python_of_the_readme(folder, script, request, whole):
+    """With a short catalogue, and with the whole one as a reader runs it."""
+    if not whole:
+        request.getfixturevalue("few_laws")
     (folder / "readme.py").write_text("\n".join(snippets("python", "README.md")), encoding="utf-8")
     said = script(folder / "readme.py", folder)
     assert "friction" in said and (folder / "report" / "report.html").exists()
     assert (folder / "rig.json").exists()
 
 
-@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.usefixtures("blank_figures", "few_laws")
 def test_commands_of_the_readme(folder, monkeypatch):
     """In this process and with a short catalogue: the snippet in Python searches the whole one on the same data."""
-    few = (pilfr.laws.CubicStiffness, pilfr.laws.PreslidingFriction)
-    monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.arguments"), "CATALOGUE", few)
     monkeypatch.chdir(folder)
     assert commands("README.md")
     for arguments in commands("README.md"):

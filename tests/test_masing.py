@@ -180,7 +180,9 @@ def event_located(u, fs, hold):
 
 
 @pytest.mark.parametrize("hold", ["zero", "linear"])
-@pytest.mark.parametrize(("name", "part"), [("train", slice(0, 700)), ("sweep", slice(0, 700))])
+@pytest.mark.parametrize(
+    ("name", "part"), [pytest.param("train", slice(0, 700), marks=pytest.mark.slow), ("sweep", slice(0, 700))]
+)
 def test_agrees_with_event_located_solution(data, name, part, hold):
     u = data.records[name].u[part, 0]
     reference = event_located(u, FS, hold)
@@ -189,7 +191,7 @@ def test_agrees_with_event_located_solution(data, name, part, hold):
         np.testing.assert_allclose(getattr(motion, name), expected, rtol=0, atol=1e-8 * expected.std(), err_msg=name)
 
 
-@pytest.mark.parametrize("name", ["train", "multisine", "sweep"])
+@pytest.mark.parametrize("name", [*(pytest.param(n, marks=pytest.mark.slow) for n in ("train", "multisine")), "sweep"])
 def test_step_halving(data, name):
     """Fourth order through all reversals and closing loops; the default is good to 1e-5."""
     u = data.records[name].u

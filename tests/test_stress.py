@@ -250,7 +250,7 @@ def test_a_stress_case_is_the_same_again():
     kept(one)
 
 
-@pytest.mark.parametrize(("name", "index"), [("wrong-fixed", 0), ("faults", 39)])
+@pytest.mark.parametrize(("name", "index"), [pytest.param("wrong-fixed", 0, marks=pytest.mark.slow), ("faults", 39)])
 def test_a_case_holds_what_its_set_says(name, index):
     kept(stress.case(seed_of(name, index)))
 

@@ -38,11 +38,12 @@ def small(realizations=3, **options):
     return measure(800.0, realizations=realizations, n_period=1024, **{"platform": SMALL, **options})
 
 
+@pytest.mark.slow
 def test_the_platform_is_in_steady_state_and_hysteretic():
-    u = np.array([10 * np.sin(2 * np.pi * np.arange(512) / 512)])
+    u = np.array([10 * np.sin(2 * np.pi * np.arange(256) / 256)])
     one, two = (SMALL.steady(u, settle=n) for n in (6, 8))
     assert np.max(np.abs(one - two)) < 1e-6 * np.ptp(two)
-    quarter = 512 // 4
+    quarter = 256 // 4
     up, down = two[0, 0], two[0, 2 * quarter]  # at zero voltage on the way up and down
     assert down - up > 0.05 * np.ptp(two)
     half = SMALL.steady(u / 2, settle=6)

@@ -417,9 +417,9 @@ def test_the_piezo_problem_names_its_remedy(capsys, tmp_path, monkeypatch):
 
 
 def test_an_interrupted_run_writes_the_best_so_far(tmp_path):
-    path = write_csv(tmp_path / "train.csv", m=2000)
+    path = write_csv(tmp_path / "train.csv", m=600)
     program = "import sys; from pilfr_casadi.cli import main; sys.exit(main(sys.argv[1:]))"
-    names = ("--inputs", "u", "--outputs", "y", "--nx", "3", "--operators", "20", "--starts", "2000")
+    names = ("--inputs", "u", "--outputs", "y", "--nx", "1", "--operators", "5", "--starts", "2000")
     process = subprocess.Popen(
         [sys.executable, "-c", program, "fit", str(path), *names, "--out", str(tmp_path / "out")],
         env={**os.environ, "OMP_NUM_THREADS": "1"},
@@ -428,7 +428,7 @@ def test_an_interrupted_run_writes_the_best_so_far(tmp_path):
     )
     try:
         assert any(line.startswith("engine:") for line in process.stdout)
-        time.sleep(3)
+        time.sleep(2)
         process.send_signal(signal.SIGINT)
         out, _ = process.communicate(timeout=60)
     finally:

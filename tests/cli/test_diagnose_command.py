@@ -81,7 +81,7 @@ def truth():
 
 @pytest.fixture
 def catalogue(monkeypatch):
-    """Shorten the catalogue to some laws; the README's snippet and many slow tests search the whole one."""
+    """Shorten the catalogue to some laws; many slow tests search the whole one."""
 
     def shorten(*laws):
         monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.arguments"), "CATALOGUE", laws)
@@ -320,6 +320,7 @@ def test_a_column_missing_in_the_recordings_is_reported(capsys, files, truth, mo
     assert status == 130 and seen["outputs"] == ("position", "speed"), err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_a_saved_model_is_diagnosed_to_the_end(capsys, files, truth, catalogue):
     """A fitted PI-LFR in place of a simulator file: its matrices are parameters of the simulator."""
@@ -375,7 +376,7 @@ def test_the_demonstration_finds_what_its_rig_hides(capsys, tmp_path, catalogue)
 def test_an_interrupted_diagnosis_says_so(files):
     code = "import sys; from pilfr_casadi.cli import main; sys.exit(main(sys.argv[1:]))"
     process = subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, arguments(files))],
+        [sys.executable, "-c", code, *map(str, arguments(files, "--hold", "zero", "--initial", "zero"))],
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -383,7 +384,7 @@ def test_an_interrupted_diagnosis_says_so(files):
     )
     try:
         assert "simulator:" in process.stdout.readline()
-        time.sleep(2.0)
+        time.sleep(1.0)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
     finally:

@@ -190,7 +190,7 @@ def test_an_observer_does_not_correct_the_time():
     assert np.array_equal(P[1], np.zeros(2))
 
 
-@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize("late", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_corrected_simulator_is_inverted(corrected, late):
     found, train, test = corrected
     if late:  # a shift register carries the input on, which memory of operators does not

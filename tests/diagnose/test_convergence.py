@@ -28,12 +28,12 @@ def test_a_fit_that_ended_early_is_continued_to_its_minimum() -> None:
 
 def test_a_fit_that_does_not_converge_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     """In the findings, and so in what is printed."""
-    options = {"hold": "zero", "effects": 0, "workers": 1}
-    found = pilfr.diagnose(rig(), recorded(rig(), 0), **options)
+    options = {"hold": "zero", "effects": 0, "laws": (), "workers": 1}
+    found = pilfr.diagnose(rig(), recorded(rig(), 0, samples=300), **options)
     assert "convergence" not in [g.finding for g in found.gates]
     pipeline = importlib.import_module("pilfr_casadi.diagnose.pipeline")  # `pilfr_casadi.diagnose` is the function
     monkeypatch.setattr(pipeline, "converge", lambda bench, fitted, _: replace(fitted, status=Status.MAX_ITERATIONS))
-    found = pilfr.diagnose(rig(), recorded(rig(), 0), **options)
+    found = pilfr.diagnose(rig(), recorded(rig(), 0, samples=300), **options)
     (note,) = (g for g in found.gates if g.finding == "convergence")
     assert "Not converged: the iteration limit was reached" in note.sentence
     assert note.sentence in str(found)

@@ -17,7 +17,10 @@ def friction() -> pilfr.Recording:
     return recorded(rig().with_element("ground", CoulombFriction().at({"F_c": 2.0, "v_0": 0.01})), 0)
 
 
-@pytest.mark.parametrize("stage", ["checks and refit", "screen", "fits", "conclusion", "proof"])
+@pytest.mark.parametrize(
+    "stage",
+    ["checks and refit", "fits", "conclusion", *(pytest.param(s, marks=pytest.mark.slow) for s in ("screen", "proof"))],
+)
 def test_ctrl_c_once_gives_an_answer(stage: str) -> None:
     """The bar raises an interrupt again if CasADi may have swallowed it, but not one that was handled."""
     laws: tuple[type[Law], ...] = (CoulombFriction,)

@@ -70,7 +70,9 @@ def test_a_law_in_line_with_a_spring_of_any_curve_follows_the_truth(kind, extra,
     assert rig.nrmse(record) > 0.1
 
 
-@pytest.mark.parametrize(("seen", "kind"), [("motor", ElasticDrive), ("link", ElasticDriveSeenAtLoad)])
+@pytest.mark.parametrize(
+    ("seen", "kind"), [pytest.param("motor", ElasticDrive, marks=pytest.mark.slow), ("link", ElasticDriveSeenAtLoad)]
+)
 def test_a_rotor_before_a_joint_is_a_mass_behind_it(seen, kind):
     """Without friction, the motor and the link may change places."""
     stiffness, damping, share = 12.0, 0.05, 0.4

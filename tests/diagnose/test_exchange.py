@@ -71,6 +71,7 @@ def test_laws_that_follow_better_at_other_ports_go_there(seed):
     assert min(e.confidence for e in found.effects) > 0.8
 
 
+@pytest.mark.slow
 def test_a_law_that_only_asks_for_finer_steps_is_no_effect():
     """A sharp dead zone of interpolated inputs needs fine steps; a fast mode beside it only has them."""
     rng = np.random.default_rng(1)

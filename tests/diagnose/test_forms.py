@@ -18,9 +18,9 @@ from pilfr_casadi.laws import (
 def test_loops_that_stiffen_are_told_from_those_that_soften():
     truth = {"k_h": 300.0, "q_0": 0.05, "h": 1.4, "n": 1.0}
     true = rig().with_element("ground", StiffeningBoucWen().at(truth))
-    train, test = recorded(true, 0), recorded(true, 1)
-    laws = (CubicStiffness, CoulombFriction, BoucWen, StiffeningBoucWen)
-    found = pilfr.diagnose(rig(430.0, 5.0), train, test=test, laws=laws)
+    train, test = recorded(true, 0, samples=500), recorded(true, 1, samples=400)
+    laws = (CoulombFriction, BoucWen, StiffeningBoucWen)
+    found = pilfr.diagnose(rig(430.0, 5.0), train, test=test, laws=laws, effects=1, hold="zero", workers=1)
     assert [(e.port, e.law, e.form) for e in found.effects] == [("ground", "hysteresis", "bouc_wen_stiffening")]
     assert found.effects[0].confidence > 0.9
     own = found.effects[0].parameters
@@ -29,12 +29,13 @@ def test_loops_that_stiffen_are_told_from_those_that_soften():
     assert errors["after"] < 0.1 * errors["before"]
 
 
+@pytest.mark.slow
 def test_a_spring_that_hardens_and_differs_between_the_directions_is_one_law():
     """Neither a cubic nor a quadratic force alone, nor a clearance that is off centre."""
     true = rig().with_element("ground", AsymmetricCubicStiffness().at({"k_3": 3e4, "b": -0.04}))
-    train, test = recorded(true, 0), recorded(true, 1)
+    train, test = recorded(true, 0, samples=500), recorded(true, 1, samples=400)
     tried = (CubicStiffness, AsymmetricCubicStiffness, QuadraticStiffness, OffCentreClearance)
-    found = pilfr.diagnose(rig(430.0, 5.0), train, test=test, laws=tried)
+    found = pilfr.diagnose(rig(430.0, 5.0), train, test=test, laws=tried, effects=1, hold="zero", workers=1)
     assert [(e.port, e.law, e.form) for e in found.effects] == [("ground", "cubic_stiffness", "asymmetric")]
     values = {name: p["value"] for name, p in found.effects[0].parameters.items()}
     assert values == pytest.approx({"k_3": 3e4, "b": -0.04}, rel=0.05)

@@ -93,7 +93,7 @@ def pushed(push, count=1):
     return out
 
 
-@pytest.mark.parametrize("samples", [1, 6])
+@pytest.mark.parametrize("samples", [pytest.param(1, marks=pytest.mark.slow), 6])
 def test_a_shock_is_no_gap(samples):
     push = np.zeros((2500, 1))
     push[1200 : 1200 + samples] = 5000 / samples

@@ -94,14 +94,14 @@ def test_the_code_on_the_page_builds_the_same_simulator(nameless, monkeypatch):
 
 
 def test_a_complete_simulator_is_handed_back_refitted():
-    found = pilfr.diagnose(rig(430.0, 5.0), recorded(rig(), 0), laws=(CubicStiffness,), **OPTIONS)
+    found = pilfr.diagnose(rig(430.0, 5.0), recorded(rig(), 0, samples=400), laws=(CubicStiffness,), **OPTIONS)
     assert (found.verdict, found.learned, found.corrected.elements) == ("complete", (), ())
     assert found.shares["named"] == found.shares["learned"] == 0
 
 
 def test_a_sure_name_that_leaves_nothing_needs_no_learned_force():
     true = rig().with_element("ground", LAWS["ground"])
-    found = pilfr.diagnose(rig(430.0, 5.0), recorded(true, 0), laws=(CubicStiffness,), **OPTIONS)
+    found = pilfr.diagnose(rig(430.0, 5.0), recorded(true, 0, samples=400), laws=(CubicStiffness,), **OPTIONS)
     assert [e.law for e in found.effects] == ["cubic_stiffness"] and found.learned == ()
     assert found.shares["named"] > 0.99 and problems(found.to_dict(), SCHEMA) == []
 

@@ -48,6 +48,7 @@ def test_one_effect_needs_each_hypothesis_once(fits):
     assert set(polished) <= set(found.memo)
 
 
+@pytest.mark.slow
 def test_what_two_effects_are_exchanged_for_is_not_fitted_twice(fits):
     begun, polished = fits
     true = rig().with_element("ground-m1", CUBIC)

@@ -85,7 +85,8 @@ def test_a_noisy_sensor_does_not_hide_whether_a_force_explains_the_innovations(r
 
 
 def test_a_small_effect_in_the_quiet_sensor_is_named(recorded):
-    found = pilfr.diagnose(mass(1000.0, 10.0), recorded(friction=True), laws=[CoulombFriction], engine="vm")
+    given = recorded(friction=True).slice(0, 1000)
+    found = pilfr.diagnose(mass(1000.0, 10.0), given, laws=[CoulombFriction], effects=1, engine="vm", workers=1)
     assert [(e.port, e.law) for e in found.effects] == [("ground", "coulomb_friction")]
     assert found.effects[0].confidence > 0.9
     assert found.effects[0].parameters["F_c"]["value"] == pytest.approx(0.1, rel=0.05)

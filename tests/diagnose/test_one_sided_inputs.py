@@ -106,6 +106,6 @@ def _prepared(u, y):
 def test_a_parameter_at_its_bound_is_said():
     tight = stage()
     bound = {**tight.parameters, "k": Parameter(55.0, bounds=(54, 200))}
-    u = levels(3)
-    d = pilfr.diagnose(tight.with_parameters(bound), recorded(u, moved(u), 4), laws=())
+    u = levels(3, 400)
+    d = pilfr.diagnose(tight.with_parameters(bound), recorded(u, moved(u), 4), laws=(), effects=0, workers=1)
     assert "k (54) came out at its bound" in str(d)

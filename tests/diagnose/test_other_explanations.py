@@ -14,7 +14,12 @@ from pilfr_casadi import Parameter, Recording, Simulator, laws
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.floor import Floor
-from pilfr_casadi.diagnose.other_explanations import find_pinned_parameters, find_untried_laws, find_varying_values
+from pilfr_casadi.diagnose.other_explanations import (
+    find_pinned_parameters,
+    find_undeclared_port,
+    find_untried_laws,
+    find_varying_values,
+)
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.verdict import NamedEffect, Posterior
 from pilfr_casadi.engine import make_engine
@@ -29,7 +34,13 @@ def short(*hidden, **options):
     return r.slice(0, 1200)
 
 
-@pytest.mark.parametrize("known", [{"fixed": True}, {"value": 1.0, "bounds": (0.3, 5.0)}], ids=["fixed", "far"])
+@pytest.mark.parametrize(
+    "known",
+    [
+        pytest.param({"fixed": True}, id="fixed"),
+        pytest.param({"value": 1.0, "bounds": (0.3, 5.0)}, id="far", marks=pytest.mark.slow),
+    ],
+)
 def test_a_value_that_cannot_go_where_it_should_is_told(known):
     simulator = mass(430.0, 5.0)  # the slow suite asks the same of two masses
     p = simulator.parameters
@@ -40,6 +51,7 @@ def test_a_value_that_cannot_go_where_it_should_is_told(known):
     assert found.parameters["k"]["refit_with"] == pytest.approx(400, rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_wrong_capacity_is_told_in_place_of_a_curve_of_the_inflow():
     tank = Simulator(
         lambda x, u, p: {"level": (u.inflow - p.a * x.level) / p.area},
@@ -57,6 +69,7 @@ def test_a_wrong_capacity_is_told_in_place_of_a_curve_of_the_inflow():
     assert found.parameters["area"]["refit_with"] == pytest.approx(1.3, rel=0.02)
 
 
+@pytest.mark.slow
 def test_two_wrong_values_are_told_in_place_of_a_gain_of_the_torque_and_a_curve_of_the_angle():
     arm = Simulator(
         lambda x, u, p: {"angle": x.speed, "speed": (u.torque - p.d * x.speed - p.weight * ca.sin(x.angle)) / p.J},
@@ -70,8 +83,8 @@ def test_two_wrong_values_are_told_in_place_of_a_gain_of_the_torque_and_a_curve_
         },
     )
     rng = np.random.default_rng(5)
-    torque = 0.4 * np.repeat(rng.standard_normal(80), 10)
-    r = Recording(torque, np.zeros(800), 0.01, ("torque",), ("angle",), hold="zero", initial="zero")
+    torque = 0.4 * np.repeat(rng.standard_normal(40), 10)
+    r = Recording(torque, np.zeros(400), 0.01, ("torque",), ("angle",), hold="zero", initial="zero")
     true = {"J": Parameter(0.021), "weight": Parameter(0.9), "d": Parameter(0.035)}
     y = arm.with_parameters(true).simulate(r)
     r = r.with_(y=y + 0.003 * np.std(y) * rng.standard_normal(y.shape))
@@ -89,7 +102,7 @@ def test_no_value_is_told_in_place_of_a_law_that_explains_nothing():
     assert find_pinned_parameters(search, Posterior(search.root, 1.0, (named,), 0.0)) is None
 
 
-@pytest.mark.slow  # the positioner below asks the same on fewer ports
+@pytest.mark.slow
 def test_friction_where_no_port_is_declared_is_told_where_it_acts():
     friction = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
     full = rig(OFF)
@@ -204,6 +217,17 @@ def test_laws_that_need_a_known_domain_are_told_where_it_is_unknown(tried, names
     assert all("thermal alone were not tried" in gate.sentence for gate in found)
 
 
+def test_a_law_in_an_equation_without_a_port_is_told_there():
+    blank, _ = recorded(20.0, 0)
+    rubbing = machine().with_element("equation:vel", laws.CoulombFriction().at({"F_c": 0.2, "v_0": 0.02}))
+    y = rubbing.simulate(blank) + 1e-3 * np.random.default_rng(1).standard_normal(blank.y.shape)
+    driven = replace(machine(), ports=(pilfr.Port("drive", {"vel": 1.0}, lambda u: u.force),))
+    search = searched(driven, blank.with_(y=y), tried=(laws.CoulombFriction,))
+    (note,), odds = find_undeclared_port(search)
+    assert (note.channel, note.finding, note.value) == ("vel", "undeclared", "coulomb friction") and odds > 1
+    assert note.sentence.startswith("No declared port reaches it: in the equation of vel, ") and not note.corrected
+
+
 def positioner():
     """A valve's stem on a spring behind a pneumatic chamber, which has the only declared port."""
     return Simulator(
@@ -225,6 +249,7 @@ def positioner():
     )
 
 
+@pytest.mark.slow
 def test_a_law_at_the_sensor_is_weighed_against_friction_where_no_port_is_declared():
     assert positioner().unreached == {"speed"}
     assert [port.name for port in positioner().undeclared] == ["equation:speed"]

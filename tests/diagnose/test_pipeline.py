@@ -11,6 +11,7 @@ from test_timing import shaken, spring
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator, laws
+from pilfr_casadi.diagnose.preparation import prepare
 
 
 def diagnosed(simulator, r, tried=(), press="", after="", **options):
@@ -32,11 +33,16 @@ def diagnosed(simulator, r, tried=(), press="", after="", **options):
     return found, stages
 
 
-@pytest.mark.parametrize("said", [None, "zero"])
+@pytest.mark.parametrize("said", [None, pytest.param("zero", marks=pytest.mark.slow)])
 def test_how_inputs_are_held_is_asked_of_the_data_unless_it_is_said(said):
-    found = pilfr.diagnose(spring(), shaken("linear", m=1200), hold=said, laws=())
+    found = pilfr.diagnose(spring(), shaken("linear", m=500), hold=said, laws=(), workers=1)
     assert found.hold == (said or "linear")
     assert (found.errors["train"]["after"] < 1e-3) is (said is None)
+
+
+def test_a_hold_that_is_said_is_not_asked_of_the_data():
+    found = prepare(spring(), [shaken("linear", m=500)], "zero", "auto")
+    assert found.bench.hold == "zero" and found.without.cost > 1e-3**2
 
 
 def stiffened(k_3, m, **options):
@@ -100,7 +106,9 @@ def test_a_channel_that_is_early_beside_something_unexplained_stays_shifted():
     assert [(g.channel, g.finding, g.value) for g in found.gates] == [("pos, vel", "alignment", -0.12)]
 
 
-@pytest.mark.parametrize(("after", "answered"), [("conclusion", True), ("checks and refit", False)])
+@pytest.mark.parametrize(
+    ("after", "answered"), [pytest.param("conclusion", True, marks=pytest.mark.slow), ("checks and refit", False)]
+)
 def test_an_answer_that_is_there_outlives_an_interrupt_of_what_adds_to_it(leaking, after, answered):
     """In the conclusion, other ports are searched where no law at a declared one explains the mismatch."""
     r = leaking.with_(u=leaking.u[::-1])  # no shift explains it
@@ -148,7 +156,11 @@ def recordings_of(placed):
 
 
 @pytest.mark.parametrize(
-    "missing", [(), (laws.CoulombFriction().at({"F_c": 40.0, "v_0": 0.02}),)], ids=["none", "friction"]
+    "missing",
+    [
+        pytest.param((), id="none"),
+        pytest.param((laws.CoulombFriction().at({"F_c": 40.0, "v_0": 0.02}),), id="friction", marks=pytest.mark.slow),
+    ],
 )
 def test_a_simulator_without_a_free_parameter_is_diagnosed(missing):
     held = rig()

@@ -55,14 +55,16 @@ def loaded(recording):
     return recording.with_(y=y + 1e-4 * np.random.default_rng(4).standard_normal(len(y)))
 
 
-def test_a_law_varies_with_a_signal_of_its_port(loaded):
+@pytest.mark.parametrize("name", ["gear", "angle"])  # the name of a state too
+def test_a_law_varies_with_a_signal_of_its_port(loaded, name):
     law = scheduled(CoulombFriction, "load")
     values = {"F_c": 0.05, "F_c_high": 0.65, "v_0": 0.01, "low": 0.0, "high": 3.0}
-    simulated = servo().with_element("gear", law().at(values)).simulate(loaded)
+    simulated = servo(name).with_element(name, law().at(values)).simulate(loaded)
     assert np.std(simulated - loaded.y) < 0.01 * np.std(loaded.y)
 
 
-@pytest.mark.parametrize("name", ["gear", "angle"])  # the name of a state too
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["gear", "angle"])
 def test_friction_that_grows_with_the_load_is_named(loaded, name):
     found = diagnose(servo(name), loaded, laws=(CoulombFriction, ViscousDamping), effects=1, workers=1)
     (effect,) = found.effects

@@ -28,6 +28,7 @@ def recording(law, samples=900):
     return r.with_(y=y + 0.003 * np.std(y) * rng.standard_normal(y.shape))
 
 
+@pytest.mark.slow
 def test_a_force_constant_that_varies_with_the_position_is_named():
     hidden = laws.scaled(laws.QuadraticStiffness, "current")().at({"k_2": 1.2e6})
     tried = (laws.QuadraticStiffness, laws.CubicStiffness, laws.CoulombFriction)

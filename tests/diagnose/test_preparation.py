@@ -22,6 +22,7 @@ def unsaid(r, u, y, initial="zero"):
     return Recording(u, y, r.dt, r.inputs, r.outputs, initial=initial)
 
 
+@pytest.mark.slow
 def test_a_shift_and_the_hold_are_told_apart():
     """Half a sample more or less, and inputs held or interpolated: the one may look like the other."""
     (r,) = recordings(count=1, hold="linear")
@@ -44,6 +45,7 @@ def of_tanks(y):
     return Recording(recorded()[0], y, DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero")
 
 
+@pytest.mark.slow
 def test_a_wrong_sign_beside_another_zero_is_told():
     y = recorded()[1] * [-1, 1] + [3.0, 0]
     found = prepare(tanks(1.15), [of_tanks(y)], "zero", "auto")

@@ -61,6 +61,7 @@ def test_weights_and_thresholds_are_bounded_below_by_zero(refined):
     assert len(refined.weights) == 12 and np.all(np.diff(refined.thresholds) >= 0)
 
 
+@pytest.mark.slow
 def test_the_loading_curve_is_recovered(many):
     refined = many.refine(operators=12, kind="stop")
     z, w = refined.loading_curve
@@ -83,6 +84,7 @@ def test_it_is_exported_and_drawn(many, refined):
     figure.canvas.draw()
 
 
+@pytest.mark.slow
 def test_where_three_operators_suffice_the_diagnosed_law_stays():
     three = StopHysteresis().at({"w": [150.0, 100.0, 60.0, 0, 0, 0], "r": [0.006, 0.02, 0.05, 1, 1, 1]})
     diagnosis = diagnosed(three, seeds=(0,))
@@ -97,7 +99,7 @@ def test_hysteresis_of_an_actuator():
     r, w = np.linspace(0.05, 0.8, 16), np.linspace(0.12, 0.0, 16)
 
     def measured(seed):
-        rng, t = np.random.default_rng(seed), np.arange(900) * 0.01
+        rng, t = np.random.default_rng(seed), np.arange(500) * 0.01
         u = sum(np.sin(2 * np.pi * f * t + p) for f, p in zip((0.3, 0.7, 1.1), rng.uniform(0, 6, 3), strict=True)) / 2
         memory, y = np.zeros(16), []
         for value in u:

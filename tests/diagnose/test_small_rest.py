@@ -17,6 +17,7 @@ def diagnosis():
     return pilfr.diagnose(rig(430.0, 5.0), measured, laws=tried, hold="zero", workers=1)
 
 
+@pytest.mark.slow
 def test_a_small_rest_is_explained_if_noise_alone_is_left(diagnosis):
     search = diagnosis.evidence["search"]
     (alone,) = [t for t in search.memo.values() if [e.port for e in t.effects] == ["ground"] and len(t.laws) == 1]
@@ -30,6 +31,7 @@ def test_a_small_rest_is_explained_if_noise_alone_is_left(diagnosis):
     assert diagnosis.errors["train"]["after"] < 1.2 * 3e-4
 
 
+@pytest.mark.slow
 def test_a_law_that_does_nothing_predicts_as_the_hypothesis_without_it(diagnosis):
     search = diagnosis.evidence["search"]
     best = search.best

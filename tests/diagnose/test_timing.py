@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 from diagnosis_rig import DT, OFF, recordings, rig
 
+from pilfr_casadi._base import Stages
 from pilfr_casadi.data import Recording
 from pilfr_casadi.diagnose import Workbench, diagnose
+from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.gates import Checked, Gate
 from pilfr_casadi.diagnose.preparation import hold_note
+from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.timing import _screen_shifts, find_time_shift
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
@@ -81,7 +84,7 @@ def slow_and_late(late):
     return simulator, Recording(u[late:, None], y[:-late], 0.02, ("force",), ("pos",))
 
 
-@pytest.mark.parametrize("late", [16, 22])
+@pytest.mark.parametrize("late", [16, pytest.param(22, marks=pytest.mark.slow)])
 def test_a_late_output_is_found_though_the_refit_follows_it_by_wrong_values(late):
     simulator, recording = slow_and_late(late)
     bench = Workbench.of(simulator, [recording], "zero")
@@ -136,6 +139,7 @@ def test_creep_in_two_stages_goes_on_from_one(one, two, name):
     assert two().starts_as(PeriodicForce(), {"a": 1.0, "b": 0.0, "L": 1.0}) == {}
 
 
+@pytest.mark.slow
 def test_a_shift_that_missing_friction_hides_is_found_beside_it():
     """With neither, the refit is in a wrong place; a mode of the sensor would imitate the lead."""
     as_recorded = recordings(CoulombFriction().at({"F_c": 10.0, "v_0": 0.005}), count=1)
@@ -147,7 +151,17 @@ def test_a_shift_that_missing_friction_hides_is_found_beside_it():
     assert found.errors["train"]["after"] < 2e-3
 
 
-def two_motors(m=1500, late=0, seed=5):
+def test_a_search_finds_a_shift_beside_its_first_law():
+    law = CoulombFriction().at({"F_c": 0.3, "v_0": 0.02})
+    early = shaken("zero", m=600, law=law, early=1).with_(initial="estimate")
+    bench = Workbench.of(spring(), [early], "zero")
+    floor = Floor(1e-4 * bench.scale, "estimated")
+    found = Search(bench, bench.fit(spring()), floor, (CoulombFriction,), 1, Stages(lambda *_: None)).run(1)
+    assert (found.shift.channel, found.shift.value) == ("pos, vel", -bench.dt)
+    assert found.shift.sentence.endswith("(beside Coulomb friction (smooth) at ground).")
+
+
+def two_motors(m=800, late=0, seed=5):
     """A body that two motors drive with their own gains; the second input is recorded so many samples late."""
     simulator = Simulator(
         lambda x, u, p: {"v": p.a * u.left + p.b * u.right - p.d * x.v},

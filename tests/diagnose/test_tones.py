@@ -11,7 +11,7 @@ from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.pipeline import with_tones
-from pilfr_casadi.diagnose.recording_faults import find_tone, find_tones
+from pilfr_casadi.diagnose.recording_faults import find_ringing_mode, find_tone, find_tones
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.trials import Trial
 from pilfr_casadi.diagnose.verdict import Posterior, judge
@@ -125,6 +125,17 @@ def disturbed(size, seed=5):
     return r.with_(y=r.y + y)
 
 
+def test_a_rest_that_swings_at_an_own_frequency_is_told_from_noise():
+    (r,) = recordings(count=1)
+    noisy = r.with_(y=r.y + 0.02 * np.std(r.y) * np.random.default_rng(2).standard_normal(r.y.shape))
+    modes = []
+    for measured in (disturbed(0.02), noisy):
+        bench = Workbench.of(rig(OFF), [measured], "zero")
+        modes.append(find_ringing_mode(bench, bench.fit(rig(OFF))))
+    assert modes[0] is not None and modes[1] is None
+
+
+@pytest.mark.slow
 def test_a_force_that_is_not_recorded_is_not_called_noise():
     found = pilfr.diagnose(rig(OFF), disturbed(0.02), laws=[laws.CubicStiffness], effects=1)
     assert found.verdict == "unexplained"

@@ -27,8 +27,9 @@ def test_a_drive_may_have_a_dead_zone_and_a_limit():
     """Both at one actuator, one after the other, as of a motor's power stage; their order decides what L means."""
     true = example_rig().with_element("actuator:force", laws.DeadZone().at({"g": 1.5}))
     true = true.with_element("actuator:force", laws.Saturation().at({"L": 12.0}))
-    train, test = recorded(true, 0), recorded(true, 1)
-    found = pilfr.diagnose(example_rig(430.0, 5.0), train, test=test)
+    train, test = recorded(true, 0, samples=500), recorded(true, 1, samples=400)
+    tried = (laws.DeadZone, laws.Saturation)
+    found = pilfr.diagnose(example_rig(430.0, 5.0), train, test=test, laws=tried, hold="zero", workers=1)
     assert {(e.port, e.law) for e in found.effects} == {
         ("actuator:force", "dead_zone"),
         ("actuator:force", "saturation"),

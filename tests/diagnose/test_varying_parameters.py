@@ -6,16 +6,17 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
+from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench, port_signals
 from pilfr_casadi.diagnose.evidence import log_prior
+from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.proof import placebo
+from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.laws import (
     VARIATIONS,
     CoulombFriction,
     CubicStiffness,
     Delay,
-    QuadraticDrag,
-    Saturation,
     VaryingParameter,
     heated,
     strengths_over,
@@ -146,10 +147,12 @@ def test_only_a_variation_stands_at_a_parameter():
 @pytest.fixture(scope="module")
 def diagnosis():
     """Diagnosis of a motor whose resistance grows with a recorded temperature, by some of the laws."""
-    tried = [CoulombFriction, QuadraticDrag, Saturation, Delay, VaryingParameter]
-    return pilfr.diagnose(motor(), recorded(3, (20, 80)), test=recorded(5, (75, 25)), laws=tried, workers=1)
+    tried = [CoulombFriction, Delay, VaryingParameter]
+    train, test = recorded(3, (20, 80)), recorded(5, (75, 25))
+    return pilfr.diagnose(motor(), train, test=test, laws=tried, effects=1, hold="zero", workers=1)
 
 
+@pytest.mark.slow
 def test_the_parameter_and_its_signal_are_named(diagnosis):
     """The answer says what varies with what, by how much, and predicts the test to the noise."""
     (effect,) = diagnosis.effects
@@ -165,6 +168,7 @@ def test_the_parameter_and_its_signal_are_named(diagnosis):
     assert effect.placebo["own"] > 0.5 > effect.placebo["unrelated"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_the_corrected_simulator_is_exported_and_reported(diagnosis, tmp_path):
     """It is an exported step like any other, and the report draws the parameter over its signal."""
@@ -178,6 +182,20 @@ def test_the_corrected_simulator_is_exported_and_reported(diagnosis, tmp_path):
     assert "How R varies with temperature." in page
     assert "variation of R with temperature" in page
     assert "varying(&#39;temperature&#39;, &#39;tilt&#39;)" in page or "varying('temperature', 'tilt')" in page
+
+
+def test_a_search_finds_the_parameter_and_its_signal():
+    bench = Workbench.of(motor(), [recorded(3, (20, 80))], "zero")
+    floor = Floor(0.01 * bench.scale, "estimated")
+    tried = (CoulombFriction, VaryingParameter)
+    found = Search(bench, bench.fit(motor()), floor, tried, 1, Stages(lambda *_: None), aligned=True).run(1)
+    (placed,) = found.best.laws
+    assert (placed.port, placed.law.id, placed.law.form) == (
+        "parameter:R",
+        "varying_parameter",
+        "scheduled by temperature",
+    )
+    assert found.best.mean_square**0.5 < 0.011
 
 
 def test_a_curve_starts_as_the_variation_that_it_refines():

@@ -51,7 +51,7 @@ def test_generated_code_is_faster_than_the_virtual_machine(case):
     assert largest_ratio(lambda: seconds(case, "vm", 2048), lambda: seconds(case, "c", 2048), 3.0) >= 3.0
 
 
-@pytest.mark.parametrize(("way", "enough"), [("naive", 5.0), ("sx", 3.0)])
+@pytest.mark.parametrize(("way", "enough"), [pytest.param("naive", 5.0, marks=pytest.mark.slow), ("sx", 3.0)])
 def test_recursion_is_faster_than_what_casadi_differentiates(case, way, enough):
     assert largest_ratio(lambda: seconds(case, way, 384), lambda: seconds(case, "vm", 2048), enough) >= enough
 

@@ -279,6 +279,7 @@ def test_without_a_compiler_the_same_numbers(tmp_path):
     assert np.array_equal(found["y"], y) and np.array_equal(found["jac"], jac)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_without_a_compiler_the_same_fit():
     record = three_plays(0, 400)

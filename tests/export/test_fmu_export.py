@@ -123,7 +123,7 @@ def test_fmpy_simulates_a_recording_by_itself(fmi):
     assert np.allclose(found["time"], t) and close(found["y"], wanted[:, 0])
 
 
-@pytest.mark.parametrize("fmi", VERSIONS)
+@pytest.mark.parametrize("fmi", [pytest.param("2.0", marks=pytest.mark.slow), "3.0"])
 def test_interpolated_inputs_are_given_by_their_slopes(fmi):
     simulator, rng = with_laws(), np.random.default_rng(1)
     u = rng.normal(size=(200, 1))
@@ -198,7 +198,7 @@ def test_bounds_and_held_parameters_are_described():
         assert described['a <&> "b".k_3'].unit == "N/m^3"
 
 
-@pytest.mark.parametrize("fmi", VERSIONS)
+@pytest.mark.parametrize("fmi", [pytest.param("2.0", marks=pytest.mark.slow), "3.0"])
 def test_the_memory_of_hysteresis_is_in_the_state_of_the_fmu(fmi):
     """A restored FMU continues as before, from its state or its serialized state."""
     from fmpy import extract, read_model_description

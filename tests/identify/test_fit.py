@@ -163,8 +163,8 @@ def test_a_linear_model_with_bounds_is_solved_within_them(record, linear):
 @pytest.mark.parametrize(
     ("structure", "blocks"),
     [
-        (PILFR(2, layer(), offset=False), FEEDBACK),
-        (hammerstein(2, layer(), offset=False), HAMMERSTEIN),
+        pytest.param(PILFR(2, layer(), offset=False), FEEDBACK, marks=pytest.mark.slow),
+        pytest.param(hammerstein(2, layer(), offset=False), HAMMERSTEIN, marks=pytest.mark.slow),
         (PILFR(0, layer(), fixed={"D_yu": 0.0}, offset=False), STATIC),
     ],
     ids=["feedback", "hammerstein", "static"],

@@ -111,9 +111,8 @@ def mass(u):
 @pytest.mark.parametrize(
     ("where", "unit"),
     [
-        ("before", 1e-3),
         ("behind", 1e3),
-        *(pytest.param(*v, marks=pytest.mark.slow) for v in (("before", 1.0), ("before", 1e3))),
+        *(pytest.param("before", v, marks=pytest.mark.slow) for v in (1e-3, 1.0, 1e3)),
         *(pytest.param(*v, marks=pytest.mark.slow) for v in (("behind", 1e-3), ("behind", 1.0))),
     ],
 )
@@ -187,7 +186,7 @@ def test_the_papers_start_with_a_fixed_direction_of_z(form, unit):
     np.testing.assert_allclose(np.max(values["r"], axis=1) / np.std(z, axis=0), 0.1, rtol=0.05)
 
 
-@pytest.mark.parametrize("form", [hammerstein, wiener])
+@pytest.mark.parametrize("form", [hammerstein, pytest.param(wiener, marks=pytest.mark.slow)])
 def test_starts_of_a_structure_with_a_fixed_place_differ(form):
     record = hysteretic_record()
     result = fit(form(2, PrandtlIshlinskii(Play, 4)), record, starts=4)
@@ -197,9 +196,15 @@ def test_starts_of_a_structure_with_a_fixed_place_differ(form):
     np.testing.assert_allclose(starts[0][0], np.arange(4) * starts[0][0, 1])
 
 
-@pytest.mark.parametrize("channels", [1, 2])
+@pytest.mark.parametrize("channels", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
-    "fixed", [{"C_y": [[1.0, 0.0]], "D_yw": 0.0}, {"B_u": [[0.0], [1.0]], "D_zu": 0.0}, {"D_yw": 0.0}, {"B_w": 0.0}]
+    "fixed",
+    [
+        {"C_y": [[1.0, 0.0]], "D_yw": 0.0},
+        pytest.param({"B_u": [[0.0], [1.0]], "D_zu": 0.0}, marks=pytest.mark.slow),
+        pytest.param({"D_yw": 0.0}, marks=pytest.mark.slow),
+        {"B_w": 0.0},
+    ],
 )
 def test_other_fixed_blocks_do_not_make_a_wiener_or_hammerstein_model(fixed, channels):
     record = hysteretic_record()
@@ -216,7 +221,7 @@ def test_other_fixed_blocks_do_not_make_a_wiener_or_hammerstein_model(fixed, cha
             np.testing.assert_array_equal(values["C_y"], scaled["C_y"])
 
 
-@pytest.mark.parametrize("yunit", [1e-3, 1e3])
+@pytest.mark.parametrize("yunit", [1e-3, pytest.param(1e3, marks=pytest.mark.slow)])
 def test_a_wiener_model_does_not_collapse_from_the_papers_start(yunit):
     """With z of the wrong sign or scale the weights fall to zero, where the model is constant and has no slope."""
     record = hysteretic_record()

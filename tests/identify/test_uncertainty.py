@@ -218,7 +218,8 @@ def well_spread(pivots):
     )
 
 
-@pytest.mark.parametrize("colour", [pytest.param(0.0, marks=pytest.mark.slow), 0.8])
+@pytest.mark.slow
+@pytest.mark.parametrize("colour", [0.0, 0.8])
 def test_monte_carlo_of_a_grey_box(colour):
     """60 noise seeds; with coloured noise the classical formula would be off by a factor of up to three."""
     pivots, classical = [], []
@@ -234,7 +235,7 @@ def test_monte_carlo_of_a_grey_box(colour):
     assert well_spread(classical) == (colour == 0)
 
 
-@pytest.mark.parametrize("colour", [0.0, 0.7])
+@pytest.mark.parametrize("colour", [pytest.param(0.0, marks=pytest.mark.slow), 0.7])
 def test_monte_carlo_of_a_pi_lfr(colour):
     """Gauge-invariant functions by the delta method, 30 noise seeds."""
     structure, values = random_lfr(21, nx=2, n=2, gain=0.5)

@@ -1,5 +1,7 @@
 """Laws made of laws: behind a gap, scaled by a signal, two in one port; and a rig that hides one of each."""
 
+import importlib
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -120,9 +122,13 @@ def test_friction_that_varies_with_a_signal_is_found(law, values):
     ("kind", "by", "values", "ends"),
     [
         (CoulombFriction, "voltage", {"F_c": 1.0, "F_c_high": 5.0, "v_0": 5e-3}, (0.5, 4.0)),
-        (CoulombFriction, "z", {"F_c": 0.5, "F_c_high": 5.0, "v_0": 5e-3}, (-0.15, 0.15)),
-        (CoulombFriction, "t", {"F_c": 1.0, "F_c_high": 5.0, "v_0": 5e-3}, (0.0, 5.998)),
-        (ViscousDamping, "t", {"c_1": 2.0, "c_1_high": 12.0}, (0.0, 5.998)),
+        pytest.param(
+            *(CoulombFriction, "z", {"F_c": 0.5, "F_c_high": 5.0, "v_0": 5e-3}, (-0.15, 0.15)), marks=pytest.mark.slow
+        ),
+        pytest.param(
+            *(CoulombFriction, "t", {"F_c": 1.0, "F_c_high": 5.0, "v_0": 5e-3}, (0.0, 5.998)), marks=pytest.mark.slow
+        ),
+        pytest.param(ViscousDamping, "t", {"c_1": 2.0, "c_1_high": 12.0}, (0.0, 5.998), marks=pytest.mark.slow),
     ],
     ids=("friction with an input", "friction with the position", "friction with the time", "damping with the time"),
 )
@@ -313,10 +319,12 @@ def test_what_cannot_be_composed_is_said(compose, sentence):
         compose()
 
 
-def test_an_input_that_the_equations_do_not_read_may_act_itself():
+def test_an_input_that_the_equations_do_not_read_may_act_itself(monkeypatch):
     """A load was recorded and left out of the simulator; it acts at the damper's port."""
     true = rig().with_element("damper", scaled(UnreadInput, "voltage")().at({"a": 3.0}))
-    found = pilfr.diagnose(rig(1000.0, 7.5), recorded(true, 0), effects=1)
+    few = (CoulombFriction, UnreadInput)
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.arguments"), "CATALOGUE", few)
+    found = pilfr.diagnose(rig(1000.0, 7.5), recorded(true, 0), effects=1, workers=1)
     assert [(e.port, e.law, e.form) for e in found.effects] == [("damper", "unread_input", "voltage")], str(found)
     assert found.effects[0].parameters["a"]["value"] == pytest.approx(3.0, rel=0.01)
     assert "voltage acts here, in proportion" in str(found)

@@ -82,7 +82,7 @@ def test_a_network_recovers_its_own_class(name):
     assert fit.linear_nrmse[0] > 5 * fit.train_nrmse[0]
 
 
-@pytest.mark.parametrize("build", [pilfr.hammerstein, pilfr.wiener])
+@pytest.mark.parametrize("build", [pilfr.hammerstein, pytest.param(pilfr.wiener, marks=pytest.mark.slow)])
 def test_hysteresis_before_or_behind_a_linear_model_is_recovered(build):
     structure = build(2, pilfr.PrandtlIshlinskii(pilfr.Play, 3))
     values = {"A": LINEAR["A"], "w": [[0.5, 0.4, 0.3]], "r": [[0.1, 0.5, 1.0]]}

@@ -137,6 +137,7 @@ def test_the_ways_to_write_an_acceleration_simulate_alike():
     assert np.std(expected - simulated(rig(by_formula), r)) > 0.1 * np.std(expected)
 
 
+@pytest.mark.slow
 def test_a_stiffening_mount_is_found_by_an_accelerometer():
     rng = np.random.default_rng(5)
     recordings = []

@@ -136,8 +136,8 @@ class Interrupted:
 def test_an_interrupt_ends_a_run_of_slow_calls_without_a_word(engine, capfd):
     called = Interrupted()
     made = from_function(called, "pos", numeric=Numeric(), **SWING)
-    u = 20 * np.sin(0.05 * np.arange(120))[:, None]
-    given = Recording(u, np.zeros((120, 1)), 0.01, ("force",), ("pos",), initial="zero", hold="zero")
+    u = 20 * np.sin(0.05 * np.arange(60))[:, None]
+    given = Recording(u, np.zeros((60, 1)), 0.01, ("force",), ("pos",), initial="zero", hold="zero")
     given = given.with_(y=made.simulate(given))
     fit(made.with_parameters({"k": 80.0}), given, engine=engine)
     whole = called.calls

@@ -159,7 +159,7 @@ def test_outputs_count_from_zero_where_states_begin_elsewhere(built):
     assert np.abs(unit.simulate(given) - swing(given.u[:, 0], pos=0.3)).max() <= 1e-12
 
 
-@pytest.mark.parametrize("end", ["os.abort()", "raise ValueError"])
+@pytest.mark.parametrize("end", [pytest.param("os.abort()", marks=pytest.mark.slow), "raise ValueError"])
 def test_a_step_that_fails_is_a_failed_trial(built, end):
     path = built(f"if self.pos > 0.4:\n    {end}\n" + SWING)
     unit = from_fmu(path, ports=PORT, outputs=("pos",), cosimulation=CoSimulation(dt=DT))

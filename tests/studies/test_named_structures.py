@@ -66,6 +66,7 @@ def test_a_run_fits_the_same_model_as_the_function(folder):
     assert found.train_nrmse == pilfr.fit(pilfr.NOE(2, 3), train, **options).train_nrmse
 
 
+@pytest.mark.slow
 def test_a_campaign_compares_structures_with_their_own_options(folder):
     grid = f"[grid]\nstructure = {list(STRUCTURES)}\n"
     model = "nx = 1\noperators = 2\noperator = 'stop'\nhidden = 2\nlags = 2"

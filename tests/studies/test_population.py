@@ -70,7 +70,7 @@ def test_four_machines_are_enough_for_a_gross_difference_only():
     assert estimate_population([100.0, 103.0, 98.0, 107.0], np.ones(4), 500.0).differs.max() < 0.5
 
 
-@pytest.mark.parametrize("size", [4, 5, 8, 20])
+@pytest.mark.parametrize("size", [4, *(pytest.param(size, marks=pytest.mark.slow) for size in (5, 8, 20))])
 def test_few_regular_machines_give_few_false_alarms(size):
     """The deviation of few machines is hardly known: a value far out may be one of theirs."""
     alarms = []
