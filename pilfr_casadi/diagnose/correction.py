@@ -168,7 +168,9 @@ def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_
         if out and (c.least >= least or search.past_deadline):
             break
         bare = c.fitted is c.base.fitted
-        out.append((c, search.held_out(c.base) if bare else search.held_out_errors(c.fitted, c.spread)))
+        found = search.held_out(c.base) if bare else search.held_out_errors(c.fitted, c.spread)
+        if np.isfinite(found.rms) or not search.past_deadline:  # otherwise the time was over before it was known
+            out.append((c, found))
     return out
 
 

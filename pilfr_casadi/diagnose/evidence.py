@@ -29,6 +29,7 @@ the second half of every recording is also predicted, from a fit to the first ha
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -37,7 +38,7 @@ import numpy as np
 from .._base import InputError, side_by_side
 from ..identify import solve_within_bounds
 from ..laws import Law
-from ..optimise import GaussNewton, Problem
+from ..optimise import GaussNewton, Problem, Status
 from ..simulators import MECHANICAL, PARAMETER, SENSOR, UNKNOWN, Placed, kind_of
 from .floor import effective_size
 from .workbench import DIVERGED, RUNAWAY, Fitted, Workbench
@@ -445,7 +446,10 @@ def blocks_of(bench: Workbench) -> list[np.ndarray]:
 
 
 def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldOut:
-    """Refit without each fold of blocks and without the second halves; return the errors on the omitted parts."""
+    """Refit without each fold of blocks and without the second halves; return the errors on the omitted parts.
+
+    They are infinite if the run diverges or the time is over.
+    """
     blocks = blocks_of(bench)
     folds = [[(b >= 0) & (b % FOLDS == fold) for b in blocks] for fold in range(FOLDS)]
     later = [b >= FOLDS * ROUNDS // 2 for b in blocks]
@@ -466,16 +470,22 @@ def _at_prior_means(fitted: Fitted) -> Fitted:
 def _sum_of_squares(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]) -> np.ndarray:
     """Refit without scoring the samples in `left`; return each output's sum of squares there, (n_y,).
 
-    It is infinite if the run diverges.
+    It is infinite if the run diverges or the time is over: a refit that is cut short has not left the samples out.
     """
     infinite = np.full(len(bench.scale), np.inf)
     residual: Sequence[np.ndarray] = fitted.residual
     if np.any(fitted.model.parameters.free) or any(r.begins == "estimate" for r in bench.recordings):
+        seconds = bench.deadline - time.perf_counter()
+        if seconds <= 0:
+            return infinite
         problem, theta = bench.problem_at(_at_prior_means(fitted), [~mask for mask in left])
         try:
             with np.errstate(all="ignore"):
-                simulated = problem.simulate(solve_within_bounds(problem, theta, REFIT).theta)
+                found = solve_within_bounds(problem, theta, replace(REFIT, time_limit=seconds))
+                simulated = problem.simulate(found.theta)
         except (InputError, RuntimeError, FloatingPointError, np.linalg.LinAlgError):
+            return infinite
+        if found.status is Status.TIME_LIMIT:
             return infinite
         residual = [y - r.y for y, r in zip(simulated, bench.recordings, strict=True)]
     with np.errstate(over="ignore", invalid="ignore"):

@@ -2,6 +2,7 @@
 
 import json
 import sys
+import time
 import types
 from dataclasses import replace
 
@@ -128,6 +129,14 @@ def test_held_out_blocks_tell_a_better_simulator():
     assert NOISE < after.error < 0.5 * before.error
     exact = Workbench.of(true, bench.recordings, "zero")
     assert held_out_errors(exact, exact.fit(true)).error == pytest.approx(NOISE, rel=0.1)
+
+
+@pytest.mark.parametrize("seconds", [-1.0, 1e-3])
+def test_a_refit_that_is_cut_short_predicts_nothing(nameless, seconds):
+    """It begins at a fit to all samples, so that it would seem to predict those left out."""
+    bench, fitted = nameless.evidence["search"].bench, nameless.evidence["after"]
+    assert np.isfinite(held_out_errors(bench, fitted).rms)
+    assert held_out_errors(replace(bench, deadline=time.perf_counter() + seconds), fitted).rms == np.inf
 
 
 def test_held_out_samples_have_no_say_in_what_predicts_them(nameless):

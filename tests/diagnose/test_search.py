@@ -109,6 +109,8 @@ def test_hypotheses_are_not_compared_by_different_errors_where_time_ran_out(monk
     monkeypatch.setattr(Search, "_likeliest", lambda self: [self.root, self.best])
     found.judge_on_held_out_data()
     assert found.out_of_time and all(known.held_out is None for known in found.findings.values())
+    found.bench = replace(found.bench, deadline=0.0)
+    assert found.held_out(found.best).rms == np.inf and found.findings[found.best.key].held_out is None
 
 
 def test_a_law_found_only_beside_another_one_may_do_without_it():
