@@ -34,7 +34,7 @@ from ..diagnose import Diagnosis
 from ..export import Exported, exported
 from ..identify import Fit
 from ..linear import measurement_update
-from ..models import PrandtlIshlinskii
+from ..models import PrandtlIshlinskii, or_one
 from ..simulators import Simulator
 
 Array = np.ndarray
@@ -333,7 +333,7 @@ def _is_semidefinite(P: Array) -> bool:
     size = np.sqrt(np.maximum(np.diag(P), 0.0))
     if np.any(np.diag(P) < 0) or np.any(P[size == 0] != 0):
         return False
-    size = np.where(size > 0, size, 1.0)
+    size = or_one(size)
     return bool(np.min(np.linalg.eigvalsh(P / np.outer(size, size)), initial=0.0) >= -1e-9)
 
 

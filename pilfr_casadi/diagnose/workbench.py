@@ -297,7 +297,7 @@ class Workbench:
                 + (unstable or "check the parameters' values and units, and the hold.")
             )
         _, theta, problem, status = best
-        values = model.parameters.unpack(problem.parameters(theta))
+        values = problem.values(theta)
         values.pop(INJECTION, None)
         return replace(self.result(simulator, values, problem.first_states(theta), engine, model), status=status)
 

@@ -179,9 +179,7 @@ class FitContext:
             note,
             describe_open_memory(judged, theta),
             describe_reached_gain(problem, theta),
-            describe_unbounded(
-                structure, problem.constraints, problem.model.parameters.unpack(problem.parameters(theta))
-            ),
+            describe_unbounded(structure, problem.constraints, problem.values(theta)),
         )
         bounds = zip(problem.labels, theta, problem.lower, problem.upper, strict=True)
         limits = limits_of(problem, solution)
@@ -301,7 +299,7 @@ def describe_open_memory(problem: Problem, theta: Array) -> str:
 def describe_reached_gain(problem: Problem, theta: Array) -> str:
     """Name the gains that hold only beyond the recordings, and why; empty if there are none."""
     found = []
-    values, moved = problem.model.parameters.unpack(problem.parameters(theta)), None
+    values, moved = problem.values(theta), None
     samples = max(len(r) for r in problem.recordings)
     for c, rows in zip(problem.constraints, problem.g_slices, strict=True):
         if not isinstance(c.expression, Gain):

@@ -30,7 +30,7 @@ import numpy as np
 
 from .._base import InputError, is_number
 from ..models import LAYER, Model, Parameter, ParameterSet, Play, PrandtlIshlinskii, Stop
-from ..optimise import Problem, Solution, Status
+from ..optimise import Problem, Solution, Status, check_penalised
 from .context import FitContext, Stage
 from .result import with_solution
 
@@ -44,11 +44,9 @@ def check_penalty(l1: dict[str, float], parameters: ParameterSet, linear: bool) 
             "l1 was given for a linear model, but the penalty acts on an element's weights; give an element."
         )
     for name, weight in l1.items():
-        lower = parameters.lower[parameters.position(name)]
+        check_penalised(name, parameters)
         if not is_number(weight) or not 0 <= weight < np.inf:
             raise InputError(f"The L1 weight of {name!r} is {weight!r}; give a number, 0 or more.")
-        if np.any(lower < 0):
-            raise InputError(f"An L1 penalty on {name!r} needs a lower bound of zero or more; bound it or use a prior.")
 
 
 def normalise_weights(model: Model) -> Model:

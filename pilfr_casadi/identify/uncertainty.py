@@ -142,7 +142,7 @@ def gauge_tangents(problem: Problem, theta: Array, structure: PILFR, at_bound: A
 def orbit_tangents(problem: Problem, theta: Array, structure: PILFR) -> tuple[Array, Array]:
     """Write the generators as columns: changes of the variables (size, k), and of all other entries (m, k)."""
     parameters = problem.model.parameters
-    values = parameters.unpack(problem.parameters(theta))
+    values = problem.values(theta)
     states = problem.initial_states(theta)
     estimated = [r.begins == "estimate" for r in problem.recordings]
     columns = []

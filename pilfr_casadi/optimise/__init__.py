@@ -42,7 +42,7 @@ if TYPE_CHECKING:
         samples_to_start as samples_to_start,
     )
     from .ipopt import Ipopt as Ipopt
-    from .problem import Problem as Problem, check_weights as check_weights
+    from .problem import Problem as Problem, check_penalised as check_penalised, check_weights as check_weights
     from .solution import (
         Candidate as Candidate,
         Iteration as Iteration,

@@ -42,7 +42,7 @@ from itertools import pairwise
 import casadi as ca
 import numpy as np
 
-from ..models import Neighbours
+from ..models import Neighbours, or_one
 from .constraints import FEASIBILITY_TOLERANCE, Constraint, RadiusExcess, loosen_radii
 from .gauss_newton import GaussNewton, QuadraticProgram, replace_rounding
 from .problem import Problem
@@ -341,7 +341,7 @@ def point_as_solution(problem: Problem, theta: Array, status: Status) -> Solutio
 
 def _tightening_path(problem: Problem, theta: Array) -> list[tuple[Constraint, ...]]:
     """List the constraints of each tightening step from the radii at θ, without the last (the wanted bounds)."""
-    values, limits, distances = problem.model.parameters.unpack(problem.parameters(theta)), radius_limits(problem), {}
+    values, limits, distances = problem.values(theta), radius_limits(problem), {}
     for c, check in limits.items():
         first = max(-np.log(max(check(values) + check.radius, 1e-300)), CLOSEST)
         distances[c] = first, max(-np.log(check.radius), first)
@@ -358,7 +358,7 @@ def _scale_inside(problem: Problem, theta: Array) -> Array:
     """Scale A and B_w so that every radius is inside; return θ unchanged if fixed entries forbid it."""
     parameters = problem.model.parameters
     names = [name for name in ("A", "B_w") if name in parameters and parameters[name].size]
-    values = parameters.unpack(problem.parameters(theta))
+    values = problem.values(theta)
     room = _log_room(problem, theta)
     if room > 0 or any(np.any(parameters[k].fixed & (parameters[k].value != 0)) for k in names):
         return theta
@@ -370,7 +370,7 @@ def _scale_inside(problem: Problem, theta: Array) -> Array:
 
 def _log_room(problem: Problem, theta: Array) -> float:
     """Return the least distance of the log radii from their bounds; negative outside."""
-    values = problem.model.parameters.unpack(problem.parameters(theta))
+    values = problem.values(theta)
     with np.errstate(divide="ignore"):
         return min(-float(np.log1p(check(values) / check.radius)) for check in radius_limits(problem).values())
 
@@ -378,7 +378,7 @@ def _log_room(problem: Problem, theta: Array) -> float:
 def _meets_all(problem: Problem, theta: Array) -> bool:
     """Tell whether θ meets every constraint."""
     unit = problem.constraint_units(theta)
-    over = problem.excess(theta) - FEASIBILITY_TOLERANCE * np.where(unit > 0, unit, 1.0)
+    over = problem.excess(theta) - FEASIBILITY_TOLERANCE * or_one(unit)
     return not violated_exact(problem, theta) and bool(np.all((over <= 0) | problem.g_exact))
 
 
@@ -425,7 +425,7 @@ def violated_exact(problem: Problem, theta: Array) -> list[str]:
     if not any(c.exact for c in problem.constraints):
         return []
     satisfied = problem.excess(theta) <= 0
-    values = problem.model.parameters.unpack(problem.parameters(theta))
+    values = problem.values(theta)
     return [
         c.name
         for c, rows in zip(problem.constraints, problem.g_slices, strict=True)
@@ -440,8 +440,7 @@ def move_inside_exact(problem: Problem, solution: Solution) -> Solution:
         return solution
     hessian = problem.normal(theta)[2]
     floor = replace_rounding(np.diag(hessian), theta, Neighbours(problem.labels))
-    unit = problem.constraint_units(theta, floor)
-    unit = np.where(unit > 0, unit, 1.0)
+    unit = or_one(problem.constraint_units(theta, floor))
     damped = hessian + MOVE_DAMPING * np.diag(floor)
     damped += np.diag(np.where(np.diag(damped) > 0, 0.0, 1.0))
     qp, margin = QuadraticProgram(problem.size, len(unit), "daqp"), FIRST_MARGIN

@@ -27,7 +27,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, abandoned, handled_interrupt, unwrapped_interrupt
-from ..models import Neighbours
+from ..models import Neighbours, or_one
 from .constraints import FEASIBILITY_TOLERANCE
 from .solution import Iteration, IterationCallback, Solution, Status, check_solver_options
 
@@ -155,8 +155,7 @@ class QuadraticProgram:
         """
         unit = 1.0 / np.sqrt(np.diag(h))
         a, g = a * unit, g * unit
-        row = np.max(np.abs(a), axis=1, initial=0.0)
-        row = np.where(row > 0, row, 1.0)
+        row = or_one(np.max(np.abs(a), axis=1, initial=0.0))
         low, high = lba / row, uba / row
         size = float(np.max(np.abs(g))) or float(np.max(np.maximum(low, -high), initial=0.0))
         size = max(size, SMALLEST_DIVISOR)

@@ -23,6 +23,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, handled_interrupt
+from ..models import or_one
 from .gauss_newton import ACCEPTED_RATIO, LEAST_DAMPING, MOST_DAMPING, SMALLEST_DIVISOR, ZERO_COLUMN, Damping
 from .problem import Problem
 from .solution import Iteration, IterationCallback, Solution, Status, check_solver_options
@@ -177,7 +178,7 @@ class Scaled:
         squares = np.diag(h).copy()
         if not (np.all(np.isfinite(h)) and np.all(np.isfinite(g))):
             raise FloatingPointError("the derivatives at the start are not finite")
-        unit, trial = 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0)), start
+        unit, trial = 1.0 / np.sqrt(or_one(squares)), start
         for _ in range(MOST_FIRST_STEPS):
             step = -unit * np.linalg.solve(h * unit * unit[:, None] + self.damping * np.eye(len(g)), g * unit)
             trial = np.clip(start + step, problem.lower, problem.upper)
@@ -188,8 +189,7 @@ class Scaled:
             self.damping *= RAISED
         self.unit = cost if cost > 0 else 1.0
         self.s = np.sqrt(_fill_zero_columns(squares, problem.labels, start, self.unit) / self.unit)
-        rows = np.max(np.abs(problem.constraint_jacobian(trial) / self.s), axis=1, initial=0.0)
-        self.g_unit = np.where(rows > 0, rows, 1.0)
+        self.g_unit = or_one(np.max(np.abs(problem.constraint_jacobian(trial) / self.s), axis=1, initial=0.0))
         self.lower, self.upper = problem.lower * self.s, problem.upper * self.s
         self.g_lower, self.g_upper = problem.g_lower / self.g_unit, problem.g_upper / self.g_unit
 

@@ -24,7 +24,7 @@ import numpy as np
 from .._base import InputError, numbers
 from ..data import Recording, as_recordings, nrmse
 from ..engine import Engine, VirtualMachine, make_engine
-from ..models import Model, Neighbours, ParameterSet, check_size
+from ..models import Model, Neighbours, ParameterSet, check_size, or_one
 from .constraints import Constraint, Rows, check_gain
 from .steady_state import NEARLY_STEADY, steady_slope, steady_state
 
@@ -95,6 +95,12 @@ def check_weights(given: Sequence[float] | Array | None, count: int) -> Array:
     return weights
 
 
+def check_penalised(name: str, parameters: ParameterSet) -> None:
+    """Refuse an L1 penalty on an unknown name or a parameter that may be negative."""
+    if np.any(parameters.lower[parameters.position(name)] < 0):
+        raise InputError(f"An L1 penalty on {name!r} needs a lower bound of zero or more; bound it or use a prior.")
+
+
 class Penalties:
     """Quadratic and L1 terms that are added to the simulation error.
 
@@ -116,12 +122,8 @@ class Penalties:
         self.states = tuple((slice(at, at + len(square)), square / residuals) for at, square in states)
         weight, mean, slope = (np.zeros(parameters.size) for _ in range(3))
         for name, strength in l1.items():
-            where = parameters.position(name)
-            if np.any(parameters.lower[where] < 0):
-                raise InputError(
-                    f"An L1 penalty on {name!r} needs a lower bound of zero or more; bound it or use a prior."
-                )
-            slope[where] = strength
+            check_penalised(name, parameters)
+            slope[parameters.position(name)] = strength
         for name, p in parameters.items():
             if p.prior is not None:
                 where = parameters.position(name)
@@ -314,6 +316,10 @@ class Problem:
         p[self.free] = theta[: self.n_free]
         return p
 
+    def values(self, theta: Array) -> dict[str, Array]:
+        """Return the model's parameters at θ by name."""
+        return self.model.parameters.unpack(self.parameters(theta))
+
     def initial_states(self, theta: Array) -> list[Array]:
         """Return the initial state with memory of each recording.
 
@@ -460,14 +466,14 @@ class Problem:
         (size,), the diagonal of the Gauss-Newton Hessian. The unit is zero if the constraint has no slope.
         """
         size = Neighbours(self.labels).sizes(theta)
-        still = np.ones(self.size) if squares is None else 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0))
+        still = np.ones(self.size) if squares is None else 1.0 / np.sqrt(or_one(squares))
         change = np.abs(self.constraint_jacobian(theta)) * np.where(size > 0, size, still)
         return self.rows.units_from(np.max(change, axis=1, initial=0.0))
 
     def active_constraints(self, theta: Array) -> Array:
         """Tell which general constraints are at or beyond a limit, within `AT_LIMIT` of their unit: (n_g,), bool."""
         g, unit = self.constraint(theta), self.constraint_units(theta)
-        slack = AT_LIMIT * np.where(unit > 0, unit, 1.0)
+        slack = AT_LIMIT * or_one(unit)
         return (g >= self.g_upper - slack) | (g <= self.g_lower + slack)
 
     def nrmse(self, theta: Array) -> list[float]:

@@ -176,7 +176,7 @@ def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
         near = (size[n:] > 0) & (np.minimum(g - low, high - g) <= 10 * FEASIBILITY_TOLERANCE * unit)
         active = problem.active_constraints(theta) | near
         checks = [c.check for c, k in zip(problem.constraints, problem.g_sizes, strict=True) for _ in range(k)]
-        values = problem.model.parameters.unpack(problem.parameters(theta))
+        values = problem.values(theta)
         for i, (name, check) in enumerate(zip(problem.g_labels, checks, strict=True)):
             if isinstance(check, RadiusExcess):
                 pushes = not known or bool(size[n + i] > ACTIVE_MULTIPLIER * solution.cost)
