@@ -85,11 +85,8 @@ def processors() -> int:
 
 def side_by_side(function: Callable[[T], R], items: Iterable[T], workers: int) -> list[R]:
     """Apply a function to each item in threads; return the results in order. A failure cancels waiting items."""
-    pool = ThreadPoolExecutor(workers)
-    try:
-        return [task.result() for task in [pool.submit(function, item) for item in items]]
-    finally:
-        pool.shutdown(cancel_futures=True)
+    with ThreadPoolExecutor(workers) as pool:
+        return list(pool.map(function, items))
 
 
 @contextlib.contextmanager

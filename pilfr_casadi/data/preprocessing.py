@@ -3,11 +3,7 @@
 The verbs of `Recording` (`cut`, `detrend`, `filter`, `resample`, `merge`) call these functions and keep the rest of the
 recording consistent.
 
-All filters are linear. If inputs and outputs go through the same filter, a linear model relates the filtered signals
-exactly as the original ones, so filter both alike. A hysteresis does not commute with a filter: its memory turns at
-the extremes of its own input, and a filter rounds them off. For a model with hysteresis or friction, filter only above
-the band in which the machine moves, and never with a high-pass. Oppenheim & Schafer (2010), Discrete-Time Signal
-Processing, sec. 4.6 (change of step), 5.7 (zero phase).
+Oppenheim & Schafer (2010), Discrete-Time Signal Processing, sec. 4.6 (change of step), 5.7 (zero phase).
 """
 
 from __future__ import annotations

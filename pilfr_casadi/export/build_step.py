@@ -119,12 +119,8 @@ def to_casadi(model: Any, name: str = "model", **options: Any) -> ca.Function:
 
     Parameters
     ----------
-    model : Fit, Simulator, Model or Diagnosis
-        The model; its values become constants of the function.
-    name : str
-        Name of the function: up to 50 letters, digits and single underscores, beginning with a letter; not a C keyword.
-    **options
-        As for `exported`: `smooth`, and for a simulator `dt`, `hold`, `substeps`.
+    model, name, **options
+        As for `exported`; the model's values become constants of the function.
 
     Returns
     -------
@@ -137,7 +133,7 @@ def to_casadi(model: Any, name: str = "model", **options: Any) -> ca.Function:
     Raises
     ------
     InputError
-        If CasADi does not take the name, or an option does not fit the model.
+        As `exported`.
     """
     return exported(model, name=name, **options).step
 

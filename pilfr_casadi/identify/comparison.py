@@ -1,12 +1,8 @@
 """Models of any kind beside one recording, all treated alike: `compare`.
 
-An error depends on where a simulation begins: one rig has 0.63 from zero and 0.0055 from a fitted state. `compare`
-starts every model in the same way, by the recording's `initial`:
-
-- `"estimate"`: each model's state is fitted to the first samples alone, at the model's parameters; a state that a fit
-  estimated from the whole recording is not used. These samples, as many as the largest model needs, are scored for
-  none. States of a black box have no scale of their own and get the weak prior around rest of `Fit.nrmse`.
-- `"zero"`, `"periodic"` or numbers: each model begins there.
+An error depends on where a simulation begins: one rig has 0.63 from zero and 0.0055 from a fitted state. So `compare`
+starts every model in the same way, and does not use a state that a fit estimated from the whole recording. States of a
+black box have no scale of their own and get the weak prior around rest of `Fit.nrmse`.
 """
 
 from __future__ import annotations
@@ -122,7 +118,7 @@ def compare(recording: Recording, models: Mapping[str, Any] | Any) -> Comparison
     """Simulate several models along one recording and tabulate their errors.
 
     All begin at the recording's `initial`. For `"estimate"` this is a state fitted to the first samples at each model's
-    own parameters; these samples are not scored. Nothing else is fitted.
+    own parameters; these samples, as many as the largest model needs, are not scored. Nothing else is fitted.
 
     Parameters
     ----------

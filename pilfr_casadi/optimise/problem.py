@@ -12,7 +12,6 @@ of the record, so memory does not grow with its length.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -21,7 +20,7 @@ from typing import Any, TypeVar
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, numbers
+from .._base import InputError, numbers, side_by_side
 from ..data import Recording, as_recordings, nrmse
 from ..engine import Engine, VirtualMachine, make_engine
 from ..models import Model, Neighbours, ParameterSet, check_size, or_one
@@ -341,8 +340,7 @@ class Problem:
         """Map the function over the items, a few at a time."""
         if self.threads == 1 or len(items[0]) == 1 or isinstance(self.engine, VirtualMachine):
             return list(map(function, *items))
-        with ThreadPoolExecutor(self.threads) as pool:
-            return list(pool.map(function, *items))
+        return side_by_side(lambda arguments: function(*arguments), zip(*items, strict=True), self.threads)
 
     def simulate(self, theta: Array) -> list[Array]:
         """Simulate the outputs of all recordings, one (M, n_y) array per recording."""
