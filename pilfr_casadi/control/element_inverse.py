@@ -82,10 +82,6 @@ def inverse_element(r: Any, w: Any, *, gain: float = 0.0, operator: Any = Play, 
     name : str
         Name of the CasADi Function.
 
-    Returns
-    -------
-    Inverse
-
     Raises
     ------
     InputError

@@ -222,10 +222,6 @@ def kalman_filter(
         Standard deviation of the process noise per step over the root mean square of the state. The default maximises
         the likelihood of the one-step predictions of the recording.
 
-    Returns
-    -------
-    KalmanFilter
-
     Raises
     ------
     InputError

@@ -127,10 +127,6 @@ def feedforward(
     observer : KalmanFilter, optional
         Observer whose state the compensator reads, including disturbances.
 
-    Returns
-    -------
-    Feedforward
-
     Raises
     ------
     InputError

@@ -69,10 +69,6 @@ def exported(
     name : str
         Name of the function: up to 50 letters, digits and single underscores, beginning with a letter; not a C keyword.
 
-    Returns
-    -------
-    Exported
-
     Raises
     ------
     InputError

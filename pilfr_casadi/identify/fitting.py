@@ -139,10 +139,6 @@ def fit(
         `train_nrmse` reached so far, averaged over the recordings, and nan while a solver runs. The stage "steps"
         reports the iterations of a start; starts in other processes do not report it.
 
-    Returns
-    -------
-    Fit
-
     Notes
     -----
     A recording with `initial="estimate"` is taken to begin at rest unless the data contradict this; then its state and

@@ -186,10 +186,6 @@ def regularization_path(
     options
         As for `prune`.
 
-    Returns
-    -------
-    RegularizationPath
-
     Raises
     ------
     InputError

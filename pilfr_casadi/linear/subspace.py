@@ -536,10 +536,6 @@ def select_order(
     progress : callable, optional
         Called with ("choosing the order", done, total, nan).
 
-    Returns
-    -------
-    OrderSelection
-
     Raises
     ------
     InputError

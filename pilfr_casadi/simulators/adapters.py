@@ -40,10 +40,6 @@ def as_simulator(thing: Any, recordings: Sequence[Recording] = ()) -> Simulator:
     recordings : sequence of Recording
         Recordings whose step a discrete-time system must have.
 
-    Returns
-    -------
-    Simulator
-
     Raises
     ------
     InputError
@@ -185,10 +181,6 @@ def load_simulator(path: str | os.PathLike[str]) -> Simulator:
     path : path
         A Python file that sets the variable `simulator` to a `Simulator` (or to what `as_simulator` accepts). It may
         import modules of the same folder.
-
-    Returns
-    -------
-    Simulator
 
     Raises
     ------
