@@ -295,7 +295,6 @@ def _digest(library: Path) -> str:
 
 
 def _cache_folder(key: str) -> Path:
-    """Return the cache folder of a library."""
     return cache_directory() / key[:2]
 
 

@@ -143,7 +143,6 @@ def _check_dt(dt: float | None) -> float:
 
 
 def _discretise_over_sample(model: Simulator, dt: float, hold: str | None, substeps: int | None) -> Model:
-    """Integrate a simulator over one sample."""
     hold = hold or model.hold or "zero"
     if hold not in ("zero", "linear"):
         raise InputError(f"hold = {hold!r} was given; use 'zero' or 'linear'.")

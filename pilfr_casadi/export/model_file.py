@@ -308,7 +308,6 @@ def _check_content(content: Any) -> dict[str, Any]:
 
 
 def _build_content(tables: schema.ModelTables, given: Model | PILFR | None) -> FitContent:
-    """Build the model and the results of its training."""
     training = tables.training
     structure, start = _build_model(tables, given)
     model = _restore_values(tables, start, structure)

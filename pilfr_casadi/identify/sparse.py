@@ -220,7 +220,6 @@ def regularization_path(
 
 
 def _replace_priors(fit: Fit, structure: PILFR, priors: Mapping[str, tuple[Any, Any]]) -> Fit:
-    """Replace priors in the structure and the model of a fit."""
     parameters = fit.model.parameters.change(**{k: {"prior": prior} for k, prior in priors.items()})
     changed = replace(structure, priors={**structure.priors, **priors})
     return replace(fit, structure=changed, model=fit.model.with_parameters(parameters))

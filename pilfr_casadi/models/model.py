@@ -390,7 +390,6 @@ def accumulate_steps(function: ca.Function, state: np.ndarray, *arguments: np.nd
 
 @functools.lru_cache(maxsize=256)
 def _accumulate_block(function: ca.Function) -> ca.Function:
-    """Chain the steps of a block."""
     return function.mapaccum("accumulated", BLOCK)
 
 

@@ -165,7 +165,6 @@ class QuadraticProgram:
         return Step(d * size * unit, size * multipliers / np.concatenate([unit, row]), good)
 
     def _solve(self, h: np.ndarray, g: np.ndarray, *limits: np.ndarray) -> Step:
-        """Solve the scaled program."""
         lbx, ubx, a, lba, uba = limits
         d = unconstrained_step(h, g)
         if d is not None and np.all((lbx <= d) & (d <= ubx)):

@@ -173,7 +173,6 @@ class _LawsAtInstant:
 
 
 def _split(vector: Any, sizes: Sequence[int]) -> list[Any]:
-    """Split a vector into blocks of some sizes."""
     return list(ca.vertsplit(vector, np.cumsum([0, *sizes]).tolist()))
 
 

@@ -408,7 +408,6 @@ def _rotate_by(quaternion: np.ndarray) -> Any:
 
 
 def _default_bounds(name: str, value: float) -> tuple[float, float]:
-    """Return the default bounds of a number of the model."""
     if ".com_" in name or name.endswith(".spring"):
         return -np.inf, np.inf
     if name.endswith((".damping", ".armature", ".stiffness")):  # a joint need not have any
