@@ -164,6 +164,8 @@ class Law:
         `Local`. Every combination of start values is tried.
     defaults : mapping
         Values of parameters before any are given; otherwise strengths are zero and shapes one.
+    constants : tuple of str
+        Shape parameters that no fit changes, such as the revolution of an angle.
     places : tuple of {"parallel", "series", "sensor", "parameter"}
         Allowed places: inside the dynamics, at an actuator or a sensor, at a sensor only, or at a parameter.
     domains : tuple of {"mechanical", "thermal", "electrical", "fluid"}
@@ -240,6 +242,7 @@ class Law:
     starts: ClassVar[Mapping[str, Grid]] = {}
     ranges: ClassVar[Mapping[str, Grid]] = {}
     defaults: ClassVar[Mapping[str, Any]] = {}
+    constants: ClassVar[tuple[str, ...]] = ()
     places: ClassVar[tuple[str, ...]] = ("parallel",)
     domains: ClassVar[tuple[str, ...]] = ()
     rare: ClassVar[tuple[str, ...]] = ()
@@ -395,10 +398,11 @@ class Law:
         for name, unit in self.units.items():
             low, high = (np.asarray(end, dtype=float) for end in self.limits.get(name, (-np.inf, np.inf)))
             value = np.clip(np.asarray(start[name], dtype=float), low, high)
-            if value.ndim == low.ndim == high.ndim == 0:  # numbers that `__post_init__` has checked
+            fixed = name in self.constants
+            if value.ndim == low.ndim == high.ndim == 0 and not fixed:  # numbers that `__post_init__` has checked
                 out[name] = Parameter.trusted(value, unit, low, high)
             else:
-                out[name] = Parameter(value, unit=unit, bounds=(low, high))
+                out[name] = Parameter(value, unit=unit, bounds=(low, high), fixed=fixed)
         return out
 
 

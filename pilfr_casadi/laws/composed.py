@@ -341,7 +341,6 @@ def _scaled(base: Any, by: str) -> Any:
         scaled_by = by
 
         def why_not(self, local: Local) -> str:
-            """Say why the data carries no information on this law; empty if it does."""
             return super().why_not(local) or _missing_signal(by, local)
 
     return _rename(Scaled, f"{base.__name__}ScaledBy_{by}", f"{base.__doc__}\n\n    Its strength is scaled by {by}.")
@@ -406,11 +405,9 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
             return base.reads() | {"z" if with_z else "t" if by == "t" else "u"}
 
         def schedule(self, local: Local) -> np.ndarray:
-            """Signal (M,) with which the strengths vary."""
             return local.z if with_z else super().schedule(local)
 
         def why_not(self, local: Local) -> str:
-            """Say why the data carries no information on this law; empty if it does."""
             unknown = not (local.readers or (local.from_zero and all(local.from_zero)))
             if with_z and unknown:  # an unknown level of each recording would look like a variation with z
                 return "no output reads the coordinate, and its start is unknown"
@@ -497,6 +494,7 @@ def _heated(by: str) -> Any:
         sentence = f"a parameter that varies with a slow state which the square of {by} drives, as by self-heating"
         units = {"c": "w", "T": "s", "s_2": f"[{by}]^2"}
         order, signal = 1, by
+        constants = ("s_2",)
         starts = {"T": ("duration", 0.03, 0.1, 0.3)}
         ranges = {"T": ("duration", 0.01, 2.0)}
 
@@ -511,13 +509,7 @@ def _heated(by: str) -> Any:
             for own in super().shapes(local):
                 yield {**own, "s_2": float(np.mean(local.z**2))}
 
-        def parameters(self) -> dict[str, Parameter]:
-            """Parameters: the mean square of the signal is fixed."""
-            found = super().parameters()
-            return {**found, "s_2": replace(found["s_2"], fixed=True)}
-
         def why_not(self, local: Local) -> str:
-            """Say why the data carries no information on this law; empty if it does."""
             return "" if np.ptp(local.z) > 0 else f"{by} is constant"
 
     return _rename(Heated, f"Heated_{by}", f"{VaryingParameter.__doc__}")

@@ -166,14 +166,10 @@ class Exponential(Polynomial):
         "R": lambda at: (at.high if at.high > -at.low else at.low,),
     }
     ranges = {"c": lambda at: (-8.0 / at.reach, 8.0 / at.reach)}
+    constants = ("R",)
 
     def force(self, z: Any, p: Any) -> Any:
         return p.R * (ca.exp(p.c * z) - 1) / (ca.exp(p.c * p.R) - 1) - z
-
-    def parameters(self) -> dict[str, Parameter]:
-        """Curvature, and the fixed end of the signal."""
-        out = super().parameters()
-        return {**out, "R": replace(out["R"], fixed=True)}
 
 
 class FreeCurve(Law):
@@ -187,6 +183,7 @@ class FreeCurve(Law):
     sentence = "a memoryless curve of a free shape, such as an open-circuit voltage over the state of charge"
     units = {"c": "w", "z_m": "z", "z_h": "z"}
     strength = ("c",)
+    constants = ("z_m", "z_h")
     domains = ("electrical", "fluid")
     special = True
     degrees = tuple(range(2, 10))  # an offset and a slope are parameters of the simulator; nine follow a narrow knee
@@ -196,10 +193,9 @@ class FreeCurve(Law):
         return sum(p.c[k] * (terms[i] - at_zero[i]) for k, i in enumerate(self.degrees))
 
     def parameters(self) -> dict[str, Parameter]:
-        """Coefficients, and the fixed middle and half of the range."""
+        """Coefficients, one for each degree, and the middle and half of the range."""
         out = super().parameters()
-        c = replace(out["c"], value=np.broadcast_to(out["c"].value, len(self.degrees)))
-        return {"c": c, **{k: replace(out[k], fixed=True) for k in ("z_m", "z_h")}}
+        return {**out, "c": replace(out["c"], value=np.broadcast_to(out["c"].value, len(self.degrees)))}
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         low, high = min(local.low, 0.0), max(local.high, 0.0)

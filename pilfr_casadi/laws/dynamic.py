@@ -37,7 +37,6 @@ class Delay(Law):
     starts = {"T": ("dt", 0.5, 1, 1.5, 2, 3, 4, 6, 8, 11, 15, 20)}
 
     def on_grid(self, h: float) -> Delay:
-        """Copy for steps of length h, s."""
         return replace(self, h=h)
 
     @property

@@ -7,13 +7,11 @@ are mechanical, and the powers among them also describe flows. `FreeCurve` cover
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
-from ..models import Parameter
 from .base import Law, Local, contact_onset, size_to_power
 
 LEAST_PERIODS = 2.0  # within the motion, from which a force counts as periodic
@@ -269,6 +267,12 @@ def _periods(local: Local) -> np.ndarray:
     return np.append(parts, local.revolution) if local.revolution < parts[-1] else parts
 
 
+def _wave(z: Any, p: Any) -> Any:
+    """Compute a wave of the period L from its two amplitudes."""
+    angle = 2 * np.pi * z / p.L
+    return p.a * ca.sin(angle) + p.b * ca.cos(angle)
+
+
 class PeriodicForce(Law):
     """A force that repeats with position: cogging, ripple of a screw or gear (Hanselman 2006)."""
 
@@ -283,8 +287,7 @@ class PeriodicForce(Law):
     starts = {"L": _periods}
 
     def force(self, z: Any, p: Any) -> Any:
-        angle = 2 * np.pi * z / p.L
-        return p.a * ca.sin(angle) + p.b * ca.cos(angle)
+        return _wave(z, p)
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         least = np.nanmin([2 * local.half / 60, local.revolution])
@@ -326,12 +329,8 @@ class _Gravity(Law):
     domains = ("mechanical",)
     angular = True
     starts = {"L": lambda at: [L for L in (at.revolution,) if np.isfinite(L)]}
+    constants = ("L",)
     least_turn: ClassVar[float] = 0.0  # share of a revolution within the motion, below which it is another curve
-
-    def parameters(self) -> dict[str, Parameter]:
-        """Sizes of the torque, and the fixed revolution."""
-        out = super().parameters()
-        return {**out, "L": replace(out["L"], fixed=True)}
 
     def why_not(self, local: Local) -> str:
         known = 2 * local.half > self.least_turn * local.revolution  # not if the revolution is not known
@@ -361,8 +360,7 @@ class WholeGravity(_Gravity):
     least_turn = 0.1  # a straight line below
 
     def force(self, z: Any, p: Any) -> Any:
-        q = 2 * np.pi * z / p.L
-        return p.a * ca.sin(q) + p.b * ca.cos(q)
+        return _wave(z, p)
 
 
 class Unbalance(_Gravity):
@@ -377,5 +375,4 @@ class Unbalance(_Gravity):
     least_turn = 1.0  # less is a curve of the angle
 
     def force(self, z: Any, dz: Any, p: Any) -> Any:
-        q = 2 * np.pi * z / p.L
-        return dz**2 * (p.a * ca.sin(q) + p.b * ca.cos(q))
+        return dz**2 * _wave(z, p)
