@@ -163,7 +163,7 @@ def build_diagnosis(
 
 def _compute_errors(
     request: Request, search: Search, found: Conclusion, final: FinalFits, tests: tuple[Recording, ...]
-) -> tuple[dict[str, dict[str, float] | None], dict[NamedEffect, float], Comparison[str] | None, tuple[Gate, ...]]:
+) -> tuple[dict[str, dict[str, float] | None], dict[NamedEffect, float], Comparison | None, tuple[Gate, ...]]:
     """Compute the table of errors (see `Diagnosis`), the test errors without each of several effects, and notes.
 
     Also returns the comparison on the test recordings, if there are any.
@@ -218,7 +218,7 @@ def _resting_notes(resting: Sequence[tuple[str, int]]) -> Iterator[Gate]:
         yield Gate("simulation", "resting test", first, words, False)
 
 
-def _edit_notes(compared: Comparison[str]) -> Iterator[Gate]:
+def _edit_notes(compared: Comparison) -> Iterator[Gate]:
     """Note that the test recordings hardly have the faults for which they were corrected as the training data were."""
     given, corrected = compared.unedited, compared.errors["after"]
     if given * NEAR_RATIO < corrected:

@@ -223,7 +223,7 @@ class Hypotheses:
             alike = [t for t in self.memo.values() if t.key < trial.key and t.thorough and self._alike(t, trial)]
             shown = min([*alike, trial], key=lambda t: len(t.key))
             known = self.findings[shown.key].held_out
-            known = known or self.held_out_errors(shown.fitted, self.spread(shown.fitted, shown.laws))
+            known = known or self.held_out_errors(shown.fitted, self.spread(shown.fitted))
             self.findings[shown.key].held_out = self.findings[trial.key].held_out = known
         return known
 
@@ -237,10 +237,15 @@ class Hypotheses:
         """Compute the held-out errors of a fitted simulator with a known spread for other inputs."""
         return replace(held_out_errors(self.bench, fitted, self.workers), spread=spread)
 
-    def spread(self, fitted: Fitted, laws: Sequence[Placed]) -> float:
+    def spread(self, fitted: Fitted) -> float:
         """Compute the mean square uncertainty of a fitted simulator's predictions for other inputs."""
         own = Sample(self.floor2, count_samples(fitted, self.bench))
-        return spread(self.bench, fitted, laws, self.bench.pool(fitted.squares + self.tolerance), own.effective(0.0))
+        v = self.bench.pool(fitted.squares + self.tolerance)
+        return spread(self.bench, fitted, self.added_laws(fitted), v, own.effective(0.0))
+
+    def added_laws(self, fitted: Fitted) -> tuple[Placed, ...]:
+        """Return the laws that a fitted simulator has beside the one that is diagnosed."""
+        return fitted.simulator.elements[len(self.bench.simulator.elements) :]
 
     @property
     def _all_wrong(self) -> bool:
@@ -274,7 +279,6 @@ class Hypotheses:
             known.held_out = None
 
     def _likeliest(self) -> list[Trial]:
-        """List the hypotheses whose evidence is near the largest."""
         return likeliest(list(self.memo.values()), self.evidence)
 
     def flexible(self, trial: Trial) -> dict[str, float]:

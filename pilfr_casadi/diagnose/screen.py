@@ -113,7 +113,7 @@ class Remainder:
             for r, w in zip(runs, windows, strict=True)
         ]
         error = np.concatenate([(r.error / bench.scale).ravel() for r in short])
-        base = followed(bench, short)
+        base = orthonormal(np.hstack(own_changes(bench, short)))
         left = project_off(error, base)
         every = (*_tasks(bench, probe, laws, runs, short), *_parameter_tasks(bench, probe, laws, runs, short))
         tasks = [t for t in every if at in ("", t.port.name)]
@@ -174,11 +174,6 @@ def in_deviations(bench: Workbench, changes: np.ndarray) -> np.ndarray:
         y = (changes / bench.scale[:, None]).reshape(-1, changes.shape[2])
     y[:, ~((y.max(axis=0) < HUGE) & (y.min(axis=0) > -HUGE))] = 0.0  # a diverging response carries no information
     return y
-
-
-def followed(bench: Workbench, runs: Sequence[Run], skips: Sequence[int] = ()) -> np.ndarray:
-    """Compute orthonormal directions of the stacked outputs that parameters and initial states can follow, (R, n)."""
-    return orthonormal(np.hstack(own_changes(bench, runs, skips)))
 
 
 def own_changes(
@@ -279,16 +274,8 @@ def _held_out_rest(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: S
     return min((held_out_rest(phi, left, odd, ridge) for ridge in ridges), key=lambda rest: float(rest @ rest))
 
 
-def held_out_squares(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> np.ndarray:
-    """Compute the sum of squares of the rest on held-out blocks, for each column of `left`."""
-    return np.asarray(np.sum(held_out_rest(phi, left, odd, ridge) ** 2, axis=0))
-
-
 def held_out_rest(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> np.ndarray:
-    """Compute the rest on every second block with coefficients fitted to the others, and vice versa.
-
-    `left` is one column (R,) or several (R, k).
-    """
+    """Compute the rest (R,) on every second block with coefficients fitted to the others, and vice versa."""
     rest = np.empty_like(left)
     for a, b in ((odd, ~odd), (~odd, odd)):
         rest[b] = left[b] - phi[b] @ ridge_solution(phi[a], left[a], ridge)
@@ -391,7 +378,6 @@ def _stays_bounded(r: Run, scale: np.ndarray) -> bool:
 
 
 def _score(rest: Remainder, task: Task, source: str) -> list[Scored]:
-    """Score each law of one port."""
     total, out = max(float(rest.left @ rest.left), 1e-300), []
     for law, doses in rest.doses(task):
         sense, scores = rest.runs[0].sense(law, task.index), []

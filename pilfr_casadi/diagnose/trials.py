@@ -178,9 +178,8 @@ class Trials:
 
         For `options` see `Workbench.fit`.
         """
-        part = self.part
         try:
-            found = part.fit(simulator, starts, **options)
+            found = self.part.fit(simulator, starts, **options)
         except InputError:
             return None
         return self.make_trial(found, count)

@@ -220,7 +220,6 @@ def heated(by: str) -> type[Law]:
 
 
 def _check_profile(profile: str, known: Sequence[str]) -> str:
-    """Check the name of a profile."""
     if profile not in known:
         raise InputError(f"profile = {profile!r} was given; give {', '.join(map(repr, known))}.")
     return profile
@@ -264,7 +263,6 @@ def behind_gap(law: type[Law]) -> type[Law]:
 
 
 def _check_force(law: Any) -> Any:
-    """Check that a law is a force."""
     if not (isinstance(law, type) and issubclass(law, Law)):
         raise InputError(f"A composed law is made of a class of laws, such as CoulombFriction; got {law!r}.")
     if "parallel" not in law.places:
