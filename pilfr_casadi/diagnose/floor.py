@@ -37,19 +37,13 @@ SAME_LEVEL = 1e-9  # distance of two values, over the range, below which they ar
 
 @dataclass(frozen=True, eq=False)
 class Floor:
-    """Standard deviation of each output's noise (n_y,), and its source.
-
-    Attributes
-    ----------
-    repeats : int
-        Number of periods, or of recordings with the same input, on which the noise is measured; 1 if it is not.
-    independent : array, shape (n_y,)
-        Independent samples of each output's noise in a repeat.
-    """
+    """Standard deviation of each output's noise (n_y,), and its source."""
 
     deviation: np.ndarray
     source: str
+    # number of periods, or of recordings with the same input, on which the noise is measured; 1 if it is not
     repeats: int = 1
+    # (n_y,), independent samples of each output's noise in a repeat
     independent: np.ndarray = field(default_factory=lambda: np.ones(1))
 
     def may_be(self, rms: np.ndarray) -> bool:

@@ -207,19 +207,9 @@ def _solve_weights(
 def learn_forces(bench: Workbench, base: Fitted, port_names: Sequence[str], workers: int = 1) -> list[Fitted]:
     """Fit a learned element at each of some ports, on top of a fitted simulator, which may already have elements.
 
-    Parameters
-    ----------
-    bench : Workbench
-        The bench with as much of the recordings as is needed to choose; see `refit_learned`.
-    port_names : sequence of str
-        Ports to try.
-    workers : int
-        Threads; the best few elements by the linear solution are fitted.
-
-    Returns
-    -------
-    list of Fitted
-        Smallest error first; the learned element is the last of each. Fits that diverge are left out.
+    The best few by the linear solution are fitted, to as much of the recordings as is needed to choose; see
+    `refit_learned`. The fits are returned with the smallest error first, and the learned element as the last of each.
+    Fits that diverge are left out.
     """
     starts = [s for s in linear_starts(bench, base, port_names) if s.share > 0]
     found = side_by_side(lambda start: _fit_element(bench, base, start), starts[:FEW], workers)

@@ -82,23 +82,12 @@ class _Gap(Gate):
 
 @dataclass(frozen=True, eq=False)
 class Jump(_Gap):
-    """A jump of the state, as where samples were lost; until it is reported, its value is (recording, sample).
+    """A jump of the state, as where samples were lost; until it is reported, its value is (recording, sample)."""
 
-    Attributes
-    ----------
-    share : float
-        Share of the mean square that the jump removes.
-    rival : float
-        Share that a shock nearby, or a step of one force or sensor there, removes.
-    neighbour : float
-        Share that a jump some samples away removes.
-    places : tuple of (int, int)
-        Once reported: each recording that is cut, and the sample at which its later piece begins.
-    """
-
-    share: float = 0.0
-    rival: float = 0.0
-    neighbour: float = 0.0
+    share: float = 0.0  # share of the mean square that the jump removes
+    rival: float = 0.0  # share that a shock nearby, or a step of one force or sensor there, removes
+    neighbour: float = 0.0  # share that a jump some samples away removes
+    # once reported: each recording that is cut, and the sample at which its later piece begins
     places: tuple[tuple[int, int], ...] = ()
     remedy: ClassVar[str] = "with the recording cut there"
 
@@ -278,17 +267,10 @@ class OutputGap(_Gap):
     """Lost samples of some outputs; until it is reported, its value is (recording, sample, number of lost samples).
 
     A negative number says that all other channels have lost samples, so that these outputs come too late.
-
-    Attributes
-    ----------
-    columns : tuple of int
-        The outputs.
-    share : float
-        Share of the mean square that is left.
     """
 
     columns: tuple[int, ...] = (0,)
-    share: float = 1.0
+    share: float = 1.0  # share of the mean square that is left
     parameters: ClassVar[int] = 2
     remedy: ClassVar[str] = "with the recording cut there and the later outputs moved back"
 

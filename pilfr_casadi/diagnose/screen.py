@@ -80,28 +80,14 @@ class Dose:
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """The error along runs, and its part that the simulator's own parameters cannot imitate.
-
-    Attributes
-    ----------
-    runs : list of Run
-        The stretches that are used.
-    base : array, shape (R, n)
-        Orthonormal directions that parameters and initial states can follow.
-    left : array, shape (R,)
-        The rest of the error, each output in units of its deviation.
-    tasks : tuple of Task
-        Ports whose laws can be tried, sensors last.
-    odd : array, shape (R,), bool
-        Every second block.
-    """
+    """The error along runs, and its part that the simulator's own parameters cannot imitate."""
 
     bench: Workbench
-    runs: list[Run]
-    base: np.ndarray
-    left: np.ndarray
-    tasks: tuple[Task, ...]
-    odd: np.ndarray
+    runs: list[Run]  # the stretches that are used
+    base: np.ndarray  # (R, n), orthonormal directions that parameters and initial states can follow
+    left: np.ndarray  # (R,), the rest of the error, each output in units of its deviation
+    tasks: tuple[Task, ...]  # ports whose laws can be tried, sensors last
+    odd: np.ndarray  # (R,), every second block
 
     @classmethod
     def of(cls, bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]], at: str = "") -> Remainder:
@@ -347,14 +333,7 @@ def screen(
 ) -> tuple[list[Scored], np.ndarray | None]:
     """Score every port and law along the simulation and along the observer, best first.
 
-    Also returns the observer's gain.
-
-    Parameters
-    ----------
-    noise : array, shape (n_y,)
-        Standard deviation of the outputs' noise.
-    workers : int
-        Ports processed in parallel.
+    `noise` (n_y,) is the standard deviation of the outputs' noise. Also returns the observer's gain.
     """
     bench = bench.balanced(fitted)
     probe, runs = linearise_runs(bench, fitted)

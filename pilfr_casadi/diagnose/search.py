@@ -64,21 +64,11 @@ class Step:
 
 @dataclass(eq=False, repr=False)
 class Search(Hypotheses):
-    """A search, filled by `run`.
+    """A search, filled by `run`."""
 
-    Attributes
-    ----------
-    steps : list of Step
-        The moves, in their order.
-    aligned : bool
-        Whether the times of the channels are settled, so that no shift is looked for.
-    shift : Gate, optional
-        The shift of a channel that ended the search, because it shows only beside a law.
-    """
-
-    steps: list[Step] = field(default_factory=list)
-    aligned: bool = False
-    shift: Gate | None = None
+    steps: list[Step] = field(default_factory=list)  # the moves, in their order
+    aligned: bool = False  # whether the times of the channels are settled, so that no shift is looked for
+    shift: Gate | None = None  # the shift of a channel that ended the search, because it shows only beside a law
 
     def run(self, effects: float) -> Search:
         """Search for up to `effects` effects; an interrupt ends the search with the present results."""

@@ -123,10 +123,7 @@ def choose_stretches(
 ) -> tuple[Stretch, ...]:
     """Choose the stretches of recordings that say most about missing forces; see the module docstring.
 
-    Parameters
-    ----------
-    most : int
-        Samples up to which everything would be searched; the stretches have two thirds of it together at most.
+    They have two thirds of `most` samples together, up to which everything would be searched.
     """
     length = max(int(STRETCH_SHARE * most) // LONG_STRETCHES, SHORTEST_STRETCH)
     stretches = [s for i, r in enumerate(recordings) for s in divide(i, len(r), r.skip, length)]

@@ -65,21 +65,14 @@ Name = tuple[str, str]  # port and law id
 
 @dataclass(frozen=True, eq=False)
 class NamedEffect:
-    """An effect of the likeliest hypothesis.
-
-    Attributes
-    ----------
-    confidence : float
-        Probability that it is included, or the same law elsewhere if the recordings cannot tell the place.
-    alike : dict
-        Port and law id of indistinguishable effects in its place -> the hypothesis, the likeliest first.
-    at_port : float
-        Probability that this law or another of the catalogue acts at its port, or at one where it looks alike.
-    """
+    """An effect of the likeliest hypothesis."""
 
     element: Placed
+    # probability that it is included, or the same law elsewhere if the recordings cannot tell the place
     confidence: float
+    # port and law id of indistinguishable effects in its place -> the hypothesis, the likeliest first
     alike: dict[Name, Trial]
+    # probability that this law or another of the catalogue acts at its port, or at one where it looks alike
     at_port: float
 
     @property
@@ -99,24 +92,12 @@ class NamedEffect:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Probabilities of the answers.
+    """Probabilities of the answers."""
 
-    Attributes
-    ----------
-    best : Trial
-        The likeliest hypothesis.
-    named : float
-        Probability that the laws of the best hypothesis are the physics, given this hypothesis.
-    effects : tuple of NamedEffect
-        Its laws, strongest first.
-    nothing : float
-        Probability of the simulator alone.
-    """
-
-    best: Trial
-    named: float
-    effects: tuple[NamedEffect, ...]
-    nothing: float
+    best: Trial  # the likeliest hypothesis
+    named: float  # probability that the laws of the best hypothesis are the physics, given this hypothesis
+    effects: tuple[NamedEffect, ...]  # its laws, strongest first
+    nothing: float  # probability of the simulator alone
 
     @property
     def sure(self) -> float:
