@@ -23,7 +23,7 @@ COMMANDS = {  # name: (file, help)
     "fit": ("models", "Identify a PI-LFR model from recordings."),
     "check": ("diagnose", "Find what recordings can reveal about a simulator, before a diagnosis."),
     "diagnose": ("diagnose", "Find the physics that a simulator leaves out."),
-    "fleet": ("fleet", "Find the physics that a simulator lacks on many machines, and the machines that differ."),
+    "fleet": ("studies", "Find the physics that a simulator lacks on many machines, and the machines that differ."),
     "simulate": ("models", "Simulate a saved model on a recording's inputs."),
     "export": ("models", "Write a model's step as a serialized CasADi function, as C, or as an FMU."),
     "run": ("studies", "Execute the jobs of a run file one by one; finished jobs are skipped."),

@@ -291,7 +291,6 @@ def simulate_command(options: SimulateOptions) -> int:
 
 
 def _simulate_equations(options: SimulateOptions) -> int:
-    """Simulate the equations of a Python file."""
     simulator = load_simulator(options.model)
     if {Path(options.data).suffix.lower(), Path(options.out).suffix.lower()} & set(STACK_SUFFIXES) - {".npz"}:
         raise InputError("Only a saved model simulates several records in one array; give one recording.")

@@ -42,54 +42,27 @@ from .workbench import Fitted, Workbench
 
 @dataclass(frozen=True, eq=False)
 class Conclusion:
-    """Answer of a search.
-
-    Attributes
-    ----------
-    fitted : Fitted
-        The corrected simulator, or the refitted one if there is nothing to correct.
-    correction : Correction
-        The elements that `fitted` has beside the refitted simulator.
-    effects : tuple of NamedEffect
-        The named effects.
-    freed : str
-        The pinned parameters whose other values explain as much as the named laws, joined by "and".
-    decided : Search, optional
-        The search that has named the effects, if it is another one.
-    """
+    """Answer of a search."""
 
     verdict: Verdict
     gates: tuple[Gate, ...]
-    fitted: Fitted
-    correction: Correction
+    fitted: Fitted  # the corrected simulator, or the refitted one if there is nothing to correct
+    correction: Correction  # the elements that `fitted` has beside the refitted simulator
     effects: tuple[NamedEffect, ...] = ()
-    freed: str = ""
-    decided: Search | None = None
+    freed: str = ""  # the pinned parameters whose other values explain as much as the named laws, joined by "and"
+    decided: Search | None = None  # the search that has named the effects, if it is another one
 
 
 @dataclass(frozen=True, eq=False)
 class FinalFits:
-    """The fits whose values and errors an answer states.
+    """The fits whose values and errors an answer states."""
 
-    Attributes
-    ----------
-    bench : Workbench
-        All training recordings as corrected.
-    without, after : Fitted
-        The refitted and the corrected simulator, fitted to them.
-    nominal : float
-        NRMSE at the user's values.
-    drawn : tuple of Fitted
-        Both along the recordings of the search's bench.
-    to_all : callable
-        Fits a simulator of the search to the recordings of `bench`.
-    """
-
-    bench: Workbench
-    without: Fitted
-    after: Fitted
-    nominal: float
-    drawn: tuple[Fitted, Fitted]
+    bench: Workbench  # all training recordings as corrected
+    without: Fitted  # the refitted simulator, fitted to them
+    after: Fitted  # the corrected simulator, fitted to them
+    nominal: float  # NRMSE at the user's values
+    drawn: tuple[Fitted, Fitted]  # both along the recordings of the search's bench
+    # fits a simulator of the search to the recordings of `bench`
     to_all: Callable[[Fitted], Fitted] = lambda fitted: fitted
 
 
@@ -163,7 +136,7 @@ def build_diagnosis(
 
 def _compute_errors(
     request: Request, search: Search, found: Conclusion, final: FinalFits, tests: tuple[Recording, ...]
-) -> tuple[dict[str, dict[str, float] | None], dict[NamedEffect, float], Comparison[str] | None, tuple[Gate, ...]]:
+) -> tuple[dict[str, dict[str, float] | None], dict[NamedEffect, float], Comparison | None, tuple[Gate, ...]]:
     """Compute the table of errors (see `Diagnosis`), the test errors without each of several effects, and notes.
 
     Also returns the comparison on the test recordings, if there are any.
@@ -218,7 +191,7 @@ def _resting_notes(resting: Sequence[tuple[str, int]]) -> Iterator[Gate]:
         yield Gate("simulation", "resting test", first, words, False)
 
 
-def _edit_notes(compared: Comparison[str]) -> Iterator[Gate]:
+def _edit_notes(compared: Comparison) -> Iterator[Gate]:
     """Note that the test recordings hardly have the faults for which they were corrected as the training data were."""
     given, corrected = compared.unedited, compared.errors["after"]
     if given * NEAR_RATIO < corrected:

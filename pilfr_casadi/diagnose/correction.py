@@ -20,7 +20,7 @@ import numpy as np
 
 from .._base import InputError
 from ..laws import CATALOGUE
-from ..simulators import Placed, name_at
+from ..simulators import name_at
 from .evidence import FORMULA_ERROR, NEAR_RATIO, SURE, HeldOut, runs_away
 from .floor import Floor
 from .hypotheses import likeliest
@@ -113,6 +113,11 @@ class _Candidate:
     base: Trial
     spread: float
 
+    @classmethod
+    def of(cls, search: Search, fitted: Fitted, base: Trial) -> _Candidate:
+        """Compute the spread of a fitted simulator."""
+        return cls(fitted, base, search.spread(fitted))
+
     @property
     def least(self) -> float:
         """Least expected mean square error: held-out error is hardly ever below the fit error."""
@@ -132,9 +137,10 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     best_laws = answer.best
     if named and (search.interrupted or _is_settled(search, answer)):
         return named_correction(search, best_laws.fitted), best_laws.fitted
-    refitted = [] if search.past_deadline else _predict(search, [_make_candidate(search, search.root)], [])
+    refit = _Candidate.of(search, search.root.fitted, search.root)
+    refitted = [] if search.past_deadline else _predict(search, [refit], [])
     tried = _named_hypotheses(search, answer) if named else _hypotheses_with_laws(search)
-    candidates = [_make_candidate(search, t) for t in tried]
+    candidates = [_Candidate.of(search, t.fitted, t) for t in tried]
     predicted = _predict(search, candidates, refitted) if refitted else []
     if len(predicted) < 2 and search.past_deadline:  # without a comparison the named laws stay, or what is far better
         stays = tried[0] if named else _far_better(search, candidates)
@@ -209,11 +215,6 @@ def _hypotheses_with_laws(search: Search) -> list[Trial]:
     return [t for t in finite if not runs_away(search.bench, t.fitted, search.without)]
 
 
-def _make_candidate(search: Search, trial: Trial) -> _Candidate:
-    """Make the candidate of a trial."""
-    return _Candidate(trial.fitted, trial, search.spread(trial.fitted, trial.laws))
-
-
 def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()) -> list[_Candidate]:
     """Make the candidate with the best learned force beside a trial at a port that is not taken, if there is one.
 
@@ -229,7 +230,7 @@ def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()
         fitted = refit_learned(search.bench, found)
     except InputError:  # it diverges
         return []
-    return [_Candidate(fitted, base, search.spread(fitted, _added_elements(search, fitted)))]
+    return [_Candidate.of(search, fitted, base)]
 
 
 def named_correction(search: Search, fitted: Fitted) -> Correction:
@@ -253,9 +254,4 @@ def _shares(search: Search, named: Fitted, whole: Fitted, floor: Floor) -> dict[
 
 def _describe_elements(search: Search, fitted: Fitted) -> tuple[tuple[str, str, str], ...]:
     """Return port, law and form of the elements that the diagnosis has added."""
-    return tuple((e.port, e.law.id, e.law.form) for e in _added_elements(search, fitted))
-
-
-def _added_elements(search: Search, fitted: Fitted) -> Sequence[Placed]:
-    """Return the elements that the diagnosis has added."""
-    return fitted.simulator.elements[len(search.bench.simulator.elements) :]
+    return tuple((e.port, e.law.id, e.law.form) for e in search.added_laws(fitted))

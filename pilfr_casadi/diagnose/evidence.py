@@ -295,10 +295,9 @@ def _covariance_root(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.n
 
 
 def _widths(fitted: Fitted, laws: Sequence[Placed], free: np.ndarray, square: np.ndarray) -> np.ndarray:
-    """Compute the prior width of each free parameter.
+    """Compute the prior width of each free parameter, from its bounds (`prior_width`) unless it is a strength of a law.
 
-    The width of a strength is that of its own prior, or else the value that moves the outputs by their deviation. The
-    width of any other parameter comes from its bounds, in logarithms if these span more than a decade.
+    The width of a strength is that of its own prior, or else the value that moves the outputs by their deviation.
     """
     parameters, values = fitted.model.parameters, fitted.vector
     width = prior_width(np.maximum(np.abs(values), 1e-300), parameters.lower, parameters.upper)

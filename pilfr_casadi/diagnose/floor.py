@@ -37,19 +37,13 @@ SAME_LEVEL = 1e-9  # distance of two values, over the range, below which they ar
 
 @dataclass(frozen=True, eq=False)
 class Floor:
-    """Standard deviation of each output's noise (n_y,), and its source.
-
-    Attributes
-    ----------
-    repeats : int
-        Number of periods, or of recordings with the same input, on which the noise is measured; 1 if it is not.
-    independent : array, shape (n_y,)
-        Independent samples of each output's noise in a repeat.
-    """
+    """Standard deviation of each output's noise (n_y,), and its source."""
 
     deviation: np.ndarray
     source: str
+    # number of periods, or of recordings with the same input, on which the noise is measured; 1 if it is not
     repeats: int = 1
+    # (n_y,), independent samples of each output's noise in a repeat
     independent: np.ndarray = field(default_factory=lambda: np.ones(1))
 
     def may_be(self, rms: np.ndarray) -> bool:
@@ -113,7 +107,7 @@ def measured_floor(recordings: Sequence[Recording]) -> Floor | None:
     for r in recordings:
         groups.setdefault(r.u.tobytes(), []).append(r)
     periods = [y for r in recordings if (y := _fold(r)) is not None]
-    alike = [y for g in groups.values() if len(g) > 1 and _repeat(g) and (y := _stack(g)) is not None]
+    alike = [y for g in groups.values() if (y := _stack(g)) is not None]
     repeated = periods or alike
     if not repeated:
         return None
@@ -170,28 +164,20 @@ def _responses(u: np.ndarray) -> np.ndarray:
     return np.hstack([a - b for a, b in pairwise(until)]) if len(edges) > 1 else np.zeros((n, 0))
 
 
-def _settled(group: Sequence[Recording]) -> int:
-    """Return the first compared sample of recordings of one input: late if their initial states may differ."""
-    first = max(r.skip for r in group)
-    return first if _begin_alike(group) else max(first, len(group[0]) // 2)
-
-
-def _begin_alike(group: Sequence[Recording]) -> bool:
-    return all(r.begins in ("zero", "periodic") for r in group)
-
-
-def _repeat(group: Sequence[Recording]) -> bool:
-    """Tell whether recordings of one input repeat an experiment.
-
-    Where the input rests, as in free decays from different heights, their unknown initial states decide what follows.
-    """
-    return _begin_alike(group) or bool(np.any(np.ptp(group[0].u[_settled(group) :], axis=0) > 0))
-
-
 def _stack(group: Sequence[Recording]) -> np.ndarray | None:
-    """Stack the outputs of recordings of one input, (P, N, n_y); None if the input drives their differences."""
-    first = _settled(group)
-    y, u = np.stack([r.y[first:] for r in group]), group[0].u
+    """Stack the outputs of recordings of one input, (P, N, n_y); None if they do not repeat an experiment.
+
+    They do not if the input drives their differences. Unknown initial states may differ, so that only the second half
+    is compared; and where the input rests there, as in free decays from different heights, they decide what follows.
+    """
+    if len(group) < 2:
+        return None
+    first, u = max(r.skip for r in group), group[0].u
+    if not all(r.begins in ("zero", "periodic") for r in group):
+        first = max(first, len(u) // 2)
+        if not np.any(np.ptp(u[first:], axis=0) > 0):
+            return None
+    y = np.stack([r.y[first:] for r in group])
     return None if _is_driven(y - np.mean(y, axis=0), u[first:], u[:first]) else y
 
 

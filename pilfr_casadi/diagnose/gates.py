@@ -245,8 +245,7 @@ def settle(now: Checked, fault: G, solver: GaussNewton = QUICK) -> tuple[G, Chec
 def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
     """Return the corrected state with its finding if the rule accepts the fault, else the state before.
 
-    The simulator is also refitted to the recordings as given, from the corrected refit's values. If that follows as
-    well, the correction only led the refit out of a local minimum, and that refit is returned.
+    If the correction only led the refit out of a local minimum, the better refit as given is returned.
     """
     if after is None or not _satisfies_rule(now, after, fault):
         return now

@@ -46,86 +46,41 @@ MOST_PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the 
 
 @dataclass(eq=False, repr=False)
 class Findings:
-    """Results about one hypothesis that are computed when they are first needed.
+    """Results about one hypothesis that are computed when they are first needed."""
 
-    Attributes
-    ----------
-    screened : tuple, optional
-        The scores of all further laws, and the observer's gain; see `screen`.
-    flexible : dict, optional
-        The share of the residual that a flexible force at each port explains.
-    innovations : float, optional
-        The share of the residual's innovations that it explains.
-    likelihood : tuple of float, optional
-        The log likelihood of a sample of its residual as coloured noise, and the log prior density of its first states.
-    learned : list of Fitted, optional
-        The learned forces beside it, best first.
-    held_out : HeldOut, optional
-        Its errors on held-out data.
-    varied : bool
-        Whether variations of parameters were tried beside it.
-    replaced : bool
-        Whether laws with constant parameters were tried in place of its last law, which varies.
-    """
-
+    # the scores of all further laws, and the observer's gain; see `screen`
     screened: tuple[list[Scored], np.ndarray | None] | None = None
-    flexible: dict[str, float] | None = None
-    innovations: float | None = None
+    flexible: dict[str, float] | None = None  # the share of the residual that a flexible force at each port explains
+    innovations: float | None = None  # the share of the residual's innovations that it explains
+    # the log likelihood of a sample of its residual as coloured noise, and the log prior density of its first states
     likelihood: tuple[float, float] | None = None
-    learned: list[Fitted] | None = None
-    held_out: HeldOut | None = None
-    varied: bool = False
-    replaced: bool = False
+    learned: list[Fitted] | None = None  # the learned forces beside it, best first
+    held_out: HeldOut | None = None  # its errors on held-out data
+    varied: bool = False  # whether variations of parameters were tried beside it
+    replaced: bool = False  # whether laws with constant parameters were tried in place of its last law, which varies
 
 
 @dataclass(eq=False, repr=False)
 class Hypotheses:
-    """The hypotheses that were fitted to some recordings, and the results about each.
+    """The hypotheses that were fitted to some recordings, and the results about each."""
 
-    Attributes
-    ----------
-    bench : Workbench
-        Recordings, and the settings for runs and fits.
-    without : Fitted
-        The refitted simulator, with no law.
-    floor : Floor
-        The noise; if it is only estimated, the search improves the estimate.
-    laws : sequence of type of Law
-        The laws that are tried.
-    memo : dict
-        The best trial of every fitted hypothesis, by key.
-    findings : dict
-        Further results about each fitted hypothesis, by key.
-    hold_said : bool
-        Whether somebody stated the hold of the inputs between samples.
-    stand_in_error : float
-        NRMSE between a surrogate and its simulation; the floor contains it.
-    count : float
-        Samples of the best residual over its correlation time.
-    until : float
-        Time (of `time.perf_counter`) at which the search ends.
-    out_of_time : bool
-        Whether the time limit ended the search.
-    mismatch2 : float, optional
-        Mean square of the mismatch, all outputs alike; formulas of laws may leave a share of it. By default the error
-        of the refit.
-    """
-
-    bench: Workbench
-    without: Fitted
-    floor: Floor
+    bench: Workbench  # recordings, and the settings for runs and fits
+    without: Fitted  # the refitted simulator, with no law
+    floor: Floor  # the noise; if it is only estimated, the search improves the estimate
     laws: Sequence[type[Law]]
     workers: int
     say: Stages
-    hold_said: bool = True
-    stand_in_error: float = 0.0
-    until: float = np.inf
-    memo: dict[Key, Trial] = field(default_factory=dict)
+    hold_said: bool = True  # whether somebody stated the hold of the inputs between samples
+    stand_in_error: float = 0.0  # NRMSE between a surrogate and its simulation; the floor contains it
+    until: float = np.inf  # time (of `time.perf_counter`) at which the search ends
+    memo: dict[Key, Trial] = field(default_factory=dict)  # the best trial of every fitted hypothesis, by key
     alternatives: dict[str, tuple[Law, ...]] = field(default_factory=dict)
+    # further results about each fitted hypothesis, by key
     findings: defaultdict[Key, Findings] = field(default_factory=lambda: defaultdict(Findings))
     times: dict[str, float] = field(default_factory=dict)
-    out_of_time: bool = False
-    count: float = FEWEST
+    out_of_time: bool = False  # whether the time limit ended the search
+    count: float = FEWEST  # samples of the best residual over its correlation time
+    # mean square of the mismatch, all outputs alike, of which formulas may leave a share; by default the refit's error
     mismatch2: float | None = None
 
     @cached_property
@@ -223,7 +178,7 @@ class Hypotheses:
             alike = [t for t in self.memo.values() if t.key < trial.key and t.thorough and self._alike(t, trial)]
             shown = min([*alike, trial], key=lambda t: len(t.key))
             known = self.findings[shown.key].held_out
-            known = known or self.held_out_errors(shown.fitted, self.spread(shown.fitted, shown.laws))
+            known = known or self.held_out_errors(shown.fitted, self.spread(shown.fitted))
             if not self.past_deadline:  # otherwise they are not known
                 self.findings[shown.key].held_out = self.findings[trial.key].held_out = known
         return known
@@ -238,10 +193,15 @@ class Hypotheses:
         """Compute the held-out errors of a fitted simulator with a known spread for other inputs."""
         return replace(held_out_errors(self.bench, fitted, self.workers), spread=spread)
 
-    def spread(self, fitted: Fitted, laws: Sequence[Placed]) -> float:
+    def spread(self, fitted: Fitted) -> float:
         """Compute the mean square uncertainty of a fitted simulator's predictions for other inputs."""
         own = Sample(self.floor2, count_samples(fitted, self.bench))
-        return spread(self.bench, fitted, laws, self.bench.pool(fitted.squares + self.tolerance), own.effective(0.0))
+        v = self.bench.pool(fitted.squares + self.tolerance)
+        return spread(self.bench, fitted, self.added_laws(fitted), v, own.effective(0.0))
+
+    def added_laws(self, fitted: Fitted) -> tuple[Placed, ...]:
+        """Return the laws that a fitted simulator has beside the one that is diagnosed."""
+        return fitted.simulator.elements[len(self.bench.simulator.elements) :]
 
     @property
     def _all_wrong(self) -> bool:
@@ -275,7 +235,6 @@ class Hypotheses:
             known.held_out = None
 
     def _likeliest(self) -> list[Trial]:
-        """List the hypotheses whose evidence is near the largest."""
         return likeliest(list(self.memo.values()), self.evidence)
 
     def flexible(self, trial: Trial) -> dict[str, float]:

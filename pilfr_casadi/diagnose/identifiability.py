@@ -90,23 +90,13 @@ class Tie:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Sensitivity of the outputs, along whole recordings, to free parameters and unknown initial states.
+    """Sensitivity of the outputs, along whole recordings, to free parameters and unknown initial states."""
 
-    Attributes
-    ----------
-    bench, fitted : Workbench, Fitted
-        The bench, whose scale is the noise, and the refitted simulator.
-    span : array, shape (n,)
-        Prior standard deviation of each value, from its bounds alone.
-    raw, start : array, shapes (R, n) and (R, k)
-        Changes of all outputs, in units of the noise, by a unit change of each parameter and unknown initial state.
-    """
-
-    bench: Workbench
-    fitted: Fitted
-    span: np.ndarray
-    raw: np.ndarray
-    start: np.ndarray
+    bench: Workbench  # its scale is the noise
+    fitted: Fitted  # the refitted simulator
+    span: np.ndarray  # (n,), prior standard deviation of each value, from its bounds alone
+    raw: np.ndarray  # (R, n), changes of all outputs, in units of the noise, by a unit change of each parameter
+    start: np.ndarray  # (R, k), the same by each unknown initial state
 
     @classmethod
     def of(cls, bench: Workbench, fitted: Fitted, runs: Sequence[Run]) -> Sensitivity:

@@ -30,7 +30,7 @@ from ..laws import POSITION_GAINS, SCALABLE, Law, Local, display_name, likely_pr
 from ..models import Parameter, play
 from .force_recovery import law_signals
 from .linearise import linearise_runs, loudest_stretch, port_signals
-from .screen import Remainder, Task, fit_shapes, held_out_squares, lengths, ridge_solution, start_values, usable
+from .screen import Remainder, Task, fit_shapes, held_out_rest, lengths, ridge_solution, start_values, usable
 from .workbench import COMPARED_SAMPLES, FEW, Fitted, Workbench
 
 STOPS = 8  # number of stops
@@ -196,29 +196,20 @@ def _solve_weights(
     if not np.any(felt):
         return Start(task.port.name, learned_force(factor)({**scales, "std": 0.0}), 0.0)
     phi, unit = phi[:, felt], float(np.mean(lengths(phi[:, felt]) ** 2))
-    wrong, ridge = min((held_out_squares(phi, rest.left, rest.odd, unit * ridge), ridge) for ridge in WEIGHT_RIDGES)
+    rests = {ridge: held_out_rest(phi, rest.left, rest.odd, unit * ridge) for ridge in WEIGHT_RIDGES}
+    wrong, ridge = min((float(np.sum(e**2)), ridge) for ridge, e in rests.items())
     weights[felt] = -ridge_solution(phi, rest.left, unit * ridge) / size[felt]
     std[felt] = 1 / (size[felt] * np.sqrt(unit * ridge * repeated))
     law = learned_force(factor)({**scales, "c": weights, "std": std})
-    return Start(task.port.name, law, 1 - float(wrong) / max(float(rest.left @ rest.left), 1e-300))
+    return Start(task.port.name, law, 1 - wrong / max(float(rest.left @ rest.left), 1e-300))
 
 
 def learn_forces(bench: Workbench, base: Fitted, port_names: Sequence[str], workers: int = 1) -> list[Fitted]:
     """Fit a learned element at each of some ports, on top of a fitted simulator, which may already have elements.
 
-    Parameters
-    ----------
-    bench : Workbench
-        The bench with as much of the recordings as is needed to choose; see `refit_learned`.
-    port_names : sequence of str
-        Ports to try.
-    workers : int
-        Threads; the best few elements by the linear solution are fitted.
-
-    Returns
-    -------
-    list of Fitted
-        Smallest error first; the learned element is the last of each. Fits that diverge are left out.
+    The best few by the linear solution are fitted, to as much of the recordings as is needed to choose; see
+    `refit_learned`. The fits are returned with the smallest error first, and the learned element as the last of each.
+    Fits that diverge are left out.
     """
     starts = [s for s in linear_starts(bench, base, port_names) if s.share > 0]
     found = side_by_side(lambda start: _fit_element(bench, base, start), starts[:FEW], workers)

@@ -65,22 +65,12 @@ def with_probes(simulator: Simulator) -> Simulator:
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """One step of the probed simulator at fitted values, its derivatives, and the local signals of its ports.
-
-    Attributes
-    ----------
-    step : casadi.Function
-        `(x, u) -> (y, A, B, C, D)`; B and D have a column for each free parameter, then each port.
-    local : casadi.Function
-        `(x, u, slope, t, p) -> (z, dz)`, one row a port; p excludes the probes.
-    values : array
-        Parameter vector of the probed model.
-    """
+    """One step of the probed simulator at fitted values, its derivatives, and the local signals of its ports."""
 
     model: Model
-    step: ca.Function
-    local: ca.Function
-    values: np.ndarray
+    step: ca.Function  # `(x, u) -> (y, A, B, C, D)`; B and D have a column for each free parameter, then each port
+    local: ca.Function  # `(x, u, slope, t, p) -> (z, dz)`, one row a port; p excludes the probes
+    values: np.ndarray  # parameter vector of the probed model
     free: np.ndarray
     ports: tuple[str, ...]
     n_x: int
@@ -106,51 +96,25 @@ class Probe:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A recording's run, with the matrices that propagate small changes along it.
+    """A recording's run, with the matrices that propagate small changes along it."""
 
-    Attributes
-    ----------
-    a, b, c, d : array, shapes (M, n_x, n_x), (M, n_x, n_c), (M, n_y, n_x), (M, n_y, n_c)
-        One per sample.
-    mean : tuple of array
-        Mean a, b, c of a sub-step.
-    error : array, shape (M, n_y)
-        Simulated (or predicted) minus measured output.
-    z, dz : array, shape (M, n_ports)
-        Local signals.
-    x, u : array, shapes (M, n_x) and (M, n_u)
-        The simulator's own states, and inputs.
-    p : array
-        Parameter vector, the simulator's own first.
-    own : array, shape (M, n)
-        The ports' own signals.
-    sign : array, shape (n_ports,)
-        +1 if a positive force opposes the port's motion, -1 if it drives it, 0 if neither.
-    back : array, shape (n_ports,)
-        The same for a positive force that pushes the port back.
-    lift, push : array, shape (n_ports,)
-        Largest effects of a unit force on the local coordinate's first and second derivative.
-    from_zero : bool
-        Whether all states begin at zero.
-    """
-
-    a: np.ndarray
-    b: np.ndarray
-    c: np.ndarray
-    d: np.ndarray
-    mean: tuple[np.ndarray, np.ndarray, np.ndarray]
-    error: np.ndarray
-    z: np.ndarray
-    dz: np.ndarray
-    x: np.ndarray
-    u: np.ndarray
-    p: np.ndarray
-    own: np.ndarray
-    sign: np.ndarray
-    back: np.ndarray
-    lift: np.ndarray
-    push: np.ndarray
-    from_zero: bool = False
+    a: np.ndarray  # (M, n_x, n_x), one for each sample
+    b: np.ndarray  # (M, n_x, n_c)
+    c: np.ndarray  # (M, n_y, n_x)
+    d: np.ndarray  # (M, n_y, n_c)
+    mean: tuple[np.ndarray, np.ndarray, np.ndarray]  # mean a, b, c of a sub-step
+    error: np.ndarray  # (M, n_y), simulated (or predicted) minus measured output
+    z: np.ndarray  # (M, n_ports), local coordinates
+    dz: np.ndarray  # (M, n_ports), their rates
+    x: np.ndarray  # (M, n_x), the simulator's own states
+    u: np.ndarray  # (M, n_u), inputs
+    p: np.ndarray  # parameter vector, the simulator's own first
+    own: np.ndarray  # (M, n), the ports' own signals
+    sign: np.ndarray  # (n_ports,), +1 if a positive force opposes the port's motion, -1 if it drives it, 0 if neither
+    back: np.ndarray  # (n_ports,), the same for a positive force that pushes the port back
+    lift: np.ndarray  # (n_ports,), largest effect of a unit force on the local coordinate's first derivative
+    push: np.ndarray  # (n_ports,), the same on its second derivative
+    from_zero: bool = False  # whether all states begin at zero
 
     @property
     def n_free(self) -> int:
@@ -292,14 +256,8 @@ def observer_gain(probe: Probe, runs: list[Run], noise: np.ndarray) -> np.ndarra
 def propagate(r: Run, forces: Sequence[tuple[int, np.ndarray]] = ()) -> np.ndarray:
     """Compute the changes of the outputs by free parameters, the initial state, and forces at ports.
 
-    Parameters
-    ----------
-    forces : list of (port, array of shape (M, n))
-        Forces at the samples of the run; a port's number counts from 0.
-
-    Returns
-    -------
-    array, shape (M, n_y, n_free + n_x + total n)
+    Each entry of `forces` is the number of a port, counted from 0, and forces (M, n) at the samples of the run. The
+    changes have the shape (M, n_y, n_free + n_x + total n).
     """
     (m, n_x, _), n_free = r.a.shape, r.n_free
     n_y, first = r.c.shape[1], n_free + n_x

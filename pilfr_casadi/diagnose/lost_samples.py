@@ -53,7 +53,7 @@ RIDGE = 1e-6  # on the normal equations, against jumps that initial states can f
 
 @dataclass(frozen=True, eq=False)
 class _Gap(Gate):
-    """A gap at which a recording is cut in two; its value begins with (recording, sample)."""
+    """A gap at which a recording is cut in two; its value is the recording's number and the arguments of `cut`."""
 
     states: Sequence[np.ndarray] = ()  # initial states of the recordings when this one is cut
 
@@ -61,9 +61,17 @@ class _Gap(Gate):
         """Return the initial states of the recordings in pieces."""
         return self.states
 
-    def put_pieces(self, bench: Workbench, pieces: tuple[Recording, Recording]) -> Workbench:
-        """Return the bench with two pieces in place of the recording."""
-        i = self.value[0]
+    def cut(self, r: Recording, *place: int) -> tuple[Recording, Recording]:
+        """Cut a recording in two; the state at the later piece is estimated.
+
+        The earlier piece ends at the first place, the later one begins at the last.
+        """
+        return r.slice(0, place[0]), r.slice(place[-1]).with_(initial="estimate", period=None)
+
+    def apply(self, bench: Workbench) -> Workbench:
+        """Return the bench with the two pieces in place of the recording."""
+        i, *place = self.value
+        pieces = self.cut(bench.recordings[i], *place)
         return replace(bench, recordings=(*bench.recordings[:i], *pieces, *bench.recordings[i + 1 :]))
 
     def run_whole(self, bench: Workbench, fitted: Fitted) -> Fitted:
@@ -74,38 +82,18 @@ class _Gap(Gate):
 
 @dataclass(frozen=True, eq=False)
 class Jump(_Gap):
-    """A jump of the state, as where samples were lost; until it is reported, its value is (recording, sample).
+    """A jump of the state, as where samples were lost; until it is reported, its value is (recording, sample)."""
 
-    Attributes
-    ----------
-    share : float
-        Share of the mean square that the jump removes.
-    rival : float
-        Share that a shock nearby, or a step of one force or sensor there, removes.
-    neighbour : float
-        Share that a jump some samples away removes.
-    places : tuple of (int, int)
-        Once reported: each recording that is cut, and the sample at which its later piece begins.
-    """
-
-    share: float = 0.0
-    rival: float = 0.0
-    neighbour: float = 0.0
+    share: float = 0.0  # share of the mean square that the jump removes
+    rival: float = 0.0  # share that a shock nearby, or a step of one force or sensor there, removes
+    neighbour: float = 0.0  # share that a jump some samples away removes
+    # once reported: each recording that is cut, and the sample at which its later piece begins
     places: tuple[tuple[int, int], ...] = ()
     remedy: ClassVar[str] = "with the recording cut there"
 
     def beats(self, other: float, share: float) -> bool:
         """Tell whether this jump leaves at most a share of the error that a rival leaves, which removes `other`."""
         return 1 - self.share < share * (1 - other)
-
-    def cut(self, r: Recording, k: int) -> tuple[Recording, Recording]:
-        """Cut a recording at sample k; the state there is estimated."""
-        return r.slice(0, k), r.slice(k).with_(initial="estimate", period=None)
-
-    def apply(self, bench: Workbench) -> Workbench:
-        """Return the bench with the recording cut."""
-        i, k = self.value
-        return self.put_pieces(bench, self.cut(bench.recordings[i], k))
 
     def relocate(self, now: Checked, after: Checked) -> Jump | None:
         """Find the jump along the run of the whole recording."""
@@ -156,7 +144,6 @@ def _name_from(r: Recording, k: int) -> str:
 
 
 def _name_pieces(now: Checked, origins: Sequence[tuple[Recording, int]]) -> Checked:
-    """Name each piece by the time at which it begins."""
     named = [
         piece.with_(name=_name_from(r, k)) if k else piece
         for piece, (r, k) in zip(now.bench.recordings, origins, strict=True)
@@ -165,7 +152,6 @@ def _name_pieces(now: Checked, origins: Sequence[tuple[Recording, int]]) -> Chec
 
 
 def _describe_gaps(jump: Jump, origins: Sequence[tuple[Recording, int]]) -> Gate:
-    """Describe the gaps before some samples."""
     gaps = sorted([(r.label, k, k * r.dt) for r, k in origins if k])
     several = len({id(r) for r, _ in origins}) > 1
     at = " and ".join(f"t = {t:.6g} s (sample {k}{f' of {label}' if several else ''})" for label, k, t in gaps)
@@ -275,39 +261,22 @@ def _solve_jumps(
 class _Pause(_Gap):
     """Samples that are left out, the rival of lost samples: a shock in them; its value is (recording, begin, end)."""
 
-    def apply(self, bench: Workbench) -> Workbench:
-        """Return the bench with the recording in two pieces."""
-        i, begin, end = self.value
-        r = bench.recordings[i]
-        return self.put_pieces(bench, (r.slice(0, begin), r.slice(end).with_(initial="estimate", period=None)))
-
 
 @dataclass(frozen=True, eq=False)
 class OutputGap(_Gap):
     """Lost samples of some outputs; until it is reported, its value is (recording, sample, number of lost samples).
 
     A negative number says that all other channels have lost samples, so that these outputs come too late.
-
-    Attributes
-    ----------
-    columns : tuple of int
-        The outputs.
-    share : float
-        Share of the mean square that is left.
     """
 
     columns: tuple[int, ...] = (0,)
-    share: float = 1.0
+    share: float = 1.0  # share of the mean square that is left
     parameters: ClassVar[int] = 2
     remedy: ClassVar[str] = "with the recording cut there and the later outputs moved back"
 
-    def apply(self, bench: Workbench) -> Workbench:
-        """Return the bench with the recording cut, and its later piece corrected."""
-        i, k, lost = self.value
-        return self.put_pieces(bench, self.cut(bench.recordings[i], k, lost))
-
-    def cut(self, r: Recording, k: int, lost: int) -> tuple[Recording, Recording]:
-        """Cut a recording at sample k, and move the later outputs; the state where they begin is estimated."""
+    def cut(self, r: Recording, *place: int) -> tuple[Recording, Recording]:
+        """Cut a recording at a sample, and move the later outputs by the number of lost samples."""
+        k, lost = place
         y, begin, end = np.array(r.y), k + max(lost, 0), len(r) + min(lost, 0)
         y[begin:end, self.columns] = r.y[begin - lost : end - lost, self.columns]
         later = r.with_(y=y).slice(begin, end)

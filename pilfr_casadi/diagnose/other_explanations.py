@@ -56,8 +56,7 @@ class PinnedParameters:
 def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameters | None:
     """Find the fewest pinned parameters that explain as much, once freed, as the named laws; None if there are none.
 
-    A law is often equivalent to another value: a spring beside a spring, a gain at the input of a known capacity. If
-    one value does not suffice, further ones are freed beside the best, up to the number of the laws' own parameters.
+    If one value does not suffice, further ones are freed beside the best, up to the number of the laws' own parameters.
     """
     named = [e.element for e in answer.effects]
     bench, without = search.bench, search.root.fitted

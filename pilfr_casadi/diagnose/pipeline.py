@@ -325,16 +325,11 @@ def _concluded(search: Search, gates: Sequence[Gate]) -> Conclusion:
 
 
 def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
-    """Draw the conclusion from a search.
+    """Draw the conclusion from a search: steps 3 to 6 of the module docstring.
 
-    1. Compute the posterior, which gives a verdict.
-    2. Check whether a wrong fixed parameter, or a clipped input, explains as much as a law.
-    3. Compare named laws with a learned force on held-out data. If the force predicts better, the name is refuted.
-       If it may stand for a law where no port is declared, weigh it against that.
-    4. If there is no name, check undeclared ports and varying values, and return the best predictor.
-
-    At the time limit, the first half of step 4 is skipped. After Ctrl-C nothing more is fitted: steps 2 to 4 are
-    skipped, and a name that was found stays; otherwise the refitted simulator is returned.
+    A name that may stand for a law where no port is declared is weighed against that. If there is no name, undeclared
+    ports and varying values are checked, unless the time is over. After Ctrl-C nothing more is fitted: a name that was
+    found stays; otherwise the refitted simulator is returned.
     """
     answer, interrupted = posterior(search), search.interrupted
     finished, elsewhere = not (interrupted or search.out_of_time), tuple[Gate, ...]()
@@ -355,7 +350,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
             verdict = judge(search, answer, gates)
         if verdict.kind == "missing-physics":
             said = f"{verdict.sentence} {correction.sentence}" if correction.learned else verdict.sentence
-            zeros = list_offsets(fitted.simulator.elements[len(search.bench.simulator.elements) :], fitted.values)
+            zeros = list_offsets(search.added_laws(fitted), fitted.values)
             notes = (*gates, *elsewhere, *zeros)
             return Conclusion(Verdict(verdict.kind, said), notes, fitted, correction, answer.effects)
     if verdict.kind == "unexplained" and finished:

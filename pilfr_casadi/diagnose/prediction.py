@@ -28,7 +28,7 @@ from .._base import InputError
 from ..data import Recording
 from ..linear import steady_state_gain
 from ..simulators import Simulator, discretise, growth_rate
-from .gates import USELESS_FIT, Gate
+from .gates import USELESS_FIT, Gate, refit
 from .linearise import linearise_runs
 from .workbench import MOST_GROWTH, Fitted, Workbench
 
@@ -83,14 +83,13 @@ def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, 
     for memory in memories:
         led = replace(simulator, observer=observer(simulator, recordings, hold, memory))
         bench = Workbench.of(led, recordings, hold, engine)
-        try:
-            cost = bench.fit(led).cost
-        except InputError:
+        found = refit(bench)
+        if found is None:
             continue
-        if cost < USELESS_FIT:
+        if found.cost < USELESS_FIT:
             return led, memory
-        if best is None or cost < best[0]:
-            best = cost, led, memory
+        if best is None or found.cost < best[0]:
+            best = found.cost, led, memory
     if best is None:
         raise InputError(
             "Led by the recordings, the simulator still cannot follow them; check the signs and units of its equations "

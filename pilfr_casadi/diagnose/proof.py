@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -20,8 +20,7 @@ from .linearise import linearise_runs
 from .screen import RIDGES, Remainder, held_out
 from .workbench import Fitted, Workbench
 
-K = TypeVar("K")
-Models = Mapping[K, tuple[Model, Sequence[np.ndarray]]]  # each with further initial states to start from
+Models = Mapping[str, tuple[Model, Sequence[np.ndarray]]]  # each with further initial states to start from
 
 AMPLITUDES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
 SINES, TRIANGLES = 12, 5  # frequencies that are tried
@@ -32,13 +31,13 @@ VISIBLE_DIFFERENCE = 0.01  # difference of two answers over the noise, above whi
 
 
 @dataclass(frozen=True)
-class Comparison(Generic[K]):
+class Comparison:
     """NRMSEs of models, averaged over recordings, and the recordings with the first sample that is scored in each.
 
     `unedited` is the error of the corrected simulator on test recordings as given, if edits were compared with that.
     """
 
-    errors: dict[K, float]
+    errors: dict[str, float]
     scored: tuple[tuple[Recording, int], ...]
     unedited: float = np.inf
 
@@ -64,7 +63,7 @@ def errors_of(bench: Workbench, model: Model, *, whole: bool = False) -> float:
     return compare_errors(bench, {"": (model, ())}, whole=whole).errors[""]
 
 
-def compare_errors(bench: Workbench, models: Models[K], *, whole: bool = False) -> Comparison[K]:
+def compare_errors(bench: Workbench, models: Models, *, whole: bool = False) -> Comparison:
     """Compute the errors of models at their start values on the same samples.
 
     Unknown initial states are estimated from rest and from the models' further initial states, on a first part that is
@@ -72,7 +71,7 @@ def compare_errors(bench: Workbench, models: Models[K], *, whole: bool = False) 
     use it to compare errors on training recordings with fits. An error is infinite if the simulation diverges.
     """
     engines = {name: make_engine(model, bench.engine) for name, (model, _) in models.items()}
-    errors: dict[K, list[float]] = {name: [] for name in models}
+    errors: dict[str, list[float]] = {name: [] for name in models}
     scored = list[tuple[Recording, int]]()
     for r in bench.recordings:
         runs = {
@@ -98,14 +97,14 @@ def starts_of(fitted: Fitted) -> list[np.ndarray]:
 
 def test_errors(
     bench: Workbench, tests: Sequence[Recording], gates: Sequence[Gate], fits: Mapping[str, Fitted], given: Model
-) -> Comparison[str]:
+) -> Comparison:
     """Compute the errors of fits, on the sub-steps that they were fitted on, and of the `given` model as "nominal".
 
     The fits see the test recordings with the gates' edits, the given model as they are; so does the fit "after" once
     more (`unedited`). All are scored on the same samples, unless an edit changes these.
     """
     models = {name: (one.fitted_model, starts_of(one)) for name, one in fits.items()}
-    nominal: Models[str] = {"nominal": (given, ())}
+    nominal: Models = {"nominal": (given, ())}
     if all(g.change is None for g in gates):
         return compare_errors(bench.on(tests), {**nominal, **models})
     found = compare_errors(bench.on(edited(tests, gates)), models)

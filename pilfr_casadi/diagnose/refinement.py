@@ -216,10 +216,9 @@ def _predict(search: Search, fitted: Fitted) -> HeldOut:
     """
     bench = search.bench
     found = held_out_errors(bench, fitted, search.workers)
-    v = max(found.blocks, found.ahead)
+    v = found.mean_square
     n = Sample(search.floor2, effective_size(bench.scored(fitted.residual))).effective(v)
-    own = fitted.simulator.elements[len(bench.simulator.elements) :]
-    return replace(found, spread=spread(bench, fitted, own, v, n) if np.isfinite(v) else np.inf)
+    return replace(found, spread=spread(bench, fitted, search.added_laws(fitted), v, n) if np.isfinite(v) else np.inf)
 
 
 def _found_hysteresis(diagnosis: Any, after: Fitted, given: int, port: str | None) -> int:
@@ -357,14 +356,12 @@ def _initial_state(after: Fitted, state: np.ndarray, number: int, law: Law, z: f
 
 
 def _memory(element: Placed) -> int:
-    """Count the memory entries of an element."""
     return int(element.law.memory) if hasattr(element.law, "step") else 0
 
 
 def _build_refinement(
     diagnosis: Any, bench: Workbench, kind: str, fitted: Fitted, number: int, held_out: Mapping[str, HeldOut]
 ) -> Refinement:
-    """Put the best layer into a Refinement."""
     element, after = fitted.simulator.elements[number], diagnosis.evidence["after"]
     values, port = element.own(fitted.values), element.port
     refined = diagnosis.with_fit(fitted)

@@ -1,14 +1,6 @@
 """Further hypotheses that the screen did not select: relatives of the best ones, and pairs of laws at once.
 
-A relative is a pair of port and law with its own start values:
-
-- a law with further terms than one that came near, and the law that it refines, from its values;
-- another form of a law that came near, and a form that shares a shape with the best law but stayed behind it;
-- a special case of the best law;
-- a resonance of known frequency: as a mass attached at another port, or in place of a delay or a lag;
-- a law of a signal with its own time scale, or a trend in time, at the other end of a nearly linear simulator;
-- a simple law whose force is most like that of a flexible law along its port's own signal, or like that of a law or of
-  a parameter that varies with a signal.
+A relative is a pair of port and law with its own start values; each function selects one kind of them.
 
 Two effects may hide each other, so that neither law explains enough alone. Then every pair of laws at two ports is
 scored along the refitted simulation. Let Q_a and Q_b be orthonormal columns of the output changes by small doses of the
@@ -125,7 +117,6 @@ def _forms_of_the_best(trials: Sequence[Trial], scored: Sequence[Scored]) -> lis
 
 
 def _first_of_pairs(entries: Iterable[Scored]) -> list[Scored]:
-    """Return the first entry of each pair."""
     out: dict[Pair, Scored] = {}
     for s in entries:
         out.setdefault(s.pair, s)

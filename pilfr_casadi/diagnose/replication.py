@@ -20,14 +20,14 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, one_blas_thread
+from .._base import one_blas_thread
 from ..data import Recording
 from ..laws import Law
 from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
 from .arguments import match_recordings, stated_hold
 from .evidence import FORMULA_ERROR, Sample, deviations, information, log_evidence, log_prior, prior_width
 from .floor import effective_size, measured_floor, third_differences
-from .gates import Checked
+from .gates import Checked, refit
 from .linearise import sample_run
 from .trials import Trials
 from .workbench import FINER_STEPS, THOROUGH, Fitted, Workbench
@@ -185,14 +185,14 @@ def _refine_steps(bench: Workbench, fitted: Fitted) -> Fitted:
     """
     most = min(FINER_STEPS**2 * bench.chosen, MOST_SUBSTEPS)
     while fitted.model.substeps < most and not fitted.simulator.discrete and np.any(fitted.model.parameters.free):
-        before, error = fitted, fitted.model.parameters.pack(deviations(bench, fitted))
+        error = fitted.model.parameters.pack(deviations(bench, fitted))
         steps = min(FINER_STEPS * fitted.model.substeps, most)
         finer = replace(bench, substeps=steps, at_least=steps, chosen=max(bench.chosen, -(-steps // FINER_STEPS)))
-        try:
-            fitted = finer.fit(fitted.simulator, [fitted.values], states=fitted.initial, solver=THOROUGH)
-        except InputError:
-            return before
-        change = np.abs(fitted.vector - before.vector) / error
+        found = refit(finer, [fitted.values], fitted.simulator, states=fitted.initial, solver=THOROUGH)
+        if found is None:
+            break
+        change = np.abs(found.vector - fitted.vector) / error
+        fitted = found
         if not np.any(change > STEP_ACCURACY):
             break
     return fitted
@@ -236,7 +236,6 @@ def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ..
 
 
 def _values(bench: Workbench, fitted: Fitted) -> Values:
-    """Return the free parameters by label."""
     own = fitted.model.parameters
     values, errors = fitted.vector, own.pack(deviations(bench, fitted))
     free = [(k, label) for k, label in enumerate(own.labels) if own.free[k]]

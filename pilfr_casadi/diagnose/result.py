@@ -578,11 +578,9 @@ def _white(noise: Mapping[str, float]) -> float:
 
 
 def _percent(value: float) -> str:
-    """Format a relative error."""
     return f"{100 * value:.3g} %" if np.isfinite(value) else "infinite (the simulation diverges)"
 
 
 def _relative_change(row: Mapping[str, Any]) -> float:
-    """Compute the relative change of a parameter."""
     nominal = float(row["nominal"])
     return (float(row["refit_with"]) - nominal) / (abs(nominal) or 1e-300)

@@ -80,28 +80,14 @@ class Dose:
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """The error along runs, and its part that the simulator's own parameters cannot imitate.
-
-    Attributes
-    ----------
-    runs : list of Run
-        The stretches that are used.
-    base : array, shape (R, n)
-        Orthonormal directions that parameters and initial states can follow.
-    left : array, shape (R,)
-        The rest of the error, each output in units of its deviation.
-    tasks : tuple of Task
-        Ports whose laws can be tried, sensors last.
-    odd : array, shape (R,), bool
-        Every second block.
-    """
+    """The error along runs, and its part that the simulator's own parameters cannot imitate."""
 
     bench: Workbench
-    runs: list[Run]
-    base: np.ndarray
-    left: np.ndarray
-    tasks: tuple[Task, ...]
-    odd: np.ndarray
+    runs: list[Run]  # the stretches that are used
+    base: np.ndarray  # (R, n), orthonormal directions that parameters and initial states can follow
+    left: np.ndarray  # (R,), the rest of the error, each output in units of its deviation
+    tasks: tuple[Task, ...]  # ports whose laws can be tried, sensors last
+    odd: np.ndarray  # (R,), every second block
 
     @classmethod
     def of(cls, bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]], at: str = "") -> Remainder:
@@ -113,7 +99,7 @@ class Remainder:
             for r, w in zip(runs, windows, strict=True)
         ]
         error = np.concatenate([(r.error / bench.scale).ravel() for r in short])
-        base = followed(bench, short)
+        base = orthonormal(np.hstack(own_changes(bench, short)))
         left = project_off(error, base)
         every = (*_tasks(bench, probe, laws, runs, short), *_parameter_tasks(bench, probe, laws, runs, short))
         tasks = [t for t in every if at in ("", t.port.name)]
@@ -174,11 +160,6 @@ def in_deviations(bench: Workbench, changes: np.ndarray) -> np.ndarray:
         y = (changes / bench.scale[:, None]).reshape(-1, changes.shape[2])
     y[:, ~((y.max(axis=0) < HUGE) & (y.min(axis=0) > -HUGE))] = 0.0  # a diverging response carries no information
     return y
-
-
-def followed(bench: Workbench, runs: Sequence[Run], skips: Sequence[int] = ()) -> np.ndarray:
-    """Compute orthonormal directions of the stacked outputs that parameters and initial states can follow, (R, n)."""
-    return orthonormal(np.hstack(own_changes(bench, runs, skips)))
 
 
 def own_changes(
@@ -279,16 +260,8 @@ def _held_out_rest(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: S
     return min((held_out_rest(phi, left, odd, ridge) for ridge in ridges), key=lambda rest: float(rest @ rest))
 
 
-def held_out_squares(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> np.ndarray:
-    """Compute the sum of squares of the rest on held-out blocks, for each column of `left`."""
-    return np.asarray(np.sum(held_out_rest(phi, left, odd, ridge) ** 2, axis=0))
-
-
 def held_out_rest(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> np.ndarray:
-    """Compute the rest on every second block with coefficients fitted to the others, and vice versa.
-
-    `left` is one column (R,) or several (R, k).
-    """
+    """Compute the rest (R,) on every second block with coefficients fitted to the others, and vice versa."""
     rest = np.empty_like(left)
     for a, b in ((odd, ~odd), (~odd, odd)):
         rest[b] = left[b] - phi[b] @ ridge_solution(phi[a], left[a], ridge)
@@ -360,14 +333,7 @@ def screen(
 ) -> tuple[list[Scored], np.ndarray | None]:
     """Score every port and law along the simulation and along the observer, best first.
 
-    Also returns the observer's gain.
-
-    Parameters
-    ----------
-    noise : array, shape (n_y,)
-        Standard deviation of the outputs' noise.
-    workers : int
-        Ports processed in parallel.
+    `noise` (n_y,) is the standard deviation of the outputs' noise. Also returns the observer's gain.
     """
     bench = bench.balanced(fitted)
     probe, runs = linearise_runs(bench, fitted)
@@ -391,7 +357,6 @@ def _stays_bounded(r: Run, scale: np.ndarray) -> bool:
 
 
 def _score(rest: Remainder, task: Task, source: str) -> list[Scored]:
-    """Score each law of one port."""
     total, out = max(float(rest.left @ rest.left), 1e-300), []
     for law, doses in rest.doses(task):
         sense, scores = rest.runs[0].sense(law, task.index), []

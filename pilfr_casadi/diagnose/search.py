@@ -36,7 +36,7 @@ from ..laws import (
 from ..simulators import ACTUATOR, PARAMETER, SENSOR, Placed, kind_of, name_at, port_name
 from .evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR, NEAR_RATIO
 from .floor import ABOVE_NOISE
-from .gates import CLEARLY_BETTER, Checked, Gate
+from .gates import CLEARLY_BETTER, Checked, Gate, refit
 from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
 from .linearise import linearise_runs
@@ -64,21 +64,11 @@ class Step:
 
 @dataclass(eq=False, repr=False)
 class Search(Hypotheses):
-    """A search, filled by `run`.
+    """A search, filled by `run`."""
 
-    Attributes
-    ----------
-    steps : list of Step
-        The moves, in their order.
-    aligned : bool
-        Whether the times of the channels are settled, so that no shift is looked for.
-    shift : Gate, optional
-        The shift of a channel that ended the search, because it shows only beside a law.
-    """
-
-    steps: list[Step] = field(default_factory=list)
-    aligned: bool = False
-    shift: Gate | None = None
+    steps: list[Step] = field(default_factory=list)  # the moves, in their order
+    aligned: bool = False  # whether the times of the channels are settled, so that no shift is looked for
+    shift: Gate | None = None  # the shift of a channel that ended the search, because it shows only beside a law
 
     def run(self, effects: float) -> Search:
         """Search for up to `effects` effects; an interrupt ends the search with the present results."""
@@ -203,13 +193,12 @@ class Search(Hypotheses):
 
     def prefers_other_hold(self) -> bool:
         """Tell whether the best hypothesis follows the recordings better with the other hold of the inputs."""
-        best, cost = self.best.fitted, np.inf
+        best = self.best.fitted
         if self.interrupted or not self.in_time():
             return False
-        with suppress(InputError):
-            held = self.bench.with_other_hold()
-            cost = held.fit(best.simulator, [best.values], states=best.initial, solver=THOROUGH).cost
-        return not self.interrupted and cost * BETTER_RATIO**2 < best.cost
+        held = self.bench.with_other_hold()
+        found = refit(held, [best.values], best.simulator, states=best.initial, solver=THOROUGH)
+        return found is not None and not self.interrupted and found.cost * BETTER_RATIO**2 < best.cost
 
     def _finds_shift(self) -> bool:
         """Look beside each of the first laws for an output that comes before its cause; their absence may hide it.
@@ -523,11 +512,8 @@ class Search(Hypotheses):
         """
         best, bench = self.best.fitted, self.bench
         with self.stage("look back"):
-            try:
-                alone = bench.fit(bench.simulator, [best.values], states=best.begin, solver=THOROUGH)
-            except InputError:
-                return False
-        if alone.cost > CLEARLY_BETTER * self.root.mean_square:
+            alone = refit(bench, [best.values], states=best.begin, solver=THOROUGH)
+        if alone is None or alone.cost > CLEARLY_BETTER * self.root.mean_square:
             return False
         self.without, self.memo, self.steps = alone, {}, []
         self.findings.clear()

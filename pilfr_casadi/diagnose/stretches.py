@@ -35,7 +35,7 @@ from ..laws import Creep, Law, StopHysteresis
 from ..models import Model
 from ..optimise import GaussNewton, estimate_initial_state, samples_for_state
 from ..simulators import Simulator
-from .gates import Gate
+from .gates import Gate, refit
 from .hypotheses import Findings, count_samples, likeliest
 from .linearise import Probe, loudest_stretch, run
 from .screen import Remainder, Surface, Task, orthonormal
@@ -123,10 +123,7 @@ def choose_stretches(
 ) -> tuple[Stretch, ...]:
     """Choose the stretches of recordings that say most about missing forces; see the module docstring.
 
-    Parameters
-    ----------
-    most : int
-        Samples up to which everything would be searched; the stretches have two thirds of it together at most.
+    They have two thirds of `most` samples together, up to which everything would be searched.
     """
     length = max(int(STRETCH_SHARE * most) // LONG_STRETCHES, SHORTEST_STRETCH)
     stretches = [s for i, r in enumerate(recordings) for s in divide(i, len(r), r.skip, length)]
@@ -277,18 +274,12 @@ def fit_to_all(bench: Workbench, fitted: Fitted, time_limit: float = np.inf) -> 
 
     Without time, or if the run diverges, the values stay as they are.
     """
-    model, engine = fitted.model, fitted.engine
-    at = fitted.fitted_model
-    states = [_first_state(at, engine, r) for r in bench.recordings]
+    at, start, found = fitted.fitted_model, [fitted.values], None
+    states = [_first_state(at, fitted.engine, r) for r in bench.recordings]
     if time_limit > 0:
         solver = replace(FINAL, time_limit=time_limit)
-        try:
-            return bench.fit(
-                fitted.simulator, [fitted.values], states=states, solver=solver, model=model, engine=engine
-            )
-        except InputError:
-            pass
-    return bench.result(fitted.simulator, fitted.values, states, engine, model)
+        found = refit(bench, start, fitted.simulator, states=states, solver=solver, like=fitted)
+    return found or bench.result(fitted.simulator, fitted.values, states, fitted.engine, fitted.model)
 
 
 @dataclass(frozen=True, eq=False)

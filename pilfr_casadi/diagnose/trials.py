@@ -47,28 +47,15 @@ Key = frozenset[Pair]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trial:
-    """A fitted hypothesis: laws in ports of the simulator.
+    """A fitted hypothesis: laws in ports of the simulator."""
 
-    Attributes
-    ----------
-    laws : tuple of Placed
-        The added laws, in their order.
-    part_mean_square : float
-        Mean square error on the part of the recordings used by the fit, in units of the outputs' variance.
-    mean_square : float
-        The same on all recordings.
-    thorough : bool
-        Whether it was fitted to convergence and to all samples.
-    information : array
-        See `evidence.information`.
-    """
-
-    laws: tuple[Placed, ...]
+    laws: tuple[Placed, ...]  # the added laws, in their order
     fitted: Fitted
+    # mean square error on the part of the recordings used by the fit, in units of the outputs' variance
     part_mean_square: float
-    mean_square: float
-    thorough: bool = False
-    information: np.ndarray | None = None
+    mean_square: float  # the same on all recordings
+    thorough: bool = False  # whether it was fitted to convergence and to all samples
+    information: np.ndarray | None = None  # see `evidence.information`
 
     @classmethod
     def of(cls, fitted: Fitted, count: int, thorough: bool = False) -> Trial:
@@ -178,9 +165,8 @@ class Trials:
 
         For `options` see `Workbench.fit`.
         """
-        part = self.part
         try:
-            found = part.fit(simulator, starts, **options)
+            found = self.part.fit(simulator, starts, **options)
         except InputError:
             return None
         return self.make_trial(found, count)

@@ -65,21 +65,14 @@ Name = tuple[str, str]  # port and law id
 
 @dataclass(frozen=True, eq=False)
 class NamedEffect:
-    """An effect of the likeliest hypothesis.
-
-    Attributes
-    ----------
-    confidence : float
-        Probability that it is included, or the same law elsewhere if the recordings cannot tell the place.
-    alike : dict
-        Port and law id of indistinguishable effects in its place -> the hypothesis, the likeliest first.
-    at_port : float
-        Probability that this law or another of the catalogue acts at its port, or at one where it looks alike.
-    """
+    """An effect of the likeliest hypothesis."""
 
     element: Placed
+    # probability that it is included, or the same law elsewhere if the recordings cannot tell the place
     confidence: float
+    # port and law id of indistinguishable effects in its place -> the hypothesis, the likeliest first
     alike: dict[Name, Trial]
+    # probability that this law or another of the catalogue acts at its port, or at one where it looks alike
     at_port: float
 
     @property
@@ -99,24 +92,12 @@ class NamedEffect:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Probabilities of the answers.
+    """Probabilities of the answers."""
 
-    Attributes
-    ----------
-    best : Trial
-        The likeliest hypothesis.
-    named : float
-        Probability that the laws of the best hypothesis are the physics, given this hypothesis.
-    effects : tuple of NamedEffect
-        Its laws, strongest first.
-    nothing : float
-        Probability of the simulator alone.
-    """
-
-    best: Trial
-    named: float
-    effects: tuple[NamedEffect, ...]
-    nothing: float
+    best: Trial  # the likeliest hypothesis
+    named: float  # probability that the laws of the best hypothesis are the physics, given this hypothesis
+    effects: tuple[NamedEffect, ...]  # its laws, strongest first
+    nothing: float  # probability of the simulator alone
 
     @property
     def sure(self) -> float:
@@ -259,23 +240,19 @@ def _make_effect(
     search: Hypotheses, best: Trial, element: Placed, by_names: Mapping[frozenset[Name], float]
 ) -> NamedEffect:
     """Make an effect, with its inclusion probability given that the physics is in the catalogue."""
-    twins = _indistinguishable(search, best, element)
-    same = {
-        (element.port, element.law.id),
-        *(n for name in twins if name[1] == element.law.id for n in _single_effects(name)),
-    }
-    included = sum(w for n, w in by_names.items() if n & same)
-    ports = {port for port, _ in same}
+    twins, law = _indistinguishable(search, best, element), element.law.id
+    ports = {element.port}
+    for places, other in twins:
+        ports |= set(places.split(" + ")) if other == law else set()
+    included = sum(w for n, w in by_names.items() if n & {(port, law) for port in ports})
     at_port = sum(w for n, w in by_names.items() if ports & {port for port, _ in n})
     return NamedEffect(element, included, twins, at_port)
 
 
 def _weights(search: Hypotheses, trials: Sequence[Trial]) -> np.ndarray:
-    """Compute the probability of each hypothesis.
+    """Compute the probability of each hypothesis; the module docstring tells why the simulator alone has another scale.
 
-    The simulator alone claims that its whole error is noise, so samples count in full against it; where that noise may
-    be slow, its innovations count. Laws claim only to be near the physics; they are weighed by samples that count as
-    far as their error is noise.
+    Laws claim only to be near the physics; they are weighed by samples that count as far as their error is noise.
     """
     tempered = np.array([search.evidence(t) for t in trials])
     alone = np.array([not names(t) for t in trials])
@@ -315,11 +292,6 @@ def _indistinguishable(search: Hypotheses, best: Trial, element: Placed) -> dict
         elif other == {(port, element.law.id) for port in every}:
             out.setdefault((" + ".join(every), element.law.id), t)
     return out
-
-
-def _single_effects(name: Name) -> list[Name]:
-    """Split an effect in several places into single effects."""
-    return [(port, name[1]) for port in name[0].split(" + ")]
 
 
 @dataclass(frozen=True)

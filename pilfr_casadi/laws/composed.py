@@ -27,21 +27,12 @@ SPARE = 0.25  # of the variation, the least strength from which a profile starts
 
 @dataclass(frozen=True)
 class Profile:
-    """How a strength varies over the range of a signal, from `low` to `high`.
+    """How a strength varies over the range of a signal, from `low` to `high`."""
 
-    Attributes
-    ----------
-    ends : tuple of str
-        The names of a strength's values are its own name with these ends.
-    how, course : str
-        The variation in words, and in an equation that names the signal.
-    weights_at : callable
-        Weight of each value at a share of the range, from the values of the law's parameters.
-    """
-
-    ends: tuple[str, ...]
-    how: str
-    course: str
+    ends: tuple[str, ...]  # the names of a strength's values are its own name with these ends
+    how: str  # the variation in words
+    course: str  # the variation in an equation that names the signal
+    # weight of each value at a share of the range, from the values of the law's parameters
     weights_at: Callable[[Any, Mapping[str, Any]], list[Any]]
 
     def weights(self, signal: Any, values: Any) -> list[Any]:
@@ -220,7 +211,6 @@ def heated(by: str) -> type[Law]:
 
 
 def _check_profile(profile: str, known: Sequence[str]) -> str:
-    """Check the name of a profile."""
     if profile not in known:
         raise InputError(f"profile = {profile!r} was given; give {', '.join(map(repr, known))}.")
     return profile
@@ -264,7 +254,6 @@ def behind_gap(law: type[Law]) -> type[Law]:
 
 
 def _check_force(law: Any) -> Any:
-    """Check that a law is a force."""
     if not (isinstance(law, type) and issubclass(law, Law)):
         raise InputError(f"A composed law is made of a class of laws, such as CoulombFriction; got {law!r}.")
     if "parallel" not in law.places:

@@ -85,7 +85,6 @@ class Compliance(_InLine):
     order = follows = 1
 
     def why_not(self, local: Local) -> str:
-        """Say why the law cannot stand in line with the port's term; empty if it can."""
         if found := super().why_not(local):
             return found
         assert local.term is not None

@@ -150,7 +150,6 @@ def mismatch_time(found: Mapping[str, Any]) -> Axes:
 
 
 def _draw_colour_bar(ax: Axes, mesh: Any, label: str, **style: Any) -> None:
-    """Draw the logarithmic colour bar of a map."""
     bar = ax.figure.colorbar(mesh, ax=ax, pad=0.02, **style)
     bar.set_label(label, fontsize=FONT - 1)
     _label_log_axis(bar.ax.yaxis, mesh.norm.vmin, mesh.norm.vmax)

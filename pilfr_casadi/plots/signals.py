@@ -106,8 +106,7 @@ def traces(
 ) -> Axes:
     """Draw measured and simulated output over a few swings around the largest."""
     ax, y = axes_or_new(ax), _select_signal(recording.y, output, "output")
-    begin, end = find_largest_swings(y - np.mean(y), recording)
-    part = slice(*np.clip(np.round(np.array([begin, end]) / recording.dt).astype(int), 0, len(y)))
+    part = _find_largest_swings(y - np.mean(y))
     unit = _unit(fit, recording, recording.outputs[output])
     size, label = scale_axis(recording.outputs[output], y[part], unit)
     line(ax, recording.t, y / size, "measured", BLUE, part=part, linewidth=3.2, alpha=0.55)
@@ -118,15 +117,15 @@ def traces(
     return finish(ax, "time [s]", label, recording.name, 3)
 
 
-def find_largest_swings(y: np.ndarray, recording: Recording) -> tuple[float, float]:
-    """Find start and end, s, of about eight swings around the largest excursion; ignore small ripple."""
+def _find_largest_swings(y: np.ndarray) -> slice:
+    """Find about eight swings around the largest excursion; ignore small ripple."""
     peak = int(np.argmax(np.abs(y)))
     large = np.flatnonzero(np.abs(y) >= 0.2 * np.abs(y[peak]))
     swings = large[1:][np.diff(np.signbit(y[large]))]
     before, after = swings[swings <= peak][-4:], swings[swings > peak][:4]
     begin = int(before[0]) if len(before) == 4 else 0
     end = int(after[-1]) if len(after) == 4 else len(y)
-    return begin * recording.dt, max(end, begin + 2) * recording.dt
+    return slice(begin, max(end, begin + 2))
 
 
 def remains(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:
@@ -285,7 +284,6 @@ def compares_linear(fit: PlottedFit) -> bool:
 
 
 def _select_signal(values: np.ndarray, index: int, role: str) -> np.ndarray:
-    """Return one of the recording's inputs or outputs, (M,)."""
     if not 0 <= index < values.shape[1]:
         raise InputError(f"The {role} {index} was given; the recording has {values.shape[1]}, counted from 0.")
     return values[:, index]
@@ -367,9 +365,7 @@ def compared_traces(
     """Draw measured output and simulations: a few swings around the largest, or a `quiet` stretch."""
     ax = axes_or_new(ax)
     y = r.y[:, output]
-    begin, end = find_largest_swings(y - np.mean(y), r)
-    first = round(begin / r.dt)
-    part = slice(first, max(round(end / r.dt), first + 2))
+    part = _find_largest_swings(y - np.mean(y))
     part = _find_quiet_stretch(y, part.stop - part.start, r.skip) if quiet else part
     size, up = scale_axis(r.outputs[output], y[part], unit)
     line(ax, r.t, y / size, "measured", BLUE, part=part, linewidth=4.0, alpha=0.45)

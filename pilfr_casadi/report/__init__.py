@@ -1,7 +1,7 @@
 """Self-contained HTML pages of fits, diagnoses and anything else.
 
-`page.py` holds the general page and its blocks. `fit.py`, `diagnosis.py` and `fleet.py` fill it, with the sections and
-tables in `fit_sections.py` and `diagnosis_tables.py`. `cards.py` makes the short summaries for notebooks.
+`page.py` holds the general page and its blocks. `fit.py`, `diagnosis.py` and `fleet.py` fill it, with the tables of a
+diagnosis in `diagnosis_tables.py`. `cards.py` makes the short summaries for notebooks.
 `templates/report.css` sets colours, fonts and layout, `templates/page.html` and `templates/blocks.html` the structure;
 `templates/explore.js` turns pictures into charts.
 """
@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     )
     from .diagnosis import diagnosis_page as diagnosis_page, diagnosis_report as diagnosis_report
     from .diagnosis_tables import corrected_file as corrected_file, usage as usage
-    from .fit import fit_page as fit_page, fit_report as fit_report
-    from .fit_sections import mode_tables as mode_tables
+    from .fit import fit_page as fit_page, fit_report as fit_report, mode_tables as mode_tables
     from .fleet import fleet_map as fleet_map, fleet_page as fleet_page
     from .page import (
         Bar as Bar,

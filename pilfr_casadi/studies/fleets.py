@@ -343,7 +343,6 @@ class _FleetExecution:
         return {label: own[label.partition("[")[0]].unit for label in own.labels}
 
     def _read_files(self) -> dict[str, bytes]:
-        """Read the files of this fleet's jobs."""
         names = [name for job in self.jobs.values() for name in self._file_names(job)]
         return {name: (self.manifest.folder / name).read_bytes() for name in sorted(names)}
 

@@ -186,7 +186,6 @@ def _describe_parameters(element: Any, fitted: Any) -> dict[str, Any]:
 
 
 def _diagnosis_entry(found: Diagnosis) -> dict[str, Any]:
-    """Return the manifest entry of a diagnosis."""
     content = found.to_dict()
     effects = [{k: e[k] for k in ("port", "law", "confidence", "parameters")} for e in content["effects"]]
     entry = {"status": DONE, "verdict": found.verdict, "sentence": found.summary, "hold": found.hold}
@@ -194,7 +193,6 @@ def _diagnosis_entry(found: Diagnosis) -> dict[str, Any]:
 
 
 def _diagnosis_files(found: Diagnosis) -> dict[str, str]:
-    """Return the page and the JSON content of a diagnosis."""
     from ..report import diagnosis_page
 
     return {PAGE: diagnosis_page(found).html(), CONTENT: json_text(found.to_dict())}
