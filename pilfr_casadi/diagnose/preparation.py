@@ -133,9 +133,10 @@ class _Checks:
         return found or first_refit(patient, gates)
 
     def _correct_gross_slip(self, bench: Workbench, slips: Sequence[Gate], gates: tuple[Gate, ...]) -> Checked | None:
-        """Correct the likeliest fault if the rule accepts it; None if the first refit was cut short for nothing.
+        """Correct the likeliest fault if the rule accepts it; None if nothing follows the recordings as given.
 
-        That refit gets half of the time: a slow simulator is not fitted at length to what it cannot follow.
+        The first refit gets half of the time: a slow simulator is not fitted at length to what it cannot follow. It
+        goes on if there is no fault.
         """
         brief = replace(bench, deadline=(time.perf_counter() + bench.deadline) / 2)
         as_given = refit(brief, solver=THOROUGH) or brief.run_given(brief.simulator)
@@ -145,8 +146,12 @@ class _Checks:
             found = now
         elif len(found.gates) > len(gates):
             return refit_corrected(found)
-        cut_short = as_given.status is Status.TIME_LIMIT and not bench.interrupt.pressed
-        return found if np.isfinite(found.cost) and not cut_short else None
+        if not np.isfinite(found.cost):
+            return None
+        if as_given.status is not Status.TIME_LIMIT or bench.interrupt.pressed:
+            return found
+        values, states = found.fitted.values, found.fitted.initial
+        return replace(found, fitted=bench.fit(bench.simulator, [values], states=states, solver=THOROUGH))
 
     def run(self, first: Checked, part: float) -> Checked:
         """Correct one fault after the other from the first refit on; `part` is the unit of shifts, see `timing`."""

@@ -9,10 +9,12 @@ from cart import cart
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
+from pilfr_casadi.diagnose import preparation
 from pilfr_casadi.diagnose.channel_faults import accept_best, find_gross_slips, scale_channels, scale_time
 from pilfr_casadi.diagnose.preparation import first_refit, prepare
 from pilfr_casadi.diagnose.workbench import Workbench
 from pilfr_casadi.engine import make_engine
+from pilfr_casadi.optimise import GaussNewton, Status
 from pilfr_casadi.simulators import discretise
 from problems.concealed import case
 
@@ -109,6 +111,27 @@ def test_half_of_the_time_is_left_to_try_gross_faults(monkeypatch):
     found = prepare(tanks(1.15), [r], "zero", "auto", until=time.perf_counter() + 100)
     assert [g.value for g in found.gates if g.fault] == [1e-3] and 40 < given[0] < 51 and given[1] > 90
     assert np.allclose(found.bench.recordings[0].y, y)
+
+
+def test_a_refit_that_was_cut_short_for_no_fault_goes_on(monkeypatch):
+    u, y = recorded()
+    r = Recording(u, y, DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero")
+    slip, starts, fit = scale_channels("y", ("upper", "lower"), [0], 10.0), [], Workbench.fit
+
+    def cut_short(bench, **_):
+        found = fit(bench, bench.simulator, solver=GaussNewton(max_iterations=1))
+        return replace(found, status=Status.TIME_LIMIT)
+
+    def kept(bench, simulator, given=({},), **options):
+        starts.append(given)
+        return fit(bench, simulator, given, **options)
+
+    monkeypatch.setattr(preparation, "find_gross_slips", lambda bench, workers: [slip])
+    monkeypatch.setattr(preparation, "refit", cut_short)
+    monkeypatch.setattr(Workbench, "fit", kept)
+    found = prepare(tanks(1.15), [r], "zero", "auto")
+    assert not found.gates and found.without.cost < 0.01**2
+    assert {} not in starts[-1] and len(starts[-1]) == 1
 
 
 def with_still_output(wrong):
