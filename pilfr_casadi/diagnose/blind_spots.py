@@ -22,7 +22,7 @@ from ..simulators import ACTUATOR, SENSOR, in_series, kind_of, port_name, split_
 from .arguments import check_laws, match_recordings, stated_hold
 from .channel_faults import accept_best, find_gross_slips, refit_corrected
 from .floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor, noise_floor
-from .gates import USELESS_FIT, Checked
+from .gates import USELESS_FIT, Checked, refit
 from .identifiability import (
     SMALL_SHARE,
     LawRow,
@@ -282,9 +282,12 @@ def check(
     stated = stated_hold(simulator, recordings, hold)
     bench = Workbench.of(simulator, recordings, stated or "zero", engine)
     slips = find_gross_slips(bench)
-    now = accept_best(Checked(bench, bench.fit(simulator)), slips)
+    plain = refit(bench) if slips else None
+    now = accept_best(Checked(bench, plain or bench.run_given(simulator)), slips)
     if now.gates:
         now = refit_corrected(now)
+    elif plain is None:
+        now = Checked(bench, bench.fit(simulator))
     if not stated:
         now = choose_hold(now, QUICK)[0]
     bench, fitted, faults = now.bench, now.fitted, now.gates
@@ -341,7 +344,8 @@ def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[Param
     doubtful = [p.name for p in parameters if p.status in ("dead", "flat")]
     if not doubtful:
         return ()
-    given = bench.run_given(fitted.simulator, fitted.model, fitted.engine)
+    values = {k: p.value for k, p in fitted.model.parameters.items()}
+    given = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model)
     if not np.isfinite(given.cost):
         return ()
     response = Sensitivity.of(bench, given, linearise_runs(bench, given)[1])

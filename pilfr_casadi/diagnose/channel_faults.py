@@ -140,8 +140,8 @@ def find_slips(now: Checked, workers: int) -> Checked:
     """
     bench = now.bench
     given = bench.run_given(bench.simulator, now.fitted.model, now.fitted.engine).residual
-    # with an offset there is a working point, which a run from rest would have to reach first
     found = accept_best(now, _possible_slips(now, given), workers)
+    # with an offset there is a working point, which a run from the stated start would have to reach first
     for i, name in enumerate(bench.simulator.output_names if found.cost > POOR_FIT else ()):
         offset = describe_constant(port_name(SENSOR, name))
         level = correct(now, offset, [{}, now.fitted.values], now.fitted.begin)

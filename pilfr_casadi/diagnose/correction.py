@@ -142,7 +142,8 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     tried = _named_hypotheses(search, answer) if named else _hypotheses_with_laws(search)
     candidates = [_Candidate.of(search, t.fitted, t) for t in tried]
     predicted = _predict(search, candidates, refitted) if refitted else []
-    if len(predicted) < 2 and search.past_deadline:  # without a comparison the named laws stay, or what is far better
+    if search.past_deadline and (len(predicted) < 2 or (named and _may_be_best(candidates[0], predicted))):
+        # without a comparison the named laws stay, or what is far better
         stays = tried[0] if named else _far_better(search, candidates)
         return replace(named_correction(search, stays.fitted), late=not named), stays.fitted
     chosen = _choose(predicted)[0].base
@@ -178,6 +179,12 @@ def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_
         if np.isfinite(found.rms) or not search.past_deadline:  # otherwise the time was over before it was known
             out.append((c, found))
     return out
+
+
+def _may_be_best(candidate: _Candidate, predicted: Sequence[_Predicted]) -> bool:
+    """Tell whether a candidate that was not predicted may have a smaller error than those that were."""
+    left_out = all(c is not candidate for c, _ in predicted)
+    return left_out and candidate.least < min(h.mean_square for _, h in predicted)
 
 
 def _far_better(search: Search, candidates: Sequence[_Candidate]) -> Trial:

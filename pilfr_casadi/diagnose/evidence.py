@@ -484,7 +484,7 @@ def _sum_of_squares(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]
                 simulated = problem.simulate(found.theta)
         except (InputError, RuntimeError, FloatingPointError, np.linalg.LinAlgError):
             return infinite
-        if found.status is Status.TIME_LIMIT:
+        if found.status in (Status.TIME_LIMIT, Status.INTERRUPTED):
             return infinite
         residual = [y - r.y for y, r in zip(simulated, bench.recordings, strict=True)]
     with np.errstate(over="ignore", invalid="ignore"):

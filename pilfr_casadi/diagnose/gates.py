@@ -245,7 +245,8 @@ def settle(now: Checked, fault: G, solver: GaussNewton = QUICK) -> tuple[G, Chec
 def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
     """Return the corrected state with its finding if the rule accepts the fault, else the state before.
 
-    If the correction only led the refit out of a local minimum, the better refit as given is returned.
+    If the recordings as given are followed as well from the corrected refit's values, the correction only led the refit
+    out of a local minimum: that refit is returned, without a finding.
     """
     if after is None or not _satisfies_rule(now, after, fault):
         return now
@@ -268,7 +269,7 @@ def _satisfies_rule(now: Checked, after: Checked, fault: Gate) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class FirstOrder:
-    """A fitted simulator linearised along its runs, to screen edits to first order; see `of`."""
+    """A fitted simulator linearised along its runs, to screen edits to first order; made by `of`."""
 
     bench: Workbench
     fitted: Fitted

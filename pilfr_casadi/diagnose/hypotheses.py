@@ -179,7 +179,7 @@ class Hypotheses:
             shown = min([*alike, trial], key=lambda t: len(t.key))
             known = self.findings[shown.key].held_out
             known = known or self.held_out_errors(shown.fitted, self.spread(shown.fitted))
-            if not self.past_deadline:  # otherwise they are not known
+            if np.isfinite(known.rms) or not self.past_deadline:  # otherwise the time was over before they were known
                 self.findings[shown.key].held_out = self.findings[trial.key].held_out = known
         return known
 

@@ -53,7 +53,10 @@ RIDGE = 1e-6  # on the normal equations, against jumps that initial states can f
 
 @dataclass(frozen=True, eq=False)
 class _Gap(Gate):
-    """A gap at which a recording is cut in two; its value is the recording's number and the arguments of `cut`."""
+    """A gap at which a recording is cut in two.
+
+    Until it is reported, its value is the recording's number and the arguments of `cut`.
+    """
 
     states: Sequence[np.ndarray] = ()  # initial states of the recordings when this one is cut
 

@@ -426,7 +426,8 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
         before, after = search.held_out(search.root), search.held_out(trial)
     answer = replace(answer, effects=named.effects).acting(search, trial)
     verdict = judge(leading, answer, ())
-    predicts = after.error < before.error and not after.rms > EQUAL_RATIO * found.correction.after
+    known = np.isfinite(before.error) or not search.past_deadline
+    predicts = known and after.error < before.error and not after.rms > EQUAL_RATIO * found.correction.after
     if verdict.kind != "missing-physics" or not predicts:
         return found
     correction = replace(named_correction(search, trial.fitted), before=before.rms, after=after.rms, closest=trial)

@@ -89,11 +89,16 @@ def prepare(
     recordings, transients = open_unsettled(recordings)
     said = stated_hold(simulator, recordings, hold)
     bench, times = open_bench(simulator, recordings, said or "zero", engine)
-    checks = _Checks(workers, early, say, until)
-    first = checks.begin(bench, (*spikes, *transients, *times))
+    checks, noted = _Checks(workers, early, say, until), (*spikes, *transients, *times)
     held: Sequence[Gate] = ()
+    try:
+        first = checks.begin(bench, noted)
+    except InputError:
+        if said:
+            raise
+        first = checks.begin(bench.with_other_hold(), noted)
     if not said:
-        first, held = choose_hold(first)
+        first, held = choose_hold(replace(first, bench=checks.patient(first.bench)))
     nominal = errors_of(replace(bench, hold=first.bench.hold), first.fitted.model, whole=True)
     say(CHECKS, 1, CHECKED)
     now = checks.run(first, 1.0 if said else 0.5)
@@ -123,39 +128,42 @@ class _Checks:
     until: float
     left_out: list[Callable[[Checked], Checked]] = field(default_factory=list)
 
+    def patient(self, bench: Workbench) -> Workbench:
+        """Return the bench with time for a first refit: until the checks end, and a few seconds in any case."""
+        return replace(bench, deadline=max(self.until, time.perf_counter() + LEAST_REFIT))
+
     def begin(self, bench: Workbench, gates: tuple[Gate, ...]) -> Checked:
         """Refit from the user's values; correct a fault of a channel that shows at these values."""
-        slips = list[Gate]()
-        patient = replace(bench, deadline=max(self.until, time.perf_counter() + LEAST_REFIT))
+        found: Checked | None = None
         with UntilInterrupted(bench.interrupt, self.say.interrupted):
-            slips = find_gross_slips(patient, self.workers)
-        found = self._correct_gross_slip(patient, slips, gates) if slips else None
-        return found or first_refit(patient, gates)
+            slips = find_gross_slips(self.patient(bench), self.workers)
+            found = self._try_gross_slips(self.patient(bench), slips, gates) if slips else None
+        return found or first_refit(self.patient(bench), gates)
 
-    def _correct_gross_slip(self, bench: Workbench, slips: Sequence[Gate], gates: tuple[Gate, ...]) -> Checked | None:
-        """Correct the likeliest fault if the rule accepts it; None if nothing follows the recordings as given.
+    def _try_gross_slips(self, bench: Workbench, slips: Sequence[Gate], gates: tuple[Gate, ...]) -> Checked | None:
+        """Correct the likeliest fault if the rule accepts it; None if there is no fault and every run diverges.
 
-        The first refit gets half of the time: a slow simulator is not fitted at length to what it cannot follow. It
-        goes on if there is no fault.
+        The refit to the recordings as given gets half of the time: a slow simulator is not fitted at length to what it
+        cannot follow. It goes on if there is no fault.
         """
         brief = replace(bench, deadline=(time.perf_counter() + bench.deadline) / 2)
-        as_given = refit(brief, solver=THOROUGH) or brief.run_given(brief.simulator)
-        now = Checked(bench, as_given, gates)
-        found = self._in_turn(now, partial(accept_best, faults=slips, workers=self.workers), in_any_case=True)
-        if bench.interrupt.pressed:
-            found = now
-        elif len(found.gates) > len(gates):
+        plain = refit(brief, solver=THOROUGH) or brief.run_given(brief.simulator)
+        now = replace(with_observer(Checked(brief, plain, gates)), bench=bench)
+        found = accept_best(now, () if bench.interrupt.pressed else slips, self.workers)
+        if bench.interrupt.pressed:  # half a fit accepts wrong faults
+            return now if np.isfinite(now.cost) else None
+        found = replace(found, bench=self.patient(found.bench))
+        if len(found.gates) > len(gates):
             return refit_corrected(found)
         if not np.isfinite(found.cost):
             return None
-        if as_given.status is not Status.TIME_LIMIT or bench.interrupt.pressed:
-            return found
-        values, states = found.fitted.values, found.fitted.initial
+        bench, values, states = found.bench, found.fitted.values, found.fitted.initial
         return replace(found, fitted=bench.fit(bench.simulator, [values], states=states, solver=THOROUGH))
 
     def run(self, first: Checked, part: float) -> Checked:
         """Correct one fault after the other from the first refit on; `part` is the unit of shifts, see `timing`."""
-        now = self._in_turn(with_observer(first).weighted(), find_wrong_start, in_any_case=True)
+        now = with_observer(replace(first, bench=self.patient(first.bench))).weighted()
+        now = self._in_turn(now, find_wrong_start, in_any_case=True)
         now = replace(now, bench=replace(now.bench, deadline=self.until))
         slips, shift = partial(self._correct_slips, part=part), partial(find_time_shift, part=part, early=self.early)
         now = self._in_turn(now, self._report(2), slips, in_any_case=True)
@@ -210,9 +218,9 @@ def _with_better_hold(
 
     If inputs are taken as held but were interpolated, a late channel is late by half a sample more or less.
     """
-    other = first.bench.with_other_hold()
     try:
-        both = now, checks.run(_on(other, first), 0.5)
+        again = _with_other_hold(replace(first, bench=checks.patient(first.bench)))
+        both = now, checks.run(again, 0.5)
     except InputError:
         return now, held
     noise2 = np.min([found.floor.squares(found.bench.scale) for found in both], axis=0)
@@ -222,7 +230,7 @@ def _with_better_hold(
         now = both[int(costs[1] < costs[0])]
         held = [hold_note(now.bench.simulator, now.bench.hold, ratio)]
     if any(s.delay > 0 and not in_steps(s.value, now.bench.dt) for s in _shifts(now)):  # a delay is physics
-        now = checks.run(first if now.bench.hold == first.bench.hold else _on(other, first), 1.0)
+        now = checks.run(first if now.bench.hold == first.bench.hold else again, 1.0)
     return now, held
 
 
@@ -248,6 +256,8 @@ def with_observer(now: Checked) -> Checked:
         return now
     bench = now.bench
     given = bench.run_given(bench.simulator, now.fitted.model, now.fitted.engine)
+    if not np.isfinite(given.cost):
+        return now
     probe, runs = linearise_runs(bench, given)
     gain = observer_gain(probe, runs, white_part(now.fitted.residual))
     if not gain.any():
@@ -264,10 +274,15 @@ def with_observer(now: Checked) -> Checked:
 
 
 def choose_hold(first: Checked, solver: GaussNewton = THOROUGH) -> tuple[Checked, Sequence[Gate]]:
-    """Choose the hold whose refit has the smaller error, and note it; keep the first one if the errors are equal."""
+    """Choose the hold whose refit has the smaller error, and note it; keep the first one if the errors are equal.
+
+    It is kept without a note if a refit was cut short, which says nothing.
+    """
     try:
-        other = _on(first.bench.with_other_hold(), first, solver)
+        other = _with_other_hold(first, solver)
     except InputError:
+        return first, [hold_note(first.bench.simulator, first.bench.hold, np.inf)]
+    if Status.TIME_LIMIT in (first.fitted.status, other.fitted.status):
         return first, ()
     costs = first.cost, other.cost
     ratio = float(np.sqrt(max(costs) / max(min(costs), 1e-300)))
@@ -277,9 +292,10 @@ def choose_hold(first: Checked, solver: GaussNewton = THOROUGH) -> tuple[Checked
     return best, [hold_note(best.bench.simulator, best.bench.hold, ratio)]
 
 
-def _on(bench: Workbench, first: Checked, solver: GaussNewton = THOROUGH) -> Checked:
-    """Repeat the first refit on another bench."""
-    return replace(first, bench=bench, fitted=bench.fit(bench.simulator, [{}, first.fitted.values], solver=solver))
+def _with_other_hold(first: Checked, solver: GaussNewton = THOROUGH) -> Checked:
+    """Repeat the first refit with the other hold, from its values and from the user's."""
+    bench = first.bench.with_other_hold()
+    return replace(first, bench=bench, fitted=bench.fit(bench.simulator, [first.fitted.values, {}], solver=solver))
 
 
 def conversions(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Gate, ...]:
@@ -296,5 +312,6 @@ def hold_note(simulator: Simulator, hold: str, ratio: float) -> Gate:
     """Note that the hold was chosen from the data; the other's error is `ratio` times as large."""
     words = {"zero": "held over each sample", "linear": "interpolated between samples"}[hold]
     how = f"fits better (error {ratio:.3g} times smaller)" if ratio > EQUAL_RATIO else "fits no worse"
+    how = how if np.isfinite(ratio) else "lets the simulation follow (otherwise it diverges)"
     sentence = f"The recordings do not say what inputs do between samples; {words} {how} and is used."
     return Gate(", ".join(simulator.inputs), "hold", hold, sentence)

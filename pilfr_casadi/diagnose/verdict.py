@@ -246,7 +246,7 @@ def _make_effect(
         ports |= set(places.split(" + ")) if other == law else set()
     included = sum(w for n, w in by_names.items() if n & {(port, law) for port in ports})
     at_port = sum(w for n, w in by_names.items() if ports & {port for port, _ in n})
-    return NamedEffect(element, included, twins, at_port)
+    return NamedEffect(element, included, twins, min(at_port, 1.0))
 
 
 def _weights(search: Hypotheses, trials: Sequence[Trial]) -> np.ndarray:

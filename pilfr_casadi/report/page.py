@@ -6,9 +6,16 @@ layout, `explore.js` for the charts. The templates escape all text. The page all
 and neither other scripts nor network access.
 
 Every picture of lines carries its numbers, and the script replaces it by an interactive chart; without the script, and
-in print, the reader sees the picture. uPlot (`uplot/`, MIT licence) draws the charts. Of the libraries that were
-measured (Chart.js, plotly.js, Bokeh) it has a fifth of the bytes of the next one in every page, and draws in a third of
-the time. It lacks a keyboard legend, values of loops under the pointer and zoom buttons, which `explore.js` adds.
+in print, the reader sees the picture. uPlot (`uplot/`, MIT licence) draws the charts. It was chosen by measurement:
+bytes of script in every page, and time to draw 12 charts of 4 lines with 6144 points (Chromium, two busy cores).
+
+    uPlot 1.6.32                           52,938 bytes    0.26 s
+    Chart.js 4.6.1, zoom 2.2.0, hammer    246,050 bytes    0.79 s
+    plotly.js-basic 4.1.1               1,191,749 bytes    1.49 s
+    Bokeh 3.9.2                         1,268,134 bytes    not run: it evaluates text as code, which the policy forbids
+
+The three libraries that run under the policy are equally legible at 420 pixels. uPlot lacks a keyboard legend, values
+of loops under the pointer and zoom buttons; `explore.js` adds them in about 250 lines.
 """
 
 from __future__ import annotations

@@ -212,6 +212,42 @@ def test_what_only_the_refit_leaves_dead_is_said_to_be_alive_as_given():
     assert "before the refit, the outputs do react to k_stop" in sentence
 
 
+def test_a_free_decay_shows_what_is_alive_as_given():
+    """A run from rest would stand still."""
+
+    def stopped(k):
+        return Simulator(
+            lambda x, u, p: {"q": x.v, "v": u.f - p.k * x.q - 2 * x.v - p.k_stop * ca.fmax(x.q - 0.05, 0.0)},
+            lambda x: {"y": x.q},
+            states=("q", "v"),
+            inputs=("f",),
+            parameters={"k": Parameter(k, bounds=(5, 500)), "k_stop": Parameter(100.0, bounds=(10, 1000))},
+        )
+
+    rest = np.zeros(SAMPLES)
+    blank = Recording(rest, rest, DT, ("f",), ("y",), initial=[0.0, 0.45], hold="zero")
+    y = stopped(100.0).simulate(blank)
+    decay = blank.with_(y=y + 1e-4 * np.random.default_rng(0).standard_normal(y.shape), initial="estimate")
+    dead = next(b for b in check(stopped(40.0), decay).blind_spots if "k_stop" in b.names)
+    assert "before the refit, the outputs do react to k_stop" in dead.sentence
+
+
+def test_a_wrong_unit_with_which_every_run_diverges_is_told():
+    swelling = Simulator(
+        lambda x, u, p: {"q": u.f - p.a * x.q + x.q**3},
+        lambda x: {"y": x.q},
+        states=("q",),
+        inputs=("f",),
+        parameters={"a": Parameter(5.0, bounds=(1, 20))},
+    )
+    right = record(swelling, noise_like(1))
+    found = check(swelling, right.with_(u=1e3 * right.u))
+    assert [b.names for b in found.blind_spots if b.kind == "recording-fault"] == [("f",)]
+    assert found.error < 0.1
+    with pytest.raises(InputError, match="diverges"):
+        check(swelling, right.with_(u=1e3 * np.cumsum(np.abs(right.u), axis=0)))
+
+
 def test_a_simulator_that_does_not_follow_is_said_to_be_rough():
     given = record(MASS, noise_like(1))
     found = check(MASS, given.with_(y=given.y[::-1]))

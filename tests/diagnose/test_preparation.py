@@ -10,11 +10,13 @@ import pytest
 from diagnosis_rig import OFF, recordings, refitted, rig
 from test_slips import DT, recorded, tanks
 
-from pilfr_casadi import Parameter, Recording, Simulator, multisine
+from pilfr_casadi import InputError, Parameter, Recording, Simulator, multisine
 from pilfr_casadi.diagnose import Workbench, preparation
+from pilfr_casadi.diagnose.gates import Checked
 from pilfr_casadi.diagnose.offsets import find_offsets, list_offsets, share_of_constants, update_offsets
 from pilfr_casadi.diagnose.preparation import prepare
 from pilfr_casadi.laws import AsymmetricSaturation
+from pilfr_casadi.optimise import Status
 
 
 def unsaid(r, u, y, initial="zero"):
@@ -81,6 +83,37 @@ def test_constants_that_look_alike_to_first_order_are_told_apart_by_their_refits
     assert share["actuator:q2"] == pytest.approx(share["sensor:lower"])
     channels = [g.channel for g in find_offsets(ready).gates]
     assert channels == ["lower"] if initial == "zero" else len(channels) == 1
+
+
+def unsaid_tanks():
+    return Workbench.of(tanks(1.15), [of_tanks(recorded()[1]).with_(hold=None)], "linear")
+
+
+def test_a_hold_with_which_the_simulation_diverges_is_not_used(monkeypatch):
+    first = preparation.first_refit
+
+    def diverging(bench, gates=()):
+        if bench.hold == "zero":
+            raise InputError("The simulation diverges.")
+        return first(bench, gates)
+
+    monkeypatch.setattr(preparation, "first_refit", diverging)
+    given = unsaid_tanks()
+    ready = prepare(given.simulator, given.recordings, None, "auto")
+    assert ready.without.cost < 0.05**2
+    with pytest.raises(InputError, match="diverges"):
+        prepare(given.simulator, given.recordings, "zero", "auto")
+    monkeypatch.setattr(Workbench, "fit", lambda *_, **__: diverging(replace(given, hold="zero")))
+    (note,) = preparation.choose_hold(Checked(given, given.run_given(given.simulator)))[1]
+    assert (note.finding, note.value) == ("hold", "linear") and "otherwise it diverges" in note.sentence
+
+
+def test_a_refit_that_was_cut_short_chooses_no_hold():
+    begun = preparation.first_refit(unsaid_tanks())
+    now, notes = preparation.choose_hold(begun)
+    assert now.bench.hold == "zero" and [g.value for g in notes] == ["zero"]  # as recorded
+    late = replace(begun, fitted=replace(begun.fitted, status=Status.TIME_LIMIT))
+    assert preparation.choose_hold(late) == (late, ())
 
 
 def test_checks_that_the_time_limit_left_out_are_told():

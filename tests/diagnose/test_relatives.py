@@ -125,7 +125,10 @@ def test_no_force_acts_as_a_parameter_that_an_output_reads(tiny):
     bench, refit = tiny
     simulator = bench.simulator
     read = replace(bench, simulator=replace(simulator, outputs=lambda x, p: {"pos": x.pos * (1 + p.k)}))
-    assert forces_of_change(read, refit, "parameter:k", np.full(len(bench.recordings[0]), 2.0)) == {}
+    change = np.full(len(bench.recordings[0]), 2.0)
+    assert forces_of_change(read, refit, "parameter:k", change) == {}
+    accelerometer = replace(bench, simulator=replace(simulator, outputs=lambda dx: {"acc": dx.vel}))
+    assert sorted(forces_of_change(accelerometer, refit, "parameter:k", change)) == ["a", "b", "c"]
 
 
 def test_a_law_that_varies_is_compared_with_laws_of_its_own_port(tiny):
