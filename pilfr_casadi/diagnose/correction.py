@@ -33,33 +33,18 @@ from .workbench import FEW, Fitted
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """The elements of the corrected simulator that the refit does not have, and its prediction errors.
+    """The elements of the corrected simulator that the refit does not have, and its prediction errors."""
 
-    Attributes
-    ----------
-    elements : tuple of (port, law, form)
-        The added elements; empty if the refit predicts as well.
-    shares : dict
-        `named`, `learned`, `left`: shares of the refit's mean square error above the noise on the training recordings.
-        Named laws remove the first, the learned element beside them the second; the third remains.
-    learned : tuple of Learned
-        The learned elements.
-    before, after : float
-        Rms error on held-out blocks of the refit and of the corrected simulator, in units of the outputs' deviation;
-        nan if nothing was compared.
-    closest : Trial, optional
-        The hypothesis with its named laws, if something was compared.
-    late : bool
-        Whether there was no time left to compare it with others.
-    """
-
-    elements: tuple[tuple[str, str, str], ...]
+    elements: tuple[tuple[str, str, str], ...]  # port, law and form of each; empty if the refit predicts as well
+    # `named`, `learned`, `left`: shares of the refit's mean square error above the noise on the training recordings.
+    # Named laws remove the first, the learned element beside them the second; the third remains.
     shares: dict[str, float]
     learned: tuple[Learned, ...] = ()
+    # rms error of the refit on held-out blocks, in units of the outputs' deviation; nan if nothing was compared
     before: float = np.nan
-    after: float = np.nan
-    closest: Trial | None = None
-    late: bool = False
+    after: float = np.nan  # the same of the corrected simulator
+    closest: Trial | None = None  # the hypothesis with its named laws, if something was compared
+    late: bool = False  # whether there was no time left to compare it with others
 
     @property
     def words(self) -> str:

@@ -395,22 +395,12 @@ def log_occam(v: float, information: np.ndarray | None, n: float) -> float:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Mean square errors of a simulator on data that it was not fitted to, outputs in units of their deviation.
+    """Mean square errors of a simulator on data that it was not fitted to, outputs in units of their deviation."""
 
-    Attributes
-    ----------
-    blocks, ahead : float
-        On held-out blocks, and on the second halves; infinite if the simulation diverges.
-    squares : array, shape (n_y,)
-        The larger of the two, of each output.
-    spread : float
-        Mean square uncertainty of predictions for other inputs; see `evidence.spread`.
-    """
-
-    blocks: float
-    ahead: float
-    squares: np.ndarray
-    spread: float = 0.0
+    blocks: float  # on held-out blocks; infinite if the simulation diverges
+    ahead: float  # the same on the second halves
+    squares: np.ndarray  # (n_y,), the larger of the two, of each output
+    spread: float = 0.0  # mean square uncertainty of predictions for other inputs; see `evidence.spread`
 
     @property
     def mean_square(self) -> float:

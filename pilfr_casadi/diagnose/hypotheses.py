@@ -260,7 +260,7 @@ class Hypotheses:
         """
         if not np.isfinite(trial.mean_square):
             return -np.inf
-        known, residuals = self.findings[trial.key], self.scored_residuals(trial)
+        known, residuals = self.findings[trial.key], self.bench.scored(trial.fitted.residual)
         size = sum(e.size for e in residuals)
         n = replace(self.sample, count=size).effective(0.0)
         if known.likelihood is None:
@@ -290,7 +290,8 @@ class Hypotheses:
         """Lower limit of the noise: the measured noise, or the white part of the best residual."""
         if self.floor.source != "estimated":
             return self.floor
-        white = np.hypot(white_part(self.scored_residuals(self.best)), self.stand_in_error * self.bench.scale)
+        white = white_part(self.bench.scored(self.best.fitted.residual))
+        white = np.hypot(white, self.stand_in_error * self.bench.scale)
         return Floor(white, self.floor.source)
 
     @property
@@ -356,13 +357,9 @@ class Hypotheses:
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
         share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
         rest = np.minimum(np.sqrt(share) * self.rms(best), LOUDEST_NOISE * self.bench.scale)
-        known, white = self.stand_in_error * self.bench.scale, white_part(self.scored_residuals(best))
+        known, white = self.stand_in_error * self.bench.scale, white_part(self.bench.scored(best.fitted.residual))
         noise = np.minimum(np.hypot(np.maximum(white, rest), known), self.rms(nearest))
         self.floor = Floor(noise, "estimated")
-
-    def scored_residuals(self, trial: Trial) -> list[np.ndarray]:
-        """Return the residual of each recording (M, n_y) without the samples that do not count."""
-        return self.bench.scored(trial.fitted.residual)
 
     def rms(self, trial: Trial) -> np.ndarray:
         """Compute the rms error of each output, (n_y,)."""

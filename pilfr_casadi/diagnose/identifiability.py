@@ -43,26 +43,17 @@ HOLD_REMAINDER = SMALL_SHARE**2  # share of a response below which a remainder c
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """A free parameter as refitted, and whether it is identifiable.
-
-    Attributes
-    ----------
-    std : float or None
-        Standard error due to the noise alone; None where the parameter is not identifiable.
-    status : str
-        "identifiable", "dead" (no output reacts), "flat" (the standard error is as large as the range of the bounds),
-        "tied" (traded off with others), "start" (traded off with the unknown initial state), or "port" (only the ports
-        read it, so that it acts only through a law).
-    at_bound : bool
-        Whether the refit ended at one of its bounds.
-    """
+    """A free parameter as refitted, and whether it is identifiable."""
 
     name: str
     value: float
     unit: str
-    std: float | None
+    std: float | None  # standard error due to the noise alone; None where the parameter is not identifiable
+    # "identifiable", "dead" (no output reacts), "flat" (the standard error is as large as the range of the bounds),
+    # "tied" (traded off with others), "start" (traded off with the unknown initial state), or "port" (only the ports
+    # read it, so that it acts only through a law)
     status: str
-    at_bound: bool = False
+    at_bound: bool = False  # whether the refit ended at one of its bounds
 
 
 @dataclass(frozen=True)
@@ -325,32 +316,21 @@ def helpful_sensors(response: Sensitivity, runs: Sequence[Run]) -> tuple[str, ..
 
 @dataclass(frozen=True)
 class LawRow:
-    """A law at a port, and whether it is detectable.
-
-    Attributes
-    ----------
-    status : str
-        "detectable", "followed" (own parameters imitate it), "weak" (it moves no output by more than the noise), or
-        "no data" (with the reason in `why`).
-    force : float or None
-        Smallest detectable rms force (in series: deviation of the signal), in `unit`.
-    share : float or None
-        That force relative to the largest own force of the simulator at the port, in series to the signal; None if
-        unknown.
-    strength : tuple or None
-        Name, value and unit of the law's strength at that force, for laws with one strength.
-    why : str
-        The parameter that imitates it, or the reason why there is no data.
-    """
+    """A law at a port, and whether it is detectable."""
 
     port: str
     law: str
+    # "detectable", "followed" (own parameters imitate it), "weak" (it moves no output by more than the noise), or "no
+    # data" (with the reason in `why`)
     status: str
-    force: float | None = None
+    force: float | None = None  # smallest detectable rms force (in series: deviation of the signal), in `unit`
     unit: str = ""
+    # that force relative to the largest own force of the simulator at the port, in series to the signal; None if
+    # unknown
     share: float | None = None
+    # name, value and unit of the law's strength at that force, for laws with one strength
     strength: tuple[str, float, str] | None = None
-    why: str = ""
+    why: str = ""  # the parameter that imitates it, or the reason why there is no data
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,13 +56,6 @@ class Constant(Law):
         return p.w
 
 
-def with_probes(simulator: Simulator) -> Simulator:
-    """Return the simulator with a constant force at every port, in the order of `all_ports`."""
-    for port in simulator.all_ports():
-        simulator = simulator.with_element(port.name, Constant())
-    return simulator
-
-
 @dataclass(frozen=True, eq=False)
 class Probe:
     """One step of the probed simulator at fitted values, its derivatives, and the local signals of its ports."""
@@ -79,8 +72,10 @@ class Probe:
     @one_at_a_time
     def of(cls, bench: Workbench, fitted: Fitted) -> Probe:
         """Differentiate the probed simulator."""
-        simulator = fitted.simulator
-        model = discretise(with_probes(simulator), bench.dt, bench.hold, fitted.model.substeps)
+        simulator = probed = fitted.simulator
+        for port in simulator.all_ports():
+            probed = probed.with_element(port.name, Constant())
+        model = discretise(probed, bench.dt, bench.hold, fitted.model.substeps)
         x, (u, p) = ca.SX.sym("x", model.n_state), model.symbols()[2:]
         following, y = model.closed(x, u, p)
         parameters = model.parameters

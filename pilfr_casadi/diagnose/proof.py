@@ -151,19 +151,10 @@ def next_experiment(
 ) -> dict[str, Any] | None:
     """Find the input that separates two fitted explanations, the `rivals`, best.
 
-    Parameters
-    ----------
-    noise : array, shape (n_y,)
-        Deviation of the outputs' noise.
-    limits : mapping, optional
-        Largest amplitude of each input; by default the input stays within its recorded range.
-
-    Returns
-    -------
-    dict or None
-        `input`, `waveform`, `level` (its mean), `amplitude`, `frequency` (Hz), `separation` (rms difference over the
-        noise), `recorded` (the separation in the recordings) and `sentence`; None if nothing within the limits
-        separates them better than the recordings do.
+    `noise` (n_y,) is the deviation of the outputs' noise; `limits` are the largest amplitudes of inputs, by default
+    such that they stay within their recorded range. Returns `input`, `waveform`, `level` (its mean), `amplitude`,
+    `frequency` (Hz), `separation` (rms difference over the noise), `recorded` (the separation in the recordings) and
+    `sentence`; None if nothing within the limits separates them better than the recordings do.
     """
     u = np.concatenate([r.u for r in bench.recordings])
     m = min(max(map(len, bench.recordings)), LONGEST_EXPERIMENT)

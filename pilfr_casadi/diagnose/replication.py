@@ -46,42 +46,20 @@ class Values:
 
 @dataclass(frozen=True, eq=False)
 class Replication:
-    """A simulator with known laws, fitted to recordings of a machine.
+    """A simulator with known laws, fitted to recordings of a machine."""
 
-    Attributes
-    ----------
-    without, after : Fitted
-        The simulator as given, and with the laws; both refitted.
-    estimate : Values
-        Parameters of `after`, on all recordings.
-    by_recording : tuple of Values
-        Parameters of each recording alone, if there are several.
-    widths : mapping
-        Width of each parameter's prior range.
-    nrmse_before, nrmse_after : float
-        NRMSE (Eq. 27) without the laws, and with the laws at the values of each recording.
-    noise : float
-        Noise over the outputs' deviation.
-    remainder, remainder_error : float
-        `l` of the module docstring, and its standard error.
-    gain : float
-        Log evidence with the laws minus the log evidence without, prior included; 0 without laws.
-    residuals : tuple of array
-        Simulated minus measured outputs of each recording, over the outputs' deviation.
-    """
-
-    without: Fitted
-    after: Fitted
-    estimate: Values
-    by_recording: tuple[Values, ...]
-    widths: Mapping[str, float]
-    nrmse_before: float
-    nrmse_after: float
-    noise: float
-    remainder: float
-    remainder_error: float
-    gain: float
-    residuals: tuple[np.ndarray, ...]
+    without: Fitted  # the simulator as given, refitted
+    after: Fitted  # the same with the laws
+    estimate: Values  # parameters of `after`, on all recordings
+    by_recording: tuple[Values, ...]  # parameters of each recording alone, if there are several
+    widths: Mapping[str, float]  # width of each parameter's prior range
+    nrmse_before: float  # NRMSE (Eq. 27) without the laws
+    nrmse_after: float  # the same with the laws, at the values of each recording
+    noise: float  # noise over the outputs' deviation
+    remainder: float  # `l` of the module docstring
+    remainder_error: float  # its standard error
+    gain: float  # log evidence with the laws minus the log evidence without, prior included; 0 without laws
+    residuals: tuple[np.ndarray, ...]  # simulated minus measured outputs of each recording, over the outputs' deviation
 
     @property
     def simulator(self) -> Simulator:

@@ -31,14 +31,14 @@ import numpy as np
 from .._base import InputError, side_by_side
 from ..data import Recording
 from ..engine import Engine
-from ..laws import Creep, Law, StopHysteresis
+from ..laws import Creep, StopHysteresis
 from ..models import Model
 from ..optimise import GaussNewton, estimate_initial_state, samples_for_state
 from ..simulators import Simulator
 from .gates import Gate, refit
 from .hypotheses import Findings, count_samples, likeliest
 from .linearise import Probe, loudest_stretch, run
-from .screen import Remainder, Surface, Task, orthonormal
+from .screen import Dose, Remainder, Surface, orthonormal
 from .search import Search
 from .trials import Trial
 from .workbench import DIVERGED, FEW, Fitted, Workbench, output_deviation
@@ -208,7 +208,7 @@ def force_features(
         r, state = piece
         part = replace(bench, recordings=(r,))
         rest = Remainder.of(part, probe, [run(part, probe, replace(fitted, initial=[state]), 0)], FAMILIES)
-        return {(t.port.name, law.id): size for t in rest.tasks for law, size in _explained(rest, t)}
+        return {(t.port.name, law.id): _explained_size(rest, d) for t in rest.tasks for law, d in rest.doses(t)}
 
     rows = side_by_side(explained, pieces, workers)
     keys = sorted(set().union(*rows))
@@ -249,13 +249,10 @@ def _loudest(
         at, state = s.end, after
 
 
-def _explained(rest: Remainder, task: Task) -> list[tuple[Law, float]]:
-    """Compute the size of the remainder along the forces of each family at a port."""
-    out = []
-    for law, doses in rest.doses(task):
-        base = orthonormal(np.hstack([d.phi for d in doses])) if doses else np.zeros((len(rest.left), 0))
-        out.append((law, float(np.linalg.norm(base.T @ rest.left))))
-    return out
+def _explained_size(rest: Remainder, doses: Sequence[Dose]) -> float:
+    """Compute the size of the remainder along the forces of a family at a port."""
+    base = orthonormal(np.hstack([d.phi for d in doses])) if doses else np.zeros((len(rest.left), 0))
+    return float(np.linalg.norm(base.T @ rest.left))
 
 
 def _first_state(model: Model, engine: Engine, r: Recording) -> np.ndarray:

@@ -380,7 +380,8 @@ def _is_slow_noise(search: Hypotheses) -> bool:
 def _times_white(search: Hypotheses) -> float:
     """Compute the ratio of the refit's error to the noise: measured, or the white noise in its residual."""
     if search.floor.source == "estimated":
-        return max(times_white(e / search.bench.scale) for e in search.scored_residuals(search.root))
+        residuals = search.bench.scored(search.root.fitted.residual)
+        return max(times_white(e / search.bench.scale) for e in residuals)
     return search.root.error / max(float(np.sqrt(search.floor2)), 1e-300)
 
 
@@ -404,12 +405,12 @@ def _swells(search: Hypotheses) -> bool:
 
     The measured outputs hold the noise itself, and their rates hardly anything else where the machine is slow.
     """
-    signals = []
-    for r, e in zip(search.bench.recordings, search.root.fitted.residual, strict=True):
+    signals, residual = [], search.root.fitted.residual
+    for r, e in zip(search.bench.recordings, residual, strict=True):
         simulated = r.y + e
         signals.append(np.column_stack([r.u, simulated, np.gradient(simulated, axis=0)])[r.skip :])
     # the noise may be of another level in each recording, such as with another range of a sensor
-    rest = [e / np.maximum(white_part([e]), 1e-300) for e in search.scored_residuals(search.root)]
+    rest = [e / np.maximum(white_part([e]), 1e-300) for e in search.bench.scored(residual)]
     return swells_with(rest, signals)
 
 

@@ -71,36 +71,19 @@ class RunsAway(InputError):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fitted:
-    """A simulator fitted to recordings.
-
-    Attributes
-    ----------
-    values : dict
-        Parameters by name.
-    initial : list of array
-        State with memory at each recording's first sample.
-    residual : list of array, shape (M, n_y)
-        Simulated minus measured outputs of each recording, unscored samples included.
-    cost : float
-        Mean square of the scored residuals, each output in units of its deviation; see `floor.pool`.
-    squares : array, shape (n_y,)
-        The same of each output.
-    balance : array, shape (n_y,)
-        Relative variances of the outputs' errors, with which they are pooled.
-    status : Status
-        How the fit ended; a run at given values counts as converged.
-    """
+    """A simulator fitted to recordings."""
 
     simulator: Simulator
     model: Model
     engine: Engine
-    values: dict[str, np.ndarray]
-    initial: list[np.ndarray]
+    values: dict[str, np.ndarray]  # parameters by name
+    initial: list[np.ndarray]  # state with memory at each recording's first sample
+    # (M, n_y), simulated minus measured outputs of each recording, unscored samples included
     residual: list[np.ndarray]
-    cost: float
-    squares: np.ndarray
-    balance: np.ndarray
-    status: Status = Status.CONVERGED
+    cost: float  # mean square of the scored residuals, each output in units of its deviation; see `floor.pool`
+    squares: np.ndarray  # (n_y,), the same of each output
+    balance: np.ndarray  # (n_y,), relative variances of the outputs' errors, with which they are pooled
+    status: Status = Status.CONVERGED  # how the fit ended; a run at given values counts as converged
 
     @property
     def vector(self) -> np.ndarray:

@@ -38,24 +38,12 @@ FAILED, TIMED_OUT, LOST = "FAILED", "TIMED_OUT", "LOST"  # statuses of jobs with
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The result of a job.
+    """The result of a job."""
 
-    Attributes
-    ----------
-    entry : dict
-        Entry in the manifest, with `status` and `sentence`.
-    seconds : float
-        Computing time.
-    files : mapping
-        Files by name below the folder of the job.
-    errors : mapping
-        NRMSE by recording, for a job of a run.
-    """
-
-    entry: dict[str, Any]
-    seconds: float = 0.0
-    files: Mapping[str, str | bytes] = field(default_factory=dict)
-    errors: Mapping[str, float | None] = field(default_factory=dict)
+    entry: dict[str, Any]  # entry in the manifest, with `status` and `sentence`
+    seconds: float = 0.0  # computing time
+    files: Mapping[str, str | bytes] = field(default_factory=dict)  # by name below the folder of the job
+    errors: Mapping[str, float | None] = field(default_factory=dict)  # NRMSE by recording, for a job of a run
 
 
 Work = Callable[[Any], Outcome]  # executes a job

@@ -141,24 +141,12 @@ class FleetValue:
 
 @dataclass(frozen=True, eq=False)
 class Common:
-    """The physics that all machines lack: laws at their ports, and their probability.
+    """The physics that all machines lack: laws at their ports, and their probability."""
 
-    Attributes
-    ----------
-    laws : tuple of LawAt
-        Empty if nothing is missing in common.
-    probability : float
-        Posterior probability of these laws, in any form, from the sampled machines.
-    sample : tuple of str
-        The machines that were diagnosed alone.
-    starts : tuple of mapping
-        Start values by name for every machine, besides the user's.
-    """
-
-    laws: tuple[LawAt, ...]
-    probability: float
-    sample: tuple[str, ...]
-    starts: tuple[Mapping[str, Any], ...] = ()
+    laws: tuple[LawAt, ...]  # empty if nothing is missing in common
+    probability: float  # posterior probability of these laws, in any form, from the sampled machines
+    sample: tuple[str, ...]  # the machines that were diagnosed alone
+    starts: tuple[Mapping[str, Any], ...] = ()  # start values by name for every machine, besides the user's
 
     @property
     def words(self) -> str:
