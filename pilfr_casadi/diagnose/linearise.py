@@ -375,8 +375,9 @@ def port_signals(bench: Workbench, fitted: Fitted, port: str) -> Local:
 
 
 def turns_back(bench: Workbench, fitted: Fitted, port: str) -> bool:
-    """Tell whether the local coordinate of a port turns back in any fitted run."""
+    """Tell whether the local coordinate of a port moves up and down in the fitted runs, within one or over several."""
     local = port_signals(bench, fitted, port)
     least = SMALLEST_SWING * float(np.ptp(local.z))
     runs = np.split(local.z, np.cumsum(local.lengths)[:-1])
-    return any(len(turning_points(z, least)) > 2 for z in runs)
+    swings = np.concatenate([np.diff(z[turning_points(z, least)]) for z in runs])
+    return bool(np.any(swings > 0) and np.any(swings < 0))

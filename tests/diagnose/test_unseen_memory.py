@@ -33,9 +33,10 @@ def test_a_motion_turns_back_or_not(course, turns):
     assert [turns_back(bench, fitted, port) for port in ("ground", "actuator:force", "sensor:pos")] == [turns] * 3
 
 
-def test_one_of_several_recordings_may_turn_back():
-    bench = Workbench.of(cart(), [driven(UP), driven(UP_AND_DOWN)], "zero", "vm")
-    assert turns_back(bench, bench.run(bench.simulator, {}, [np.zeros(2)] * 2), "ground")
+@pytest.mark.parametrize("other", [UP_AND_DOWN, UP[::-1] - 60])
+def test_several_recordings_may_turn_back_together(other):
+    bench = Workbench.of(cart(), [driven(UP), driven(other)], "zero", "vm")
+    assert turns_back(bench, bench.run(bench.simulator, {}, [np.zeros(2)] * 2), "actuator:force")
 
 
 @pytest.mark.parametrize("law", [StopHysteresis, BoucWen, Backlash])
