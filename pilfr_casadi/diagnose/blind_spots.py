@@ -124,6 +124,8 @@ class Check:
         Stated course of the inputs between samples ("" if not stated), and the start of each recording.
     hold_taken : str
         The course with which the simulator was refitted: the stated one, or the one that fits better.
+    idle_inputs : tuple of str
+        Inputs that the simulator's equations do not read.
     next_record : str
         The recording that would help most.
     seconds : float
@@ -140,6 +142,7 @@ class Check:
     hold: str
     starts: tuple[str, ...]
     hold_taken: str = "zero"
+    idle_inputs: tuple[str, ...] = ()
     next_record: str = ""
     seconds: float = 0.0
 
@@ -212,7 +215,7 @@ class Check:
             (e.port, f"{e.travel:.3g} {e.unit}", str(e.reversals), str(e.amplitudes), str(e.rests))
             for e in self.excitation
         ]
-        yield from _table(("local coordinate", "travel", "reversals", "amplitudes", "rests"), rows)
+        yield from _table(("simulated coordinate", "travel", "reversals", "amplitudes", "rests"), rows)
 
     def _circumstances(self) -> Iterator[str]:
         units = {e.port: e.unit for e in self.excitation}
@@ -228,6 +231,8 @@ class Check:
         unsaid = f"not stated, here taken as {taken}; say hold='zero' or hold='linear' if you know"
         yield f"inputs between samples: {taken if self.hold else unsaid}"
         yield f"start of each recording: {', '.join(self.starts)}"
+        if self.idle_inputs:
+            yield f"inputs that the equations do not read: {in_words(self.idle_inputs)}; a diagnosis tries their effects"
 
 
 def _why(r: LawRow) -> str:
@@ -326,6 +331,7 @@ def assess_recordings(
         error=bench.nrmse(fitted),
         hold=stated,
         hold_taken=bench.hold,
+        idle_inputs=bench.simulator.idle_inputs,
         starts=tuple(START_WORDS[r.begins] for r in bench.recordings),
     )
     swings = np.ptp(np.concatenate([r.u for r in bench.recordings]), axis=0)

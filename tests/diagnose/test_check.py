@@ -268,6 +268,8 @@ def test_an_input_that_no_equation_reads_is_no_port():
     )
     found = check(idle, record(idle, np.column_stack([noise_like(2), noise_like(3)])))
     assert not found.blind_spots and "actuator:temperature" not in {r.port for r in found.laws}
+    assert found.idle_inputs == ("temperature",)
+    assert "inputs that the equations do not read: temperature; a diagnosis tries" in str(found)
 
 
 def test_standard_errors_are_those_of_many_noises(mass):
