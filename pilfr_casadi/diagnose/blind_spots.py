@@ -232,7 +232,8 @@ class Check:
         yield f"inputs between samples: {taken if self.hold else unsaid}"
         yield f"start of each recording: {', '.join(self.starts)}"
         if self.idle_inputs:
-            yield f"inputs that the equations do not read: {in_words(self.idle_inputs)}; a diagnosis tries their effects"
+            idle = in_words(self.idle_inputs)
+            yield f"inputs that the equations do not read: {idle}; a diagnosis tries their effects"
 
 
 def _why(r: LawRow) -> str:
