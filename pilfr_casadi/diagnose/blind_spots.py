@@ -37,6 +37,7 @@ from .identifiability import (
     port_units,
 )
 from .linearise import SMALLEST_SWING, Probe, Run, linearise_runs, turning_points
+from .offsets import WrongStart, find_wrong_start
 from .preparation import choose_hold
 from .workbench import QUICK, Fitted, Workbench
 
@@ -294,6 +295,7 @@ def check(
         now = Checked(bench, bench.fit(simulator))
     if not stated:
         now = choose_hold(now, QUICK)[0]
+    now = find_wrong_start(now)
     bench, fitted, faults = now.bench, now.fitted, now.gates
     bench.interrupt.raise_pending()  # half a fit would tell wrong things
     bench.check_followed(fitted)
@@ -302,7 +304,10 @@ def check(
     if not faults:
         return found
     told = tuple(BlindSpot("recording-fault", (f.channel,), f"{f.sentence} Below, it is corrected.") for f in faults)
-    first = f"Correct the recordings first: check wiring, sign and unit of {in_words([f.channel for f in faults])}."
+    wired = [f.channel for f in faults if not isinstance(f, WrongStart)]
+    first = "State first how the recordings begin: give each state's value, or leave the start unknown."
+    if wired:
+        first = f"Correct the recordings first: check wiring, sign and unit of {in_words(wired)}."
     return replace(found, blind_spots=(*told, *found.blind_spots), next_record=first)
 
 
