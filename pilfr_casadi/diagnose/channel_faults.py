@@ -15,7 +15,7 @@ import numpy as np
 from .._base import InputError, side_by_side
 from ..data import Recording
 from ..optimise import GaussNewton
-from ..simulators import SENSOR, port_name
+from ..simulators import SENSOR, Simulator, port_name
 from .gates import CLEARLY_BETTER, CURED_SHARE, POOR_FIT, USELESS_FIT, Checked, Gate, accept, correct
 from .offsets import describe_constant
 from .workbench import THOROUGH, Workbench
@@ -54,6 +54,19 @@ def exchange_channels(kind: str, names: Sequence[str], one: int, other: int) -> 
     matrix, both = np.eye(len(names)), [names[one], names[other]]
     matrix[[one, other]] = matrix[[other, one]]
     return map_channels(kind, matrix, ", ".join(both), "exchange", both, "are exchanged")
+
+
+def exchange_input(simulator: Simulator, i: int, j: int) -> Gate:
+    """Return the fault that input i and output j are exchanged."""
+    both = [simulator.inputs[i], simulator.output_names[j]]
+
+    def exchange(r: Recording) -> Recording:
+        u, y = r.u.copy(), r.y.copy()
+        u[:, i], y[:, j] = r.y[:, j], r.u[:, i]
+        return r.with_(u=u, y=y)
+
+    sentence = f"{IN_RECORDINGS}{' and '.join(both)} are exchanged"
+    return Gate(", ".join(both), "exchange", both, sentence, change=exchange)
 
 
 def scale_time(factor: float) -> Gate:
@@ -179,7 +192,9 @@ def _possible_slips(now: Checked, errors: Sequence[np.ndarray], trust_values: bo
     faults += [scale_channels("y", channels["y"], every, f) for f in joint]
     for kind, names in channels.items():
         faults += [exchange_channels(kind, names, i, j) for i, j in combinations(range(len(names)), 2)]
-    return [*faults, *(map(scale_time, TIME_UNITS) if now.cost > POOR_FIT and not trust_values else ())]
+    if trust_values:  # with other values, a machine may follow its output backwards as well
+        return faults + [exchange_input(now.bench.simulator, i, j) for i in range(len(channels["u"])) for j in every]
+    return [*faults, *(map(scale_time, TIME_UNITS) if now.cost > POOR_FIT else ())]
 
 
 def _near(now: Checked, errors: Sequence[np.ndarray], sized: bool) -> Callable[[str, Sequence[int], float], bool]:

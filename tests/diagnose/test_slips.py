@@ -79,6 +79,7 @@ def test_equal_explanations_of_a_wrong_unit_are_told():
     [
         ("small", "lower is too small by a factor of 1000,"),
         ("exchanged", "upper and lower are exchanged"),
+        ("in for out", "q2 and lower are exchanged"),
         ("", ""),
     ],
 )
@@ -86,7 +87,9 @@ def test_a_check_tells_gross_faults_of_channels_and_assesses_corrected_recording
     """A time constant that is off by 3.6 is no unit."""
     u, y = recorded()
     levels = y * [1.0, 100.0]  # the lower one in cm
-    wrong = {"small": levels * [1.0, 1e-3], "exchanged": levels[:, ::-1], "": levels}[fault]
+    wrong = {"small": levels * [1.0, 1e-3], "exchanged": levels[:, ::-1]}.get(fault, levels)
+    if fault == "in for out":
+        u, wrong = np.column_stack([u[:, 0], levels[:, 1]]), np.column_stack([levels[:, 0], u[:, 1]])
     rig = tanks(3.6 if not fault else 1.15, unit=100.0)
     found = pilfr.check(rig, Recording(u, wrong, DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero"))
     faults = [spot.sentence for spot in found.blind_spots if spot.kind == "recording-fault"]
