@@ -74,6 +74,18 @@ def test_equal_explanations_of_a_wrong_unit_are_told():
     assert "these recordings do not tell which" in fault.sentence
 
 
+@pytest.mark.parametrize(("unit", "told"), [("m/s^2", {"9.807"}), ("", {"9.807", "9.549"})])
+def test_a_factor_that_does_not_fit_the_unit_is_not_tried(unit, told):
+    """A reading in g is not one in revolutions a minute, though 9.81 and 9.55 are nearly alike."""
+    u = pilfr.multisine(M, f_max=1.5, fs=1 / DT, rng=np.random.default_rng(0))
+    r = Recording(u, u, DT, ("force",), ("pos",), initial="zero", hold="zero")
+    y = cart().simulate(r)
+    y = y + 0.05 * np.std(y) * np.random.default_rng(1).standard_normal(y.shape)
+    known = replace(cart(50.0, 1.2), units={"pos": unit, "force": "N"})
+    (fault,) = prepare(known, [r.with_(y=y / 9.80665)], "zero", "auto").gates
+    assert {factor for factor in ("9.807", "9.549") if factor in fault.sentence} == told
+
+
 @pytest.mark.parametrize(
     ("fault", "told"),
     [
