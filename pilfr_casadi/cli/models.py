@@ -332,6 +332,8 @@ def _write_simulated(
     else:
         state = {"zero": "zero", "periodic": "periodic steady state"}.get(recording.begins, "as given")
         print(f"{options.data} has no outputs ({listed(outputs)}) to compare with; initial state: {state}")
+        if options.initial is None:
+            print("  If the machine begins elsewhere, give each state's value with --initial.")
     print(f"simulated outputs: {options.out}")
     return DONE
 

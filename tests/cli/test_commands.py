@@ -364,12 +364,12 @@ def test_inputs_alone_are_enough_to_simulate(capsys, tmp_path, train, model, suf
     else:
         {".npz": lambda: np.savez(path, t=t, u=u), ".mat": lambda: savemat(path, {"t": t, "u": u})}[suffix]()
     status, said, _ = run(capsys, "simulate", model, path, "--out", out)
-    assert status == 0 and "NRMSE" not in said and "initial state: zero" in said
+    assert status == 0 and "NRMSE" not in said and "initial state: zero" in said and "with --initial" in said
     assert run(capsys, "simulate", model, train, "--initial", "zero", "--out", both)[0] == 0
     assert out.read_text() == both.read_text()
     periodic = ("--initial", "periodic", "--period", 300)
     status, said, _ = run(capsys, "simulate", model, path, *periodic, "--out", out)
-    assert status == 0 and "initial state: periodic steady state" in said
+    assert status == 0 and "initial state: periodic steady state" in said and "with --initial" not in said
     refused(capsys, "simulate", model, path, "--initial", "estimate", "--out", out, says="needs measured outputs")
     refused(capsys, "simulate", model, path, "--outputs", "y", "--out", out, says="no column 'y'")
     refused(capsys, "fit", path, "--inputs", "u", "--outputs", "y", "--out", tmp_path / "no", says="no column 'y'")
