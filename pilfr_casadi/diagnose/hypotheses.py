@@ -243,6 +243,7 @@ class Hypotheses:
                 if not self.in_time():  # an unfinished comparison favours the hypotheses that were not judged
                     self.forget_held_out()
                     break
+                self.say("held-out blocks", done, min(done + len(left), max(MOST_PREDICTED, done + 1)))
                 self.held_out(left[0])
 
     def forget_held_out(self) -> None:
