@@ -1,6 +1,8 @@
 """NumPy functions as simulators: the equations agree with the function, or one sentence says why not."""
 
+import itertools
 import math
+import random
 from math import copysign
 
 import casadi as ca
@@ -251,8 +253,9 @@ def asks_for_a_type(t, x, u, p):
     return [x[0] if isinstance(x[0], np.floating) else 2 * x[0], x[1]]
 
 
-NOISE = np.random.default_rng(0)
+NOISE, COUNTER = np.random.default_rng(0), itertools.count()
 TABLE = RegularGridInterpolator([[-1e9, 0.0, 1e9]], [0.0, 1.0, 2.0])
+randn = np.random.randn
 BAD = {
     "not callable": (3, ("3", "function of t, x, u and p")),
     "other arguments": (lambda t, x: x, ("(t, x, u, p)",)),
@@ -272,7 +275,10 @@ BAD = {
     "whole number": (converts, ("line", "int(x[0])", "leave out int()")),
     "adds into numbers": (adds_into_numbers, ("line", "total += x", "y = y + ...")),
     "table of another package": (looks_up, ("line", "TABLE(x[:1])", "CasADi")),
-    "random": (lambda t, x, u, p: x * NOISE.random(), ("its equations", "random numbers")),
+    "random": (lambda t, x, u, p: x * NOISE.random(), ("line", "NOISE.random()", "draws random numbers")),
+    "legacy random": (lambda t, x, u, p: x + randn(), ("line", "randn()", "draws random numbers")),
+    "random of Python": (lambda t, x, u, p: x + random.random(), ("line", "random.random()", "draws random numbers")),
+    "memory": (lambda t, x, u, p: x * next(COUNTER), ("its equations", "memory", "random numbers")),
     "types": (asks_for_a_type, ("its equations", "types")),
 }
 
