@@ -228,6 +228,8 @@ def _write(
         result.save(target)
         from ..report import fit_report
     print(result)
+    if result.status is Status.MAX_ITERATIONS:
+        print(f"To go on from here: --from {target}")
     if isinstance(task, PILFR) and task.element is not None and result.structure != task:
         print("No start was finished: this is the initial linear model.")
     for recording in tests:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import casadi as ca
@@ -20,6 +21,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi._base import ordered_digest
 from pilfr_casadi.cli import main, name_options
 from pilfr_casadi.identify import multistart
+from pilfr_casadi.optimise import GaussNewton
 
 
 @pytest.fixture
@@ -349,6 +351,16 @@ def test_a_time_limit_keeps_the_best_so_far(capsys, tmp_path):
     assert json.loads((tmp_path / "out" / "model.json").read_text())["parameters"]["A"]
     status, _, err = run(capsys, "fit", path, *names, "--time-limit", 1e-3, "--out", tmp_path / "none")
     assert status == 1 and "--time-limit 0.001" in err and not (tmp_path / "none" / "model.json").exists()
+
+
+@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.parametrize("iterations", [1, 200])
+def test_a_fit_that_ends_at_the_iteration_limit_says_how_to_go_on(capsys, tmp_path, train, monkeypatch, iterations):
+    monkeypatch.setattr("pilfr_casadi.cli.models.GaussNewton", partial(GaussNewton, max_iterations=iterations))
+    names = ("--inputs", "u", "--outputs", "y", "--nx", 1, "--starts", 1, "--operators", 1)
+    status, said, _ = run(capsys, "fit", train, *names, "--out", tmp_path / "out")
+    assert status == 0 and ("Not converged" in said) == (iterations == 1)
+    assert (f"To go on from here: --from {tmp_path / 'out' / 'model.json'}" in said) == (iterations == 1)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".npz", ".mat"])
