@@ -205,7 +205,8 @@ def _possible_slips(now: Checked, errors: Sequence[np.ndarray], trust_values: bo
     for kind, names in channels.items():
         faults += [exchange_channels(kind, names, i, j) for i, j in combinations(range(len(names)), 2)]
     if trust_values:  # with other values, a machine may follow its output backwards as well
-        return faults + [exchange_input(now.bench.simulator, i, j) for i in range(len(channels["u"])) for j in every]
+        moving = np.flatnonzero(np.ptp(np.concatenate([r.u for r in now.bench.recordings]), axis=0))  # an output moves
+        return faults + [exchange_input(now.bench.simulator, i, j) for i in moving.tolist() for j in every]
     return [*faults, *(map(scale_time, TIME_UNITS) if now.cost > POOR_FIT else ())]
 
 
