@@ -116,8 +116,8 @@ class DataOptions:
         [],
     )
     initial: Any = initial_state(
-        "State at the first sample: estimate, zero, periodic, or the states' values, such as 20,0.5 (default: "
-        "estimate; zero where no outputs were measured)."
+        "State at the first sample: estimate, zero (every state is zero), periodic, or the states' values, such as "
+        "20,0.5 (default: estimate; zero where no outputs were measured)."
     )
     period: int | None = whole("Samples per period; needs --initial.", 0, MOST_SAMPLES, metavar="SAMPLES")
     hold: Literal["zero", "linear"] | None = option("Course of the inputs between samples.")

@@ -228,6 +228,8 @@ def _write(
         result.save(target)
         from ..report import fit_report
     print(result)
+    if result.status is Status.MAX_ITERATIONS:
+        print(f"To go on from here: --from {target}")
     if isinstance(task, PILFR) and task.element is not None and result.structure != task:
         print("No start was finished: this is the initial linear model.")
     for recording in tests:
@@ -332,6 +334,8 @@ def _write_simulated(
     else:
         state = {"zero": "zero", "periodic": "periodic steady state"}.get(recording.begins, "as given")
         print(f"{options.data} has no outputs ({listed(outputs)}) to compare with; initial state: {state}")
+        if options.initial is None:
+            print("  If the machine begins elsewhere, give each state's value with --initial.")
     print(f"simulated outputs: {options.out}")
     return DONE
 

@@ -274,6 +274,8 @@ def _make_effect(
             label = name.removeprefix(element.prefix) + (f"[{i}]" if len(flat) > 1 else "")
             error = float(np.ravel(std[name])[i])
             shown[label] = {"value": float(v), "std": error if np.isfinite(error) else None, "unit": unit}
+            if v and fitted.strained([name]):
+                shown[label]["at_limit"] = bool(np.ravel(fitted.at_bound(name))[i])
     remarks = [law.remark(element.own(fitted.values)), *_order(fitted, element)]
     return Effect(
         port=element.port,

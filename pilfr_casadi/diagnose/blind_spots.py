@@ -36,11 +36,10 @@ from .identifiability import (
     live_ports,
     port_units,
 )
-from .linearise import Probe, Run, linearise_runs
+from .linearise import SMALLEST_SWING, Probe, Run, linearise_runs, turning_points
+from .offsets import WrongStart, find_wrong_start
 from .preparation import choose_hold
 from .workbench import QUICK, Fitted, Workbench
-
-SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
 
 IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the blind spot
     "identifiable": ("yes", ""),
@@ -126,6 +125,8 @@ class Check:
         Stated course of the inputs between samples ("" if not stated), and the start of each recording.
     hold_taken : str
         The course with which the simulator was refitted: the stated one, or the one that fits better.
+    idle_inputs : tuple of str
+        Inputs that the simulator's equations do not read.
     next_record : str
         The recording that would help most.
     seconds : float
@@ -142,6 +143,7 @@ class Check:
     hold: str
     starts: tuple[str, ...]
     hold_taken: str = "zero"
+    idle_inputs: tuple[str, ...] = ()
     next_record: str = ""
     seconds: float = 0.0
 
@@ -214,7 +216,7 @@ class Check:
             (e.port, f"{e.travel:.3g} {e.unit}", str(e.reversals), str(e.amplitudes), str(e.rests))
             for e in self.excitation
         ]
-        yield from _table(("local coordinate", "travel", "reversals", "amplitudes", "rests"), rows)
+        yield from _table(("simulated coordinate", "travel", "reversals", "amplitudes", "rests"), rows)
 
     def _circumstances(self) -> Iterator[str]:
         units = {e.port: e.unit for e in self.excitation}
@@ -230,6 +232,9 @@ class Check:
         unsaid = f"not stated, here taken as {taken}; say hold='zero' or hold='linear' if you know"
         yield f"inputs between samples: {taken if self.hold else unsaid}"
         yield f"start of each recording: {', '.join(self.starts)}"
+        if self.idle_inputs:
+            idle = in_words(self.idle_inputs)
+            yield f"inputs that the equations do not read: {idle}; a diagnosis tries their effects"
 
 
 def _why(r: LawRow) -> str:
@@ -290,6 +295,7 @@ def check(
         now = Checked(bench, bench.fit(simulator))
     if not stated:
         now = choose_hold(now, QUICK)[0]
+    now = find_wrong_start(now)
     bench, fitted, faults = now.bench, now.fitted, now.gates
     bench.interrupt.raise_pending()  # half a fit would tell wrong things
     bench.check_followed(fitted)
@@ -298,7 +304,10 @@ def check(
     if not faults:
         return found
     told = tuple(BlindSpot("recording-fault", (f.channel,), f"{f.sentence} Below, it is corrected.") for f in faults)
-    first = f"Correct the recordings first: check wiring, sign and unit of {in_words([f.channel for f in faults])}."
+    wired = [f.channel for f in faults if not isinstance(f, WrongStart)]
+    first = "State first how the recordings begin: give each state's value, or leave the start unknown."
+    if wired:
+        first = f"Correct the recordings first: check wiring, sign and unit of {in_words(wired)}."
     return replace(found, blind_spots=(*told, *found.blind_spots), next_record=first)
 
 
@@ -328,6 +337,7 @@ def assess_recordings(
         error=bench.nrmse(fitted),
         hold=stated,
         hold_taken=bench.hold,
+        idle_inputs=bench.simulator.idle_inputs,
         starts=tuple(START_WORDS[r.begins] for r in bench.recordings),
     )
     swings = np.ptp(np.concatenate([r.u for r in bench.recordings]), axis=0)
@@ -459,28 +469,13 @@ def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator
         least = SMALLEST_SWING * travel
         reversals, rests, swings = 0, 0, list[float]()
         for z in signals if travel > 0 else ():
-            turns = _turning_points(z, least)
+            turns = turning_points(z, least)
             reversals += max(len(turns) - 2, 0)
             swings += np.abs(np.diff(z[turns])).tolist()
             longest = 2 * float(np.median(np.diff(turns))) if len(turns) > 2 else SMALL_SHARE * len(z)
             rests += _count_rests(z, least, longest)
         unit = port.across_unit or port_units(port, bench.recordings[0])[1]
         yield Excitation(port.name, travel, unit, reversals, _count_distinct(np.array(swings)), rests)
-
-
-def _turning_points(z: np.ndarray, least: float) -> list[int]:
-    """Find the turning points of z (M,) between swings of at least `least`, the first and the last included."""
-    turns, extreme, direction = [0], 0, 0.0
-    for k, value in enumerate(z.tolist()):
-        if direction == 0:
-            if abs(value - z[0]) >= least:
-                direction, extreme = np.sign(value - z[0]), k
-        elif direction * (value - z[extreme]) >= 0:
-            extreme = k
-        elif direction * (z[extreme] - value) >= least:
-            turns.append(extreme)
-            direction, extreme = -direction, k
-    return [*turns, extreme] if extreme > turns[-1] else turns
 
 
 def _count_distinct(swings: np.ndarray) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -13,17 +13,27 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, side_by_side
-from ..data import Recording
+from ..data import Recording, dimension
 from ..optimise import GaussNewton
-from ..simulators import SENSOR, port_name
+from ..simulators import SENSOR, Simulator, port_name
 from .gates import CLEARLY_BETTER, CURED_SHARE, POOR_FIT, USELESS_FIT, Checked, Gate, accept, correct
 from .offsets import describe_constant
 from .workbench import THOROUGH, Workbench
 
-# metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
-UNITS = (1e3, 1e6, 1e2, 180 / np.pi, 9.80665, 30 / np.pi, 3.6, 1e5, 60.0, 4.4482216, 25.4, 1 / 0.0254, 6894.757)
-FACTORS = tuple(f for unit in UNITS for f in (unit, 1 / unit))  # each unit by mistake in either direction
-FAHRENHEIT = (1.8, 1 / 1.8)  # Fahrenheit's zero differs as well: this unit comes with an offset
+# factors by which units are mistaken, and units of the quantities in which that happens; () for any quantity
+UNITS: dict[float, tuple[str, ...]] = {
+    **dict.fromkeys((1e3, 1e6, 1e2, 60.0), ()),  # metric prefixes, minutes
+    180 / np.pi: ("rad", "rad/s", "rad/s^2"),  # degrees
+    30 / np.pi: ("rad/s",),  # revolutions a minute
+    9.80665: ("m/s^2", "N", "N m"),  # standard gravity
+    3.6: ("m/s",),  # km/h
+    1e5: ("Pa",),  # bar
+    4.4482216: ("N",),  # pounds
+    25.4: ("m",),  # inches to mm
+    1 / 0.0254: ("m",),  # inches to m
+    6894.757: ("Pa",),  # pounds per square inch
+}
+FAHRENHEIT: dict[float, tuple[str, ...]] = {1.8: ("K",)}  # its zero differs as well: this unit comes with an offset
 # factors on the time: ms, minutes, µs, hours, and the reverse of the first two
 TIME_UNITS = (1e-3, 1 / 60, 1e-6, 1 / 3600, 60.0, 1e3)
 IN_RECORDINGS = "In the recordings "
@@ -54,6 +64,19 @@ def exchange_channels(kind: str, names: Sequence[str], one: int, other: int) -> 
     matrix, both = np.eye(len(names)), [names[one], names[other]]
     matrix[[one, other]] = matrix[[other, one]]
     return map_channels(kind, matrix, ", ".join(both), "exchange", both, "are exchanged")
+
+
+def exchange_input(simulator: Simulator, i: int, j: int) -> Gate:
+    """Return the fault that input i and output j are exchanged."""
+    both = [simulator.inputs[i], simulator.output_names[j]]
+
+    def exchange(r: Recording) -> Recording:
+        u, y = r.u.copy(), r.y.copy()
+        u[:, i], y[:, j] = r.y[:, j], r.u[:, i]
+        return r.with_(u=u, y=y)
+
+    sentence = f"{IN_RECORDINGS}{' and '.join(both)} are exchanged"
+    return Gate(", ".join(both), "exchange", both, sentence, change=exchange)
 
 
 def scale_time(factor: float) -> Gate:
@@ -148,7 +171,8 @@ def find_slips(now: Checked, workers: int) -> Checked:
         if level is None:
             continue
         near = _near(level, level.fitted.residual, level.cost <= 1)
-        factors = [f for f in (-1.0, *FACTORS, *FAHRENHEIT) if f < 0 or near("y", [i], f)]
+        unit = bench.simulator.units.get(name, "")
+        factors = [f for f in (-1.0, *_mistakes(unit, UNITS | FAHRENHEIT)) if f < 0 or near("y", [i], f)]
         faults = [scale_channels("y", bench.simulator.output_names, [i], f, " and an offset") for f in factors]
         beside = accept_best(level, faults, workers)
         if len(beside.gates) > len(now.gates) and beside.cost < CURED_SHARE * found.cost:
@@ -170,16 +194,27 @@ def _possible_slips(now: Checked, errors: Sequence[np.ndarray], trust_values: bo
     """
     near, faults = _near(now, errors, trust_values or now.cost <= 1), list[Gate]()
     channels = {"y": now.bench.simulator.output_names, "u": now.bench.simulator.inputs}
+    known = now.bench.simulator.units
     for kind, names in channels.items():
         for i in range(len(names)):
-            factors = [f for f in FACTORS if near(kind, [i], f)]
+            factors = [f for f in _mistakes(known.get(names[i], "")) if near(kind, [i], f)]
             faults += [scale_channels(kind, names, [i], f) for f in (-1.0, *factors)]
     every = range(len(channels["y"]))
-    joint = [f for f in FACTORS if len(every) > 1 and near("y", every, f)]
+    joint = [f for f in _mistakes("") if len(every) > 1 and near("y", every, f)]
     faults += [scale_channels("y", channels["y"], every, f) for f in joint]
     for kind, names in channels.items():
         faults += [exchange_channels(kind, names, i, j) for i, j in combinations(range(len(names)), 2)]
-    return [*faults, *(map(scale_time, TIME_UNITS) if now.cost > POOR_FIT and not trust_values else ())]
+    if trust_values:  # with other values, a machine may follow its output backwards as well
+        moving = np.flatnonzero(np.ptp(np.concatenate([r.u for r in now.bench.recordings]), axis=0))  # an output moves
+        return faults + [exchange_input(now.bench.simulator, i, j) for i in moving.tolist() for j in every]
+    return [*faults, *(map(scale_time, TIME_UNITS) if now.cost > POOR_FIT else ())]
+
+
+def _mistakes(unit: str, units: Mapping[float, Sequence[str]] = UNITS) -> list[float]:
+    """List factors by which a quantity is off in a wrong unit, of those that fit its own unit, if that is known."""
+    own = dimension(unit)
+    fitting = [f for f, of in units.items() if own is None or not of or own in map(dimension, of)]
+    return [one for factor in fitting for one in (factor, 1 / factor)]  # mistaken in either direction
 
 
 def _near(now: Checked, errors: Sequence[np.ndarray], sized: bool) -> Callable[[str, Sequence[int], float], bool]:

@@ -49,6 +49,10 @@ class Effect:
         surer = self.at_port > SURE > self.confidence
         return f"; confidence {self.at_port:.2f} that a law acts there" if surer else ""
 
+    def limit(self, name: str) -> str:
+        """Say that a parameter is at a limit of the law, beyond which the fit may want it; empty if it is not."""
+        return ", at its limit" if self.parameters.get(name, {}).get("at_limit") else ""
+
     @property
     def defined(self) -> dict[str, dict[str, Any]]:
         """Derived quantities: a product in the equation, such as `F_c = k_t r`, or the whole gap of a clearance."""
@@ -101,7 +105,7 @@ class Effect:
         ]
         for name, p in (self.parameters | self.defined).items():
             std = "" if p["std"] is None else f" ± {p['std']:.2g}"
-            lines.append(f"  {name} = {p['value']:.5g}{std} {p['unit']}".rstrip())
+            lines.append(f"  {name} = {p['value']:.5g}{std} {p['unit']}".rstrip() + self.limit(name))
         if self.indistinguishable:
             others = ", ".join(name_at(port, law) for port, law in self.indistinguishable)
             lines.append(f"  cannot be told apart from {others}")

@@ -37,6 +37,7 @@ from .evidence import (
 )
 from .floor import FEWEST, Floor, effective_size, white_part
 from .gates import EQUAL_RATIO
+from .linearise import turns_back
 from .screen import Scored, flexible_shares, innovation_share, screen
 from .trials import Key, Trial, Trials
 from .workbench import DIVERGED, Fitted, Workbench
@@ -56,6 +57,7 @@ class Findings:
     likelihood: tuple[float, float] | None = None
     learned: list[Fitted] | None = None  # the learned forces beside it, best first
     held_out: HeldOut | None = None  # its errors on held-out data
+    turning: dict[str, bool] = field(default_factory=dict)  # whether its motion turns back, by port
     varied: bool = False  # whether variations of parameters were tried beside it
     replaced: bool = False  # whether laws with constant parameters were tried in place of its last law, which varies
 
@@ -161,7 +163,21 @@ class Hypotheses:
 
     def log_prior(self, trial: Trial) -> float:
         """Compute the log prior probability of a hypothesis."""
-        return log_prior(trial.laws, self.alternatives, trial.doubtful, self.domains)
+        doubtful = trial.doubtful or any(self._hides_memory(trial, e) for e in trial.laws)
+        return log_prior(trial.laws, self.alternatives, doubtful, self.domains)
+
+    def doubtful(self, trial: Trial, element: Placed) -> bool:
+        """Tell whether a law of a hypothesis degenerates at its fitted values or along its motion."""
+        return element.law.doubtful(element.own(trial.fitted.values)) or self._hides_memory(trial, element)
+
+    def _hides_memory(self, trial: Trial, element: Placed) -> bool:
+        """Tell whether a law depends on where its motion turns back, but that never does; the law is a curve then."""
+        if not element.law.turns or not np.isfinite(trial.mean_square):
+            return False
+        turning = self.findings[trial.key].turning
+        if element.port not in turning:
+            turning[element.port] = turns_back(self.bench, trial.fitted, element.port)
+        return not turning[element.port]
 
     @cached_property
     def domains(self) -> dict[str, str]:
@@ -227,6 +243,7 @@ class Hypotheses:
                 if not self.in_time():  # an unfinished comparison favours the hypotheses that were not judged
                     self.forget_held_out()
                     break
+                self.say("held-out blocks", done, min(done + len(left), max(MOST_PREDICTED, done + 1)))
                 self.held_out(left[0])
 
     def forget_held_out(self) -> None:

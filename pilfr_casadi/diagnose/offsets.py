@@ -41,28 +41,42 @@ VISIBLE_SHARE = 1e-6  # share of a constant's response above which initial state
 
 @dataclass(frozen=True)
 class WrongStart(Gate):
-    """Initial states that are not as stated."""
+    """Initial states that are not as stated; other physics may remain beside it."""
 
+    most_left: ClassVar[float] = 1.0
     remedy: ClassVar[str] = "with them estimated"
 
 
 def find_wrong_start(now: Checked) -> Checked:
-    """Estimate the initial states if the stated ones contradict the first samples and no constant explains it as well.
+    """Estimate the initial states if the stated ones contradict the first samples and no constant removes that.
 
-    A first sample depends on no dynamics: missing physics cannot contradict it.
+    A first sample depends on no dynamics: missing physics cannot contradict it. So the refit may follow better with a
+    constant and still begin elsewhere.
     """
-    both = zip(now.bench.recordings, now.fitted.residual, strict=True)
-    stated = [(r, e[0]) for r, e in both if r.begins in ("zero", "given")]
+    stated = [r for r in now.bench.recordings if r.begins in ("zero", "given")]
     unknown = len(stated) * len(now.bench.simulator.states)
-    if not any(np.any(np.abs(first) > CERTAIN_ERRORS * now.floor.deviation) for _, first in stated) or not unknown:
+    missed = _missed_start(now)
+    if not missed:
         return now
-    words = "The initial states are not as stated"
-    fault = WrongStart("initial state", "start", stated[0][0].begins, words, change=_with_unknown_start)
+    words = f"The initial states are not as stated: {missed}"
+    fault = WrongStart("initial state", "start", stated[0].begins, words, change=_with_unknown_start)
     after = correct(now, fault, [now.fitted.values, {}])
     if after is None or gain(now.cost, after.cost, after.residuals, unknown) < LEAST_GAIN:
         return now
-    found = accept(now, after, fault)
-    return found if found.cost * EQUAL_RATIO < find_offsets(now).cost else now
+    found, shifted = accept(now, after, fault), find_offsets(now)
+    return found if found.cost * EQUAL_RATIO < shifted.cost or _missed_start(shifted) else now
+
+
+def _missed_start(now: Checked) -> str:
+    """Describe the first sample that a run from a stated start misses most; empty if it may be noise."""
+    noise, names = np.maximum(now.floor.deviation, 1e-300), now.bench.simulator.output_names
+    both = zip(now.bench.recordings, now.fitted.residual, strict=True)
+    first = [(abs(e[0]) / noise, r.y[0], e[0]) for r, e in both if r.begins in ("zero", "given")]
+    errors, y, off = max(first, key=lambda one: float(np.max(one[0])), default=(np.zeros(1), noise, noise))
+    k = int(np.argmax(errors))
+    if not errors[k] > CERTAIN_ERRORS:
+        return ""
+    return f"{names[k]} would begin at {y[k] + off[k]:.3g}, but its first sample is {y[k]:.3g}"
 
 
 def _with_unknown_start(r: Recording) -> Recording:

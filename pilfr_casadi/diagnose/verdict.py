@@ -206,7 +206,7 @@ def _named_beside(search: Hypotheses, best: Trial, effect: NamedEffect) -> float
 
 def _odds_against(search: Hypotheses, trial: Trial, elements: Sequence[Placed]) -> float:
     """Compute how much likelier the fitted values are of wrong laws: at a bound, or where every law degenerates."""
-    degenerate = all(e.law.doubtful(e.own(trial.fitted.values)) for e in elements)
+    degenerate = all(search.doubtful(trial, e) for e in elements)
     return (STRAINED_ODDS if strained(search, trial) else 1.0) * (float(np.exp(-DOUBTFUL_PRIOR)) if degenerate else 1.0)
 
 

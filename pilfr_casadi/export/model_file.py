@@ -244,7 +244,9 @@ def _read_text(path: str) -> str:
     try:
         file = existing_file(path)
         size = file.stat().st_size
-        if size > LARGEST_FILE:
+        if file.suffix == ".py":
+            fault = "is a simulator in Python; read it by `pilfr_casadi.simulators.load_simulator`"
+        elif size > LARGEST_FILE:
             fault = f"has {size / 1e6:.0f} MB, which no model file has; give a file that `save` wrote"
         else:
             return file.read_text(encoding="utf-8-sig")

@@ -199,6 +199,8 @@ class Law:
     memory, shifts : int, bool
         `memory` is the length of its discrete memory. `shifts` says that the memory is a shift register, which reads
         the signal at the beginning of a step.
+    turns : bool
+        The force depends on where the motion last turned round; a motion that never does leaves a curve of z.
     in_line : bool
         The law stands in line with the port's `term`, which `force` and `flow` may call: `term(z, dz)`.
     driven : bool
@@ -261,6 +263,7 @@ class Law:
     follows: ClassVar[int] = 0
     memory: ClassVar[Any] = 0
     shifts: ClassVar[bool] = False
+    turns: ClassVar[bool] = False
     in_line: ClassVar[bool] = False
     driven: ClassVar[bool] = False
     sensed: ClassVar[bool] = False

@@ -44,6 +44,7 @@ class _Hysteresis(Law):
     flexible = True
     contains = ("backlash", "coulomb_friction", "linear_stiffness")
     sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
+    turns = True
     dissipative = True
 
 
@@ -269,6 +270,7 @@ class Backlash(Law):
     units = {"r": "z"}
     places = ("series",)
     rare: ClassVar[tuple[str, ...]] = ("thermal",)
+    turns = True
     memory = 1
     starts = {"r": ("half", 0.01, 0.03, 0.08, 0.18, 0.35, 0.6)}
     ranges = {"r": ("half", 0.001, 0.9)}

@@ -195,6 +195,7 @@ class Clearance(Law):
     source = "Shaw & Holmes (1983), J. Sound Vib. 90(1)"
     sentence = "a clearance: the spring carries load only beyond a gap on either side"
     units = {"k_g": "w/z", "g": "z"}
+    absent = ("thermal",)  # heat flows at any difference
     two_sided = True
     starts = {"g": ("reach", 0.03, 0.08, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8)}
     ranges = {"g": ("reach", 0.001, 0.97), "k_g": ("max_stiffness", -1.0, 1.0)}

@@ -19,6 +19,7 @@ from ..simulators import MECHANICAL, PARAMETER, UNKNOWN, kind_of, name_at, name_
 from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
+CLEAR = 0.9  # confidence below which the report says what limits it
 BAR_MARGIN = 1.03  # smallest error over the left end of the bars' scale
 OPPOSING_MOTION = ("friction", "damping", "drag")  # ends of the names of laws that have no stiffness
 OPEN_ROWS = 12  # candidates in the open table; a folded table holds the others
@@ -166,7 +167,7 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
     if worth := diagnosis.worth(e):
         out.append(Text(f"{worth[0].upper()}{worth[1:]}."))
     rows = [
-        [name, uncertain_text(p["value"], with_nan(p["std"])), p["unit"] or "–"]
+        [name, uncertain_text(p["value"], with_nan(p["std"])) + e.limit(name), p["unit"] or "–"]
         for name, p in (e.defined | e.parameters).items()
     ]
     if rows:
@@ -177,7 +178,8 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
         others = "; ".join(name_at(port, law) for port, law in e.indistinguishable)
         out.append(Text(f"These recordings cannot tell it apart from: {others}."))
     else:
-        out.append(Text("No other law comes close on these recordings."))
+        unsure = " The confidence is limited by what this one leaves unexplained." if e.confidence < CLEAR else ""
+        out.append(Text(f"No other law of the catalogue is about as likely.{unsure}"))
     return out
 
 
@@ -205,7 +207,8 @@ CANDIDATES = (
     "Each law is fitted together with the simulator's own parameters. Where a model is wrong, the likeliest laws are "
     "also judged on held-out blocks, which are not used in the fit. Bars: from the noise to the error without a law, "
     "logarithmic; the thin line ends at the error on held-out blocks, if it was computed. Margin: error of the fit "
-    "divided by the winner's. ΔBIC: twice the loss of log evidence; below zero is better than no law."
+    "divided by that of the law in bold; below one, a law follows more closely but is less likely, such as one with "
+    "more parameters. ΔBIC: twice the loss of log evidence; below zero is better than no law."
 )
 
 

@@ -244,6 +244,8 @@ class _UserFunction:
     def describe_failure(self, error: BaseException, symbolic: bool = False) -> str:
         """Describe an error of the function with its line; `symbolic` says that symbols were given to it."""
         place = f"{self.called} ({_find_user_line(error)})"
+        if isinstance(error.__cause__, NotTraceable):  # compiled code wraps it in an error of its own
+            error = error.__cause__
         if isinstance(error, NotTraceable):
             return f"{place} {error}, or write the equations in CasADi as a Simulator."
         if _writes_into_arguments(error):
@@ -256,8 +258,8 @@ class _UserFunction:
         if symbolic:
             return (
                 f"{place} fails with symbols in place of numbers, for which every branch is entered ({said}); use "
-                "arithmetic and functions of NumPy (np.interp for tables), leave out checks, or write the equations in "
-                "CasADi as a Simulator."
+                "arithmetic and functions of NumPy (np.interp for tables), leave out checks, give numeric=Numeric(...) "
+                "for solvers, or write the equations in CasADi as a Simulator."
             )
         return f"{place} fails with numbers ({said}); it is called as {self.called}(t, x, u, p) with p[name]."
 

@@ -65,8 +65,8 @@ class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
             return float(self.sx)
         raise NotTraceable(
             f"{does} from a value that is a symbol here",
-            "leave out int(), use functions of NumPy in place of other modules (np.interp for tables), and collect "
-            "results by np.array([...])",
+            "leave out int(), use functions of NumPy in place of other modules (np.interp for tables), collect "
+            "results by np.array([...]), give numeric=Numeric(...) for solvers",
         )
 
     def __float__(self) -> float:

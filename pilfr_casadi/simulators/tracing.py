@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import functools
 import math
+import random
 import types
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
@@ -154,6 +155,7 @@ class _SymbolicProxy:
         return _replace(getattr(self._owner, name), self._done)
 
 
+RANDOM = (np.random.RandomState, np.random.Generator, random.Random)
 COPIED = (types.ModuleType, types.FunctionType, types.BuiltinFunctionType, types.MethodType, functools.partial)
 
 
@@ -163,13 +165,19 @@ def accept_symbols(function: Any) -> Any:
     return _replace(function.__call__ if is_object else function, {})
 
 
+def _refuse_random(*_: Any, **__: Any) -> Any:
+    raise NotTraceable("draws random numbers", "leave them out or make them an input")
+
+
 def _replace(value: Any, done: dict[int, Any]) -> Any:
     """Return the variant of a value that accepts symbols; `done` holds copied functions by their id."""
-    if isinstance(value, types.ModuleType):
+    if isinstance(value, (types.ModuleType, *RANDOM)):
         return _SymbolicProxy(value, done)
+    if isinstance(value, types.MethodType | types.BuiltinFunctionType) and isinstance(value.__self__, RANDOM):
+        return _refuse_random
     if type(value).__module__.startswith("numba."):
         value = getattr(value, "py_func", value)  # the function that it has compiled
-    if isinstance(value, types.MethodType):
+    if isinstance(value, types.MethodType) and isinstance(value.__func__, types.FunctionType):  # C needs its own self
         return types.MethodType(_replace(value.__func__, done), _SymbolicProxy(value.__self__, done))
     if isinstance(value, functools.partial):
         return functools.partial(_replace(value.func, done), *value.args, **value.keywords)

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import casadi as ca
@@ -20,6 +21,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi._base import ordered_digest
 from pilfr_casadi.cli import main, name_options
 from pilfr_casadi.identify import multistart
+from pilfr_casadi.optimise import GaussNewton
 
 
 @pytest.fixture
@@ -351,6 +353,16 @@ def test_a_time_limit_keeps_the_best_so_far(capsys, tmp_path):
     assert status == 1 and "--time-limit 0.001" in err and not (tmp_path / "none" / "model.json").exists()
 
 
+@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.parametrize("iterations", [1, 200])
+def test_a_fit_that_ends_at_the_iteration_limit_says_how_to_go_on(capsys, tmp_path, train, monkeypatch, iterations):
+    monkeypatch.setattr("pilfr_casadi.cli.models.GaussNewton", partial(GaussNewton, max_iterations=iterations))
+    names = ("--inputs", "u", "--outputs", "y", "--nx", 1, "--starts", 1, "--operators", 1)
+    status, said, _ = run(capsys, "fit", train, *names, "--out", tmp_path / "out")
+    assert status == 0 and ("Not converged" in said) == (iterations == 1)
+    assert (f"To go on from here: --from {tmp_path / 'out' / 'model.json'}" in said) == (iterations == 1)
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".npz", ".mat"])
 def test_inputs_alone_are_enough_to_simulate(capsys, tmp_path, train, model, suffix):
     from scipy.io import savemat
@@ -364,12 +376,12 @@ def test_inputs_alone_are_enough_to_simulate(capsys, tmp_path, train, model, suf
     else:
         {".npz": lambda: np.savez(path, t=t, u=u), ".mat": lambda: savemat(path, {"t": t, "u": u})}[suffix]()
     status, said, _ = run(capsys, "simulate", model, path, "--out", out)
-    assert status == 0 and "NRMSE" not in said and "initial state: zero" in said
+    assert status == 0 and "NRMSE" not in said and "initial state: zero" in said and "with --initial" in said
     assert run(capsys, "simulate", model, train, "--initial", "zero", "--out", both)[0] == 0
     assert out.read_text() == both.read_text()
     periodic = ("--initial", "periodic", "--period", 300)
     status, said, _ = run(capsys, "simulate", model, path, *periodic, "--out", out)
-    assert status == 0 and "initial state: periodic steady state" in said
+    assert status == 0 and "initial state: periodic steady state" in said and "with --initial" not in said
     refused(capsys, "simulate", model, path, "--initial", "estimate", "--out", out, says="needs measured outputs")
     refused(capsys, "simulate", model, path, "--outputs", "y", "--out", out, says="no column 'y'")
     refused(capsys, "fit", path, "--inputs", "u", "--outputs", "y", "--out", tmp_path / "no", says="no column 'y'")

@@ -268,6 +268,8 @@ def test_an_input_that_no_equation_reads_is_no_port():
     )
     found = check(idle, record(idle, np.column_stack([noise_like(2), noise_like(3)])))
     assert not found.blind_spots and "actuator:temperature" not in {r.port for r in found.laws}
+    assert found.idle_inputs == ("temperature",)
+    assert "inputs that the equations do not read: temperature; a diagnosis tries" in str(found)
 
 
 def test_standard_errors_are_those_of_many_noises(mass):
@@ -341,6 +343,14 @@ def test_wrong_input_gets_a_sentence():
         check(MASS, given.with_(y=np.ones(SAMPLES)))
     with pytest.raises(InputError, match="has no outputs"):
         check(MASS, given.with_(y=np.zeros((SAMPLES, 0)), outputs=()))
+
+
+def test_a_stated_start_that_the_first_sample_contradicts_is_told():
+    given = record(MASS, noise_like(1), begin=[0.3, 0.0])
+    found = check(MASS, given)
+    assert found.blind_spots[0].names == ("initial state",) and found.starts == ("estimated",)
+    assert "would begin at 0, but its first sample is 0.3" in str(found)
+    assert found.next_record.startswith("State first how the recordings begin")
 
 
 def test_hold_and_start_are_told(mass):

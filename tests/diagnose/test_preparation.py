@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from diagnosis_rig import OFF, recordings, refitted, rig
+from tank import tank
 from test_slips import DT, recorded, tanks
 
 from pilfr_casadi import InputError, Parameter, Recording, Simulator, multisine
@@ -83,6 +84,28 @@ def test_constants_that_look_alike_to_first_order_are_told_apart_by_their_refits
     assert share["actuator:q2"] == pytest.approx(share["sensor:lower"])
     channels = [g.channel for g in find_offsets(ready).gates]
     assert channels == ["lower"] if initial == "zero" else len(channels) == 1
+
+
+def started(curved, level, offset):
+    """A recording, said to begin at zero, of a tank that begins at a level and has a sensor with an offset."""
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.uniform(0, 8, 20), 20)[:, None]
+    blank = Recording(u, 0 * u, 20.0, ("pump",), ("level",), initial=[level], hold="zero")
+    y = tank(curved=curved).simulate(blank) + offset
+    return blank.with_(y=y + 1e-3 * np.std(y) * rng.standard_normal(y.shape), initial="zero")
+
+
+@pytest.mark.parametrize(
+    ("curved", "level", "offset", "found"),
+    [(0.0, 0.25, 0.0, "start"), (1e-4, 0.25, 0.0, "start"), (0.0, 0.0, 0.25, "offset")],
+    ids=["nothing missing", "physics missing", "a sensor's offset"],
+)
+def test_a_start_that_the_first_sample_contradicts_is_estimated(curved, level, offset, found):
+    """Physics that is missing as well lets a constant follow better, but not at the first sample."""
+    gates = prepare(tank(outflow=1.5e-4), [started(curved, level, offset)], "zero", "auto").gates
+    assert gates[0].finding == found, [g.sentence for g in gates]
+    if found == "start":
+        assert "level would begin at 0, but its first sample is 0.25" in gates[0].sentence
 
 
 def unsaid_tanks():

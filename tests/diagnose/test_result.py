@@ -3,9 +3,11 @@
 import json
 from dataclasses import replace
 from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 import pytest
+from cart import cart
 from diagnosis_example import example, recorded, rig
 
 import pilfr_casadi as pilfr
@@ -16,7 +18,7 @@ from pilfr_casadi.diagnose.offsets import Offset
 from pilfr_casadi.diagnose.proof import compare_errors, next_experiment
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.identify import run_free
-from pilfr_casadi.laws import CoulombFriction, CubicStiffness, StopHysteresis
+from pilfr_casadi.laws import Backlash, CoulombFriction, CubicStiffness, StopHysteresis
 from pilfr_casadi.models import Parameter
 from pilfr_casadi.report import diagnosis_report
 from pilfr_casadi.simulators import Simulator
@@ -171,6 +173,18 @@ def test_a_port_that_is_surer_than_the_law_is_told(confidence, at_port, told):
     first = str(effect).splitlines()[0]
     assert first.endswith(f"{confidence:.2f}; confidence {at_port:.2f} that a law acts there") == told
     assert effect.to_dict()["confidence_at_port"] == at_port
+
+
+def test_a_value_at_a_limit_of_its_law_is_told():
+    class Narrow(Backlash):
+        ranges: ClassVar = {"r": ("half", 0.001, 0.06)}
+
+    u = 20 * pilfr.multisine(600, f_max=1.0, fs=50.0, rng=np.random.default_rng(0))
+    blank = pilfr.Recording(u, 0 * u, 0.02, ("force",), ("pos",), initial="zero", hold="zero")
+    y = cart().with_element("actuator:force", Backlash().at({"r": 4.0})).simulate(blank)
+    for law, limited in ((Narrow, True), (Backlash, False)):
+        (effect,) = pilfr.diagnose(cart(), blank.with_(y=y), laws=[law], effects=1, workers=1).effects
+        assert effect.parameters["r"].get("at_limit", False) == limited == (", at its limit" in str(effect))
 
 
 def test_a_correction_that_no_test_recording_tried_says_so():

@@ -74,11 +74,24 @@ def test_equal_explanations_of_a_wrong_unit_are_told():
     assert "these recordings do not tell which" in fault.sentence
 
 
+@pytest.mark.parametrize(("unit", "told"), [("m/s^2", {"9.807"}), ("", {"9.807", "9.549"})])
+def test_a_factor_that_does_not_fit_the_unit_is_not_tried(unit, told):
+    """A reading in g is not one in revolutions a minute, though 9.81 and 9.55 are nearly alike."""
+    u = pilfr.multisine(M, f_max=1.5, fs=1 / DT, rng=np.random.default_rng(0))
+    r = Recording(u, u, DT, ("force",), ("pos",), initial="zero", hold="zero")
+    y = cart().simulate(r)
+    y = y + 0.05 * np.std(y) * np.random.default_rng(1).standard_normal(y.shape)
+    known = replace(cart(50.0, 1.2), units={"pos": unit, "force": "N"})
+    (fault,) = prepare(known, [r.with_(y=y / 9.80665)], "zero", "auto").gates
+    assert {factor for factor in ("9.807", "9.549") if factor in fault.sentence} == told
+
+
 @pytest.mark.parametrize(
     ("fault", "told"),
     [
         ("small", "lower is too small by a factor of 1000,"),
         ("exchanged", "upper and lower are exchanged"),
+        ("in for out", "q2 and lower are exchanged"),
         ("", ""),
     ],
 )
@@ -86,7 +99,9 @@ def test_a_check_tells_gross_faults_of_channels_and_assesses_corrected_recording
     """A time constant that is off by 3.6 is no unit."""
     u, y = recorded()
     levels = y * [1.0, 100.0]  # the lower one in cm
-    wrong = {"small": levels * [1.0, 1e-3], "exchanged": levels[:, ::-1], "": levels}[fault]
+    wrong = {"small": levels * [1.0, 1e-3], "exchanged": levels[:, ::-1]}.get(fault, levels)
+    if fault == "in for out":
+        u, wrong = np.column_stack([u[:, 0], levels[:, 1]]), np.column_stack([levels[:, 0], u[:, 1]])
     rig = tanks(3.6 if not fault else 1.15, unit=100.0)
     found = pilfr.check(rig, Recording(u, wrong, DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero"))
     faults = [spot.sentence for spot in found.blind_spots if spot.kind == "recording-fault"]

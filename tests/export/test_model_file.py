@@ -225,6 +225,7 @@ def test_what_is_not_a_model_file_is_one_sentence(tmp_path):
         "blank": (b" \n ", "is empty"),
         "half": (good[: len(good) // 2], "is incomplete"),
         "binary": (bytes(range(256)), "not text"),
+        "rig.py": (b"simulator = None", "is a simulator in Python; read it by"),
         "csv": (b"t,u,y\n0,1,2\n", "not valid JSON"),
         "list": (b"[1, 2]", "not a model file"),
         "deep": (b"[" * 100_000, "not a model file"),

@@ -53,8 +53,10 @@ def rig(*ports):
     )
 
 
-@pytest.mark.parametrize("law", [laws.Mode, laws.QuadraticDrag, laws.CubicDamping, laws.DirectionalDamping])
-def test_heat_has_no_inertia_and_no_drag(law):
+@pytest.mark.parametrize(
+    "law", [laws.Mode, laws.QuadraticDrag, laws.CubicDamping, laws.DirectionalDamping, laws.Clearance]
+)
+def test_heat_has_no_inertia_no_drag_and_no_gap(law):
     assert port("N", "m").admits(law) and port().admits(law) and not port("W", "K").admits(law)
 
 

@@ -1,6 +1,8 @@
 """NumPy functions as simulators: the equations agree with the function, or one sentence says why not."""
 
+import itertools
 import math
+import random
 from math import copysign
 
 import casadi as ca
@@ -8,6 +10,7 @@ import cloudpickle
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline, PchipInterpolator, RegularGridInterpolator, interp1d, make_interp_spline
+from scipy.optimize import brentq
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Simulator
@@ -251,8 +254,15 @@ def asks_for_a_type(t, x, u, p):
     return [x[0] if isinstance(x[0], np.floating) else 2 * x[0], x[1]]
 
 
-NOISE = np.random.default_rng(0)
+NOISE, COUNTER = np.random.default_rng(0), itertools.count()
 TABLE = RegularGridInterpolator([[-1e9, 0.0, 1e9]], [0.0, 1.0, 2.0])
+
+
+def finds_a_root(t, x, u, p):
+    return [brentq(lambda z: z + z**3 - x[0], -1e9, 1e9), x[1]]
+
+
+randn = np.random.randn
 BAD = {
     "not callable": (3, ("3", "function of t, x, u and p")),
     "other arguments": (lambda t, x: x, ("(t, x, u, p)",)),
@@ -272,7 +282,11 @@ BAD = {
     "whole number": (converts, ("line", "int(x[0])", "leave out int()")),
     "adds into numbers": (adds_into_numbers, ("line", "total += x", "y = y + ...")),
     "table of another package": (looks_up, ("line", "TABLE(x[:1])", "CasADi")),
-    "random": (lambda t, x, u, p: x * NOISE.random(), ("its equations", "random numbers")),
+    "solver": (finds_a_root, ("line", "brentq(", "a plain number", "numeric=Numeric(...)")),
+    "random": (lambda t, x, u, p: x * NOISE.random(), ("line", "NOISE.random()", "draws random numbers")),
+    "legacy random": (lambda t, x, u, p: x + randn(), ("line", "randn()", "draws random numbers")),
+    "random of Python": (lambda t, x, u, p: x + random.random(), ("line", "random.random()", "draws random numbers")),
+    "memory": (lambda t, x, u, p: x * next(COUNTER), ("its equations", "memory", "random numbers")),
     "types": (asks_for_a_type, ("its equations", "types")),
 }
 

@@ -126,6 +126,11 @@ def test_a_law_inside_the_dynamics(record, hold):
     assert np.max(np.abs(run(closed, record, hold, 16) - expected)) < 1e-7
 
 
+def test_a_class_in_place_of_a_law_is_refused():
+    with pytest.raises(InputError, match=r"class CubicStiffness .* such as CubicStiffness\(\).at\({'k_3': 1.0}\)"):
+        rig().with_element("ground", CubicStiffness)
+
+
 def test_a_law_with_equations_of_its_own(record):
     law = Relaxation(values={"k_v": 60.0, "T": 0.2})
     expected = reference(
