@@ -303,12 +303,14 @@ def check(
     found = assess_recordings(bench, fitted, floor, stated or "", laws)
     if not faults:
         return found
-    told = tuple(BlindSpot("recording-fault", (f.channel,), f"{f.sentence} Below, it is corrected.") for f in faults)
+    told = [f.sentence + " Below, it is corrected." * f.corrected for f in faults]
+    spots = (BlindSpot("recording-fault", (f.channel,), text) for f, text in zip(faults, told, strict=True))
     wired = [f.channel for f in faults if not isinstance(f, WrongStart)]
-    first = "State first how the recordings begin: give each state's value, or leave the start unknown."
-    if wired:
-        first = f"Correct the recordings first: check wiring, sign and unit of {in_words(wired)}."
-    return replace(found, blind_spots=(*told, *found.blind_spots), next_record=first)
+    advice = [f"Correct the recordings first: check wiring, sign and unit of {in_words(wired)}."] if wired else []
+    if len(wired) < len(faults):
+        advice.append("State how the recordings begin: give each state's value, or leave the start unknown.")
+    starts = tuple(START_WORDS[r.begins] for r in recordings)
+    return replace(found, blind_spots=(*spots, *found.blind_spots), next_record=" ".join(advice), starts=starts)
 
 
 def assess_recordings(

@@ -348,9 +348,9 @@ def test_wrong_input_gets_a_sentence():
 def test_a_stated_start_that_the_first_sample_contradicts_is_told():
     given = record(MASS, noise_like(1), begin=[0.3, 0.0])
     found = check(MASS, given)
-    assert found.blind_spots[0].names == ("initial state",) and found.starts == ("estimated",)
+    assert found.blind_spots[0].names == ("initial state",) and found.starts == ("at zero",)
     assert "would begin at 0, but its first sample is 0.3" in str(found)
-    assert found.next_record.startswith("State first how the recordings begin")
+    assert found.next_record.startswith("State how the recordings begin")
 
 
 def test_hold_and_start_are_told(mass):
