@@ -36,10 +36,12 @@ from .identifiability import (
     live_ports,
     port_units,
 )
-from .linearise import SMALLEST_SWING, Probe, Run, linearise_runs, turning_points
+from .linearise import Probe, Run, linearise_runs
 from .offsets import WrongStart, find_wrong_start
 from .preparation import choose_hold
 from .workbench import QUICK, Fitted, Workbench
+
+SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
 
 IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the blind spot
     "identifiable": ("yes", ""),
@@ -471,13 +473,28 @@ def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator
         least = SMALLEST_SWING * travel
         reversals, rests, swings = 0, 0, list[float]()
         for z in signals if travel > 0 else ():
-            turns = turning_points(z, least)
+            turns = _turning_points(z, least)
             reversals += max(len(turns) - 2, 0)
             swings += np.abs(np.diff(z[turns])).tolist()
             longest = 2 * float(np.median(np.diff(turns))) if len(turns) > 2 else SMALL_SHARE * len(z)
             rests += _count_rests(z, least, longest)
         unit = port.across_unit or port_units(port, bench.recordings[0])[1]
         yield Excitation(port.name, travel, unit, reversals, _count_distinct(np.array(swings)), rests)
+
+
+def _turning_points(z: np.ndarray, least: float) -> list[int]:
+    """Find the turning points of z (M,) between swings of at least `least`, the first and the last included."""
+    turns, extreme, direction = [0], 0, 0.0
+    for k, value in enumerate(z.tolist()):
+        if direction == 0:
+            if abs(value - z[0]) >= least:
+                direction, extreme = np.sign(value - z[0]), k
+        elif direction * (value - z[extreme]) >= 0:
+            extreme = k
+        elif direction * (z[extreme] - value) >= least:
+            turns.append(extreme)
+            direction, extreme = -direction, k
+    return [*turns, extreme] if extreme > turns[-1] else turns
 
 
 def _count_distinct(swings: np.ndarray) -> int:

@@ -353,6 +353,12 @@ def test_a_stated_start_that_the_first_sample_contradicts_is_told():
     assert found.next_record.startswith("State how the recordings begin")
 
 
+def test_a_wrong_start_is_told_beside_a_fault_of_a_channel():
+    given = record(MASS, noise_like(1), begin=[0.3, 0.0])
+    found = check(MASS, given.with_(y=-given.y))
+    assert "check wiring, sign and unit" in found.next_record and "State how the recordings begin" in found.next_record
+
+
 def test_hold_and_start_are_told(mass):
     given, found = mass
     assert found.hold == "zero" and found.starts == ("at zero",)
