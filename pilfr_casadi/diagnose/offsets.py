@@ -87,7 +87,7 @@ def _describe_miss(now: Checked, misses: Sequence[np.ndarray]) -> str:
     i, k = divmod(int(np.argmax(np.abs(np.array(misses)) / now.bench.scale)), len(now.bench.scale))
     r, name = now.bench.recordings[i], now.bench.simulator.output_names[k]
     stated, first = r.y[0, k] + misses[i][k], r.y[0, k]
-    of = f" of {r.label}" if len(misses) > 1 else ""
+    of = f" of {r.name or f'recording {i + 1}'}" if len(misses) > 1 else ""
     scaled = f", unless the scale of {name} is wrong" if abs(stated) > FORMULA_ERROR * abs(first) else ""
     return f"{name} would begin at {stated:.3g}, but its first sample{of} is {first:.3g}{scaled}"
 

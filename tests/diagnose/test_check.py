@@ -6,6 +6,7 @@ import json
 import casadi as ca
 import numpy as np
 import pytest
+from cart import cart
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, check, multisine
@@ -354,8 +355,11 @@ def test_a_stated_start_that_the_first_sample_contradicts_is_told():
 
 
 def test_a_wrong_start_is_told_beside_a_fault_of_a_channel():
-    given = record(MASS, noise_like(1), begin=[0.3, 0.0])
-    found = check(MASS, given.with_(y=-given.y))
+    u = 20 * multisine(600, f_max=1.5, fs=50.0, rng=np.random.default_rng(0))
+    given = Recording(u, 0 * u, 0.02, ("force",), ("pos",), initial=[0.5, 0.0], hold="zero")
+    y = cart().simulate(given)
+    y = y + 1e-3 * np.random.default_rng(1).standard_normal(y.shape)
+    found = check(cart(), given.with_(y=-y, initial="zero"))
     assert "check wiring, sign and unit" in found.next_record and "State how the recordings begin" in found.next_record
 
 
