@@ -48,6 +48,7 @@ SMOOTHED_SAMPLES = 4000  # longest stretch of a recording that is smoothed: the 
 PASSES = 3  # linearisations at most
 # random steps of the force that are tried, in units of the force that explains the residual
 RANDOM_STEPS = np.logspace(-4.0, 0.5, 10)
+REPEATS = 0.01  # share of the ranges of coordinate and force within which a sample repeats another
 SAME_CHANGE = 1e-6  # share of the change of the derivatives up to which a force acts as a parameter does
 
 
@@ -241,15 +242,21 @@ def signals_along(bench: Workbench, fitted: Fitted, number: int = -1) -> tuple[n
 def is_curve(z: np.ndarray, w: np.ndarray) -> bool:
     """Tell whether a force w (M,) is a function of the coordinate z (M,) alone, as that of memory which is not shown.
 
-    In the order of z, each force lies on the chord of its neighbours then. Elsewhere those come from other branches.
+    In the order of z, each force lies between those of its neighbours then, or near them. Elsewhere the neighbours come
+    from another branch. Of samples that nearly repeat each other, as over many periods, one counts: they would be each
+    other's neighbours.
     """
-    any_order = np.random.default_rng(0).permutation(len(z))  # of samples at the same z
+    finite = np.isfinite(z) & np.isfinite(w)
+    z, w = z[finite], w[finite]
+    if len(z) < 3 or np.ptp(z) == 0 or np.ptp(w) == 0:
+        return True
+    cells = np.round(np.column_stack([z / np.ptp(z), w / np.ptp(w)]) / REPEATS).astype(np.int64)
+    _, first = np.unique(cells, axis=0, return_index=True)
+    any_order = np.random.default_rng(0).permutation(first)  # of samples at the same z
     order = any_order[np.argsort(z[any_order], kind="stable")]
-    z, w = z[order], w[order]
-    span = z[2:] - z[:-2]
-    share = np.divide(z[1:-1] - z[:-2], span, out=np.full(len(span), 0.5), where=span > 0)
-    off = w[1:-1] - w[:-2] - share * (w[2:] - w[:-2])
-    return bool(np.mean(off**2) < FORMULA_ERROR * np.var(w))
+    beside = np.sort([w[order][:-2], w[order][2:]], axis=0)
+    off = w[order][1:-1] - np.clip(w[order][1:-1], *beside)
+    return len(off) == 0 or bool(np.mean(off**2) < FORMULA_ERROR * np.var(w[order]))
 
 
 def forces_of_change(bench: Workbench, fitted: Fitted, port: str, change: np.ndarray) -> dict[str, np.ndarray]:

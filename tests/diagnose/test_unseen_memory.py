@@ -46,6 +46,13 @@ def test_any_curve_is_one_however_often_it_is_passed():
     assert is_curve(z, np.tanh(2 * z)) and is_curve(z, np.abs(z)) and not is_curve(z, np.tanh(2 * np.roll(z, 3)))
 
 
+@pytest.mark.parametrize("period", [25, 25.001])
+def test_memory_shows_over_periods_that_repeat(period):
+    phase = 2 * np.pi * np.arange(1000) / period
+    z, w = np.sin(phase), np.sin(phase - 0.3)
+    assert not is_curve(z, w) and is_curve(z, z**3)
+
+
 @pytest.mark.parametrize(("course", "sure"), [(UP, False), (UP_AND_DOWN, True)])
 def test_hysteresis_is_named_only_where_its_memory_shows(course, sure):
     r = driven(course)
