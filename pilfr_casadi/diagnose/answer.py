@@ -269,14 +269,15 @@ def _make_effect(
     shown: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
         unit = readable_unit(element.law.units[name.removeprefix(element.prefix)], w_unit, z_unit, signals)
-        flat = np.ravel(value)
+        flat, at_bound = np.ravel(value), np.ravel(fitted.at_bound(name) & ~fitted.model.parameters[name].fixed)
         for i, v in enumerate(flat):
             label = name.removeprefix(element.prefix) + (f"[{i}]" if len(flat) > 1 else "")
             error = float(np.ravel(std[name])[i])
             shown[label] = {"value": float(v), "std": error if np.isfinite(error) else None, "unit": unit}
-            if v and fitted.strained([name]):
-                shown[label]["at_limit"] = bool(np.ravel(fitted.at_bound(name))[i])
+            shown[label]["at_limit"] = bool(v and at_bound[i])
     remarks = [law.remark(element.own(fitted.values)), *_order(fitted, element)]
+    if any(search.hides_memory(t, named.element) for t in search.memo.values() if named.element in t.laws):
+        remarks.append("these recordings do not show its memory: a curve follows them as well")
     return Effect(
         port=element.port,
         law=law.id,

@@ -36,10 +36,12 @@ from .identifiability import (
     live_ports,
     port_units,
 )
-from .linearise import SMALLEST_SWING, Probe, Run, linearise_runs, turning_points
+from .linearise import Probe, Run, linearise_runs
 from .offsets import WrongStart, find_wrong_start
 from .preparation import choose_hold
 from .workbench import QUICK, Fitted, Workbench
+
+SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
 
 IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the blind spot
     "identifiable": ("yes", ""),
@@ -303,12 +305,14 @@ def check(
     found = assess_recordings(bench, fitted, floor, stated or "", laws)
     if not faults:
         return found
-    told = tuple(BlindSpot("recording-fault", (f.channel,), f"{f.sentence} Below, it is corrected.") for f in faults)
+    told = [f.sentence + " Below, it is corrected." * f.corrected for f in faults]
+    spots = (BlindSpot("recording-fault", (f.channel,), text) for f, text in zip(faults, told, strict=True))
     wired = [f.channel for f in faults if not isinstance(f, WrongStart)]
-    first = "State first how the recordings begin: give each state's value, or leave the start unknown."
-    if wired:
-        first = f"Correct the recordings first: check wiring, sign and unit of {in_words(wired)}."
-    return replace(found, blind_spots=(*told, *found.blind_spots), next_record=first)
+    advice = [f"Correct the recordings first: check wiring, sign and unit of {in_words(wired)}."] if wired else []
+    if len(wired) < len(faults):
+        advice.append("State how the recordings begin: give each state's value, or leave the start unknown.")
+    starts = tuple(START_WORDS[r.begins] for r in recordings)
+    return replace(found, blind_spots=(*spots, *found.blind_spots), next_record=" ".join(advice), starts=starts)
 
 
 def assess_recordings(
@@ -469,13 +473,28 @@ def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator
         least = SMALLEST_SWING * travel
         reversals, rests, swings = 0, 0, list[float]()
         for z in signals if travel > 0 else ():
-            turns = turning_points(z, least)
+            turns = _turning_points(z, least)
             reversals += max(len(turns) - 2, 0)
             swings += np.abs(np.diff(z[turns])).tolist()
             longest = 2 * float(np.median(np.diff(turns))) if len(turns) > 2 else SMALL_SHARE * len(z)
             rests += _count_rests(z, least, longest)
         unit = port.across_unit or port_units(port, bench.recordings[0])[1]
         yield Excitation(port.name, travel, unit, reversals, _count_distinct(np.array(swings)), rests)
+
+
+def _turning_points(z: np.ndarray, least: float) -> list[int]:
+    """Find the turning points of z (M,) between swings of at least `least`, the first and the last included."""
+    turns, extreme, direction = [0], 0, 0.0
+    for k, value in enumerate(z.tolist()):
+        if direction == 0:
+            if abs(value - z[0]) >= least:
+                direction, extreme = np.sign(value - z[0]), k
+        elif direction * (value - z[extreme]) >= 0:
+            extreme = k
+        elif direction * (z[extreme] - value) >= least:
+            turns.append(extreme)
+            direction, extreme = -direction, k
+    return [*turns, extreme] if extreme > turns[-1] else turns
 
 
 def _count_distinct(swings: np.ndarray) -> int:

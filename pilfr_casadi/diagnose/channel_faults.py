@@ -20,17 +20,17 @@ from .gates import CLEARLY_BETTER, CURED_SHARE, POOR_FIT, USELESS_FIT, Checked, 
 from .offsets import describe_constant
 from .workbench import THOROUGH, Workbench
 
-# factors by which units are mistaken, and units of the quantities in which that happens; () for any quantity
+# factors by which units are mistaken, and units of the quantities, apart from angles, in which that happens; () for any
 UNITS: dict[float, tuple[str, ...]] = {
     **dict.fromkeys((1e3, 1e6, 1e2, 60.0), ()),  # metric prefixes, minutes
     180 / np.pi: ("rad", "rad/s", "rad/s^2"),  # degrees
     30 / np.pi: ("rad/s",),  # revolutions a minute
-    9.80665: ("m/s^2", "N", "N m"),  # standard gravity
+    9.80665: ("m/s^2", "N", "N m", "kg"),  # standard gravity
     3.6: ("m/s",),  # km/h
     1e5: ("Pa",),  # bar
-    4.4482216: ("N",),  # pounds
-    25.4: ("m",),  # inches to mm
-    1 / 0.0254: ("m",),  # inches to m
+    4.4482216: ("N", "kg"),  # pounds
+    25.4: ("m", "m/s", "m/s^2"),  # inches to mm
+    1 / 0.0254: ("m", "m/s", "m/s^2"),  # inches to m
     6894.757: ("Pa",),  # pounds per square inch
 }
 FAHRENHEIT: dict[float, tuple[str, ...]] = {1.8: ("K",)}  # its zero differs as well: this unit comes with an offset
@@ -200,12 +200,14 @@ def _possible_slips(now: Checked, errors: Sequence[np.ndarray], trust_values: bo
             factors = [f for f in _mistakes(known.get(names[i], "")) if near(kind, [i], f)]
             faults += [scale_channels(kind, names, [i], f) for f in (-1.0, *factors)]
     every = range(len(channels["y"]))
-    joint = [f for f in _mistakes("") if len(every) > 1 and near("y", every, f)]
+    units = [known.get(name, "") for name in channels["y"]]
+    shared = [f for f in _mistakes("") if len(every) > 1 and all(f in _mistakes(unit) for unit in units)]
+    joint = [f for f in shared if near("y", every, f)]
     faults += [scale_channels("y", channels["y"], every, f) for f in joint]
     for kind, names in channels.items():
         faults += [exchange_channels(kind, names, i, j) for i, j in combinations(range(len(names)), 2)]
     if trust_values:  # with other values, a machine may follow its output backwards as well
-        moving = np.flatnonzero(np.ptp(np.concatenate([r.u for r in now.bench.recordings]), axis=0))  # an output moves
+        moving = np.flatnonzero(np.max([np.ptp(r.u, axis=0) for r in now.bench.recordings], axis=0))  # as outputs do
         return faults + [exchange_input(now.bench.simulator, i, j) for i in moving.tolist() for j in every]
     return [*faults, *(map(scale_time, TIME_UNITS) if now.cost > POOR_FIT else ())]
 

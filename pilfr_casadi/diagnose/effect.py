@@ -50,7 +50,7 @@ class Effect:
         return f"; confidence {self.at_port:.2f} that a law acts there" if surer else ""
 
     def limit(self, name: str) -> str:
-        """Say that a parameter is at a limit of the law, beyond which the fit may want it; empty if it is not."""
+        """Say that a parameter is at a limit of what is tried here, and may want to be beyond; empty if it is not."""
         return ", at its limit" if self.parameters.get(name, {}).get("at_limit") else ""
 
     @property

@@ -12,12 +12,14 @@ simulator is linearised again along the result.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from .._base import one_at_a_time
 from ..data import Recording
 from ..linear import measurement_update
 from ..models import Model, ParameterSet, map_points
@@ -37,6 +39,7 @@ from ..simulators import (
     stack,
     states_along,
 )
+from .evidence import FORMULA_ERROR
 from .linearise import Constant, compose_substeps, input_slope, local_signals, loudest_stretch, simulate_states
 from .workbench import Fitted, Workbench
 
@@ -45,6 +48,7 @@ SMOOTHED_SAMPLES = 4000  # longest stretch of a recording that is smoothed: the 
 PASSES = 3  # linearisations at most
 # random steps of the force that are tried, in units of the force that explains the residual
 RANDOM_STEPS = np.logspace(-4.0, 0.5, 10)
+REPEATS = 0.01  # share of the ranges of coordinate and force within which a sample repeats another
 SAME_CHANGE = 1e-6  # share of the change of the derivatives up to which a force acts as a parameter does
 
 
@@ -207,19 +211,52 @@ def hidden_force(
 
 def law_signals(bench: Workbench, fitted: Fitted, number: int, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute local coordinate, rate and force, (M,) each, of an element along the fitted run of recording i."""
-    r = bench.recordings[i]
+    r, function = bench.recordings[i], _law_function(fitted, number, bench.dt)
     states = simulate_states(fitted, r, fitted.initial[i])
-    simulator = on_grid(fitted.simulator, bench.dt / fitted.model.substeps)
-    own = simulator.parameter_set
-    vector = ca.SX.sym("p", own.size)
-    equations = ClosedEquations(simulator, vector)
-    n_s, n_u = sum(equations.n_s), len(simulator.inputs)
-    n_x = states.shape[1] - n_s
-    x, s, u, v, t = (ca.SX.sym(k, m) for k, m in (("x", n_x), ("s", n_s), ("u", n_u), ("v", n_u), ("t", 1)))
-    found = equations.evaluate(Instant(x, s, u, v, t))[3][number]
-    function = ca.Function("law", [ca.vertcat(x, s), u, v, t, vector], [ca.vertcat(*map(ca.SX, found))])
     (rows,) = map_points(function, states, r.u, input_slope(bench, r), r.clock[:, None], fitted.vector)
     return rows[:, 0, 0], rows[:, 1, 0], rows[:, 2, 0]
+
+
+@one_at_a_time
+@functools.lru_cache(maxsize=4)  # for all recordings
+def _law_function(fitted: Fitted, number: int, dt: float) -> ca.Function:
+    """Build `(states, u, slope of u, t, parameters) -> (z, dz, w)` of an element."""
+    simulator = on_grid(fitted.simulator, dt / fitted.model.substeps)
+    vector = ca.SX.sym("p", simulator.parameter_set.size)
+    equations = ClosedEquations(simulator, vector)
+    n_s, n_u = sum(equations.n_s), len(simulator.inputs)
+    n_x = fitted.model.n_state - n_s
+    x, s, u, v, t = (ca.SX.sym(k, m) for k, m in (("x", n_x), ("s", n_s), ("u", n_u), ("v", n_u), ("t", 1)))
+    found = equations.evaluate(Instant(x, s, u, v, t))[3][number]
+    return ca.Function("law", [ca.vertcat(x, s), u, v, t, vector], [ca.vertcat(*map(ca.SX, found))])
+
+
+def signals_along(bench: Workbench, fitted: Fitted, number: int = -1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute local coordinate, rate and force of an element along the runs of all recordings, (M,) each."""
+    number %= len(fitted.simulator.elements)
+    found = [law_signals(bench, fitted, number, i) for i in range(len(bench.recordings))]
+    z, dz, w = (np.concatenate(part) for part in zip(*found, strict=True))
+    return z, dz, w
+
+
+def is_curve(z: np.ndarray, w: np.ndarray) -> bool:
+    """Tell whether a force w (M,) is a function of the coordinate z (M,) alone, as that of memory which is not shown.
+
+    In the order of z, each force lies between those of its neighbours then, or near them. Elsewhere the neighbours come
+    from another branch. Of samples that nearly repeat each other, as over many periods, one counts: they would be each
+    other's neighbours.
+    """
+    finite = np.isfinite(z) & np.isfinite(w)
+    z, w = z[finite], w[finite]
+    if len(z) < 3 or np.ptp(z) == 0 or np.ptp(w) == 0:
+        return True
+    cells = np.round(np.column_stack([z / np.ptp(z), w / np.ptp(w)]) / REPEATS).astype(np.int64)
+    _, first = np.unique(cells, axis=0, return_index=True)
+    any_order = np.random.default_rng(0).permutation(first)  # of samples at the same z
+    order = any_order[np.argsort(z[any_order], kind="stable")]
+    beside = np.sort([w[order][:-2], w[order][2:]], axis=0)
+    off = w[order][1:-1] - np.clip(w[order][1:-1], *beside)
+    return len(off) == 0 or bool(np.mean(off**2) < FORMULA_ERROR * np.var(w[order]))
 
 
 def forces_of_change(bench: Workbench, fitted: Fitted, port: str, change: np.ndarray) -> dict[str, np.ndarray]:

@@ -36,8 +36,8 @@ from .evidence import (
     spread,
 )
 from .floor import FEWEST, Floor, effective_size, white_part
+from .force_recovery import is_curve, signals_along
 from .gates import EQUAL_RATIO
-from .linearise import turns_back
 from .screen import Scored, flexible_shares, innovation_share, screen
 from .trials import Key, Trial, Trials
 from .workbench import DIVERGED, Fitted, Workbench
@@ -57,7 +57,8 @@ class Findings:
     likelihood: tuple[float, float] | None = None
     learned: list[Fitted] | None = None  # the learned forces beside it, best first
     held_out: HeldOut | None = None  # its errors on held-out data
-    turning: dict[str, bool] = field(default_factory=dict)  # whether its motion turns back, by port
+    # whether the force of a law with memory is a curve along the runs, by the prefix of its parameters
+    curves: dict[str, bool] = field(default_factory=dict)
     varied: bool = False  # whether variations of parameters were tried beside it
     replaced: bool = False  # whether laws with constant parameters were tried in place of its last law, which varies
 
@@ -163,21 +164,22 @@ class Hypotheses:
 
     def log_prior(self, trial: Trial) -> float:
         """Compute the log prior probability of a hypothesis."""
-        doubtful = trial.doubtful or any(self._hides_memory(trial, e) for e in trial.laws)
+        doubtful = trial.doubtful or any(self.hides_memory(trial, e) for e in trial.laws)
         return log_prior(trial.laws, self.alternatives, doubtful, self.domains)
 
     def doubtful(self, trial: Trial, element: Placed) -> bool:
-        """Tell whether a law of a hypothesis degenerates at its fitted values or along its motion."""
-        return element.law.doubtful(element.own(trial.fitted.values)) or self._hides_memory(trial, element)
+        """Tell whether a law of a hypothesis degenerates, at its fitted values or along its motion."""
+        return element.law.doubtful(element.own(trial.fitted.values)) or self.hides_memory(trial, element)
 
-    def _hides_memory(self, trial: Trial, element: Placed) -> bool:
-        """Tell whether a law depends on where its motion turns back, but that never does; the law is a curve then."""
+    def hides_memory(self, trial: Trial, element: Placed) -> bool:
+        """Tell whether a law remembers where its motion turned, but its force is a curve along the fitted runs."""
         if not element.law.turns or not np.isfinite(trial.mean_square):
             return False
-        turning = self.findings[trial.key].turning
-        if element.port not in turning:
-            turning[element.port] = turns_back(self.bench, trial.fitted, element.port)
-        return not turning[element.port]
+        curves, number = self.findings[trial.key].curves, trial.fitted.simulator.elements.index(element)
+        if element.prefix not in curves:
+            z, _, w = signals_along(self.bench, trial.fitted, number)
+            curves[element.prefix] = is_curve(z, w)
+        return curves[element.prefix]
 
     @cached_property
     def domains(self) -> dict[str, str]:

@@ -28,7 +28,7 @@ import numpy as np
 from .._base import InputError, side_by_side
 from ..laws import POSITION_GAINS, SCALABLE, Law, Local, display_name, likely_profiles, scaled, scheduled, unit_forces
 from ..models import Parameter, play
-from .force_recovery import law_signals
+from .force_recovery import signals_along
 from .linearise import linearise_runs, loudest_stretch, port_signals
 from .screen import Remainder, Task, fit_shapes, held_out_rest, lengths, ridge_solution, start_values, usable
 from .workbench import COMPARED_SAMPLES, FEW, Fitted, Workbench
@@ -243,14 +243,6 @@ def refit_learned(bench: Workbench, found: Fitted) -> Fitted:
     seen = {f"{placed.elements[-1].prefix}{k}": np.array(v) for k, v in _ranges(EXTENSION, z=z, v=dz).items()}
     whole = bench.result(placed, {**fitted.values, **seen}, fitted.initial, engine, model)
     return replace(whole, status=fitted.status)
-
-
-def signals_along(bench: Workbench, fitted: Fitted, number: int = -1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute local coordinate, rate and force of an element along the runs of all recordings, (M,) each."""
-    number %= len(fitted.simulator.elements)
-    found = [law_signals(bench, fitted, number, i) for i in range(len(bench.recordings))]
-    z, dz, w = (np.concatenate(part) for part in zip(*found, strict=True))
-    return z, dz, w
 
 
 @dataclass(frozen=True, eq=False)

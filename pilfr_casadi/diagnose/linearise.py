@@ -39,7 +39,6 @@ WALL = 1.0  # largest |λ| h of a contact on the finest steps
 
 BLOCK = 256  # samples propagated at a time
 CHUNK, ENTRIES = 300, 2e7  # samples linearised at a time, and entries of their matrices, at most
-SMALLEST_SWING = 0.05  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
 POINTS, MOST_SAMPLED = 60, 3000  # samples at which the user's equations are evaluated, among the first of a run
 
 
@@ -339,21 +338,6 @@ def parameter_signals(bench: Workbench, value: float, x: Sequence[np.ndarray], u
     return Local(z, np.zeros_like(z), bench.dt, tuple(map(len, u)), inputs=signals)
 
 
-def turning_points(z: np.ndarray, least: float) -> list[int]:
-    """Find the turning points of z (M,) between swings of at least `least`, the first and the last included."""
-    turns, extreme, direction = [0], 0, 0.0
-    for k, value in enumerate(z.tolist()):
-        if direction == 0:
-            if abs(value - z[0]) >= least:
-                direction, extreme = np.sign(value - z[0]), k
-        elif direction * (value - z[extreme]) >= 0:
-            extreme = k
-        elif direction * (z[extreme] - value) >= least:
-            turns.append(extreme)
-            direction, extreme = -direction, k
-    return [*turns, extreme] if extreme > turns[-1] else turns
-
-
 def port_signals(bench: Workbench, fitted: Fitted, port: str) -> Local:
     """Compute the local signals of a port, or of a parameter, along the fitted runs of all recordings."""
     simulator = fitted.simulator
@@ -372,12 +356,3 @@ def port_signals(bench: Workbench, fitted: Fitted, port: str) -> Local:
     local = bench.local(z, dz)
     local = replace(local, inputs={**local.inputs, **own_signals(simulator, own)[index]})
     return _with_equations(simulator, simulator.port(port), local, x, u, fitted.vector)
-
-
-def turns_back(bench: Workbench, fitted: Fitted, port: str) -> bool:
-    """Tell whether the local coordinate of a port moves up and down in the fitted runs, within one or over several."""
-    local = port_signals(bench, fitted, port)
-    least = SMALLEST_SWING * float(np.ptp(local.z))
-    runs = np.split(local.z, np.cumsum(local.lengths)[:-1])
-    swings = np.concatenate([np.diff(z[turning_points(z, least)]) for z in runs])
-    return bool(np.any(swings > 0) and np.any(swings < 0))

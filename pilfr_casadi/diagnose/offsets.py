@@ -15,6 +15,7 @@ import numpy as np
 from ..data import Recording
 from ..laws import Law
 from ..simulators import ACTUATOR, SENSOR, Simulator, kind_of, port_name, split_port
+from .evidence import FORMULA_ERROR
 from .floor import ABOVE_NOISE
 from .gates import (
     CERTAIN_ERRORS,
@@ -48,35 +49,47 @@ class WrongStart(Gate):
 
 
 def find_wrong_start(now: Checked) -> Checked:
-    """Estimate the initial states if the stated ones contradict the first samples and no constant removes that.
+    """Estimate the initial states if the stated ones contradict the first samples more than a sensor's zero could.
 
-    A first sample depends on no dynamics: missing physics cannot contradict it. So the refit may follow better with a
-    constant and still begin elsewhere.
+    Missing dynamics cannot contradict a first sample. If the sensor's zero is wrong instead, it is wrong by that miss.
+    So both explanations begin at the first sample, and the one with which the refit follows better is told.
     """
-    stated = [r for r in now.bench.recordings if r.begins in ("zero", "given")]
-    unknown = len(stated) * len(now.bench.simulator.states)
-    missed = _missed_start(now)
-    if not missed:
+    bench, misses = now.bench, _missed_starts(now)
+    stated = [r for r in bench.recordings if r.begins in ("zero", "given")]
+    unknown = len(stated) * len(bench.simulator.states)
+    if not unknown or not np.any(misses):
         return now
+    missed = _describe_miss(now, misses)
     words = f"The initial states are not as stated: {missed}"
     fault = WrongStart("initial state", "start", stated[0].begins, words, change=_with_unknown_start)
     after = correct(now, fault, [now.fitted.values, {}])
     if after is None or gain(now.cost, after.cost, after.residuals, unknown) < LEAST_GAIN:
         return now
-    found, shifted = accept(now, after, fault), find_offsets(now)
-    return found if found.cost * EQUAL_RATIO < shifted.cost or _missed_start(shifted) else now
+    zeroed = [r.with_(y=r.y + miss) for r, miss in zip(bench.recordings, misses, strict=True)]
+    rival = refit(bench.on(zeroed), [now.fitted.values, {}], states=now.fitted.begin)
+    found = accept(now, after, fault)
+    if rival is None or rival.cost >= EQUAL_RATIO * found.cost:
+        return found
+    words = "a wrong zero of the sensor explains that better than another start. If the machine did begin elsewhere"
+    words = f"As stated, {missed}; {words}, give each state's value, or leave the start unknown."
+    return now.then(bench, now.fitted, replace(fault, sentence=words, corrected=False, change=None))
 
 
-def _missed_start(now: Checked) -> str:
-    """Describe the first sample that a run from a stated start misses most; empty if it may be noise."""
-    noise, names = np.maximum(now.floor.deviation, 1e-300), now.bench.simulator.output_names
-    both = zip(now.bench.recordings, now.fitted.residual, strict=True)
-    first = [(abs(e[0]) / noise, r.y[0], e[0]) for r, e in both if r.begins in ("zero", "given")]
-    errors, y, off = max(first, key=lambda one: float(np.max(one[0])), default=(np.zeros(1), noise, noise))
-    k = int(np.argmax(errors))
-    if not errors[k] > CERTAIN_ERRORS:
-        return ""
-    return f"{names[k]} would begin at {y[k] + off[k]:.3g}, but its first sample is {y[k]:.3g}"
+def _missed_starts(now: Checked) -> list[np.ndarray]:
+    """Compute by how much a run from its stated start misses each recording's first sample, (n_y,); noise is zero."""
+    least, both = CERTAIN_ERRORS * now.floor.deviation, zip(now.bench.recordings, now.fitted.residual, strict=True)
+    first = (e[0] if r.begins in ("zero", "given") else np.zeros(r.n_y) for r, e in both)
+    return [np.where(np.abs(e) > least, e, 0.0) for e in first]
+
+
+def _describe_miss(now: Checked, misses: Sequence[np.ndarray]) -> str:
+    """Describe the first sample that is missed most."""
+    i, k = divmod(int(np.argmax(np.abs(np.array(misses)) / now.bench.scale)), len(now.bench.scale))
+    r, name = now.bench.recordings[i], now.bench.simulator.output_names[k]
+    stated, first = r.y[0, k] + misses[i][k], r.y[0, k]
+    of = f" of {r.name or f'recording {i + 1}'}" if len(misses) > 1 else ""
+    scaled = f", unless the scale of {name} is wrong" if abs(stated) > FORMULA_ERROR * abs(first) else ""
+    return f"{name} would begin at {stated:.3g}, but its first sample{of} is {first:.3g}{scaled}"
 
 
 def _with_unknown_start(r: Recording) -> Recording:

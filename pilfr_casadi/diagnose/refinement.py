@@ -37,7 +37,7 @@ from ..models import check_size, play
 from ..simulators import Placed, Simulator, discretise, in_series, on_grid
 from .evidence import HeldOut, Sample, held_out_errors, spread
 from .floor import effective_size
-from .learned import signals_along
+from .force_recovery import signals_along
 from .search import Search
 from .workbench import THOROUGH, Fitted, Workbench
 

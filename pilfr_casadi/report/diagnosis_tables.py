@@ -19,7 +19,7 @@ from ..simulators import MECHANICAL, PARAMETER, UNKNOWN, kind_of, name_at, name_
 from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
-CLEAR = 0.9  # confidence below which the report says what limits it
+CLEAR = 0.9  # confidence below which the report says what may lower it
 BAR_MARGIN = 1.03  # smallest error over the left end of the bars' scale
 OPPOSING_MOTION = ("friction", "damping", "drag")  # ends of the names of laws that have no stiffness
 OPEN_ROWS = 12  # candidates in the open table; a folded table holds the others
@@ -178,8 +178,10 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
         others = "; ".join(name_at(port, law) for port, law in e.indistinguishable)
         out.append(Text(f"These recordings cannot tell it apart from: {others}."))
     else:
-        unsure = " The confidence is limited by what this one leaves unexplained." if e.confidence < CLEAR else ""
-        out.append(Text(f"No other law of the catalogue is about as likely.{unsure}"))
+        out.append(Text("No other law of the catalogue is nearly as likely."))
+        if e.confidence < CLEAR:
+            why = "what it leaves unexplained, values at a limit, or less likely laws together"
+            out.append(Text(f"The law is less than certain because of {why}."))
     return out
 
 

@@ -186,11 +186,9 @@ class Simulator(Equations):
         """Copy with a law in a port; see `close_loop`."""
         place = self.port(port)
         if isinstance(law, type):
-            example = f"{{{next(iter(getattr(law, 'units', {})), 'k')!r}: 1.0}}"
-            raise InputError(
-                f"The class {law.__name__} was given for port {port!r}; give a law with values, such as "
-                f"{law.__name__}().at({example})."
-            )
+            names = [*getattr(law, "units", ())]
+            example = f", such as {law.__name__}().at({{{names[0]!r}: 1.0}})" if names else ""
+            raise InputError(f"The class {law.__name__} was given for port {port!r}; give a law with values{example}.")
         allowed = getattr(law, "places", ("series", "parallel"))
         if not place.kinds & set(allowed):
             kind = "a parameter" if place.kinds == {"parameter"} else "series" if place.series else "parallel"

@@ -166,7 +166,7 @@ def accept_symbols(function: Any) -> Any:
 
 
 def _refuse_random(*_: Any, **__: Any) -> Any:
-    raise NotTraceable("draws random numbers", "leave them out or make them an input")
+    raise NotTraceable("uses random numbers", "leave them out or make them an input")
 
 
 def _replace(value: Any, done: dict[int, Any]) -> Any:

@@ -6,6 +6,7 @@ import json
 import casadi as ca
 import numpy as np
 import pytest
+from cart import cart
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, check, multisine
@@ -348,9 +349,18 @@ def test_wrong_input_gets_a_sentence():
 def test_a_stated_start_that_the_first_sample_contradicts_is_told():
     given = record(MASS, noise_like(1), begin=[0.3, 0.0])
     found = check(MASS, given)
-    assert found.blind_spots[0].names == ("initial state",) and found.starts == ("estimated",)
+    assert found.blind_spots[0].names == ("initial state",) and found.starts == ("at zero",)
     assert "would begin at 0, but its first sample is 0.3" in str(found)
-    assert found.next_record.startswith("State first how the recordings begin")
+    assert found.next_record.startswith("State how the recordings begin")
+
+
+def test_a_wrong_start_is_told_beside_a_fault_of_a_channel():
+    u = 20 * multisine(600, f_max=1.5, fs=50.0, rng=np.random.default_rng(0))
+    given = Recording(u, 0 * u, 0.02, ("force",), ("pos",), initial=[0.5, 0.0], hold="zero")
+    y = cart().simulate(given)
+    y = y + 1e-3 * np.random.default_rng(1).standard_normal(y.shape)
+    found = check(cart(), given.with_(y=-y, initial="zero"))
+    assert "check wiring, sign and unit" in found.next_record and "State how the recordings begin" in found.next_record
 
 
 def test_hold_and_start_are_told(mass):

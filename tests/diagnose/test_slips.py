@@ -86,6 +86,16 @@ def test_a_factor_that_does_not_fit_the_unit_is_not_tried(unit, told):
     assert {factor for factor in ("9.807", "9.549") if factor in fault.sentence} == told
 
 
+def test_a_factor_on_all_outputs_fits_the_units_of_each():
+    u, y = recorded()
+    known = replace(tanks(1.15), units={"upper": "m/s^2", "lower": "m/s^2"})
+    r = Recording(u, y / 9.80665, DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero")
+    y = r.y + 0.05 * np.std(r.y, axis=0) * np.random.default_rng(1).standard_normal(r.y.shape)
+    (fault,) = prepare(known, [r.with_(y=y)], "zero", "auto").gates
+    assert "upper, lower are too small by a factor of 9.807" in fault.sentence
+    assert "lower are too small by a factor of 9.549" not in fault.sentence
+
+
 @pytest.mark.parametrize(
     ("fault", "told"),
     [

@@ -283,9 +283,9 @@ BAD = {
     "adds into numbers": (adds_into_numbers, ("line", "total += x", "y = y + ...")),
     "table of another package": (looks_up, ("line", "TABLE(x[:1])", "CasADi")),
     "solver": (finds_a_root, ("line", "brentq(", "a plain number", "numeric=Numeric(...)")),
-    "random": (lambda t, x, u, p: x * NOISE.random(), ("line", "NOISE.random()", "draws random numbers")),
-    "legacy random": (lambda t, x, u, p: x + randn(), ("line", "randn()", "draws random numbers")),
-    "random of Python": (lambda t, x, u, p: x + random.random(), ("line", "random.random()", "draws random numbers")),
+    "random": (lambda t, x, u, p: x * NOISE.random(), ("line", "NOISE.random()", "uses random numbers")),
+    "legacy random": (lambda t, x, u, p: x + randn(), ("line", "randn()", "uses random numbers")),
+    "random of Python": (lambda t, x, u, p: x + random.random(), ("line", "random.random()", "uses random numbers")),
     "memory": (lambda t, x, u, p: x * next(COUNTER), ("its equations", "memory", "random numbers")),
     "types": (asks_for_a_type, ("its equations", "types")),
 }
