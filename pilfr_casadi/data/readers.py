@@ -1,8 +1,8 @@
 """Read recordings from CSV, ``.mat``, ``.npz``, Parquet and MDF files, and from frames of pandas or polars.
 
-A file holds one recording: a time column (``t``, ``t_s``, ``time`` or ``time [s]``, in seconds, uniform) and one column
-for each input and output by name, with or without its unit in brackets; other columns are ignored. One sentence reports
-a fault of a file; it names the file, the column and the line.
+A file holds one recording: a time column (``t``, ``t_s``, ``time`` or ``time [s]``, uniform, in seconds; in a CSV file
+or a frame also dates) and one column for each input and output by name, with or without its unit in brackets; other
+columns are ignored. One sentence reports a fault of a file; it names the file, the column and the line.
 """
 
 import re
@@ -14,7 +14,7 @@ from typing import Any, overload
 import numpy as np
 
 from .._base import InputError, listed, positive
-from .preprocessing import even_grid
+from .preprocessing import LONGEST_GAP, even_grid
 from .recording import Recording, as_tuple
 from .tables import ArrayTable, CsvTable, frame_table, open_table
 
@@ -28,6 +28,7 @@ _UNITS = r"ns|us|µs|μs|ms|min|h|d|nanoseconds?|microseconds?|milliseconds?|min
 _WITH_UNIT = re.compile(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")  # such as "force [N]" or "speed (rad/s)"
 _IN_SECONDS = re.compile(r"(?:t|time)\s*[\[(]\s*(?:s|sec|secs|seconds?)\s*[\])]", re.IGNORECASE)
 _OTHER_UNIT = re.compile(rf"(?:t|time)[\s_\-\[(]+({_UNITS})[\])]?", re.IGNORECASE)
+_IN_OTHER_UNIT = re.compile(rf".*[\[(]\s*({_UNITS})\s*[\])]", re.IGNORECASE)  # of a column that is chosen as the time
 
 
 @overload
@@ -46,6 +47,9 @@ def read_csv(
     **recording_options: Any,
 ) -> Recording | tuple[Recording, ...]:
     """Read recordings from CSV files with a header row.
+
+    Lines of a title may stand above the header, and a row of units below it. Times may be dates such as
+    ``2024-05-01T10:00:00.25``; they become seconds after the first one.
 
     Parameters
     ----------
@@ -259,7 +263,7 @@ class _Request:
     def recording(self, table: CsvTable | ArrayTable) -> Recording:
         """Make the recording from the columns of a file."""
         time, wanted = self.locate(table.names, str(table.path))
-        parts = table.columns([*wanted, time] if time else wanted)
+        parts = table.columns(wanted, time)
         if self.new_step is not None:
             assert time is not None
             t = parts.pop()[:, 0]
@@ -338,16 +342,18 @@ def _find_time_column(names: Sequence[str], chosen: str | None, source: str) -> 
         raise InputError(
             f"{source} has several time columns ({', '.join(found)}); choose one, as in columns={{'t': '{found[0]}'}}."
         )
+    found[0] = _find_column(found[0], names)
     if found[0] not in names:
         raise InputError(f"{source} has no column {found[0]!r} for the time; its columns are {listed(names)}.")
     _refuse_other_unit(found, source)
+    _refuse_other_unit(found, source, _IN_OTHER_UNIT)
     return found[0]
 
 
-def _refuse_other_unit(names: Sequence[str], source: str) -> None:
+def _refuse_other_unit(names: Sequence[str], source: str, pattern: re.Pattern[str] = _OTHER_UNIT) -> None:
     """Refuse a name such as ``t_ms`` or ``Time [min]``, which states a unit other than seconds."""
     for name in names:
-        unit = _OTHER_UNIT.fullmatch(name.strip())
+        unit = pattern.fullmatch(name.strip())
         if unit:
             raise InputError(
                 f"{source}: column {name!r} is named as time in {unit.group(1)}, but time must be in seconds; "
@@ -388,7 +394,11 @@ def step_of(
         raise InputError(
             f"{column} is not uniform: {place(k)} comes {gaps[k - 1]:.6g} s after the sample before it where "
             f"{median:.6g} s is usual, and samples lie up to {deviation.max() / step:.2g} steps off a uniform grid; "
-            "resample with resample=STEP, or allow more with time_tolerance=STEPS."
+            + (
+                "cut the record there into two."
+                if gaps.max() > LONGEST_GAP * median
+                else "resample with resample=STEP, or allow more with time_tolerance=STEPS."
+            )
         )
     step = float(f"{step:.12g}")
     if dt is None:

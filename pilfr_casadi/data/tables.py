@@ -1,8 +1,9 @@
 """Read named columns of numbers from CSV, MATLAB, NumPy, Parquet and MDF files; errors name the file, column and line.
 
 NumPy reads a CSV file at once; only if that fails, the file is read cell by cell to find the bad cell. Commas,
-semicolons and tabs separate cells; a byte-order mark, Windows line ends, quoted cells and blank lines are accepted.
-Lines are counted as in an editor: the header is line 1. Code in a ``.mat`` or ``.npz`` file is never run.
+semicolons and tabs separate cells; a byte-order mark, Windows line ends, quoted cells, blank lines, lines of a title
+above the header and a row of units below it are accepted. Lines are counted as in an editor. Code in a ``.mat`` or
+``.npz`` file is never run.
 """
 
 import contextlib
@@ -12,6 +13,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,11 +21,13 @@ from typing import Any
 import numpy as np
 
 from .._base import REPAIR, InputError, existing_file, read_bytes, usable
+from .units import dimension
 
 Array = np.ndarray
 
 CONTROL_CHARACTER = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
 DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
+LONGEST_TITLE = 100  # lines above the header of a CSV file, at most
 KINDS = {
     "c": "complex numbers",
     "V": "a struct",
@@ -44,8 +48,12 @@ class CsvTable:
     lines: list[str]
     first_line: int
 
-    def columns(self, names: Sequence[str]) -> list[Array]:
-        """Return each named column as finite numbers, (M, 1)."""
+    def columns(self, names: Sequence[str], time: str | None = None) -> list[Array]:
+        """Return each named column as finite numbers, (M, 1); last the times, s, where dates count from the first."""
+        if time is not None:
+            if self._has_dates(time):
+                return [*self.columns(names), self._count_seconds(time)]
+            names = [*names, time]
         where = [self.names.index(name) for name in names]
         numbers = self._read_at_once(where)
         if numbers is None or not usable(numbers).all():
@@ -56,6 +64,25 @@ class CsvTable:
         """Return the cells of a column as they are written."""
         where = self.names.index(name)
         return [_cells(text, self.delimiter, str(self.path))[where] for text in self.lines if text.strip()]
+
+    def _has_dates(self, name: str) -> bool:
+        """Tell whether a column begins with a date."""
+        cells = _cells(next(text for text in self.lines if text.strip()), self.delimiter, str(self.path))
+        return len(cells) == len(self.names) and _date(cells[self.names.index(name)]) is not None
+
+    def _count_seconds(self, name: str) -> Array:
+        """Return a column of dates as seconds after the first one, (M, 1)."""
+        cells = self.texts(name)
+        dates = [_date(cell) for cell in cells]
+        first = dates[0]
+        assert first is not None
+        for row, date in enumerate(dates):
+            if date is None or (date.tzinfo is None) != (first.tzinfo is None):
+                raise InputError(
+                    f"{self.path}: column {name!r}, {self.place(row)} reads {cells[row][:40]!r}, but the column begins "
+                    f"with {cells[0]!r}; write all times in one way."
+                )
+        return np.array([[(date - first).total_seconds()] for date in dates if date is not None])
 
     def place(self, row: int) -> str:
         """Return the line of the data row `row`, counted from 0, in words."""
@@ -80,10 +107,17 @@ class CsvTable:
             if len(cells) != len(self.names):
                 raise InputError(
                     f"{self.path}: line {line} has {len(cells)} cell(s) but the header names {len(self.names)}; "
-                    f"give every line one cell for each column, separated by {DELIMITERS[self.delimiter]}s."
+                    f"{self._wrong_count(cells)}."
                 )
             rows.append([self._value(cells[i], self.names[i], line) for i in where])
         return np.array(rows)
+
+    def _wrong_count(self, cells: Sequence[str]) -> str:
+        """Advise what to do about a line with another number of cells than the header."""
+        width = len(self.names)
+        if self.delimiter == "," and width < len(cells) <= 2 * width and all(map(str.isdigit, cells[1::2])):
+            return "if its decimals are written with commas, write them with points"
+        return f"give every line one cell for each column, separated by {DELIMITERS[self.delimiter]}s"
 
     def _value(self, cell: str, column: str, line: int) -> float:
         place = f"{self.path}: column {column!r}, line {line}"
@@ -112,8 +146,12 @@ class ArrayTable:
     names: tuple[str, ...]
     arrays: Mapping[str, Any]
 
-    def columns(self, names: Sequence[str]) -> list[Array]:
-        """Return each named variable as finite numbers, (M, channels); a row vector becomes a column."""
+    def columns(self, names: Sequence[str], time: str | None = None) -> list[Array]:
+        """Return each named variable, and last the times, as finite numbers, (M, channels).
+
+        A row vector becomes a column.
+        """
+        names = [*names, time] if time is not None else names
         parts = [self._samples(name) for name in names]
         if len({len(part) for part in parts}) > 1:
             counts = ", ".join(f"{name} {len(part)}" for name, part in zip(names, parts, strict=True))
@@ -197,22 +235,49 @@ def open_table(path: Path, wanted: Sequence[str] = (), suffix: str = "") -> CsvT
 
 
 def _open_csv(path: Path, wanted: Sequence[str]) -> CsvTable:
-    """Read the header; choose the delimiter that yields most of the `wanted` columns."""
+    """Find the header: the first line, or the first one that names all `wanted` columns; read the names and units."""
     lines = _text(path).split("\n")
-    top = next((i for i, line in enumerate(lines) if line.strip()), None)
-    if top is None:
+    written = [i for i, line in enumerate(lines) if line.strip()]
+    if not written:
         raise InputError(f"{path} is empty; give a CSV file with a header row and one row for each sample.")
-    headers = {d: _cells(lines[top], d, f"{path}: line {top + 1}") for d in DELIMITERS}
-    delimiter = max(DELIMITERS, key=lambda d: (sum(n in headers[d] for n in wanted), len(headers[d]), d == ","))
-    names = headers[delimiter]
+    headers = ((i, *_split_header(lines[i], wanted, f"{path}: line {i + 1}")) for i in written[:LONGEST_TITLE])
+    first = next(headers)
+    below_title = (found for found in headers if _named(found[2], wanted) == len(wanted))
+    complete = _named(first[2], wanted) == len(wanted)
+    top, delimiter, names = first if complete else next(below_title, first)
     if all(_number(name) is not None for name in names):
         raise InputError(
             f"{path} has no header row: line {top + 1} reads {lines[top].strip()[:60]!r}; name the columns there."
         )
-    below = lines[top + 1 :]
-    if not any(line.strip() for line in below):
+    rows = [i for i in written if i > top]
+    if rows and (units := _read_units(_cells(lines[rows[0]], delimiter, f"{path}: line {rows[0] + 1}"), names)):
+        names = tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True))
+        top = rows.pop(0)
+    if not rows:
         raise InputError(f"{path} has a header but no data below it; give one row for each sample.")
-    return CsvTable(path, names, delimiter, below, top + 2)
+    return CsvTable(path, names, delimiter, lines[top + 1 :], top + 2)
+
+
+def _split_header(line: str, wanted: Sequence[str], place: str) -> tuple[str, tuple[str, ...]]:
+    """Return the delimiter that yields most of the `wanted` columns, and the names; a comment's mark is left out."""
+    line = line.strip().lstrip("#%").lstrip() if line.lstrip().startswith(("#", "%")) else line
+    names = {d: _cells(line, d, place) for d in DELIMITERS}
+    delimiter = max(DELIMITERS, key=lambda d: (_named(names[d], wanted), len(names[d]), d == ","))
+    return delimiter, names[delimiter]
+
+
+def _named(names: Sequence[str], wanted: Sequence[str]) -> int:
+    """Count the `wanted` columns among the names, which may have a unit in brackets."""
+    bare = {re.sub(r"\s*(\[.*\]|\(.*\))$", "", name) for name in names} | {*names}
+    return sum(name in bare for name in wanted)
+
+
+def _read_units(cells: Sequence[str], names: Sequence[str]) -> list[str] | None:
+    """Return the units of a row of units below the names, empty for a column without; None if it is no such row."""
+    units = [cell.strip("[]() ") for cell in cells]
+    units = ["" if unit == "-" else unit for unit in units]
+    known = all(not unit or (_number(unit) is None and dimension(unit) is not None) for unit in units)
+    return units if known and any(units) and len(units) == len(names) else None
 
 
 def _open_mat(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:
@@ -391,6 +456,14 @@ def _cells(line: str, delimiter: str, place: str) -> tuple[str, ...]:
         return tuple(cell.strip() for cell in next(csv.reader([line], delimiter=delimiter)))
     except csv.Error as error:
         raise InputError(f"{place} is not a row of a CSV file ({error}); give one row for each sample.") from None
+
+
+def _date(cell: str) -> datetime | None:
+    """Return a date and time in the form of ISO 8601, such as 2024-05-01T10:00:00.25; None if it is none."""
+    try:
+        return datetime.fromisoformat(cell) if "-" in cell else None
+    except ValueError:
+        return None
 
 
 def _number(cell: str) -> float | None:
