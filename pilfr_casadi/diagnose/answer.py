@@ -17,10 +17,11 @@ from ..laws import readable_unit, short_name
 from ..simulators import Placed, in_series, name_at, split_port
 from .arguments import Request
 from .blind_spots import BlindSpot, assess_recordings
+from .channel_faults import IN_RECORDINGS, find_gross_slips
 from .correction import Correction
 from .effect import Effect
 from .evidence import NEAR_RATIO, SURE, deviations
-from .gates import Gate, edited
+from .gates import TEST_FAULT, Gate, edited
 from .identifiability import port_units
 from .mismatch_map import mismatch
 from .offsets import Offset, remove_idle_offsets, update_offsets
@@ -152,13 +153,23 @@ def _compute_errors(
         fits = {"before": without, "after": after, **{f"without {i}": f for i, f in enumerate(each.values())}}
         compared = test_errors(bench, tests, found.gates, fits, bench.on(tests).model(request.simulator))
         on_tests = compared.errors
-        notes = (*_resting_notes(compared.find_resting()), *_edit_notes(compared))
+        notes = (*_test_faults(bench, after, tests, found.gates), *_resting_notes(compared.find_resting()))
+        notes = (*notes, *_edit_notes(compared))
         fewer = {e: on_tests[f"without {i}"] for i, e in enumerate(each)}
         errors["test"] = {name: on_tests[name] for name in ("nominal", "before", "after")}
     if bench.simulator.observer is not None:
         free = edited(tests, found.gates) or bench.recordings
         errors["free_run"] = free_run_errors(bench, free, request.simulator, without, after)
     return errors, fewer, compared, notes
+
+
+def _test_faults(
+    bench: Workbench, after: Fitted, tests: tuple[Recording, ...], gates: Sequence[Gate]
+) -> Iterator[Gate]:
+    """Note a wrong sign, a wrong unit or an exchange in the test recordings, which the corrected simulator shows."""
+    for fault in find_gross_slips(replace(bench.renewed(edited(tests, gates)), simulator=after.corrected()))[:1]:
+        words = fault.sentence.replace(IN_RECORDINGS, "In the test recordings, unlike the training recordings, ")
+        yield Gate(fault.channel, TEST_FAULT, fault.value, f"{words}. Correct them.", False)
 
 
 def _surrogate_note(error: float) -> tuple[Gate, ...]:

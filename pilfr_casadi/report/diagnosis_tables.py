@@ -73,8 +73,8 @@ def _name_errors(diagnosis: Diagnosis) -> dict[str, str]:
 
 
 def judged_errors(diagnosis: Diagnosis) -> tuple[str, Mapping[str, float]]:
-    """Return the role of the recordings that judge the answer, test if there are any, and their errors."""
-    errors = diagnosis.errors.get("test")
+    """Return the role of the recordings that judge the answer, test if they can, and their errors."""
+    errors = None if diagnosis.test_fault else diagnosis.errors.get("test")
     return ("test", errors) if errors else ("training", diagnosis.errors["train"] or {})
 
 

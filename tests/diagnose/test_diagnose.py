@@ -140,8 +140,28 @@ def test_the_next_experiment_stays_within_the_users_limits():
 
 
 def test_test_data_that_was_trained_on_is_refused(plain):
-    with pytest.raises(pilfr.InputError, match="equals a training recording"):
-        pilfr.diagnose(rig(), plain, test=plain[0])
+    whole, m = plain[0], len(plain[0])
+
+    def part(start, stop):
+        return whole.with_(u=whole.u[start:stop], y=whole.y[start:stop], initial="estimate")
+
+    for test in (whole, part(m // 2, m)):
+        with pytest.raises(pilfr.InputError, match="equals a training recording or a part of one"):
+            pilfr.diagnose(rig(), plain, test=test)
+    for train, test in ((part(0, 500), part(300, 900)), (part(300, 900), part(0, 500))):
+        with pytest.raises(pilfr.InputError, match=f"200 of the {len(test)} samples of a test recording are training"):
+            pilfr.diagnose(rig(), train, test=test)
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"), [(1e3, "too large by a factor of 1000"), (1e-3, "too small"), (-1, "sign")]
+)
+def test_a_wrong_channel_of_the_test_recordings_is_told_and_judges_nothing(factor, words):
+    train, test = recordings(Backlash(values={"r": 1.0}), port="actuator:force", count=2)
+    found = pilfr.diagnose(rig(OFF), train, test=test.with_(y=factor * test.y), laws=FEW)
+    fault = next(g for g in found.gates if g.finding == "test fault")
+    assert (found.verdict, found.outcome, fault.channel) == ("missing-physics", "", "x2")
+    assert words in fault.sentence and fault.sentence in found.summary and "worse" not in found.summary
 
 
 @pytest.mark.parametrize(
