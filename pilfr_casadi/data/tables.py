@@ -27,6 +27,9 @@ Array = np.ndarray
 
 CONTROL_CHARACTER = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
 DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
+TIME_NAMES = ("t", "t_s", "time")
+WITH_UNIT = re.compile(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")  # such as "force [N]" or "speed (rad/s)"
+_IN_SECONDS = re.compile(r"(?:t|time)\s*[\[(]\s*(?:s|sec|secs|seconds?)\s*[\])]", re.IGNORECASE)
 LONGEST_TITLE = 100  # lines above the header of a CSV file, at most
 KINDS = {
     "c": "complex numbers",
@@ -114,10 +117,10 @@ class CsvTable:
 
     def _wrong_count(self, cells: Sequence[str]) -> str:
         """Advise what to do about a line with another number of cells than the header."""
-        width = len(self.names)
-        if self.delimiter == "," and width < len(cells) <= 2 * width and all(map(str.isdigit, cells[1::2])):
-            return "if its decimals are written with commas, write them with points"
-        return f"give every line one cell for each column, separated by {DELIMITERS[self.delimiter]}s"
+        advice = f"give every line one cell for each column, separated by {DELIMITERS[self.delimiter]}s"
+        if self.delimiter == "," and len(cells) > len(self.names) and all(map(str.isdigit, cells[1::2])):
+            advice += "; if its decimals are written with commas, write them with points"
+        return advice
 
     def _value(self, cell: str, column: str, line: int) -> float:
         place = f"{self.path}: column {column!r}, line {line}"
@@ -235,16 +238,15 @@ def open_table(path: Path, wanted: Sequence[str] = (), suffix: str = "") -> CsvT
 
 
 def _open_csv(path: Path, wanted: Sequence[str]) -> CsvTable:
-    """Find the header: the first line, or the first one that names all `wanted` columns; read the names and units."""
+    """Find the header: the line that names most of the `wanted` columns, or the first; read the names and units."""
     lines = _text(path).split("\n")
     written = [i for i, line in enumerate(lines) if line.strip()]
     if not written:
         raise InputError(f"{path} is empty; give a CSV file with a header row and one row for each sample.")
-    headers = ((i, *_split_header(lines[i], wanted, f"{path}: line {i + 1}")) for i in written[:LONGEST_TITLE])
-    first = next(headers)
-    below_title = (found for found in headers if _named(found[2], wanted) == len(wanted))
-    complete = _named(first[2], wanted) == len(wanted)
-    top, delimiter, names = first if complete else next(below_title, first)
+    headers = [(i, *_split_header(lines[i], wanted, f"{path}: line {i + 1}")) for i in written[:LONGEST_TITLE]]
+    known = [_count_known(names, wanted) for _, _, names in headers]
+    best = max(range(len(headers)), key=lambda k: (known[k], known[k] and len(headers[k][2]), -k))
+    top, delimiter, names = headers[best]
     if all(_number(name) is not None for name in names):
         raise InputError(
             f"{path} has no header row: line {top + 1} reads {lines[top].strip()[:60]!r}; name the columns there."
@@ -260,24 +262,44 @@ def _open_csv(path: Path, wanted: Sequence[str]) -> CsvTable:
 
 def _split_header(line: str, wanted: Sequence[str], place: str) -> tuple[str, tuple[str, ...]]:
     """Return the delimiter that yields most of the `wanted` columns, and the names; a comment's mark is left out."""
-    line = line.strip().lstrip("#%").lstrip() if line.lstrip().startswith(("#", "%")) else line
-    names = {d: _cells(line, d, place) for d in DELIMITERS}
-    delimiter = max(DELIMITERS, key=lambda d: (_named(names[d], wanted), len(names[d]), d == ","))
+    names = {d: _without_mark(_cells(line, d, place), wanted) for d in DELIMITERS}
+    delimiter = max(DELIMITERS, key=lambda d: (_count_known(names[d], wanted), len(names[d]), d == ","))
     return delimiter, names[delimiter]
 
 
-def _named(names: Sequence[str], wanted: Sequence[str]) -> int:
-    """Count the `wanted` columns among the names, which may have a unit in brackets."""
-    bare = {re.sub(r"\s*(\[.*\]|\(.*\))$", "", name) for name in names} | {*names}
-    return sum(name in bare for name in wanted)
+def _without_mark(names: tuple[str, ...], wanted: Sequence[str]) -> tuple[str, ...]:
+    """Leave out the mark of a comment before a known name, as in ``# t,force``."""
+    bare = names[0].lstrip("#%").lstrip()
+    return (bare, *names[1:]) if names[0] not in wanted and _count_known((bare,), wanted) else names
+
+
+def _count_known(names: Sequence[str], wanted: Sequence[str]) -> int:
+    """Count the `wanted` columns among the names, and a time column."""
+    return sum(find_column(name, names) in names for name in wanted) + any(map(is_time, names))
+
+
+def find_column(column: str, names: Sequence[str]) -> str:
+    """Return a file's name of a column, which may have a unit in brackets; `column` itself if there is none."""
+    found = [name for name in names if (parts := WITH_UNIT.fullmatch(name)) and parts.group(1) == column]
+    return found[0] if column not in names and len(found) == 1 else column
+
+
+def is_time(column: str) -> bool:
+    """Tell whether a column holds the time in seconds by its name, which may have the unit in brackets.
+
+    >>> is_time("t"), is_time("Time [s]"), is_time("time (ms)"), is_time("T")
+    (True, True, False, False)
+    """
+    return column in TIME_NAMES or bool(_IN_SECONDS.fullmatch(column.strip()))
 
 
 def _read_units(cells: Sequence[str], names: Sequence[str]) -> list[str] | None:
     """Return the units of a row of units below the names, empty for a column without; None if it is no such row."""
-    units = [cell.strip("[]() ") for cell in cells]
-    units = ["" if unit == "-" else unit for unit in units]
-    known = all(not unit or (_number(unit) is None and dimension(unit) is not None) for unit in units)
-    return units if known and any(units) and len(units) == len(names) else None
+    units = [cell.lstrip("# ").strip("[]() ") for cell in cells]
+    words = all(_number(unit) is None for unit in units) and len(units) == len(names)
+    if not (words and any(dimension(unit) is not None for unit in units)):
+        return None
+    return ["" if unit == "-" or WITH_UNIT.fullmatch(name) else unit for unit, name in zip(units, names, strict=True)]
 
 
 def _open_mat(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:

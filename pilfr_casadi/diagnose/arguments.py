@@ -103,14 +103,22 @@ def match_tests(
 def _shared_samples(train: Recording, test: Recording) -> int:
     """Count the samples with which a test recording repeats a part of a training recording, or its begin or end.
 
-    Parts that are too short to tell, or at rest, do not count.
+    Parts in which the outputs hardly move tell nothing, and samples that are not scored may be shared.
     """
     one, other = (np.column_stack([r.y, r.u]) for r in (train, test))
+    moves = (np.diff(test.y, axis=0) != 0).any(axis=1)
+    if not moves.any():
+        return 0
     (i, part), (j, again) = (_first_motion(rows, train.y.shape[1]) for rows in (one, other))
     for shift in (*(_places(one, again) - j), *(i - _places(other, part))):  # of the test in the training recording
-        rest, repeated = one[max(shift, 0) :], other[max(-shift, 0) :]
-        shared = min(len(rest), len(repeated))
-        if shared >= min(FEWEST_SHARED, len(other)) and np.array_equal(rest[:shared], repeated[:shared]):
+        begin, rest = max(-shift, 0), one[max(shift, 0) :]
+        shared = min(len(rest), len(other) - begin)
+        seen = int(np.sum(moves[begin : begin + shared - 1]))
+        if (
+            seen >= min(FEWEST_SHARED, int(np.sum(moves)))
+            and begin + shared > test.skip
+            and np.array_equal(rest[:shared], other[begin : begin + shared])
+        ):
             return shared
     return 0
 

@@ -316,7 +316,8 @@ def check(
     advice = [f"Correct the recordings first: check wiring, sign and unit of {in_words(wired)}."] if wired else []
     if len(wired) < len(faults):
         advice.append("State how the recordings begin: give each state's value, or leave the start unknown.")
-    starts = tuple(START_WORDS[r.begins] for r in recordings)
+    estimated = any(isinstance(f, WrongStart) and f.corrected for f in faults)
+    starts = tuple(START_WORDS[r.begins] + ", here estimated" * estimated for r in recordings)
     return replace(found, blind_spots=(*spots, *found.blind_spots), next_record=" ".join(advice), starts=starts)
 
 

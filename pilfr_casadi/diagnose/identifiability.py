@@ -374,7 +374,7 @@ def assess_laws(
         seen = {type(law) for law, _ in task.pairs}
         for law in (law for law in wanted if law not in seen):
             jumps = np.ptp(task.local.z) > 0 and not np.any(task.local.dz)
-            still = "its coordinate has no rate, as an input that is held" if jumps else "its signals do not change"
+            still = "its coordinate jumps and has no rate, like a held input" if jumps else "its signals do not change"
             why = law().why_not(task.local) or still
             rows.append(LawRow(task.port.name, law.id, "no data", why=why))
     return tuple(rows), _group_responses(responses)

@@ -67,9 +67,11 @@ def find_wrong_start(now: Checked) -> Checked:
         return now
     zeroed = [r.with_(y=r.y + miss) for r, miss in zip(bench.recordings, misses, strict=True)]
     rival = refit(bench.on(zeroed), [now.fitted.values, {}], states=now.fitted.begin)
-    found = accept(now, after, fault)
-    if rival is None or rival.cost >= EQUAL_RATIO * found.cost:
-        return found
+    if rival is None or rival.cost > EQUAL_RATIO * after.cost:
+        return accept(now, after, fault)
+    if EQUAL_RATIO * rival.cost > after.cost:
+        words = f"{words}; a wrong zero of the sensor explains that as well"
+        return accept(now, after, replace(fault, sentence=words))
     words = "a wrong zero of the sensor explains that better than another start. If the machine did begin elsewhere"
     words = f"As stated, {missed}; {words}, give each state's value, or leave the start unknown."
     return now.then(bench, now.fitted, replace(fault, sentence=words, corrected=False, change=None))

@@ -422,7 +422,7 @@ class Diagnosis:
                 f"{'it has' if one else 'they have'} too little room. The ± of the other values do not include that."
             )
         out += self._doubtful_offsets()
-        test, train = self.errors["test"], self.errors["train"]
+        train, test = self.errors["train"], None if self.test_fault else self.errors["test"]
         if train and train["before"] > NEAR_CONSTANT and self.verdict in ("missing-physics", "unexplained"):
             out.append(
                 f"Refitted, the simulator alone is hardly better than a constant (error {train['before']:.2g} of the "

@@ -60,6 +60,10 @@ def sentence(caught):
         "# " + GOOD,
         "Recorder 7, serial 12\nforce and travel;2024\n\n" + GOOD,
         GOOD.replace("x2\n", "x2\n[s],[N],[mm]\n"),
+        "# " + GOOD.replace("x2\n", "x2\n# s,counts,-\n"),
+        GOOD.replace("force,x2", "force [N],x2 [mm]").replace("[mm]\n", "[mm]\ns,N,mm\n"),
+        "#\tt\tforce\tx2\n" + "\n".join(f"{i},{line}" for i, line in enumerate(GOOD.split()[1:])).replace(",", "\t"),
+        "time,2024\n" + GOOD,
         GOOD.replace("0,1,10", "2024-05-01 23:59:59.9,1,10")
         .replace("0.1,", "2024-05-02,")
         .replace("0.2,", "2024-05-02 00:00:00.1,")
@@ -88,6 +92,19 @@ def test_columns_are_mapped(write):
     assert np.array_equal(r.u, MATRIX[:, 1:2])
     both = read_csv(path, ["a", "b"], "x2", columns={"a": "u_vir_V", "b": "u_vir_V", "time": "clock"})
     assert np.array_equal(both.u[:, 0], both.u[:, 1])
+
+
+def test_a_name_may_begin_with_a_mark(write):
+    path = write(GOOD.replace("t,force", "#t,% open"))
+    assert read_csv(path, "% open", "x2", columns={"t": "#t"}).dt == 0.1
+    first = write(GOOD.replace("t,force", "# turns,t").replace("\n0,1,", "\n1,0,"))
+    assert read_csv(first, "# turns", "x2", columns={"t": "t"}, time_tolerance=9).inputs == ("# turns",)
+
+
+def test_names_and_times_are_found_below_a_title(write):
+    path = write("Recorder 7, serial 12\n" + GOOD.replace("t,force", "time,force").replace("\n0", "\n10"))
+    assert column_names(path) == ("time", "force", "x2")
+    assert written_times(path, wanted=["force"]) == written_times(path) == ["10", "10.1", "10.2", "10.3"]
 
 
 def test_a_row_of_units_states_the_units(write):
@@ -173,7 +190,8 @@ BAD_FILES = {
     "decimal comma": (GOOD.replace(",", ";").replace("0.2;3", "0.2;3,5"), "line 4 reads '3,5'.* with a point"),
     "decimal commas between commas": ("t,force,x2\n0,1,5,10\n0,1,2,20\n", "line 2 has 4 cell.*with points"),
     "units in milliseconds": (GOOD.replace("x2\n", "x2\nms,N,m\n"), r"'t \[ms\]' is named as time in ms"),
-    "row of words": (GOOD.replace("x2\n", "x2\ns,newtons,m\n"), "column 'force', line 2 reads 'newtons'"),
+    "row of words": (GOOD.replace("x2\n", "x2\nfirst,second,third\n"), "column 'force', line 2 reads 'second'"),
+    "title, then a misspelt name": ("Recorder 7\n" + GOOD.replace("x2", "x3"), "no column 'x2'; it has t, force, x3"),
     "dates, then seconds": ("t,force,x2\n2024-05-01 10:00:00,1,2\n0.1,1,2\n", "line 3 reads '0.1', but .* begins"),
     "dates with and without zone": (
         "t,force,x2\n2024-05-01T10:00:00Z,1,2\n2024-05-01T10:00:01,1,2\n",
@@ -181,7 +199,7 @@ BAD_FILES = {
     ),
     "date in an output": (GOOD.replace("0.2,3,30", "0.2,3,2024-05-01"), "line 4 reads '2024-05-01'"),
     "dates in a short row": ("t,force,x2\n2024-05-01,1\n", "line 2 has 2 cell.* names 3"),
-    "pause": (GOOD + "9.0,1,1\n9.1,1,1\n", "line 6 comes 8.7 s after.*cut the record there into two"),
+    "pause": (GOOD + "9.0,1,1\n9.1,1,1\n", "line 6 comes 8.7 s after.*cut the record at such gaps"),
     "gap": (GOOD.replace("0.2,3,", "0.2,,"), "column 'force', line 4 is empty"),
     "nan": (GOOD.replace("30", "NaN"), "column 'x2', line 4 is NaN"),
     "inf": (GOOD.replace("30", "-inf"), "column 'x2', line 4 is -inf"),

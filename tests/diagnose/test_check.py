@@ -272,7 +272,7 @@ def test_a_law_of_the_rate_needs_more_than_a_held_input():
     for hold in ("zero", "linear"):
         found = check(simulator, given.with_(hold=hold), laws=[CubicStiffness, CubicDamping])
         why = {r.law: r.why for r in found.laws if r.port == "coil"}
-        assert ("its coordinate has no rate" in why["cubic_damping"]) is (hold == "zero")
+        assert ("its coordinate jumps and has no rate" in why["cubic_damping"]) is (hold == "zero")
 
 
 def test_a_refit_that_ends_at_a_bound_is_marked():
@@ -369,7 +369,7 @@ def test_wrong_input_gets_a_sentence():
 def test_a_stated_start_that_the_first_sample_contradicts_is_told():
     given = record(MASS, noise_like(1), begin=[0.3, 0.0])
     found = check(MASS, given)
-    assert found.blind_spots[0].names == ("initial state",) and found.starts == ("at zero",)
+    assert found.blind_spots[0].names == ("initial state",) and found.starts == ("at zero, here estimated",)
     assert "would begin at 0, but its first sample is 0.3" in str(found)
     assert found.next_record.startswith("State how the recordings begin")
 
