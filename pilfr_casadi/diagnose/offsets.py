@@ -67,14 +67,21 @@ def find_wrong_start(now: Checked) -> Checked:
         return now
     zeroed = [r.with_(y=r.y + miss) for r, miss in zip(bench.recordings, misses, strict=True)]
     rival = refit(bench.on(zeroed), [now.fitted.values, {}], states=now.fitted.begin)
-    if rival is None or rival.cost > EQUAL_RATIO * after.cost:
+    left = np.inf if rival is None else rival.cost - _constant_part(bench, rival, np.any(misses, axis=0))
+    if left > EQUAL_RATIO * after.cost:
         return accept(now, after, fault)
-    if EQUAL_RATIO * rival.cost > after.cost:
+    if EQUAL_RATIO * left > after.cost:
         words = f"{words}; a wrong zero of the sensor explains that as well"
         return accept(now, after, replace(fault, sentence=words))
     words = "a wrong zero of the sensor explains that better than another start. If the machine did begin elsewhere"
     words = f"As stated, {missed}; {words}, give each state's value, or leave the start unknown."
     return now.then(bench, now.fitted, replace(fault, sentence=words, corrected=False, change=None))
+
+
+def _constant_part(bench: Workbench, fitted: Fitted, outputs: np.ndarray) -> float:
+    """Compute the mean square of the constants in the residual of some outputs; one noisy sample has set their zero."""
+    constants = np.mean(np.concatenate(bench.scored(fitted.residual)), axis=0) / bench.scale
+    return float(np.mean(np.where(outputs, constants, 0.0) ** 2))
 
 
 def _missed_starts(now: Checked) -> list[np.ndarray]:
