@@ -11,6 +11,7 @@ import csv
 import gc
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -243,10 +244,7 @@ def _open_csv(path: Path, wanted: Sequence[str]) -> CsvTable:
     written = [i for i, line in enumerate(lines) if line.strip()]
     if not written:
         raise InputError(f"{path} is empty; give a CSV file with a header row and one row for each sample.")
-    headers = [(i, *_split_header(lines[i], wanted, f"{path}: line {i + 1}")) for i in written[:LONGEST_TITLE]]
-    known = [_count_known(names, wanted) for _, _, names in headers]
-    best = max(range(len(headers)), key=lambda k: (known[k], known[k] and len(headers[k][2]), -k))
-    top, delimiter, names = headers[best]
+    top, delimiter, names = _find_header(path, lines, written[:LONGEST_TITLE], wanted)
     if all(_number(name) is not None for name in names):
         raise InputError(
             f"{path} has no header row: line {top + 1} reads {lines[top].strip()[:60]!r}; name the columns there."
@@ -258,6 +256,28 @@ def _open_csv(path: Path, wanted: Sequence[str]) -> CsvTable:
     if not rows:
         raise InputError(f"{path} has a header but no data below it; give one row for each sample.")
     return CsvTable(path, names, delimiter, lines[top + 1 :], top + 2)
+
+
+def _find_header(
+    path: Path, lines: Sequence[str], written: Sequence[int], wanted: Sequence[str]
+) -> tuple[int, str, tuple[str, ...]]:
+    """Return the number of the header's line, its delimiter, and the names."""
+    best, rank = None, (0, 0)
+    for i in written:
+        try:
+            delimiter, names = _split_header(lines[i], wanted, f"{path}: line {i + 1}")
+        except InputError:
+            if best is None:
+                raise
+            break  # among the data
+        known = _count_known(names, wanted)
+        if best is None or (known and (known, len(names)) > rank):
+            best, rank = (i, delimiter, names), (known, len(names))
+        complete = wanted and rank[0] > len({*wanted})
+        if complete or (rank[0] and all(_number(name) is not None for name in names)):
+            break
+    assert best is not None
+    return best
 
 
 def _split_header(line: str, wanted: Sequence[str], place: str) -> tuple[str, tuple[str, ...]]:
@@ -275,13 +295,19 @@ def _without_mark(names: tuple[str, ...], wanted: Sequence[str]) -> tuple[str, .
 
 def _count_known(names: Sequence[str], wanted: Sequence[str]) -> int:
     """Count the `wanted` columns among the names, and a time column."""
-    return sum(find_column(name, names) in names for name in wanted) + any(map(is_time, names))
+    bare = Counter(
+        parts.group(1) for name in names if name.endswith(("]", ")")) and (parts := WITH_UNIT.fullmatch(name))
+    )
+    there = {*names} | {name for name, count in bare.items() if count == 1}
+    return len({*wanted} & there) + any(map(is_time, names))
 
 
 def find_column(column: str, names: Sequence[str]) -> str:
     """Return a file's name of a column, which may have a unit in brackets; `column` itself if there is none."""
+    if column in names:
+        return column
     found = [name for name in names if (parts := WITH_UNIT.fullmatch(name)) and parts.group(1) == column]
-    return found[0] if column not in names and len(found) == 1 else column
+    return found[0] if len(found) == 1 else column
 
 
 def is_time(column: str) -> bool:
@@ -294,12 +320,25 @@ def is_time(column: str) -> bool:
 
 
 def _read_units(cells: Sequence[str], names: Sequence[str]) -> list[str] | None:
-    """Return the units of a row of units below the names, empty for a column without; None if it is no such row."""
-    units = [cell.lstrip("# ").strip("[]() ") for cell in cells]
-    words = all(_number(unit) is None for unit in units) and len(units) == len(names)
-    if not (words and any(dimension(unit) is not None for unit in units)):
+    """Return the units of a row of units below the names, empty for a column without; None if it is no such row.
+
+    Most of its words are known units, and none is a number or a date.
+    """
+    first, *others = cells
+    units = [cell.strip("[]() ") for cell in (re.sub(r"^[#%]\s*(?=\S)", "", first), *others)]
+    words = [unit for unit in units if unit not in ("", "-")]
+    if len(units) != len(names) or any(_number(word) is not None or _date(word) for word in words):
         return None
-    return ["" if unit == "-" or WITH_UNIT.fullmatch(name) else unit for unit, name in zip(units, names, strict=True)]
+    if 2 * sum(dimension(word) is not None for word in words) <= len(words):
+        return None
+    return ["" if unit == "-" or _states_unit(name) else unit for unit, name in zip(units, names, strict=True)]
+
+
+def _states_unit(name: str) -> bool:
+    """Tell whether a name ends with a known unit in brackets, rather than with a number or a word."""
+    parts = WITH_UNIT.fullmatch(name)
+    unit = (parts.group(2) or parts.group(3) or "") if parts else ""
+    return _number(unit) is None and dimension(unit) is not None
 
 
 def _open_mat(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:
@@ -474,6 +513,8 @@ def _text(path: Path) -> str:
 
 
 def _cells(line: str, delimiter: str, place: str) -> tuple[str, ...]:
+    if delimiter not in line and '"' not in line:
+        return (line.strip(),)
     try:
         return tuple(cell.strip() for cell in next(csv.reader([line], delimiter=delimiter)))
     except csv.Error as error:

@@ -171,15 +171,26 @@ def _test_faults(bench: Workbench, after: Fitted, tests: Sequence[Recording], ga
     With the channel corrected it has to follow about as well as it does the training recordings. Otherwise physics that
     only the test shows may as well be the reason.
     """
-    for r, now in zip(tests, edited(tests, gates), strict=True):
+    for i, (r, now) in enumerate(zip(tests, edited(tests, gates), strict=True), 1):
+        if not np.ptp(now.y, axis=0).all():
+            continue
         slips = find_gross_slips(replace(bench.renewed([now]), simulator=after.corrected()))
         if not slips or slips[0].left ** 0.5 > FAR_RATIO * bench.nrmse(after):
             continue
-        name = f"recording {r.name}" if len(tests) > 1 and r.name else "recordings"
+        name = f"recording {r.name or i}" if len(tests) > 1 else "recording"
         place = f"In the test {name}, unlike the training recordings, "
         equal = [g for g in slips if g.left <= EQUAL_RATIO * slips[0].left]
         words = ", or ".join(g.sentence.removeprefix(IN_RECORDINGS) for g in equal)
-        yield Gate(slips[0].channel, TEST_FAULT, slips[0].value, f"{place}{words}. Correct that.", False)
+        advice = "It does not tell which: check both." if len(equal) > 1 else "Correct that."
+        yield Gate(slips[0].channel, TEST_FAULT, slips[0].value, f"{place}{words}. {advice}", False)
+
+
+def _is_curve_along(bench: Workbench, fitted: Fitted, number: int) -> bool:
+    """Tell whether the force of an element is a curve of its coordinate along the runs."""
+    if not np.isfinite(fitted.cost):
+        return False
+    z, _, w = signals_along(bench, fitted, number)
+    return is_curve(z, w)
 
 
 def _surrogate_note(error: float) -> tuple[Gate, ...]:
@@ -297,8 +308,7 @@ def _make_effect(
             shown[label] = {"value": float(v), "std": error if np.isfinite(error) else None, "unit": unit}
             shown[label]["at_limit"] = bool(v and at_bound[i])
     remarks = [law.remark(element.own(fitted.values)), *_order(fitted, element)]
-    z, _, w = signals_along(bench, final.drawn[1], fitted.simulator.elements.index(element))
-    if law.turns and is_curve(z, w):
+    if law.turns and _is_curve_along(bench, final.drawn[1], fitted.simulator.elements.index(element)):
         remarks.append("these recordings do not show its memory: a curve follows them as well")
     return Effect(
         port=element.port,

@@ -100,8 +100,9 @@ def _pool_unequal(squares: tuple[float, ...], noises2: tuple[float, ...]) -> tup
     balances = variances / np.exp(np.mean(np.log(variances), axis=1, keepdims=True))
     pooled = np.mean(squares / balances, axis=1)
     k, mean = int(np.argmin(pooled)), float(np.mean(squares))
-    balances.flags.writeable = False  # all callers share it
-    return (float(pooled[k]), balances[k]) if pooled[k] < mean else (mean, np.ones(len(squares)))
+    balance = balances[k].copy() if pooled[k] < mean else np.ones(len(squares))
+    balance.flags.writeable = False  # all callers share it
+    return min(float(pooled[k]), mean), balance
 
 
 def noise_floor(recordings: Sequence[Recording], residuals: Sequence[np.ndarray]) -> Floor:

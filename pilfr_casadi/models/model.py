@@ -128,7 +128,7 @@ class Model:
         if given.size not in (len(self.states), self.n_state):
             expected = " or ".join(map(str, dict.fromkeys((len(self.states), self.n_state))))
             numbers = "1 number" if given.size == 1 else f"{given.size} numbers"
-            order = f", in the order {listed(self.states)}" if self.states else ""
+            order = f"; the states are {listed(self.states)}" if self.states else ""
             raise InputError(f"An initial state of {numbers} was given; expected {expected}{order}.")
         return self.rest_at(given, recording.u[0], self.parameters.start)
 

@@ -60,7 +60,7 @@ def sentence(caught):
         "# " + GOOD,
         "Recorder 7, serial 12\nforce and travel;2024\n\n" + GOOD,
         GOOD.replace("x2\n", "x2\n[s],[N],[mm]\n"),
-        "# " + GOOD.replace("x2\n", "x2\n# s,counts,-\n"),
+        "% " + GOOD.replace("x2\n", "x2\n% s,N,counts\n"),
         GOOD.replace("force,x2", "force [N],x2 [mm]").replace("[mm]\n", "[mm]\ns,N,mm\n"),
         "#\tt\tforce\tx2\n" + "\n".join(f"{i},{line}" for i, line in enumerate(GOOD.split()[1:])).replace(",", "\t"),
         "time,2024\n" + GOOD,
@@ -92,6 +92,21 @@ def test_columns_are_mapped(write):
     assert np.array_equal(r.u, MATRIX[:, 1:2])
     both = read_csv(path, ["a", "b"], "x2", columns={"a": "u_vir_V", "b": "u_vir_V", "time": "clock"})
     assert np.array_equal(both.u[:, 0], both.u[:, 1])
+
+
+def test_many_columns_are_found_at_once(write):
+    names = [f"c{i}" for i in range(5000)]
+    rows = [",".join(f"{k + i / 7:.12f}" for i in range(5000)) + f",{k}" for k in range(20)]
+    path = write("\n".join([",".join(names) + ",t", *rows]))
+    start = time.perf_counter()
+    r = read_csv(path, names[:100], names[100:400])
+    assert (r.n_u, r.n_y, r.dt) == (100, 300, 1.0) and time.perf_counter() - start < 5
+    assert len(column_names(path)) == 5001
+
+
+def test_words_in_brackets_are_no_units(write):
+    r = read_csv(write(GOOD.replace("x2\n", "x (left)\ns,N,mm\n")), "force", "x (left)")
+    assert r.units == {"force": "N", "x (left)": "mm"}
 
 
 def test_a_name_may_begin_with_a_mark(write):
@@ -190,6 +205,7 @@ BAD_FILES = {
     "decimal comma": (GOOD.replace(",", ";").replace("0.2;3", "0.2;3,5"), "line 4 reads '3,5'.* with a point"),
     "decimal commas between commas": ("t,force,x2\n0,1,5,10\n0,1,2,20\n", "line 2 has 4 cell.*with points"),
     "units in milliseconds": (GOOD.replace("x2\n", "x2\nms,N,m\n"), r"'t \[ms\]' is named as time in ms"),
+    "second row of names": (GOOD.replace("x2\n", "x2\ntime,in,out\n"), "column 'force', line 2 reads 'in'"),
     "row of words": (GOOD.replace("x2\n", "x2\nfirst,second,third\n"), "column 'force', line 2 reads 'second'"),
     "title, then a misspelt name": ("Recorder 7\n" + GOOD.replace("x2", "x3"), "no column 'x2'; it has t, force, x3"),
     "dates, then seconds": ("t,force,x2\n2024-05-01 10:00:00,1,2\n0.1,1,2\n", "line 3 reads '0.1', but .* begins"),

@@ -136,6 +136,22 @@ def test_a_start_and_a_zero_that_fit_as_well_are_both_told():
     assert "a wrong zero of the sensor explains that as well" in fault.sentence
 
 
+def test_a_start_is_not_blamed_on_a_zero_where_another_sensor_is_noisy():
+    lags = Simulator(
+        lambda x, u, p: {"y": p.k * u.u - x.y, "z": u.u - 0.2 * x.z},
+        lambda x: {"y": x.y, "z": x.z},
+        ("y", "z"),
+        ("u",),
+        parameters={"k": Parameter(1.0, bounds=(0.1, 10))},
+    )
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.standard_normal(40), 10)[:, None]
+    blank = Recording(u, np.zeros((400, 2)), 0.05, ("u",), ("y", "z"), initial=[0.0, 0.5], hold="zero")
+    y = lags.simulate(blank) + rng.standard_normal((400, 2)) * [1e-3, 0.05]
+    gates = prepare(lags, [blank.with_(y=y, initial="zero")], "zero", "vm").gates
+    assert [(g.finding, g.corrected) for g in gates] == [("start", True)], [g.sentence for g in gates]
+
+
 def unsaid_tanks():
     return Workbench.of(tanks(1.15), [of_tanks(recorded()[1]).with_(hold=None)], "linear")
 
