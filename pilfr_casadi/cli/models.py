@@ -373,7 +373,8 @@ def _recording_table(
     options: SimulateOptions, recording: Recording, y: np.ndarray, outputs: Sequence[str], columns: dict[str, str]
 ) -> str:
     """Write the times as in the file, the inputs, and the simulated outputs as CSV."""
-    written = None if options.resample else written_times(options.data, columns)
+    wanted = [columns.get(name, name) for name in (*recording.inputs, *recording.outputs)]
+    written = None if options.resample else written_times(options.data, columns, wanted)
     times = written or map(_time_text, recording.t)
     rows = np.column_stack([recording.u, y]).tolist()
     lines = [[t.strip(), *row] for t, row in zip(times, rows, strict=True)]

@@ -1,8 +1,8 @@
 """Read recordings from CSV, ``.mat``, ``.npz``, Parquet and MDF files, and from frames of pandas or polars.
 
-A file holds one recording: a time column (``t``, ``t_s``, ``time`` or ``time [s]``, in seconds, uniform) and one column
-for each input and output by name, with or without its unit in brackets; other columns are ignored. One sentence reports
-a fault of a file; it names the file, the column and the line.
+A file holds one recording: a time column (``t``, ``t_s``, ``time`` or ``time [s]``, uniform, in seconds; in a CSV file
+or a frame also dates) and one column for each input and output by name, with or without its unit in brackets; other
+columns are ignored. One sentence reports a fault of a file; it names the file, the column and the line.
 """
 
 import re
@@ -14,20 +14,18 @@ from typing import Any, overload
 import numpy as np
 
 from .._base import InputError, listed, positive
-from .preprocessing import even_grid
+from .preprocessing import LONGEST_GAP, even_grid
 from .recording import Recording, as_tuple
-from .tables import ArrayTable, CsvTable, frame_table, open_table
+from .tables import TIME_NAMES, WITH_UNIT, ArrayTable, CsvTable, find_column, frame_table, is_time, open_table
 
 PathLike = str | Path
 Names = Sequence[str] | str
 
-TIME_NAMES = ("t", "t_s", "time")
 TOLERANCE = 1e-4  # allowed deviation of a sample from the grid, in steps; recorders' clocks drift less in a record
 AGREEMENT = 1e-3  # allowed relative difference of a stated step from the times; a wrong unit differs by far more
 _UNITS = r"ns|us|µs|μs|ms|min|h|d|nanoseconds?|microseconds?|milliseconds?|minutes?|hours?|days?"
-_WITH_UNIT = re.compile(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")  # such as "force [N]" or "speed (rad/s)"
-_IN_SECONDS = re.compile(r"(?:t|time)\s*[\[(]\s*(?:s|sec|secs|seconds?)\s*[\])]", re.IGNORECASE)
 _OTHER_UNIT = re.compile(rf"(?:t|time)[\s_\-\[(]+({_UNITS})[\])]?", re.IGNORECASE)
+_IN_OTHER_UNIT = re.compile(rf".*[\[(]\s*({_UNITS})\s*[\])]", re.IGNORECASE)  # of a column that is chosen as the time
 
 
 @overload
@@ -46,6 +44,9 @@ def read_csv(
     **recording_options: Any,
 ) -> Recording | tuple[Recording, ...]:
     """Read recordings from CSV files with a header row.
+
+    Lines of a title may stand above the header, and a row of units below it. Times may be dates such as
+    ``2024-05-01T10:00:00.25``; they become seconds after the first one.
 
     Parameters
     ----------
@@ -155,15 +156,20 @@ def column_names(path: PathLike, wanted: Sequence[str] = ()) -> tuple[str, ...]:
     A column with a unit behind a wanted name, such as ``force [N]``, is returned by the wanted name.
     """
     names = open_table(Path(path), wanted).names
-    short = {_find_column(name, names): name for name in wanted}
+    short = {find_column(name, names): name for name in wanted}
     return tuple(short.get(name, name) for name in names)
 
 
-def written_times(path: PathLike, columns: Mapping[str, str] | None = None) -> list[str] | None:
-    """Return the times of a file as text, all digits included; None if it has no time column."""
+def written_times(
+    path: PathLike, columns: Mapping[str, str] | None = None, wanted: Sequence[str] = ()
+) -> list[str] | None:
+    """Return the times of a file as text, all digits included; None if it has no time column.
+
+    The other `wanted` columns help to find the header of a CSV file.
+    """
     columns = columns or {}
     chosen = next((columns[name] for name in TIME_NAMES if name in columns), None)
-    table = open_table(Path(path), [chosen or "t"])
+    table = open_table(Path(path), [*wanted, chosen] if chosen else wanted)
     time = _find_time_column(table.names, chosen, str(path))
     return table.texts(time) if time else None
 
@@ -220,11 +226,16 @@ class _Request:
         """The columns of the inputs and outputs."""
         return [self.column(name) for name in (*self.inputs, *self.outputs)]
 
+    @property
+    def sought(self) -> list[str]:
+        """These columns, and that of the time if it has another name."""
+        return [*self.wanted, *(column for name, column in self.columns.items() if name in TIME_NAMES)]
+
     def locate(self, names: Sequence[str], source: str) -> tuple[str | None, list[str]]:
         """Return the time column, or None, and the columns of the inputs and outputs."""
         mapped = [column for name, column in self.columns.items() if name in TIME_NAMES]
         time = _find_time_column(names, mapped[0] if mapped else None, source)
-        wanted = [_find_column(column, names) for column in self.wanted]
+        wanted = [find_column(column, names) for column in self.wanted]
         both = sorted({*map(self.column, self.inputs)} & {*map(self.column, self.outputs)})
         if both:
             raise InputError(
@@ -259,7 +270,7 @@ class _Request:
     def recording(self, table: CsvTable | ArrayTable) -> Recording:
         """Make the recording from the columns of a file."""
         time, wanted = self.locate(table.names, str(table.path))
-        parts = table.columns([*wanted, time] if time else wanted)
+        parts = table.columns(wanted, time)
         if self.new_step is not None:
             assert time is not None
             t = parts.pop()[:, 0]
@@ -283,15 +294,9 @@ class _Request:
             raise InputError(f"{table.path}: {error}") from None
 
 
-def _find_column(column: str, names: Sequence[str]) -> str:
-    """Return a file's name of a column, which may have a unit in brackets; `column` itself if there is none."""
-    found = [name for name in names if (parts := _WITH_UNIT.fullmatch(name)) and parts.group(1) == column]
-    return found[0] if column not in names and len(found) == 1 else column
-
-
 def _read_unit(column: str) -> str:
     """Return the unit in brackets behind the name of a column; empty if there is none."""
-    parts = _WITH_UNIT.fullmatch(column)
+    parts = WITH_UNIT.fullmatch(column)
     return (parts.group(2) or parts.group(3) or "").strip() if parts else ""
 
 
@@ -307,26 +312,17 @@ def _read_each(
 ) -> Recording | tuple[Recording, ...]:
     """Read one file, or several into a tuple; a `suffix` overrides that of the files."""
     if isinstance(path, PathLike):
-        return request.recording(open_table(Path(path), request.wanted, suffix))
+        return request.recording(open_table(Path(path), request.sought, suffix))
     paths = tuple(path) if isinstance(path, Iterable) else (path,)
     if not all(isinstance(p, PathLike) for p in paths):
         raise InputError(f"the file {path!r} was given; give its path as text, or a list of paths.")
-    return tuple(request.recording(open_table(Path(p), request.wanted, suffix)) for p in paths)
+    return tuple(request.recording(open_table(Path(p), request.sought, suffix)) for p in paths)
 
 
 def _channel_names(names: Sequence[str], parts: Sequence[np.ndarray]) -> tuple[str, ...]:
     """Number the channels of a matrix: `u1, u2` for `u`."""
     pairs = zip(names, parts, strict=True)
     return tuple(f"{n}{i + 1}" if p.shape[1] > 1 else n for n, p in pairs for i in range(p.shape[1]))
-
-
-def is_time(column: str) -> bool:
-    """Tell whether a column holds the time in seconds by its name, which may have the unit in brackets.
-
-    >>> is_time("t"), is_time("Time [s]"), is_time("time (ms)"), is_time("T")
-    (True, True, False, False)
-    """
-    return column in TIME_NAMES or bool(_IN_SECONDS.fullmatch(column.strip()))
 
 
 def _find_time_column(names: Sequence[str], chosen: str | None, source: str) -> str | None:
@@ -338,16 +334,18 @@ def _find_time_column(names: Sequence[str], chosen: str | None, source: str) -> 
         raise InputError(
             f"{source} has several time columns ({', '.join(found)}); choose one, as in columns={{'t': '{found[0]}'}}."
         )
+    found[0] = find_column(found[0], names)
     if found[0] not in names:
         raise InputError(f"{source} has no column {found[0]!r} for the time; its columns are {listed(names)}.")
     _refuse_other_unit(found, source)
+    _refuse_other_unit(found, source, _IN_OTHER_UNIT)
     return found[0]
 
 
-def _refuse_other_unit(names: Sequence[str], source: str) -> None:
+def _refuse_other_unit(names: Sequence[str], source: str, pattern: re.Pattern[str] = _OTHER_UNIT) -> None:
     """Refuse a name such as ``t_ms`` or ``Time [min]``, which states a unit other than seconds."""
     for name in names:
-        unit = _OTHER_UNIT.fullmatch(name.strip())
+        unit = pattern.fullmatch(name.strip())
         if unit:
             raise InputError(
                 f"{source}: column {name!r} is named as time in {unit.group(1)}, but time must be in seconds; "
@@ -388,7 +386,11 @@ def step_of(
         raise InputError(
             f"{column} is not uniform: {place(k)} comes {gaps[k - 1]:.6g} s after the sample before it where "
             f"{median:.6g} s is usual, and samples lie up to {deviation.max() / step:.2g} steps off a uniform grid; "
-            "resample with resample=STEP, or allow more with time_tolerance=STEPS."
+            + (
+                "cut the record at such gaps."
+                if gaps.max() > LONGEST_GAP * median
+                else "resample with resample=STEP, or allow more with time_tolerance=STEPS."
+            )
         )
     step = float(f"{step:.12g}")
     if dt is None:

@@ -1,8 +1,9 @@
 """Read named columns of numbers from CSV, MATLAB, NumPy, Parquet and MDF files; errors name the file, column and line.
 
 NumPy reads a CSV file at once; only if that fails, the file is read cell by cell to find the bad cell. Commas,
-semicolons and tabs separate cells; a byte-order mark, Windows line ends, quoted cells and blank lines are accepted.
-Lines are counted as in an editor: the header is line 1. Code in a ``.mat`` or ``.npz`` file is never run.
+semicolons and tabs separate cells; a byte-order mark, Windows line ends, quoted cells, blank lines, lines of a title
+above the header and a row of units below it are accepted. Lines are counted as in an editor. Code in a ``.mat`` or
+``.npz`` file is never run.
 """
 
 import contextlib
@@ -10,8 +11,10 @@ import csv
 import gc
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,11 +22,16 @@ from typing import Any
 import numpy as np
 
 from .._base import REPAIR, InputError, existing_file, read_bytes, usable
+from .units import dimension
 
 Array = np.ndarray
 
 CONTROL_CHARACTER = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
 DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
+TIME_NAMES = ("t", "t_s", "time")
+WITH_UNIT = re.compile(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")  # such as "force [N]" or "speed (rad/s)"
+_IN_SECONDS = re.compile(r"(?:t|time)\s*[\[(]\s*(?:s|sec|secs|seconds?)\s*[\])]", re.IGNORECASE)
+LONGEST_TITLE = 100  # lines above the header of a CSV file, at most
 KINDS = {
     "c": "complex numbers",
     "V": "a struct",
@@ -44,8 +52,12 @@ class CsvTable:
     lines: list[str]
     first_line: int
 
-    def columns(self, names: Sequence[str]) -> list[Array]:
-        """Return each named column as finite numbers, (M, 1)."""
+    def columns(self, names: Sequence[str], time: str | None = None) -> list[Array]:
+        """Return each named column as finite numbers, (M, 1); last the times, s, where dates count from the first."""
+        if time is not None:
+            if self._has_dates(time):
+                return [*self.columns(names), self._count_seconds(time)]
+            names = [*names, time]
         where = [self.names.index(name) for name in names]
         numbers = self._read_at_once(where)
         if numbers is None or not usable(numbers).all():
@@ -56,6 +68,25 @@ class CsvTable:
         """Return the cells of a column as they are written."""
         where = self.names.index(name)
         return [_cells(text, self.delimiter, str(self.path))[where] for text in self.lines if text.strip()]
+
+    def _has_dates(self, name: str) -> bool:
+        """Tell whether a column begins with a date."""
+        cells = _cells(next(text for text in self.lines if text.strip()), self.delimiter, str(self.path))
+        return len(cells) == len(self.names) and _date(cells[self.names.index(name)]) is not None
+
+    def _count_seconds(self, name: str) -> Array:
+        """Return a column of dates as seconds after the first one, (M, 1)."""
+        cells = self.texts(name)
+        dates = [_date(cell) for cell in cells]
+        first = dates[0]
+        assert first is not None
+        for row, date in enumerate(dates):
+            if date is None or (date.tzinfo is None) != (first.tzinfo is None):
+                raise InputError(
+                    f"{self.path}: column {name!r}, {self.place(row)} reads {cells[row][:40]!r}, but the column begins "
+                    f"with {cells[0]!r}; write all times in one way."
+                )
+        return np.array([[(date - first).total_seconds()] for date in dates if date is not None])
 
     def place(self, row: int) -> str:
         """Return the line of the data row `row`, counted from 0, in words."""
@@ -80,10 +111,17 @@ class CsvTable:
             if len(cells) != len(self.names):
                 raise InputError(
                     f"{self.path}: line {line} has {len(cells)} cell(s) but the header names {len(self.names)}; "
-                    f"give every line one cell for each column, separated by {DELIMITERS[self.delimiter]}s."
+                    f"{self._wrong_count(cells)}."
                 )
             rows.append([self._value(cells[i], self.names[i], line) for i in where])
         return np.array(rows)
+
+    def _wrong_count(self, cells: Sequence[str]) -> str:
+        """Advise what to do about a line with another number of cells than the header."""
+        advice = f"give every line one cell for each column, separated by {DELIMITERS[self.delimiter]}s"
+        if self.delimiter == "," and len(cells) > len(self.names) and all(map(str.isdigit, cells[1::2])):
+            advice += "; if its decimals are written with commas, write them with points"
+        return advice
 
     def _value(self, cell: str, column: str, line: int) -> float:
         place = f"{self.path}: column {column!r}, line {line}"
@@ -112,8 +150,12 @@ class ArrayTable:
     names: tuple[str, ...]
     arrays: Mapping[str, Any]
 
-    def columns(self, names: Sequence[str]) -> list[Array]:
-        """Return each named variable as finite numbers, (M, channels); a row vector becomes a column."""
+    def columns(self, names: Sequence[str], time: str | None = None) -> list[Array]:
+        """Return each named variable, and last the times, as finite numbers, (M, channels).
+
+        A row vector becomes a column.
+        """
+        names = [*names, time] if time is not None else names
         parts = [self._samples(name) for name in names]
         if len({len(part) for part in parts}) > 1:
             counts = ", ".join(f"{name} {len(part)}" for name, part in zip(names, parts, strict=True))
@@ -197,22 +239,106 @@ def open_table(path: Path, wanted: Sequence[str] = (), suffix: str = "") -> CsvT
 
 
 def _open_csv(path: Path, wanted: Sequence[str]) -> CsvTable:
-    """Read the header; choose the delimiter that yields most of the `wanted` columns."""
+    """Find the header: the line that names most of the `wanted` columns, or the first; read the names and units."""
     lines = _text(path).split("\n")
-    top = next((i for i, line in enumerate(lines) if line.strip()), None)
-    if top is None:
+    written = [i for i, line in enumerate(lines) if line.strip()]
+    if not written:
         raise InputError(f"{path} is empty; give a CSV file with a header row and one row for each sample.")
-    headers = {d: _cells(lines[top], d, f"{path}: line {top + 1}") for d in DELIMITERS}
-    delimiter = max(DELIMITERS, key=lambda d: (sum(n in headers[d] for n in wanted), len(headers[d]), d == ","))
-    names = headers[delimiter]
+    top, delimiter, names = _find_header(path, lines, written[:LONGEST_TITLE], wanted)
     if all(_number(name) is not None for name in names):
         raise InputError(
             f"{path} has no header row: line {top + 1} reads {lines[top].strip()[:60]!r}; name the columns there."
         )
-    below = lines[top + 1 :]
-    if not any(line.strip() for line in below):
+    rows = [i for i in written if i > top]
+    if rows and (units := _read_units(_cells(lines[rows[0]], delimiter, f"{path}: line {rows[0] + 1}"), names)):
+        names = tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True))
+        top = rows.pop(0)
+    if not rows:
         raise InputError(f"{path} has a header but no data below it; give one row for each sample.")
-    return CsvTable(path, names, delimiter, below, top + 2)
+    return CsvTable(path, names, delimiter, lines[top + 1 :], top + 2)
+
+
+def _find_header(
+    path: Path, lines: Sequence[str], written: Sequence[int], wanted: Sequence[str]
+) -> tuple[int, str, tuple[str, ...]]:
+    """Return the number of the header's line, its delimiter, and the names."""
+    best, rank = None, (0, 0)
+    for i in written:
+        try:
+            delimiter, names = _split_header(lines[i], wanted, f"{path}: line {i + 1}")
+        except InputError:
+            if best is None:
+                raise
+            break  # among the data
+        known = _count_known(names, wanted)
+        if best is None or (known and (known, len(names)) > rank):
+            best, rank = (i, delimiter, names), (known, len(names))
+        complete = wanted and rank[0] > len({*wanted})
+        if complete or (rank[0] and all(_number(name) is not None for name in names)):
+            break
+    assert best is not None
+    return best
+
+
+def _split_header(line: str, wanted: Sequence[str], place: str) -> tuple[str, tuple[str, ...]]:
+    """Return the delimiter that yields most of the `wanted` columns, and the names; a comment's mark is left out."""
+    names = {d: _without_mark(_cells(line, d, place), wanted) for d in DELIMITERS}
+    delimiter = max(DELIMITERS, key=lambda d: (_count_known(names[d], wanted), len(names[d]), d == ","))
+    return delimiter, names[delimiter]
+
+
+def _without_mark(names: tuple[str, ...], wanted: Sequence[str]) -> tuple[str, ...]:
+    """Leave out the mark of a comment before a known name, as in ``# t,force``."""
+    bare = names[0].lstrip("#%").lstrip()
+    return (bare, *names[1:]) if names[0] not in wanted and _count_known((bare,), wanted) else names
+
+
+def _count_known(names: Sequence[str], wanted: Sequence[str]) -> int:
+    """Count the `wanted` columns among the names, and a time column."""
+    bare = Counter(
+        parts.group(1) for name in names if name.endswith(("]", ")")) and (parts := WITH_UNIT.fullmatch(name))
+    )
+    there = {*names} | {name for name, count in bare.items() if count == 1}
+    return len({*wanted} & there) + any(map(is_time, names))
+
+
+def find_column(column: str, names: Sequence[str]) -> str:
+    """Return a file's name of a column, which may have a unit in brackets; `column` itself if there is none."""
+    if column in names:
+        return column
+    found = [name for name in names if (parts := WITH_UNIT.fullmatch(name)) and parts.group(1) == column]
+    return found[0] if len(found) == 1 else column
+
+
+def is_time(column: str) -> bool:
+    """Tell whether a column holds the time in seconds by its name, which may have the unit in brackets.
+
+    >>> is_time("t"), is_time("Time [s]"), is_time("time (ms)"), is_time("T")
+    (True, True, False, False)
+    """
+    return column in TIME_NAMES or bool(_IN_SECONDS.fullmatch(column.strip()))
+
+
+def _read_units(cells: Sequence[str], names: Sequence[str]) -> list[str] | None:
+    """Return the units of a row of units below the names, empty for a column without; None if it is no such row.
+
+    Most of its words are known units, and none is a number or a date.
+    """
+    first, *others = cells
+    units = [cell.strip("[]() ") for cell in (re.sub(r"^[#%]\s*(?=\S)", "", first), *others)]
+    words = [unit for unit in units if unit not in ("", "-")]
+    if len(units) != len(names) or any(_number(word) is not None or _date(word) for word in words):
+        return None
+    if 2 * sum(dimension(word) is not None for word in words) <= len(words):
+        return None
+    return ["" if unit == "-" or _states_unit(name) else unit for unit, name in zip(units, names, strict=True)]
+
+
+def _states_unit(name: str) -> bool:
+    """Tell whether a name ends with a known unit in brackets, rather than with a number or a word."""
+    parts = WITH_UNIT.fullmatch(name)
+    unit = (parts.group(2) or parts.group(3) or "") if parts else ""
+    return _number(unit) is None and dimension(unit) is not None
 
 
 def _open_mat(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:
@@ -387,10 +513,20 @@ def _text(path: Path) -> str:
 
 
 def _cells(line: str, delimiter: str, place: str) -> tuple[str, ...]:
+    if delimiter not in line and '"' not in line:
+        return (line.strip(),)
     try:
         return tuple(cell.strip() for cell in next(csv.reader([line], delimiter=delimiter)))
     except csv.Error as error:
         raise InputError(f"{place} is not a row of a CSV file ({error}); give one row for each sample.") from None
+
+
+def _date(cell: str) -> datetime | None:
+    """Return a date and time in the form of ISO 8601, such as 2024-05-01T10:00:00.25; None if it is none."""
+    try:
+        return datetime.fromisoformat(cell) if "-" in cell else None
+    except ValueError:
+        return None
 
 
 def _number(cell: str) -> float | None:

@@ -17,10 +17,12 @@ from ..laws import readable_unit, short_name
 from ..simulators import Placed, in_series, name_at, split_port
 from .arguments import Request
 from .blind_spots import BlindSpot, assess_recordings
+from .channel_faults import IN_RECORDINGS, find_gross_slips
 from .correction import Correction
 from .effect import Effect
-from .evidence import NEAR_RATIO, SURE, deviations
-from .gates import Gate, edited
+from .evidence import FAR_RATIO, NEAR_RATIO, SURE, deviations
+from .force_recovery import is_curve, signals_along
+from .gates import EQUAL_RATIO, TEST_FAULT, Gate, edited
 from .identifiability import port_units
 from .mismatch_map import mismatch
 from .offsets import Offset, remove_idle_offsets, update_offsets
@@ -82,7 +84,7 @@ def build_diagnosis(
     bench, without, after = final.bench, final.without, final.after
     std = deviations(bench, after)
     errors, fewer, compared, test_notes = _compute_errors(request, search, found, final, tests)
-    effects = tuple(_make_effect(search, e, after, std, fewer.get(e, np.nan)) for e in found.effects)
+    effects = tuple(_make_effect(search, e, final, std, fewer.get(e, np.nan)) for e in found.effects)
     floor = search.least_floor if found.verdict.kind == "unexplained" else search.floor
     floors = {"nrmse": floor, "white": search.least_floor}
     settled = found.verdict.kind in ("complete", "recording-fault") or (
@@ -152,13 +154,43 @@ def _compute_errors(
         fits = {"before": without, "after": after, **{f"without {i}": f for i, f in enumerate(each.values())}}
         compared = test_errors(bench, tests, found.gates, fits, bench.on(tests).model(request.simulator))
         on_tests = compared.errors
-        notes = (*_resting_notes(compared.find_resting()), *_edit_notes(compared))
+        notes = (*_edit_notes(compared), *_resting_notes(compared.find_resting()))
+        if not list(_edit_notes(compared)) and on_tests["after"] > FAR_RATIO * bench.nrmse(after):
+            notes = (*_test_faults(bench, after, tests, found.gates), *notes)
         fewer = {e: on_tests[f"without {i}"] for i, e in enumerate(each)}
         errors["test"] = {name: on_tests[name] for name in ("nominal", "before", "after")}
     if bench.simulator.observer is not None:
         free = edited(tests, found.gates) or bench.recordings
         errors["free_run"] = free_run_errors(bench, free, request.simulator, without, after)
     return errors, fewer, compared, notes
+
+
+def _test_faults(bench: Workbench, after: Fitted, tests: Sequence[Recording], gates: Sequence[Gate]) -> Iterator[Gate]:
+    """Note a wrong sign, a wrong unit or an exchange in a test recording, which the corrected simulator shows.
+
+    With the channel corrected it has to follow about as well as it does the training recordings. Otherwise physics that
+    only the test shows may as well be the reason.
+    """
+    for i, (r, now) in enumerate(zip(tests, edited(tests, gates), strict=True), 1):
+        if not np.ptp(now.y, axis=0).all():
+            continue
+        slips = find_gross_slips(replace(bench.renewed([now]), simulator=after.corrected()))
+        if not slips or slips[0].left ** 0.5 > FAR_RATIO * bench.nrmse(after):
+            continue
+        name = f"recording {r.name or i}" if len(tests) > 1 else "recording"
+        place = f"In the test {name}, unlike the training recordings, "
+        equal = [g for g in slips if g.left <= EQUAL_RATIO * slips[0].left]
+        words = ", or ".join(g.sentence.removeprefix(IN_RECORDINGS) for g in equal)
+        advice = "It does not tell which: check both." if len(equal) > 1 else "Correct that."
+        yield Gate(slips[0].channel, TEST_FAULT, slips[0].value, f"{place}{words}. {advice}", False)
+
+
+def _is_curve_along(bench: Workbench, fitted: Fitted, number: int) -> bool:
+    """Tell whether the force of an element is a curve of its coordinate along the runs."""
+    if not np.isfinite(fitted.cost):
+        return False
+    z, _, w = signals_along(bench, fitted, number)
+    return is_curve(z, w)
 
 
 def _surrogate_note(error: float) -> tuple[Gate, ...]:
@@ -254,9 +286,9 @@ def _without_each_effect(search: Search, found: Conclusion) -> dict[NamedEffect,
 
 
 def _make_effect(
-    search: Search, named: NamedEffect, fitted: Fitted, std: dict[str, np.ndarray], test_without: float
+    search: Search, named: NamedEffect, final: FinalFits, std: dict[str, np.ndarray], test_without: float
 ) -> Effect:
-    bench = search.bench
+    bench, fitted = search.bench, final.after
     element = next(e for e in fitted.simulator.elements if (e.port, e.law.id) == named.name)  # its form may differ
     law = element.law
     own, unrelated = placebo(bench, search.root.fitted, element.port, law)
@@ -276,7 +308,7 @@ def _make_effect(
             shown[label] = {"value": float(v), "std": error if np.isfinite(error) else None, "unit": unit}
             shown[label]["at_limit"] = bool(v and at_bound[i])
     remarks = [law.remark(element.own(fitted.values)), *_order(fitted, element)]
-    if any(search.hides_memory(t, named.element) for t in search.memo.values() if named.element in t.laws):
+    if law.turns and _is_curve_along(bench, final.drawn[1], fitted.simulator.elements.index(element)):
         remarks.append("these recordings do not show its memory: a curve follows them as well")
     return Effect(
         port=element.port,

@@ -26,6 +26,7 @@ from ..simulators import Simulator, as_simulator
 from .gates import Gate
 from .stretches import Stretches
 
+FEWEST_SHARED = 20  # equal samples in a row that cannot be chance, where the outputs move
 FEWEST_SAMPLES = 20  # samples in all training recordings together; fewer cannot determine a model
 
 
@@ -85,11 +86,54 @@ def match_tests(
     """Return the test recordings with the simulator's channels; refuse training data and other steps."""
     tests = tuple(match_channels(simulator, r) for r in as_recordings(test)) if test is not None else ()
     for t in tests:
-        if any(len(r) == len(t) and np.array_equal(r.u, t.u) and np.array_equal(r.y, t.y) for r in train):
-            raise InputError("A test recording equals a training recording; give data the fit has not seen.")
+        for r in train:
+            if (shared := _shared_samples(r, t)) == len(t):
+                raise InputError(
+                    "A test recording equals a training recording or a part of one; give data the fit has not seen."
+                )
+            if shared:
+                raise InputError(
+                    f"{shared} of the {len(t)} samples of a test recording are training data; cut them off."
+                )
         if abs(t.dt / train[0].dt - 1) > SAME_STEP:
             raise InputError(f"The test recording's step is {t.dt:g} s, the training's {train[0].dt:g} s; resample it.")
     return tests
+
+
+def _shared_samples(train: Recording, test: Recording) -> int:
+    """Count the samples with which a test recording repeats a part of a training recording, or its begin or end.
+
+    Parts in which the outputs hardly move tell nothing, and samples that are not scored may be shared.
+    """
+    one, other = (np.column_stack([r.y, r.u]) for r in (train, test))
+    moves = (np.diff(test.y, axis=0) != 0).any(axis=1)
+    if not moves.any():
+        return 0
+    (i, part), (j, again) = (_first_motion(rows, train.y.shape[1]) for rows in (one, other))
+    for shift in (*(_places(one, again) - j), *(i - _places(other, part))):  # of the test in the training recording
+        begin, rest = max(-shift, 0), one[max(shift, 0) :]
+        shared = min(len(rest), len(other) - begin)
+        seen = int(np.sum(moves[begin : begin + shared - 1]))
+        if (
+            seen >= min(FEWEST_SHARED, int(np.sum(moves)))
+            and begin + shared > test.skip
+            and np.array_equal(rest[:shared], other[begin : begin + shared])
+        ):
+            return shared
+    return 0
+
+
+def _first_motion(rows: np.ndarray, n_y: int) -> tuple[int, np.ndarray]:
+    """Return where the outputs, the first columns, begin to move, and the rows there that tell the place."""
+    first = int(np.argmax((np.diff(rows[:, :n_y], axis=0) != 0).any(axis=1)))
+    return first, rows[first : first + FEWEST_SHARED]
+
+
+def _places(rows: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Return the places at which rows (M, n) contain a part of other rows."""
+    count = max(len(rows) - len(part) + 1, 0)
+    same = [(rows[k : k + count] == row).all(axis=1) for k, row in enumerate(part)]
+    return np.flatnonzero(np.all(same, axis=0))
 
 
 def check_laws(laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:

@@ -167,13 +167,23 @@ class Check:
         return clean
 
     def __str__(self) -> str:
-        lines = ["Blind spots of these recordings:"] if self.blind_spots else ["No blind spot was found."]
+        lines = [*self._error_lines(), ""]
+        lines += ["Blind spots of these recordings:"] if self.blind_spots else ["No blind spot was found."]
         lines += [f"- {b.sentence}" for b in self.blind_spots]
         lines += ["", *self._parameter_lines(), "", *self._law_lines()]
         if groups := list(self._group_lines()):
             lines += ["", "Laws that look the same, one group a line:", *groups]
         lines += ["", *self._excitation_lines(), "", *self._circumstances(), f"next record: {self.next_record}"]
         return "\n".join([*lines, f"computed in {self.seconds:.1f} s"])
+
+    def _error_lines(self) -> Iterator[str]:
+        """State the error of the refitted simulator, and what follows if it is above the noise."""
+        floor = float(np.mean(list(self.noise["share"].values())))
+        times = self.error / max(floor, 1e-300)
+        yield f"refitted: error {100 * self.error:.3g} % of the outputs' deviation, {times:.2g} times the noise"
+        if times > ABOVE_NOISE:
+            yield "  Something is missing, or the noise is slow. Refitted values may stand in for missing physics;"
+            yield "  standard errors and detectable strengths count the noise alone."
 
     def _parameter_lines(self) -> Iterator[str]:
         if not self.parameters:
@@ -225,11 +235,6 @@ class Check:
         each = ((f"{name} {value:.2g}", port_name(SENSOR, name)) for name, value in self.noise["deviation"].items())
         noise = ", ".join(f"{text} {units.get(port, '')}".rstrip() for text, port in each)
         yield f"noise ({self.noise['source']}): {noise}"
-        floor = float(np.mean(list(self.noise["share"].values())))
-        times = self.error / max(floor, 1e-300)
-        yield f"refitted: error {100 * self.error:.3g} % of the outputs' deviation, {times:.2g} times the noise"
-        if times > ABOVE_NOISE:
-            yield "  Something is missing or the noise is slow: the strengths above count the noise alone."
         taken = HOLD_WORDS[self.hold_taken]
         unsaid = f"not stated, here taken as {taken}; say hold='zero' or hold='linear' if you know"
         yield f"inputs between samples: {taken if self.hold else unsaid}"
@@ -311,7 +316,8 @@ def check(
     advice = [f"Correct the recordings first: check wiring, sign and unit of {in_words(wired)}."] if wired else []
     if len(wired) < len(faults):
         advice.append("State how the recordings begin: give each state's value, or leave the start unknown.")
-    starts = tuple(START_WORDS[r.begins] for r in recordings)
+    estimated = any(isinstance(f, WrongStart) and f.corrected for f in faults)
+    starts = tuple(START_WORDS[r.begins] + ", here estimated" * estimated for r in recordings)
     return replace(found, blind_spots=(*spots, *found.blind_spots), next_record=" ".join(advice), starts=starts)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from itertools import combinations, compress
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,8 @@ UNITS: dict[float, tuple[str, ...]] = {
     9.80665: ("m/s^2", "N", "N m", "kg"),  # standard gravity
     3.6: ("m/s",),  # km/h
     1e5: ("Pa",),  # bar
-    4.4482216: ("N", "kg"),  # pounds
+    4.4482216: ("N",),  # pounds of force
+    2.2046226: ("kg",),  # pounds
     25.4: ("m", "m/s", "m/s^2"),  # inches to mm
     1 / 0.0254: ("m", "m/s", "m/s^2"),  # inches to m
     6894.757: ("Pa",),  # pounds per square inch
@@ -113,7 +114,7 @@ def open_bench(simulator: Any, recordings: Sequence[Recording], hold: str, engin
 
 
 def find_gross_slips(bench: Workbench, workers: int = 1) -> list[Gate]:
-    """Find wrong signs and units and exchanges that show at the user's values, without a fit.
+    """Find wrong signs and units and exchanges that show at the simulator's values, without a fit; best first.
 
     The run at these values has to be off by more than its own size, and with the channel corrected by less.
     """
@@ -124,7 +125,7 @@ def find_gross_slips(bench: Workbench, workers: int = 1) -> list[Gate]:
     slips = _possible_slips(given, given.fitted.residual, trust_values=True)
     left = np.array(side_by_side(partial(_run_corrected, given), slips, workers))
     near = (left < min(CURED_SHARE * before, 1.0)) & (CURED_SHARE * left <= np.min(left))
-    return list(compress(slips, near))
+    return [replace(slips[i], left=float(left[i])) for i in np.argsort(left, kind="stable") if near[i]]
 
 
 def _run_corrected(given: Checked, fault: Gate) -> float:

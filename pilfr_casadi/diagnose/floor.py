@@ -11,6 +11,7 @@ it on held-out data), the residual itself is the floor.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -84,16 +85,24 @@ def pool(squares: np.ndarray, noise2: np.ndarray | None) -> tuple[float, np.ndar
     as log likelihood, it is the determinant criterion (Bard 1974, Nonlinear Parameter Estimation, sec. 4-9) for
     variances of this form. For one output, equal noise, or unknown noise, it is the mean.
     """
-    plain = float(np.mean(squares)), np.ones(len(squares))
-    if noise2 is None or np.ptp(noise2) <= 0 or not 0 < plain[0] < HUGE2:
-        return plain
-    noise2 = np.maximum(noise2, SENSOR_RESOLUTION**2)
+    mean = float(np.mean(squares))
+    if noise2 is None or np.ptp(noise2) <= 0 or not 0 < mean < HUGE2:
+        return mean, np.ones(len(squares))
+    return _pool_unequal(tuple(squares.tolist()), tuple(noise2.tolist()))
+
+
+@functools.lru_cache(maxsize=1 << 14)  # each ranking of hypotheses pools the errors of all
+def _pool_unequal(squares: tuple[float, ...], noises2: tuple[float, ...]) -> tuple[float, np.ndarray]:
+    """Pool mean square errors of outputs with unequal noise."""
+    noise2 = np.maximum(noises2, SENSOR_RESOLUTION**2)
     common = np.append(0.0, np.geomspace(1e-3 * np.min(noise2), 1e3 * max(*noise2, *squares), MODEL_ERRORS))
     variances = noise2 + common[:, None]
     balances = variances / np.exp(np.mean(np.log(variances), axis=1, keepdims=True))
     pooled = np.mean(squares / balances, axis=1)
-    k = int(np.argmin(pooled))
-    return (float(pooled[k]), balances[k]) if pooled[k] < plain[0] else plain
+    k, mean = int(np.argmin(pooled)), float(np.mean(squares))
+    balance = balances[k].copy() if pooled[k] < mean else np.ones(len(squares))
+    balance.flags.writeable = False  # all callers share it
+    return min(float(pooled[k]), mean), balance
 
 
 def noise_floor(recordings: Sequence[Recording], residuals: Sequence[np.ndarray]) -> Floor:

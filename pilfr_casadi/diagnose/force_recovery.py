@@ -250,7 +250,9 @@ def is_curve(z: np.ndarray, w: np.ndarray) -> bool:
     z, w = z[finite], w[finite]
     if len(z) < 3 or np.ptp(z) == 0 or np.ptp(w) == 0:
         return True
-    cells = np.round(np.column_stack([z / np.ptp(z), w / np.ptp(w)]) / REPEATS).astype(np.int64)
+    cells = np.round(np.column_stack([(z - np.min(z)) / np.ptp(z), (w - np.min(w)) / np.ptp(w)]) / REPEATS).astype(
+        np.int64
+    )
     _, first = np.unique(cells, axis=0, return_index=True)
     any_order = np.random.default_rng(0).permutation(first)  # of samples at the same z
     order = any_order[np.argsort(z[any_order], kind="stable")]

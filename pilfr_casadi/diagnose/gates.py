@@ -43,6 +43,7 @@ EXCEPTION_SHARE = 0.02  # share of a mean square, or of the samples, up to which
 EQUAL_RATIO = 1.02  # ratio of errors that count as equal
 NEAR_NOISE_RATIO = 5.0  # rms error over the noise up to which nothing else is wrong
 MOST_ROUNDS = 8  # alternations of edit and refit at most
+TEST_FAULT = "test fault"  # the finding that a channel of the test recordings is wrong
 
 
 @dataclass(frozen=True)

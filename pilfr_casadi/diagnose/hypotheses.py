@@ -85,6 +85,8 @@ class Hypotheses:
     count: float = FEWEST  # samples of the best residual over its correlation time
     # mean square of the mismatch, all outputs alike, of which formulas may leave a share; by default the refit's error
     mismatch2: float | None = None
+    # the key and the value of `_least_tolerant`, and what must live as long as its identity is in the key
+    _least: tuple[tuple[float, ...], float, tuple[object, ...]] | None = None
 
     @cached_property
     def fits(self) -> Trials:
@@ -99,7 +101,15 @@ class Hypotheses:
     @property
     def samples(self) -> float:
         """Effective samples, shared by all hypotheses."""
-        return self.sample.effective(min(map(self._tolerant, self.memo.values())))
+        return self.sample.effective(self._least_tolerant())
+
+    def _least_tolerant(self) -> float:
+        """Compute the smallest `_tolerant` of all hypotheses; kept while these stay, because each evidence needs it."""
+        kept = (self.bench, *self.memo.values())
+        key = (self.tolerance, *map(id, kept))
+        if self._least is None or self._least[0] != key:
+            self._least = key, min(map(self._tolerant, self.memo.values())), kept
+        return self._least[1]
 
     @property
     def floor2(self) -> float:

@@ -373,7 +373,9 @@ def assess_laws(
             responses += [response] if response else []
         seen = {type(law) for law, _ in task.pairs}
         for law in (law for law in wanted if law not in seen):
-            why = law().why_not(task.local) or "its signals do not change"
+            jumps = np.ptp(task.local.z) > 0 and not np.any(task.local.dz)
+            still = "its coordinate jumps and has no rate, like a held input" if jumps else "its signals do not change"
+            why = law().why_not(task.local) or still
             rows.append(LawRow(task.port.name, law.id, "no data", why=why))
     return tuple(rows), _group_responses(responses)
 

@@ -16,7 +16,7 @@ from ..data import Recording
 from ..laws import Law
 from ..simulators import ACTUATOR, SENSOR, Simulator, kind_of, port_name, split_port
 from .evidence import FORMULA_ERROR
-from .floor import ABOVE_NOISE
+from .floor import ABOVE_NOISE, noise_floor
 from .gates import (
     CERTAIN_ERRORS,
     CURED_SHARE,
@@ -67,12 +67,24 @@ def find_wrong_start(now: Checked) -> Checked:
         return now
     zeroed = [r.with_(y=r.y + miss) for r, miss in zip(bench.recordings, misses, strict=True)]
     rival = refit(bench.on(zeroed), [now.fitted.values, {}], states=now.fitted.begin)
-    found = accept(now, after, fault)
-    if rival is None or rival.cost >= EQUAL_RATIO * found.cost:
-        return found
+    left = np.inf if rival is None else _error_at_own_zero(bench, rival, misses)
+    if left > EQUAL_RATIO * after.cost:
+        return accept(now, after, fault)
+    if EQUAL_RATIO * left > after.cost:
+        words = f"{words}; a wrong zero of the sensor explains that as well"
+        return accept(now, after, replace(fault, sentence=words))
     words = "a wrong zero of the sensor explains that better than another start. If the machine did begin elsewhere"
     words = f"As stated, {missed}; {words}, give each state's value, or leave the start unknown."
     return now.then(bench, now.fitted, replace(fault, sentence=words, corrected=False, change=None))
+
+
+def _error_at_own_zero(bench: Workbench, zeroed: Fitted, misses: Sequence[np.ndarray]) -> float:
+    """Compute the mean square error without the constants that are left where one noisy sample has set the zero."""
+    residuals = bench.scored(zeroed.residual)
+    most = CERTAIN_ERRORS * noise_floor(bench.recordings, residuals).deviation
+    left = [np.clip(np.mean(e, axis=0), -most, most) * (miss != 0) for e, miss in zip(residuals, misses, strict=True)]
+    errors = np.concatenate([e - constant for e, constant in zip(residuals, left, strict=True)])
+    return bench.pool(np.mean(errors**2, axis=0) / bench.scale**2)
 
 
 def _missed_starts(now: Checked) -> list[np.ndarray]:

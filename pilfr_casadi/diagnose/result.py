@@ -22,7 +22,7 @@ from .correction import Correction
 from .effect import Effect
 from .evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, SURE
 from .floor import ABOVE_NOISE
-from .gates import Gate, edited
+from .gates import TEST_FAULT, Gate, edited
 from .learned import Learned
 from .offsets import Offset
 from .proof import starts_of
@@ -137,10 +137,11 @@ class Diagnosis:
     def outcome(self) -> str:
         """Effect of the correction on the test error: "better", "same", "worse"; "" if unknown.
 
-        It is unknown without test recordings, and if the corrected simulator is the refitted one.
+        It is unknown without test recordings, if a channel of these is wrong, and if the corrected simulator is the
+        refitted one.
         """
         errors = self.errors.get("test")
-        if not errors or not self._changed:
+        if not errors or not self._changed or self.test_fault:
             return ""
         before, after = errors["before"], errors["after"]
         if not after <= BETTER_RATIO * before:
@@ -159,6 +160,8 @@ class Diagnosis:
         if not errors:
             untested = " This correction is not tested yet: give a recording of another experiment as test."
             return said + untested if self._changed else said
+        if self.test_fault:
+            return f"{said} {self.test_fault} Until then the test error says nothing of this answer."
         given, before, after = (_percent(errors[k]) for k in ("nominal", "before", "after"))
         if self.outcome == "same":
             said += f" On the test recordings it makes no difference: {before} before, {after} after."
@@ -173,10 +176,15 @@ class Diagnosis:
             said += f" As given, the simulator follows the test recordings better than with any fit here: {given}."
         return said
 
+    @property
+    def test_fault(self) -> str:
+        """The sentence on a wrong channel of the test recordings; empty if none is known."""
+        return next((g.sentence for g in self.gates if g.finding == TEST_FAULT), "")
+
     def worth(self, effect: Effect) -> str:
         """State the test error with and without one of several effects; empty if it is unknown."""
         errors = self.errors.get("test")
-        if not errors or np.isnan(effect.test_without):
+        if not errors or self.test_fault or np.isnan(effect.test_without):
             return ""
         with_it, without = _percent(errors["after"]), _percent(effect.test_without)
         return f"error on the test recordings: {with_it} with it, {without} without it (the rest refitted)"
@@ -414,7 +422,7 @@ class Diagnosis:
                 f"{'it has' if one else 'they have'} too little room. The ± of the other values do not include that."
             )
         out += self._doubtful_offsets()
-        test, train = self.errors["test"], self.errors["train"]
+        train, test = self.errors["train"], None if self.test_fault else self.errors["test"]
         if train and train["before"] > NEAR_CONSTANT and self.verdict in ("missing-physics", "unexplained"):
             out.append(
                 f"Refitted, the simulator alone is hardly better than a constant (error {train['before']:.2g} of the "

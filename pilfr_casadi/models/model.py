@@ -19,7 +19,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, listed
 from ..data import Recording, default_names
 from .elements import Element
 from .parameters import Parameter, ParameterSet
@@ -128,7 +128,8 @@ class Model:
         if given.size not in (len(self.states), self.n_state):
             expected = " or ".join(map(str, dict.fromkeys((len(self.states), self.n_state))))
             numbers = "1 number" if given.size == 1 else f"{given.size} numbers"
-            raise InputError(f"An initial state of {numbers} was given; expected {expected}.")
+            order = f"; the states are {listed(self.states)}" if self.states else ""
+            raise InputError(f"An initial state of {numbers} was given; expected {expected}{order}.")
         return self.rest_at(given, recording.u[0], self.parameters.start)
 
     @cached_property

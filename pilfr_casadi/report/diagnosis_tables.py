@@ -73,8 +73,8 @@ def _name_errors(diagnosis: Diagnosis) -> dict[str, str]:
 
 
 def judged_errors(diagnosis: Diagnosis) -> tuple[str, Mapping[str, float]]:
-    """Return the role of the recordings that judge the answer, test if there are any, and their errors."""
-    errors = diagnosis.errors.get("test")
+    """Return the role of the recordings that judge the answer, test if they can, and their errors."""
+    errors = None if diagnosis.test_fault else diagnosis.errors.get("test")
     return ("test", errors) if errors else ("training", diagnosis.errors["train"] or {})
 
 
@@ -180,8 +180,8 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
     else:
         out.append(Text("No other law of the catalogue is nearly as likely."))
         if e.confidence < CLEAR:
-            why = "what it leaves unexplained, values at a limit, or less likely laws together"
-            out.append(Text(f"The law is less than certain because of {why}."))
+            why = "something is left unexplained, a value is at a limit, or several less likely laws share the rest"
+            out.append(Text(f"The confidence is lower because {why}."))
     return out
 
 

@@ -57,6 +57,17 @@ def sentence(caught):
         GOOD.replace("0.1,2,20", "1e-1,+2.0,2E1"),
         "x2,label,t,force\n10,a,0,1\n20,b,0.1,2\n30,,0.2,3\n40,nan,0.3,4\n",
         "x2,x,t,x,force\n10,a,0,1,1\n20,b,0.1,1,2\n30,,0.2,1,3\n40,nan,0.3,1,4\n",
+        "# " + GOOD,
+        "Recorder 7, serial 12\nforce and travel;2024\n\n" + GOOD,
+        GOOD.replace("x2\n", "x2\n[s],[N],[mm]\n"),
+        "% " + GOOD.replace("x2\n", "x2\n% s,N,counts\n"),
+        GOOD.replace("force,x2", "force [N],x2 [mm]").replace("[mm]\n", "[mm]\ns,N,mm\n"),
+        "#\tt\tforce\tx2\n" + "\n".join(f"{i},{line}" for i, line in enumerate(GOOD.split()[1:])).replace(",", "\t"),
+        "time,2024\n" + GOOD,
+        GOOD.replace("0,1,10", "2024-05-01 23:59:59.9,1,10")
+        .replace("0.1,", "2024-05-02,")
+        .replace("0.2,", "2024-05-02 00:00:00.1,")
+        .replace("0.3,", "2024-05-02 00:00:00.2,"),
         "temp °C,t,force,x2\n1,0,1,10\n1,0.1,2,20\n1,0.2,3,30\n1,0.3,4,40\n".encode("latin-1"),
     ],
 )
@@ -81,6 +92,42 @@ def test_columns_are_mapped(write):
     assert np.array_equal(r.u, MATRIX[:, 1:2])
     both = read_csv(path, ["a", "b"], "x2", columns={"a": "u_vir_V", "b": "u_vir_V", "time": "clock"})
     assert np.array_equal(both.u[:, 0], both.u[:, 1])
+
+
+def test_many_columns_are_found_at_once(write):
+    names = [f"c{i}" for i in range(5000)]
+    rows = [",".join(f"{k + i / 7:.12f}" for i in range(5000)) + f",{k}" for k in range(20)]
+    path = write("\n".join([",".join(names) + ",t", *rows]))
+    start = time.perf_counter()
+    r = read_csv(path, names[:100], names[100:400])
+    assert (r.n_u, r.n_y, r.dt) == (100, 300, 1.0) and time.perf_counter() - start < 5
+    assert len(column_names(path)) == 5001
+
+
+def test_words_in_brackets_are_no_units(write):
+    r = read_csv(write(GOOD.replace("x2\n", "x (left)\ns,N,mm\n")), "force", "x (left)")
+    assert r.units == {"force": "N", "x (left)": "mm"}
+
+
+def test_a_name_may_begin_with_a_mark(write):
+    path = write(GOOD.replace("t,force", "#t,% open"))
+    assert read_csv(path, "% open", "x2", columns={"t": "#t"}).dt == 0.1
+    first = write(GOOD.replace("t,force", "# turns,t").replace("\n0,1,", "\n1,0,"))
+    assert read_csv(first, "# turns", "x2", columns={"t": "t"}, time_tolerance=9).inputs == ("# turns",)
+
+
+def test_names_and_times_are_found_below_a_title(write):
+    path = write("Recorder 7, serial 12\n" + GOOD.replace("t,force", "time,force").replace("\n0", "\n10"))
+    assert column_names(path) == ("time", "force", "x2")
+    assert written_times(path, wanted=["force"]) == written_times(path) == ["10", "10.1", "10.2", "10.3"]
+
+
+def test_a_row_of_units_states_the_units(write):
+    path = write("Zeit;Kraft;Weg\ns;N;mm\n" + GOOD.split("\n", 1)[1].replace(",", ";"))
+    r = read_csv(path, "Kraft", "Weg", columns={"t": "Zeit"})
+    assert (r.dt, r.units) == (0.1, {"Kraft": "N", "Weg": "mm"})
+    with pytest.raises(InputError, match=r"column 'Zeit \[ms\]' is named as time in ms"):
+        read_csv(write(path.read_text().replace("s;N", "ms;N")), "Kraft", "Weg", columns={"t": "Zeit"})
 
 
 def test_dt_instead_of_time(write):
@@ -156,7 +203,19 @@ BAD_FILES = {
     "word": (GOOD.replace("0.2,3", "0.2,high"), "column 'force', line 4 reads 'high', which is not a number"),
     "underscore": (GOOD.replace("0.2,3,30", "0.2,3,3_0"), "column 'x2', line 4 reads '3_0'"),
     "decimal comma": (GOOD.replace(",", ";").replace("0.2;3", "0.2;3,5"), "line 4 reads '3,5'.* with a point"),
-    "unit row": (GOOD.replace("x2\n", "x2\ns,N,m\n"), "column 'force', line 2 reads 'N'"),
+    "decimal commas between commas": ("t,force,x2\n0,1,5,10\n0,1,2,20\n", "line 2 has 4 cell.*with points"),
+    "units in milliseconds": (GOOD.replace("x2\n", "x2\nms,N,m\n"), r"'t \[ms\]' is named as time in ms"),
+    "second row of names": (GOOD.replace("x2\n", "x2\ntime,in,out\n"), "column 'force', line 2 reads 'in'"),
+    "row of words": (GOOD.replace("x2\n", "x2\nfirst,second,third\n"), "column 'force', line 2 reads 'second'"),
+    "title, then a misspelt name": ("Recorder 7\n" + GOOD.replace("x2", "x3"), "no column 'x2'; it has t, force, x3"),
+    "dates, then seconds": ("t,force,x2\n2024-05-01 10:00:00,1,2\n0.1,1,2\n", "line 3 reads '0.1', but .* begins"),
+    "dates with and without zone": (
+        "t,force,x2\n2024-05-01T10:00:00Z,1,2\n2024-05-01T10:00:01,1,2\n",
+        "line 3 reads '2024-05-01T10:00:01', but",
+    ),
+    "date in an output": (GOOD.replace("0.2,3,30", "0.2,3,2024-05-01"), "line 4 reads '2024-05-01'"),
+    "dates in a short row": ("t,force,x2\n2024-05-01,1\n", "line 2 has 2 cell.* names 3"),
+    "pause": (GOOD + "9.0,1,1\n9.1,1,1\n", "line 6 comes 8.7 s after.*cut the record at such gaps"),
     "gap": (GOOD.replace("0.2,3,", "0.2,,"), "column 'force', line 4 is empty"),
     "nan": (GOOD.replace("30", "NaN"), "column 'x2', line 4 is NaN"),
     "inf": (GOOD.replace("30", "-inf"), "column 'x2', line 4 is -inf"),

@@ -11,7 +11,7 @@ from cart import cart
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, check, multisine
 from pilfr_casadi.diagnose.identifiability import Tie
-from pilfr_casadi.laws import CATALOGUE, CoulombFriction, CubicStiffness
+from pilfr_casadi.laws import CATALOGUE, CoulombFriction, CubicDamping, CubicStiffness
 from pilfr_casadi.models import close_loop
 from problems.blind_spots import DT, NOISE, SAMPLES, controls, noise_like, plain, record, rigs
 
@@ -255,6 +255,26 @@ def test_a_simulator_that_does_not_follow_is_said_to_be_rough():
     assert found.blind_spots[0].kind == "rough" and "check its values and units" in found.next_record
 
 
+def test_an_error_above_the_noise_is_told_first():
+    given = record(MASS, noise_like(1))
+    bent = check(MASS, given.with_(y=given.y + 0.3 * np.abs(given.y)), laws=())
+    assert str(bent).startswith("refitted: error") and "Refitted values may stand in for missing physics" in str(bent)
+    assert "Something is missing" not in str(check(MASS, given, laws=()))
+
+
+def test_a_law_of_the_rate_needs_more_than_a_held_input():
+    port = Port("coil", into={"y": 1.0}, across=lambda x, u: u.u, unit="V", across_unit="A")
+    simulator = gained(lambda p: p.g, {"g": WIDE})
+    simulator = Simulator(
+        simulator.dynamics, lambda x: {"y": x.x}, ("x",), ("u",), parameters=simulator.parameters, ports=(port,)
+    )
+    given = record(simulator, noise_like(2))
+    for hold in ("zero", "linear"):
+        found = check(simulator, given.with_(hold=hold), laws=[CubicStiffness, CubicDamping])
+        why = {r.law: r.why for r in found.laws if r.port == "coil"}
+        assert ("its coordinate jumps and has no rate" in why["cubic_damping"]) is (hold == "zero")
+
+
 def test_a_refit_that_ends_at_a_bound_is_marked():
     simulator = gained(lambda p: p.g, {"g": WIDE})
     held = gained(lambda p: p.g, {"g": Parameter(2.0, bounds=(1.0, 2.5))})
@@ -349,7 +369,7 @@ def test_wrong_input_gets_a_sentence():
 def test_a_stated_start_that_the_first_sample_contradicts_is_told():
     given = record(MASS, noise_like(1), begin=[0.3, 0.0])
     found = check(MASS, given)
-    assert found.blind_spots[0].names == ("initial state",) and found.starts == ("at zero",)
+    assert found.blind_spots[0].names == ("initial state",) and found.starts == ("at zero, here estimated",)
     assert "would begin at 0, but its first sample is 0.3" in str(found)
     assert found.next_record.startswith("State how the recordings begin")
 

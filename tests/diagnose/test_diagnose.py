@@ -9,6 +9,7 @@ from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
+from pilfr_casadi.diagnose.arguments import match_tests
 from pilfr_casadi.laws import CATALOGUE, Backlash, CoulombFriction, CubicStiffness, Delay, DirectionalDamping
 
 IDS = {
@@ -140,8 +141,59 @@ def test_the_next_experiment_stays_within_the_users_limits():
 
 
 def test_test_data_that_was_trained_on_is_refused(plain):
-    with pytest.raises(pilfr.InputError, match="equals a training recording"):
-        pilfr.diagnose(rig(), plain, test=plain[0])
+    whole, m = plain[0], len(plain[0])
+
+    def part(start, stop):
+        return whole.with_(u=whole.u[start:stop], y=whole.y[start:stop], initial="estimate")
+
+    for test in (whole, part(m // 2, m)):
+        with pytest.raises(pilfr.InputError, match="equals a training recording or a part of one"):
+            pilfr.diagnose(rig(), plain, test=test)
+    for train, test in ((part(0, 500), part(300, 900)), (part(300, 900), part(0, 500))):
+        with pytest.raises(pilfr.InputError, match=f"200 of the {len(test)} samples of a test recording are training"):
+            pilfr.diagnose(rig(), train, test=test)
+
+
+LOOSE = Backlash(values={"r": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [(1e3, "too large by a factor of 1000"), (1e-3, "x2 is too small"), (-1, "x2 has the wrong sign")],
+)
+def test_a_wrong_channel_of_the_test_recordings_is_told_and_judges_nothing(factor, words):
+    train, test = recordings(LOOSE, port="actuator:force", count=2)
+    right = test.with_(y=test.y[::1], name="right")
+    for tests in (test.with_(y=factor * test.y), [right, test.with_(y=factor * test.y, name="wrong")]):
+        found = pilfr.diagnose(rig(OFF), train, test=tests, laws=FEW)
+        (fault,) = (g for g in found.gates if g.finding == "test fault")
+        assert (found.verdict, found.outcome, fault.channel) == ("missing-physics", "", "x2")
+        assert words in fault.sentence and fault.sentence in found.summary and "worse" not in found.summary
+        assert not any("test error" in text for text in found.warnings())
+    assert "In the test recording wrong," in fault.sentence
+
+
+def test_correct_tests_are_not_blamed_for_faults_of_the_training_data_nor_for_physics_of_their_own():
+    train, test = recordings(count=2)
+    found = pilfr.diagnose(rig(OFF), train.with_(y=-train.y), test=test, laws=FEW)
+    assert [g.finding for g in found.gates if g.corrected] == ["sign"]
+    assert "test correction" in {g.finding for g in found.gates} and not found.test_fault
+    hard = CubicStiffness(values={"k_3": 4e5})
+    loud = rig(OFF).with_element("ground-m1", hard).simulate(test.with_(u=60 * test.u))
+    found = pilfr.diagnose(rig(OFF), train, test=test.with_(u=60 * test.u, y=loud), laws=FEW)
+    assert found.errors["test"]["after"] > 1 and not found.test_fault
+
+
+def test_tests_may_begin_in_the_training_data_where_they_are_not_scored(plain):
+    whole = plain[0]
+    train, after = (
+        whole.with_(u=whole.u[part], y=whole.y[part], initial="estimate") for part in (slice(0, 500), slice(400, 900))
+    )
+    assert len(match_tests(rig(), after.with_(skip=100), [train])) == 1
+    still = np.zeros((600, 1))
+    quiet = train.with_(u=still[:500], y=np.vstack([train.y[:400], still[:100]]))
+    begin = train.with_(u=still[:500], y=np.vstack([still[:60], train.y[:440]]))
+    assert len(match_tests(rig(), begin, [quiet])) == 1
 
 
 @pytest.mark.parametrize(

@@ -240,3 +240,13 @@ def test_a_law_that_degenerates_at_its_values_names_nothing_however_well_it_foll
     found = posterior(search(*given))
     assert sure_of(found)[("b", "cubic_stiffness")] < 0.5 < sure_of(found)[DRY_NAME] and found.named > 0.9
     assert posterior(search(trial(CUBIC))).named < 0.5
+
+
+def test_effective_samples_follow_the_hypotheses_and_are_counted_once(search, trial, monkeypatch):
+    found, pooled = search(trial(DRY, left=0.5), trial(CUBIC, left=0.2)), []
+    whole = type(found)._tolerant
+    monkeypatch.setattr(type(found), "_tolerant", lambda self, t: pooled.append(t) or whole(self, t))
+    before = [found.samples for _ in range(5)]
+    assert len(pooled) <= len(found.memo) and len(set(before)) == 1
+    found.keep(trial(DRY, CUBIC, left=0.01))
+    assert found.samples > before[0]

@@ -115,6 +115,43 @@ def test_a_wrong_start_is_told_from_a_wrong_zero_of_the_sensor(curved, level, of
     ]  # the other explanation is told as well
 
 
+def test_a_worse_explanation_is_not_called_better():
+    gates = prepare(tank(outflow=1.5e-4), [started(1e-3, 1.0, 0.0)], "zero", "auto").gates
+    assert not any("explains that better" in g.sentence for g in gates)
+
+
+def test_a_start_and_a_zero_that_fit_as_well_are_both_told():
+    integrator = Simulator(
+        lambda x, u, p: {"x": p.k * u.u},
+        lambda x: {"y": x.x},
+        ("x",),
+        ("u",),
+        parameters={"k": Parameter(1.0, bounds=(0.1, 10))},
+    )
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.standard_normal(40), 10)[:, None]
+    blank = Recording(u, 0 * u, 0.05, ("u",), ("y",), initial="zero", hold="zero")
+    y = 0.5 + integrator.simulate(blank) + 1e-3 * rng.standard_normal(u.shape)
+    (fault,) = (g for g in prepare(integrator, [blank.with_(y=y)], "zero", "vm").gates if g.finding == "start")
+    assert "a wrong zero of the sensor explains that as well" in fault.sentence
+
+
+def test_a_start_is_not_blamed_on_a_zero_where_another_sensor_is_noisy():
+    lags = Simulator(
+        lambda x, u, p: {"y": p.k * u.u - x.y, "z": u.u - 0.2 * x.z},
+        lambda x: {"y": x.y, "z": x.z},
+        ("y", "z"),
+        ("u",),
+        parameters={"k": Parameter(1.0, bounds=(0.1, 10))},
+    )
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.standard_normal(40), 10)[:, None]
+    blank = Recording(u, np.zeros((400, 2)), 0.05, ("u",), ("y", "z"), initial=[0.0, 0.5], hold="zero")
+    y = lags.simulate(blank) + rng.standard_normal((400, 2)) * [1e-3, 0.05]
+    gates = prepare(lags, [blank.with_(y=y, initial="zero")], "zero", "vm").gates
+    assert [(g.finding, g.corrected) for g in gates] == [("start", True)], [g.sentence for g in gates]
+
+
 def unsaid_tanks():
     return Workbench.of(tanks(1.15), [of_tanks(recorded()[1]).with_(hold=None)], "linear")
 

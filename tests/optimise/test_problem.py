@@ -278,7 +278,7 @@ def test_without_constraints():
 def test_model_and_recordings_must_fit():
     with pytest.raises(InputError, match="2 inputs and 1 outputs"):
         problem(recording(0, n_u=2))
-    with pytest.raises(InputError, match="An initial state of 5 numbers was given; expected 3 or 7"):
+    with pytest.raises(InputError, match="state of 5 numbers was given; expected 3 or 7; the states are x1, x2, x3"):
         problem(recording(0, initial=np.zeros(5)))
     with pytest.raises(InputError, match="L1 penalty on 'A' needs a lower bound"):
         problem(options={"l1": {"A": 1.0}})
