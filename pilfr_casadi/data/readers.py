@@ -16,7 +16,16 @@ import numpy as np
 from .._base import InputError, listed, positive
 from .preprocessing import LONGEST_GAP, even_grid
 from .recording import Recording, as_tuple
-from .tables import TIME_NAMES, WITH_UNIT, ArrayTable, CsvTable, find_column, frame_table, is_time, open_table
+from .tables import (
+    TIME_NAMES,
+    ArrayTable,
+    CsvTable,
+    find_column,
+    frame_table,
+    is_time,
+    open_table,
+    unit_in_brackets,
+)
 
 PathLike = str | Path
 Names = Sequence[str] | str
@@ -285,19 +294,13 @@ class _Request:
         n_u = len(self.inputs)
         u, y = np.hstack(parts[:n_u]), np.hstack([np.empty((len(parts[0]), 0)), *parts[n_u:]])
         names = _channel_names(self.inputs, parts[:n_u]), _channel_names(self.outputs, parts[n_u:])
-        found = zip((*self.inputs, *self.outputs), map(_read_unit, wanted), strict=True)
+        found = zip((*self.inputs, *self.outputs), map(unit_in_brackets, wanted), strict=True)
         units = {name: unit for name, unit in found if unit and name in names[0] + names[1]}
         units |= self.options.get("units") or {}
         try:
             return Recording(u, y, dt, *names, **{"name": table.path.stem, **self.options, "units": units})
         except InputError as error:
             raise InputError(f"{table.path}: {error}") from None
-
-
-def _read_unit(column: str) -> str:
-    """Return the unit in brackets behind the name of a column; empty if there is none."""
-    parts = WITH_UNIT.fullmatch(column)
-    return (parts.group(2) or parts.group(3) or "").strip() if parts else ""
 
 
 def _check_names(given: Any, role: str) -> tuple[str, ...]:

@@ -295,19 +295,25 @@ def _without_mark(names: tuple[str, ...], wanted: Sequence[str]) -> tuple[str, .
 
 def _count_known(names: Sequence[str], wanted: Sequence[str]) -> int:
     """Count the `wanted` columns among the names, and a time column."""
-    bare = Counter(
-        parts.group(1) for name in names if name.endswith(("]", ")")) and (parts := WITH_UNIT.fullmatch(name))
-    )
-    there = {*names} | {name for name, count in bare.items() if count == 1}
-    return len({*wanted} & there) + any(map(is_time, names))
+    return len({*wanted} & {*_by_bare_name(names)}) + any(map(is_time, names))
 
 
 def find_column(column: str, names: Sequence[str]) -> str:
     """Return a file's name of a column, which may have a unit in brackets; `column` itself if there is none."""
-    if column in names:
-        return column
-    found = [name for name in names if (parts := WITH_UNIT.fullmatch(name)) and parts.group(1) == column]
-    return found[0] if len(found) == 1 else column
+    return _by_bare_name(names).get(column, column)
+
+
+def _by_bare_name(names: Sequence[str]) -> dict[str, str]:
+    """Return each name by itself and, if that is one alone, by what stands before its brackets."""
+    bare = [parts.group(1) for name in names if (parts := WITH_UNIT.fullmatch(name))]
+    counts, short = Counter(bare), dict(zip(bare, filter(WITH_UNIT.fullmatch, names), strict=True))
+    return {name: full for name, full in short.items() if counts[name] == 1} | {name: name for name in names}
+
+
+def unit_in_brackets(column: str) -> str:
+    """Return the unit in brackets behind the name of a column; empty if there is none."""
+    parts = WITH_UNIT.fullmatch(column)
+    return (parts.group(2) or parts.group(3) or "").strip() if parts else ""
 
 
 def is_time(column: str) -> bool:
@@ -336,8 +342,7 @@ def _read_units(cells: Sequence[str], names: Sequence[str]) -> list[str] | None:
 
 def _states_unit(name: str) -> bool:
     """Tell whether a name ends with a known unit in brackets, rather than with a number or a word."""
-    parts = WITH_UNIT.fullmatch(name)
-    unit = (parts.group(2) or parts.group(3) or "") if parts else ""
+    unit = unit_in_brackets(name)
     return _number(unit) is None and dimension(unit) is not None
 
 

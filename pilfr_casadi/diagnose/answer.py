@@ -21,7 +21,7 @@ from .channel_faults import IN_RECORDINGS, find_gross_slips
 from .correction import Correction
 from .effect import Effect
 from .evidence import FAR_RATIO, NEAR_RATIO, SURE, deviations
-from .force_recovery import is_curve, signals_along
+from .force_recovery import is_curve_along
 from .gates import EQUAL_RATIO, TEST_FAULT, Gate, edited
 from .identifiability import port_units
 from .mismatch_map import mismatch
@@ -185,14 +185,6 @@ def _test_faults(bench: Workbench, after: Fitted, tests: Sequence[Recording], ga
         yield Gate(slips[0].channel, TEST_FAULT, slips[0].value, f"{place}{words}. {advice}", False)
 
 
-def _is_curve_along(bench: Workbench, fitted: Fitted, number: int) -> bool:
-    """Tell whether the force of an element is a curve of its coordinate along the runs."""
-    if not np.isfinite(fitted.cost):
-        return False
-    z, _, w = signals_along(bench, fitted, number)
-    return is_curve(z, w)
-
-
 def _surrogate_note(error: float) -> tuple[Gate, ...]:
     """Note that a surrogate replaces the simulation, with an NRMSE of `error`; no note if the error is zero."""
     if not error:
@@ -308,7 +300,7 @@ def _make_effect(
             shown[label] = {"value": float(v), "std": error if np.isfinite(error) else None, "unit": unit}
             shown[label]["at_limit"] = bool(v and at_bound[i])
     remarks = [law.remark(element.own(fitted.values)), *_order(fitted, element)]
-    if law.turns and _is_curve_along(bench, final.drawn[1], fitted.simulator.elements.index(element)):
+    if law.turns and is_curve_along(bench, final.drawn[1], fitted.simulator.elements.index(element)):
         remarks.append("these recordings do not show its memory: a curve follows them as well")
     return Effect(
         port=element.port,

@@ -261,6 +261,14 @@ def is_curve(z: np.ndarray, w: np.ndarray) -> bool:
     return len(off) == 0 or bool(np.mean(off**2) < FORMULA_ERROR * np.var(w[order]))
 
 
+def is_curve_along(bench: Workbench, fitted: Fitted, number: int) -> bool:
+    """Tell whether the force of an element is a curve along the runs of all recordings; not if they diverge."""
+    if not np.isfinite(fitted.cost):
+        return False
+    z, _, w = signals_along(bench, fitted, number)
+    return is_curve(z, w)
+
+
 def forces_of_change(bench: Workbench, fitted: Fitted, port: str, change: np.ndarray) -> dict[str, np.ndarray]:
     """Return the forces (M,) by port that change the derivatives as a change (M,) of a parameter does along the runs.
 

@@ -36,7 +36,7 @@ from .evidence import (
     spread,
 )
 from .floor import FEWEST, Floor, effective_size, white_part
-from .force_recovery import is_curve, signals_along
+from .force_recovery import is_curve_along
 from .gates import EQUAL_RATIO
 from .screen import Scored, flexible_shares, innovation_share, screen
 from .trials import Key, Trial, Trials
@@ -183,12 +183,11 @@ class Hypotheses:
 
     def hides_memory(self, trial: Trial, element: Placed) -> bool:
         """Tell whether a law remembers where its motion turned, but its force is a curve along the fitted runs."""
-        if not element.law.turns or not np.isfinite(trial.mean_square):
+        if not element.law.turns:
             return False
         curves, number = self.findings[trial.key].curves, trial.fitted.simulator.elements.index(element)
         if element.prefix not in curves:
-            z, _, w = signals_along(self.bench, trial.fitted, number)
-            curves[element.prefix] = is_curve(z, w)
+            curves[element.prefix] = is_curve_along(self.bench, trial.fitted, number)
         return curves[element.prefix]
 
     @cached_property

@@ -110,9 +110,8 @@ def test_a_wrong_start_is_told_from_a_wrong_zero_of_the_sensor(curved, level, of
     gates = prepare(tank(outflow=1.5e-4), [started(curved, level, offset)], "zero", "auto").gates
     faults, miss = [g.finding for g in gates if g.fault], "level would begin at 0, but its first sample is 0."
     assert faults[0] == found and (faults[1:] == [] or found == "start"), [g.sentence for g in gates]
-    assert [miss in g.sentence for g in gates if g.finding == "start"] == [
-        True
-    ]  # the other explanation is told as well
+    told = [miss in g.sentence for g in gates if g.finding == "start"]
+    assert told == [True], "the other explanation is told as well"
 
 
 def test_a_worse_explanation_is_not_called_better():
