@@ -42,7 +42,15 @@ VISIBLE_SHARE = 1e-6  # share of a constant's response above which initial state
 
 @dataclass(frozen=True)
 class WrongStart(Gate):
-    """Initial states that are not as stated; other physics may remain beside it."""
+    """Initial states that are not as stated; other physics may remain beside it.
+
+    Attributes
+    ----------
+    otherwise : WrongStart
+        The finding if a search from unknown initial states follows better, where a refit does so with a wrong zero.
+    """
+
+    otherwise: WrongStart | None = None
 
     most_left: ClassVar[float] = 1.0
     remedy: ClassVar[str] = "with them estimated"
@@ -73,9 +81,12 @@ def find_wrong_start(now: Checked) -> Checked:
     if EQUAL_RATIO * left > after.cost:
         words = f"{words}; a wrong zero of the sensor explains that as well"
         return accept(now, after, replace(fault, sentence=words))
+    searched = f"{words}; beside the physics that is missing, another start explains that better than a wrong zero."
+    otherwise = replace(fault, sentence=searched, fault=True)
     words = "a wrong zero of the sensor explains that better than another start. If the machine did begin elsewhere"
     words = f"As stated, {missed}; {words}, give each state's value, or leave the start unknown."
-    return now.then(bench, now.fitted, replace(fault, sentence=words, corrected=False, change=None))
+    zero = replace(fault, sentence=words, corrected=False, change=None, otherwise=otherwise)
+    return now.then(bench, now.fitted, zero)
 
 
 def _error_at_own_zero(bench: Workbench, zeroed: Fitted, misses: Sequence[np.ndarray]) -> float:
