@@ -300,7 +300,7 @@ def test_a_mode_that_is_damped_more_than_machines_are_is_hardly_a_mode():
     assert law.doubtful({"D": 1.0, "W": 50.0}) and not law.doubtful({"D": 0.1, "W": 50.0})
     assert law.doubtful({"D": 0.1, "W": 800.0}) and law.doubtful(
         {"D": 0.1, "W": 1.0}
-    )  # too fast or too slow to be seen
+    )  # not seen
 
 
 @pytest.mark.parametrize("kind", (laws.Creep, laws.TwoStageCreep))
