@@ -223,7 +223,7 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: 
 
 
 def _accept_on_same_samples(now: Checked, after: Checked, fault: TimeShift) -> Checked:
-    """Accept a shift by the rule of all faults, but compare it with a refit to the samples that it does not leave out."""
+    """Accept a shift by the rule of all faults, but compare on the samples that it keeps."""
     kept = now.bench.on(list(map(fault.without, now.bench.recordings)))
     plain = refit(kept, [now.fitted.values], states=now.fitted.initial)
     if plain is None:
