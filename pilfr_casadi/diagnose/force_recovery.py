@@ -242,14 +242,18 @@ def signals_along(bench: Workbench, fitted: Fitted, number: int = -1) -> tuple[n
 def is_curve(z: np.ndarray, w: np.ndarray) -> bool:
     """Tell whether a force w (M,) is a function of the coordinate z (M,) alone, as that of memory which is not shown.
 
-    In the order of z, each force lies between those of its neighbours then, or near them. Elsewhere the neighbours come
-    from another branch. Of samples that nearly repeat each other, as over many periods, one counts: they would be each
-    other's neighbours.
+    It has one value at each level of z then, as of a held input. In the order of z, each force lies between those of
+    its neighbours, or near them. Elsewhere the neighbours come from another branch. Of samples that nearly repeat each
+    other, as over many periods, one counts: they would be each other's neighbours.
     """
     finite = np.isfinite(z) & np.isfinite(w)
     z, w = z[finite], w[finite]
     if len(z) < 3 or np.ptp(z) == 0 or np.ptp(w) == 0:
         return True
+    _, level, samples = np.unique(z, return_inverse=True, return_counts=True)
+    mean = np.bincount(level, w) / samples
+    if np.mean((w - mean[level]) ** 2) > FORMULA_ERROR * np.var(w):
+        return False
     cells = np.round(np.column_stack([(z - np.min(z)) / np.ptp(z), (w - np.min(w)) / np.ptp(w)]) / REPEATS).astype(
         np.int64
     )

@@ -61,6 +61,12 @@ def test_a_drive_may_have_a_dead_zone_and_a_limit():
         (laws.DeadZone, laws.SoftSaturation, True),  # of small and of large signals
         (laws.DeadZone, laws.AsymmetricDeadZone, False),
         (laws.CubicStiffness, laws.scheduled(laws.LinearStiffness, "z"), False),
+        (laws.Delay, laws.Backlash, True),  # the path of a signal
+        (laws.Delay, laws.Lag, True),
+        (laws.Resonance, laws.DeadZone, True),
+        (laws.Delay, laws.Delay, False),
+        (laws.Lag, laws.Resonance, False),
+        (laws.Lag, laws.Creep, False),
     ],
 )
 def test_only_different_physics_stands_beside_a_law(one, other, apart):
