@@ -92,6 +92,7 @@ UNKNOWN_SHARE = 1e-6  # squared share of a parameter in an unknown combination; 
 
 # Held-out data
 FOLDS, ROUNDS = 4, 2  # folds, and blocks of a recording in each fold: eight blocks, spread over the recording
+LEAST_EARLIER = 0.1  # least share of the information on each parameter in the part from which a later part is predicted
 LEAD_SHARE = 0.5  # share of a block that is never held out at the start of a recording: it determines the initial state
 # The fit to all blocks is near each of these fits; a fit that has not converged after so many steps is used as it is.
 REFIT = GaussNewton(max_iterations=8, tolerance=1e-2, patience=2)
@@ -398,7 +399,7 @@ class HeldOut:
     """Mean square errors of a simulator on data that it was not fitted to, outputs in units of their deviation."""
 
     blocks: float  # on held-out blocks; infinite if the simulation diverges
-    ahead: float  # the same on the second halves
+    ahead: float  # the same on the later blocks, predicted from the earlier ones
     squares: np.ndarray  # (n_y,), the larger of the two, of each output
     spread: float = 0.0  # mean square uncertainty of predictions for other inputs; see `evidence.spread`
 
@@ -434,14 +435,39 @@ def blocks_of(bench: Workbench) -> list[np.ndarray]:
     return out
 
 
-def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldOut:
-    """Refit without each fold of blocks and without the second halves; return the errors on the omitted parts.
+def later_block(bench: Workbench, fitted: Fitted) -> int:
+    """Return the number of the block from which on all is predicted from the blocks before: the middle, or a later one.
 
-    They are infinite if the run diverges or the time is over.
+    It is later if the first half hardly informs about one of the free parameters of a fitted simulator.
+    """
+    blocks, middle, last = blocks_of(bench), FOLDS * ROUNDS // 2, FOLDS * ROUNDS - FOLDS // 2
+
+    def on_parameters(masks: Sequence[np.ndarray]) -> np.ndarray:
+        problem, theta = bench.problem_at(fitted, masks)
+        with np.errstate(all="ignore"):
+            own = np.diag(problem.normal(theta)[2])[: problem.n_free]
+        return own * sum(int(np.sum(mask)) for mask in masks)
+
+    try:
+        total = on_parameters([b >= 0 for b in blocks])
+        for number in range(middle, last):
+            if np.all(on_parameters([(b >= 0) & (b < number) for b in blocks]) >= LEAST_EARLIER * total):
+                return number
+    except (InputError, RuntimeError):  # the run diverges
+        return middle
+    return last
+
+
+def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1, later_from: int | None = None) -> HeldOut:
+    """Refit without each fold of blocks and without the later blocks; return the errors on the omitted parts.
+
+    The later blocks are those from `later_from` on, by default the second half. The errors are infinite if the run
+    diverges or the time is over.
     """
     blocks = blocks_of(bench)
+    later_from = FOLDS * ROUNDS // 2 if later_from is None else later_from
     folds = [[(b >= 0) & (b % FOLDS == fold) for b in blocks] for fold in range(FOLDS)]
-    later = [b >= FOLDS * ROUNDS // 2 for b in blocks]
+    later = [b >= later_from for b in blocks]
     *squares, second = side_by_side(lambda left: _sum_of_squares(bench, fitted, left), [*folds, later], workers)
     scored, ahead = (max(sum(int(np.sum(mask)) for mask in masks), 1) for masks in ([b >= 0 for b in blocks], later))
     both = np.sum(squares, axis=0) / scored, second / ahead
