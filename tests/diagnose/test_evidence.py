@@ -14,6 +14,7 @@ from pilfr_casadi.diagnose.evidence import (
     WRONG_MODEL_SAMPLES,
     Sample,
     information,
+    later_block,
     log_evidence,
     log_prior,
     runs_away,
@@ -45,6 +46,26 @@ def test_a_parameter_has_to_pay_for_itself(n):
     dear, dearer = (alone - log_evidence(0.01, np.array([size]), 0.0, n) for size in (1.0, 4.0))
     assert dearer - dear == pytest.approx(0.5 * np.log(4), rel=0.05)
     assert log_evidence(0.01 * np.exp(-2.6 * dear / n), np.array([1.0]), 0.0, n) > alone
+
+
+@pytest.mark.parametrize(("from_sample", "block"), [(0, 4), (200, 4), (460, 5), (660, 6), (900, 6)])
+def test_a_later_part_is_predicted_where_a_parameter_shows_late(from_sample, block):
+    """A window warms a house only while the sun shines."""
+    house = pilfr.Simulator(
+        lambda x, u, p: {"T": 0.1 * u.heater + p.window * u.sun - p.loss * x.T},
+        lambda x: {"T": x.T},
+        ("T",),
+        ("heater", "sun"),
+        {"loss": pilfr.Parameter(0.2, bounds=(0, 1)), "window": pilfr.Parameter(0.3, bounds=(0, 1))},
+        pilfr.Port("air", {"T": -1.0}, lambda x: x.T),
+    )
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(0, 1, (100, 2)), 10, axis=0)
+    u[:from_sample, 1] = 0.0
+    blank = pilfr.Recording(u, 0 * u[:, :1], 0.1, house.inputs, ("T",), initial="zero", hold="zero")
+    r = blank.with_(y=house.simulate(blank) + 1e-3 * rng.standard_normal((1000, 1)))
+    bench = Workbench.of(house, [r], "zero", "vm")
+    assert later_block(bench, bench.fit(house)) == block
 
 
 def test_what_diverges_has_no_evidence():
