@@ -166,9 +166,9 @@ class Hypotheses:
         return self._log_evidence(trial, v, self.samples)
 
     def _held_out_ratio(self, quantile: float) -> float:
-        """Compute a quantile of the ratios of held-out to fit error (mean squares); of two ratios the median is the smaller.
+        """Compute a quantile of the known ratios of held-out to fit error (mean squares).
 
-        One hypothesis that predicts badly says nothing about the others.
+        Of two ratios the median is the smaller: one hypothesis that predicts badly says nothing about the others.
         """
         known = [(self.findings[key].held_out, trial.mean_square) for key, trial in self.memo.items()]
         ratios = [h.error**2 / fit for h, fit in known if h and np.isfinite(h.error) and fit > 0]
