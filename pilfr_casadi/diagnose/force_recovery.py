@@ -247,17 +247,14 @@ def is_curve(z: np.ndarray, w: np.ndarray) -> bool:
     other, as over many periods, one counts: they would be each other's neighbours.
     """
     finite = np.isfinite(z) & np.isfinite(w)
-    z, w = z[finite], w[finite]
-    if len(z) < 3 or np.ptp(z) == 0 or np.ptp(w) == 0:
+    if np.sum(finite) < 3 or np.ptp(z[finite]) == 0 or np.ptp(w[finite]) == 0:
         return True
+    z, w = ((v[finite] - np.min(v[finite])) / np.ptp(v[finite]) for v in (z, w))
+    least = FORMULA_ERROR * np.var(w)
     _, level, samples = np.unique(z, return_inverse=True, return_counts=True)
-    mean = np.bincount(level, w) / samples
-    if np.mean((w - mean[level]) ** 2) > FORMULA_ERROR * np.var(w):
+    if np.mean((w - (np.bincount(level, w) / samples)[level]) ** 2) > least:
         return False
-    cells = np.round(np.column_stack([(z - np.min(z)) / np.ptp(z), (w - np.min(w)) / np.ptp(w)]) / REPEATS).astype(
-        np.int64
-    )
-    _, first = np.unique(cells, axis=0, return_index=True)
+    _, first = np.unique(np.round(np.column_stack([z, w]) / REPEATS).astype(np.int64), axis=0, return_index=True)
     any_order = np.random.default_rng(0).permutation(first)  # of samples at the same z
     order = any_order[np.argsort(z[any_order], kind="stable")]
     beside = np.sort([w[order][:-2], w[order][2:]], axis=0)
