@@ -92,7 +92,8 @@ UNKNOWN_SHARE = 1e-6  # squared share of a parameter in an unknown combination; 
 
 # Held-out data
 FOLDS, ROUNDS = 4, 2  # folds, and blocks of a recording in each fold: eight blocks, spread over the recording
-LEAST_EARLIER = 0.1  # least share of the information on each parameter in the part from which a later part is predicted
+LEAST_EARLIER = 0.1  # least share of the information on a parameter in the earlier part: three times its standard error
+MIDDLE, LATEST = 4, 6  # first of the eight blocks that are predicted from the earlier part; at the latest, a quarter is
 LEAD_SHARE = 0.5  # share of a block that is never held out at the start of a recording: it determines the initial state
 # The fit to all blocks is near each of these fits; a fit that has not converged after so many steps is used as it is.
 REFIT = GaussNewton(max_iterations=8, tolerance=1e-2, patience=2)
@@ -436,11 +437,11 @@ def blocks_of(bench: Workbench) -> list[np.ndarray]:
 
 
 def later_block(bench: Workbench, fitted: Fitted) -> int:
-    """Return the number of the block from which on all is predicted from the blocks before: the middle, or a later one.
+    """Return the first block of the part that is predicted from the earlier part.
 
-    It is later if the first half hardly informs about one of the free parameters of a fitted simulator.
+    It is the middle one, or a later one if the first half hardly informs about a free parameter of a fitted simulator.
     """
-    blocks, middle, last = blocks_of(bench), FOLDS * ROUNDS // 2, FOLDS * ROUNDS - FOLDS // 2
+    blocks = blocks_of(bench)
 
     def on_parameters(masks: Sequence[np.ndarray]) -> np.ndarray:
         problem, theta = bench.problem_at(fitted, masks)
@@ -450,22 +451,20 @@ def later_block(bench: Workbench, fitted: Fitted) -> int:
 
     try:
         total = on_parameters([b >= 0 for b in blocks])
-        for number in range(middle, last):
-            if np.all(on_parameters([(b >= 0) & (b < number) for b in blocks]) >= LEAST_EARLIER * total):
+        for number in range(MIDDLE, LATEST):
+            if not np.any(on_parameters([(b >= 0) & (b < number) for b in blocks]) < LEAST_EARLIER * total):
                 return number
     except (InputError, RuntimeError):  # the run diverges
-        return middle
-    return last
+        return MIDDLE
+    return LATEST
 
 
-def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1, later_from: int | None = None) -> HeldOut:
+def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1, later_from: int = MIDDLE) -> HeldOut:
     """Refit without each fold of blocks and without the later blocks; return the errors on the omitted parts.
 
-    The later blocks are those from `later_from` on, by default the second half. The errors are infinite if the run
-    diverges or the time is over.
+    The later blocks are those from `later_from` on. The errors are infinite if the run diverges or the time is over.
     """
     blocks = blocks_of(bench)
-    later_from = FOLDS * ROUNDS // 2 if later_from is None else later_from
     folds = [[(b >= 0) & (b % FOLDS == fold) for b in blocks] for fold in range(FOLDS)]
     later = [b >= later_from for b in blocks]
     *squares, second = side_by_side(lambda left: _sum_of_squares(bench, fitted, left), [*folds, later], workers)

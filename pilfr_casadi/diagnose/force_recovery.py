@@ -49,6 +49,7 @@ PASSES = 3  # linearisations at most
 # random steps of the force that are tried, in units of the force that explains the residual
 RANDOM_STEPS = np.logspace(-4.0, 0.5, 10)
 REPEATS = 0.01  # share of the ranges of coordinate and force within which a sample repeats another
+LEVEL_DIGITS = 9  # decimals of a coordinate over its range, up to which two samples are at one level
 SAME_CHANGE = 1e-6  # share of the change of the derivatives up to which a force acts as a parameter does
 
 
@@ -251,7 +252,7 @@ def is_curve(z: np.ndarray, w: np.ndarray) -> bool:
         return True
     z, w = ((v[finite] - np.min(v[finite])) / np.ptp(v[finite]) for v in (z, w))
     least = FORMULA_ERROR * np.var(w)
-    _, level, samples = np.unique(z, return_inverse=True, return_counts=True)
+    _, level, samples = np.unique(np.round(z, LEVEL_DIGITS), return_inverse=True, return_counts=True)
     if np.mean((w - (np.bincount(level, w) / samples)[level]) ** 2) > least:
         return False
     _, first = np.unique(np.round(np.column_stack([z, w]) / REPEATS).astype(np.int64), axis=0, return_index=True)

@@ -47,7 +47,7 @@ class WrongStart(Gate):
     Attributes
     ----------
     otherwise : WrongStart
-        The finding if a search from unknown initial states follows better, where a refit does so with a wrong zero.
+        Finding to report instead if a search with estimated initial states follows better.
     """
 
     otherwise: WrongStart | None = None
@@ -64,8 +64,9 @@ def find_wrong_start(now: Checked) -> Checked:
     """
     bench, misses = now.bench, _missed_starts(now)
     stated = [r for r in bench.recordings if r.begins in ("zero", "given")]
-    unknown = len(stated) * len(bench.simulator.states)
-    if not unknown or not np.any(misses):
+    # the states of other recordings come out as stated
+    unknown = sum(map(np.any, misses)) * len(bench.simulator.states)
+    if not unknown:
         return now
     missed = _describe_miss(now, misses)
     words = f"The initial states are not as stated: {missed}"
@@ -81,7 +82,7 @@ def find_wrong_start(now: Checked) -> Checked:
     if EQUAL_RATIO * left > after.cost:
         words = f"{words}; a wrong zero of the sensor explains that as well"
         return accept(now, after, replace(fault, sentence=words))
-    searched = f"{words}; beside the physics that is missing, another start explains that better than a wrong zero."
+    searched = f"{words}; a search with them estimated follows better than one with a wrong zero of the sensor."
     otherwise = replace(fault, sentence=searched, fault=True)
     words = "a wrong zero of the sensor explains that better than another start. If the machine did begin elsewhere"
     words = f"As stated, {missed}; {words}, give each state's value, or leave the start unknown."

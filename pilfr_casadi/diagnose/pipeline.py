@@ -231,7 +231,7 @@ def _search(request: Request) -> tuple[Prepared, Search]:
         return _search_realigned(request, ready, search, search.shift)
     start = next((g.otherwise for g in ready.gates if isinstance(g, WrongStart) and g.otherwise), None)
     if start is not None and not (search.interrupted or search.out_of_time):
-        return _search_from_unknown_start(request, ready, search, start)
+        request, ready, search = _search_from_unknown_start(request, ready, search, start)
     leads = any(isinstance(g, TimeShift) and g.leads for g in ready.gates)
     if not leads or search.interrupted or search.out_of_time or not search.can_improve(search.best):
         return ready, search
@@ -270,24 +270,26 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
 
 def _search_from_unknown_start(
     request: Request, ready: Prepared, search: Search, start: WrongStart
-) -> tuple[Prepared, Search]:
+) -> tuple[Request, Prepared, Search]:
     """Search with the initial states estimated; keep that if it follows to the noise, and clearly better.
 
     Before the missing physics is known, it may be what makes a wrong zero more likely than a wrong start. While it is
     unknown, free initial states and an offset together make up for a part of it.
     """
-    say, recordings = request.say.under("unknown start: "), edited(request.recordings, (start,))
-    found = _again(search, partial(_search_once, replace(request, recordings=recordings, say=say), shift_early=True))
+    recordings = edited(request.recordings, (start,))
+    opened = replace(request, recordings=recordings, say=request.say.under("unknown start: "))
+    found = _again(search, partial(_search_once, opened, shift_early=True))
     if found is None:
-        return ready, search
+        return request, ready, search
     other, again = found
-    opened = sum(a is not b for a, b in zip(recordings, request.recordings, strict=True))
-    residuals, unknown = again.bench.scored(again.best.fitted.residual), opened * len(request.simulator.states)
+    changed = sum(a is not b for a, b in zip(recordings, request.recordings, strict=True))
+    unknown = changed * len(opened.simulator.states)
+    residuals = again.bench.scored(again.best.fitted.residual)
     explained = not again.can_improve(again.best)
     if explained and gain(*_comparable(search, again), residuals, unknown) > LEAST_GAIN:
-        return replace(other, nominal=ready.nominal, gates=(start, *other.gates)), again
+        return opened, replace(other, nominal=ready.nominal, gates=(start, *other.gates)), again
     search.cut_short_with(again)
-    return ready, search
+    return request, ready, search
 
 
 def _again(search: Search, prepare_and_search: Callable[[], tuple[Prepared, Search]]) -> tuple[Prepared, Search] | None:

@@ -101,8 +101,8 @@ class TimeShift(Gate):
         values = getattr(r, self.kind)
         return [_interpolant(r, values[:, i], self._wraps(r), smooth=self.kind == "y") for i in self.columns]
 
-    def without(self, r: Recording) -> Recording:
-        """Return the samples of a recording that are scored with the channels read at their times, as recorded."""
+    def kept_samples(self, r: Recording) -> Recording:
+        """Return a recording as given, cut to the samples that the shift keeps."""
         moved = self.read(r)
         return r.slice(0, len(moved)).with_(skip=moved.skip)
 
@@ -128,7 +128,7 @@ class TimeShift(Gate):
             if np.mean(known) < LEAST_RECORDED:
                 return np.inf
             after, before = np.mean(first.project_off(np.column_stack([error, first.error]), known) ** 2, axis=0)
-            return float(after / max(before, 1e-300)) if np.isfinite(after) else np.inf
+            return float(after / before) if np.isfinite(after) and before > 0 else np.inf
 
         curves = list(map(self.curves, bench.recordings))
         as_recorded = [] if self.kind == "u" else list(map(simulate, bench.recordings, fitted.initial))
@@ -224,8 +224,8 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: 
 
 def _accept_on_same_samples(now: Checked, after: Checked, fault: TimeShift) -> Checked:
     """Accept a shift by the rule of all faults, but compare on the samples that it keeps."""
-    kept = now.bench.on(list(map(fault.without, now.bench.recordings)))
-    plain = refit(kept, [now.fitted.values], states=now.fitted.initial)
+    kept = replace(now.bench.on(list(map(fault.kept_samples, now.bench.recordings))), scale=after.bench.scale)
+    plain = refit(kept, [now.fitted.values], states=now.fitted.initial, like=now.fitted)
     if plain is None:
         return now
     found = accept(now.then(kept, plain), after, fault)

@@ -25,7 +25,10 @@ SAMPLES_PER_STATE = 10  # an estimate from so many samples adds a tenth of the n
 LEAST_INFORMATION = 1e-9  # singular value, over the largest, below which a direction of the state moves no output
 LARGEST_STATE = 1.1  # mean square of a first state, in units of its prior, above which the prior is widened
 PRIOR_WIDTH = 2.0  # prior deviation of a first state over its deviation along known runs
-LEAST_VARIANCE = 1e-6  # variance of a combination of states, over that of each, below which it counts as that
+LEAST_VARIANCE = 1e-6  # least variance of a combination of states, over that of each
+ROUNDING = 1e-9  # deviation of a state, over its size, below which it rests
+MOST_CONFLICT = 3.0  # largest misfit to prior and samples together, over its expectation, the number of states
+WIDER = 100.0  # factor on the prior covariance where the samples contradict it
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +58,7 @@ class StatePrior:
         if not (np.all(np.isfinite(states)) and np.all(np.isfinite(noise)) and np.all(noise > 0)):
             return None
         mean, deviation = np.mean(states, axis=0), np.std(states, axis=0)
-        moves = deviation > 0
+        moves = deviation > ROUNDING * np.max(np.abs(states), axis=0)
         scaled = (states - mean)[:, moves] / deviation[moves]
         square = np.zeros((len(mean), len(mean)))
         inverse = np.linalg.inv(scaled.T @ scaled / len(scaled) + LEAST_VARIANCE * np.eye(scaled.shape[1]))
@@ -126,7 +129,7 @@ def estimate_initial_state(
 
     An estimated state is fitted to the first `samples` outputs alone, from rest and from each of `starts`. With
     `state_prior` it has a prior around rest on the scale of the states in a run over all inputs (`state_precision`),
-    and is fitted from rest alone. With `known` it has that prior, and is fitted from its mean as well.
+    and is fitted from rest alone. With `known` it has that prior instead, and is fitted from its mean as well.
     """
     n, values, state = model.n_state, model.parameters.start, model.first_state(recording)
     if recording.begins == "periodic":
@@ -135,15 +138,11 @@ def estimate_initial_state(
     if recording.begins != "estimate" or not n:
         return state
     head = recording.slice(0, max(min(len(recording), samples or samples_for_state(model)), 2)).with_(skip=0)
-    problem, solver = (
-        _state_problem(model, engine, head, known.noise if known else None),
-        GaussNewton(max_iterations=50),
-    )
-    square = state_precision(engine, model.drive(recording), values, model.n_x, model.n_s) if state_prior else None
+    problem = _state_problem(model, engine, head, known.noise if known else None)
+    solver = GaussNewton(max_iterations=50)
     if known is not None:
-        prior = [(0, known.precision, known.mean)]
-        problem.penalties = Penalties(problem.model.parameters, {}, 1.0, problem.residuals, problem.size, prior)
-        starts = (*starts, known.mean)
+        return _fit_with_prior(problem, solver, (problem.start, *starts, known.mean), known)
+    square = state_precision(engine, model.drive(recording), values, model.n_x, model.n_s) if state_prior else None
     if square is None:
         found = [solver.solve(problem, start) for start in (problem.start, *starts)]
         return min(found, key=lambda solution: solution.cost).theta
@@ -157,3 +156,22 @@ def estimate_initial_state(
             break
         wider = size
     return state
+
+
+def _fit_with_prior(
+    problem: Problem, solver: GaussNewton, starts: Sequence[np.ndarray], known: StatePrior
+) -> np.ndarray:
+    """Fit an initial state with a prior, which is widened as long as the samples contradict it.
+
+    If prior and noise are right, the misfit to both beyond that of the best fit to the samples alone is a chi-square of
+    as many degrees of freedom as there are states (Gelman et al. 2013, Bayesian Data Analysis, ch. 6).
+    """
+    free = min((solver.solve(problem, start) for start in starts), key=lambda solution: solution.cost)
+    found, n = free, len(known.mean)
+    for i in range(STATE_ROUNDS):
+        prior = [(0, known.precision / WIDER**i, known.mean)]
+        problem.penalties = Penalties(problem.model.parameters, {}, 1.0, problem.residuals, problem.size, prior)
+        found = min((solver.solve(problem, x) for x in (known.mean, free.theta)), key=lambda solution: solution.cost)
+        if 2 * problem.residuals * (found.cost - free.cost) <= MOST_CONFLICT * n:
+            break
+    return found.theta

@@ -211,13 +211,13 @@ def heated(warm, offset):
     ids=["start", "zero", "interrupted"],
 )
 def test_missing_physics_shows_whether_the_start_or_the_zero_of_a_sensor_is_wrong(warm, offset, press):
-    """Before it is known, it makes a wrong zero likelier."""
+    """Unknown radiation makes a wrong zero look likelier than a wrong start."""
     tried = (laws.Radiation, laws.PiecewiseStiffness)
     found, stages = diagnosed(oven(), heated(warm, offset), tried, press, effects=1)
     (gate,) = (g for g in found.gates if g.finding == "start")
     assert stages.count("unknown start: checks and refit") == 1
     assert gate.corrected is (warm > 0 and not press), gate.sentence
-    assert ("another start explains that better" in gate.sentence) is gate.corrected
+    assert ("a search with them estimated follows better" in gate.sentence) is gate.corrected
     if not press:
         assert [e.law for e in found.effects] == ["radiation"]
         assert [g.finding for g in found.gates if g.fault and g is not gate] == (["offset"] if offset else [])

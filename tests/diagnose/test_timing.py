@@ -220,3 +220,23 @@ def test_a_shift_is_judged_on_the_samples_that_it_keeps():
     refitted = bench.fit(bench.simulator)
     assert not any(fault.channel == "speed" for fault in _screen_shifts(bench, refitted))
     assert not find_time_shift(Checked(bench, refitted)).gates
+
+
+def test_a_shift_that_keeps_only_rest_shows_nothing():
+    """Constant inputs could be read so late that nothing was left but rest; they took the place of the true shift."""
+    names = ("force", "a", "b", "c", "d")
+    cart = Simulator(
+        lambda x, u, p: {"v": p.gain * u.force - p.drag * x.v},
+        lambda x: {"v": x.v},
+        ("v",),
+        names,
+        {"gain": Parameter(3.0, bounds=(1, 9)), "drag": Parameter(1.0, bounds=(0.1, 9))},
+        Port("wheels", {"v": -1.0}, lambda x: x.v),
+    )
+    force = np.concatenate([np.zeros(250), np.repeat(np.random.default_rng(0).uniform(-1, 1, 10), 5)])
+    u = np.column_stack([force, *np.full((4, 300), 0.3)])
+    blank = Recording(u, 0 * u[:, :1], 0.05, names, ("v",), initial="zero", hold="zero")
+    y = np.vstack([np.zeros((8, 1)), np.round(cart.simulate(blank), 2)[:-8]])
+    bench = Workbench.of(cart, [blank.with_(y=y)], "zero", "vm")
+    (found,) = find_time_shift(Checked(bench, bench.fit(cart))).gates
+    assert found.channel == "force" and found.delay == pytest.approx(0.4)

@@ -44,17 +44,50 @@ def states_and_recording(seed, m, begin):
 
 
 def test_a_state_that_the_first_samples_hardly_reveal_is_as_in_other_runs():
-    model, known, trained = states_and_recording(0, 4000, [6.0, 2.0, 6.0, 0.0])
+    model, known, trained = states_and_recording(0, 4000, [6.0, 2.0, 6.0, 0.3])
     prior = StatePrior.of(known, trained.y - known[:, :1])
     assert prior.noise == pytest.approx([NOISE], rel=0.05)
     assert not prior.precision[3].any() and prior.precision[0, 0] > 0  # the constant did not move
     errors = {"none": [], "known": []}
     for seed in range(1, 9):
-        _, states, r = states_and_recording(seed, 240, [7.0, 2.5, 6.0, 0.0])
+        _, states, r = states_and_recording(seed, 240, [7.0, 2.5, 6.0, 3.0])
         for name, one in (("none", None), ("known", prior)):
             y, first = run_free(model, make_engine(model), r.with_(initial="estimate"), known=one)
             errors[name].append(np.sqrt(np.mean((y - states[:, :1])[first:] ** 2)))
     assert np.mean(errors["known"]) < 0.7 * np.mean(errors["none"])
+
+
+def two_lags():
+    """Two slow states of which the output shows the sum."""
+    return Simulator(
+        lambda x, u: {"a": u.f - 0.2 * x.a, "b": u.g - 0.05 * x.b},
+        lambda x: {"y": x.a + x.b},
+        ("a", "b"),
+        ("f", "g"),
+        ports=(Port("a", {"a": -1.0}, lambda x: x.a),),
+        hold="zero",
+    )
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-15, 0.1])
+def test_samples_that_contradict_the_prior_win(share):
+    """The other runs hardly moved a state that is plain to see."""
+    rng = np.random.default_rng(0)
+    model = discretise(two_lags(), 0.1, "zero")
+    engine = make_engine(model)
+    u = np.repeat(rng.uniform(-1, 1, (120, 2)), 10, axis=0) * [1.0, share]
+
+    def run(state, noise):
+        r = Recording(u, 0 * u[:, :1], 0.1, ("f", "g"), ("y",), hold="zero")
+        y = engine.simulate(model.drive(r), model.parameters.start, np.array(state))[0]
+        return r.with_(y=y + noise * rng.standard_normal(y.shape), initial="estimate"), y
+
+    states = np.cumsum(0.05 * u, axis=0)  # about those of the runs
+    states[:, 1] += 0.3
+    prior = StatePrior.of(states, 0.02 * rng.standard_normal((1200, 1)))
+    r, true = run([-0.3, 4.0], 0.02)
+    y, first = run_free(model, engine, r, known=prior)
+    assert np.sqrt(np.mean((y - true)[first:] ** 2)) < 0.02
 
 
 def test_runs_that_diverge_or_have_no_error_tell_nothing():
