@@ -17,6 +17,7 @@ from ..models import Model
 from ..optimise import StatePrior
 from ..simulators import Simulator, discretise
 from .evidence import BETTER_RATIO
+from .floor import effective_size
 from .gates import Gate, edited
 from .linearise import linearise_runs, simulate_states
 from .screen import RIDGES, Remainder, held_out
@@ -108,7 +109,11 @@ def prior_of(bench: Workbench, fitted: Fitted) -> StatePrior | None:
     runs = zip(bench.recordings, fitted.initial, strict=True)
     with np.errstate(all="ignore"):
         states = np.concatenate([simulate_states(fitted, r.slice(0, most), state) for r, state in runs])
-    return StatePrior.of(states, np.concatenate(bench.scored(fitted.residual))) if states.shape[1] else None
+    if not states.shape[1]:
+        return None
+    residuals = bench.scored(fitted.residual)
+    errors = np.concatenate(residuals)
+    return StatePrior.of(states, errors, max(len(errors) / effective_size(residuals), 1.0))
 
 
 def test_errors(

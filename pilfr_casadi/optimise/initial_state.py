@@ -44,7 +44,7 @@ class StatePrior:
     precision : array, shape (n, n)
         Inverse of its prior covariance; without information on states that did not move.
     noise : array, shape (n_y,)
-        Rms error of each output along those runs.
+        Rms error of each output along those runs, larger if neighbouring errors are alike and so tell less.
     """
 
     mean: np.ndarray
@@ -52,9 +52,12 @@ class StatePrior:
     noise: np.ndarray
 
     @classmethod
-    def of(cls, states: np.ndarray, errors: np.ndarray) -> Self | None:
-        """Take the states (M, n) and the errors (M, n_y) of runs; None if they diverge or an output has no error."""
-        noise = np.sqrt(np.mean(errors**2, axis=0))
+    def of(cls, states: np.ndarray, errors: np.ndarray, correlation: float = 1.0) -> Self | None:
+        """Take the states (M, n) and the errors (M, n_y) of runs; None if they diverge or an output has no error.
+
+        The errors are alike over so many samples, the `correlation`.
+        """
+        noise = np.sqrt(correlation * np.mean(errors**2, axis=0))
         if not (np.all(np.isfinite(states)) and np.all(np.isfinite(noise)) and np.all(noise > 0)):
             return None
         mean, deviation = np.mean(states, axis=0), np.std(states, axis=0)
