@@ -13,7 +13,7 @@ thresholds of the best fit are then spread along the density of their weights, b
 and the layer is fitted again, as long as that helps.
 
 The layer replaces the law if it predicts held-out parts of the training recordings better (`evidence`): by the error on
-blocks or later parts that a fit has not seen, plus the spread of predictions for other inputs, which grows with every
+blocks or second halves that a fit has not seen, plus the spread of predictions for other inputs, which grows with every
 parameter that the recordings hardly determine. Test recordings are never used. Otherwise the diagnosed law stays.
 
 The initial loading curve is the response to z growing from zero with empty memory (virgin curve); for plays
@@ -215,7 +215,7 @@ def _predict(search: Search, fitted: Fitted) -> HeldOut:
     named law.
     """
     bench = search.bench
-    found = held_out_errors(bench, fitted, search.workers, search.later_from)
+    found = held_out_errors(bench, fitted, search.workers, search.late)
     v = found.mean_square
     n = Sample(search.floor2, effective_size(bench.scored(fitted.residual))).effective(v)
     return replace(found, spread=spread(bench, fitted, search.added_laws(fitted), v, n) if np.isfinite(v) else np.inf)
