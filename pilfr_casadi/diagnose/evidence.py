@@ -23,9 +23,7 @@ scored. The state at the beginning of a block therefore needs no estimate: it fo
 before. Neighbouring samples are correlated, and so whole blocks are held out (Burman, Chow & Nolan 1994, Biometrika
 81(2)). Samples after a block still constrain a simulation that drifts, for example behind a free integrator. Therefore
 the second half of every recording is also predicted, from a fit to the first half (Tashman 2000, Int. J. Forecasting
-16(4)). Parameters of the simulator about which the first half hardly informs keep their values there, as a window's
-area if the sun shines in the second half alone. The larger of both errors counts, plus the spread of predictions for
-other inputs (`spread`).
+16(4)). The larger of both errors counts, plus the spread of predictions for other inputs (`spread`).
 """
 
 from __future__ import annotations
@@ -94,8 +92,6 @@ UNKNOWN_SHARE = 1e-6  # squared share of a parameter in an unknown combination; 
 
 # Held-out data
 FOLDS, ROUNDS = 4, 2  # folds, and blocks of a recording in each fold: eight blocks, spread over the recording
-LEAST_EARLIER = 0.1  # least share of the information on a parameter in the first half: three times its standard error
-MIDDLE = FOLDS * ROUNDS // 2  # the first block of the second half
 LEAD_SHARE = 0.5  # share of a block that is never held out at the start of a recording: it determines the initial state
 # The fit to all blocks is near each of these fits; a fit that has not converged after so many steps is used as it is.
 REFIT = GaussNewton(max_iterations=8, tolerance=1e-2, patience=2)
@@ -402,7 +398,7 @@ class HeldOut:
     """Mean square errors of a simulator on data that it was not fitted to, outputs in units of their deviation."""
 
     blocks: float  # on held-out blocks; infinite if the simulation diverges
-    ahead: float  # the same on the second halves, predicted from the first
+    ahead: float  # the same on the second halves
     squares: np.ndarray  # (n_y,), the larger of the two, of each output
     spread: float = 0.0  # mean square uncertainty of predictions for other inputs; see `evidence.spread`
 
@@ -438,38 +434,15 @@ def blocks_of(bench: Workbench) -> list[np.ndarray]:
     return out
 
 
-def late_parameters(bench: Workbench, fitted: Fitted) -> tuple[str, ...]:
-    """Return the names of the free parameters of a fitted simulator about which the first half hardly informs."""
-    blocks, own = blocks_of(bench), fitted.model.parameters
-
-    def on_parameters(masks: Sequence[np.ndarray]) -> np.ndarray:
-        problem, theta = bench.problem_at(fitted, masks)
-        out = np.full(own.size, np.inf)
-        with np.errstate(all="ignore"):
-            out[own.free] = np.diag(problem.normal(theta)[2])[: problem.n_free]
-        return out * sum(int(np.sum(mask)) for mask in masks)
-
-    try:
-        whole, half = (on_parameters([(b >= 0) & (b < end) for b in blocks]) for end in (FOLDS * ROUNDS, MIDDLE))
-    except (InputError, RuntimeError):  # the run diverges
-        return ()
-    late = half < LEAST_EARLIER * whole
-    return tuple(name for name in own if np.any(late[own.position(name)]))
-
-
-def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1, late: Sequence[str] = ()) -> HeldOut:
+def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldOut:
     """Refit without each fold of blocks and without the second halves; return the errors on the omitted parts.
 
-    The `late` parameters keep their values where the second halves are predicted. The errors are infinite if the run
-    diverges or the time is over.
+    They are infinite if the run diverges or the time is over.
     """
     blocks = blocks_of(bench)
     folds = [[(b >= 0) & (b % FOLDS == fold) for b in blocks] for fold in range(FOLDS)]
-    later = [b >= MIDDLE for b in blocks]
-    keeping = fitted.model.parameters.change(**{name: {"fixed": True} for name in late})
-    known = replace(fitted, model=fitted.model.with_parameters(keeping)) if late else fitted
-    pairs = [*((fitted, left) for left in folds), (known, later)]
-    *squares, second = side_by_side(lambda pair: _sum_of_squares(bench, *pair), pairs, workers)
+    later = [b >= FOLDS * ROUNDS // 2 for b in blocks]
+    *squares, second = side_by_side(lambda left: _sum_of_squares(bench, fitted, left), [*folds, later], workers)
     scored, ahead = (max(sum(int(np.sum(mask)) for mask in masks), 1) for masks in ([b >= 0 for b in blocks], later))
     both = np.sum(squares, axis=0) / scored, second / ahead
     pooled = bench.pool(both[0]), bench.pool(both[1])

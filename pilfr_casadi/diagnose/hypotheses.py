@@ -29,7 +29,6 @@ from .evidence import (
     Sample,
     held_out_errors,
     information,
-    late_parameters,
     log_evidence,
     log_occam,
     log_prior,
@@ -223,12 +222,7 @@ class Hypotheses:
 
     def held_out_errors(self, fitted: Fitted, spread: float) -> HeldOut:
         """Compute the held-out errors of a fitted simulator with a known spread for other inputs."""
-        return replace(held_out_errors(self.bench, fitted, self.workers, self.late), spread=spread)
-
-    @cached_property
-    def late(self) -> tuple[str, ...]:
-        """The simulator's parameters about which the first half of the recordings hardly informs."""
-        return late_parameters(self.bench, self.root.fitted)
+        return replace(held_out_errors(self.bench, fitted, self.workers), spread=spread)
 
     def spread(self, fitted: Fitted) -> float:
         """Compute the mean square uncertainty of a fitted simulator's predictions for other inputs."""

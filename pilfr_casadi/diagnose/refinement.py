@@ -215,7 +215,7 @@ def _predict(search: Search, fitted: Fitted) -> HeldOut:
     named law.
     """
     bench = search.bench
-    found = held_out_errors(bench, fitted, search.workers, search.late)
+    found = held_out_errors(bench, fitted, search.workers)
     v = found.mean_square
     n = Sample(search.floor2, effective_size(bench.scored(fitted.residual))).effective(v)
     return replace(found, spread=spread(bench, fitted, search.added_laws(fitted), v, n) if np.isfinite(v) else np.inf)

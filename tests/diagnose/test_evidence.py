@@ -13,9 +13,7 @@ from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.evidence import (
     WRONG_MODEL_SAMPLES,
     Sample,
-    held_out_errors,
     information,
-    late_parameters,
     log_evidence,
     log_prior,
     runs_away,
@@ -47,29 +45,6 @@ def test_a_parameter_has_to_pay_for_itself(n):
     dear, dearer = (alone - log_evidence(0.01, np.array([size]), 0.0, n) for size in (1.0, 4.0))
     assert dearer - dear == pytest.approx(0.5 * np.log(4), rel=0.05)
     assert log_evidence(0.01 * np.exp(-2.6 * dear / n), np.array([1.0]), 0.0, n) > alone
-
-
-@pytest.mark.parametrize(("from_sample", "late"), [(0, ()), (200, ()), (500, ("window",))])
-def test_a_parameter_that_shows_late_is_not_fitted_to_the_first_half(from_sample, late):
-    """A window warms a house only while the sun shines; nothing else can tell its area."""
-    house = pilfr.Simulator(
-        lambda x, u, p: {"T": 0.1 * u.heater + p.window * u.sun - p.loss * x.T},
-        lambda x: {"T": x.T},
-        ("T",),
-        ("heater", "sun"),
-        {"loss": pilfr.Parameter(0.2, fixed=True), "window": pilfr.Parameter(0.3, bounds=(0, 1))},
-        pilfr.Port("air", {"T": -1.0}, lambda x: x.T),
-    )
-    rng = np.random.default_rng(0)
-    u = np.repeat(rng.uniform(0, 1, (100, 2)), 10, axis=0)
-    u[:from_sample, 1] *= 0.02  # a cloudy day
-    blank = pilfr.Recording(u, 0 * u[:, :1], 0.1, house.inputs, ("T",), initial="zero", hold="zero")
-    r = blank.with_(y=house.simulate(blank) + 0.02 * np.sin(np.arange(1000) / 90)[:, None])
-    bench = Workbench.of(house, [r], "zero", "vm")
-    fitted = bench.fit(house)
-    assert late_parameters(bench, fitted) == late
-    free, kept = (held_out_errors(bench, fitted, late=names).ahead for names in ((), late))
-    assert kept < 2 * fitted.cost and (free > 4 * kept) is bool(late)
 
 
 def test_what_diverges_has_no_evidence():
