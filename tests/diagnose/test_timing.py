@@ -8,10 +8,10 @@ from pilfr_casadi._base import Stages
 from pilfr_casadi.data import Recording
 from pilfr_casadi.diagnose import Workbench, diagnose
 from pilfr_casadi.diagnose.floor import Floor
-from pilfr_casadi.diagnose.gates import Checked, Gate
+from pilfr_casadi.diagnose.gates import Checked, Gate, accept, correct
 from pilfr_casadi.diagnose.preparation import hold_note
 from pilfr_casadi.diagnose.search import Search
-from pilfr_casadi.diagnose.timing import _screen_shifts, find_time_shift
+from pilfr_casadi.diagnose.timing import TimeShift, _accept_on_same_samples, _screen_shifts, find_time_shift
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
     CoulombFriction,
@@ -212,14 +212,19 @@ def test_a_shift_is_judged_on_the_samples_that_it_keeps():
         {"gain": Parameter(3.0, bounds=(1, 9))},
         Port("yaw", {"heading": -1.0}, lambda x: x.heading),
     )
-    u = np.column_stack([np.repeat([0.0, 0.2, 0.0, 0.2], 30), np.full(120, 0.3)])
+    u = np.column_stack([np.repeat([0.0, 0.2, -0.1, 0.05], 30), np.full(120, 0.3)])
     blank = Recording(u, 0 * u[:, :1], 0.025, car.inputs, ("heading",), initial="zero", hold="zero")
-    late = car.with_element("actuator:steering", Lag().at({"T": 0.15}))
-    wandering = np.where(np.arange(120) < 60, 0.0, 0.02 * np.sin(np.arange(120) / 8))[:, None]
+    late = car.with_element("actuator:steering", Lag().at({"T": 0.03}))
+    wandering = np.where(np.arange(120) < 60, 0.0, 0.3 * np.sin(np.arange(120)))[:, None]
     bench = Workbench.of(car, [blank.with_(y=late.simulate(blank) + wandering)], "zero")
     refitted = bench.fit(bench.simulator)
     assert not any(fault.channel == "speed" for fault in _screen_shifts(bench, refitted))
-    assert not find_time_shift(Checked(bench, refitted)).gates
+    now = Checked(bench, refitted)
+    assert not find_time_shift(now).gates
+    fault = TimeShift("speed", "alignment", 0.0, kind="u", columns=(1,)).at(60 * 0.025, 0.025)
+    after = correct(now, fault)
+    assert after.cost < 0.25 * now.cost and accept(now, after, fault).gates
+    assert not _accept_on_same_samples(now, after, fault).gates
 
 
 def test_a_shift_that_keeps_only_rest_shows_nothing():

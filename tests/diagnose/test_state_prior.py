@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pilfr_casadi import Parameter, Port, Recording, Simulator
+from pilfr_casadi.diagnose import Workbench, proof
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.identify import run_free
 from pilfr_casadi.optimise import StatePrior
@@ -55,6 +56,20 @@ def test_a_state_that_the_first_samples_hardly_reveal_is_as_in_other_runs():
             y, first = run_free(model, make_engine(model), r.with_(initial="estimate"), known=one)
             errors[name].append(np.sqrt(np.mean((y - states[:, :1])[first:] ** 2)))
     assert np.mean(errors["known"]) < 0.7 * np.mean(errors["none"])
+
+
+def test_fits_are_tested_with_what_their_own_runs_tell():
+    """The simulator as given has the same values here, but no runs."""
+    trained = states_and_recording(0, 4000, [6.0, 2.0, 6.0, 0.3])[2].with_(initial="estimate")
+    bench = Workbench.of(house(), [trained], "zero")
+    fitted = bench.fit(house())
+    tests = [states_and_recording(seed, 240, [7.0, 2.5, 6.0, 3.0])[2] for seed in range(1, 9)]
+    unknown = [r.with_(initial="estimate") for r in tests]
+    fits = {"before": fitted, "after": fitted}
+    errors = proof.test_errors(bench, unknown, (), fits, bench.model(house())).errors
+    assert errors["after"] == errors["before"] < 0.9 * errors["nominal"]
+    known = proof.test_errors(bench, tests, (), fits, bench.model(house())).errors
+    assert known["after"] == known["nominal"]
 
 
 def two_lags():
