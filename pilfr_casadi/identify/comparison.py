@@ -218,7 +218,7 @@ def run_free(
     """Simulate a model at its start values along a recording.
 
     An unknown initial state is fitted to the first part of the recording, starting from rest and from `starts`, with
-    the prior `known` if there is one; with `whole` to all of it, as in a fit.
+    the prior `known` if there is one; with `whole` to all of it, without a prior, as in a fit.
 
     Returns
     -------
