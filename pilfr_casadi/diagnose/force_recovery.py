@@ -49,6 +49,7 @@ PASSES = 3  # linearisations at most
 # random steps of the force that are tried, in units of the force that explains the residual
 RANDOM_STEPS = np.logspace(-4.0, 0.5, 10)
 REPEATS = 0.01  # share of the ranges of coordinate and force within which a sample repeats another
+LEVEL_DIGITS = 9  # decimals of a coordinate over its range, up to which two samples are at one level
 SAME_CHANGE = 1e-6  # share of the change of the derivatives up to which a force acts as a parameter does
 
 
@@ -242,18 +243,19 @@ def signals_along(bench: Workbench, fitted: Fitted, number: int = -1) -> tuple[n
 def is_curve(z: np.ndarray, w: np.ndarray) -> bool:
     """Tell whether a force w (M,) is a function of the coordinate z (M,) alone, as that of memory which is not shown.
 
-    In the order of z, each force lies between those of its neighbours then, or near them. Elsewhere the neighbours come
-    from another branch. Of samples that nearly repeat each other, as over many periods, one counts: they would be each
-    other's neighbours.
+    It has one value at each level of z then, as of a held input. In the order of z, each force lies between those of
+    its neighbours, or near them. Elsewhere the neighbours come from another branch. Of samples that nearly repeat each
+    other, as over many periods, one counts: they would be each other's neighbours.
     """
     finite = np.isfinite(z) & np.isfinite(w)
-    z, w = z[finite], w[finite]
-    if len(z) < 3 or np.ptp(z) == 0 or np.ptp(w) == 0:
+    if np.sum(finite) < 3 or np.ptp(z[finite]) == 0 or np.ptp(w[finite]) == 0:
         return True
-    cells = np.round(np.column_stack([(z - np.min(z)) / np.ptp(z), (w - np.min(w)) / np.ptp(w)]) / REPEATS).astype(
-        np.int64
-    )
-    _, first = np.unique(cells, axis=0, return_index=True)
+    z, w = ((v[finite] - np.min(v[finite])) / np.ptp(v[finite]) for v in (z, w))
+    least = FORMULA_ERROR * np.var(w)
+    _, level, samples = np.unique(np.round(z, LEVEL_DIGITS), return_inverse=True, return_counts=True)
+    if np.mean((w - (np.bincount(level, w) / samples)[level]) ** 2) > least:
+        return False
+    _, first = np.unique(np.round(np.column_stack([z, w]) / REPEATS).astype(np.int64), axis=0, return_index=True)
     any_order = np.random.default_rng(0).permutation(first)  # of samples at the same z
     order = any_order[np.argsort(z[any_order], kind="stable")]
     beside = np.sort([w[order][:-2], w[order][2:]], axis=0)

@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -154,20 +154,24 @@ class Hypotheses:
 
         Where all models are wrong, the spread of predictions for other inputs counts as an error.
         """
+        return self._judged_evidence(trial, 0.5)
+
+    def _judged_evidence(self, trial: Trial, quantile: float) -> float:
+        """Compute the log evidence, with a quantile of the known ratios for a hypothesis that was not predicted."""
         known, v = self.findings[trial.key].held_out, np.inf
         if known or np.isfinite(trial.mean_square):
-            squares = known.squares if known else trial.fitted.squares * self._held_out_ratio()
+            squares = known.squares if known else trial.fitted.squares * self._held_out_ratio(quantile)
             v = self.bench.pool(squares + self.tolerance) + (known.spread if known and self._all_wrong else 0.0)
         return self._log_evidence(trial, v, self.samples)
 
-    def _held_out_ratio(self) -> float:
-        """Compute the usual ratio of held-out to fit error (mean squares), for hypotheses that were not predicted.
+    def _held_out_ratio(self, quantile: float) -> float:
+        """Compute a quantile of the known ratios of held-out to fit error (mean squares).
 
-        Of two ratios the smaller is usual: one hypothesis that predicts badly says nothing about the others.
+        Of two ratios the median is the smaller: one hypothesis that predicts badly says nothing about the others.
         """
         known = [(self.findings[key].held_out, trial.mean_square) for key, trial in self.memo.items()]
         ratios = [h.error**2 / fit for h, fit in known if h and np.isfinite(h.error) and fit > 0]
-        return float(np.quantile(ratios, 0.5, method="lower")) if ratios else 1.0
+        return float(np.quantile(ratios, quantile, method="lower")) if ratios else 1.0
 
     def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
         return log_evidence(v, trial.information, self.log_prior(trial), n)
@@ -247,15 +251,15 @@ class Hypotheses:
             if self._all_wrong:
                 self.held_out(self.root)
             for done in itertools.count():
-                likely = self._likeliest()
-                left = [t for t in likely if self.findings[t.key].held_out is None]
-                if not left or (done >= MOST_PREDICTED and left[0] is not likely[0]):
+                best = max(self.memo.values(), key=self.evidence)
+                unknown = [t for t in (best, *self._likeliest()) if self.findings[t.key].held_out is None]
+                if not unknown or (done >= MOST_PREDICTED and unknown[0] is not best):
                     break
                 if not self.in_time():  # an unfinished comparison favours the hypotheses that were not judged
                     self.forget_held_out()
                     break
-                self.say("held-out blocks", done, min(done + len(left), max(MOST_PREDICTED, done + 1)))
-                self.held_out(left[0])
+                self.say("held-out blocks", done, min(done + len(unknown), max(MOST_PREDICTED, done + 1)))
+                self.held_out(unknown[0])
 
     def forget_held_out(self) -> None:
         """Forget the held-out errors, so that all hypotheses are compared by their fit errors."""
@@ -263,7 +267,8 @@ class Hypotheses:
             known.held_out = None
 
     def _likeliest(self) -> list[Trial]:
-        return likeliest(list(self.memo.values()), self.evidence)
+        """List the hypotheses that may be the likeliest if they predict as well as any that did."""
+        return likeliest(list(self.memo.values()), partial(self._judged_evidence, quantile=0.0))
 
     def flexible(self, trial: Trial) -> dict[str, float]:
         """Compute the share of a trial's residual that a flexible force explains, by port."""

@@ -42,7 +42,15 @@ VISIBLE_SHARE = 1e-6  # share of a constant's response above which initial state
 
 @dataclass(frozen=True)
 class WrongStart(Gate):
-    """Initial states that are not as stated; other physics may remain beside it."""
+    """Initial states that are not as stated; other physics may remain beside it.
+
+    Attributes
+    ----------
+    otherwise : WrongStart
+        Finding to report instead if a search with estimated initial states follows better.
+    """
+
+    otherwise: WrongStart | None = None
 
     most_left: ClassVar[float] = 1.0
     remedy: ClassVar[str] = "with them estimated"
@@ -56,8 +64,9 @@ def find_wrong_start(now: Checked) -> Checked:
     """
     bench, misses = now.bench, _missed_starts(now)
     stated = [r for r in bench.recordings if r.begins in ("zero", "given")]
-    unknown = len(stated) * len(bench.simulator.states)
-    if not unknown or not np.any(misses):
+    # the states of other recordings come out as stated
+    unknown = sum(map(np.any, misses)) * len(bench.simulator.states)
+    if not unknown:
         return now
     missed = _describe_miss(now, misses)
     words = f"The initial states are not as stated: {missed}"
@@ -73,9 +82,12 @@ def find_wrong_start(now: Checked) -> Checked:
     if EQUAL_RATIO * left > after.cost:
         words = f"{words}; a wrong zero of the sensor explains that as well"
         return accept(now, after, replace(fault, sentence=words))
+    searched = f"{words}; a search with them estimated follows better than one with a wrong zero of the sensor."
+    otherwise = replace(fault, sentence=searched, fault=True)
     words = "a wrong zero of the sensor explains that better than another start. If the machine did begin elsewhere"
     words = f"As stated, {missed}; {words}, give each state's value, or leave the start unknown."
-    return now.then(bench, now.fitted, replace(fault, sentence=words, corrected=False, change=None))
+    zero = replace(fault, sentence=words, corrected=False, change=None, otherwise=otherwise)
+    return now.then(bench, now.fitted, zero)
 
 
 def _error_at_own_zero(bench: Workbench, zeroed: Fitted, misses: Sequence[np.ndarray]) -> float:

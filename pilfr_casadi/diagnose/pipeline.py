@@ -25,12 +25,13 @@ How an answer comes about:
 **Long recordings.** Steps 1 to 6 see only their most informative stretches (`stretches`). The leading hypotheses are
 then fitted to everything before step 3, and the answer's simulator before step 7.
 
-**Repetitions.** Steps 1 and 2 are repeated in four cases: with an observer if the simulator is unstable and runs away
+**Repetitions.** Steps 1 and 2 are repeated in five cases: with an observer if the simulator is unstable and runs away
 from the recordings (`prediction`); with the other hold if nobody stated it and the best hypothesis follows better with
-it; without a shift if a channel seemed to be early, because missing physics can look like a lead; and with a shift that
-shows only beside the first law. Each search fits different data. Its evidence is therefore not comparable; the smaller
-error decides. If nothing has a name after step 6 and the simulator drifts, the search is repeated in predictions, and
-the laws that are found there are refitted in free run (`_name_in_predictions`).
+it; without a shift if a channel seemed to be early, because missing physics can look like a lead; with a shift that
+shows only beside the first law; and from unknown initial states if a wrong zero was preferred to a wrong start. Each
+search fits different data. Its evidence is therefore not comparable; the smaller error decides. If nothing has a name
+after step 6 and the simulator drifts, the search is repeated in predictions, and the laws that are found there are
+refitted in free run (`_name_in_predictions`).
 """
 
 from __future__ import annotations
@@ -61,8 +62,8 @@ from .arguments import (
 from .correction import find_correction, named_correction
 from .evidence import AS_GIVEN_RATIO, SURE
 from .floor import Floor, measured_floor
-from .gates import EQUAL_RATIO, USELESS_FIT, Checked, Gate, edited
-from .offsets import Offset, fix_idle_offsets, list_offsets
+from .gates import EQUAL_RATIO, LEAST_GAIN, USELESS_FIT, Checked, Gate, edited, gain
+from .offsets import Offset, WrongStart, fix_idle_offsets, list_offsets
 from .other_explanations import (
     find_pinned_parameters,
     find_undeclared_port,
@@ -222,11 +223,15 @@ def _comparable(one: Search, other: Search) -> tuple[float, float]:
 def _search(request: Request) -> tuple[Prepared, Search]:
     """Prepare and search; if a lead was corrected, repeat without, and keep that if it is clearly better.
 
-    If a channel proves shifted beside a law, repeat with it at its right times.
+    If a channel proves shifted beside a law, repeat with it at its right times. If a wrong zero was preferred to a
+    wrong start, repeat with the start unknown.
     """
     ready, search = _search_once(request, shift_early=True)
     if search.shift is not None:
         return _search_realigned(request, ready, search, search.shift)
+    start = next((g.otherwise for g in ready.gates if isinstance(g, WrongStart) and g.otherwise), None)
+    if start is not None and not (search.interrupted or search.out_of_time):
+        request, ready, search = _search_from_unknown_start(request, ready, search, start)
     leads = any(isinstance(g, TimeShift) and g.leads for g in ready.gates)
     if not leads or search.interrupted or search.out_of_time or not search.can_improve(search.best):
         return ready, search
@@ -261,6 +266,30 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
         search.cut_short_with(again)
         return ready, search
     return replace(other, nominal=ready.nominal, gates=(*edits, shift, *other.gates)), again
+
+
+def _search_from_unknown_start(
+    request: Request, ready: Prepared, search: Search, start: WrongStart
+) -> tuple[Request, Prepared, Search]:
+    """Search with the initial states estimated; keep that if it follows to the noise, and clearly better.
+
+    Before the missing physics is known, it may be what makes a wrong zero more likely than a wrong start. While it is
+    unknown, free initial states and an offset together make up for a part of it.
+    """
+    recordings = edited(request.recordings, (start,))
+    opened = replace(request, recordings=recordings, say=request.say.under("unknown start: "))
+    found = _again(search, partial(_search_once, opened, shift_early=True))
+    if found is None:
+        return request, ready, search
+    other, again = found
+    changed = sum(a is not b for a, b in zip(recordings, request.recordings, strict=True))
+    unknown = changed * len(opened.simulator.states)
+    residuals = again.bench.scored(again.best.fitted.residual)
+    explained = not again.can_improve(again.best)
+    if explained and gain(*_comparable(search, again), residuals, unknown) > LEAST_GAIN:
+        return opened, replace(other, nominal=ready.nominal, gates=(start, *other.gates)), again
+    search.cut_short_with(again)
+    return request, ready, search
 
 
 def _again(search: Search, prepare_and_search: Callable[[], tuple[Prepared, Search]]) -> tuple[Prepared, Search] | None:

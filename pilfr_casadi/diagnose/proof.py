@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,15 +14,19 @@ from ..engine import make_engine
 from ..identify import run_free
 from ..laws import Law
 from ..models import Model
+from ..optimise import StatePrior
 from ..simulators import Simulator, discretise
 from .evidence import BETTER_RATIO
+from .floor import effective_size
 from .gates import Gate, edited
-from .linearise import linearise_runs
+from .linearise import linearise_runs, simulate_states
 from .screen import RIDGES, Remainder, held_out
 from .workbench import Fitted, Workbench
 
-Models = Mapping[str, tuple[Model, Sequence[np.ndarray]]]  # each with further initial states to start from
+# each with further initial states to start from, and a prior of initial states
+Models = Mapping[str, tuple[Model, Sequence[np.ndarray], StatePrior | None]]
 
+PRIOR_SAMPLES = 20_000  # samples of the training runs at most, about, that a prior of initial states is taken from
 AMPLITUDES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
 SINES, TRIANGLES = 12, 5  # frequencies that are tried
 LONGEST_EXPERIMENT = 3000  # longest simulated experiment, in samples
@@ -60,22 +65,24 @@ def _rests_after(recording: Recording, first: int) -> bool:
 
 def errors_of(bench: Workbench, model: Model, *, whole: bool = False) -> float:
     """Compute the NRMSE of a model at its start values; see `compare_errors`."""
-    return compare_errors(bench, {"": (model, ())}, whole=whole).errors[""]
+    return compare_errors(bench, {"": (model, (), None)}, whole=whole).errors[""]
 
 
 def compare_errors(bench: Workbench, models: Models, *, whole: bool = False) -> Comparison:
     """Compute the errors of models at their start values on the same samples.
 
-    Unknown initial states are estimated from rest and from the models' further initial states, on a first part that is
-    not scored; it is the longest that a model needs. With `whole` they are fitted to all samples, which are all scored;
-    use it to compare errors on training recordings with fits. An error is infinite if the simulation diverges.
+    Unknown initial states are estimated from rest and from the models' further initial states, with the models'
+    priors, on a first part that is not scored; it is the longest that a model needs. With `whole` they are fitted
+    to all samples, which are all scored; use it to compare errors on training recordings with fits. An error is
+    infinite if the simulation diverges.
     """
-    engines = {name: make_engine(model, bench.engine) for name, (model, _) in models.items()}
+    engines = {name: make_engine(model, bench.engine) for name, (model, *_) in models.items()}
     errors: dict[str, list[float]] = {name: [] for name in models}
     scored = list[tuple[Recording, int]]()
     for r in bench.recordings:
         runs = {
-            name: run_free(model, engines[name], r, starts, whole=whole) for name, (model, starts) in models.items()
+            name: run_free(model, engines[name], r, starts, whole=whole, known=known)
+            for name, (model, starts, known) in models.items()
         }
         first = max((skip for _, skip in runs.values()), default=0)
         scored.append((r, first))
@@ -95,6 +102,20 @@ def starts_of(fitted: Fitted) -> list[np.ndarray]:
     return fitted.initial if learned else fitted.initial[:1]
 
 
+@lru_cache(maxsize=4)
+def prior_of(bench: Workbench, fitted: Fitted) -> StatePrior | None:
+    """Return the prior of a further recording's initial state from a fit's runs; None if it has no state."""
+    most = max(PRIOR_SAMPLES // len(bench.recordings), 2)
+    runs = zip(bench.recordings, fitted.initial, strict=True)
+    with np.errstate(all="ignore"):
+        states = np.concatenate([simulate_states(fitted, r.slice(0, most), state) for r, state in runs])
+    if not states.shape[1]:
+        return None
+    residuals = bench.scored(fitted.residual)
+    errors = np.concatenate(residuals)
+    return StatePrior.of(states, errors, max(len(errors) / effective_size(residuals), 1.0))
+
+
 def test_errors(
     bench: Workbench, tests: Sequence[Recording], gates: Sequence[Gate], fits: Mapping[str, Fitted], given: Model
 ) -> Comparison:
@@ -103,8 +124,9 @@ def test_errors(
     The fits see the test recordings with the gates' edits, the given model as they are; so does the fit "after" once
     more (`unedited`). All are scored on the same samples, unless an edit changes these.
     """
-    models = {name: (one.fitted_model, starts_of(one)) for name, one in fits.items()}
-    nominal: Models = {"nominal": (given, ())}
+    unknown = any(r.begins == "estimate" for r in edited(tests, gates))
+    models = {name: (f.fitted_model, starts_of(f), prior_of(bench, f) if unknown else None) for name, f in fits.items()}
+    nominal: Models = {"nominal": (given, (), None)}
     if all(g.change is None for g in gates):
         return compare_errors(bench.on(tests), {**nominal, **models})
     found = compare_errors(bench.on(edited(tests, gates)), models)
@@ -116,11 +138,11 @@ def free_run_errors(
     bench: Workbench, recordings: Sequence[Recording], simulator: Simulator, without: Fitted, after: Fitted
 ) -> dict[str, float]:
     """Compute the NRMSEs without an observer, on corrected recordings."""
-    models = {}
+    models: dict[str, tuple[Model, Sequence[np.ndarray], StatePrior | None]] = {}
     for name, fitted in {"nominal": without, "before": without, "after": after}.items():
         led = simulator if name == "nominal" else fitted.corrected()
         free = discretise(replace(led, observer=None), bench.dt, bench.hold, fitted.model.substeps)
-        models[name] = free, starts_of(fitted)
+        models[name] = free, starts_of(fitted), None
     return compare_errors(bench.on(recordings), models).errors
 
 

@@ -41,10 +41,15 @@ def complements(one: Law, other: Law) -> bool:
 
     So are dry friction and a drag that grows with speed, a dead zone and a saturation, and two curves of position if a
     signal, such as a pressure, varies the strength of one alone. A constant offset may stand beside any other law, and
-    a mass on a spring beside any force without such a mass.
+    a mass on a spring beside any force without such a mass. The path of a signal may have a delay, a lag, and a curve
+    or a memory of its size.
     """
     if "offset" in (one.id, other.id):
         return one.id != other.id
+    if "delay" in (one.id, other.id) or any(
+        law.id == "extra_mode" and law.places == ("series",) for law in (one, other)
+    ):
+        return (one.shifts, one.order > 0) != (other.shifts, other.order > 0)
     sprung = [isinstance(law, SprungMass) for law in (one, other)]
     if any(sprung):
         plain = other if sprung[0] else one

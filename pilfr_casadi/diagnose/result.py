@@ -25,7 +25,7 @@ from .floor import ABOVE_NOISE
 from .gates import TEST_FAULT, Gate, edited
 from .learned import Learned
 from .offsets import Offset
-from .proof import starts_of
+from .proof import prior_of, starts_of
 from .refinement import Refinement, refine
 from .workbench import Fitted, output_deviation
 
@@ -238,7 +238,7 @@ class Diagnosis:
 
         With an observer (`focus="prediction"`), the outputs are predictions one sample ahead.
         Recordings are corrected as the training recordings were (sign, unit, shift; see `gates`). An unknown initial
-        state is estimated from the first samples.
+        state is estimated from the first samples, and expected to be like those of the training runs.
 
         Parameters
         ----------
@@ -343,7 +343,11 @@ class Diagnosis:
         fitted = self.evidence.get("after" if simulator is self.corrected else "without")
         substeps = fitted.model.substeps if fitted is not None else self.substeps
         model = discretise(simulator, dt, self.hold, substeps)
-        y, skip = run_free(model, make_engine(model), r, starts_of(fitted) if fitted is not None else ())
+        starts, search = starts_of(fitted) if fitted is not None else (), self.evidence.get("search")
+        known = None
+        if fitted is not None and search is not None and simulator in (self.corrected, self.refitted):
+            known = prior_of(search.bench, fitted) if r.begins == "estimate" else None
+        y, skip = run_free(model, make_engine(model), r, starts, known=known)
         return r, y, skip
 
     def export(self, **options: Any) -> Any:

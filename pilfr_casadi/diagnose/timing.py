@@ -101,8 +101,16 @@ class TimeShift(Gate):
         values = getattr(r, self.kind)
         return [_interpolant(r, values[:, i], self._wraps(r), smooth=self.kind == "y") for i in self.columns]
 
+    def kept_samples(self, r: Recording) -> Recording:
+        """Return a recording as given, cut to the samples that the shift keeps."""
+        moved = self.read(r)
+        return r.slice(0, len(moved)).with_(skip=moved.skip)
+
     def remainder(self, first: FirstOrder, fitted: Fitted) -> Callable[[float], float]:
-        """Return the mean square that parameters and initial states leave, as a function of the value."""
+        """Return the mean square that parameters and initial states leave, as a function of the value.
+
+        It is relative to what they leave of the same samples as recorded, because a shift leaves out samples at an end.
+        """
         bench = first.bench
 
         def simulate(r: Recording, state: np.ndarray) -> np.ndarray:
@@ -119,8 +127,8 @@ class TimeShift(Gate):
             known = np.concatenate([np.repeat(k[other.skip :], len(bench.scale)) for k, other in inside])
             if np.mean(known) < LEAST_RECORDED:
                 return np.inf
-            mean = float(np.mean(first.project_off(error, known) ** 2))
-            return mean if np.isfinite(mean) else np.inf
+            after, before = np.mean(first.project_off(np.column_stack([error, first.error]), known) ** 2, axis=0)
+            return float(after / before) if np.isfinite(after) and before > 0 else np.inf
 
         curves = list(map(self.curves, bench.recordings))
         as_recorded = [] if self.kind == "u" else list(map(simulate, bench.recordings, fitted.initial))
@@ -206,12 +214,25 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: 
     if best is None:
         return now
     fault, after = best
-    found = accept(now, after, fault)
+    found = _accept_on_same_samples(now, after, fault)
     if len(found.gates) == len(now.gates):
         return found
     more_is_wrong = after.cost > NEAR_NOISE_RATIO**2 * noise2  # then a delay or a slow clock may be physics
     may_be_physics = fault.is_like_delay(bench.dt, part) or (more_is_wrong and not (fault.leads and early))
     return now if may_be_physics or _is_lag(now, after, fault) else found
+
+
+def _accept_on_same_samples(now: Checked, after: Checked, fault: TimeShift) -> Checked:
+    """Accept a shift by the rule of all faults, but compare on the samples that it keeps."""
+    kept = replace(now.bench.on(list(map(fault.kept_samples, now.bench.recordings))), scale=after.bench.scale)
+    plain = refit(kept, [now.fitted.values], states=now.fitted.initial, like=now.fitted)
+    if plain is None:
+        return now
+    found = accept(now.then(kept, plain), after, fault)
+    if len(found.gates) > len(now.gates):
+        return found
+    back = refit(now.bench, [found.fitted.values], states=now.fitted.initial, like=now.fitted)
+    return now.then(now.bench, back) if back is not None and back.cost < now.cost else now
 
 
 def _is_lag(now: Checked, after: Checked, fault: TimeShift) -> bool:
@@ -252,8 +273,8 @@ def _screen_shifts(bench: Workbench, plain: Fitted, also_given: bool = True) -> 
                 value, share = float(values[k]), shares[k]
                 if finding == "clock":  # over a whole record, one step of a rate is many samples
                     value, share = _minimise(left, values[max(k - 1, 0)], values[min(k + 1, len(values) - 1)])
-                if share < CLEARLY_BETTER * left(0.0):
-                    found.append((share / left(0.0), fault.at(value, bench.dt)))
+                if share < CLEARLY_BETTER:
+                    found.append((share, fault.at(value, bench.dt)))
     best = list[TimeShift]()
     for _, fault in sorted(found, key=lambda pair: pair[0]):
         known = [b.value for b in best if (b.channel, b.finding) == (fault.channel, fault.finding)]

@@ -17,7 +17,7 @@ from .._base import InputError, later
 from ..data import Recording, as_recordings, rmse_per_output
 from ..engine import Engine, make_engine
 from ..models import Model
-from ..optimise import estimate_initial_state, samples_to_start
+from ..optimise import StatePrior, estimate_initial_state, samples_to_start
 from ..simulators import Simulator, as_simulator, discretise_for
 from .result import Fit, match_channels
 
@@ -207,12 +207,18 @@ def run_simulator(simulator: Simulator, recording: Recording) -> tuple[Recording
 
 
 def run_free(
-    model: Model, engine: Engine, recording: Recording, starts: Sequence[np.ndarray] = (), *, whole: bool = False
+    model: Model,
+    engine: Engine,
+    recording: Recording,
+    starts: Sequence[np.ndarray] = (),
+    *,
+    whole: bool = False,
+    known: StatePrior | None = None,
 ) -> tuple[np.ndarray, int]:
     """Simulate a model at its start values along a recording.
 
-    An unknown initial state is fitted to the first part of the recording, starting from rest and from `starts`; with
-    `whole` to all of it, as in a fit.
+    An unknown initial state is fitted to the first part of the recording, starting from rest and from `starts`, with
+    the prior `known` if there is one; with `whole` to all of it, without a prior, as in a fit.
 
     Returns
     -------
@@ -225,7 +231,7 @@ def run_free(
     used = samples_to_start(model, engine, recording) if estimated else 0
     with np.errstate(all="ignore"):
         try:
-            state = estimate_initial_state(model, engine, recording, used or None, starts=starts)
+            state = estimate_initial_state(model, engine, recording, used or None, starts=starts, known=known)
             if whole and estimated:
                 used, state = 0, estimate_initial_state(model, engine, recording, len(recording), starts=(state,))
             y = engine.simulate(model.drive(recording), model.parameters.start, state)[0]

@@ -231,11 +231,12 @@ class Mode(Resonance):
         return p.c_1 * q[0] + p.c_2 * q[1]
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """Tell whether it is damped more than modes of machines are, or too fast to be visible.
+        """Tell whether it is damped more than modes of machines are, or too fast or too slow to be visible.
 
-        With strengths of either sign it then imitates nearly anything linear.
+        With strengths of either sign it then imitates nearly anything linear, or a drift.
         """
-        return bool(values["D"] > MOST_DAMPED_MODE or values["W"] >= self.parameters()["W"].bounds[1])
+        slowest, fastest = self.parameters()["W"].bounds
+        return bool(values["D"] > MOST_DAMPED_MODE or not slowest < values["W"] < fastest)
 
 
 class SprungMass:

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
         unconstrained_step as unconstrained_step,
     )
     from .initial_state import (
+        StatePrior as StatePrior,
         estimate_initial_state as estimate_initial_state,
         samples_for_state as samples_for_state,
         samples_to_start as samples_to_start,

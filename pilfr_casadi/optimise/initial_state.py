@@ -7,6 +7,8 @@ the same prior (`state_precision` there).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -22,6 +24,49 @@ STATE_ROUNDS = 20  # most solves for a first state, each with a wider prior
 SAMPLES_PER_STATE = 10  # an estimate from so many samples adds a tenth of the noise's mean square to the run
 LEAST_INFORMATION = 1e-9  # singular value, over the largest, below which a direction of the state moves no output
 LARGEST_STATE = 1.1  # mean square of a first state, in units of its prior, above which the prior is widened
+PRIOR_WIDTH = 2.0  # prior deviation of a first state over its deviation along known runs
+LEAST_VARIANCE = 1e-6  # least variance of a combination of states, over that of each
+ROUNDING = 1e-9  # deviation of a state, over its size, below which it rests
+MOST_CONFLICT = 3.0  # largest misfit to prior and samples together, over its expectation, the number of states
+WIDER = 100.0  # factor on the prior covariance where the samples contradict it
+
+
+@dataclass(frozen=True, eq=False)
+class StatePrior:
+    """What is known of a state before its recording, because the same simulator followed others.
+
+    A state that the first samples hardly reveal, as the temperature of a wall, would otherwise be fitted to noise.
+
+    Attributes
+    ----------
+    mean : array, shape (n,)
+        Mean of the state with memory along the other runs.
+    precision : array, shape (n, n)
+        Inverse of its prior covariance; without information on states that did not move.
+    noise : array, shape (n_y,)
+        Rms error of each output along those runs, larger if neighbouring errors are alike and so tell less.
+    """
+
+    mean: np.ndarray
+    precision: np.ndarray
+    noise: np.ndarray
+
+    @classmethod
+    def of(cls, states: np.ndarray, errors: np.ndarray, correlation: float = 1.0) -> Self | None:
+        """Take the states (M, n) and the errors (M, n_y) of runs; None if they diverge or an output has no error.
+
+        The errors are alike over so many samples, the `correlation`.
+        """
+        noise = np.sqrt(correlation * np.mean(errors**2, axis=0))
+        if not (np.all(np.isfinite(states)) and np.all(np.isfinite(noise)) and np.all(noise > 0)):
+            return None
+        mean, deviation = np.mean(states, axis=0), np.std(states, axis=0)
+        moves = deviation > ROUNDING * np.max(np.abs(states), axis=0)
+        scaled = (states - mean)[:, moves] / deviation[moves]
+        square = np.zeros((len(mean), len(mean)))
+        inverse = np.linalg.inv(scaled.T @ scaled / len(scaled) + LEAST_VARIANCE * np.eye(scaled.shape[1]))
+        square[np.ix_(moves, moves)] = inverse / np.outer(deviation[moves], deviation[moves]) / PRIOR_WIDTH**2
+        return cls(mean, square, noise)
 
 
 def samples_for_state(model: Model) -> int:
@@ -55,12 +100,12 @@ def samples_to_start(model: Model, engine: Engine, recording: Recording) -> int:
     return used
 
 
-def _state_problem(model: Model, engine: Engine, recording: Recording) -> Problem:
-    """Make the problem whose only variables are the initial state; outputs are scaled by their deviations."""
+def _state_problem(model: Model, engine: Engine, recording: Recording, noise: np.ndarray | None = None) -> Problem:
+    """Make the problem whose only variables are the initial state; outputs are scaled by noise or their deviations."""
     fixed = model.parameters.change(**{k: {"fixed": True, "prior": None} for k in model.parameters})
     spread = np.std(recording.y, axis=0)
     scale = np.where(spread > 0, spread, np.max(spread) or 1.0)  # a constant output gets the largest deviation
-    return Problem(model.with_parameters(fixed), recording, engine=engine, scale=scale)
+    return Problem(model.with_parameters(fixed), recording, engine=engine, scale=scale if noise is None else noise)
 
 
 def _slope_by_state(model: Model, engine: Engine, recording: Recording) -> np.ndarray:
@@ -81,12 +126,13 @@ def estimate_initial_state(
     *,
     state_prior: bool = False,
     starts: Sequence[np.ndarray] = (),
+    known: StatePrior | None = None,
 ) -> np.ndarray:
     """Find the state with memory at a recording's first sample, as its `initial` says, at the model's parameters.
 
     An estimated state is fitted to the first `samples` outputs alone, from rest and from each of `starts`. With
     `state_prior` it has a prior around rest on the scale of the states in a run over all inputs (`state_precision`),
-    and is fitted from rest alone.
+    and is fitted from rest alone. With `known` it has that prior instead, and is fitted from its mean as well.
     """
     n, values, state = model.n_state, model.parameters.start, model.first_state(recording)
     if recording.begins == "periodic":
@@ -95,14 +141,17 @@ def estimate_initial_state(
     if recording.begins != "estimate" or not n:
         return state
     head = recording.slice(0, max(min(len(recording), samples or samples_for_state(model)), 2)).with_(skip=0)
-    problem, solver = _state_problem(model, engine, head), GaussNewton(max_iterations=50)
+    problem = _state_problem(model, engine, head, known.noise if known else None)
+    solver = GaussNewton(max_iterations=50)
+    if known is not None:
+        return _fit_with_prior(problem, solver, (problem.start, *starts, known.mean), known)
     square = state_precision(engine, model.drive(recording), values, model.n_x, model.n_s) if state_prior else None
     if square is None:
         found = [solver.solve(problem, start) for start in (problem.start, *starts)]
         return min(found, key=lambda solution: solution.cost).theta
     state, wider = problem.start, 1.0
     for _ in range(STATE_ROUNDS):  # free decay from a large state exceeds the states of forced motion
-        prior = [(0, square / wider)]
+        prior = [(0, square / wider, np.zeros(n))]
         problem.penalties = Penalties(problem.model.parameters, {}, 1.0, problem.residuals, problem.size, prior)
         state = solver.solve(problem, state).theta
         size = float(state @ square @ state) / STATE_NOISE**2 / n
@@ -110,3 +159,22 @@ def estimate_initial_state(
             break
         wider = size
     return state
+
+
+def _fit_with_prior(
+    problem: Problem, solver: GaussNewton, starts: Sequence[np.ndarray], known: StatePrior
+) -> np.ndarray:
+    """Fit an initial state with a prior, which is widened as long as the samples contradict it.
+
+    If prior and noise are right, the misfit to both beyond that of the best fit to the samples alone is a chi-square of
+    as many degrees of freedom as there are states (Gelman et al. 2013, Bayesian Data Analysis, ch. 6).
+    """
+    free = min((solver.solve(problem, start) for start in starts), key=lambda solution: solution.cost)
+    found, n = free, len(known.mean)
+    for i in range(STATE_ROUNDS):
+        prior = [(0, known.precision / WIDER**i, known.mean)]
+        problem.penalties = Penalties(problem.model.parameters, {}, 1.0, problem.residuals, problem.size, prior)
+        found = min((solver.solve(problem, x) for x in (known.mean, free.theta)), key=lambda solution: solution.cost)
+        if 2 * problem.residuals * (found.cost - free.cost) <= MOST_CONFLICT * n:
+            break
+    return found.theta

@@ -105,8 +105,8 @@ class Penalties:
 
     `l1` holds the weight of an L1 penalty by name, `noise` is the standard deviation of the noise relative to the
     output's, `residuals` and `size` count the residuals and the variables: the free parameters come first, then the
-    estimated initial states. `states` holds the first variable and the prior precision (n_state, n_state) of each
-    initial state that has a prior around rest.
+    estimated initial states. `states` holds the first variable, the prior precision (n_state, n_state) and the prior
+    mean (n_state,) of each initial state that has a prior.
     """
 
     def __init__(
@@ -116,9 +116,9 @@ class Penalties:
         noise: float,
         residuals: int,
         size: int,
-        states: Sequence[tuple[int, Array]] = (),
+        states: Sequence[tuple[int, Array, Array]] = (),
     ) -> None:
-        self.states = tuple((slice(at, at + len(square)), square / residuals) for at, square in states)
+        self.states = tuple((slice(at, at + len(mean)), square / residuals, mean) for at, square, mean in states)
         weight, mean, slope = (np.zeros(parameters.size) for _ in range(3))
         for name, strength in l1.items():
             check_penalised(name, parameters)
@@ -135,22 +135,22 @@ class Penalties:
     def value(self, theta: Array) -> float:
         """Sum all terms."""
         value = float(0.5 * self.weight @ (theta - self.mean) ** 2 + self.slope @ theta)
-        for part, square in self.states:
-            value += 0.5 * float(theta[part] @ square @ theta[part])
+        for part, square, mean in self.states:
+            value += 0.5 * float((theta[part] - mean) @ square @ (theta[part] - mean))
         return value
 
     def gradient(self, theta: Array) -> Array:
         """Compute the gradient of `value`, shape (n,)."""
         slope = np.asarray(self.weight * (theta - self.mean) + self.slope)
-        for part, square in self.states:
-            slope[part] += square @ theta[part]
+        for part, square, mean in self.states:
+            slope[part] += square @ (theta[part] - mean)
         return slope
 
     @property
     def hessian(self) -> Array:
         """Hessian of `value`, shape (n, n)."""
         out = np.diag(self.weight)
-        for part, square in self.states:
+        for part, square, _ in self.states:
             out[part, part] += square
         return out
 
@@ -511,8 +511,8 @@ class Problem:
             residual.append(ca.vec(((y - r.y.T) / np.tile(part.scale[:, None], (1, len(r))))[:, scored]))
         e, penalties = ca.vertcat(*residual), self.penalties
         prior = 0.5 * ca.dot(penalties.weight, (theta - penalties.mean) ** 2) + ca.dot(penalties.slope, theta)
-        for own, square in penalties.states:
-            prior += 0.5 * ca.bilin(ca.DM(square), theta[own], theta[own])
+        for own, square, mean in penalties.states:
+            prior += 0.5 * ca.bilin(ca.DM(square), theta[own] - mean, theta[own] - mean)
         return Horizon(
             x=theta,
             f=0.5 * ca.sumsqr(e) / self.residuals + prior,

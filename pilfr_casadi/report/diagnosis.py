@@ -323,7 +323,7 @@ def _proof(case: _Case) -> list[Block]:
         out.append(
             Text(
                 "Simulated from the inputs alone. These recordings were used neither to fit nor to choose; only an "
-                "unknown initial state was estimated from the first samples."
+                "unknown initial state was estimated from the first samples and the training runs."
             )
         )
     role, recordings = ("test", d.test) if d.test else ("training", d.train)

@@ -171,3 +171,53 @@ def test_a_simulator_without_a_free_parameter_is_diagnosed(missing):
     named = [(e.port, e.law) for e in found.effects]
     assert named == ([("ground-m1", "coulomb_friction")] if missing else [])
     assert found.verdict == ("missing-physics" if missing else "complete")
+
+
+def oven(heat=1400.0, inner=5.0, outer=2.5, radiating=0.0):
+    """A heated load in a wall, temperatures above the room's; the wall may radiate."""
+
+    def dynamics(x, u, p):
+        through, hot = p.inner * (x.wall - x.load), x.wall + 295.0
+        outside = p.outer * x.wall + radiating * (hot**4 - 295.0**4)
+        return {"wall": (u.power - through - outside) / p.heat, "load": (through - 0.8 * x.load) / 4500}
+
+    return Simulator(
+        dynamics,
+        lambda x: {"load": x.load},
+        ("wall", "load"),
+        ("power",),
+        {
+            "heat": Parameter(heat, bounds=(500, 4000)),
+            "inner": Parameter(inner, bounds=(1, 20)),
+            "outer": Parameter(outer, bounds=(0, 10)),
+        },
+        Port("walls", lambda p: {"wall": -1 / p.heat}, lambda x: x.wall, unit="W", across_unit="K"),
+        hold="zero",
+    )
+
+
+def heated(warm, offset):
+    """A recording, said to begin at zero, of a radiating oven that begins warm and has a sensor with an offset."""
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.uniform(0, 2500, 12), 40)[:, None]
+    blank = Recording(u, 0 * u, 15.0, ("power",), ("load",), initial=[warm, warm])
+    y = oven(1500.0, 6.0, 1.8, radiating=1.2e-8).simulate(blank) + offset
+    return blank.with_(y=y + 0.3 * rng.standard_normal(y.shape), initial="zero")
+
+
+@pytest.mark.parametrize(
+    ("warm", "offset", "press"),
+    [(22.0, 0.0, ""), (0.0, 22.0, ""), (22.0, 0.0, "unknown start: checks and refit")],
+    ids=["start", "zero", "interrupted"],
+)
+def test_missing_physics_shows_whether_the_start_or_the_zero_of_a_sensor_is_wrong(warm, offset, press):
+    """Unknown radiation makes a wrong zero look likelier than a wrong start."""
+    tried = (laws.Radiation, laws.PiecewiseStiffness)
+    found, stages = diagnosed(oven(), heated(warm, offset), tried, press, effects=1)
+    (gate,) = (g for g in found.gates if g.finding == "start")
+    assert stages.count("unknown start: checks and refit") == 1
+    assert gate.corrected is (warm > 0 and not press), gate.sentence
+    assert ("a search with them estimated follows better" in gate.sentence) is gate.corrected
+    if not press:
+        assert [e.law for e in found.effects] == ["radiation"]
+        assert [g.finding for g in found.gates if g.fault and g is not gate] == (["offset"] if offset else [])

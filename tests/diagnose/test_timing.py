@@ -8,15 +8,16 @@ from pilfr_casadi._base import Stages
 from pilfr_casadi.data import Recording
 from pilfr_casadi.diagnose import Workbench, diagnose
 from pilfr_casadi.diagnose.floor import Floor
-from pilfr_casadi.diagnose.gates import Checked, Gate
+from pilfr_casadi.diagnose.gates import Checked, Gate, accept, correct
 from pilfr_casadi.diagnose.preparation import hold_note
 from pilfr_casadi.diagnose.search import Search
-from pilfr_casadi.diagnose.timing import _screen_shifts, find_time_shift
+from pilfr_casadi.diagnose.timing import TimeShift, _accept_on_same_samples, _screen_shifts, find_time_shift
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
     CoulombFriction,
     Creep,
     CubicStiffness,
+    Lag,
     Mode,
     PeriodicForce,
     Relaxation,
@@ -199,3 +200,48 @@ def test_a_short_shift_of_an_input_is_a_fault_only_if_no_delay_explains_it(late,
     simulator, recording = two_motors(late=late)
     bench = Workbench.of(simulator, [recording], "zero")
     assert [g.finding for g in find_time_shift(Checked(bench, bench.fit(simulator))).gates] == findings
+
+
+def test_a_shift_is_judged_on_the_samples_that_it_keeps():
+    """A constant input may be read at any time; where that left out the worse part, it seemed to help."""
+    car = Simulator(
+        lambda x, u, p: {"heading": p.gain * u.speed * u.steering},
+        lambda x: {"heading": x.heading},
+        ("heading",),
+        ("steering", "speed"),
+        {"gain": Parameter(3.0, bounds=(1, 9))},
+        Port("yaw", {"heading": -1.0}, lambda x: x.heading),
+    )
+    u = np.column_stack([np.repeat([0.0, 0.2, -0.1, 0.05], 30), np.full(120, 0.3)])
+    blank = Recording(u, 0 * u[:, :1], 0.025, car.inputs, ("heading",), initial="zero", hold="zero")
+    late = car.with_element("actuator:steering", Lag().at({"T": 0.03}))
+    wandering = np.where(np.arange(120) < 60, 0.0, 0.3 * np.sin(np.arange(120)))[:, None]
+    bench = Workbench.of(car, [blank.with_(y=late.simulate(blank) + wandering)], "zero")
+    refitted = bench.fit(bench.simulator)
+    assert not any(fault.channel == "speed" for fault in _screen_shifts(bench, refitted))
+    now = Checked(bench, refitted)
+    assert not find_time_shift(now).gates
+    fault = TimeShift("speed", "alignment", 0.0, kind="u", columns=(1,)).at(60 * 0.025, 0.025)
+    after = correct(now, fault)
+    assert after.cost < 0.25 * now.cost and accept(now, after, fault).gates
+    assert not _accept_on_same_samples(now, after, fault).gates
+
+
+def test_a_shift_that_keeps_only_rest_shows_nothing():
+    """Constant inputs could be read so late that nothing was left but rest; they took the place of the true shift."""
+    names = ("force", "a", "b", "c", "d")
+    cart = Simulator(
+        lambda x, u, p: {"v": p.gain * u.force - p.drag * x.v},
+        lambda x: {"v": x.v},
+        ("v",),
+        names,
+        {"gain": Parameter(3.0, bounds=(1, 9)), "drag": Parameter(1.0, bounds=(0.1, 9))},
+        Port("wheels", {"v": -1.0}, lambda x: x.v),
+    )
+    force = np.concatenate([np.zeros(250), np.repeat(np.random.default_rng(0).uniform(-1, 1, 10), 5)])
+    u = np.column_stack([force, *np.full((4, 300), 0.3)])
+    blank = Recording(u, 0 * u[:, :1], 0.05, names, ("v",), initial="zero", hold="zero")
+    y = np.vstack([np.zeros((8, 1)), np.round(cart.simulate(blank), 2)[:-8]])
+    bench = Workbench.of(cart, [blank.with_(y=y)], "zero", "vm")
+    (found,) = find_time_shift(Checked(bench, bench.fit(cart))).gates
+    assert found.channel == "force" and found.delay == pytest.approx(0.4)

@@ -41,6 +41,18 @@ def test_a_drive_may_have_a_dead_zone_and_a_limit():
     assert found.errors["test"]["after"] < 1.3 * found.floor["nrmse"]
 
 
+def test_a_drive_may_have_a_dead_zone_and_a_delay():
+    true = example_rig().with_element("actuator:force", laws.DeadZone().at({"g": 1.5}))
+    true = true.with_element("actuator:force", laws.Delay().at({"T": 0.013}))
+    train, test = recorded(true, 0, samples=500), recorded(true, 1, samples=400)
+    tried = (laws.DeadZone, laws.Delay)
+    found = pilfr.diagnose(example_rig(430.0, 5.0), train, test=test, laws=tried, hold="zero", workers=1)
+    assert {e.law for e in found.effects} == {"dead_zone", "delay"}  # behind the rig the delay looks the same
+    assert frozenset(("actuator:force", kind) for kind in tried) in found.evidence["search"].memo
+    values = {name: p["value"] for e in found.effects for name, p in e.parameters.items()}
+    assert values == pytest.approx({"g": 1.5, "T": 0.013}, rel=0.05)
+
+
 @pytest.mark.parametrize(
     ("one", "other", "apart"),
     [
@@ -61,6 +73,12 @@ def test_a_drive_may_have_a_dead_zone_and_a_limit():
         (laws.DeadZone, laws.SoftSaturation, True),  # of small and of large signals
         (laws.DeadZone, laws.AsymmetricDeadZone, False),
         (laws.CubicStiffness, laws.scheduled(laws.LinearStiffness, "z"), False),
+        (laws.Delay, laws.Backlash, True),  # the path of a signal
+        (laws.Delay, laws.Lag, True),
+        (laws.Resonance, laws.DeadZone, True),
+        (laws.Delay, laws.Delay, False),
+        (laws.Lag, laws.Resonance, False),
+        (laws.Lag, laws.Creep, False),
     ],
 )
 def test_only_different_physics_stands_beside_a_law(one, other, apart):

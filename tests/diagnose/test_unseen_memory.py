@@ -46,6 +46,15 @@ def test_any_curve_is_one_however_often_it_is_passed():
     assert is_curve(z, np.tanh(2 * z)) and is_curve(z, np.abs(z)) and not is_curve(z, np.tanh(2 * np.roll(z, 3)))
 
 
+def test_a_force_that_depends_on_the_level_before_is_no_curve():
+    """A held input has few levels; from one recording to another, the force at one of them differs."""
+    z = np.repeat([0.0, -1.0, 0.0, 0.0, 1.0, 0.0], 100)
+    w = np.repeat([0.0, -0.8, -0.2, 0.0, 0.8, 0.2], 100)
+    rounding = 1e-14 * np.random.default_rng(0).standard_normal(600)
+    assert not is_curve(z, w) and not is_curve(z + rounding, w)
+    assert is_curve(z, 0.8 * z) and is_curve(z[:300], np.repeat([0.0, -0.8, 0.0], 100))
+
+
 @pytest.mark.parametrize("period", [25, 25.001])
 def test_memory_shows_over_periods_that_repeat(period):
     phase = 2 * np.pi * np.arange(1000) / period
