@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from ..laws import (
     seen_by,
 )
 from ..simulators import Simulator, as_simulator
-from .gates import Gate
+from .gates import Gate, edited
 from .stretches import Stretches
 
 FEWEST_SHARED = 20  # equal samples in a row that cannot be chance, where the outputs move
@@ -48,6 +48,13 @@ class Request:
     notes: tuple[Gate, ...] = ()
     stretches: Stretches | None = None  # where `recordings` are stretches of long ones
     aligned: bool = False  # whether the times of the channels are settled
+    edits: tuple[Gate, ...] = ()  # corrections that `recordings` have already
+    nominal: float = np.nan  # error at the user's values before these
+
+    def corrected(self, edits: Sequence[Gate], nominal: float, stage: str) -> Request:
+        """Return the request with recordings corrected by further edits; its stages are shown under another name."""
+        recordings, say = edited(self.recordings, edits), self.say.under(stage)
+        return replace(self, recordings=recordings, edits=(*self.edits, *edits), nominal=nominal, say=say)
 
     @property
     def hold_said(self) -> bool:

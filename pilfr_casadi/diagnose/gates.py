@@ -103,6 +103,10 @@ class Gate:
         """Return the recordings corrected of which stretches were checked, each from (recording, sample) on."""
         return list(map(self.edit, whole)) if self.corrected else whole
 
+    def kept(self, r: Recording) -> slice:
+        """Return which samples of a recording are still scored after the correction."""
+        return slice(r.skip, None)
+
     def begin(self, previous: Fitted) -> Sequence[np.ndarray]:
         """Return guesses of the initial states of the corrected recordings."""
         return previous.begin
@@ -259,13 +263,23 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
     noises = (after.cost / max(now.noise2, 1e-300)) ** 0.5
     if noises > NEAR_NOISE_RATIO:
         sentence += f", still {noises:.2g} times the noise: more is wrong"
-    told = replace(fault, sentence=f"{sentence}.", fault=True, left=after.cost / now.cost)
+    told = replace(fault, sentence=f"{sentence}.", fault=True, left=after.cost / _cost_where_kept(now, after, fault))
     return now.then(after.bench, after.fitted, told)
 
 
 def _satisfies_rule(now: Checked, after: Checked, fault: Gate) -> bool:
-    gained = gain(now.cost, after.cost, after.residuals, fault.parameters)
-    return gained > LEAST_GAIN and after.cost < min(fault.most_left * now.cost, USELESS_FIT)
+    before = _cost_where_kept(now, after, fault)
+    gained = gain(before, after.cost, after.residuals, fault.parameters)
+    return gained > LEAST_GAIN and after.cost < min(fault.most_left * before, USELESS_FIT)
+
+
+def _cost_where_kept(now: Checked, after: Checked, fault: Gate) -> float:
+    """Compute the mean square error before a correction on the samples that it keeps."""
+    kept = list(map(fault.kept, now.bench.recordings))
+    if all(where == slice(r.skip, None) for where, r in zip(kept, now.bench.recordings, strict=True)):
+        return now.cost
+    errors = [e[where] / after.bench.scale for e, where in zip(now.fitted.residual, kept, strict=True)]
+    return now.bench.pool(np.mean(np.concatenate(errors) ** 2, axis=0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -62,7 +62,7 @@ from .arguments import (
 from .correction import find_correction, named_correction
 from .evidence import AS_GIVEN_RATIO, SURE
 from .floor import Floor, measured_floor
-from .gates import EQUAL_RATIO, LEAST_GAIN, USELESS_FIT, Checked, Gate, edited, gain
+from .gates import EQUAL_RATIO, LEAST_GAIN, USELESS_FIT, Checked, Gate, gain
 from .offsets import Offset, WrongStart, fix_idle_offsets, list_offsets
 from .other_explanations import (
     find_pinned_parameters,
@@ -252,8 +252,7 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
     Missing physics can look like a lead.
     """
     edits = [g for g in ready.gates if g.corrected and g.change is not None]  # the shift is one of corrected channels
-    recordings = edited(request.recordings, (*edits, shift))
-    moved = replace(request, recordings=recordings, aligned=True, say=request.say.under("shifted: "))
+    moved = replace(request.corrected((*edits, shift), ready.nominal, "shifted: "), aligned=True)
     search.shift, search.aligned = None, True
     found = _again(search, partial(_search_once, moved, shift_early=True))
     if found is None:
@@ -265,7 +264,7 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
     if before2 < AS_GIVEN_RATIO * after2:
         search.cut_short_with(again)
         return ready, search
-    return replace(other, nominal=ready.nominal, gates=(*edits, shift, *other.gates)), again
+    return other, again
 
 
 def _search_from_unknown_start(
@@ -276,18 +275,17 @@ def _search_from_unknown_start(
     Before the missing physics is known, it may be what makes a wrong zero more likely than a wrong start. While it is
     unknown, free initial states and an offset together make up for a part of it.
     """
-    recordings = edited(request.recordings, (start,))
-    opened = replace(request, recordings=recordings, say=request.say.under("unknown start: "))
+    opened = request.corrected((start,), ready.nominal, "unknown start: ")
     found = _again(search, partial(_search_once, opened, shift_early=True))
     if found is None:
         return request, ready, search
     other, again = found
-    changed = sum(a is not b for a, b in zip(recordings, request.recordings, strict=True))
+    changed = sum(a is not b for a, b in zip(opened.recordings, request.recordings, strict=True))
     unknown = changed * len(opened.simulator.states)
     residuals = again.bench.scored(again.best.fitted.residual)
     explained = not again.can_improve(again.best)
     if explained and gain(*_comparable(search, again), residuals, unknown) > LEAST_GAIN:
-        return opened, replace(other, nominal=ready.nominal, gates=(start, *other.gates)), again
+        return opened, other, again
     search.cut_short_with(again)
     return request, ready, search
 
@@ -315,6 +313,8 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
     )
     if request.focus is None:  # an unstable simulator may stay within bounds and still not follow
         ready.bench.check_followed(ready.without, USELESS_FIT)
+    nominal = ready.nominal if np.isnan(request.nominal) else request.nominal
+    ready = replace(ready, gates=(*request.edits, *ready.gates), nominal=nominal)
     ready = replace(ready, bench=replace(ready.bench, deadline=request.deadline), floor=_noise(request, ready))
     now = Checked(ready.bench, ready.without).weighted(ready.floor)
     ready = replace(ready, bench=now.bench, without=now.fitted)

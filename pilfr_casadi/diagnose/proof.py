@@ -23,9 +23,6 @@ from .linearise import linearise_runs, simulate_states
 from .screen import RIDGES, Remainder, held_out
 from .workbench import Fitted, Workbench
 
-# each with further initial states to start from, and a prior of initial states
-Models = Mapping[str, tuple[Model, Sequence[np.ndarray], StatePrior | None]]
-
 PRIOR_SAMPLES = 20_000  # samples of the training runs at most, about, that a prior of initial states is taken from
 AMPLITUDES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
 SINES, TRIANGLES = 12, 5  # frequencies that are tried
@@ -65,10 +62,10 @@ def _rests_after(recording: Recording, first: int) -> bool:
 
 def errors_of(bench: Workbench, model: Model, *, whole: bool = False) -> float:
     """Compute the NRMSE of a model at its start values; see `compare_errors`."""
-    return compare_errors(bench, {"": (model, (), None)}, whole=whole).errors[""]
+    return compare_errors(bench, {"": Started(model)}, whole=whole).errors[""]
 
 
-def compare_errors(bench: Workbench, models: Models, *, whole: bool = False) -> Comparison:
+def compare_errors(bench: Workbench, models: Mapping[str, Started], *, whole: bool = False) -> Comparison:
     """Compute the errors of models at their start values on the same samples.
 
     Unknown initial states are estimated from rest and from the models' further initial states, with the models'
@@ -76,13 +73,13 @@ def compare_errors(bench: Workbench, models: Models, *, whole: bool = False) -> 
     to all samples, which are all scored; use it to compare errors on training recordings with fits. An error is
     infinite if the simulation diverges.
     """
-    engines = {name: make_engine(model, bench.engine) for name, (model, *_) in models.items()}
+    engines = {name: make_engine(one.model, bench.engine) for name, one in models.items()}
     errors: dict[str, list[float]] = {name: [] for name in models}
     scored = list[tuple[Recording, int]]()
     for r in bench.recordings:
         runs = {
-            name: run_free(model, engines[name], r, starts, whole=whole, known=known)
-            for name, (model, starts, known) in models.items()
+            name: run_free(one.model, engines[name], r, one.starts, whole=whole, known=one.known)
+            for name, one in models.items()
         }
         first = max((skip for _, skip in runs.values()), default=0)
         scored.append((r, first))
@@ -90,6 +87,20 @@ def compare_errors(bench: Workbench, models: Models, *, whole: bool = False) -> 
             finite = np.all(np.isfinite(y))
             errors[name].append(nrmse(r.y, y, skip=first, resting=bench.scale) if finite else np.inf)
     return Comparison({name: float(np.mean(each)) for name, each in errors.items()}, tuple(scored))
+
+
+@dataclass(frozen=True, eq=False)
+class Started:
+    """A model with what is known of its initial state in a recording that it was not fitted to."""
+
+    model: Model
+    starts: Sequence[np.ndarray] = ()  # further initial states to try
+    known: StatePrior | None = None
+
+    @classmethod
+    def of(cls, model: Model, fitted: Fitted, bench: Workbench | None = None) -> Started:
+        """Take the initial states of a fit, and the prior if its bench is given."""
+        return cls(model, starts_of(fitted), None if bench is None else prior_of(bench, fitted))
 
 
 def starts_of(fitted: Fitted) -> list[np.ndarray]:
@@ -124,9 +135,9 @@ def test_errors(
     The fits see the test recordings with the gates' edits, the given model as they are; so does the fit "after" once
     more (`unedited`). All are scored on the same samples, unless an edit changes these.
     """
-    unknown = any(r.begins == "estimate" for r in edited(tests, gates))
-    models = {name: (f.fitted_model, starts_of(f), prior_of(bench, f) if unknown else None) for name, f in fits.items()}
-    nominal: Models = {"nominal": (given, (), None)}
+    known = bench if any(r.begins == "estimate" for r in edited(tests, gates)) else None
+    models = {name: Started.of(fitted.fitted_model, fitted, known) for name, fitted in fits.items()}
+    nominal = {"nominal": Started(given)}
     if all(g.change is None for g in gates):
         return compare_errors(bench.on(tests), {**nominal, **models})
     found = compare_errors(bench.on(edited(tests, gates)), models)
@@ -138,11 +149,11 @@ def free_run_errors(
     bench: Workbench, recordings: Sequence[Recording], simulator: Simulator, without: Fitted, after: Fitted
 ) -> dict[str, float]:
     """Compute the NRMSEs without an observer, on corrected recordings."""
-    models: dict[str, tuple[Model, Sequence[np.ndarray], StatePrior | None]] = {}
+    models = {}
     for name, fitted in {"nominal": without, "before": without, "after": after}.items():
         led = simulator if name == "nominal" else fitted.corrected()
         free = discretise(replace(led, observer=None), bench.dt, bench.hold, fitted.model.substeps)
-        models[name] = free, starts_of(fitted), None
+        models[name] = Started.of(free, fitted)
     return compare_errors(bench.on(recordings), models).errors
 
 

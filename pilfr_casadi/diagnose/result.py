@@ -25,7 +25,7 @@ from .floor import ABOVE_NOISE
 from .gates import TEST_FAULT, Gate, edited
 from .learned import Learned
 from .offsets import Offset
-from .proof import prior_of, starts_of
+from .proof import Started
 from .refinement import Refinement, refine
 from .workbench import Fitted, output_deviation
 
@@ -343,11 +343,12 @@ class Diagnosis:
         fitted = self.evidence.get("after" if simulator is self.corrected else "without")
         substeps = fitted.model.substeps if fitted is not None else self.substeps
         model = discretise(simulator, dt, self.hold, substeps)
-        starts, search = starts_of(fitted) if fitted is not None else (), self.evidence.get("search")
-        known = None
-        if fitted is not None and search is not None and simulator in (self.corrected, self.refitted):
-            known = prior_of(search.bench, fitted) if r.begins == "estimate" else None
-        y, skip = run_free(model, make_engine(model), r, starts, known=known)
+        one = Started(model)
+        if fitted is not None:
+            follows = r.begins == "estimate" and simulator in (self.corrected, self.refitted)
+            search = self.evidence.get("search") if follows else None
+            one = Started.of(model, fitted, search.bench if search is not None else None)
+        y, skip = run_free(model, make_engine(model), r, one.starts, known=one.known)
         return r, y, skip
 
     def export(self, **options: Any) -> Any:

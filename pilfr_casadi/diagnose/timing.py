@@ -101,10 +101,10 @@ class TimeShift(Gate):
         values = getattr(r, self.kind)
         return [_interpolant(r, values[:, i], self._wraps(r), smooth=self.kind == "y") for i in self.columns]
 
-    def kept_samples(self, r: Recording) -> Recording:
-        """Return a recording as given, cut to the samples that the shift keeps."""
+    def kept(self, r: Recording) -> slice:
+        """Return which samples of a recording are still scored after the correction."""
         moved = self.read(r)
-        return r.slice(0, len(moved)).with_(skip=moved.skip)
+        return slice(moved.skip, len(moved) if len(moved) < len(r) else None)
 
     def remainder(self, first: FirstOrder, fitted: Fitted) -> Callable[[float], float]:
         """Return the mean square that parameters and initial states leave, as a function of the value.
@@ -214,25 +214,12 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: 
     if best is None:
         return now
     fault, after = best
-    found = _accept_on_same_samples(now, after, fault)
+    found = accept(now, after, fault)
     if len(found.gates) == len(now.gates):
         return found
     more_is_wrong = after.cost > NEAR_NOISE_RATIO**2 * noise2  # then a delay or a slow clock may be physics
     may_be_physics = fault.is_like_delay(bench.dt, part) or (more_is_wrong and not (fault.leads and early))
     return now if may_be_physics or _is_lag(now, after, fault) else found
-
-
-def _accept_on_same_samples(now: Checked, after: Checked, fault: TimeShift) -> Checked:
-    """Accept a shift by the rule of all faults, but compare on the samples that it keeps."""
-    kept = replace(now.bench.on(list(map(fault.kept_samples, now.bench.recordings))), scale=after.bench.scale)
-    plain = refit(kept, [now.fitted.values], states=now.fitted.initial, like=now.fitted)
-    if plain is None:
-        return now
-    found = accept(now.then(kept, plain), after, fault)
-    if len(found.gates) > len(now.gates):
-        return found
-    back = refit(now.bench, [found.fitted.values], states=now.fitted.initial, like=now.fitted)
-    return now.then(now.bench, back) if back is not None and back.cost < now.cost else now
 
 
 def _is_lag(now: Checked, after: Checked, fault: TimeShift) -> bool:

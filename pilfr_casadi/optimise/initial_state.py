@@ -33,18 +33,18 @@ WIDER = 100.0  # factor on the prior covariance where the samples contradict it
 
 @dataclass(frozen=True, eq=False)
 class StatePrior:
-    """What is known of a state before its recording, because the same simulator followed others.
+    """Prior of the initial state of a recording, from runs of the same simulator along other recordings.
 
-    A state that the first samples hardly reveal, as the temperature of a wall, would otherwise be fitted to noise.
+    Without it, a state that the first samples hardly show is fitted to their noise, such as the temperature of a wall.
 
     Attributes
     ----------
     mean : array, shape (n,)
-        Mean of the state with memory along the other runs.
+        Mean of the state with memory along those runs.
     precision : array, shape (n, n)
         Inverse of its prior covariance; without information on states that did not move.
     noise : array, shape (n_y,)
-        Rms error of each output along those runs, larger if neighbouring errors are alike and so tell less.
+        Rms error of each output along those runs, enlarged if neighbouring errors are correlated.
     """
 
     mean: np.ndarray
@@ -55,7 +55,7 @@ class StatePrior:
     def of(cls, states: np.ndarray, errors: np.ndarray, correlation: float = 1.0) -> Self | None:
         """Take the states (M, n) and the errors (M, n_y) of runs; None if they diverge or an output has no error.
 
-        The errors are alike over so many samples, the `correlation`.
+        `correlation` is the number of samples over which errors are correlated; only one of these counts.
         """
         noise = np.sqrt(correlation * np.mean(errors**2, axis=0))
         if not (np.all(np.isfinite(states)) and np.all(np.isfinite(noise)) and np.all(noise > 0)):
@@ -151,8 +151,7 @@ def estimate_initial_state(
         return min(found, key=lambda solution: solution.cost).theta
     state, wider = problem.start, 1.0
     for _ in range(STATE_ROUNDS):  # free decay from a large state exceeds the states of forced motion
-        prior = [(0, square / wider, np.zeros(n))]
-        problem.penalties = Penalties(problem.model.parameters, {}, 1.0, problem.residuals, problem.size, prior)
+        _set_prior(problem, square / wider, np.zeros(n))
         state = solver.solve(problem, state).theta
         size = float(state @ square @ state) / STATE_NOISE**2 / n
         if size <= LARGEST_STATE * wider:
@@ -172,9 +171,14 @@ def _fit_with_prior(
     free = min((solver.solve(problem, start) for start in starts), key=lambda solution: solution.cost)
     found, n = free, len(known.mean)
     for i in range(STATE_ROUNDS):
-        prior = [(0, known.precision / WIDER**i, known.mean)]
-        problem.penalties = Penalties(problem.model.parameters, {}, 1.0, problem.residuals, problem.size, prior)
+        _set_prior(problem, known.precision / WIDER**i, known.mean)
         found = min((solver.solve(problem, x) for x in (known.mean, free.theta)), key=lambda solution: solution.cost)
         if 2 * problem.residuals * (found.cost - free.cost) <= MOST_CONFLICT * n:
             break
     return found.theta
+
+
+def _set_prior(problem: Problem, precision: np.ndarray, mean: np.ndarray) -> None:
+    """Give the initial state of a problem a prior."""
+    states = [(0, precision, mean)]
+    problem.penalties = Penalties(problem.model.parameters, {}, 1.0, problem.residuals, problem.size, states)

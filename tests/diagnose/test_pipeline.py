@@ -11,6 +11,11 @@ from test_timing import shaken, spring
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator, laws
+from pilfr_casadi._base import Stages
+from pilfr_casadi.diagnose.arguments import Request
+from pilfr_casadi.diagnose.gates import Gate
+from pilfr_casadi.diagnose.offsets import WrongStart
+from pilfr_casadi.diagnose.pipeline import _search_once
 from pilfr_casadi.diagnose.preparation import prepare
 
 
@@ -221,3 +226,18 @@ def test_missing_physics_shows_whether_the_start_or_the_zero_of_a_sensor_is_wron
     if not press:
         assert [e.law for e in found.effects] == ["radiation"]
         assert [g.finding for g in found.gates if g.fault and g is not gate] == (["offset"] if offset else [])
+
+
+def test_a_repeated_search_knows_the_corrections_of_its_recordings():
+    """So no repetition of a repetition loses a finding, or the error at the values given."""
+    r = stiffened(1e6, 200).with_(initial="zero")
+    request = Request(spring(), (r,), (), "linear", "auto", 1, 0, 0.0, np.inf, Stages(lambda *_: None))
+    start = WrongStart("initial state", "start", "zero", change=lambda one: one.with_(initial="estimate"))
+    shown = Gate("force", "unit", 1.0, change=lambda one: one.with_(u=2 * one.u))
+    once = request.corrected((start,), 0.7, "unknown start: ")
+    twice = once.corrected((shown,), 0.7, "again: ")
+    assert twice.recordings[0].begins == "estimate" and np.array_equal(twice.recordings[0].u, 2 * r.u)
+    for asked, gates in ((once, (start,)), (twice, (start, shown))):
+        ready, search = _search_once(asked, shift_early=False)
+        assert ready.gates[: len(gates)] == gates and ready.nominal == 0.7
+        assert search.bench.recordings[0].begins == "estimate"

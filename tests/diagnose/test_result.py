@@ -15,7 +15,7 @@ from pilfr_casadi import InputError
 from pilfr_casadi.data import nrmse
 from pilfr_casadi.diagnose import BlindSpot, Effect, Workbench
 from pilfr_casadi.diagnose.offsets import Offset
-from pilfr_casadi.diagnose.proof import compare_errors, next_experiment
+from pilfr_casadi.diagnose.proof import Started, compare_errors, next_experiment
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.identify import run_free
 from pilfr_casadi.laws import Backlash, CoulombFriction, CubicStiffness, StopHysteresis
@@ -279,7 +279,7 @@ def test_simulators_are_compared_on_the_same_samples():
     plain, rich = (bench.model(s) for s in (rig(), rig().with_element("ground", StopHysteresis())))
     (alone, sooner), (_, first) = (run_free(m, make_engine(m), r) for m in (plain, rich))
     assert first > sooner
-    errors = compare_errors(bench, {"plain": (plain, (), None), "rich": (rich, (), None)}).errors
+    errors = compare_errors(bench, {"plain": Started(plain), "rich": Started(rich)}).errors
     assert errors["plain"] == pytest.approx(nrmse(r.y, alone, skip=first))
 
 
@@ -291,7 +291,7 @@ def test_a_test_recording_that_rests_after_its_start_is_told():
 
     def resting(*tests):
         bench = Workbench.of(rig(), tests, "zero")
-        return [name for name, _ in compare_errors(bench, {"": (bench.model(rig()), (), None)}).find_resting()]
+        return [name for name, _ in compare_errors(bench, {"": Started(bench.model(rig()))}).find_resting()]
 
     assert resting(fading, rest) == ["push"]
     assert not resting(fading.with_(initial="zero"))
@@ -317,5 +317,5 @@ def test_a_recording_in_which_the_machine_rests_is_scored_by_the_others(diagnose
     still = replace(test, u=0 * test.u, y=0 * test.y, initial="zero")
     assert found.nrmse(still) == pytest.approx(0.0, abs=1e-9)
     bench = Workbench.of(rig(), [test, still], "zero")
-    errors = compare_errors(bench, {"": (bench.model(HIDDEN), (), None)}).errors[""]
+    errors = compare_errors(bench, {"": Started(bench.model(HIDDEN))}).errors[""]
     assert 0 < errors < 0.01

@@ -23,18 +23,23 @@ def test_friction_and_ripple_at_one_port_are_both_named():
     assert found.errors["test"]["after"] < 1.2 * found.floor["nrmse"]
 
 
+def driven_with(kind, values):
+    """The diagnosis of a rig whose drive has a dead zone, and behind it a law of a kind; and the values found."""
+    true = example_rig().with_element("actuator:force", laws.DeadZone().at({"g": 1.5}))
+    true = true.with_element("actuator:force", kind().at(values))
+    train, test = recorded(true, 0, samples=500), recorded(true, 1, samples=400)
+    tried = (laws.DeadZone, kind)
+    found = pilfr.diagnose(example_rig(430.0, 5.0), train, test=test, laws=tried, hold="zero", workers=1)
+    return found, {name: p["value"] for e in found.effects for name, p in e.parameters.items()}
+
+
 def test_a_drive_may_have_a_dead_zone_and_a_limit():
     """Both at one actuator, one after the other, as of a motor's power stage; their order decides what L means."""
-    true = example_rig().with_element("actuator:force", laws.DeadZone().at({"g": 1.5}))
-    true = true.with_element("actuator:force", laws.Saturation().at({"L": 12.0}))
-    train, test = recorded(true, 0, samples=500), recorded(true, 1, samples=400)
-    tried = (laws.DeadZone, laws.Saturation)
-    found = pilfr.diagnose(example_rig(430.0, 5.0), train, test=test, laws=tried, hold="zero", workers=1)
+    found, values = driven_with(laws.Saturation, {"L": 12.0})
     assert {(e.port, e.law) for e in found.effects} == {
         ("actuator:force", "dead_zone"),
         ("actuator:force", "saturation"),
     }
-    values = {name: p["value"] for e in found.effects for name, p in e.parameters.items()}
     limit = next(e for e in found.effects if e.law == "saturation")
     first = "after the dead zone" not in limit.sentence  # then it limits the signal before the dead zone
     assert values == pytest.approx({"g": 1.5, "L": 13.5 if first else 12.0}, rel=0.03)
@@ -42,14 +47,10 @@ def test_a_drive_may_have_a_dead_zone_and_a_limit():
 
 
 def test_a_drive_may_have_a_dead_zone_and_a_delay():
-    true = example_rig().with_element("actuator:force", laws.DeadZone().at({"g": 1.5}))
-    true = true.with_element("actuator:force", laws.Delay().at({"T": 0.013}))
-    train, test = recorded(true, 0, samples=500), recorded(true, 1, samples=400)
-    tried = (laws.DeadZone, laws.Delay)
-    found = pilfr.diagnose(example_rig(430.0, 5.0), train, test=test, laws=tried, hold="zero", workers=1)
+    found, values = driven_with(laws.Delay, {"T": 0.013})
     assert {e.law for e in found.effects} == {"dead_zone", "delay"}  # behind the rig the delay looks the same
-    assert frozenset(("actuator:force", kind) for kind in tried) in found.evidence["search"].memo
-    values = {name: p["value"] for e in found.effects for name, p in e.parameters.items()}
+    at_drive = frozenset(("actuator:force", kind) for kind in (laws.DeadZone, laws.Delay))
+    assert at_drive in found.evidence["search"].memo
     assert values == pytest.approx({"g": 1.5, "T": 0.013}, rel=0.05)
 
 
