@@ -40,7 +40,7 @@ from .force_recovery import is_curve_along
 from .gates import EQUAL_RATIO
 from .screen import Scored, flexible_shares, innovation_share, screen
 from .trials import Key, Trial, Trials
-from .workbench import DIVERGED, Fitted, Workbench
+from .workbench import DIVERGED, FEW, Fitted, Workbench
 
 MOST_PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
 
@@ -144,6 +144,30 @@ class Hypotheses:
     def best(self) -> Trial:
         """The most promising hypothesis, from which the search continues."""
         return max(self.memo.values(), key=self.optimistic_evidence)
+
+    def most_promising(self, trials: Sequence[Trial]) -> Trial:
+        """Choose the hypothesis from which further laws are tried.
+
+        Where even the best ones are wrong, it is among those of the same number of effects the one that predicts best:
+        a wrong law may follow the recordings best, and what is added to it makes up for what it does.
+        """
+        ranked = sorted(trials, key=self.optimistic_evidence, reverse=True)
+        first = dict[frozenset[tuple[str, str]], Trial]()
+        for trial in ranked:
+            if len(trial.effects) == len(ranked[0].effects):
+                first.setdefault(frozenset((e.port, e.law.id) for e in trial.laws), trial)
+        rivals = list(first.values())[:FEW]
+        if not self._all_wrong or not ranked[0].effects or len(rivals) < 2 or self.past_deadline:
+            return ranked[0]
+        with self.stage("held-out blocks"):
+            for trial in rivals:
+                self.held_out(self.thorough(trial))
+        return max((self.memo[t.key] for t in rivals), key=self._promise)
+
+    def _promise(self, trial: Trial) -> float:
+        """Compute the optimistic evidence of a hypothesis from its error on held-out blocks."""
+        v = self.bench.pool(self.held_out(trial).squares + self.tolerance)
+        return self._log_evidence(trial, v, self.sample.effective(0.0))
 
     def optimistic_evidence(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis with as many effective samples as at the noise level."""

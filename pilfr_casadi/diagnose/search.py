@@ -138,10 +138,8 @@ class Search(Hypotheses):
 
     def _parent(self, varied: bool) -> Trial:
         """Return the best hypothesis, or the best one in which no parameter varies."""
-        if varied:
-            return self.best
-        fixed = [t for t in self.memo.values() if all(kind_of(e.port) != PARAMETER for e in t.laws)]
-        return max(fixed, key=self.optimistic_evidence)
+        fixed = [t for t in self.memo.values() if varied or all(kind_of(e.port) != PARAMETER for e in t.laws)]
+        return self.most_promising(fixed)
 
     def _grow_to_noise(self) -> None:
         """Add a law for a rest as small as the formula error of the laws before it.
