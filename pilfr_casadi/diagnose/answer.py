@@ -17,15 +17,16 @@ from ..laws import readable_unit, short_name
 from ..simulators import Placed, in_series, name_at, split_port
 from .arguments import Request
 from .blind_spots import BlindSpot, assess_recordings
-from .channel_faults import IN_RECORDINGS, find_gross_slips
 from .correction import Correction
 from .effect import Effect
-from .evidence import FAR_RATIO, NEAR_RATIO, SURE, deviations
-from .force_recovery import is_curve_along
-from .gates import EQUAL_RATIO, TEST_FAULT, Gate, edited
+from .faults.channels import IN_RECORDINGS, find_gross_slips
+from .faults.gates import EQUAL_RATIO, TEST_FAULT, Gate, edited
+from .faults.offsets import Offset, remove_idle_offsets, update_offsets
+from .fits.evidence import FAR_RATIO, NEAR_RATIO, SURE, deviations
+from .fits.force_recovery import is_curve_along
+from .fits.workbench import Fitted, Workbench
 from .identifiability import port_units
 from .mismatch_map import mismatch
-from .offsets import Offset, remove_idle_offsets, update_offsets
 from .preparation import Prepared
 from .proof import (
     Comparison,
@@ -36,10 +37,9 @@ from .proof import (
     test_errors,
 )
 from .result import Diagnosis
-from .search import Search
-from .trials import Trial
+from .search.moves import Search
+from .search.trials import Trial
 from .verdict import NamedEffect, Verdict, names
-from .workbench import Fitted, Workbench
 
 
 @dataclass(frozen=True, eq=False)

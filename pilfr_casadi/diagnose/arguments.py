@@ -23,8 +23,8 @@ from ..laws import (
     seen_by,
 )
 from ..simulators import Simulator, as_simulator
-from .gates import Gate, edited
-from .stretches import Stretches
+from .faults.gates import Gate, edited
+from .search.stretches import Stretches
 
 FEWEST_SHARED = 20  # equal samples in a row that cannot be chance, where the outputs move
 FEWEST_SAMPLES = 20  # samples in all training recordings together; fewer cannot determine a model

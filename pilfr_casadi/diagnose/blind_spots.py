@@ -20,9 +20,12 @@ from ..data import Recording
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings, stated_hold
-from .channel_faults import accept_best, find_gross_slips, refit_corrected
-from .floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor, noise_floor
-from .gates import USELESS_FIT, Checked, refit
+from .faults.channels import accept_best, find_gross_slips, refit_corrected
+from .faults.gates import USELESS_FIT, Checked, refit
+from .faults.offsets import WrongStart, find_wrong_start
+from .fits.floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor, noise_floor
+from .fits.linearise import Probe, Run, linearise_runs
+from .fits.workbench import QUICK, Fitted, Workbench
 from .identifiability import (
     SMALL_SHARE,
     LawRow,
@@ -36,10 +39,7 @@ from .identifiability import (
     live_ports,
     port_units,
 )
-from .linearise import Probe, Run, linearise_runs
-from .offsets import WrongStart, find_wrong_start
 from .preparation import choose_hold
-from .workbench import QUICK, Fitted, Workbench
 
 SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
 

@@ -60,10 +60,13 @@ from .arguments import (
     stated_hold,
 )
 from .correction import find_correction, named_correction
-from .evidence import AS_GIVEN_RATIO, SURE
-from .floor import Floor, measured_floor
-from .gates import EQUAL_RATIO, LEAST_GAIN, USELESS_FIT, Checked, Gate, gain
-from .offsets import Offset, WrongStart, fix_idle_offsets, list_offsets
+from .faults.gates import EQUAL_RATIO, LEAST_GAIN, USELESS_FIT, Checked, Gate, gain
+from .faults.offsets import Offset, WrongStart, fix_idle_offsets, list_offsets
+from .faults.samples import find_clipped_input, find_tones, open_unsettled, remove_glitches
+from .faults.timing import TimeShift
+from .fits.evidence import AS_GIVEN_RATIO, SURE
+from .fits.floor import Floor, measured_floor
+from .fits.workbench import RunsAway, converge
 from .other_explanations import (
     find_pinned_parameters,
     find_undeclared_port,
@@ -74,13 +77,10 @@ from .other_explanations import (
 from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
 from .preparation import CHECKS, Prepared, conversions, hold_note, prepare
 from .proof import errors_of
-from .recording_faults import find_clipped_input, find_tones, open_unsettled, remove_glitches
 from .result import Diagnosis
-from .search import Search
-from .stretches import SEARCHED_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
-from .timing import TimeShift
+from .search.moves import Search
+from .search.stretches import SEARCHED_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
 from .verdict import Posterior, Verdict, judge, names, posterior
-from .workbench import RunsAway, converge
 
 # shares of the remaining time for the preparation, and for preparation and search; the rest is for the correction
 PREPARATION_SHARE, SEARCH_SHARE = 0.35, 0.7

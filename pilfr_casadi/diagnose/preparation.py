@@ -18,9 +18,8 @@ from ..data import Recording
 from ..optimise import GaussNewton, Status
 from ..simulators import Simulator, unit_factor, unit_notes
 from .arguments import stated_hold
-from .channel_faults import accept_best, find_gross_slips, find_slips, open_bench, refit_corrected
-from .floor import Floor, pool, white_part
-from .gates import (
+from .faults.channels import accept_best, find_gross_slips, find_slips, open_bench, refit_corrected
+from .faults.gates import (
     CURED_SHARE,
     EQUAL_RATIO,
     NEAR_NOISE_RATIO,
@@ -29,13 +28,14 @@ from .gates import (
     Gate,
     refit,
 )
-from .linearise import linearise_runs, observer_gain, sample_run
-from .lost_samples import find_gaps, find_output_gaps
-from .offsets import find_offsets, find_wrong_start
+from .faults.lost_samples import find_gaps, find_output_gaps
+from .faults.offsets import find_offsets, find_wrong_start
+from .faults.samples import mend_stale_samples, open_unsettled, remove_glitches, unclip
+from .faults.timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps
+from .fits.floor import Floor, pool, white_part
+from .fits.linearise import linearise_runs, observer_gain, sample_run
+from .fits.workbench import THOROUGH, Fitted, Workbench, refine_steps
 from .proof import errors_of
-from .recording_faults import mend_stale_samples, open_unsettled, remove_glitches, unclip
-from .timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps
-from .workbench import THOROUGH, Fitted, Workbench, refine_steps
 
 CHECKED_ABOVE = 4e-4  # mean square error up to which signs and units are not checked
 CHECKS, CHECKED = "checks and refit", 6  # the stage's name, and the number of its parts that are reported

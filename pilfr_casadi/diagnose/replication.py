@@ -25,12 +25,12 @@ from ..data import Recording
 from ..laws import Law
 from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
 from .arguments import match_recordings, stated_hold
-from .evidence import FORMULA_ERROR, Sample, deviations, information, log_evidence, log_prior, prior_width
-from .floor import effective_size, measured_floor, third_differences
-from .gates import Checked, refit
-from .linearise import sample_run
-from .trials import Trials
-from .workbench import FINER_STEPS, THOROUGH, Fitted, Workbench
+from .faults.gates import Checked, refit
+from .fits.evidence import FORMULA_ERROR, Sample, deviations, information, log_evidence, log_prior, prior_width
+from .fits.floor import effective_size, measured_floor, third_differences
+from .fits.linearise import sample_run
+from .fits.workbench import FINER_STEPS, THOROUGH, Fitted, Workbench
+from .search.trials import Trials
 
 STEP_ACCURACY = 0.25  # standard errors by which finer steps may change a value: 3 % of it, added in squares
 THIRD_DIFFERENCES = 2.31  # 1 + 2 Σ ρ² of third differences of white noise

@@ -20,14 +20,14 @@ from ..simulators import ACTUATOR, Simulator, discretise, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
 from .effect import Effect
-from .evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, SURE
-from .floor import ABOVE_NOISE
-from .gates import TEST_FAULT, Gate, edited
-from .learned import Learned
-from .offsets import Offset
+from .faults.gates import TEST_FAULT, Gate, edited
+from .faults.offsets import Offset
+from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, SURE
+from .fits.floor import ABOVE_NOISE
+from .fits.workbench import Fitted, output_deviation
 from .proof import Started
 from .refinement import Refinement, refine
-from .workbench import Fitted, output_deviation
+from .search.learned import Learned
 
 VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 

@@ -29,7 +29,9 @@ import numpy as np
 
 from .._base import in_words
 from ..simulators import SENSOR, Placed, name_at, name_at_any, port_name
-from .evidence import (
+from .faults.gates import Gate
+from .faults.samples import find_ringing_mode
+from .fits.evidence import (
     AT_NOISE_RATIO,
     BETTER_RATIO,
     COLOURED_NOISE_RATIO,
@@ -53,12 +55,10 @@ from .evidence import (
     WHITE_NOISE_RATIO,
     significance,
 )
-from .floor import ABOVE_NOISE, Floor, swells_with, times_white, white_part
-from .gates import Gate
-from .hypotheses import Hypotheses
-from .recording_faults import find_ringing_mode
-from .trials import Trial
-from .workbench import Fitted
+from .fits.floor import ABOVE_NOISE, Floor, swells_with, times_white, white_part
+from .fits.workbench import Fitted
+from .search.hypotheses import Hypotheses
+from .search.trials import Trial
 
 Name = tuple[str, str]  # port and law id
 

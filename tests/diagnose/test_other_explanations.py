@@ -13,14 +13,14 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator, laws
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.floor import Floor
+from pilfr_casadi.diagnose.fits.floor import Floor
 from pilfr_casadi.diagnose.other_explanations import (
     find_pinned_parameters,
     find_undeclared_port,
     find_untried_laws,
     find_varying_values,
 )
-from pilfr_casadi.diagnose.search import Search
+from pilfr_casadi.diagnose.search.moves import Search
 from pilfr_casadi.diagnose.verdict import NamedEffect, Posterior
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.report.diagnosis_tables import headline

@@ -13,8 +13,8 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator, laws
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose.arguments import Request
-from pilfr_casadi.diagnose.gates import Gate
-from pilfr_casadi.diagnose.offsets import WrongStart
+from pilfr_casadi.diagnose.faults.gates import Gate
+from pilfr_casadi.diagnose.faults.offsets import WrongStart
 from pilfr_casadi.diagnose.pipeline import _search_once
 from pilfr_casadi.diagnose.preparation import prepare
 
