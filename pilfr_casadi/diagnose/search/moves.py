@@ -39,7 +39,7 @@ from ..faults.timing import TimeShift, find_time_shift
 from ..fits.evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR, NEAR_RATIO
 from ..fits.floor import ABOVE_NOISE
 from ..fits.linearise import linearise_runs
-from ..fits.screen import Remainder, Scored, screen, usable
+from ..fits.screen import Pair, Remainder, Scored, screen, usable
 from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted
 from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
@@ -266,9 +266,19 @@ class Search(Hypotheses):
         known = self.memo.get(trial.key, trial)
         if not known.error < trial.error:
             return trial
-        if known.pair == trial.pair:
-            return known
-        return self.run_laws(sorted(known.laws, key=lambda e: (e.port, type(e.law)) == trial.pair), known)
+        return self._with_last(known, trial.pair)
+
+    def _with_last(self, trial: Trial, pair: Pair) -> Trial:
+        """Return a hypothesis with one of its laws as the last."""
+        if trial.pair == pair:
+            return trial
+        return self.run_laws(sorted(trial.laws, key=lambda e: (e.port, type(e.law)) == pair), trial)
+
+    def _best_with_one_more(self, parent: Trial) -> Trial | None:
+        """Return the best hypothesis, its further law as the last, if it has one law more than a parent."""
+        best = self.best
+        added = best.key - parent.key
+        return self._with_last(best, *added) if len(added) == 1 and parent.key < best.key else None
 
     def _record(self, parent: Trial, scored: Sequence[Scored], trials: Sequence[Trial]) -> None:
         """Keep the trials of a move, and note the move."""
@@ -304,9 +314,9 @@ class Search(Hypotheses):
 
     def _finer(self, parent: Trial) -> None:
         """Fit the best law of a step in its finer forms; then let the strength of the best that may vary do so."""
-        best = self.best
-        if len(best.laws) == len(parent.laws) + 1:
-            self._refine(best, FINER.get(type(best.element.law), ()))
+        best = self._best_with_one_more(parent)
+        if best is not None:
+            self._refine(best, FINER.get(type(best.law), ()))
         may_vary = [kind for kind in SCALABLE if kind.id not in LINEAR]  # a linear law was screened with every signal
         added = [t for t in self.steps[-1].trials if constant(type(t.law)) in may_vary]
         kept = [self.memo[t.key] for t in added]  # perhaps found before, with these laws added in another order
@@ -315,13 +325,13 @@ class Search(Hypotheses):
         if step and self.can_improve(self.best, self.least_floor) and self.in_time():
             likeliest = max(step, key=self.optimistic_evidence)
             forms = [t for t in step if t.law.id == likeliest.law.id]
-            self._vary([likeliest], ("z", *self._entry(likeliest).local.inputs))
+            entry = self._entry(likeliest)
+            self._vary([likeliest], ("z", *entry.local.inputs) if entry else ())
             if self.best.laws and self.best.law.scheduled_by:  # with the signal found, other forms may be the physics
                 self._vary([t for t in forms if t is not likeliest], (self.best.law.scheduled_by,))
-        best = self.best
-        added_now = len(best.laws) == len(parent.laws) + 1
-        by = (best.law.scheduled_by or best.law.scaled_by) if added_now else ""
-        if by and "parallel" in best.law.places and self.in_time():
+        best = self._best_with_one_more(parent)
+        by = (best.law.scheduled_by or best.law.scaled_by) if best is not None else ""
+        if best is not None and by and "parallel" in best.law.places and self.in_time():
             kind = constant(type(best.law))
             self._refine(best, [scheduled(kind, by, p) for p in likely_profiles(kind) if p != best.law.profile])
         self.replace_variation(parent)
@@ -332,14 +342,19 @@ class Search(Hypotheses):
             kind = constant(type(trial.law))
             self._refine(trial, [scheduled(kind, by, likely_profiles(kind)[0]) for by in signals])
 
-    def _entry(self, trial: Trial) -> Scored:
-        """Return how the last law of a trial, or another with the same sense, was first screened at its port."""
+    def _entry(self, trial: Trial) -> Scored | None:
+        """Return how the last law of a trial, or another with the same sense, was first screened at its port.
+
+        None if none was there: the hypothesis comes from another search.
+        """
         there = [s for step in self.steps for s in step.scored if s.port == trial.port]
-        return next((s for s in there if s.law.dissipative == trial.law.dissipative), there[0])
+        return min(there, key=lambda s: s.law.dissipative != trial.law.dissipative, default=None)
 
     def _refine(self, trial: Trial, kinds: Sequence[Any]) -> None:
         """Fit a hypothesis with its last law in other forms, which start from its values and oppose motion alike."""
         entry, base, law = self._entry(trial), trial.fitted, trial.law
+        if entry is None or not kinds:
+            return
         if law.dissipative and not entry.sense:
             total = sum(np.sum(trial.own[name]) for name in law.strength if name not in law.signed)
             entry = replace(entry, sense=int(np.sign(total)))
