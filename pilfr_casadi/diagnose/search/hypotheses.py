@@ -145,26 +145,24 @@ class Hypotheses:
         """The most promising hypothesis, from which the search continues."""
         return max(self.memo.values(), key=self.optimistic_evidence)
 
-    def most_promising(self, trials: Sequence[Trial]) -> Trial:
-        """Choose the hypothesis from which further laws are tried.
+    def better_predictor(self, trial: Trial, others: Sequence[Trial]) -> Trial | None:
+        """Return the one of several hypotheses with as many effects that predicts best, unless `trial` itself does.
 
-        Where even the best ones are wrong, it is among those of the same number of effects the one that predicts best:
-        a wrong law may follow the recordings best, and what is added to it makes up for what it does.
+        None as well unless even the best hypotheses are wrong. Then a wrong law may follow the recordings best, and
+        what is added to it only makes up for what it does.
         """
-        ranked = sorted(trials, key=self.optimistic_evidence, reverse=True)
-        first = dict[frozenset[tuple[str, str]], Trial]()
-        for trial in ranked:
-            if len(trial.effects) == len(ranked[0].effects):
-                first.setdefault(frozenset((e.port, e.law.id) for e in trial.laws), trial)
-        rivals = list(first.values())[:FEW]
-        if not self._all_wrong or not ranked[0].effects or len(rivals) < 2 or self.past_deadline:
-            return ranked[0]
+        if not (trial.effects and self._all_wrong and self.can_improve(self.best)) or self.past_deadline:
+            return None
+        alike = [t for t in others if len(t.effects) == len(trial.effects)]
+        first = dict[frozenset[tuple[str, str]], Trial]()  # the likeliest form of each
+        for t in sorted(alike, key=self.optimistic_evidence, reverse=True):
+            first.setdefault(frozenset((e.port, e.law.id) for e in t.laws), t)
+        rivals = [self.thorough(t) for t in list(first.values())[:FEW]]
         with self.stage("held-out blocks"):
-            for trial in rivals:
-                self.held_out(self.thorough(trial))
-        return max((self.memo[t.key] for t in rivals), key=self._promise)
+            best = max(rivals, key=self._predicted_evidence)
+        return None if best.key == trial.key else best
 
-    def _promise(self, trial: Trial) -> float:
+    def _predicted_evidence(self, trial: Trial) -> float:
         """Compute the optimistic evidence of a hypothesis from its error on held-out blocks."""
         v = self.bench.pool(self.held_out(trial).squares + self.tolerance)
         return self._log_evidence(trial, v, self.sample.effective(0.0))
