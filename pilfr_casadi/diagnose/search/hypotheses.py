@@ -82,6 +82,9 @@ class Hypotheses:
     findings: defaultdict[Key, Findings] = field(default_factory=lambda: defaultdict(Findings))
     times: dict[str, float] = field(default_factory=dict)
     out_of_time: bool = False  # whether the time limit ended the search
+    # pairs of port and law that were selected for a fit beside the simulator alone, and those that were fitted
+    selected: int = 0
+    tried: int = 0
     count: float = FEWEST  # samples of the best residual over its correlation time
     # mean square of the mismatch, all outputs alike, of which formulas may leave a share; by default the refit's error
     mismatch2: float | None = None

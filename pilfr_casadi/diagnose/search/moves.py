@@ -44,7 +44,7 @@ from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted
 from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
 from .relatives import choose_pairs, complements, fit_pair, in_place_of_variation, relatives
-from .trials import Key, Trial, place_law
+from .trials import Key, Trial, place_law, select_pairs
 
 # Effort
 MOST_CONVERGED = 5  # trials of a step that are fitted to convergence at most
@@ -296,7 +296,10 @@ class Search(Hypotheses):
     ) -> list[Trial]:
         began = time.perf_counter()
         stage = f"fits, effect {len(parent.laws) + 1}" if parent.laws else "fits"
-        trials = self.fits.fit_pairs(parent, scored, gain, enough, partial(self.say, stage), again)
+        pairs = select_pairs(scored, again)
+        trials = self.fits.fit_pairs(parent, pairs, gain, enough, partial(self.say, stage), again)
+        if not parent.laws:
+            self.tried, self.selected = self.tried + len(trials), self.selected + len(pairs)
         self.times["fits"] = self.times.get("fits", 0.0) + time.perf_counter() - began
         self.bench.interrupt.raise_pending()
         return trials

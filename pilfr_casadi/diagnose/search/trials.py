@@ -208,18 +208,17 @@ class Trials:
     def fit_pairs(
         self,
         parent: Trial,
-        scored: Sequence[Scored],
+        pairs: Sequence[Sequence[Scored]],
         gain: np.ndarray | None,
         enough: float,
         report: Callable[[int, int, float], None],
         again: bool = False,
     ) -> list[Trial]:
-        """Fit every pair of port and law that the screen selects beside a parent's laws, smallest error first.
+        """Fit every selected pair of port and law beside a parent's laws, smallest error first.
 
         If one of the first pairs has an error below `enough`, pairs far behind it are not refined. With `again`, which
-        looks for a law in place of a known one, fewer pairs are fitted.
+        looks for a law in place of a known one, fewer pairs are refined.
         """
-        pairs = select_pairs(scored, BEST_AGAIN if again else BEST)
         most = FEW if again else MOST_REFINED
         done, total = 0, len(pairs) + min(len(pairs), most)
 
@@ -353,14 +352,16 @@ def _head(r: Recording, share: float, power: np.ndarray) -> Recording:
     return r if cut >= len(r) else open_start(r.slice(0, cut))
 
 
-def select_pairs(scored: Sequence[Scored], best: int) -> list[list[Scored]]:
+def select_pairs(scored: Sequence[Scored], again: bool = False) -> list[list[Scored]]:
     """Select the pairs worth a full fit: the best of both lists and of each port, and some whatever their score.
+
+    With `again`, which looks for a law in place of a known one, there are fewer.
 
     These are the best law of each port with a single free parameter, which richer ones hide in the list, and the laws
     made for a port: special laws of its domain, and laws in line with its term. Their forces are so curved that a small
     dose says little about them.
     """
-    chosen: dict[Pair, list[Scored]] = {}
+    chosen, best = dict[Pair, list[Scored]](), BEST_AGAIN if again else BEST
     for source in ("simulation", "observer"):
         ports, plain, passed = set[str](), set[str](), list[Scored]()
         for s in (s for s in scored if s.source == source):

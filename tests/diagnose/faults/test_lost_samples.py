@@ -13,7 +13,8 @@ from test_timing import shaken, spring
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
-from pilfr_casadi.diagnose import Workbench, lost_samples
+from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose.faults import lost_samples
 from pilfr_casadi.diagnose.faults.gates import CURED_SHARE, Checked
 from pilfr_casadi.diagnose.faults.lost_samples import OutputGap, find_gaps, find_jump, find_output_gaps, settle_jump
 from pilfr_casadi.diagnose.preparation import prepare

@@ -11,10 +11,11 @@ from diagnosis_rig import OFF, recordings, rig
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
 from pilfr_casadi._base import Interrupt, Stages
-from pilfr_casadi.diagnose import Workbench, correction, hypotheses, preparation
+from pilfr_casadi.diagnose import Workbench, correction, preparation
 from pilfr_casadi.diagnose.faults.gates import Checked
 from pilfr_casadi.diagnose.fits.floor import Floor
 from pilfr_casadi.diagnose.fits.screen import flexible_shares
+from pilfr_casadi.diagnose.search import hypotheses
 from pilfr_casadi.diagnose.search.moves import Search
 from pilfr_casadi.diagnose.search.trials import Trial, Trials
 from pilfr_casadi.diagnose.verdict import posterior
@@ -97,6 +98,7 @@ def test_at_the_time_limit_the_search_answers_from_what_it_has():
     diagnosis = pilfr.diagnose(rig(OFF), r.slice(0, 800), laws=TRIED, time_limit=1e-3)
     assert diagnosis.evidence["search"].bench.deadline == np.inf  # what is fitted later, as by `refine`, has time
     assert "The time limit ended the search" in str(diagnosis)
+    assert "none of the laws that were fitted before the time limit (1 of " in diagnosis.sentence
     with pytest.raises(pilfr.InputError, match="time_limit=0 was given"):
         pilfr.diagnose(rig(OFF), r, time_limit=0)
 
