@@ -46,7 +46,7 @@ SAID = {
     "docs/howto/closed_loop.md": "leaves out Coulomb friction at guide.",
     "docs/howto/delay.md": "leaves out delay at sensor:x2 and Coulomb friction at ground-m2.",
     "docs/diagnose.md": "leaves out Coulomb friction at ground-m2.",
-    "docs/howto/ports.md": "['equation:pos', 'equation:vel', 'actuator:force', 'sensor:position']",
+    "docs/howto/ports.md": "['equation:vel', 'actuator:force', 'sensor:position']",
 }
 WRITTEN = {
     "docs/diagnose.md": {"report/report.html", "diagnosis/diagnosis.json"},
