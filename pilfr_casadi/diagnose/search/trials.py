@@ -247,7 +247,7 @@ class Trials:
                     found.append(refined)
                     step(found)
             found += [p.trial for p in prepared[most:]]
-            report(total, total, min((t.error for t in found if t), default=np.inf))
+            report(done if self.over else total, total, min((t.error for t in found if t), default=np.inf))
         finally:
             pool.shutdown(cancel_futures=True)
         return sorted((t for t in found if t is not None), key=lambda t: t.error)
