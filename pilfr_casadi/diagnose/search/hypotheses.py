@@ -39,7 +39,7 @@ from ..fits.evidence import (
 from ..fits.floor import FEWEST, Floor, effective_size, white_part
 from ..fits.force_recovery import is_curve_along
 from ..fits.screen import Scored, flexible_shares, innovation_share, screen
-from ..fits.workbench import DIVERGED, FEW, Fitted, Workbench
+from ..fits.workbench import DIVERGED, Fitted, Workbench
 from .trials import Key, Trial, Trials
 
 MOST_PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
@@ -147,28 +147,6 @@ class Hypotheses:
     def best(self) -> Trial:
         """The most promising hypothesis, from which the search continues."""
         return max(self.memo.values(), key=self.optimistic_evidence)
-
-    def better_predictor(self, trial: Trial, others: Sequence[Trial]) -> Trial | None:
-        """Return the one of several hypotheses with as many effects that predicts best, unless `trial` itself does.
-
-        None as well unless even the best hypotheses are wrong. Then a wrong law may follow the recordings best, and
-        what is added to it only makes up for what it does.
-        """
-        if not (trial.effects and self._all_wrong and self.can_improve(self.best)) or self.past_deadline:
-            return None
-        alike = [t for t in others if len(t.effects) == len(trial.effects)]
-        first = dict[frozenset[tuple[str, str]], Trial]()  # the likeliest form of each
-        for t in sorted(alike, key=self.optimistic_evidence, reverse=True):
-            first.setdefault(frozenset((e.port, e.law.id) for e in t.laws), t)
-        rivals = [self.thorough(t) for t in list(first.values())[:FEW]]
-        with self.stage("held-out blocks"):
-            best = max(rivals, key=self._predicted_evidence)
-        return None if best.key == trial.key else best
-
-    def _predicted_evidence(self, trial: Trial) -> float:
-        """Compute the optimistic evidence of a hypothesis from its error on held-out blocks."""
-        v = self.bench.pool(self.held_out(trial).squares + self.tolerance)
-        return self._log_evidence(trial, v, self.sample.effective(0.0))
 
     def optimistic_evidence(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis with as many effective samples as at the noise level."""

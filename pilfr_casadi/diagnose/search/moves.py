@@ -120,9 +120,6 @@ class Search(Hypotheses):
             and (self.in_time() or not self.steps)
         ):
             self.add(parent)
-            rival = self.better_predictor(parent, self._allowed(varied))
-            if rival is not None and not self._expanded(rival):
-                self.add(rival, again=True)
             if not parent.laws and self.in_time() and self._escape_local_minimum():
                 self.add(self.root)
             if (not self.hold_said and self.prefers_other_hold()) or (not parent.laws and self._finds_shift()):
@@ -141,11 +138,10 @@ class Search(Hypotheses):
 
     def _parent(self, varied: bool) -> Trial:
         """Return the best hypothesis, or the best one in which no parameter varies."""
-        return max(self._allowed(varied), key=self.optimistic_evidence)
-
-    def _allowed(self, varied: bool) -> list[Trial]:
-        """List the hypotheses, or those in which no parameter varies."""
-        return [t for t in self.memo.values() if varied or all(kind_of(e.port) != PARAMETER for e in t.laws)]
+        if varied:
+            return self.best
+        fixed = [t for t in self.memo.values() if all(kind_of(e.port) != PARAMETER for e in t.laws)]
+        return max(fixed, key=self.optimistic_evidence)
 
     def _grow_to_noise(self) -> None:
         """Add a law for a rest as small as the formula error of the laws before it.
