@@ -322,24 +322,32 @@ class Search(Hypotheses):
         best = self._best_with_one_more(parent)
         if best is not None:
             self._refine(best, FINER.get(type(best.law), ()))
-        may_vary = [kind for kind in SCALABLE if kind.id not in LINEAR]  # a linear law was screened with every signal
-        added = [t for t in self.steps[-1].trials if constant(type(t.law)) in may_vary]
-        kept = [self.memo[t.key] for t in added]  # perhaps found before, with these laws added in another order
-        step = [new if known.pair != new.pair else known for new, known in zip(added, kept, strict=True)]
-        # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
-        if step and self.can_improve(self.best, self.least_floor) and self.in_time():
-            likeliest = max(step, key=self.optimistic_evidence)
-            forms = [t for t in step if t.law.id == likeliest.law.id]
-            entry = self._entry(likeliest)
-            self._vary([likeliest], ("z", *entry.local.inputs) if entry else ())
-            if self.best.laws and self.best.law.scheduled_by:  # with the signal found, other forms may be the physics
-                self._vary([t for t in forms if t is not likeliest], (self.best.law.scheduled_by,))
+        self._vary_strength()
         best = self._best_with_one_more(parent)
         by = (best.law.scheduled_by or best.law.scaled_by) if best is not None else ""
         if best is not None and by and "parallel" in best.law.places and self.in_time():
             kind = constant(type(best.law))
             self._refine(best, [scheduled(kind, by, p) for p in likely_profiles(kind) if p != best.law.profile])
         self.replace_variation(parent)
+
+    def _vary_strength(self) -> None:
+        """Let the strength of the likeliest law of the last step that may vary do so, with every signal.
+
+        With the signal found, its other forms may be the physics. A linear law was screened with every signal.
+        """
+        may_vary = [kind for kind in SCALABLE if kind.id not in LINEAR]
+        added = [t for t in self.steps[-1].trials if constant(type(t.law)) in may_vary]
+        kept = [self.memo[t.key] for t in added]  # perhaps found before, with these laws added in another order
+        step = [new if known.pair != new.pair else known for new, known in zip(added, kept, strict=True)]
+        # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
+        if not step or not self.can_improve(self.best, self.least_floor) or not self.in_time():
+            return
+        likeliest = max(step, key=self.optimistic_evidence)
+        forms = [t for t in step if t.law.id == likeliest.law.id and t is not likeliest]
+        entry = self._entry(likeliest)
+        self._vary([likeliest], ("z", *entry.local.inputs) if entry else ())
+        if self.best.laws and self.best.law.scheduled_by:
+            self._vary(forms, (self.best.law.scheduled_by,))
 
     def _vary(self, trials: Sequence[Trial], signals: Sequence[str]) -> None:
         """Fit hypotheses with the strength of their last law varying with each signal."""
