@@ -77,7 +77,10 @@ class CsvTable:
         names = [*names, time] if time is not None else names
         where = [self.names.index(name) for name in names]
         may_miss = np.array([name != time for name in names])
-        numbers = self._read_at_once(where)
+        numbers = self._read_at_once(where, self.lines)
+        if numbers is None:
+            empty = rf"^(?={self.delimiter})|(?<={self.delimiter})(?={self.delimiter}|$)"
+            numbers = self._read_at_once(where, [re.sub(empty, "nan", line) for line in self.lines])
         if numbers is None or not (usable(numbers) | (may_miss & np.isnan(numbers))).all():
             numbers = self._read_cells(where, may_miss)
         return [numbers[:, i : i + 1] for i in range(len(names))]
@@ -111,12 +114,12 @@ class CsvTable:
         rows = [i for i, line in enumerate(self.lines) if line.strip()]
         return f"line {self.first_line + rows[row]}"
 
-    def _read_at_once(self, where: Sequence[int]) -> Array | None:
+    def _read_at_once(self, where: Sequence[int], lines: Sequence[str]) -> Array | None:
         width = len(self.names) - 1
-        if any('"' in line or line.count(self.delimiter) != width for line in self.lines if line.strip()):
+        if any('"' in line or line.count(self.delimiter) != width for line in lines if line.strip()):
             return None
         try:
-            return np.loadtxt(self.lines, delimiter=self.delimiter, usecols=where, ndmin=2, comments=None)
+            return np.loadtxt(lines, delimiter=self.delimiter, usecols=where, ndmin=2, comments=None)
         except ValueError:
             return None
 
