@@ -36,6 +36,7 @@ QUICK = {  # pages of about a second; all others are slow
         "other_domains",
         "own_law",
         "ports",
+        "rates",
         "unknown_start",
         "varying_strength",
     )

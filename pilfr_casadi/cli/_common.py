@@ -126,7 +126,7 @@ class DataOptions:
     time_tolerance: float | None = option(
         "Largest deviation of samples from a uniform grid (default: 1e-4 steps, beyond rounding).", "STEPS"
     )
-    resample: float | None = option("New step, for times that are not uniform.", "SECONDS")
+    resample: float | None = option("New step, for uneven times or channels of different rates.", "SECONDS")
 
     def __post_init__(self) -> None:
         if self.period is not None and self.initial is None:
