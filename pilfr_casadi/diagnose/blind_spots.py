@@ -23,6 +23,7 @@ from .arguments import check_laws, match_recordings, stated_hold
 from .faults.channels import accept_best, find_gross_slips, refit_corrected
 from .faults.gates import USELESS_FIT, Checked, refit
 from .faults.offsets import WrongStart, find_wrong_start
+from .faults.samples import find_held_outputs
 from .fits.floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor, noise_floor
 from .fits.linearise import Probe, Run, linearise_runs
 from .fits.workbench import QUICK, Fitted, Workbench
@@ -304,18 +305,21 @@ def check(
         now = choose_hold(now, QUICK)[0]
     now = find_wrong_start(now)
     bench, fitted, faults = now.bench, now.fitted, now.gates
+    slow = find_held_outputs(recordings)
     bench.interrupt.raise_pending()  # half a fit would tell wrong things
     bench.check_followed(fitted)
     floor = noise_floor(bench.recordings, bench.scored(fitted.residual))
     found = assess_recordings(bench, fitted, floor, stated or "", laws)
-    if not faults:
+    if not (faults or slow):
         return found
-    told = [f.sentence + " Below, it is corrected." * f.corrected for f in faults]
-    spots = (BlindSpot("recording-fault", (f.channel,), text) for f, text in zip(faults, told, strict=True))
+    told = [f.sentence + " Below, it is corrected." * f.corrected for f in (*faults, *slow)]
+    spots = (BlindSpot("recording-fault", (f.channel,), text) for f, text in zip((*faults, *slow), told, strict=True))
     wired = [f.channel for f in faults if not isinstance(f, WrongStart)]
     advice = [f"Correct the recordings first: check wiring, sign and unit of {in_words(wired)}."] if wired else []
     if len(wired) < len(faults):
         advice.append("State how the recordings begin: give each state's value, or leave the start unknown.")
+    if slow:
+        advice.append(f"Read {in_words([f.channel for f in slow])} at the rate at which it was measured.")
     estimated = any(isinstance(f, WrongStart) and f.corrected for f in faults)
     starts = tuple(START_WORDS[r.begins] + ", here estimated" * estimated for r in recordings)
     return replace(found, blind_spots=(*spots, *found.blind_spots), next_record=" ".join(advice), starts=starts)

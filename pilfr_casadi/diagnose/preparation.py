@@ -30,7 +30,7 @@ from .faults.gates import (
 )
 from .faults.lost_samples import find_gaps, find_output_gaps
 from .faults.offsets import find_offsets, find_wrong_start
-from .faults.samples import mend_stale_samples, open_unsettled, remove_glitches, unclip
+from .faults.samples import find_held_outputs, mend_stale_samples, open_unsettled, remove_glitches, unclip
 from .faults.timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps
 from .fits.floor import Floor, pool, white_part
 from .fits.linearise import linearise_runs, observer_gain, sample_run
@@ -87,9 +87,10 @@ def prepare(
     say(CHECKS, 0, CHECKED)
     recordings, spikes = remove_glitches(recordings)
     recordings, transients = open_unsettled(recordings)
+    slow = find_held_outputs(recordings)
     said = stated_hold(simulator, recordings, hold)
     bench, times = open_bench(simulator, recordings, said or "zero", engine)
-    checks, noted = _Checks(workers, early, say, until), (*spikes, *transients, *times)
+    checks, noted = _Checks(workers, early, say, until), (*spikes, *transients, *slow, *times)
     held: Sequence[Gate] = ()
     try:
         first = checks.begin(bench, noted)

@@ -6,6 +6,8 @@
 - Stale samples: a channel that otherwise never repeats a value sometimes repeats its last one. Interpolation replaces
   them. Other repeats are not stale: a coarse converter, or an encoder that moves by no more than its step, has few
   values; a machine at rest repeats one value for long; a clipped channel repeats its limit.
+- Held outputs: an output that changes at every k-th sample alone was measured at that rate and held in between, which
+  looks like a delay of (k - 1) / 2 samples. The values between cannot be told, so that this is only noted.
 - Clipped channels: exactly repeated extremes. A clipped output can be compared with an equally clipped simulation; the
   part of a clipped input beyond its limit is lost.
 - Unsettled periods: the rms differences of neighbouring periods are all equal if only noise differs, and larger at
@@ -55,6 +57,9 @@ FEWEST_STEPS = 2.0  # least distance of a glitch over the resolution of a quanti
 ISOLATED_SHARE = 0.12  # distance of neighbours, and deviation nearby, over a glitch's distance; a kink leaves 1/6
 
 ROUNDING = 1e-6  # bound on the relative rounding of distances
+
+FEWEST_CHANGES = 20  # of an output, from which chance hardly puts all of them on one raster
+ON_RASTER = 0.98  # least share of an output's changes that lie on the raster of a held output
 
 LONGEST_REST = 5  # longest rest of an encoder or a machine, in samples
 LARGEST_MOTION = 5  # largest motion of an encoder in a sample, in steps
@@ -225,6 +230,43 @@ def _find_repeats(y: np.ndarray, step: float) -> np.ndarray:
         if end - begin > LONGEST_REST or abs(y[min(end, len(y) - 1)] - y[begin]) < LARGEST_MOTION * step:
             same[begin:end] = False
     return same
+
+
+# held outputs
+
+
+def find_held_outputs(recordings: Sequence[Recording]) -> list[Gate]:
+    """Note each output that was measured at a slower rate than it was recorded."""
+    found, dt = list[Gate](), recordings[0].dt
+    for i, name in enumerate(recordings[0].outputs):
+        k = min(_samples_between_changes(r.y[:, i], r.u) for r in recordings)
+        if k > 1:
+            sentence = (
+                f"{name} changes only at every {k}th sample, as if it were measured every {k * dt:.3g} s and held in "
+                f"between, which looks like a delay of about {(k - 1) / 2 * dt:.3g} s. Leave its repeated values out "
+                f"(empty cells), and read the file with resample={dt:.6g}."
+            )
+            found.append(Gate(name, "held", k, sentence, corrected=False))
+    return found
+
+
+def _samples_between_changes(y: np.ndarray, u: np.ndarray) -> int:
+    """Return the largest number of samples on whose raster an output changes; 1 if there is none.
+
+    So does an encoder at constant speed, but by a few of its steps; and a static machine without noise, but with
+    inputs that are held on the same raster.
+    """
+    motions, driven = np.abs(np.diff(y)), np.flatnonzero(np.any(np.diff(u, axis=0) != 0, axis=1))
+    changes = np.flatnonzero(motions)
+    if len(changes) < FEWEST_CHANGES or np.median(motions[changes]) < LARGEST_MOTION * _smallest_step(y):
+        return 1
+    k = next((k for k in range(len(y) // FEWEST_CHANGES, 1, -1) if _on_raster(changes, k)), 1)
+    with_inputs = max(np.mean(np.isin(changes - late, driven)) for late in (0, 1)) >= ON_RASTER
+    return 1 if with_inputs and _on_raster(driven, k) else k
+
+
+def _on_raster(places: np.ndarray, k: int) -> bool:
+    return bool(np.max(np.bincount(places % k), initial=0) >= ON_RASTER * len(places))
 
 
 # clipped channels

@@ -10,6 +10,7 @@ from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.faults import samples
 from pilfr_casadi.diagnose.faults.samples import (
     find_glitches,
+    find_held_outputs,
     mend,
     mend_stale_samples,
     open_unsettled,
@@ -136,6 +137,32 @@ def test_a_converter_and_a_rest_are_not_stale(kind):
 
 
 # periodic recordings whose periods still differ by what dies away
+
+
+def held(r, k):
+    """The recording with its output measured at every k-th sample alone."""
+    return r.with_(y=r.y[np.arange(len(r)) // k * k])
+
+
+def test_an_output_that_was_measured_at_a_slower_rate_is_told():
+    (r,) = recordings(count=1)
+    (gate,) = find_held_outputs([held(r, 5)])
+    assert (gate.channel, gate.finding, gate.value, gate.corrected) == ("x2", "held", 5, False)
+    assert f"a delay of about {2 * r.dt:.3g} s" in gate.sentence and f"resample={r.dt:g}" in gate.sentence
+    checked = pilfr.check(rig(OFF), held(r, 5))
+    assert gate.sentence in [spot.sentence for spot in checked.blind_spots]
+    assert checked.next_record == "Read x2 at the rate at which it was measured."
+
+
+@pytest.mark.parametrize("kind", ["noise", "encoder", "driven"])
+def test_outputs_that_change_regularly_for_other_reasons_are_not(kind):
+    (r,) = recordings(count=1)
+    if kind == "encoder":  # at constant speed
+        r = r.with_(y=0.01 * (np.arange(len(r))[:, None] // 5))
+    if kind == "driven":  # by held levels, without memory or noise
+        u = r.u[np.arange(len(r)) // 10 * 10]
+        r = r.with_(u=u, y=np.tanh(u))
+    assert find_held_outputs([r]) == []
 
 
 def periodic(decay, noise=1e-3, seed=0):
