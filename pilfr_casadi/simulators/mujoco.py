@@ -2,10 +2,12 @@
 
 MuJoCo reads the file. The equations of motion
 
-    M(q) dv/dt + c(q, v) = τ_actuators - D v - K (q - q_spring) + w
+    M(q) dv/dt + c(q, v) = τ_actuators - D v - K (q - q_spring) - f(v) + w
 
 (Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 2) are then written for CasADi. So they can be compiled, have
-exact derivatives by states and by all numbers of the model, and accept a force w at every joint. They are compared with
+exact derivatives by states and by all numbers of the model, and accept a force w at every joint. The dry friction f is
+the joint's `frictionloss` while it slides, and `s v` while it sticks, where s is the slope of MuJoCo's own friction at
+rest. They are compared with
 MuJoCo's own accelerations at several points. Contacts and joint limits are left out, with a note. A model with any
 other feature that the equations lack is refused.
 """
@@ -52,11 +54,11 @@ def from_mujoco(
         Numbers of the model that a fit may change: `<body>.mass`, with which the inertia scales; `<body>.inertia`, a
         factor on the inertia alone; `<body>.inertia_x`, `inertia_y`, `inertia_z`, the moments of inertia about the
         principal axes in the order of MuJoCo; `<body>.com_x`, `com_y`, `com_z`; `<joint>.damping`, `armature`,
-        `stiffness`, `spring`; `<actuator>.gain`, `gear`; `gravity`. By default all masses and dampings, and those
-        with `bounds`. The others keep the model's values.
+        `stiffness`, `spring`, `frictionloss`; `<actuator>.gain`, `gear`; `gravity`. By default all masses and dampings,
+        friction losses that are not zero, and those with `bounds`. The others keep the model's values.
     bounds : mapping, optional
-        `(lower, upper)` by parameter; by default a factor of ten either way; dampings, armatures, stiffnesses and
-        values of zero are bounded by zero below.
+        `(lower, upper)` by parameter; by default a factor of ten either way; dampings, armatures, stiffnesses,
+        friction losses and values of zero are bounded by zero below.
     inputs : tuple of str, optional
         Recorded actuators; by default all. The others are at zero.
     outputs : tuple of str, optional
@@ -69,7 +71,7 @@ def from_mujoco(
     ------
     InputError
         If MuJoCo is not installed or cannot read the file, a name is unknown, or the model has features that the
-        equations lack, such as free bodies, tendons, equality constraints, muscles or dry friction.
+        equations lack, such as free bodies, tendons, equality constraints or muscles.
     """
     tree, bounds = MujocoTree.load(model), bounds or {}
     given = tree.default_parameters if parameters is None else parameters
@@ -109,24 +111,26 @@ class _Equations:
         controls = {name: u[i] for i, name in enumerate(inputs)}
         numbers = {**tree.numbers, **{name: p[i] for i, name in enumerate(free)}}
         forces, driven = self._actuator_forces(q, v, controls, numbers)
-        mass, rest = self._motion_terms(q, v, driven, numbers)
-        # M, the rest of the equations M dv/dt = rest, the actuators' forces on the joints, and their own
-        self.motion = ca.Function("motion", [q, v, u, p], [mass, rest, driven, forces])
+        sizes = ca.vertcat(*(numbers[f"{name}.frictionloss"] for name in tree.joints))
+        friction = _clip(ca.DM(tree.friction_slopes) * v, -sizes, sizes)
+        mass, rest = self._motion_terms(q, v, driven - friction, numbers)
+        # M, the rest of the equations M dv/dt = rest, the actuators' forces on the joints and their own, the friction
+        self.motion = ca.Function("motion", [q, v, u, p], [mass, rest, driven, forces, friction])
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Write the equations again in another process."""
         return _Equations, (self.tree, self.free, self.inputs, self.measured)
 
     def check(self) -> None:
-        """Compare with MuJoCo's accelerations at several points."""
+        """Compare with MuJoCo's accelerations at several points, without dry friction, which depends on its solver."""
         tree, rng, n = self.tree, np.random.default_rng(0), len(self.tree.joints)
         drives = [tree.actuators.index(name) for name in self.inputs]
         values = [tree.numbers[name] for name in self.free]
         for _ in range(COMPARED_POINTS):
             q, v, u = rng.uniform(-0.7, 0.7, n), rng.normal(0, 1, n), np.zeros(len(tree.actuators))
             u[drives] = rng.uniform(-0.5, 0.5, len(drives))
-            mass, rest, _, _ = self.motion(q, v, u[drives], values)
-            wanted, found = tree.acceleration(q, v, u), np.linalg.solve(mass.full(), rest.full().ravel())
+            mass, rest, _, _, friction = self.motion(q, v, u[drives], values)
+            wanted, found = tree.acceleration(q, v, u), np.linalg.solve(mass.full(), (rest + friction).full().ravel())
             if not np.max(np.abs(found - wanted)) <= AGREE * max(np.max(np.abs(wanted)), 1.0):
                 raise InputError(
                     f"{tree.label} moves otherwise than a tree of rigid bodies with linear springs, dampers and "
@@ -170,7 +174,7 @@ class _Equations:
         return out
 
     def _motion_terms(self, q: Any, v: Any, driven: Any, numbers: Mapping[str, Any]) -> tuple[Any, Any]:
-        """Return M(q), (n, n), and the rest of the equations M dv/dt = rest, (n,), with the actuators' forces."""
+        """Return M(q), (n, n), and the rest of the equations M dv/dt = rest, (n,), with the forces `driven`."""
         m, n, tree = self.tree.model, len(self.tree.joints), self.tree
         down = m.opt.gravity / (np.linalg.norm(m.opt.gravity) or 1.0)
         fall = numbers["gravity"] * ca.SX(ca.DM(down))
@@ -204,14 +208,14 @@ class _Equations:
             j, gear = int(m.actuator_trnid[i, 0]), numbers[f"{name}.gear"]
             control = controls.get(name, 0.0)
             if m.actuator_ctrllimited[i]:
-                control = _clip(control, m.actuator_ctrlrange[i])
+                control = _clip(control, *m.actuator_ctrlrange[i])
             b0, b1, b2 = m.actuator_biasprm[i, :3]
             gain = m.actuator_gainprm[i, 0] * numbers[f"{name}.gain"]
             force = gain * control + b0 + b1 * gear * q[j] + b2 * gear * v[j]
-            forces[i] = _clip(force, m.actuator_forcerange[i]) if m.actuator_forcelimited[i] else force
+            forces[i] = _clip(force, *m.actuator_forcerange[i]) if m.actuator_forcelimited[i] else force
             driven[j] += gear * forces[i]
         for j in np.flatnonzero(m.jnt_actfrclimited).tolist():
-            driven[j] = _clip(driven[j], m.jnt_actfrcrange[j])
+            driven[j] = _clip(driven[j], *m.jnt_actfrcrange[j])
         return forces, driven
 
     def _evaluate(self, x: Named, u: Named, p: Named) -> Any:
@@ -232,7 +236,7 @@ class _Equations:
     def __call__(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
         """Evaluate the derivatives by state: the dynamics of a `Simulator`."""
         names = self.tree.joints
-        mass, rest, _, _ = self._evaluate(x, u, p)
+        mass, rest = self._evaluate(x, u, p)[:2]
         faster = ca.vertsplit(ca.solve(mass, rest))
         return {n: x[f"{n}.speed"] for n in names} | {f"{n}.speed": a for n, a in zip(names, faster, strict=True)}
 
@@ -286,13 +290,13 @@ def _rotate_by(quaternion: np.ndarray) -> Any:
     return ca.SX(ca.DM.eye(3) + 2 * w * k + 2 * k @ k)
 
 
-def _clip(value: Any, ends: np.ndarray) -> Any:
-    return ca.fmin(ca.fmax(value, ends[0]), ends[1])
+def _clip(value: Any, low: Any, high: Any) -> Any:
+    return ca.fmin(ca.fmax(value, low), high)
 
 
 def _default_bounds(name: str, value: float) -> tuple[float, float]:
     if ".com_" in name or name.endswith(".spring"):
         return -np.inf, np.inf
-    if name.endswith((".damping", ".armature", ".stiffness")):  # a joint need not have any
+    if name.endswith((".damping", ".armature", ".stiffness", ".frictionloss")):  # a joint need not have any
         return 0.0, within_a_factor(value)[1] or np.inf
     return within_a_factor(value) if value else (0.0, np.inf)

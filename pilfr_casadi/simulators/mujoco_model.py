@@ -17,7 +17,7 @@ from .._base import InputError, existing_file, in_words
 
 AXES = ("x", "y", "z")
 OF_BODIES = ("mass", "inertia", *(f"inertia_{axis}" for axis in AXES), *(f"com_{axis}" for axis in AXES))
-OF_JOINTS = ("damping", "armature", "stiffness", "spring")
+OF_JOINTS = ("damping", "armature", "stiffness", "spring", "frictionloss")
 OF_ACTUATORS = ("gain", "gear")
 
 
@@ -36,18 +36,16 @@ class MujocoTree:
             import mujoco
         except ImportError:
             raise InputError("mujoco is not installed; install it with `pip install pilfr-casadi[mujoco]`.") from None
-        path, model = None, copy.copy(source)
+        in_memory = isinstance(source, mujoco.MjModel | mujoco.MjSpec)
+        path = None if in_memory else existing_file(_as_path(source))
         try:
-            if isinstance(source, mujoco.MjSpec):
-                model = source.copy().compile()
-            elif not isinstance(source, mujoco.MjModel):
-                path = existing_file(_as_path(source))
+            if path is not None:
                 model = mujoco.MjModel.from_xml_path(str(path))
-        except InputError:
-            raise
+            else:
+                model = copy.copy(source) if isinstance(source, mujoco.MjModel) else source.copy().compile()
         except Exception as error:
-            reason, name = " ".join(str(error).split()), path or "the MjSpec"
-            raise InputError(f"MuJoCo cannot read {name} ({reason}); correct it.") from None
+            reason = " ".join(str(error).split())
+            raise InputError(f"MuJoCo cannot read {path or 'the MjSpec'} ({reason}); correct it.") from None
         tree = cls(path or model, mujoco, model)
         if not model.njnt:
             raise InputError(f"{tree.label} has no joint, so nothing in it can move; give a model with joints.")
@@ -76,7 +74,6 @@ class MujocoTree:
             "a free or a ball joint": any(kind not in one_axis for kind in m.jnt_type),
             "an equality constraint": m.neq > 0,
             "a tendon": m.ntendon > 0,
-            "dry friction in a joint (frictionloss)": np.any(m.dof_frictionloss > 0),
             "an actuator that acts on something else than a joint": any(
                 kind != int(mj.mjtTrn.mjTRN_JOINT) for kind in m.actuator_trntype
             ),
@@ -174,8 +171,8 @@ class MujocoTree:
             values = (m.body_mass[i], 1.0, *m.body_inertia[i], *m.body_ipos[i])
             found |= _name_numbers(self.bodies[i], OF_BODIES, values)
         for i, name in enumerate(self.joints):
-            values = (m.dof_damping[i], m.dof_armature[i], m.jnt_stiffness[i], m.qpos_spring[m.jnt_qposadr[i]])
-            found |= _name_numbers(name, OF_JOINTS, values)
+            values = m.dof_damping[i], m.dof_armature[i], m.jnt_stiffness[i], m.qpos_spring[m.jnt_qposadr[i]]
+            found |= _name_numbers(name, OF_JOINTS, (*values, m.dof_frictionloss[i]))
         for i, name in enumerate(self.actuators):
             found |= _name_numbers(name, OF_ACTUATORS, (1.0, m.actuator_gear[i, 0]))
         return found
@@ -202,8 +199,21 @@ class MujocoTree:
 
     @property
     def default_parameters(self) -> tuple[str, ...]:
-        """Masses and dampings."""
-        return tuple(n for n in self.numbers if n.endswith((".mass", ".damping")))
+        """Masses and dampings, and friction losses that are not zero."""
+        kinds = (".mass", ".damping")
+        return tuple(n for n, v in self.numbers.items() if n.endswith(kinds) or (n.endswith(".frictionloss") and v))
+
+    @property
+    def friction_slopes(self) -> np.ndarray:
+        """Dry friction by speed of each joint that sticks, (n,): b / R in the terms of MuJoCo's soft constraints.
+
+        A friction at rest has R = (1 - d) / d times the joint's inverse inertia, and the reference acceleration -b v.
+        """
+        m = self.model
+        d, most = np.clip(m.dof_solimp[:, :2], 1e-4, 1 - 1e-4).T  # as MuJoCo limits them
+        time = np.maximum(m.dof_solref[:, 0], 2 * m.opt.timestep)
+        b = np.where(m.dof_solref[:, 0] > 0, 2 / (most * time), -m.dof_solref[:, 1] / most)
+        return np.asarray(b * d / ((1 - d) * m.dof_invweight0))
 
     def hinge(self, joint: int) -> bool:
         """Tell whether a joint is a hinge."""

@@ -114,7 +114,6 @@ def test_it_may_be_sent_to_another_process(arm, recording):
 @pytest.mark.parametrize(
     ("before", "after", "said"),
     [
-        ('damping="0.1"', 'damping="0.1" frictionloss="1"', "dry friction in a joint"),
         ('<joint name="shoulder" axis="0 1 0" damping="0.1"/>', "<freejoint/>", "a free or a ball joint"),
         ("<motor ", '<intvelocity name="m0" joint="elbow" kp="1" actrange="0 1"/><motor ', "a state of its own"),
         ("<worldbody>", "<worldbody", "MuJoCo cannot read"),
@@ -135,10 +134,8 @@ def test_what_the_equations_do_not_hold_is_refused(tmp_path, before, after, said
 
 
 def test_unknown_names_are_refused(arm):
-    with pytest.raises(
-        InputError,
-        match=r"has no 'wrist.mass' among its parameters; they are mass, inertia, .* of the bodies upper, lower and tip; damping",
-    ):
+    known = "'wrist.mass' among its parameters; they are mass, inertia, .* of the bodies upper, lower and tip; damping"
+    with pytest.raises(InputError, match=known):
         from_mujoco(arm, parameters=["wrist.mass"])
     with pytest.raises(InputError, match=r"has no 'm9' among its actuators; they are m1, m2"):
         from_mujoco(arm, inputs=["m9"])
