@@ -5,7 +5,7 @@ import pickle
 import casadi as ca
 import numpy as np
 import pytest
-from command_line import refused
+from command_line import refused, run
 
 from pilfr_casadi import InputError, Parameter, Recording, from_mujoco
 from pilfr_casadi.laws import CoulombFriction
@@ -32,6 +32,17 @@ ARM = """
   </worldbody>
   <actuator><motor name="m1" joint="shoulder" gear="3"/><position name="m2" joint="elbow" kp="5" kv=".3"/></actuator>
   <sensor><jointpos name="q1" joint="shoulder"/><jointvel name="w2" joint="elbow"/></sensor>
+</mujoco>"""
+
+PENDULUM = """
+<mujoco>
+  <worldbody>
+    <body>
+      <joint name="joint" axis="0 1 0" damping="0.1" range="-90 90"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".03" mass="1"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="m" joint="joint"/></actuator>
 </mujoco>"""
 
 
@@ -238,6 +249,20 @@ def test_the_command_takes_a_model(arm, tmp_path, capsys, recording):
     refused(capsys, "diagnose", str(arm), train, "--bound", "wrist.mass=1:2", *out, says="'wrist.mass'")
     refused(capsys, "diagnose", str(arm), train, "--port", "a=b:c", *out, says="--port was given")
     assert not (tmp_path / "out").exists()
+
+
+def test_the_command_frees_a_bounded_parameter_and_prints_the_note(tmp_path, capsys):
+    t, rng = 0.02 * np.arange(200), np.random.default_rng(0)
+    u = np.sin(5 * t) + np.sin(11 * t)
+    recording = Recording(u[:, None], np.zeros((200, 1)), 0.02, ("m",), ("joint",), initial="zero", hold="zero")
+    arm, train = tmp_path / "arm.xml", tmp_path / "train.csv"
+    arm.write_text(PENDULUM, encoding="utf-8")
+    y = from_mujoco(arm).simulate(recording)[:, 0] + 1e-3 * rng.standard_normal(200)
+    np.savetxt(train, np.column_stack([t, u, y]), delimiter=",", header="t,m,joint", comments="")
+    given = ("check", arm, train, "--bound", "joint.armature=0:1", "--initial", "zero", "--hold", "zero")
+    status, said, _ = run(capsys, *given, "--out", tmp_path)
+    found = (tmp_path / "check.json").read_text(encoding="utf-8")
+    assert status == 0 and "joint.armature" in found and "the equations leave out the limits of joint" in said
 
 
 def test_laws_have_parameters_of_their_own_beside_the_joints(arm):
