@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, check_known
-from ..models import Named, Parameter, parameter_within, within_a_factor
+from ..models import Named, Parameter, ParameterSet, parameter_within, within_a_factor
 from .mujoco_model import AXES, MujocoTree
 from .ports import Port
 from .simulator import Simulator
@@ -82,7 +82,7 @@ def from_mujoco(
     ends = {n: bounds.get(n) or _default_bounds(n, tree.numbers[n]) for n in own}
     made = {n: parameter_within(n, tree.numbers[n], ends[n]) for n in own}
     if isinstance(given, Mapping):
-        made |= {n: p for n, p in given.items() if n not in bounds}
+        made |= ParameterSet(given).free_within({n: ends[n] for n in bounds if n in given})
     drives = tuple(tree.actuators if inputs is None else inputs)
     measured = tuple(tree.default_outputs if outputs is None else outputs)
     equations = _Equations(tree, tuple(made), drives, measured)

@@ -144,8 +144,8 @@ class MujocoTree:
     def _find_contact(self) -> tuple[str, ...]:
         """Name two bodies that can collide, by the rules of MuJoCo; empty if there are none."""
         m = self.model
-        for body, other in zip(m.pair_geom1, m.pair_geom2, strict=True):
-            return self.bodies[m.geom_bodyid[body]], self.bodies[m.geom_bodyid[other]]
+        if m.npair:
+            return tuple(self.bodies[m.geom_bodyid[geom[0]]] for geom in (m.pair_geom1, m.pair_geom2))
         excluded = {frozenset(divmod(int(pair), 1 << 16)) for pair in m.exclude_signature}
         for i, j in itertools.combinations(range(m.nbody), 2):
             welds = {int(m.body_weldid[i]), int(m.body_weldid[j])}

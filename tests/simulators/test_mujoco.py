@@ -122,8 +122,11 @@ def test_bounds_free_a_parameter(arm):
     assert [*simulator.parameters] == [*usual.parameters, "lower.inertia"]
     assert simulator.parameters["lower.inertia"].bounds == (0.3, 3)
     assert simulator.parameters["lower.mass"].bounds == (0.5, 2)
-    given = from_mujoco(arm, parameters={"gravity": Parameter(9.8)}, bounds={"lower.mass": (0.5, 2)}).parameters
-    assert given["gravity"].value == 9.8 and [*given] == ["gravity", "lower.mass"]
+    own = {"gravity": Parameter(9.8, fixed=True), "lower.mass": Parameter(0.7, "kg", fixed=True)}
+    given = from_mujoco(arm, parameters=own, bounds={"lower.mass": (0.5, 2), "tip.mass": (0.1, 1)}).parameters
+    assert [*given] == ["gravity", "lower.mass", "tip.mass"] and given["gravity"].fixed
+    changed = given["lower.mass"]
+    assert (changed.value, changed.unit, changed.bounds, changed.fixed) == (0.7, "kg", (0.5, 2), False)
 
 
 def test_a_model_in_memory_is_read(arm, recording):
