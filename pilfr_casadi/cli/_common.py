@@ -195,7 +195,11 @@ class SimulatorOptions(DataOptions):
         "NAME=INTO:ACROSS[:RATE]",
         [],
     )
-    bound: list[str] = option("Bounds of a parameter of an FMU (repeatable).", "NAME=LOW:HIGH", [])
+    bound: list[str] = option(
+        "Bounds of a parameter, which the refit may then change (repeatable).",
+        "NAME=LOW:HIGH",
+        [],
+    )
 
     @property
     def source(self) -> str | None:
@@ -225,6 +229,9 @@ class SimulatorOptions(DataOptions):
         if scripts := [path for path in self.recordings if Path(path).suffix.lower() == ".py"]:
             none = f", and none with {instead}" if instead else ""
             raise InputError(f"{scripts[0]} was given as a recording; give one simulator file, first{none}.")
+        if self.source is None and (self.bound or self.port):
+            name = "bound" if self.bound else "port"
+            raise InputError(f"--{name} was given, which is for a simulator file, not for {instead}; leave it out.")
         if not self.train:
             raise InputError("No training recording was given; give the simulator file and at least one recording.")
         if self.source is not None and (self.inputs or self.outputs):
@@ -235,19 +242,22 @@ class SimulatorOptions(DataOptions):
     def load_simulator(self) -> Any:
         """Load the `simulator` of a Python file, the model of a model.json, an FMU, or a MuJoCo model."""
         from ..identify import load
-        from ..simulators import from_mujoco, simulator_variable
+        from ..simulators import Simulator, from_mujoco, simulator_variable
 
         path = self.files[0]
         kind = Path(path).suffix.lower()
         if kind == ".fmu":
             return self._load_fmu(path)
-        mechanism = kind in (".xml", ".urdf")
-        for name in ("port",) if mechanism else ("port", "bound"):
-            if getattr(self, name):
-                raise InputError(f"--{name} was given, which is for an FMU; {path} has its own, so leave it out.")
-        if mechanism:
-            return from_mujoco(path, bounds=bounds_of(self.bound))
-        return load(path) if kind == ".json" else simulator_variable(path)
+        if self.port:
+            raise InputError(f"--port was given, which is for an FMU; {path} has its own, so leave it out.")
+        bounds = bounds_of(self.bound)
+        if kind in (".xml", ".urdf"):
+            return from_mujoco(path, bounds=bounds)
+        found: Any = load(path) if kind == ".json" else simulator_variable(path)
+        if bounds and not isinstance(found, Simulator):
+            what = f"a {type(found).__name__}, whose numbers have no names" if kind == ".py" else "a fitted model"
+            raise InputError(f"--bound was given, but {path} holds {what}; leave it out, or give a Simulator.")
+        return found.with_bounds(bounds) if bounds else found
 
     def _load_fmu(self, path: str) -> Any:
         """Make a simulator from an FMU, with the inputs and outputs that the first recording has."""
@@ -357,6 +367,12 @@ def check_names(fitted: Fit, inputs: Sequence[str], outputs: Sequence[str]) -> N
 def print_line(line: str) -> None:
     """Print a line at once, also into a pipe."""
     print(line, flush=True)
+
+
+def print_note(simulator: Any) -> None:
+    """Print the note of an imported simulator, if it has one."""
+    if note := getattr(simulator.dynamics, "note", ""):
+        print_line(f"  {note}")
 
 
 def print_recordings(kind: str, recordings: Mapping[str, Recording]) -> None:

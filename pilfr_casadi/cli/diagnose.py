@@ -7,7 +7,7 @@ and writes check.json if a folder is given.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -23,12 +23,14 @@ from ._common import (
     INTERRUPTED,
     NO_RESULT,
     SimulatorOptions,
+    bounds_of,
     flag,
     make_folder,
     new_file,
     numbers_of,
     option,
     print_line,
+    print_note,
     print_recordings,
     say,
     seconds,
@@ -141,13 +143,15 @@ def diagnose_command(options: DiagnoseOptions) -> int:
             )
     except KeyboardInterrupt:
         return say("Interrupted before there was a diagnosis; nothing was written.", INTERRUPTED)
-    return write_diagnosis(diagnosis, folder, options.source or "")
+    return write_diagnosis(diagnosis, folder, options.source or "", bounds_of(options.bound))
 
 
-def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: str = "") -> int:
+def write_diagnosis(
+    diagnosis: Diagnosis, folder: Path, source: str = "", bounds: Mapping[str, tuple[float, float]] | None = None
+) -> int:
     """Write diagnosis.json, corrected.py, then the report; print the diagnosis and the paths; return the exit status.
 
-    corrected.py corrects the simulator file `source`, if that is a Python file.
+    corrected.py corrects the simulator file `source`, if that is a Python file, with other `bounds` of its parameters.
     """
     target = folder / "diagnosis.json"
     try:
@@ -159,7 +163,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: str = "") -> int
             corrected = folder / "corrected.py" if Path(source).suffix.lower() == ".py" else None
             if corrected is not None:
                 there = os.path.relpath(os.path.realpath(source), os.path.realpath(folder))
-                write_atomically(corrected, corrected_file(diagnosis, Path(there).as_posix()))
+                write_atomically(corrected, corrected_file(diagnosis, Path(there).as_posix(), bounds))
         with progress_bar() as progress:
             progress("writing the report", 0, 0, np.nan)
             page = diagnosis_report(diagnosis, folder)
@@ -197,8 +201,7 @@ def _announce(simulator: Simulator, name: str, train: dict[str, Recording], test
     free = sum(not bool(np.all(p.fixed)) for p in simulator.parameters.values())
     counts = f"{len(simulator.states)} states, {len(simulator.parameters)} parameters ({free} free)"
     print_line(f"{name}, {counts}; ports {ports}")
-    if simulator.discrete and (note := getattr(simulator.dynamics, "note", "")):
-        print_line(f"  {note}")
+    print_note(simulator)
     print_recordings("training", train)
     print_recordings("test", tests)
 
@@ -301,6 +304,7 @@ def check_command(options: CheckOptions) -> int:
     simulator = as_simulator(given)
     recordings = options.read_all(options.train, simulator.inputs, simulator.output_names)
     folder = make_folder(options.out) if options.out is not None else None
+    print_note(simulator)
     print_recordings("training", recordings)
     with deferred_interrupt():
         from ..diagnose import check

@@ -309,9 +309,12 @@ def usage(diagnosis: Diagnosis) -> str:
     return render("use_diagnosis.txt", **_collect_correction(diagnosis))
 
 
-def corrected_file(diagnosis: Diagnosis, source: str) -> str:
-    """Write a simulator file that corrects the simulator of another file; `source` is its path from this one."""
-    return render("corrected.txt", source=source, **_collect_correction(diagnosis)) + "\n"
+def corrected_file(diagnosis: Diagnosis, source: str, bounds: Mapping[str, tuple[float, float]] | None = None) -> str:
+    """Write a simulator file that corrects the simulator of another file; `source` is its path from this one.
+
+    `bounds` are those of parameters that had others in the diagnosis than in the file.
+    """
+    return render("corrected.txt", source=source, bounds=bounds, **_collect_correction(diagnosis)) + "\n"
 
 
 def _collect_correction(diagnosis: Diagnosis) -> dict[str, Any]:

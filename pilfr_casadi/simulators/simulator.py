@@ -7,7 +7,7 @@ like any other.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -172,15 +172,30 @@ class Simulator(Equations):
         InputError
             If a name is unknown.
         """
+        self._check_parameters(parameters)
         own = self.parameter_set
-        for name in parameters:
-            if name not in own:
-                raise InputError(f"There is no parameter {name!r}; the simulator has {', '.join(own) or 'none'}.")
         given = ParameterSet(
             {k: p if isinstance(p := parameters.get(k, q), Parameter) else replace(q, value=p) for k, q in own.items()}
         )
         alike = all(given[name].shape == own[name].shape for name in own)
         return self._copy_with(parameters=given) if alike else replace(self, parameters=given)
+
+    def _check_parameters(self, names: Iterable[str]) -> None:
+        own = self.parameter_set
+        for name in names:
+            if name not in own:
+                raise InputError(f"There is no parameter {name!r}; the simulator has {', '.join(own) or 'none'}.")
+
+    def with_bounds(self, bounds: Mapping[str, tuple[float, float]]) -> Simulator:
+        """Copy with other bounds `(lower, upper)` of some parameters, which a fit may then change.
+
+        Raises
+        ------
+        InputError
+            If a name is unknown, or a value lies outside its bounds.
+        """
+        self._check_parameters(bounds)
+        return self._copy_with(parameters=self.parameter_set.free_within(bounds))
 
     def with_element(self, port: str, law: Any) -> Simulator:
         """Copy with a law in a port; see `close_loop`."""

@@ -229,7 +229,7 @@ def test_the_command_checks_a_unit(tmp_path, capsys, units):
     refused(capsys, "check", units["c"], train, "--bound", "k1=2:1", says="infeasible")
     model = tmp_path / "model.py"
     model.write_text("simulator = 1\n")
-    refused(capsys, "check", model, train, "--bound", "k1=1:2", says="--bound was given, which is for an FMU")
+    refused(capsys, "check", model, train, "--port", "a=b:c", says="--port was given, which is for an FMU")
     table = tmp_path / "other.csv"
     table.write_text("t,a,b\n0,1,2\n1,2,3\n")
     refused(capsys, "check", units["c"], table, says="has no column for any input")
