@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from .replication import (
         Replication as Replication,
         Values as Values,
+        find_channel_faults as find_channel_faults,
         refit_error as refit_error,
         replicate as replicate,
     )
