@@ -260,7 +260,8 @@ def _samples_between_changes(y: np.ndarray, u: np.ndarray) -> int:
     changes = np.flatnonzero(motions)
     if len(changes) < FEWEST_CHANGES or np.median(motions[changes]) < LARGEST_MOTION * _smallest_step(y):
         return 1
-    k = next((k for k in range(len(y) // FEWEST_CHANGES, 1, -1) if _on_raster(changes, k)), 1)
+    usual = int(np.argmax(np.bincount(np.diff(changes))))
+    k = next((k for k in range(usual, 1, -1) if usual % k == 0 and _on_raster(changes, k)), 1)
     with_inputs = max(np.mean(np.isin(changes - late, driven)) for late in (0, 1)) >= ON_RASTER
     return 1 if with_inputs and _on_raster(driven, k) else k
 
