@@ -25,6 +25,10 @@ def swing_jacobian(t, x, u, p):
     return np.array([[0.0, 1.0, 0.0, 0.0, 0.0], np.array(slope) / 2.0])
 
 
+def jacobian_by_name(t, y, k, d):
+    return swing_jacobian(t, y, None, {"k": k, "d": d})
+
+
 SWING = dict(
     states=("pos", "vel"),
     inputs="force",
@@ -43,7 +47,10 @@ def sensitivities(simulator, engine):
 
 
 @pytest.mark.parametrize("engine", ["vm", pytest.param("c", marks=needs_compiler)])
-@pytest.mark.parametrize("numeric, exact", [(Numeric(), 1e-6), (Numeric(jacobian=swing_jacobian), 1e-12)])
+@pytest.mark.parametrize(
+    "numeric, exact",
+    [(Numeric(), 1e-6), (Numeric(jacobian=swing_jacobian), 1e-12), (Numeric(jacobian=jacobian_by_name), 1e-12)],
+)
 def test_a_function_called_with_numbers_has_the_derivatives_of_its_equations(engine, numeric, exact):
     y_equations, jac_equations = sensitivities(from_function(swing, "pos", **SWING), "vm")
     made = from_function(swing, "pos", numeric=numeric, **SWING)
