@@ -9,7 +9,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 
@@ -185,6 +185,23 @@ def simulator_files(metavar: str) -> Any:
     return typer.Argument(..., metavar=metavar, help=text)
 
 
+@dataclass(frozen=True)
+class SimulatorFile:
+    """A file with a simulator, the name of the function that loads it, and options of that function."""
+
+    path: str
+    loader: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def load(self) -> Any:
+        """Load the file; a Python file's `simulator` and a saved model are returned as they are."""
+        from ..identify import load
+        from ..simulators import from_fmu, from_mujoco, simulator_variable
+
+        loaders = {"load": load, "load_simulator": simulator_variable, "from_fmu": from_fmu, "from_mujoco": from_mujoco}
+        return loaders[self.loader](self.path, **self.options)
+
+
 @dataclass(frozen=True, kw_only=True)
 class SimulatorOptions(DataOptions):
     """Options of commands that compare a simulator with recordings."""
@@ -232,27 +249,24 @@ class SimulatorOptions(DataOptions):
             raise InputError(f"--inputs and --outputs were given, but a simulator file has its own names{where}.")
         check_given_once(self.recordings)
 
-    def load_simulator(self) -> Any:
-        """Load the `simulator` of a Python file, the model of a model.json, an FMU, or a MuJoCo model."""
-        from ..identify import load
-        from ..simulators import from_mujoco, simulator_variable
-
+    def simulator_file(self) -> SimulatorFile:
+        """Choose how to load the simulator of a Python file, a model.json, an FMU, or a MuJoCo model."""
         path = self.files[0]
         kind = Path(path).suffix.lower()
         if kind == ".fmu":
-            return self._load_fmu(path)
+            return SimulatorFile(path, "from_fmu", self._fmu_options(path))
         mechanism = kind in (".xml", ".urdf")
         for name in ("port",) if mechanism else ("port", "bound"):
             if getattr(self, name):
                 raise InputError(f"--{name} was given, which is for an FMU; {path} has its own, so leave it out.")
         if mechanism:
-            return from_mujoco(path, bounds=bounds_of(self.bound))
-        return load(path) if kind == ".json" else simulator_variable(path)
+            return SimulatorFile(path, "from_mujoco", {"bounds": bounds_of(self.bound)})
+        return SimulatorFile(path, "load" if kind == ".json" else "load_simulator")
 
-    def _load_fmu(self, path: str) -> Any:
-        """Make a simulator from an FMU, with the inputs and outputs that the first recording has."""
+    def _fmu_options(self, path: str) -> dict[str, Any]:
+        """Return the options of `from_fmu`, with the inputs and outputs that the first recording has."""
         from ..data import column_names
-        from ..simulators import CoSimulation, fmu_signals, from_fmu
+        from ..simulators import CoSimulation, fmu_signals
 
         ports = {}
         for name, text in pairs(self.port, "--port", "INTO:ACROSS").items():
@@ -277,7 +291,7 @@ class SimulatorOptions(DataOptions):
                 )
         inputs, outputs = kept
         steps = CoSimulation(self.read(self.train[0], inputs, outputs, only_these=True).dt)
-        return from_fmu(path, ports=ports, bounds=bounds, inputs=inputs, outputs=outputs, cosimulation=steps)
+        return {"ports": ports, "bounds": bounds, "inputs": inputs, "outputs": outputs, "cosimulation": steps}
 
 
 def bounds_of(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
