@@ -2,12 +2,15 @@
 
 import re
 import signal
+import time
+import timeit
 
+import casadi as ca
 import cloudpickle
 import numpy as np
 import pytest
 
-from pilfr_casadi import InputError, Parameter, Recording, fit
+from pilfr_casadi import InputError, Parameter, Recording, diagnose, fit
 from pilfr_casadi.engine import compiler, make_engine
 from pilfr_casadi.simulators import Numeric, PythonFunction, discretise, from_function
 
@@ -103,6 +106,44 @@ def test_a_function_that_fails_at_a_point_is_a_failed_trial():
     given = Recording(np.full((200, 1), 5.0), np.zeros((200, 1)), 0.05, ("force",), ("pos",))
     assert np.isnan(made.simulate(given)[-1, 0]) and np.isfinite(made.simulate(given)[0, 0])
     assert "it failed first with ValueError('too far')" in str(made)
+
+
+def test_a_diagnosis_says_how_often_it_calls_and_how_long_a_simulation_takes():
+    left = 0
+
+    def slow_at_first(t, x, u, p):
+        nonlocal left
+        left -= 1
+        if left > 0:
+            time.sleep(0.002)
+        return swing(t, x, u, p)
+
+    made = from_function(slow_at_first, "pos", numeric=Numeric(), **SWING)
+    u = 20 * np.sin(0.05 * np.arange(200) + np.sin(0.013 * np.arange(200)))[:, None]
+    given = Recording(u, np.zeros((200, 1)), 0.01, ("force",), ("pos",), initial="zero", hold="zero")
+    given = given.with_(y=made.simulate(given) + 1e-3 * np.random.default_rng(0).standard_normal((200, 1)))
+    before, left, stages = made.program_calls["slow_at_first"], 300, set()
+    found = diagnose(made, given, laws=(), effects=0, workers=1, progress=lambda stage, *_: stages.add(stage))
+    counted = made.program_calls["slow_at_first"] - before
+    assert all("s a simulation: " in stage for stage in stages) and "calls slow_at_first at every step" in str(found)
+    said = int(re.search(r"computed in .* s, (\d+) calls of slow_at_first$", str(found))[1])
+    assert 1000 < said == found.calls["slow_at_first"] <= counted
+
+
+def test_a_call_costs_little_beside_the_function():
+    leaf = PythonFunction(lambda z: z[:2], (9,), 2)
+    many, points = leaf.map(2000), ca.DM(np.ones((9, 2000)))
+    one, matrix = np.ones(9), ca.DM(np.ones(9))
+
+    def convert():
+        for _ in range(2000):
+            ca.DM(one)
+            matrix.full()
+
+    def fastest(run):
+        return min(timeit.repeat(run, number=1, repeat=5))
+
+    assert fastest(lambda: many(points)) < fastest(convert)
 
 
 @pytest.mark.parametrize(
