@@ -9,6 +9,7 @@ import casadi as ca
 import cloudpickle
 import numpy as np
 import pytest
+from command_line import refused
 
 from pilfr_casadi import InputError, Parameter, Recording, diagnose, fit
 from pilfr_casadi.engine import compiler, make_engine
@@ -157,6 +158,20 @@ def test_wrong_sizes_are_refused_in_one_sentence(numeric, says):
     with pytest.raises(InputError, match=says) as error:
         from_function(swing, "pos", numeric=numeric, **SWING)
     assert str(error.value).count(".") <= 3 and "\n" not in str(error.value)
+
+
+def test_the_command_says_how_to_use_what_it_cannot_export(tmp_path, capsys):
+    text = """\
+from pilfr_casadi import from_function
+from pilfr_casadi.simulators import Numeric
+
+simulator = from_function(lambda t, y, flow: [flow - y[0]], "h", states="h", inputs="flow", numeric=Numeric())
+"""
+    (tmp_path / "tank.py").write_text(text)
+    out = tmp_path / "c"
+    says = ("no file can hold", "use `pilfr_casadi.exported` in Python")
+    refused(capsys, "export", tmp_path / "tank.py", "--dt", 0.1, "--c", "--out", out, says=says)
+    assert not out.exists()
 
 
 def test_it_survives_another_process():
