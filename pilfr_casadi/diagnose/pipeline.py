@@ -120,7 +120,7 @@ def diagnose_in_steps(
     tried = (*add_scaled_laws(check_laws(laws), simulator), *((VaryingParameter,) if laws is None else ()))
     deadline = np.inf if time_limit is None else began + float(time_limit)
     calls, slow = simulator.program_calls, slow_note(simulator, recordings)
-    say = say.under(slow[0].value) if slow else say
+    say = say.under(f"{slow[0].value:.2g} s a simulation: ") if slow else say
     request = Request(
         simulator,
         recordings,

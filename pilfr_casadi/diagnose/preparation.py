@@ -314,7 +314,7 @@ def conversions(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[
 def slow_note(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Gate, ...]:
     """Note how long a simulation of all recordings takes, if the simulator calls programs and it takes long.
 
-    The value of the note is the prefix of stages that says so while the diagnosis runs. A short piece is simulated.
+    A short piece is simulated; the value of the note is the time in s.
     """
     if not simulator.program_calls:
         return ()
@@ -334,7 +334,7 @@ def slow_note(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Ga
         f"{in_words(list(simulator.program_calls))} at every step, and each fit takes hundreds of simulations. Give "
         "shorter recordings, or equations, or more time (time_limit, --time-limit)."
     )
-    return (Gate("simulation", "slow", f"{seconds:.2g} s a simulation: ", words, corrected=False),)
+    return (Gate("simulation", "slow", seconds, words, corrected=False),)
 
 
 def hold_note(simulator: Simulator, hold: str, ratio: float) -> Gate:
