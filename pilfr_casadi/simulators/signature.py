@@ -31,11 +31,14 @@ class Signature:
         Names of all inputs.
     further : tuple of str or None
         Arguments behind t and x that are passed by name; None if u and p are passed by position.
+    renamed : tuple of str
+        The function's own names of u and p, if they are passed by position.
     """
 
     called: str
     inputs: tuple[str, ...]
     further: tuple[str, ...] | None
+    renamed: tuple[str, ...] = ()
 
     def call(self, function: Any, t: Any, x: Any, u: Any, p: Any) -> Any:
         """Call the function, or a copy of it, with the inputs u in an array and the parameters p in a mapping."""
@@ -56,7 +59,8 @@ class Signature:
         of_all = {ALL_INPUTS: "u is the array of the inputs", ALL_PARAMETERS: "p[name] a parameter"}
         arguments = ARGUMENTS if self.further is None else self.further
         said = [words for name, words in of_all.items() if name in arguments]
-        return f"it is called as {self.called}" + f", where {in_words(said)}" * bool(said)
+        why = f", because {in_words(self.renamed)} are no names of inputs or parameters" * (len(self.renamed) > 1)
+        return f"it is called as {self.called}{why}" + f"; {in_words(said)}" * bool(said)
 
     def check_driven(self) -> None:
         """Refuse dynamics that take none of the inputs, so that a recording could not drive them."""
@@ -84,7 +88,7 @@ def read_signature(function: Any, name: str, inputs: Sequence[str], parameters: 
         ) from None
     own = [a for a in signature.parameters.values() if a.kind not in VARIADIC]
     first = [a.name for a in own if a.kind is not a.KEYWORD_ONLY][:2]
-    declared = {*inputs, *parameters}
+    declared = {*inputs, *parameters} - {ALL_INPUTS, ALL_PARAMETERS}
     further = [a for a in own if a.name not in first]
     by_name = [a.name for a in further if a.name in {*declared, ALL_INPUTS, ALL_PARAMETERS} and a.kind in BY_NAME]
     unknown = [a.name for a in further if a.name not in by_name and a.default is a.empty]
@@ -93,7 +97,7 @@ def read_signature(function: Any, name: str, inputs: Sequence[str], parameters: 
         raise InputError(f"{called} takes the time behind the states; write {name}(t, {first[0]}, ...).")
     open_ended = bool(unknown) or len(own) < len(signature.parameters)
     if not declared & set(by_name) and (open_ended or by_name == [ALL_INPUTS, ALL_PARAMETERS]) and _binds(signature):
-        return Signature(f"{name}({', '.join(ARGUMENTS)})", tuple(inputs), None)
+        return Signature(f"{name}({', '.join(ARGUMENTS)})", tuple(inputs), None, tuple(unknown))
     if len(first) < 2:
         raise InputError(f"{name} cannot be called as {name}(t, x, u, p); give a function of these four.")
     if unknown:

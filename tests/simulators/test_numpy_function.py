@@ -319,7 +319,10 @@ BAD = {
     "input inside": (lambda t, y: [y[1], force(t)], ("(t, y) does not take f", "recording", "as an argument", "y, f)")),
     "input inside, parameters": (lambda t, y, k: [y[1], force(t) - k], ("(t, y, k) does not take f",)),
     "undeclared argument": (lambda t, y, f, k, d: y, ("(t, y, f, k, d)", "'d'", "input (f)", "parameter (k)")),
-    "undeclared arguments": (lambda t, y, d, m: [y[1], -m * y[0]], ("u is the array of the inputs and p[name]",)),
+    "undeclared arguments": (
+        lambda t, y, d, m: [y[1], -m * y[0]],
+        ("because d and m are no names", "u is the array of the inputs"),
+    ),
     "time behind the states": (lambda y, t, f: y, ("(y, t, f) takes the time behind", "<lambda>(t, y, ...)")),
     "too few": (lambda t, x, u, p: [x[0]], ("1 value;", "derivatives a, b")),
     "too many": (lambda t, x, u, p: [x[0], x[1], 0], ("3 values;", "derivatives a, b")),
