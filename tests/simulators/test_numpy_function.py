@@ -154,8 +154,9 @@ def ivp_with_mapping(t, y, p, force):
         functools.partial(ivp_with_force, m=PARAMETERS["m"].value),
         lambda *given: rhs(*given),
         lambda time, state, forces, values: rhs(time, state, forces, values),
+        lambda time, state, u, values: rhs(time, state, u, values),
     ],
-    ids=["names", "inputs in u", "parameters in p", "partial", "open-ended", "positions"],
+    ids=["names", "inputs in u", "parameters in p", "partial", "open-ended", "positions", "one position"],
 )
 def test_arguments_may_be_inputs_and_parameters_by_name(function, numeric):
     made = from_function(function, lambda t, y, k, d: {"load": k * y[0] + d * y[1]}, numeric=numeric, **NAMES)
