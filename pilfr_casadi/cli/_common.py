@@ -9,7 +9,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 
@@ -185,6 +185,45 @@ def simulator_files(metavar: str) -> Any:
     return typer.Argument(..., metavar=metavar, help=text)
 
 
+@dataclass(frozen=True)
+class SimulatorFile:
+    """A file with a simulator, and how to load it.
+
+    Attributes
+    ----------
+    loader : {"load_simulator", "load", "from_fmu", "from_mujoco"}
+        Name of the function that loads it.
+    options : mapping
+        Options of that function.
+    bounds : mapping
+        Other bounds of parameters of a Python file's simulator.
+    """
+
+    path: str
+    loader: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def load(self) -> Any:
+        """Load the file; a Python file's `simulator` and a saved model are returned as they are but for the bounds."""
+        from ..identify import load
+        from ..simulators import Simulator, from_fmu, from_mujoco, simulator_variable
+
+        loaders: dict[str, Callable[..., Any]] = {
+            "load": load,
+            "load_simulator": simulator_variable,
+            "from_fmu": from_fmu,
+            "from_mujoco": from_mujoco,
+        }
+        found = loaders[self.loader](self.path, **self.options)
+        if self.bounds and not isinstance(found, Simulator):
+            fitted = (
+                "a fitted model" if self.loader == "load" else f"a {type(found).__name__}, whose numbers have no names"
+            )
+            raise InputError(f"--bound was given, but {self.path} holds {fitted}; leave it out, or give a Simulator.")
+        return found.with_bounds(self.bounds) if self.bounds else found
+
+
 @dataclass(frozen=True, kw_only=True)
 class SimulatorOptions(DataOptions):
     """Options of commands that compare a simulator with recordings."""
@@ -239,30 +278,23 @@ class SimulatorOptions(DataOptions):
             raise InputError(f"--inputs and --outputs were given, but a simulator file has its own names{where}.")
         check_given_once(self.recordings)
 
-    def load_simulator(self) -> Any:
-        """Load the `simulator` of a Python file, the model of a model.json, an FMU, or a MuJoCo model."""
-        from ..identify import load
-        from ..simulators import Simulator, from_mujoco, simulator_variable
-
+    def simulator_file(self) -> SimulatorFile:
+        """Choose how to load the simulator of a Python file, a model.json, an FMU, or a MuJoCo model."""
         path = self.files[0]
         kind = Path(path).suffix.lower()
         if kind == ".fmu":
-            return self._load_fmu(path)
+            return SimulatorFile(path, "from_fmu", self._fmu_options(path))
         if self.port:
             raise InputError(f"--port was given, which is for an FMU; {path} has its own, so leave it out.")
         bounds = bounds_of(self.bound)
         if kind in (".xml", ".urdf"):
-            return from_mujoco(path, bounds=bounds)
-        found: Any = load(path) if kind == ".json" else simulator_variable(path)
-        if bounds and not isinstance(found, Simulator):
-            what = f"a {type(found).__name__}, whose numbers have no names" if kind == ".py" else "a fitted model"
-            raise InputError(f"--bound was given, but {path} holds {what}; leave it out, or give a Simulator.")
-        return found.with_bounds(bounds) if bounds else found
+            return SimulatorFile(path, "from_mujoco", {"bounds": bounds})
+        return SimulatorFile(path, "load" if kind == ".json" else "load_simulator", bounds=bounds)
 
-    def _load_fmu(self, path: str) -> Any:
-        """Make a simulator from an FMU, with the inputs and outputs that the first recording has."""
+    def _fmu_options(self, path: str) -> dict[str, Any]:
+        """Return the options of `from_fmu`, with the inputs and outputs that the first recording has."""
         from ..data import column_names
-        from ..simulators import CoSimulation, fmu_signals, from_fmu
+        from ..simulators import CoSimulation, fmu_signals
 
         ports = {}
         for name, text in pairs(self.port, "--port", "INTO:ACROSS").items():
@@ -287,7 +319,7 @@ class SimulatorOptions(DataOptions):
                 )
         inputs, outputs = kept
         steps = CoSimulation(self.read(self.train[0], inputs, outputs, only_these=True).dt)
-        return from_fmu(path, ports=ports, bounds=bounds, inputs=inputs, outputs=outputs, cosimulation=steps)
+        return {"ports": ports, "bounds": bounds, "inputs": inputs, "outputs": outputs, "cosimulation": steps}
 
 
 def bounds_of(texts: Sequence[str]) -> dict[str, tuple[float, float]]:

@@ -7,7 +7,7 @@ and writes check.json if a folder is given.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -22,8 +22,8 @@ from ._common import (
     DONE,
     INTERRUPTED,
     NO_RESULT,
+    SimulatorFile,
     SimulatorOptions,
-    bounds_of,
     flag,
     make_folder,
     new_file,
@@ -103,11 +103,12 @@ def diagnose_command(options: DiagnoseOptions) -> int:
     """Writes the answer to DIR/diagnosis.json and the report to DIR/report.html."""
     options.check_files("--simulated SIM.csv")
     new_file(options.out, "diagnosis.json", options.overwrite)
-    given = None
+    given = source = None
     if options.source is None:
         inputs, outputs = _simulated_names(options)
     else:
-        given = options.load_simulator()
+        source = options.simulator_file()
+        given = source.load()
         simulator = as_simulator(given)
         inputs, outputs = simulator.inputs, simulator.output_names
     train = options.read_all(options.train, inputs, outputs)
@@ -143,15 +144,13 @@ def diagnose_command(options: DiagnoseOptions) -> int:
             )
     except KeyboardInterrupt:
         return say("Interrupted before there was a diagnosis; nothing was written.", INTERRUPTED)
-    return write_diagnosis(diagnosis, folder, options.source or "", bounds_of(options.bound))
+    return write_diagnosis(diagnosis, folder, source)
 
 
-def write_diagnosis(
-    diagnosis: Diagnosis, folder: Path, source: str = "", bounds: Mapping[str, tuple[float, float]] | None = None
-) -> int:
+def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: SimulatorFile | None = None) -> int:
     """Write diagnosis.json, corrected.py, then the report; print the diagnosis and the paths; return the exit status.
 
-    corrected.py corrects the simulator file `source`, if that is a Python file, with other `bounds` of its parameters.
+    corrected.py loads and corrects the simulator file `source`, if there is one.
     """
     target = folder / "diagnosis.json"
     try:
@@ -160,10 +159,12 @@ def write_diagnosis(
             print(diagnosis, flush=True)
             from ..report import corrected_file, diagnosis_report
 
-            corrected = folder / "corrected.py" if Path(source).suffix.lower() == ".py" else None
-            if corrected is not None:
-                there = os.path.relpath(os.path.realpath(source), os.path.realpath(folder))
-                write_atomically(corrected, corrected_file(diagnosis, Path(there).as_posix(), bounds))
+            corrected = folder / "corrected.py" if source is not None else None
+            if corrected is not None and source is not None:
+                there = Path(os.path.relpath(os.path.realpath(source.path), os.path.realpath(folder))).as_posix()
+                write_atomically(
+                    corrected, corrected_file(diagnosis, there, source.loader, source.options, source.bounds)
+                )
         with progress_bar() as progress:
             progress("writing the report", 0, 0, np.nan)
             page = diagnosis_report(diagnosis, folder)
@@ -177,8 +178,6 @@ def write_diagnosis(
     print(f"diagnosis: {target}\nreport: {page}")
     if corrected is not None:
         print(f"corrected simulator: {corrected}")
-    elif source:
-        print(f"corrected simulator: in Python alone, as diagnose(...).corrected, because {source} is no Python file")
     return INTERRUPTED if diagnosis.interrupted else DONE
 
 
@@ -300,7 +299,7 @@ def check_command(options: CheckOptions) -> int:
     options.check_files()
     if options.out is not None:
         new_file(options.out, "check.json", options.overwrite)
-    given = options.load_simulator()
+    given = options.simulator_file().load()
     simulator = as_simulator(given)
     recordings = options.read_all(options.train, simulator.inputs, simulator.output_names)
     folder = make_folder(options.out) if options.out is not None else None

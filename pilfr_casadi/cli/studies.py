@@ -247,7 +247,7 @@ def fleet_command(options: FleetOptions) -> int:
     options.check_files()
     if options.against is None:
         options.check_folder()
-    given = options.load_simulator()
+    given = options.simulator_file().load()
     simulator = as_simulator(given)
     inputs, outputs = simulator.inputs, simulator.output_names
     machines = {

@@ -134,6 +134,7 @@ def build_diagnosis(
         freed=found.freed,
         correction=found.correction,
         blind_spots=blind_spots,
+        calls={n: count - request.calls[n] for n, count in request.simulator.program_calls.items()},
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -50,6 +50,7 @@ class Request:
     aligned: bool = False  # whether the times of the channels are settled
     edits: tuple[Gate, ...] = ()  # corrections that `recordings` have already
     nominal: float = np.nan  # error at the user's values before these
+    calls: Mapping[str, int] = field(default_factory=dict)  # of the simulator's programs before
 
     def corrected(self, edits: Sequence[Gate], nominal: float, stage: str) -> Request:
         """Return the request with recordings corrected by further edits; its stages are shown under another name."""

@@ -75,7 +75,7 @@ from .other_explanations import (
     may_act_elsewhere,
 )
 from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
-from .preparation import CHECKS, Prepared, conversions, hold_note, prepare
+from .preparation import CHECKS, Prepared, conversions, hold_note, prepare, slow_note
 from .proof import errors_of
 from .result import Diagnosis
 from .search.moves import Search
@@ -119,6 +119,8 @@ def diagnose_in_steps(
     check_limits(simulator, limits)
     tried = (*add_scaled_laws(check_laws(laws), simulator), *((VaryingParameter,) if laws is None else ()))
     deadline = np.inf if time_limit is None else began + float(time_limit)
+    calls, slow = simulator.program_calls, slow_note(simulator, recordings)
+    say = say.under(f"{slow[0].value:.2g} s a simulation: ") if slow else say
     request = Request(
         simulator,
         recordings,
@@ -131,7 +133,8 @@ def diagnose_in_steps(
         deadline,
         say,
         focus,
-        notes=conversions(simulator, given),
+        notes=(*conversions(simulator, given), *slow),
+        calls=calls,
     )
     most = SEARCHED_SAMPLES if search_samples is None else whole(search_samples, "search_samples", FEWEST_SAMPLES)
     request, ready, search = _search_with_focus(_on_stretches(request, most))

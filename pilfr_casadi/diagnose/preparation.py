@@ -13,10 +13,11 @@ from functools import partial
 
 import numpy as np
 
-from .._base import InputError, Stages, UntilInterrupted
+from .._base import InputError, Stages, UntilInterrupted, in_words
 from ..data import Recording
+from ..engine import make_engine
 from ..optimise import GaussNewton, Status
-from ..simulators import Simulator, unit_factor, unit_notes
+from ..simulators import Simulator, discretise_for, unit_factor, unit_notes
 from .arguments import stated_hold
 from .faults.channels import accept_best, find_gross_slips, find_slips, open_bench, refit_corrected
 from .faults.gates import (
@@ -44,6 +45,8 @@ UNCHECKED = (
     "Some checks of the recordings were left out, because the time was over or somebody interrupted them: a shift, a "
     "gap or an offset of a channel may have been missed."
 )
+TIMED_SAMPLES = 50  # samples whose simulation is timed
+LONG_SIMULATION = 1.0  # seconds that a simulation takes without a note
 OBSERVER_GAINS = (1.0, 0.3, 0.1, 0.03, 0.01)  # gains of the observer, in turn
 
 
@@ -307,6 +310,32 @@ def conversions(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[
         for name, sentence in unit_notes(simulator, r).items()
     }
     return tuple(found.values())
+
+
+def slow_note(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Gate, ...]:
+    """Note how long a simulation of all recordings takes, if the simulator calls programs and it takes long.
+
+    A short piece is simulated; the value of the note is the time in s.
+    """
+    if not simulator.program_calls:
+        return ()
+    piece = recordings[0].slice(0, TIMED_SAMPLES)
+    try:
+        model = discretise_for(simulator, [piece])
+        engine, drive = make_engine(model, "vm"), model.drive(piece)
+        began = time.perf_counter()
+        engine.simulate(drive, model.parameters.start, np.zeros(model.n_state))
+    except InputError:  # what is wrong is said where all of the recordings are simulated
+        return ()
+    seconds = (time.perf_counter() - began) * sum(map(len, recordings)) / len(piece)
+    if seconds < LONG_SIMULATION:
+        return ()
+    words = (
+        f"A simulation of the training recordings takes about {seconds:.2g} s, because it calls "
+        f"{in_words(list(simulator.program_calls))} at every step, and each fit takes hundreds of simulations. Give "
+        "shorter recordings, or equations, or more time (time_limit, --time-limit)."
+    )
+    return (Gate("simulation", "slow", seconds, words, corrected=False),)
 
 
 def hold_note(simulator: Simulator, hold: str, ratio: float) -> Gate:

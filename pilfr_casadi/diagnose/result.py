@@ -101,6 +101,8 @@ class Diagnosis:
         among `effects` predict unseen data better than the refit but have no sure name.
     blind_spots : tuple of BlindSpot
         Facts that the recordings cannot reveal, the gravest first; see `check`.
+    calls : dict
+        How often the diagnosis called functions that have no equations, by name; see `Numeric`.
     """
 
     verdict: str
@@ -127,6 +129,7 @@ class Diagnosis:
     freed: str = ""
     correction: Correction | None = None
     blind_spots: tuple[BlindSpot, ...] = ()
+    calls: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def sure(self) -> bool:
@@ -498,7 +501,8 @@ class Diagnosis:
         lines += [f"note: {text}" for text in (*further, *self.warnings())]
         if self.next_experiment:
             lines.append(f"next experiment: {self.next_experiment['sentence']}")
-        lines.append(f"computed in {self.seconds:.{1 if self.seconds < 10 else 0}f} s")
+        calls = "".join(f", {count} calls of {name}" for name, count in self.calls.items() if count)
+        lines.append(f"computed in {self.seconds:.{1 if self.seconds < 10 else 0}f} s{calls}")
         return "\n".join(lines)
 
     __repr__ = __str__

@@ -141,9 +141,14 @@ class PythonFunction(ca.Callback):
         """Return the shape of the result."""
         return ca.Sparsity.dense(self.size, 1)
 
-    def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:
+    def has_eval_buffer(self) -> bool:
+        """Let CasADi pass its memory; matrices would cost more time than many functions do."""
+        return True
+
+    def eval_buffer(self, arguments: Sequence[memoryview], results: Sequence[memoryview]) -> int:
         """Call the function, for CasADi."""
-        return [ca.DM(self.evaluate([a.full().ravel() for a in arguments]))]
+        np.frombuffer(results[0])[:] = self.evaluate([np.frombuffer(a) for a in arguments])
+        return 0
 
     def evaluate(self, arguments: list[np.ndarray]) -> np.ndarray:
         """Call the function; a failed point is a failed trial, not the end. In an abandoned run it is not called."""

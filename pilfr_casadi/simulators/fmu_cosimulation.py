@@ -253,6 +253,11 @@ class SteppedEquations:
         )
 
     @property
+    def program_calls(self) -> dict[str, int]:
+        """Number of calls by the file's name; empty if equations were found."""
+        return self._box.program_calls if self.discrete else {}
+
+    @property
     def dt(self) -> float | None:
         """Length of the steps, s; None if equations were found."""
         return self.unit.dt if self.discrete else None

@@ -130,6 +130,17 @@ class Simulator(Equations):
         """
         return later("identify.compare")(recording, self).plot()
 
+    @property
+    def program_calls(self) -> dict[str, int]:
+        """How often functions have been called with numbers, by name; empty if there are equations for all.
+
+        A worker process counts its own calls.
+        """
+        found = dict[str, int]()
+        for part in (self.dynamics, self.outputs):
+            found |= getattr(part, "program_calls", {})
+        return found
+
     def _repr_html_(self) -> str:
         return str(later("report.simulator_card")(self))
 

@@ -360,6 +360,11 @@ def test_a_saved_model_is_diagnosed_to_the_end(capsys, files, truth, catalogue):
     assert status == 0 and "the simulator's own values, refitted" in out, out + err
     found = json.loads((files / "out" / "diagnosis.json").read_text())
     assert np.shape(found["parameters"]["A"]["refit_with"]) == (2, 2) and found["candidates"]
+    corrected, y = files / "out" / "corrected.py", files / "y.csv"
+    status, out, err = run(capsys, "simulate", corrected, files / "test.csv", "--initial", "zero", "--out", y)
+    assert status == 0, err
+    error = float(re.search(r"NRMSE on test: ([\d.]+)", out)[1])
+    assert error == pytest.approx(found["fit"]["test"]["after"], rel=1e-2)
     assert (files / "out" / "report.html").exists()
 
 

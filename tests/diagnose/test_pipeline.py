@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from diagnosis_example import recorded, rig as cart_rig
 from diagnosis_rig import OFF, recordings, rig
-from test_timing import shaken, spring
+from spring_rig import shaken, spring
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator, laws

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from diagnosis_rig import OFF, recordings, refitted, rig
 from tank import tank
-from test_slips import DT, recorded, tanks
+from tanks_rig import DT, recorded, tanks
 
 from pilfr_casadi import InputError, Parameter, Recording, Simulator, multisine
 from pilfr_casadi.diagnose import Workbench, preparation

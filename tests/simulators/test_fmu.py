@@ -1,20 +1,24 @@
 """Simulators from functional mock-up units: the numbers of their equations, ports, parameters, error messages."""
 
 import pickle
+import shutil
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 
 import cloudpickle
 import numpy as np
 import pytest
 from command_line import refused, run
+from diagnosis_example import example
 from exported_fits import one_sentence
 
 from pilfr_casadi import InputError, Parameter, exported, from_fmu
 from pilfr_casadi.engine import VirtualMachine, compiler, make_engine
 from pilfr_casadi.laws import CoulombFriction
-from pilfr_casadi.simulators import discretise
+from pilfr_casadi.report import corrected_file
+from pilfr_casadi.simulators import CoSimulation, discretise, load_simulator
 from problems.fmu_rig import FOLDER, GUIDE, PARAMETERS, c_rig, casadi_rig, description, recording, rig
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler")
@@ -85,7 +89,8 @@ ELSEWHERE = """
 import pickle, sys
 import numpy as np
 from pilfr_casadi.engine import make_engine
-from pilfr_casadi.simulators import discretise
+from pilfr_casadi.report import corrected_file
+from pilfr_casadi.simulators import CoSimulation, discretise, load_simulator
 simulator, given = pickle.load(sys.stdin.buffer)
 model = discretise(simulator, given.dt, "zero", 1)
 y = make_engine(model).simulate(model.drive(given), model.parameters.start, np.zeros(model.n_state))[0]
@@ -212,6 +217,21 @@ def write_table(path, given):
     rows = "\n".join(",".join(map(repr, row)) for row in columns.tolist())
     path.write_text(f"t,force [N],pos1 [m],pos2\n{rows}\n")
     return path
+
+
+def test_the_corrected_simulator_of_a_unit_is_a_file(tmp_path, units):
+    ports = {"guide": {"into": "guide_force", "across": "pos1", "rate": "vel1"}}
+    options = {"ports": ports, "bounds": {"k1": (300.0, 500.0)}, "inputs": ("force",), "outputs": ("pos1", "pos2")}
+    unit = from_fmu(units["c"], **options).with_parameters({"k1": 390.0})
+    law = CoulombFriction({"F_c": 3.0, "v_0": 0.002})
+    found = replace(example(), corrected=unit.with_element("guide", law), refitted=unit)
+    shutil.copy(units["c"], tmp_path / "unit.fmu")
+    (tmp_path / "out").mkdir()
+    file = tmp_path / "out" / "corrected.py"
+    file.write_text(corrected_file(found, "../unit.fmu", "from_fmu", {**options, "cosimulation": CoSimulation(0.01)}))
+    again, given = load_simulator(file), recording(4, samples=200)
+    assert np.array_equal(again.simulate(given), found.corrected.simulate(given))
+    assert again.parameters["k1"].bounds == (300.0, 500.0) and again.hold == found.hold
 
 
 def test_the_command_checks_a_unit(tmp_path, capsys, units):

@@ -1,5 +1,7 @@
 """Simulators from MuJoCo models: the same motion as in MuJoCo, numbers as parameters, error messages."""
 
+import importlib
+import json
 import pickle
 
 import casadi as ca
@@ -9,6 +11,7 @@ from command_line import refused, run
 
 from pilfr_casadi import InputError, Parameter, Recording, from_mujoco
 from pilfr_casadi.laws import CoulombFriction
+from pilfr_casadi.simulators import load_simulator
 
 mujoco = pytest.importorskip("mujoco")
 STEP, SAMPLES = 0.002, 400
@@ -202,6 +205,41 @@ def test_ports_load_and_units(arm):
     x, u, p, t = simulator.symbols()
     load = simulator.port_signals(ports["shoulder"], x, u, p, t)["load"]
     assert float(ca.Function("load", [u["m1"]], [load])(-2.0)) == pytest.approx(6.0)
+
+
+PENDULUM = """
+<mujoco>
+  <worldbody>
+    <body name="rod">
+      <joint name="pivot" axis="0 1 0" damping="0.02"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="0.5"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="torque" joint="pivot"/></actuator>
+</mujoco>"""
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_the_command_writes_a_corrected_simulator_that_other_commands_take(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.arguments"), "CATALOGUE", (CoulombFriction,))
+    model, rng = tmp_path / "pendulum.xml", np.random.default_rng(0)
+    model.write_text(PENDULUM, encoding="utf-8")
+    t, dt = 0.01 * np.arange(300), 0.01
+    torque = 0.4 * np.sin(4 * t + 2 * np.sin(t))[:, None]
+    blank = Recording(torque, torque, dt, ("torque",), ("pivot",), initial="zero", hold="zero")
+    true = from_mujoco(model).with_element("pivot", CoulombFriction({"F_c": 0.1, "v_0": 0.05}))
+    rows = np.column_stack([t, torque, true.simulate(blank) + 1e-4 * rng.standard_normal((300, 1))])
+    np.savetxt(tmp_path / "train.csv", rows, delimiter=",", header="t,torque,pivot", comments="")
+    known, out = ("--initial", "zero", "--hold", "zero", "--workers", 1), tmp_path / "out"
+    monkeypatch.chdir(tmp_path)
+    given = ("diagnose", model, "train.csv", *known, "--bound", "rod.mass=0.4:0.7", "--out", out)
+    status, said, err = run(capsys, *given)
+    assert status == 0 and f"corrected simulator: {out / 'corrected.py'}" in said, err
+    error = json.loads((out / "diagnosis.json").read_text())["fit"]["train"]["after"]
+    status, said, err = run(capsys, "simulate", "out/corrected.py", "train.csv", "--initial", "zero", "--out", "y.csv")
+    assert status == 0 and float(said.split("NRMSE on train: ")[1].split()[0]) == pytest.approx(error, rel=1e-2), err
+    assert run(capsys, "export", "out/corrected.py", "--dt", dt, "--c", "--out", "c")[0] == 0
+    assert load_simulator(out / "corrected.py").parameters["rod.mass"].bounds == (0.4, 0.7)
 
 
 def test_it_may_be_sent_to_another_process(arm, recording):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from diagnosis_contract import SCHEMA, problems
 from diagnosis_rig import OFF, recordings, refitted, rig
-from test_timing import shaken, spring
+from spring_rig import shaken, spring
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
