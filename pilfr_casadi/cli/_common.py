@@ -252,7 +252,7 @@ class SimulatorOptions(DataOptions):
     def _load_fmu(self, path: str) -> Any:
         """Make a simulator from an FMU, with the inputs and outputs that the first recording has."""
         from ..data import column_names
-        from ..simulators import CoSimulation, fmu_signals, from_fmu
+        from ..simulators import CoSimulation, fmu_signals, from_fmu, needs_step_size
 
         ports = {}
         for name, text in pairs(self.port, "--port", "INTO:ACROSS").items():
@@ -276,8 +276,13 @@ class SimulatorOptions(DataOptions):
                     f"say which they are, as in --column {names[0]}=COLUMN."
                 )
         inputs, outputs = kept
-        steps = CoSimulation(self.read(self.train[0], inputs, outputs, only_these=True).dt)
-        return from_fmu(path, ports=ports, bounds=bounds, inputs=inputs, outputs=outputs, cosimulation=steps)
+        steps = None
+        if needs_step_size(path):
+            steps = CoSimulation(self.read(self.train[0], inputs, outputs, only_these=True).dt)
+        made = from_fmu(path, ports=ports, bounds=bounds, inputs=inputs, outputs=outputs, cosimulation=steps)
+        if note := getattr(made.dynamics, "note", ""):
+            print(f"note: {note}", flush=True)
+        return made
 
 
 def bounds_of(texts: Sequence[str]) -> dict[str, tuple[float, float]]:

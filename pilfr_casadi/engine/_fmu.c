@@ -75,8 +75,17 @@ static int change_parameters(fmu_t *f) {
   return f->leave_events(*f->instance);
 }
 
+static int is_finite(const double *values, size_t n) {
+  size_t i;
+  for (i = 0; i < n; i++)
+    if (!isfinite(values[i])) return 0;
+  return 1;
+}
+
 static int evaluate(fmu_t *f) {
   int status;
+  if (!isfinite(*f->t) || !is_finite(f->x, f->n_x) || !is_finite(f->u, f->n_u) || !is_finite(f->p, f->n_p))
+    return DISCARD; /* a diverged simulation does not call the unit */
   if (*f->failed || (f->n_p && memcmp(f->p, f->last_p, f->n_p * sizeof(double)))) {
     if (change_parameters(f) > OK) return DISCARD + 1; /* the mode is unknown */
     memcpy(f->last_p, f->p, f->n_p * sizeof(double));
@@ -92,7 +101,7 @@ void fmu_evaluate(void *unit) {
   fmu_t *f = unit;
   int status = evaluate(f);
   size_t i;
-  *f->failed = status > DISCARD;
+  if (status != DISCARD) *f->failed = status > DISCARD;
   if (status <= OK) return;
   for (i = 0; i < f->n_x; i++) f->derivatives[i] = NAN;
   for (i = 0; i < f->n_y; i++) f->y[i] = NAN;

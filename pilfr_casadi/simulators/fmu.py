@@ -35,6 +35,7 @@ from .ports import Port
 from .simulator import Simulator
 
 COMPARED_POINTS = 8  # trial points at which derivatives and outputs are compared with states and with forces in ports
+PORT_KEYS = ("into", "across", "rate", "unit", "across_unit")
 TIMES = (0.0, 0.7, 13.0, 400.0)  # s, at which a dependence on time is looked for
 
 
@@ -134,19 +135,21 @@ def from_fmu(
     ports : mapping, optional
         By name of a port `dict(into=..., across=..., rate=...)` with names of the unit's variables: `into` an input to
         which a law's force is added with the opposite sign (friction opposes motion), or `{input: factor}`; `across` an
-        output or a state, the local coordinate; `rate`, which may be left out, its speed. By default each state's
-        equation is a port. Actuators and sensors are always ports.
+        output or a state, the local coordinate; `rate`, which may be left out, its speed; `unit` and `across_unit`
+        the units of force and coordinate, by default those of the file. By default each state's equation is a port.
+        Actuators and sensors are always ports.
     parameters : names, or mapping from names to Parameter, optional
-        Tunable parameters that a fit may change; by default all. The others keep the unit's values.
+        Parameters that a fit may change; by default all tunable ones. Fixed ones may be named too; each change of
+        their values restarts the unit. The others keep the unit's values.
     bounds : mapping, optional
         `(lower, upper)` by parameter; by default the unit's bounds, else a factor of ten either way.
     inputs, outputs : tuple of str, optional
         Recorded inputs and outputs; by default all outputs, and all inputs that no port uses. Other inputs keep their
-        start values.
+        start values, so name the recorded ones if the recordings lack some.
     hold : {"zero", "linear"}, optional
         As of `Simulator`.
     cosimulation : CoSimulation, optional
-        Step size and states of a unit for co-simulation alone.
+        Step size and states of a unit for co-simulation; a unit for both kinds is then stepped.
 
     Returns
     -------
@@ -344,21 +347,28 @@ class _Equations:
 
 def _check_port(name: str, given: Any) -> None:
     """Refuse a port that does not give the names of the unit's variables."""
-    usable = isinstance(given, Mapping) and set(given) <= {"into", "across", "rate"} and _factors(given.get("into"))
-    if not usable or not isinstance(given.get("across"), str) or not isinstance(given.get("rate"), str | None):
-        raise InputError(
-            f"The port {name!r} is {given!r}; give dict(into=INPUT, across=VARIABLE, rate=VARIABLE) with "
-            "names of the unit's variables."
-        )
+    form = (
+        "give dict(into=INPUT, across=VARIABLE, rate=VARIABLE, unit=UNIT, across_unit=UNIT); the last three are free."
+    )
+    if not isinstance(given, Mapping):
+        raise InputError(f"The port {name!r} is {given!r}; {form}")
+    for key in given:
+        if key not in PORT_KEYS:
+            raise InputError(f"The port {name!r} has the unknown key {key!r}; {form}")
+    texts = (given.get("across"), *(given.get(key, "") for key in PORT_KEYS[3:]))
+    usable = all(isinstance(text, str) for text in texts) and isinstance(given.get("rate"), str | None)
+    if not usable or not _factors(given.get("into")):
+        raise InputError(f"The port {name!r} is {given!r}; {form}")
 
 
 def _make_port(equations: _Equations | SteppedEquations, name: str, given: Mapping[str, Any]) -> Port:
-    """Make a port from the names of the unit's variables."""
+    """Make a port from the names of the unit's variables, whose units it has by default."""
     factors, across, rate = _factors(given["into"]), given["across"], given.get("rate")
     z = equations.signal(name, "across", across)
     dz = None if rate is None else equations.signal(name, "rate", rate)
     force, coordinate = (equations.unit.variables[n] for n in (next(iter(factors)), across))
-    return Port(name, equations.into(name, factors), z, dz, force.unit, coordinate.unit)
+    stated = given.get("unit", force.unit), given.get("across_unit", coordinate.unit)
+    return Port(name, equations.into(name, factors), z, dz, *stated)
 
 
 def _rate(state: str) -> str:

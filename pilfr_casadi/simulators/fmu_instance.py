@@ -12,6 +12,7 @@ import ctypes
 import functools
 import hashlib
 import io
+import os
 import shutil
 import tempfile
 import zipfile
@@ -211,15 +212,16 @@ class FmuInstance:
 
     def restart(self, parameters: np.ndarray) -> int:
         """Initialise the instance anew with values of parameters, in a new instance if it cannot be reset."""
+        if self.call("Reset") <= OK and self._initialise(parameters):
+            return 0
+        free = getattr(self.library, f"fmi{self.file.version}FreeInstance")
+        free.restype = None
+        free(self.handle)
         try:
-            if self.call("Reset") > OK:
-                free = getattr(self.library, f"fmi{self.file.version}FreeInstance")
-                free.restype = None
-                free(self.handle)
-                self._instantiate()
-            return 0 if self._initialise(parameters) else DISCARD + 1
+            self._instantiate()
         except UnitError:
-            return DISCARD + 1
+            os._exit(1)  # the next evaluation starts a new process
+        return 0 if self._initialise(parameters) else DISCARD + 1
 
 
 class FmuEvaluation:

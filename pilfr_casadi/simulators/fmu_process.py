@@ -31,6 +31,7 @@ LOADING_SECONDS = 60.0  # further seconds that the first job of a unit may take
 CALL_SECONDS = 5.0  # seconds that another job may take
 PACE = 20.0  # further seconds, over those of the slowest job of its kind and length
 MOST_IDLE = 4  # processes that wait for their next job
+MOST_LOSSES = 3  # processes that a point's parameters may end before they count as failed
 WATCH_SECONDS = 0.1  # interval at which limits are checked
 HEAD = struct.Struct("<cQ")  # kind and length of a message
 POINT, CALL = b"p", b"c"
@@ -174,6 +175,7 @@ class FmuFunction(ca.Callback):
     def __init__(self, name: str, signals: FmuSignals) -> None:
         ca.Callback.__init__(self)
         self.signals, self.failure = signals, ""
+        self._losses: dict[bytes, int] = {}  # lost processes by parameter values
         self.construct(name, {})
 
     def get_n_in(self) -> int:
@@ -199,14 +201,26 @@ class FmuFunction(ca.Callback):
         return 0
 
     def evaluate(self, z: bytes) -> np.ndarray:
-        """Evaluate one point in a process of the unit; in an abandoned run it is not called."""
-        if abandoned.pending:
-            return np.full(self.signals.results, np.nan)
+        """Evaluate one point in a process of the unit.
+
+        The unit is not called in an abandoned run or by a diverged simulation, nor again with parameters at which it
+        has ended `MOST_LOSSES` processes.
+        """
+        point, none = np.frombuffer(z), np.full(self.signals.results, np.nan)
+        if abandoned.pending or not np.isfinite(point.sum()):
+            return none
+        if self._losses:
+            parameters = point[len(point) - self.signals.sizes[3] :].astype(np.float32).tobytes()
+            if self._losses.get(parameters, 0) >= MOST_LOSSES:
+                return none
         reply, failure = _ask(self.signals, POINT, z, CALL_SECONDS)
         if not failure and len(reply) == 8 * self.signals.results:
             return np.frombuffer(reply)
-        self.failure = self.failure or failure or reply.decode()
-        return np.full(self.signals.results, np.nan)
+        if failure:
+            parameters = point[len(point) - self.signals.sizes[3] :].astype(np.float32).tobytes()
+            self._losses[parameters] = self._losses.get(parameters, 0) + 1
+        self.failure = self.failure or failure or f"fails ({reply.decode()})"
+        return none
 
 
 def has_time_event(signals: FmuSignals) -> bool:
