@@ -294,7 +294,7 @@ class SimulatorOptions(DataOptions):
     def _fmu_options(self, path: str) -> dict[str, Any]:
         """Return the options of `from_fmu`, with the inputs and outputs that the first recording has."""
         from ..data import column_names
-        from ..simulators import CoSimulation, fmu_signals
+        from ..simulators import CoSimulation, fmu_signals, needs_step_size
 
         ports = {}
         for name, text in pairs(self.port, "--port", "INTO:ACROSS").items():
@@ -318,8 +318,10 @@ class SimulatorOptions(DataOptions):
                     f"say which they are, as in --column {names[0]}=COLUMN."
                 )
         inputs, outputs = kept
-        steps = CoSimulation(self.read(self.train[0], inputs, outputs, only_these=True).dt)
-        return {"ports": ports, "bounds": bounds, "inputs": inputs, "outputs": outputs, "cosimulation": steps}
+        options: dict[str, Any] = {"ports": ports, "bounds": bounds, "inputs": inputs, "outputs": outputs}
+        if needs_step_size(path):
+            options["cosimulation"] = CoSimulation(self.read(self.train[0], inputs, outputs, only_these=True).dt)
+        return options
 
 
 def bounds_of(texts: Sequence[str]) -> dict[str, tuple[float, float]]:

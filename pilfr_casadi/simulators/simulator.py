@@ -92,7 +92,8 @@ class Simulator(Equations):
         if set(recording.inputs) != set(self.inputs):
             raise InputError(
                 f"{recording.label} has the inputs {', '.join(recording.inputs) or 'none'}; the simulator has "
-                f"{', '.join(self.inputs) or 'none'}."
+                f"{', '.join(self.inputs) or 'none'}; give the missing ones as columns, or for an FMU name the "
+                "recorded ones, as in from_fmu(..., inputs=...)."
             )
         columns = [recording.inputs.index(name) for name in self.inputs]
         factors = [unit_factor(self, recording, name) for name in self.inputs]
