@@ -211,6 +211,7 @@ def test_options_are_checked(built):
         from_fmu(built(body), ports=squared, cosimulation=CoSimulation(dt=DT))
 
 
+@pytest.mark.slow
 def test_a_unit_that_fails_at_most_parameters_names_them(built):
     path = built("if self.g > 9.5:\n    raise ValueError\n" + SWING)
     with pytest.raises(InputError, match="fails at all values of its parameters") as error:
