@@ -542,3 +542,8 @@ def test_a_column_may_say_its_unit_in_brackets(tmp_path):
     assert np.array_equal(r.y[:, 0], [2, 5, 8]) and dict(r.units) == {"road": "mm", "speed": "m/s"}
     with pytest.raises(InputError, match=r"columns=\{'spee': 'speed"):
         read_csv(path, inputs="road", outputs="spee")
+
+
+def test_numbers_that_may_have_thousands_separators_are_refused(write):
+    with pytest.raises(InputError, match="line 3 reads '1,001'"):
+        read_csv(write("u;y\n999;1\n1,001;2\n"), inputs="u", outputs="y", dt=1.0)
