@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from .._base import InputError, is_number, listed, positive
-from .preprocessing import common_times, hold_at, sample_at
+from .preprocessing import common_times, hold_at, levels_last, sample_at
 from .recording import SAME_STEP, Recording, as_tuple
 
 Names = Sequence[str] | str | None
@@ -30,8 +30,9 @@ def merge(
     """Put the channels of two records of one experiment on one clock, over the time that both cover.
 
     Name, initial state, hold and skipped samples come from the first record. The initial state is kept only if the
-    common time begins with the first record. If the first record's hold is `"zero"`, an input becomes its mean over
-    each new step, and is held.
+    common time begins with the first record. If all inputs are held (`hold="zero"`) and each of their levels lasts at
+    least a new step, an input becomes its mean over each new step, and is held; else a stated hold becomes `"linear"`,
+    unless no input was resampled.
 
     Parameters
     ----------
@@ -57,16 +58,22 @@ def merge(
     if not is_number(start) or not np.isfinite(start):
         raise InputError(f"start={start!r} was given; give the time of the second record's first sample in seconds.")
     step = max(first.dt, second.dt) if dt is None else positive(dt, "dt", "the common step in seconds")
-    times = common_times([(0.0, first.t[-1]), (start, start + second.t[-1])], step)
+    try:
+        times = common_times([(0.0, first.t[-1]), (start, start + second.t[-1])], step)
+    except InputError:
+        raise InputError(
+            f"the recordings have fewer than 2 samples of {step:g} s in common; check start and dt."
+        ) from None
     u = first.inputs + second.inputs if inputs is None else as_tuple(inputs)
     y = first.outputs + second.outputs if outputs is None else as_tuple(outputs)
     known = [*first.inputs, *first.outputs, *second.inputs, *second.outputs]
     for name in (*u, *y):
         if name not in known:
             raise InputError(f"the two recordings have no channel {name!r}; they have {listed(known)}.")
-    held = u if first.hold == "zero" else ()
+    held = u if all(_is_held(first, name, step) or _is_held(second, name, step) for name in u) else ()
     signals = {**_signals_at(first, times, step, held), **_signals_at(second, times - start, step, held)}
     begin = times[0]
+    as_sampled = bool(held) or (begin == 0 and step == first.dt and (step == second.dt or not second.n_u))
     keeps_initial = begin == 0 and first.begins != "periodic"
     return replace(
         first,
@@ -79,8 +86,14 @@ def merge(
         period=None,
         start=first.start + begin,
         initial=first.initial if keeps_initial else "estimate",
+        hold=first.hold if as_sampled or not first.hold else "linear",
         skip=min(max(int(np.ceil((first.skip * first.dt - begin) / step - SAME_STEP)), 0), len(times) - 1),
     )
+
+
+def _is_held(r: Recording, name: str, step: float) -> bool:
+    """Tell whether a channel is an input that a recording holds for at least a step."""
+    return r.hold == "zero" and name in r.inputs and levels_last(r.t, r.u[:, r.inputs.index(name)], step)
 
 
 def _signals_at(r: Recording, times: np.ndarray, step: float, held: Sequence[str]) -> dict[str, np.ndarray]:

@@ -115,28 +115,28 @@ def common_times(spans: Sequence[tuple[float, float]], step: float) -> Array:
     return times
 
 
-def check_times(t: Array, step: float, label: str) -> None:
+def check_times(t: Array, step: float, label: str, held: bool = False) -> None:
     """Refuse times (M,), s, that do not increase, or have gaps longer than `LONGEST_GAP` median gaps and steps.
 
-    `label` begins the message.
+    `label` begins the message. A signal that is `held` may have gaps of any length.
     """
     gaps = np.diff(t)
     if not len(gaps) or np.any(gaps <= 0):
         raise InputError(f"{label} needs at least two times that increase from sample to sample; sort the samples.")
     usual = float(np.median(gaps))
     worst = int(np.argmax(gaps))
-    if gaps[worst] > LONGEST_GAP * max(usual, step):
+    if gaps[worst] > LONGEST_GAP * max(usual, step) and not held:
         raise InputError(
             f"{label} has a gap of {gaps[worst]:.3g} s after {t[worst]:.6g} s, where {usual:.3g} s is usual; cut the "
             "record there into two."
         )
 
 
-def interpolate_at(t: Array, values: Array, times: Array, step: float) -> Array:
+def interpolate_at(t: Array, values: Array, times: Array, step: float, smooth: bool) -> Array:
     """Bring samples (M,) from their own times t, s, to even `times` within these; a filter precedes a longer step.
 
     The samples are interpolated on a grid at least as fine as their median gap, then resampled to `step`: by a cubic
-    spline if the gaps differ little, else linearly.
+    spline if the signal is `smooth`, as of a machine, and the gaps differ little; else linearly.
     """
     gaps = np.diff(t)
     usual = float(np.median(gaps))
@@ -145,13 +145,19 @@ def interpolate_at(t: Array, values: Array, times: Array, step: float) -> Array:
     begin = times[0] - before * step
     count = max(int((t[-1] - begin) * parts / step * (1 + RATIO_ERROR)), (before + len(times) - 1) * parts) + 1
     grid = np.clip(begin + np.arange(count) * step / parts, t[0], t[-1])
-    if np.max(np.abs(gaps - usual)) < MOST_UNEVEN * usual:
+    if smooth and np.max(np.abs(gaps - usual)) < MOST_UNEVEN * usual:
         from scipy.interpolate import CubicSpline
 
         even = CubicSpline(t, values)(grid)
     else:
         even = np.interp(grid, t, values)
     return change_step(even[:, None], step / parts, step)[before : before + len(times), 0]
+
+
+def levels_last(t: Array, values: Array, step: float) -> bool:
+    """Tell whether each level of a held signal (M,) lasts at least a step, so that its means keep its course."""
+    changes = t[1:][np.diff(values) != 0]
+    return bool(np.min(np.diff(changes), initial=np.inf) > step * (1 - SAME_TIME))
 
 
 def hold_at(t: Array, values: Array, times: Array, step: float) -> Array:

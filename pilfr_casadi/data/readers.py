@@ -8,13 +8,14 @@ columns are ignored. One sentence reports a fault of a file; it names the file, 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
 
 from .._base import InputError, listed, positive
-from .preprocessing import LONGEST_GAP, check_times, common_times, hold_at, interpolate_at
+from .preprocessing import LONGEST_GAP, check_times, common_times, hold_at, interpolate_at, levels_last
 from .recording import Recording, as_tuple
 from .tables import (
     TIME_NAMES,
@@ -277,17 +278,18 @@ class _Request:
         if time is None and self.dt is None:
             _refuse_other_unit(names, source)
             raise InputError(
-                f"{source} has no time column; it has {listed(names)}: name one {' or '.join(TIME_NAMES)}, in "
-                f"seconds, map one, as in columns={{'t': {_guess_time(table)!r}}}, or state the step with dt=STEP."
+                f"{source} has no time column; it has {listed(names)}: name one {' or '.join(TIME_NAMES)}, in seconds, "
+                f"map one, as in columns={{'t': {_guess_time(table, wanted)!r}}}, or state the step with dt=STEP."
             )
         return time, wanted
 
     def recording(self, table: CsvTable | ArrayTable) -> Recording:
         """Make the recording from the columns of a file."""
         time, wanted = self.locate(table)
+        hold = self.options.get("hold")
         if self.new_step is not None:
             assert time is not None
-            dt, parts = float(self.new_step), self._resample(table, wanted, time)
+            dt, (parts, hold) = float(self.new_step), self._resample(table, wanted, time)
         elif time is None:
             assert self.dt is not None
             dt, parts = float(self.dt), table.columns(wanted)
@@ -302,26 +304,42 @@ class _Request:
         units = {name: unit for name, unit in found if unit and name in names[0] + names[1]}
         units |= self.options.get("units") or {}
         try:
-            return Recording(u, y, dt, *names, **{"name": table.path.stem, **self.options, "units": units})
+            options = {"name": table.path.stem, **self.options, "hold": hold, "units": units}
+            return Recording(u, y, dt, *names, **options)
         except InputError as error:
             raise InputError(f"{table.path}: {error}") from None
 
-    def _resample(self, table: CsvTable | ArrayTable, wanted: list[str], time: str) -> list[np.ndarray]:
-        """Bring each channel from its own samples to the common step; keep inputs held where `hold` is zero."""
+    def _resample(
+        self, table: CsvTable | ArrayTable, wanted: list[str], time: str
+    ) -> tuple[list[np.ndarray], str | None]:
+        """Bring each channel from its own samples to the common step; return them and the inputs' hold.
+
+        Inputs stay held if they are, and each of their levels lasts at least a step.
+        """
         assert self.new_step is not None
+        step, hold, n_u = float(self.new_step), self.options.get("hold"), len(self.inputs)
         series = table.series(wanted, time)
-        for column, (t, _) in zip(wanted, series, strict=True):
-            check_times(t, self.new_step, f"{table.path}: column {column!r}")
+        inputs = [(t, column) for t, values in series[:n_u] for column in values.T]
+        held = hold == "zero" and all(levels_last(t, column, step) for t, column in inputs)
+        for i, (column, (t, _)) in enumerate(zip(wanted, series, strict=True)):
+            check_times(t, step, f"{table.path}: column {column!r}", held and i < n_u)
+        first, last = min(t[0] for t, _ in series), max(t[-1] for t, _ in series)
+        spans = [(t[0], last if held and i < n_u else t[-1]) for i, (t, _) in enumerate(series)]
         try:
-            times = common_times([(t[0], t[-1]) for t, _ in series], self.new_step)
+            times = common_times(spans, step)
         except InputError as error:
             raise InputError(f"{table.path}: {error}") from None
+        stated = self.options.get("initial", "estimate")
+        if times[0] > first and not (isinstance(stated, str) and stated == "estimate"):
+            raise InputError(
+                f"{table.path}: the channels have values together from {times[0]:.6g} s on, but initial was stated for "
+                f"{first:.6g} s; leave initial out, or give each channel a value there."
+            )
         parts = []
         for i, (t, values) in enumerate(series):
-            held = i < len(self.inputs) and self.options.get("hold") == "zero"
-            bring = hold_at if held else interpolate_at
-            parts.append(np.column_stack([bring(t, column, times, self.new_step) for column in values.T]))
-        return parts
+            bring = hold_at if held and i < n_u else partial(interpolate_at, smooth=i >= n_u)
+            parts.append(np.column_stack([bring(t, column, times, step) for column in values.T]))
+        return parts, "linear" if hold and not held else hold
 
 
 def _check_names(given: Any, role: str) -> tuple[str, ...]:
@@ -366,12 +384,13 @@ def _find_time_column(names: Sequence[str], chosen: str | None, source: str) -> 
     return found[0]
 
 
-def _guess_time(table: CsvTable | ArrayTable) -> str:
+def _guess_time(table: CsvTable | ArrayTable, wanted: Sequence[str]) -> str:
     """Return the column that most likely holds the time: by its name, else the first one that rises evenly."""
-    named = [name for name in table.names if any(word in name.lower() for word in TIME_WORDS)]
+    others = [name for name in table.names if name not in wanted]
+    named = [name for name in others if {*re.findall(r"[a-z]+", name.lower())} & {*TIME_WORDS}]
     if named:
         return named[0]
-    for name in table.names[:MOST_TRIED]:
+    for name in others[:MOST_TRIED]:
         try:
             step_of(table.columns([name])[0][:, 0], name, str)
         except InputError:

@@ -15,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from .._base import REPAIR, InputError, is_number, is_whole, later, listed, positive, real_array, usable
-from .preprocessing import butterworth, change_step, hold_at, remove_trend
+from .preprocessing import butterworth, change_step, hold_at, levels_last, remove_trend
 
 SAME_STEP = 1e-4  # relative difference up to which two steps count as the same; written times have few digits
 HOLDS = ("zero", "linear", None)
@@ -270,8 +270,9 @@ class Recording:
     def resample(self, dt: float) -> Self:
         """Resample to another step in seconds; an anti-alias filter precedes a longer step.
 
-        If `hold` is `"zero"`, an input becomes its mean over each new step, and is held. `skip` covers the same time as
-        before. A period that is not a whole number of new samples is dropped.
+        If `hold` is `"zero"` and each level of the inputs lasts at least a new step, an input becomes its mean over
+        each new step, and is held; else the hold becomes `"linear"`. `skip` covers the same time as before. A period
+        that is not a whole number of new samples is dropped.
 
         Raises
         ------
@@ -282,15 +283,18 @@ class Recording:
         u, y = (change_step(values, self.dt, dt) if values.shape[1] else values for values in (self.u, self.y))
         if u is self.u:
             return self
-        if self.hold == "zero":
+        hold = self.hold
+        if hold == "zero" and all(levels_last(self.t, column, dt) for column in self.u.T):
             u = np.column_stack([hold_at(self.t, column, np.arange(len(u)) * dt, dt) for column in self.u.T])
+        elif hold:
+            hold = "linear"
         skip = min(int(np.ceil(self.skip * self.dt / dt * (1 - SAME_STEP))), len(u) - 2)
         period = round((self.period or 0) * self.dt / dt)
         whole = bool(self.period) and abs(period * dt / ((self.period or 1) * self.dt) - 1) < SAME_STEP / period
         kept = period if whole and 2 <= period <= len(u) - skip else None
         initial = "estimate" if self.begins == "periodic" and kept is None else self.initial
         y = y if self.n_y else np.empty((len(u), 0))
-        return replace(self, u=u, y=y, dt=dt, skip=skip, period=kept, initial=initial)
+        return replace(self, u=u, y=y, dt=dt, skip=skip, period=kept, initial=initial, hold=hold)
 
     def to_frame(self) -> Any:
         """Return a pandas `DataFrame` with a column for each input and output over the index `t`, in seconds.

@@ -31,6 +31,7 @@ DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
 TIME_NAMES = ("t", "t_s", "time")
 WITH_UNIT = re.compile(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")  # such as "force [N]" or "speed (rad/s)"
 _IN_SECONDS = re.compile(r"(?:t|time)\s*[\[(]\s*(?:s|sec|secs|seconds?)\s*[\])]", re.IGNORECASE)
+NO_UNIT = ("", "1", "-")  # units that files state for numbers without one
 ONE_STEP = "bring all channels to one step with resample=STEP"
 LONGEST_TITLE = 100  # lines above the header of a CSV file, at most
 KINDS = {
@@ -339,12 +340,15 @@ def _open_csv(path: Path, wanted: Sequence[str]) -> CsvTable:
 
 
 def _with_decimal_points(lines: list[str], delimiter: str) -> list[str]:
-    """Replace decimal commas by points, unless commas separate cells or another number has a decimal point."""
+    """Replace decimal commas by points, unless they may separate cells or thousands, or a number has a point."""
     if delimiter == "," or not any("," in line for line in lines):
         return lines
     text = "\n".join(lines)
+    decimal = r"(?<![\d,])(\d*),(\d*)(?![\d,])"
+    if all(len(end) == 3 and 0 < len(begin) <= 3 and begin[0] != "0" for begin, end in set(re.findall(decimal, text))):
+        return lines
     with_point = rf'(?:^|{delimiter})[ "]*[+-]?\d*\.\d*(?:[eE][+-]?\d+)?[ "]*(?:$|{delimiter})'
-    return lines if re.search(with_point, text, re.MULTILINE) else text.replace(",", ".").split("\n")
+    return lines if re.search(with_point, text, re.MULTILINE) else re.sub(decimal, r"\1.\2", text).split("\n")
 
 
 def _find_header(
@@ -505,7 +509,7 @@ def _open_mdf(path: Path, wanted: Sequence[str] = ()) -> ArrayTable:
             clocks = {name: signal.timestamps for name, signal in signals.items()}
             times = next(iter(clocks.values())) if clocks else mdf.get_master(0)
     arrays = {"t": times, **{name: signal.samples for name, signal in signals.items()}}
-    units = {name: signal.unit.strip() for name, signal in signals.items() if signal.unit}
+    units = {name: signal.unit.strip() for name, signal in signals.items() if signal.unit.strip() not in NO_UNIT}
     return ArrayTable(path, tuple(dict.fromkeys(["t", *names])), arrays, clocks, units)
 
 

@@ -319,7 +319,7 @@ def check(
     if len(wired) < len(faults):
         advice.append("State how the recordings begin: give each state's value, or leave the start unknown.")
     if slow:
-        advice.append(f"Read {in_words([f.channel for f in slow])} at the rate at which it was measured.")
+        advice.append(f"Leave the repeated values of {in_words([f.channel for f in slow])} out first.")
     estimated = any(isinstance(f, WrongStart) and f.corrected for f in faults)
     starts = tuple(START_WORDS[r.begins] + ", here estimated" * estimated for r in recordings)
     return replace(found, blind_spots=(*spots, *found.blind_spots), next_record=" ".join(advice), starts=starts)

@@ -26,8 +26,11 @@ def parameter_within(name: str, value: float, bounds: tuple[float, float], unit:
     return Parameter(value, unit, bounds)
 
 
-def _check_within(name: str, value: Any, bounds: tuple[float, float]) -> None:
-    low, high = bounds
+def _check_within(name: str, value: Any, bounds: Any) -> None:
+    ends = np.ravel(np.asarray(bounds, dtype=object))
+    if len(ends) != 2 or not all(isinstance(end, int | float | np.number) and not np.isnan(end) for end in ends):
+        raise InputError(f"The bounds of {name!r} are {bounds!r}; give a pair of numbers (lower, upper).")
+    low, high = ends
     if not low <= high:
         raise InputError(
             f"The bounds {low:g} to {high:g} of {name!r} are infeasible: the lower one exceeds the upper one; swap "

@@ -163,6 +163,13 @@ class MujocoTree:
             moves[i] = bool(m.body_jntnum[i]) or moves[m.body_parentid[i]]
         return [i for i in range(1, m.nbody) if moves[i] and m.body_mass[i] > 0]
 
+    @property
+    def frictionless(self) -> bool:
+        """Whether a flag of the model disables the dry friction of its joints."""
+        from mujoco import mjtDisableBit as flags
+
+        return bool(self.model.opt.disableflags & (flags.mjDSBL_FRICTIONLOSS | flags.mjDSBL_CONSTRAINT))
+
     @cached_property
     def numbers(self) -> dict[str, float]:
         """Every number that may be a parameter, by name."""
@@ -172,7 +179,7 @@ class MujocoTree:
             found |= _name_numbers(self.bodies[i], OF_BODIES, values)
         for i, name in enumerate(self.joints):
             values = m.dof_damping[i], m.dof_armature[i], m.jnt_stiffness[i], m.qpos_spring[m.jnt_qposadr[i]]
-            found |= _name_numbers(name, OF_JOINTS, (*values, m.dof_frictionloss[i]))
+            found |= _name_numbers(name, OF_JOINTS, (*values, 0.0 if self.frictionless else m.dof_frictionloss[i]))
         for i, name in enumerate(self.actuators):
             found |= _name_numbers(name, OF_ACTUATORS, (1.0, m.actuator_gear[i, 0]))
         return found

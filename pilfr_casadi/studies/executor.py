@@ -226,7 +226,9 @@ def dask_executor(address: str) -> Iterator[tuple[Executor, int, int]]:
         await (await connect(address, timeout=SCHEDULER_TIMEOUT, **given)).close()
 
     try:
-        asyncio.run(reach_scheduler())  # a client that fails to connect waits 20 s more and prints a traceback
+        # a client that fails to connect waits 20 s more and prints a traceback; this thread may run a loop already
+        with ThreadPoolExecutor(1) as other:
+            other.submit(asyncio.run, reach_scheduler()).result()
         client = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -214,7 +214,7 @@ def _diagnosis_entry(found: Diagnosis) -> dict[str, Any]:
     content = found.to_dict()
     effects = [{k: e[k] for k in ("port", "law", "confidence", "parameters")} for e in content["effects"]]
     entry = {"status": DONE, "verdict": found.verdict, "sentence": found.summary, "hold": found.hold}
-    return {**entry, "effects": effects, "faults": found.corrected_faults, "fit": content["fit"]}
+    return {**entry, "effects": effects, "fit": content["fit"]}
 
 
 def _diagnosis_files(found: Diagnosis) -> dict[str, str]:

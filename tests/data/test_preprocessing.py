@@ -319,3 +319,45 @@ def test_any_table_of_named_columns_is_a_frame():
 def test_frames_that_cannot_be_used(frame, said):
     with pytest.raises(InputError, match=said):
         read_frame(frame, "u", "y")
+
+
+def test_an_input_that_is_faster_than_the_new_step_is_filtered_as_the_outputs_are():
+    u = np.random.default_rng(0).standard_normal(2000)  # a level for each sample
+    r = Recording(u, u, 1e-3, ("u",), ("y",), hold="zero")
+    slow = r.resample(1e-2)
+    assert slow.hold == "linear" and np.allclose(slow.u, slow.y)
+    assert r.with_(u=u[np.arange(2000) // 20 * 20]).resample(1e-2).hold == "zero"
+
+
+def test_an_input_of_unknown_hold_keeps_its_levels_between_uneven_samples(tmp_path):
+    rng = np.random.default_rng(0)
+    t = 0.01 * (np.arange(400) + 0.2 * rng.uniform(-1, 1, 400))
+    u = np.sign(rng.standard_normal(400))
+    path = tmp_path / "run.csv"
+    np.savetxt(path, np.column_stack([t, u, np.cumsum(u)]), delimiter=",", header="t,u,y", comments="")
+    assert np.max(np.abs(read_csv(path, inputs="u", outputs="y", resample=0.009).u)) <= 1.0
+
+
+def test_a_held_input_that_is_written_when_it_changes_lasts_to_the_end(tmp_path):
+    rows = [f"{0.01 * k:.2f},{k // 50 if k in (0, 50) else ''},{np.sin(k)}" for k in range(100)]
+    path = tmp_path / "events.csv"
+    path.write_text("\n".join(["t,u,y", *rows]), encoding="utf-8")
+    r = read_csv(path, inputs="u", outputs="y", resample=0.01, hold="zero")
+    assert len(r) == 100 and r.hold == "zero" and np.array_equal(r.u[:, 0], np.arange(100) // 50)
+
+
+def test_a_stated_start_that_would_move_is_refused(tmp_path):
+    rows = [f"{0.01 * k:.2f},{np.cos(k)},{np.sin(k) if k % 4 == 3 else ''}" for k in range(100)]
+    path = tmp_path / "late.csv"
+    path.write_text("\n".join(["t,u,y", *rows]), encoding="utf-8")
+    with pytest.raises(InputError, match=r"from 0\.03 s on, but initial was stated for 0 s"):
+        read_csv(path, inputs="u", outputs="y", resample=0.01, initial=[1.0])
+    assert read_csv(path, inputs="u", outputs="y", resample=0.01).begins == "estimate"
+
+
+def test_a_merged_input_is_linear_where_one_of_the_records_is():
+    u = np.random.default_rng(0).standard_normal((500, 2))
+    held = Recording(u[np.arange(500) // 50 * 50, :1], np.empty((500, 0)), 0.01, ("a",), (), hold="zero")
+    smooth = Recording(u[:, 1:], u[:, 1:], 0.02, ("b",), ("y",), hold="linear")
+    assert pilfr.merge(held, smooth).hold == "linear"
+    assert pilfr.merge(held, smooth, inputs="a", outputs="y").hold == "zero"

@@ -225,7 +225,7 @@ BAD_FILES = {
     "word": (GOOD.replace("0.2,3", "0.2,high"), "column 'force', line 4 reads 'high', which is not a number"),
     "underscore": (GOOD.replace("0.2,3,30", "0.2,3,3_0"), "column 'x2', line 4 reads '3_0'"),
     "decimal comma": (GOOD.replace(",", ";").replace("0.2;3", "0.2;3,5"), "line 4 reads '3,5'.* with a point"),
-    "thousands": (GOOD.replace(",", ";").replace(".", ",").replace("40", "1,234,567"), "line 5 reads '1.234.567'"),
+    "thousands": (GOOD.replace(",", ";").replace(".", ",").replace("40", "1,234,567"), "line 5 reads '1,234,567'"),
     "thousands and a point": (GOOD.replace(",", ";").replace("0;1;10", "0;1;1,234.5"), "line 2 reads '1,234.5'"),
     "decimal commas between commas": ("t,force,x2\n0,1,5,10\n0,1,2,20\n", "line 2 has 4 cell.*with points"),
     "units in milliseconds": (GOOD.replace("x2\n", "x2\nms,N,m\n"), r"'t \[ms\]' is named as time in ms"),
@@ -542,3 +542,8 @@ def test_a_column_may_say_its_unit_in_brackets(tmp_path):
     assert np.array_equal(r.y[:, 0], [2, 5, 8]) and dict(r.units) == {"road": "mm", "speed": "m/s"}
     with pytest.raises(InputError, match=r"columns=\{'spee': 'speed"):
         read_csv(path, inputs="road", outputs="spee")
+
+
+def test_numbers_that_may_have_thousands_separators_are_refused(write):
+    with pytest.raises(InputError, match="line 3 reads '1,001'"):
+        read_csv(write("u;y\n999;1\n1,001;2\n"), inputs="u", outputs="y", dt=1.0)

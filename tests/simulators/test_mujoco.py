@@ -207,7 +207,7 @@ def test_ports_load_and_units(arm):
     assert float(ca.Function("load", [u["m1"]], [load])(-2.0)) == pytest.approx(6.0)
 
 
-PENDULUM = """
+ROD = """
 <mujoco>
   <worldbody>
     <body name="rod">
@@ -223,7 +223,7 @@ PENDULUM = """
 def test_the_command_writes_a_corrected_simulator_that_other_commands_take(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.arguments"), "CATALOGUE", (CoulombFriction,))
     model, rng = tmp_path / "pendulum.xml", np.random.default_rng(0)
-    model.write_text(PENDULUM, encoding="utf-8")
+    model.write_text(ROD, encoding="utf-8")
     t, dt = 0.01 * np.arange(300), 0.01
     torque = 0.4 * np.sin(4 * t + 2 * np.sin(t))[:, None]
     blank = Recording(torque, torque, dt, ("torque",), ("pivot",), initial="zero", hold="zero")
@@ -304,6 +304,18 @@ def test_the_command_frees_a_bounded_parameter_and_prints_the_note(tmp_path, cap
     status, said, _ = run(capsys, *given, "--out", tmp_path)
     found = (tmp_path / "check.json").read_text(encoding="utf-8")
     assert status == 0 and "joint.armature" in found and "the equations leave out the limits of joint" in said
+
+
+def test_dry_friction_that_a_flag_disables_is_none(tmp_path):
+    path = tmp_path / "arm.xml"
+    rubbing = PENDULUM.replace("<joint ", '<joint frictionloss="0.3" ', 1)
+    for flags in (
+        "",
+        '<option><flag frictionloss="disable"/></option>',
+        '<option><flag constraint="disable"/></option>',
+    ):
+        path.write_text(rubbing.replace("<mujoco>", f"<mujoco>{flags}"), encoding="utf-8")
+        assert ("joint.frictionloss" in from_mujoco(path).parameters) == (not flags)
 
 
 def test_laws_have_parameters_of_their_own_beside_the_joints(arm):

@@ -242,7 +242,7 @@ def find_held_outputs(recordings: Sequence[Recording]) -> list[Gate]:
         k = min(_samples_between_changes(r.y[:, i], r.u) for r in recordings)
         if k > 1:
             sentence = (
-                f"{name} changes only at every {k}th sample, as if it were measured every {k * dt:.3g} s and held in "
+                f"{name} changes only once in {k} samples, as if it were measured every {k * dt:.3g} s and held in "
                 f"between, which looks like a delay of about {(k - 1) / 2 * dt:.3g} s. Leave its repeated values out "
                 f"(empty cells), and read the file with resample={dt:.6g}."
             )

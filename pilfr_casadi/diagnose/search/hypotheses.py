@@ -82,7 +82,7 @@ class Hypotheses:
     findings: defaultdict[Key, Findings] = field(default_factory=lambda: defaultdict(Findings))
     times: dict[str, float] = field(default_factory=dict)
     out_of_time: bool = False  # whether the time limit ended the search
-    # pairs of port and law that were selected for a fit beside the simulator alone, and those that were fitted
+    # pairs of port and law that were selected for a fit beside the simulator alone, and those that were tried
     selected: int = 0
     tried: int = 0
     count: float = FEWEST  # samples of the best residual over its correlation time

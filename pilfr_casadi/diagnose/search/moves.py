@@ -293,9 +293,9 @@ class Search(Hypotheses):
         began = time.perf_counter()
         stage = f"fits, effect {len(parent.laws) + 1}" if parent.laws else "fits"
         pairs = select_pairs(scored, again)
-        trials = self.fits.fit_pairs(parent, pairs, gain, enough, partial(self.say, stage), again)
+        trials, tried = self.fits.fit_pairs(parent, pairs, gain, enough, partial(self.say, stage), again)
         if not parent.laws:
-            self.tried, self.selected = self.tried + len(trials), self.selected + len(pairs)
+            self.tried, self.selected = self.tried + tried, self.selected + len(pairs)
         self.times["fits"] = self.times.get("fits", 0.0) + time.perf_counter() - began
         self.bench.interrupt.raise_pending()
         return trials

@@ -213,9 +213,10 @@ class Trials:
         enough: float,
         report: Callable[[int, int, float], None],
         again: bool = False,
-    ) -> list[Trial]:
-        """Fit every selected pair of port and law beside a parent's laws, smallest error first.
+    ) -> tuple[list[Trial], int]:
+        """Fit every selected pair of port and law beside a parent's laws; return the fits, smallest error first.
 
+        Also returns how many pairs were tried before the time was over, with those whose every fit diverges.
         If one of the first pairs has an error below `enough`, pairs far behind it are not refined. With `again`, which
         looks for a law in place of a known one, fewer pairs are refined.
         """
@@ -250,7 +251,7 @@ class Trials:
             report(done if self.over else total, total, min((t.error for t in found if t), default=np.inf))
         finally:
             pool.shutdown(cancel_futures=True)
-        return sorted((t for t in found if t is not None), key=lambda t: t.error)
+        return sorted((t for t in found if t is not None), key=lambda t: t.error), len(prepared)
 
     def _fit_briefly(self, parent: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> _BriefFit:
         """Compile a pair and fit it briefly from its best start."""
