@@ -328,7 +328,7 @@ def test_the_corrected_simulator_of_a_unit_is_a_file(tmp_path, units):
     shutil.copy(units["c"], tmp_path / "unit.fmu")
     (tmp_path / "out").mkdir()
     file = tmp_path / "out" / "corrected.py"
-    file.write_text(corrected_file(found, "../unit.fmu", "from_fmu", {**options, "cosimulation": CoSimulation(0.01)}))
+    file.write_text(corrected_file(found, "../unit.fmu", "from_fmu", options))
     again, given = load_simulator(file), recording(4, samples=200)
     assert np.array_equal(again.simulate(given), found.corrected.simulate(given))
     assert again.parameters["k1"].bounds == (300.0, 500.0) and again.hold == found.hold
