@@ -15,7 +15,7 @@ import numpy as np
 
 from pilfr_casadi.data import Recording
 from pilfr_casadi.diagnose import Diagnosis, Fitted, Workbench
-from pilfr_casadi.diagnose.workbench import THOROUGH
+from pilfr_casadi.diagnose.fits.workbench import THOROUGH
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import Simulator
 

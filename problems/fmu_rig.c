@@ -1,6 +1,8 @@
 /* A two-mass rig for model exchange by FMI 2.0, written by hand for the tests: linear springs and dampers.
  *
  * Value references are places in `v`: parameters, states, derivatives, inputs, outputs. It keeps neither time nor events.
+ * Macros make variants: CRASHES on instantiation; FAILURE, a statement, and FAILED, a status of the
+ * getters, at stiffnesses above 600 N/m; STRICT refuses parameters in continuous-time mode.
  */
 #include <stdlib.h>
 #include <string.h>
@@ -14,9 +16,13 @@
 enum { K1, K2, D1, D2, M1, M2, X1, V1, X2, V2, DX1, DV1, DX2, DV2, FORCE, GUIDE, POS1, POS2, VEL1, POWER, N_V };
 typedef struct {
   double v[N_V];
+  int continuous; /* in continuous-time mode */
 } rig_t;
 
 static void evaluate(double *v) {
+#ifdef FAILURE
+  if (v[K1] > 600) FAILURE;
+#endif
   const double inner = v[K2] * (v[X1] - v[X2]) + v[D2] * (v[V1] - v[V2]);
   v[DX1] = v[V1];
   v[DV1] = (v[FORCE] + v[GUIDE] - v[K1] * v[X1] - v[D1] * v[V1] - inner) / v[M1];
@@ -42,6 +48,7 @@ EXPORT void *fmi2Instantiate(const char *name, int type, const char *guid, const
   if (type != 0 || strcmp(guid, "rig")) return NULL;
   m = malloc(sizeof *m);
   if (m) memcpy(m->v, start, sizeof start);
+  if (m) m->continuous = 0;
   return m;
 }
 EXPORT void fmi2FreeInstance(void *c) { free(c); }
@@ -49,16 +56,26 @@ EXPORT int fmi2SetupExperiment(void *c, int given, double tolerance, double star
 EXPORT int fmi2EnterInitializationMode(void *c) { return 0; }
 EXPORT int fmi2ExitInitializationMode(void *c) { return 0; }
 EXPORT int fmi2Terminate(void *c) { return 0; }
-EXPORT int fmi2Reset(void *c) { return 0; }
+EXPORT int fmi2Reset(void *c) {
+  ((rig_t *)c)->continuous = 0;
+  return 0;
+}
 
 EXPORT int fmi2GetReal(void *c, const unsigned vr[], size_t n, double value[]) {
   size_t i;
+#ifdef FAILED
+  if (((rig_t *)c)->v[K1] > 600) return FAILED;
+#endif
   evaluate(((rig_t *)c)->v);
   for (i = 0; i < n; i++) value[i] = ((rig_t *)c)->v[vr[i]];
   return 0;
 }
 EXPORT int fmi2SetReal(void *c, const unsigned vr[], size_t n, const double value[]) {
   size_t i;
+#ifdef STRICT
+  for (i = 0; i < n; i++)
+    if (vr[i] <= M2 && ((rig_t *)c)->continuous) return 3;
+#endif
   for (i = 0; i < n; i++) ((rig_t *)c)->v[vr[i]] = value[i];
   return 0;
 }
@@ -81,12 +98,18 @@ EXPORT int fmi2GetDirectionalDerivative(void *c, const unsigned unknown[], size_
   return 3;
 }
 
-EXPORT int fmi2EnterEventMode(void *c) { return 0; }
+EXPORT int fmi2EnterEventMode(void *c) {
+  ((rig_t *)c)->continuous = 0;
+  return 0;
+}
 EXPORT int fmi2NewDiscreteStates(void *c, void *information) {
   memset(information, 0, 5 * sizeof(int));
   return 0;
 }
-EXPORT int fmi2EnterContinuousTimeMode(void *c) { return 0; }
+EXPORT int fmi2EnterContinuousTimeMode(void *c) {
+  ((rig_t *)c)->continuous = 1;
+  return 0;
+}
 EXPORT int fmi2CompletedIntegratorStep(void *c, int final, int *event, int *terminate) {
   *event = *terminate = 0;
   return 0;
@@ -101,6 +124,9 @@ EXPORT int fmi2GetContinuousStates(void *c, double x[], size_t n) {
   return 0;
 }
 EXPORT int fmi2GetDerivatives(void *c, double xdot[], size_t n) {
+#ifdef FAILED
+  if (((rig_t *)c)->v[K1] > 600) return FAILED;
+#endif
   evaluate(((rig_t *)c)->v);
   memcpy(xdot, ((rig_t *)c)->v + DX1, n * sizeof(double));
   return 0;

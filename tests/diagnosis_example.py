@@ -7,7 +7,7 @@ import numpy as np
 
 from pilfr_casadi.data import Recording
 from pilfr_casadi.diagnose import Diagnosis, Effect, Workbench, mismatch
-from pilfr_casadi.diagnose.gates import Gate
+from pilfr_casadi.diagnose.faults.gates import Gate
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import BoucWen, CubicStiffness, Saturation
 from pilfr_casadi.models import Parameter

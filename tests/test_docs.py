@@ -31,11 +31,11 @@ QUICK = {  # pages of about a second; all others are slow
         "hold",
         "known_physics",
         "look",
-        "mujoco",
         "numpy",
         "other_domains",
         "own_law",
         "ports",
+        "rates",
         "unknown_start",
         "varying_strength",
     )
@@ -44,9 +44,10 @@ SAID = {
     "docs/start/axis.md": "leaves out Coulomb friction at guide.",
     "docs/start/tank.md": "leaves out dead zone at actuator:pump.",
     "docs/howto/closed_loop.md": "leaves out Coulomb friction at guide.",
+    "docs/howto/mujoco.md": "leaves out Coulomb friction at shoulder.",
     "docs/howto/delay.md": "leaves out delay at sensor:x2 and Coulomb friction at ground-m2.",
     "docs/diagnose.md": "leaves out Coulomb friction at ground-m2.",
-    "docs/howto/ports.md": "['equation:pos', 'equation:vel', 'actuator:force', 'sensor:position']",
+    "docs/howto/ports.md": "['equation:vel', 'actuator:force', 'sensor:position']",
 }
 WRITTEN = {
     "docs/diagnose.md": {"report/report.html", "diagnosis/diagnosis.json"},
@@ -172,10 +173,24 @@ def folder(tmp_path):
     return tmp_path
 
 
-def commands(*names):
-    """The `pilfr` commands of the documents as lists of arguments, without comments."""
-    lines = [line for block in snippets("sh", *names) for line in block.splitlines() if line.startswith("pilfr ")]
+def pilfr_commands(block):
+    """The `pilfr` commands of a block as lists of arguments, without comments."""
+    lines = [line for line in block.splitlines() if line.startswith("pilfr ")]
     return [line.partition("  #")[0].split()[1:] for line in lines]
+
+
+def commands(*names):
+    """The `pilfr` commands of the documents."""
+    return [command for block in snippets("sh", *names) for command in pilfr_commands(block)]
+
+
+def as_script(name):
+    """A page as one script: its Python, and its `pilfr` commands, in their order."""
+    parts = ["from pilfr_casadi.cli import main as run_command"]
+    for language, block in re.findall(r"```(python|sh)\n(.*?)```", (ROOT / name).read_text(encoding="utf-8"), re.S):
+        called = (f"assert run_command({command!r}) == 0" for command in pilfr_commands(block))
+        parts += [block] if language == "python" else called
+    return "\n".join(parts)
 
 
 # run files have a test of their own
@@ -238,19 +253,11 @@ def test_commands_of_the_readme(folder, monkeypatch):
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in EXECUTED]
 )
-def test_snippets_of_a_page(folder, name, script, monkeypatch):
-    """Every page stands alone: its Python runs as one script beside the demonstration's files, then its commands."""
-    blocks, lines, alone = snippets("python", name), commands(name), name not in QUICK
-    if blocks:
-        (folder / "page.py").write_text("\n".join(blocks), encoding="utf-8")
-        said = run(["page.py"], folder) if alone else script(folder / "page.py", folder)
-        assert SAID.get(name, "") in said
-    monkeypatch.chdir(folder)
-    for arguments in lines:
-        if alone:
-            run(["-c", COMMAND, *arguments], folder)
-        else:
-            assert main(arguments) == 0
+def test_snippets_of_a_page(folder, name, script):
+    """Every page stands alone: it runs as one script beside the demonstration's files."""
+    (folder / "page.py").write_text(as_script(name), encoding="utf-8")
+    said = run(["page.py"], folder) if name not in QUICK else script(folder / "page.py", folder)
+    assert SAID.get(name, "") in said
     assert all((folder / file).exists() for file in WRITTEN.get(name, ()))
     if name == "docs/howto/constraints.md":  # the path shows what it is for
         table = said.partition("strength  operators")[2].partition("the strongest")[0]

@@ -29,6 +29,7 @@ ORDER = [
     "studies",
     "cli",
 ]
+INSIDE = {"diagnose": ["fits", "faults", "search", ""]}  # folders of a folder, in the same order; "" for its own files
 
 
 def files():
@@ -73,6 +74,20 @@ def test_a_folder_imports_only_folders_before_it(folder):
         for line, target in imported(name):
             there = target.partition("/")[0]
             if there not in ORDER or ORDER.index(there) > ORDER.index(folder):
+                wrong.append(f"{name}.py:{line} imports {target}")
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("folder", INSIDE)
+def test_a_folder_inside_another_imports_only_those_before_it(folder):
+    order, wrong = INSIDE[folder], []
+    inside = {name: name.split("/")[1:-1] for name in FILES if name.startswith(f"{folder}/")}
+    where = {name: parts[0] if parts else "" for name, parts in inside.items()}
+    where |= {f"{folder}/{sub}": sub for sub in order if sub}
+    assert set(where.values()) == set(order)
+    for name, own in where.items():
+        for line, target in imported(name):
+            if order.index(where.get(target, order[0])) > order.index(own):
                 wrong.append(f"{name}.py:{line} imports {target}")
     assert not wrong, "\n".join(wrong)
 

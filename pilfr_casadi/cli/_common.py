@@ -9,7 +9,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 
@@ -126,7 +126,7 @@ class DataOptions:
     time_tolerance: float | None = option(
         "Largest deviation of samples from a uniform grid (default: 1e-4 steps, beyond rounding).", "STEPS"
     )
-    resample: float | None = option("New step, for times that are not uniform.", "SECONDS")
+    resample: float | None = option("New step, for uneven times or channels of different rates.", "SECONDS")
 
     def __post_init__(self) -> None:
         if self.period is not None and self.initial is None:
@@ -185,6 +185,45 @@ def simulator_files(metavar: str) -> Any:
     return typer.Argument(..., metavar=metavar, help=text)
 
 
+@dataclass(frozen=True)
+class SimulatorFile:
+    """A file with a simulator, and how to load it.
+
+    Attributes
+    ----------
+    loader : {"load_simulator", "load", "from_fmu", "from_mujoco"}
+        Name of the function that loads it.
+    options : mapping
+        Options of that function.
+    bounds : mapping
+        Other bounds of parameters of a Python file's simulator.
+    """
+
+    path: str
+    loader: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def load(self) -> Any:
+        """Load the file; a Python file's `simulator` and a saved model are returned as they are but for the bounds."""
+        from ..identify import load
+        from ..simulators import Simulator, from_fmu, from_mujoco, simulator_variable
+
+        loaders: dict[str, Callable[..., Any]] = {
+            "load": load,
+            "load_simulator": simulator_variable,
+            "from_fmu": from_fmu,
+            "from_mujoco": from_mujoco,
+        }
+        found = loaders[self.loader](self.path, **self.options)
+        if self.bounds and not isinstance(found, Simulator):
+            fitted = (
+                "a fitted model" if self.loader == "load" else f"a {type(found).__name__}, whose numbers have no names"
+            )
+            raise InputError(f"--bound was given, but {self.path} holds {fitted}; leave it out, or give a Simulator.")
+        return found.with_bounds(self.bounds) if self.bounds else found
+
+
 @dataclass(frozen=True, kw_only=True)
 class SimulatorOptions(DataOptions):
     """Options of commands that compare a simulator with recordings."""
@@ -195,7 +234,11 @@ class SimulatorOptions(DataOptions):
         "NAME=INTO:ACROSS[:RATE]",
         [],
     )
-    bound: list[str] = option("Bounds of a parameter of an FMU (repeatable).", "NAME=LOW:HIGH", [])
+    bound: list[str] = option(
+        "Bounds of a parameter, which the refit may then change (repeatable).",
+        "NAME=LOW:HIGH",
+        [],
+    )
 
     @property
     def source(self) -> str | None:
@@ -225,6 +268,9 @@ class SimulatorOptions(DataOptions):
         if scripts := [path for path in self.recordings if Path(path).suffix.lower() == ".py"]:
             none = f", and none with {instead}" if instead else ""
             raise InputError(f"{scripts[0]} was given as a recording; give one simulator file, first{none}.")
+        if self.source is None and (self.bound or self.port):
+            name = "bound" if self.bound else "port"
+            raise InputError(f"--{name} was given, which is for a simulator file, not for {instead}; leave it out.")
         if not self.train:
             raise InputError("No training recording was given; give the simulator file and at least one recording.")
         if self.source is not None and (self.inputs or self.outputs):
@@ -232,27 +278,23 @@ class SimulatorOptions(DataOptions):
             raise InputError(f"--inputs and --outputs were given, but a simulator file has its own names{where}.")
         check_given_once(self.recordings)
 
-    def load_simulator(self) -> Any:
-        """Load the `simulator` of a Python file, the model of a model.json, an FMU, or a MuJoCo model."""
-        from ..identify import load
-        from ..simulators import from_mujoco, simulator_variable
-
+    def simulator_file(self) -> SimulatorFile:
+        """Choose how to load the simulator of a Python file, a model.json, an FMU, or a MuJoCo model."""
         path = self.files[0]
         kind = Path(path).suffix.lower()
         if kind == ".fmu":
-            return self._load_fmu(path)
-        mechanism = kind in (".xml", ".urdf")
-        for name in ("port",) if mechanism else ("port", "bound"):
-            if getattr(self, name):
-                raise InputError(f"--{name} was given, which is for an FMU; {path} has its own, so leave it out.")
-        if mechanism:
-            return from_mujoco(path, bounds=bounds_of(self.bound))
-        return load(path) if kind == ".json" else simulator_variable(path)
+            return SimulatorFile(path, "from_fmu", self._fmu_options(path))
+        if self.port:
+            raise InputError(f"--port was given, which is for an FMU; {path} has its own, so leave it out.")
+        bounds = bounds_of(self.bound)
+        if kind in (".xml", ".urdf"):
+            return SimulatorFile(path, "from_mujoco", {"bounds": bounds})
+        return SimulatorFile(path, "load" if kind == ".json" else "load_simulator", bounds=bounds)
 
-    def _load_fmu(self, path: str) -> Any:
-        """Make a simulator from an FMU, with the inputs and outputs that the first recording has."""
+    def _fmu_options(self, path: str) -> dict[str, Any]:
+        """Return the options of `from_fmu`, with the inputs and outputs that the first recording has."""
         from ..data import column_names
-        from ..simulators import CoSimulation, fmu_signals, from_fmu
+        from ..simulators import CoSimulation, fmu_signals, needs_step_size
 
         ports = {}
         for name, text in pairs(self.port, "--port", "INTO:ACROSS").items():
@@ -276,8 +318,10 @@ class SimulatorOptions(DataOptions):
                     f"say which they are, as in --column {names[0]}=COLUMN."
                 )
         inputs, outputs = kept
-        steps = CoSimulation(self.read(self.train[0], inputs, outputs, only_these=True).dt)
-        return from_fmu(path, ports=ports, bounds=bounds, inputs=inputs, outputs=outputs, cosimulation=steps)
+        options: dict[str, Any] = {"ports": ports, "bounds": bounds, "inputs": inputs, "outputs": outputs}
+        if needs_step_size(path):
+            options["cosimulation"] = CoSimulation(self.read(self.train[0], inputs, outputs, only_these=True).dt)
+        return options
 
 
 def bounds_of(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -357,6 +401,12 @@ def check_names(fitted: Fit, inputs: Sequence[str], outputs: Sequence[str]) -> N
 def print_line(line: str) -> None:
     """Print a line at once, also into a pipe."""
     print(line, flush=True)
+
+
+def print_note(simulator: Any) -> None:
+    """Print the note of an imported simulator, if it has one."""
+    if note := getattr(simulator.dynamics, "note", ""):
+        print_line(f"  {note}")
 
 
 def print_recordings(kind: str, recordings: Mapping[str, Recording]) -> None:

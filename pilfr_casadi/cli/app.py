@@ -154,6 +154,7 @@ def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
 def name_options(sentence: str) -> str:
     """Replace keyword arguments in a message by options of the command line."""
     sentence = sentence.replace("give the model as `model=`", "use it in Python with load(FILE, model=MODEL)")
-    sentence = re.sub(r"columns=\{'([^']*)': '([^']*)'\}", r"--column \1=\2", sentence)
+    sentence = re.sub(r"columns=\{'([^']*)': '([\w.-]*)'\}", r"--column \1=\2", sentence)
+    sentence = re.sub(r"columns=\{'([^']*)': '([^']*)'\}", r'--column "\1=\2"', sentence)
     keyword = rf"`?(?<![\w-])({KEYWORDS})=(?:'([^']*)'|([^\s;,()`]*[^\s;,.()`]))?`?"
     return re.sub(keyword, lambda m: f"--{m[1].replace('_', '-')} {m[2] or m[3] or m[1].upper()}", sentence)

@@ -22,6 +22,7 @@ from ._common import (
     DONE,
     INTERRUPTED,
     NO_RESULT,
+    SimulatorFile,
     SimulatorOptions,
     flag,
     make_folder,
@@ -29,6 +30,7 @@ from ._common import (
     numbers_of,
     option,
     print_line,
+    print_note,
     print_recordings,
     say,
     seconds,
@@ -101,11 +103,12 @@ def diagnose_command(options: DiagnoseOptions) -> int:
     """Writes the answer to DIR/diagnosis.json and the report to DIR/report.html."""
     options.check_files("--simulated SIM.csv")
     new_file(options.out, "diagnosis.json", options.overwrite)
-    given = None
+    given = source = None
     if options.source is None:
         inputs, outputs = _simulated_names(options)
     else:
-        given = options.load_simulator()
+        source = options.simulator_file()
+        given = source.load()
         simulator = as_simulator(given)
         inputs, outputs = simulator.inputs, simulator.output_names
     train = options.read_all(options.train, inputs, outputs)
@@ -141,13 +144,13 @@ def diagnose_command(options: DiagnoseOptions) -> int:
             )
     except KeyboardInterrupt:
         return say("Interrupted before there was a diagnosis; nothing was written.", INTERRUPTED)
-    return write_diagnosis(diagnosis, folder, options.source or "")
+    return write_diagnosis(diagnosis, folder, source)
 
 
-def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: str = "") -> int:
+def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: SimulatorFile | None = None) -> int:
     """Write diagnosis.json, corrected.py, then the report; print the diagnosis and the paths; return the exit status.
 
-    corrected.py corrects the simulator file `source`, if that is a Python file.
+    corrected.py loads and corrects the simulator file `source`, if there is one.
     """
     target = folder / "diagnosis.json"
     try:
@@ -156,10 +159,12 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: str = "") -> int
             print(diagnosis, flush=True)
             from ..report import corrected_file, diagnosis_report
 
-            corrected = folder / "corrected.py" if Path(source).suffix.lower() == ".py" else None
-            if corrected is not None:
-                there = os.path.relpath(os.path.realpath(source), os.path.realpath(folder))
-                write_atomically(corrected, corrected_file(diagnosis, Path(there).as_posix()))
+            corrected = folder / "corrected.py" if source is not None else None
+            if corrected is not None and source is not None:
+                there = Path(os.path.relpath(os.path.realpath(source.path), os.path.realpath(folder))).as_posix()
+                write_atomically(
+                    corrected, corrected_file(diagnosis, there, source.loader, source.options, source.bounds)
+                )
         with progress_bar() as progress:
             progress("writing the report", 0, 0, np.nan)
             page = diagnosis_report(diagnosis, folder)
@@ -173,8 +178,6 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: str = "") -> int
     print(f"diagnosis: {target}\nreport: {page}")
     if corrected is not None:
         print(f"corrected simulator: {corrected}")
-    elif source:
-        print(f"corrected simulator: in Python alone, as diagnose(...).corrected, because {source} is no Python file")
     return INTERRUPTED if diagnosis.interrupted else DONE
 
 
@@ -197,8 +200,7 @@ def _announce(simulator: Simulator, name: str, train: dict[str, Recording], test
     free = sum(not bool(np.all(p.fixed)) for p in simulator.parameters.values())
     counts = f"{len(simulator.states)} states, {len(simulator.parameters)} parameters ({free} free)"
     print_line(f"{name}, {counts}; ports {ports}")
-    if simulator.discrete and (note := getattr(simulator.dynamics, "note", "")):
-        print_line(f"  {note}")
+    print_note(simulator)
     print_recordings("training", train)
     print_recordings("test", tests)
 
@@ -297,10 +299,11 @@ def check_command(options: CheckOptions) -> int:
     options.check_files()
     if options.out is not None:
         new_file(options.out, "check.json", options.overwrite)
-    given = options.load_simulator()
+    given = options.simulator_file().load()
     simulator = as_simulator(given)
     recordings = options.read_all(options.train, simulator.inputs, simulator.output_names)
     folder = make_folder(options.out) if options.out is not None else None
+    print_note(simulator)
     print_recordings("training", recordings)
     with deferred_interrupt():
         from ..diagnose import check

@@ -240,14 +240,14 @@ class FleetOptions(SimulatorOptions):
 
 @takes_options
 def fleet_command(options: FleetOptions) -> int:
-    """Writes report.html, fleet.json and fleet.csv to DIR. The same command continues after an interrupt."""
+    """Writes pages, fleet.json and fleet.csv to DIR. The same command continues after an interrupt or adds machines."""
     check_cluster(options.dask, options.workers)
     if options.against is not None and options.out is not None:
         raise InputError("--against and --out were given; --against writes nothing, so leave one of them out.")
     options.check_files()
     if options.against is None:
         options.check_folder()
-    given = options.load_simulator()
+    given = options.simulator_file().load()
     simulator = as_simulator(given)
     inputs, outputs = simulator.inputs, simulator.output_names
     machines = {
@@ -292,6 +292,5 @@ def _judge(options: FleetOptions, simulator: object, machines: dict[str, list[Re
     fleet = read_fleet(options.against, simulator)
     for name, recordings in machines.items():
         found = fleet.judge(name, recordings)
-        findings = "; ".join(f"{text} ({p:.2f})" for text, p in found.reasons) or "as the others"
-        print_line(f"{name}: {findings}")
+        print_line(f"{name}: {found.findings or 'as the others'}")
     return DONE

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from .._base import InputError, is_number, listed, positive
-from .preprocessing import sample_at
+from .preprocessing import common_times, hold_at, levels_last, sample_at
 from .recording import SAME_STEP, Recording, as_tuple
 
 Names = Sequence[str] | str | None
@@ -29,9 +29,10 @@ def merge(
 ) -> Recording:
     """Put the channels of two records of one experiment on one clock, over the time that both cover.
 
-    Name, initial state and skipped samples come from the first record. The initial state is kept only if the common
-    time begins with the first record. Resampled inputs are no longer held between samples, so a stated `hold` becomes
-    `"linear"`.
+    Name, initial state, hold and skipped samples come from the first record. The initial state is kept only if the
+    common time begins with the first record. If all inputs are held (`hold="zero"`) and each of their levels lasts at
+    least a new step, an input becomes its mean over each new step, and is held; else a stated hold becomes `"linear"`,
+    unless no input was resampled.
 
     Parameters
     ----------
@@ -57,18 +58,22 @@ def merge(
     if not is_number(start) or not np.isfinite(start):
         raise InputError(f"start={start!r} was given; give the time of the second record's first sample in seconds.")
     step = max(first.dt, second.dt) if dt is None else positive(dt, "dt", "the common step in seconds")
-    times = _common_times(first, second, start, step)
-    signals: dict[str, np.ndarray] = {}
-    for r, offset in ((first, 0.0), (second, start)):
-        values = sample_at(np.hstack([r.u, r.y]), r.dt, times - offset, step)
-        signals |= dict(zip((*r.inputs, *r.outputs), values.T, strict=True))
+    try:
+        times = common_times([(0.0, first.t[-1]), (start, start + second.t[-1])], step)
+    except InputError:
+        raise InputError(
+            f"the recordings have fewer than 2 samples of {step:g} s in common; check start and dt."
+        ) from None
     u = first.inputs + second.inputs if inputs is None else as_tuple(inputs)
     y = first.outputs + second.outputs if outputs is None else as_tuple(outputs)
+    known = [*first.inputs, *first.outputs, *second.inputs, *second.outputs]
     for name in (*u, *y):
-        if name not in signals:
-            raise InputError(f"the two recordings have no channel {name!r}; they have {listed(list(signals))}.")
+        if name not in known:
+            raise InputError(f"the two recordings have no channel {name!r}; they have {listed(known)}.")
+    held = u if all(_is_held(first, name, step) or _is_held(second, name, step) for name in u) else ()
+    signals = {**_signals_at(first, times, step, held), **_signals_at(second, times - start, step, held)}
     begin = times[0]
-    as_sampled = begin == 0 and step == first.dt and (step == second.dt or not second.n_u)
+    as_sampled = bool(held) or (begin == 0 and step == first.dt and (step == second.dt or not second.n_u))
     keeps_initial = begin == 0 and first.begins != "periodic"
     return replace(
         first,
@@ -86,13 +91,17 @@ def merge(
     )
 
 
-def _common_times(first: Recording, second: Recording, start: float, step: float) -> np.ndarray:
-    """Return the times that both records cover, on the clock of the first, (M,), in seconds."""
-    begin, end = max(0.0, start), min(first.t[-1], start + second.t[-1])
-    times = begin + np.arange(int(np.floor(max(end - begin, 0.0) / step + SAME_STEP)) + 1) * step
-    if end < begin or len(times) < 2:
-        raise InputError(f"the recordings have fewer than 2 samples of {step:g} s in common; check start and dt.")
-    return times
+def _is_held(r: Recording, name: str, step: float) -> bool:
+    """Tell whether a channel is an input that a recording holds for at least a step."""
+    return r.hold == "zero" and name in r.inputs and levels_last(r.t, r.u[:, r.inputs.index(name)], step)
+
+
+def _signals_at(r: Recording, times: np.ndarray, step: float, held: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return the channels of a recording at times in s after its first sample, by name."""
+    names = (*r.inputs, *r.outputs)
+    values = np.hstack([r.u, r.y])
+    signals = dict(zip(names, sample_at(values, r.dt, times, step).T, strict=True))
+    return signals | {n: hold_at(r.t, values[:, i], times, step) for i, n in enumerate(names) if n in held}
 
 
 def _stack_columns(signals: dict[str, np.ndarray], names: tuple[str, ...], count: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Preprocess signals given as arrays, by SciPy: detrend, filter, resample, interpolate onto an even grid.
+"""Preprocess signals given as arrays, by SciPy: detrend, filter, resample, interpolate onto even times.
 
 The verbs of `Recording` (`cut`, `detrend`, `filter`, `resample`, `merge`) call these functions and keep the rest of the
 recording consistent.
@@ -8,6 +8,7 @@ Oppenheim & Schafer (2010), Discrete-Time Signal Processing, sec. 4.6 (change of
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any
 
@@ -23,6 +24,8 @@ LARGEST_FACTOR = 1000  # largest numerator and denominator of a rational change 
 RATIO_ERROR = 1e-9  # relative error of that ratio, far below a sample over the longest recordings
 PASSBAND = 0.8  # share of the new Nyquist frequency that the anti-alias filter passes; the rest is its transition band
 ANTI_ALIAS_ORDER = 8  # order of the Butterworth filter before an irrational change of step
+SAME_TIME = 1e-4  # difference of two times in steps up to which they count as the same; written times have few digits
+MOST_UNEVEN = 0.5  # largest deviation of a gap from the median one for a spline, which wiggles between uneven samples
 LONGEST_GAP = 10  # in median steps; samples interpolated over a longer gap would be invented
 
 
@@ -100,24 +103,72 @@ def sample_at(values: Array, dt: float, times: Array, step: float) -> Array:
     return np.asarray(CubicSpline(known, values, axis=0)(np.clip(times, 0.0, known[-1])))
 
 
-def even_grid(t: Array, values: Array, step: float, label: str) -> Array:
-    """Interpolate samples at uneven times t (M,), s, onto an even grid from t[0] on.
+def common_times(spans: Sequence[tuple[float, float]], step: float) -> Array:
+    """Return the times that all spans (first and last time, s) cover, from the last beginning on, (M,), in seconds."""
+    begin, end = (pick(times) for pick, times in zip((max, min), zip(*spans, strict=True), strict=True))
+    times = begin + np.arange(int(np.floor(max(end - begin, 0.0) / step + SAME_TIME)) + 1) * step
+    if end < begin or len(times) < 2:
+        raise InputError(
+            f"the channels begin by {begin:.6g} s and end from {end:.6g} s on, so they have fewer than 2 samples of "
+            f"{step:g} s in common; check their times, or give a shorter step."
+        )
+    return times
 
-    The signals are interpolated linearly on a grid at least as fine as the median gap, then resampled to `step`. Times
-    that do not increase, and gaps longer than `LONGEST_GAP` median gaps, are refused; `label` begins the message.
+
+def check_times(t: Array, step: float, label: str, held: bool = False) -> None:
+    """Refuse times (M,), s, that do not increase, or have gaps longer than `LONGEST_GAP` median gaps and steps.
+
+    `label` begins the message. A signal that is `held` may have gaps of any length.
     """
-    positive(step, "resample", "the new step in seconds")
     gaps = np.diff(t)
     if not len(gaps) or np.any(gaps <= 0):
         raise InputError(f"{label} needs at least two times that increase from sample to sample; sort the samples.")
     usual = float(np.median(gaps))
     worst = int(np.argmax(gaps))
-    if gaps[worst] > LONGEST_GAP * max(usual, step):
+    if gaps[worst] > LONGEST_GAP * max(usual, step) and not held:
         raise InputError(
             f"{label} has a gap of {gaps[worst]:.3g} s after {t[worst]:.6g} s, where {usual:.3g} s is usual; cut the "
             "record there into two."
         )
-    fine = step / max(int(np.ceil(step / usual - RATIO_ERROR)), 1)
-    grid = t[0] + np.arange(int(np.floor((t[-1] - t[0]) / fine * (1 + RATIO_ERROR))) + 1) * fine
-    even = np.column_stack([np.interp(grid, t, column) for column in values.T])
-    return change_step(even, fine, step)
+
+
+def interpolate_at(t: Array, values: Array, times: Array, step: float, smooth: bool) -> Array:
+    """Bring samples (M,) from their own times t, s, to even `times` within these; a filter precedes a longer step.
+
+    The samples are interpolated on a grid at least as fine as their median gap, then resampled to `step`: by a cubic
+    spline if the signal is `smooth`, as of a machine, and the gaps differ little; else linearly.
+    """
+    gaps = np.diff(t)
+    usual = float(np.median(gaps))
+    parts = max(int(np.ceil(step / usual - RATIO_ERROR)), 1)
+    before = int((times[0] - t[0]) / step)  # whole steps before the first time, for the filter
+    begin = times[0] - before * step
+    count = max(int((t[-1] - begin) * parts / step * (1 + RATIO_ERROR)), (before + len(times) - 1) * parts) + 1
+    grid = np.clip(begin + np.arange(count) * step / parts, t[0], t[-1])
+    if smooth and np.max(np.abs(gaps - usual)) < MOST_UNEVEN * usual:
+        from scipy.interpolate import CubicSpline
+
+        even = CubicSpline(t, values)(grid)
+    else:
+        even = np.interp(grid, t, values)
+    return change_step(even[:, None], step / parts, step)[before : before + len(times), 0]
+
+
+def levels_last(t: Array, values: Array, step: float) -> bool:
+    """Tell whether each level of a held signal (M,) lasts at least a step, so that its means keep its course."""
+    changes = t[1:][np.diff(values) != 0]
+    return bool(np.min(np.diff(changes), initial=np.inf) > step * (1 - SAME_TIME))
+
+
+def hold_at(t: Array, values: Array, times: Array, step: float) -> Array:
+    """Return the mean of a signal (M,), held from each of its times t to the next, over the step after each of `times`.
+
+    The means keep the signal's integral; a value that is held throughout a step is kept.
+    """
+    changes = np.append(True, np.diff(values) != 0)
+    t, values = t[changes], values[changes]
+    known = np.append(t, max(t[-1], times[-1]) + 2 * step)
+    integral = np.append(0.0, np.cumsum(values * np.diff(known)))
+    means = np.diff(np.interp(np.append(times, times[-1] + step), known, integral)) / step
+    first, last = (np.searchsorted(t, times + share * step, "right") - 1 for share in (SAME_TIME, 1 - SAME_TIME))
+    return np.where(first == last, values[first], means)  # without rounding where the signal keeps its value

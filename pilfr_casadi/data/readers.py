@@ -8,13 +8,14 @@ columns are ignored. One sentence reports a fault of a file; it names the file, 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
 
 from .._base import InputError, listed, positive
-from .preprocessing import LONGEST_GAP, even_grid
+from .preprocessing import LONGEST_GAP, check_times, common_times, hold_at, interpolate_at, levels_last
 from .recording import Recording, as_tuple
 from .tables import (
     TIME_NAMES,
@@ -24,7 +25,6 @@ from .tables import (
     frame_table,
     is_time,
     open_table,
-    unit_in_brackets,
 )
 
 PathLike = str | Path
@@ -32,6 +32,8 @@ Names = Sequence[str] | str
 
 TOLERANCE = 1e-4  # allowed deviation of a sample from the grid, in steps; recorders' clocks drift less in a record
 AGREEMENT = 1e-3  # allowed relative difference of a stated step from the times; a wrong unit differs by far more
+TIME_WORDS = ("time", "zeit", "temps", "tiempo", "tempo", "clock", "seconds")  # parts of the names of time columns
+MOST_TRIED = 5  # columns that are read to find an unnamed time, at most
 _UNITS = r"ns|us|µs|μs|ms|min|h|d|nanoseconds?|microseconds?|milliseconds?|minutes?|hours?|days?"
 _OTHER_UNIT = re.compile(rf"(?:t|time)[\s_\-\[(]+({_UNITS})[\])]?", re.IGNORECASE)
 _IN_OTHER_UNIT = re.compile(rf".*[\[(]\s*({_UNITS})\s*[\])]", re.IGNORECASE)  # of a column that is chosen as the time
@@ -74,8 +76,10 @@ def read_csv(
         Allowed deviation of the times from a uniform grid, in steps, beyond the rounding of the written times; 1e-4 by
         default.
     resample : float, optional
-        New step in seconds, for times that are not uniform: linear interpolation onto a fine grid, then an anti-alias
-        filter. A gap longer than ten median steps is refused.
+        New step in seconds, for times that are not uniform, and for channels of different rates, whose cells are empty
+        or nan between their samples. Each channel is interpolated from its own samples, over the time that all cover;
+        an anti-alias filter precedes a longer step. With ``hold="zero"`` an input becomes its mean over each step, and
+        is held. A gap longer than ten median steps is refused.
     **recording_options
         Further fields of :class:`Recording`: `hold`, `initial`, `period`, `skip`, `units`, and `name` (by default the
         file's name).
@@ -130,8 +134,8 @@ def read(
 
     The suffixes are .csv, .tsv, .txt or .dat, .mat, .npz, .parquet, .mf4 and .mdf. Parquet files need
     ``pilfr-casadi[parquet]``, MDF files ``pilfr-casadi[mdf]``. The column ``t`` of an MDF file holds the times of its
-    channels; all channels that are read must have the same times. Parameters, returned values and errors are the same
-    as for :func:`read_csv`; a list may mix kinds of files.
+    channels; channels of different times need `resample`. Parameters, returned values and errors are the same as for
+    :func:`read_csv`; a list may mix kinds of files.
     """
     return _read_each(path, _Request(inputs, outputs, **options))
 
@@ -199,7 +203,10 @@ class _Request:
         self.inputs, self.outputs = _check_names(inputs, "inputs"), _check_names(outputs, "outputs")
         self.dt, self.time_tolerance, self.new_step, self.options = dt, time_tolerance, resample, options
         if not self.inputs:
-            raise InputError("a recording needs at least one input; name its column.")
+            raise InputError(
+                "a recording needs at least one input; name its column. To merge a file of sensors only, read these as "
+                "inputs with outputs=(), and give merge the inputs and outputs of the result."
+            )
         known = [f.name for f in fields(Recording) if f.name not in ("u", "y", "dt", "inputs", "outputs")]
         for name in options:
             if name not in known:
@@ -240,8 +247,9 @@ class _Request:
         """These columns, and that of the time if it has another name."""
         return [*self.wanted, *(column for name, column in self.columns.items() if name in TIME_NAMES)]
 
-    def locate(self, names: Sequence[str], source: str) -> tuple[str | None, list[str]]:
+    def locate(self, table: CsvTable | ArrayTable) -> tuple[str | None, list[str]]:
         """Return the time column, or None, and the columns of the inputs and outputs."""
+        names, source = table.names, str(table.path)
         mapped = [column for name, column in self.columns.items() if name in TIME_NAMES]
         time = _find_time_column(names, mapped[0] if mapped else None, source)
         wanted = [find_column(column, names) for column in self.wanted]
@@ -269,38 +277,69 @@ class _Request:
                 raise InputError(f"{source} has {list(names).count(name)} columns named {name!r}; rename all but one.")
         if time is None and self.dt is None:
             _refuse_other_unit(names, source)
-            like = next((name for name in names if name.lower().startswith("t")), "COLUMN")
             raise InputError(
-                f"{source} has no time column; it has {listed(names)}: name one {' or '.join(TIME_NAMES)}, in "
-                f"seconds, map one, as in columns={{'t': {like!r}}}, or state the step with dt=STEP."
+                f"{source} has no time column; it has {listed(names)}: name one {' or '.join(TIME_NAMES)}, in seconds, "
+                f"map one, as in columns={{'t': {_guess_time(table, wanted)!r}}}, or state the step with dt=STEP."
             )
         return time, wanted
 
     def recording(self, table: CsvTable | ArrayTable) -> Recording:
         """Make the recording from the columns of a file."""
-        time, wanted = self.locate(table.names, str(table.path))
-        parts = table.columns(wanted, time)
+        time, wanted = self.locate(table)
+        hold = self.options.get("hold")
         if self.new_step is not None:
             assert time is not None
-            t = parts.pop()[:, 0]
-            parts = [even_grid(t, part, self.new_step, f"{table.path}: column {time!r}") for part in parts]
-            dt = float(self.new_step)
+            dt, (parts, hold) = float(self.new_step), self._resample(table, wanted, time)
         elif time is None:
             assert self.dt is not None
-            dt = float(self.dt)
+            dt, parts = float(self.dt), table.columns(wanted)
         else:
+            *parts, t = table.columns(wanted, time)
             label = f"{table.path}: column {time!r}"
-            dt = step_of(parts.pop()[:, 0], label, table.place, dt=self.dt, tolerance=self.time_tolerance)
+            dt = step_of(t[:, 0], label, table.place, dt=self.dt, tolerance=self.time_tolerance)
         n_u = len(self.inputs)
         u, y = np.hstack(parts[:n_u]), np.hstack([np.empty((len(parts[0]), 0)), *parts[n_u:]])
         names = _channel_names(self.inputs, parts[:n_u]), _channel_names(self.outputs, parts[n_u:])
-        found = zip((*self.inputs, *self.outputs), map(unit_in_brackets, wanted), strict=True)
+        found = zip((*self.inputs, *self.outputs), map(table.unit, wanted), strict=True)
         units = {name: unit for name, unit in found if unit and name in names[0] + names[1]}
         units |= self.options.get("units") or {}
         try:
-            return Recording(u, y, dt, *names, **{"name": table.path.stem, **self.options, "units": units})
+            options = {"name": table.path.stem, **self.options, "hold": hold, "units": units}
+            return Recording(u, y, dt, *names, **options)
         except InputError as error:
             raise InputError(f"{table.path}: {error}") from None
+
+    def _resample(
+        self, table: CsvTable | ArrayTable, wanted: list[str], time: str
+    ) -> tuple[list[np.ndarray], str | None]:
+        """Bring each channel from its own samples to the common step; return them and the inputs' hold.
+
+        Inputs stay held if they are, and each of their levels lasts at least a step.
+        """
+        assert self.new_step is not None
+        step, hold, n_u = float(self.new_step), self.options.get("hold"), len(self.inputs)
+        series = table.series(wanted, time)
+        inputs = [(t, column) for t, values in series[:n_u] for column in values.T]
+        held = hold == "zero" and all(levels_last(t, column, step) for t, column in inputs)
+        for i, (column, (t, _)) in enumerate(zip(wanted, series, strict=True)):
+            check_times(t, step, f"{table.path}: column {column!r}", held and i < n_u)
+        first, last = min(t[0] for t, _ in series), max(t[-1] for t, _ in series)
+        spans = [(t[0], last if held and i < n_u else t[-1]) for i, (t, _) in enumerate(series)]
+        try:
+            times = common_times(spans, step)
+        except InputError as error:
+            raise InputError(f"{table.path}: {error}") from None
+        stated = self.options.get("initial", "estimate")
+        if times[0] > first and not (isinstance(stated, str) and stated == "estimate"):
+            raise InputError(
+                f"{table.path}: the channels have values together from {times[0]:.6g} s on, but initial was stated for "
+                f"{first:.6g} s; leave initial out, or give each channel a value there."
+            )
+        parts = []
+        for i, (t, values) in enumerate(series):
+            bring = hold_at if held and i < n_u else partial(interpolate_at, smooth=i >= n_u)
+            parts.append(np.column_stack([bring(t, column, times, step) for column in values.T]))
+        return parts, "linear" if hold and not held else hold
 
 
 def _check_names(given: Any, role: str) -> tuple[str, ...]:
@@ -343,6 +382,21 @@ def _find_time_column(names: Sequence[str], chosen: str | None, source: str) -> 
     _refuse_other_unit(found, source)
     _refuse_other_unit(found, source, _IN_OTHER_UNIT)
     return found[0]
+
+
+def _guess_time(table: CsvTable | ArrayTable, wanted: Sequence[str]) -> str:
+    """Return the column that most likely holds the time: by its name, else the first one that rises evenly."""
+    others = [name for name in table.names if name not in wanted]
+    named = [name for name in others if {*re.findall(r"[a-z]+", name.lower())} & {*TIME_WORDS}]
+    if named:
+        return named[0]
+    for name in others[:MOST_TRIED]:
+        try:
+            step_of(table.columns([name])[0][:, 0], name, str)
+        except InputError:
+            continue
+        return name
+    return "COLUMN"
 
 
 def _refuse_other_unit(names: Sequence[str], source: str, pattern: re.Pattern[str] = _OTHER_UNIT) -> None:

@@ -6,6 +6,7 @@ samples that are not scored. It is immutable, and all code that receives one tru
 """
 
 import hashlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
@@ -14,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from .._base import REPAIR, InputError, is_number, is_whole, later, listed, positive, real_array, usable
-from .preprocessing import butterworth, change_step, remove_trend
+from .preprocessing import butterworth, change_step, hold_at, levels_last, remove_trend
 
 SAME_STEP = 1e-4  # relative difference up to which two steps count as the same; written times have few digits
 HOLDS = ("zero", "linear", None)
@@ -263,13 +264,15 @@ class Recording:
             If a cutoff is not below the Nyquist frequency, there are too few samples, or a name is unknown.
         """
         edited = self._edit_channels(lambda values: butterworth(values, self.dt, cutoff, kind, order), channels)
-        return replace(edited, hold=self._hold_after_smoothing(channels))
+        smooth = self.hold and set(self._select(channels)) & set(self.inputs)
+        return replace(edited, hold="linear" if smooth else self.hold)
 
     def resample(self, dt: float) -> Self:
         """Resample to another step in seconds; an anti-alias filter precedes a longer step.
 
-        The input is no longer held between samples, so a stated `hold` becomes `"linear"`. `skip` covers the same time
-        as before. A period that is not a whole number of new samples is dropped.
+        If `hold` is `"zero"` and each level of the inputs lasts at least a new step, an input becomes its mean over
+        each new step, and is held; else the hold becomes `"linear"`. `skip` covers the same time as before. A period
+        that is not a whole number of new samples is dropped.
 
         Raises
         ------
@@ -280,13 +283,17 @@ class Recording:
         u, y = (change_step(values, self.dt, dt) if values.shape[1] else values for values in (self.u, self.y))
         if u is self.u:
             return self
+        hold = self.hold
+        if hold == "zero" and all(levels_last(self.t, column, dt) for column in self.u.T):
+            u = np.column_stack([hold_at(self.t, column, np.arange(len(u)) * dt, dt) for column in self.u.T])
+        elif hold:
+            hold = "linear"
         skip = min(int(np.ceil(self.skip * self.dt / dt * (1 - SAME_STEP))), len(u) - 2)
         period = round((self.period or 0) * self.dt / dt)
         whole = bool(self.period) and abs(period * dt / ((self.period or 1) * self.dt) - 1) < SAME_STEP / period
         kept = period if whole and 2 <= period <= len(u) - skip else None
         initial = "estimate" if self.begins == "periodic" and kept is None else self.initial
         y = y if self.n_y else np.empty((len(u), 0))
-        hold = self._hold_after_smoothing(None)
         return replace(self, u=u, y=y, dt=dt, skip=skip, period=kept, initial=initial, hold=hold)
 
     def to_frame(self) -> Any:
@@ -321,10 +328,6 @@ class Recording:
     def _select(self, channels: Sequence[str] | str | None) -> tuple[str, ...]:
         """Return the given channels as a tuple of names; None stands for all of them."""
         return (*self.inputs, *self.outputs) if channels is None else as_tuple(channels)
-
-    def _hold_after_smoothing(self, channels: Sequence[str] | str | None) -> str | None:
-        """Return the hold after some channels were smoothed: a stated hold becomes linear if they include inputs."""
-        return "linear" if self.hold and set(self._select(channels)) & set(self.inputs) else self.hold
 
 
 def as_tuple(given: Any) -> tuple[Any, ...]:
@@ -379,21 +382,22 @@ def check_for_identification(
     free parameters. With `excited`, at least one input has to change.
     """
     recordings = as_recordings(data)
+    labels = _distinct_labels(recordings)
     first = recordings[0]
-    for r in recordings:
+    for label, r in zip(labels, recordings, strict=True):
         if not r.n_y:
-            raise InputError(f"{r.label} has no outputs, so nothing can be fitted to it; name the measured columns.")
-    for other in recordings[1:]:
+            raise InputError(f"{label} has no outputs, so nothing can be fitted to it; name the measured columns.")
+    for label, other in zip(labels[1:], recordings[1:], strict=True):
         for key in ("inputs", "outputs"):
             a, b = getattr(first, key), getattr(other, key)
             if a != b:
                 raise InputError(
-                    f"{other.label} has the {key} {listed(b)} and {first.label} has {listed(a)}; "
+                    f"{label} has the {key} {listed(b)} and {labels[0]} has {listed(a)}; "
                     "recordings fitted together need the same, in the same order."
                 )
         if abs(other.dt - first.dt) > SAME_STEP * first.dt:
             raise InputError(
-                f"{other.label} has a step of {other.dt:g} s and {first.label} one of {first.dt:g} s; "
+                f"{label} has a step of {other.dt:g} s and {labels[0]} one of {first.dt:g} s; "
                 "resample them to one step before fitting them together."
             )
     scored = sum(len(r) - r.skip for r in recordings)
@@ -406,16 +410,22 @@ def check_for_identification(
         inputs = (
             f"inputs {listed(first.inputs)} never change" if first.n_u > 1 else f"input {first.inputs[0]} never changes"
         )
-        raise InputError(
-            f"the {inputs} in {listed([r.label for r in recordings])}; nothing can be identified without excitation."
-        )
+        raise InputError(f"the {inputs} in {listed(labels)}; nothing can be identified without excitation.")
     for i, name in enumerate(first.outputs):
         if not any(_varies(r.y[r.skip :, i]) for r in recordings):
             raise InputError(
-                f"the output {name!r} never changes in {listed([r.label for r in recordings])}; check the sensor "
-                "or leave this output out."
+                f"the output {name!r} never changes in {listed(labels)}; check the sensor or leave this output out."
             )
     return recordings
+
+
+def _distinct_labels(recordings: Sequence[Recording]) -> list[str]:
+    """Return the recordings' names in messages, with a number, from 1 on, where several have the same or none."""
+    counts = Counter(r.name for r in recordings)
+    return [
+        r.label if counts[r.name] == 1 else f"recording {number}" + (f" ({r.name!r})" if r.name else "")
+        for number, r in enumerate(recordings, 1)
+    ]
 
 
 def _varies(x: np.ndarray) -> bool:

@@ -13,7 +13,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,8 @@ DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
 TIME_NAMES = ("t", "t_s", "time")
 WITH_UNIT = re.compile(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")  # such as "force [N]" or "speed (rad/s)"
 _IN_SECONDS = re.compile(r"(?:t|time)\s*[\[(]\s*(?:s|sec|secs|seconds?)\s*[\])]", re.IGNORECASE)
+NO_UNIT = ("", "1", "-")  # units that files state for numbers without one
+ONE_STEP = "bring all channels to one step with resample=STEP"
 LONGEST_TITLE = 100  # lines above the header of a CSV file, at most
 KINDS = {
     "c": "complex numbers",
@@ -54,14 +56,34 @@ class CsvTable:
 
     def columns(self, names: Sequence[str], time: str | None = None) -> list[Array]:
         """Return each named column as finite numbers, (M, 1); last the times, s, where dates count from the first."""
-        if time is not None:
-            if self._has_dates(time):
-                return [*self.columns(names), self._count_seconds(time)]
-            names = [*names, time]
+        parts = self._columns(names, time)
+        if any(np.isnan(part).any() for part in parts):
+            _refuse_slow_channels(self.path, names, parts)
+            self._read_cells([self.names.index(name) for name in names], np.zeros(len(names), dtype=bool))
+        return parts
+
+    def series(self, names: Sequence[str], time: str) -> list[tuple[Array, Array]]:
+        """Return each named column without its missing samples: their times (K,), s, and values (K, 1)."""
+        *parts, t = self._columns(names, time)
+        return [_present(self.path, name, t[:, 0], part) for name, part in zip(names, parts, strict=True)]
+
+    def unit(self, name: str) -> str:
+        """Return the unit of a column; empty if there is none."""
+        return unit_in_brackets(name)
+
+    def _columns(self, names: Sequence[str], time: str | None) -> list[Array]:
+        """Return each named column as numbers, (M, 1), nan where one is missing; last the times, none missing."""
+        if time is not None and self._has_dates(time):
+            return [*self._columns(names, None), self._count_seconds(time)]
+        names = [*names, time] if time is not None else names
         where = [self.names.index(name) for name in names]
-        numbers = self._read_at_once(where)
-        if numbers is None or not usable(numbers).all():
-            numbers = self._read_cells(where)
+        may_miss = np.array([name != time for name in names])
+        numbers = self._read_at_once(where, self.lines)
+        if numbers is None:
+            empty = rf"^(?={self.delimiter})|(?<={self.delimiter})(?={self.delimiter}|$)"
+            numbers = self._read_at_once(where, [re.sub(empty, "nan", line) for line in self.lines])
+        if numbers is None or not (usable(numbers) | (may_miss & np.isnan(numbers))).all():
+            numbers = self._read_cells(where, may_miss)
         return [numbers[:, i : i + 1] for i in range(len(names))]
 
     def texts(self, name: str) -> list[str]:
@@ -93,16 +115,17 @@ class CsvTable:
         rows = [i for i, line in enumerate(self.lines) if line.strip()]
         return f"line {self.first_line + rows[row]}"
 
-    def _read_at_once(self, where: Sequence[int]) -> Array | None:
+    def _read_at_once(self, where: Sequence[int], lines: Sequence[str]) -> Array | None:
         width = len(self.names) - 1
-        if any('"' in line or line.count(self.delimiter) != width for line in self.lines if line.strip()):
+        if any('"' in line or line.count(self.delimiter) != width for line in lines if line.strip()):
             return None
         try:
-            return np.loadtxt(self.lines, delimiter=self.delimiter, usecols=where, ndmin=2, comments=None)
+            return np.loadtxt(lines, delimiter=self.delimiter, usecols=where, ndmin=2, comments=None)
         except ValueError:
             return None
 
-    def _read_cells(self, where: Sequence[int]) -> Array:
+    def _read_cells(self, where: Sequence[int], may_miss: Array) -> Array:
+        """Read columns cell by cell; empty cells of columns that may miss samples become nan."""
         rows = []
         for line, text in enumerate(self.lines, self.first_line):
             if not text.strip():
@@ -113,7 +136,12 @@ class CsvTable:
                     f"{self.path}: line {line} has {len(cells)} cell(s) but the header names {len(self.names)}; "
                     f"{self._wrong_count(cells)}."
                 )
-            rows.append([self._value(cells[i], self.names[i], line) for i in where])
+            rows.append(
+                [
+                    np.nan if may and cells[i].lower() in ("", "nan") else self._value(cells[i], self.names[i], line)
+                    for i, may in zip(where, may_miss, strict=True)
+                ]
+            )
         return np.array(rows)
 
     def _wrong_count(self, cells: Sequence[str]) -> str:
@@ -131,7 +159,7 @@ class CsvTable:
                 raise InputError(f"{place} is empty; fill in a number or cut out that piece.")
             hint = "write a number there"
             if cell.count(",") == 1 and cell.replace(",", "").strip(" +-").isdigit():
-                hint = "write decimals with a point"
+                hint = "write all decimals with a point"
             raise InputError(f"{place} reads {cell.strip()[:40]!r}, which is not a number; {hint}.")
         if not usable(np.array(value)):
             raise InputError(f"{place} is {cell.strip()}; {REPAIR}.")
@@ -143,20 +171,53 @@ class ArrayTable:
     """The variables of a file other than CSV.
 
     An entry of `arrays` is an array, a function that reads one, or the error of reading it, which is raised when the
-    variable is used.
+    variable is used. `clocks` holds the times of each channel, s, in a file of several clocks; `units` holds the units
+    that the file states.
     """
 
     path: Path
     names: tuple[str, ...]
     arrays: Mapping[str, Any]
+    clocks: Mapping[str, Array] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def columns(self, names: Sequence[str], time: str | None = None) -> list[Array]:
         """Return each named variable, and last the times, as finite numbers, (M, channels).
 
         A row vector becomes a column.
         """
-        names = [*names, time] if time is not None else names
-        parts = [self._samples(name) for name in names]
+        first = next(iter(self.clocks), "")
+        for name, t in self.clocks.items():
+            if not np.array_equal(t, self.clocks[first]):
+                raise InputError(
+                    f"{self.path}: the channels {first!r} and {name!r} have different times ({len(self.clocks[first])} "
+                    f"and {len(t)} samples); {ONE_STEP}."
+                )
+        parts = self._columns(names, time)
+        if any(np.isnan(part).any() for part in parts):
+            _refuse_slow_channels(self.path, names, parts)
+            for name in names:
+                self._samples(name)
+        return parts
+
+    def series(self, names: Sequence[str], time: str) -> list[tuple[Array, Array]]:
+        """Return each named variable without its missing samples: their times (K,), s, and values (K, channels)."""
+        if self.clocks:
+            pairs = [(self.clocks[name], self._samples(name, may_miss=True)) for name in names]
+        else:
+            *parts, t = self._columns(names, time)
+            pairs = [(t[:, 0], part) for part in parts]
+        return [_present(self.path, name, *pair) for name, pair in zip(names, pairs, strict=True)]
+
+    def unit(self, name: str) -> str:
+        """Return the unit of a variable; empty if there is none."""
+        return self.units.get(name, "") or unit_in_brackets(name)
+
+    def _columns(self, names: Sequence[str], time: str | None) -> list[Array]:
+        """Return each named variable, (M, channels), nan where a sample is missing; last the times, none missing."""
+        parts = [self._samples(name, may_miss=True) for name in names]
+        if time is not None:
+            names, parts = [*names, time], [*parts, self._samples(time)]
         if len({len(part) for part in parts}) > 1:
             counts = ", ".join(f"{name} {len(part)}" for name, part in zip(names, parts, strict=True))
             raise InputError(f"{self.path} has vectors of different lengths ({counts} samples); give all the same.")
@@ -186,7 +247,8 @@ class ArrayTable:
             raise InputError(f"{self.path}: variable {name!r} is not an array; give a vector of real numbers.")
         return values
 
-    def _samples(self, name: str) -> Array:
+    def _samples(self, name: str, may_miss: bool = False) -> Array:
+        """Return a variable as finite numbers, (M, channels); samples that `may_miss` are nan."""
         values = self.array(name)
         if values.dtype.kind not in "biuf" or values.ndim > 2 or values.size == 0:
             kind = KINDS.get(values.dtype.kind, f"{values.dtype} numbers")
@@ -196,11 +258,30 @@ class ArrayTable:
             )
         column = values.reshape(-1, 1) if values.ndim < 2 or 1 in values.shape else values
         column = column.astype(float)
-        bad = np.argwhere(~usable(column))
+        bad = np.argwhere(~usable(column) & ~(may_miss & np.isnan(column)))
         if bad.size:
             k, i = bad[0]
             raise InputError(f"{self.path}: variable {name!r}, sample {k} is {column[k, i]}; {REPAIR}.")
         return column
+
+
+def _present(path: Path, name: str, t: Array, values: Array) -> tuple[Array, Array]:
+    """Leave out the samples of a channel at which a value is missing."""
+    there = ~np.isnan(values).any(axis=1)
+    if np.count_nonzero(there) < 2:
+        raise InputError(f"{path}: column {name!r} has {np.count_nonzero(there)} number(s); at least 2 are needed.")
+    return t[there], values[there]
+
+
+def _refuse_slow_channels(path: Path, names: Sequence[str], parts: Sequence[Array]) -> None:
+    """Refuse channels that usually miss samples between two others, rather than here and there."""
+    for name, part in zip(names, parts, strict=False):
+        there = np.flatnonzero(~np.isnan(part).any(axis=1))
+        if len(there) > 1 and np.median(np.diff(there)) >= 2:
+            raise InputError(
+                f"{path}: column {name!r} has numbers in {len(there)} of {len(part)} rows, as a channel of a slower "
+                f"rate; {ONE_STEP}."
+            )
 
 
 def frame_table(frame: Any, time_names: Sequence[str], wanted: Sequence[str]) -> ArrayTable:
@@ -255,7 +336,19 @@ def _open_csv(path: Path, wanted: Sequence[str]) -> CsvTable:
         top = rows.pop(0)
     if not rows:
         raise InputError(f"{path} has a header but no data below it; give one row for each sample.")
-    return CsvTable(path, names, delimiter, lines[top + 1 :], top + 2)
+    return CsvTable(path, names, delimiter, _with_decimal_points(lines[top + 1 :], delimiter), top + 2)
+
+
+def _with_decimal_points(lines: list[str], delimiter: str) -> list[str]:
+    """Replace decimal commas by points, unless they may separate cells or thousands, or a number has a point."""
+    if delimiter == "," or not any("," in line for line in lines):
+        return lines
+    text = "\n".join(lines)
+    decimal = r"(?<![\d,])(\d*),(\d*)(?![\d,])"
+    if all(len(end) == 3 and 0 < len(begin) <= 3 and begin[0] != "0" for begin, end in set(re.findall(decimal, text))):
+        return lines
+    with_point = rf'(?:^|{delimiter})[ "]*[+-]?\d*\.\d*(?:[eE][+-]?\d+)?[ "]*(?:$|{delimiter})'
+    return lines if re.search(with_point, text, re.MULTILINE) else re.sub(decimal, r"\1.\2", text).split("\n")
 
 
 def _find_header(
@@ -393,7 +486,7 @@ def _parquet_column(path: Path, index: int) -> Array:
 
 
 def _open_mdf(path: Path, wanted: Sequence[str] = ()) -> ArrayTable:
-    """Read the `wanted` channels of an MDF file, in physical units, and their common times as ``t``."""
+    """Read the `wanted` channels of an MDF file, in physical units, and the times of the first as ``t``."""
     with _report_parser_errors(path, "an MDF file", "save it again as MDF 4"):
         try:
             from asammdf import MDF
@@ -410,18 +503,14 @@ def _open_mdf(path: Path, wanted: Sequence[str] = ()) -> ArrayTable:
         if mdf is None:
             raise ValueError(failed)
         with mdf:
-            clocks = {mdf.groups[i].channels[k].name for i, k in mdf.masters_db.items()}
-            names = [name for name in mdf.channels_db if name not in clocks]
+            masters = {mdf.groups[i].channels[k].name for i, k in mdf.masters_db.items()}
+            names = [name for name in mdf.channels_db if name not in masters]
             signals = {name: mdf.get(name) for name in dict.fromkeys(wanted) if name in names}
-            times = [signal.timestamps for signal in signals.values()] or [mdf.get_master(0)]
-    for name, t in zip(signals, times, strict=False):
-        if not np.array_equal(t, times[0]):
-            raise InputError(
-                f"{path}: the channels {next(iter(signals))!r} and {name!r} have different times ({len(times[0])} and "
-                f"{len(t)} samples); write them with one raster, as MDF.resample of asammdf does."
-            )
-    arrays = {"t": times[0], **{name: signal.samples for name, signal in signals.items()}}
-    return ArrayTable(path, tuple(dict.fromkeys(["t", *names])), arrays)
+            clocks = {name: signal.timestamps for name, signal in signals.items()}
+            times = next(iter(clocks.values())) if clocks else mdf.get_master(0)
+    arrays = {"t": times, **{name: signal.samples for name, signal in signals.items()}}
+    units = {name: signal.unit.strip() for name, signal in signals.items() if signal.unit.strip() not in NO_UNIT}
+    return ArrayTable(path, tuple(dict.fromkeys(["t", *names])), arrays, clocks, units)
 
 
 @contextlib.contextmanager

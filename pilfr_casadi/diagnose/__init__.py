@@ -2,23 +2,17 @@
 
 A hypothesis is the simulator with laws in its ports. All hypotheses are fitted to the same recordings and compared by
 one log evidence; verdict, effects and confidence are sums over their posterior. `pipeline` shows how an answer comes
-about. The files by stage:
+about. Folders and files by stage:
 
-- The whole: `pipeline` (the steps in their order), `workbench` (what all steps share).
+- `fits`: a simulator fitted to recordings, the noise, the screen of laws, and the evidence on which all is compared.
+- `faults`: what may be wrong with recordings, and the rule by which a fault is accepted and corrected.
+- `search`: the hypotheses, and the moves from one to others.
 - Preparation: `arguments` checks the arguments. `prediction` stabilises an unstable simulator with an observer.
-  `preparation` checks the recordings. A check corrects a fault where it finds one; `gates` is what a finding is and
-  when it is accepted. The faults: `channel_faults` (sign, unit or gain, exchange), `offsets`, `recording_faults`
-  (glitches, stale and clipped samples, unsettled periods, tones), `timing` (shift, clock) and `lost_samples`. `floor`
-  estimates the noise, and `coloured_noise` tells slow noise from missing physics.
-- Long recordings: `stretches` chooses what the search sees of them, and fits the leading hypotheses to everything.
-- Search: `hypotheses` keeps what was fitted, with its evidence. `search` moves from one hypothesis to others.
-  `linearise`, `screen` and `relatives` select those that are worth a fit, `trials` fits them. `learned` fits forces
-  that have no name yet.
-- Evidence: `evidence` is the one scale: log evidence, prior of laws, errors on held-out data, and a table of the
-  numbers on which answers rest. `verdict` turns the evidences into a posterior and a verdict.
-- Correction: `correction` chooses the corrected simulator, with a learned force where named laws do not suffice.
-- Other explanations: `other_explanations` (a pinned value, an undeclared port, a machine that changed).
-- Proof: `proof` (errors before and after, placebo, next experiment), `force_recovery`, `mismatch_map`.
+  `preparation` checks the recordings for faults, in order.
+- Answer: `verdict` turns the evidences into a posterior and a verdict. `correction` chooses the corrected simulator,
+  with a learned force where named laws do not suffice. `other_explanations` weighs a pinned value, an undeclared port,
+  and a machine that changed.
+- Proof: `proof` (errors before and after, placebo, next experiment), `mismatch_map`.
 - Result: `answer` puts it together, `result` is what users hold, an `effect` is a law that was found, and `refinement`
   puts a Prandtl-Ishlinskii layer in place of the hysteresis that was found.
 - After a diagnosis: `replication` fits laws that were found to the recordings of further machines.
@@ -45,20 +39,21 @@ if TYPE_CHECKING:
     )
     from .blind_spots import BlindSpot as BlindSpot, Check as Check, check as check
     from .effect import Effect as Effect
-    from .evidence import SURE as SURE
-    from .force_recovery import (
+    from .faults.gates import Gate as Gate
+    from .fits.evidence import SURE as SURE
+    from .fits.force_recovery import (
         HiddenForce as HiddenForce,
         hidden_force as hidden_force,
         law_signals as law_signals,
     )
-    from .gates import Gate as Gate
-    from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
-    from .linearise import port_signals as port_signals
+    from .fits.linearise import port_signals as port_signals
+    from .fits.workbench import Fitted as Fitted, Workbench as Workbench
     from .mismatch_map import mismatch as mismatch
     from .refinement import Refinement as Refinement
     from .replication import (
         Replication as Replication,
         Values as Values,
+        find_channel_faults as find_channel_faults,
         refit_error as refit_error,
         replicate as replicate,
     )
@@ -67,7 +62,7 @@ if TYPE_CHECKING:
         BeforeAfter as BeforeAfter,
         Diagnosis as Diagnosis,
     )
-    from .workbench import Fitted as Fitted, Workbench as Workbench
+    from .search.learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
     __all__.append("diagnose")

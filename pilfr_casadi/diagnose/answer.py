@@ -13,19 +13,20 @@ import numpy as np
 from .._base import InputError, in_words
 from ..data import Recording
 from ..identify import surrogate_warning
-from ..laws import readable_unit, short_name
+from ..laws import Law, display_name, readable_unit, short_name
 from ..simulators import Placed, in_series, name_at, split_port
 from .arguments import Request
 from .blind_spots import BlindSpot, assess_recordings
-from .channel_faults import IN_RECORDINGS, find_gross_slips
 from .correction import Correction
 from .effect import Effect
-from .evidence import FAR_RATIO, NEAR_RATIO, SURE, deviations
-from .force_recovery import is_curve_along
-from .gates import EQUAL_RATIO, TEST_FAULT, Gate, edited
+from .faults.channels import IN_RECORDINGS, find_gross_slips
+from .faults.gates import EQUAL_RATIO, TEST_FAULT, Gate, edited
+from .faults.offsets import Offset, remove_idle_offsets, update_offsets
+from .fits.evidence import FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, SURE, deviations
+from .fits.force_recovery import is_curve_along
+from .fits.workbench import Fitted, Workbench
 from .identifiability import port_units
 from .mismatch_map import mismatch
-from .offsets import Offset, remove_idle_offsets, update_offsets
 from .preparation import Prepared
 from .proof import (
     Comparison,
@@ -36,10 +37,9 @@ from .proof import (
     test_errors,
 )
 from .result import Diagnosis
-from .search import Search
-from .trials import Trial
+from .search.moves import Search
+from .search.trials import Trial
 from .verdict import NamedEffect, Verdict, names
-from .workbench import Fitted, Workbench
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,14 +84,15 @@ def build_diagnosis(
     bench, without, after = final.bench, final.without, final.after
     std = deviations(bench, after)
     errors, fewer, compared, test_notes = _compute_errors(request, search, found, final, tests)
-    effects = tuple(_make_effect(search, e, final, std, fewer.get(e, np.nan)) for e in found.effects)
+    decided = found.decided or search
+    forms = {e: _other_forms(decided, found.effects, e) for e in found.effects}
+    effects = tuple(_make_effect(search, e, final, std, forms[e], fewer.get(e, np.nan)) for e in found.effects)
     floor = search.least_floor if found.verdict.kind == "unexplained" else search.floor
     floors = {"nrmse": floor, "white": search.least_floor}
     settled = found.verdict.kind in ("complete", "recording-fault") or (
         min((e.confidence for e in effects), default=0) > SURE
     )
     simulated = [e + r.y for e, r in zip(without.residual, bench.recordings, strict=True)]
-    decided = found.decided or search
     experiment = _design_experiment(decided, found.effects, limits)
     blind_spots = _blind_spots(request, ready, search)
     request.say("proof", 1, 1)
@@ -133,6 +134,7 @@ def build_diagnosis(
         freed=found.freed,
         correction=found.correction,
         blind_spots=blind_spots,
+        calls={n: count - request.calls[n] for n, count in request.simulator.program_calls.items()},
     )
 
 
@@ -278,7 +280,12 @@ def _without_each_effect(search: Search, found: Conclusion) -> dict[NamedEffect,
 
 
 def _make_effect(
-    search: Search, named: NamedEffect, final: FinalFits, std: dict[str, np.ndarray], test_without: float
+    search: Search,
+    named: NamedEffect,
+    final: FinalFits,
+    std: dict[str, np.ndarray],
+    other_forms: Sequence[Law],
+    test_without: float,
 ) -> Effect:
     bench, fitted = search.bench, final.after
     element = next(e for e in fitted.simulator.elements if (e.port, e.law.id) == named.name)  # its form may differ
@@ -302,6 +309,9 @@ def _make_effect(
     remarks = [law.remark(element.own(fitted.values)), *_order(fitted, element)]
     if law.turns and is_curve_along(bench, final.drawn[1], fitted.simulator.elements.index(element)):
         remarks.append("these recordings do not show its memory: a curve follows them as well")
+    if other_forms:
+        others = in_words([display_name(other.id, other.form) for other in other_forms])
+        remarks.append(f"{others} {'are' if other_forms[1:] else 'is'} about as likely")
     return Effect(
         port=element.port,
         law=law.id,
@@ -315,6 +325,20 @@ def _make_effect(
         test_without=test_without,
         at_port=named.at_port,
     )
+
+
+def _other_forms(search: Search, effects: Sequence[NamedEffect], effect: NamedEffect) -> list[Law]:
+    """List the laws of no more parameters that make another form of an effect about as likely, the likeliest first."""
+    stated, law = {e.name for e in effects}, effect.element.law
+    alike = [t for t in search.memo.values() if names(t) == stated]
+    own = [t for t in alike if any(type(e.law) is type(law) for e in t.effects)]
+    least = max(map(search.evidence, own), default=np.inf) - INDISTINGUISHABLE_NATS
+    found = dict[str, Law]()
+    for t in sorted((t for t in alike if search.evidence(t) > least), key=search.evidence, reverse=True):
+        for e in t.effects:
+            if (e.port, e.law.id) == effect.name and len(e.law.units) <= len(law.units):
+                found.setdefault(e.law.form, e.law)
+    return [other for form, other in found.items() if form != law.form]
 
 
 def _order(fitted: Fitted, element: Placed) -> Iterator[str]:

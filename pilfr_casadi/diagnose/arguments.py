@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,8 +23,8 @@ from ..laws import (
     seen_by,
 )
 from ..simulators import Simulator, as_simulator
-from .gates import Gate, edited
-from .stretches import Stretches
+from .faults.gates import Gate, edited
+from .search.stretches import Stretches
 
 FEWEST_SHARED = 20  # equal samples in a row that cannot be chance, where the outputs move
 FEWEST_SAMPLES = 20  # samples in all training recordings together; fewer cannot determine a model
@@ -50,6 +50,7 @@ class Request:
     aligned: bool = False  # whether the times of the channels are settled
     edits: tuple[Gate, ...] = ()  # corrections that `recordings` have already
     nominal: float = np.nan  # error at the user's values before these
+    calls: Mapping[str, int] = field(default_factory=dict)  # of the simulator's programs before
 
     def corrected(self, edits: Sequence[Gate], nominal: float, stage: str) -> Request:
         """Return the request with recordings corrected by further edits; its stages are shown under another name."""

@@ -20,9 +20,13 @@ from ..data import Recording
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings, stated_hold
-from .channel_faults import accept_best, find_gross_slips, refit_corrected
-from .floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor, noise_floor
-from .gates import USELESS_FIT, Checked, refit
+from .faults.channels import accept_best, find_gross_slips, refit_corrected
+from .faults.gates import USELESS_FIT, Checked, refit
+from .faults.offsets import WrongStart, find_wrong_start
+from .faults.samples import find_held_outputs
+from .fits.floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor, noise_floor
+from .fits.linearise import Probe, Run, linearise_runs
+from .fits.workbench import QUICK, Fitted, Workbench
 from .identifiability import (
     SMALL_SHARE,
     LawRow,
@@ -36,10 +40,7 @@ from .identifiability import (
     live_ports,
     port_units,
 )
-from .linearise import Probe, Run, linearise_runs
-from .offsets import WrongStart, find_wrong_start
 from .preparation import choose_hold
-from .workbench import QUICK, Fitted, Workbench
 
 SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
 
@@ -304,18 +305,21 @@ def check(
         now = choose_hold(now, QUICK)[0]
     now = find_wrong_start(now)
     bench, fitted, faults = now.bench, now.fitted, now.gates
+    slow = find_held_outputs(recordings)
     bench.interrupt.raise_pending()  # half a fit would tell wrong things
     bench.check_followed(fitted)
     floor = noise_floor(bench.recordings, bench.scored(fitted.residual))
     found = assess_recordings(bench, fitted, floor, stated or "", laws)
-    if not faults:
+    if not (faults or slow):
         return found
-    told = [f.sentence + " Below, it is corrected." * f.corrected for f in faults]
-    spots = (BlindSpot("recording-fault", (f.channel,), text) for f, text in zip(faults, told, strict=True))
+    told = [f.sentence + " Below, it is corrected." * f.corrected for f in (*faults, *slow)]
+    spots = (BlindSpot("recording-fault", (f.channel,), text) for f, text in zip((*faults, *slow), told, strict=True))
     wired = [f.channel for f in faults if not isinstance(f, WrongStart)]
     advice = [f"Correct the recordings first: check wiring, sign and unit of {in_words(wired)}."] if wired else []
     if len(wired) < len(faults):
         advice.append("State how the recordings begin: give each state's value, or leave the start unknown.")
+    if slow:
+        advice.append(f"Leave the repeated values of {in_words([f.channel for f in slow])} out first.")
     estimated = any(isinstance(f, WrongStart) and f.corrected for f in faults)
     starts = tuple(START_WORDS[r.begins] + ", here estimated" * estimated for r in recordings)
     return replace(found, blind_spots=(*spots, *found.blind_spots), next_record=" ".join(advice), starts=starts)

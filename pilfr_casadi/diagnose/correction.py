@@ -21,14 +21,14 @@ import numpy as np
 from .._base import InputError
 from ..laws import CATALOGUE
 from ..simulators import name_at
-from .evidence import FORMULA_ERROR, NEAR_RATIO, SURE, HeldOut, runs_away
-from .floor import Floor
-from .hypotheses import likeliest
-from .learned import Learned, LearnedForce, describe_learned, refit_learned
-from .search import Search
-from .trials import Trial
+from .fits.evidence import FORMULA_ERROR, NEAR_RATIO, SURE, HeldOut, runs_away
+from .fits.floor import Floor
+from .fits.workbench import FEW, Fitted
+from .search.hypotheses import likeliest
+from .search.learned import Learned, LearnedForce, describe_learned, refit_learned
+from .search.moves import Search
+from .search.trials import Trial
 from .verdict import Posterior, explainable_remainder, names, share_left
-from .workbench import FEW, Fitted
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..simulators import EQUATION, PARAMETER, in_series, name_at, split_port
-from .evidence import SURE
+from .fits.evidence import SURE
 
 
 @dataclass(frozen=True, eq=False)

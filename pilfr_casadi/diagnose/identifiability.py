@@ -28,10 +28,10 @@ from ..data import Recording
 from ..laws import CATALOGUE, Law, readable_unit
 from ..models import map_points
 from ..simulators import ACTUATOR, EQUATION, Port, Simulator, port_name, split_port, stack
-from .evidence import prior_width
-from .linearise import Probe, Run, sample_run
-from .screen import Remainder, Task, lengths, orthonormal, own_changes, project_off
-from .workbench import Fitted, Workbench
+from .fits.evidence import prior_width
+from .fits.linearise import Probe, Run, sample_run
+from .fits.screen import Remainder, Task, lengths, orthonormal, own_changes, project_off
+from .fits.workbench import Fitted, Workbench
 
 LARGEST_EXPONENT = 3  # in numerators and denominators; physical laws have small exponents
 TRIAL_FACTOR = 1.1  # factor of a trial step that distinguishes a product from a sum; they differ by a twentieth of it

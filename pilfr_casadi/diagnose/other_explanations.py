@@ -21,8 +21,7 @@ from .._base import InputError, listed
 from ..data import Recording
 from ..laws import display_name
 from ..simulators import UNKNOWN, Placed, in_series, name_at
-from .evidence import AT_NOISE_RATIO, BETTER_RATIO, CONTENDING_NATS, FAR_RATIO, NEAR_RATIO, SURE, deviations
-from .gates import (
+from .faults.gates import (
     CERTAIN_ERRORS,
     CURED_SHARE,
     EQUAL_RATIO,
@@ -34,11 +33,12 @@ from .gates import (
     open_start,
     refit,
 )
-from .linearise import simulate_states
-from .search import Search
-from .trials import Trial
+from .fits.evidence import AT_NOISE_RATIO, BETTER_RATIO, CONTENDING_NATS, FAR_RATIO, NEAR_RATIO, SURE, deviations
+from .fits.linearise import simulate_states
+from .fits.workbench import FEW, THOROUGH, Fitted, Workbench
+from .search.moves import Search
+from .search.trials import Trial
 from .verdict import Posterior, posterior, strained
-from .workbench import FEW, THOROUGH, Fitted, Workbench
 
 # factors on a parameter's start value that are tried if the refit says nothing
 DECADES = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3)

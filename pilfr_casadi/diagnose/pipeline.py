@@ -60,10 +60,13 @@ from .arguments import (
     stated_hold,
 )
 from .correction import find_correction, named_correction
-from .evidence import AS_GIVEN_RATIO, SURE
-from .floor import Floor, measured_floor
-from .gates import EQUAL_RATIO, LEAST_GAIN, USELESS_FIT, Checked, Gate, gain
-from .offsets import Offset, WrongStart, fix_idle_offsets, list_offsets
+from .faults.gates import EQUAL_RATIO, LEAST_GAIN, USELESS_FIT, Checked, Gate, gain
+from .faults.offsets import Offset, WrongStart, fix_idle_offsets, list_offsets
+from .faults.samples import find_clipped_input, find_tones, open_unsettled, remove_glitches
+from .faults.timing import TimeShift
+from .fits.evidence import AS_GIVEN_RATIO, SURE
+from .fits.floor import Floor, measured_floor
+from .fits.workbench import RunsAway, converge
 from .other_explanations import (
     find_pinned_parameters,
     find_undeclared_port,
@@ -72,15 +75,12 @@ from .other_explanations import (
     may_act_elsewhere,
 )
 from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
-from .preparation import CHECKS, Prepared, conversions, hold_note, prepare
+from .preparation import CHECKS, Prepared, conversions, hold_note, prepare, slow_note
 from .proof import errors_of
-from .recording_faults import find_clipped_input, find_tones, open_unsettled, remove_glitches
 from .result import Diagnosis
-from .search import Search
-from .stretches import SEARCHED_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
-from .timing import TimeShift
+from .search.moves import Search
+from .search.stretches import SEARCHED_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
 from .verdict import Posterior, Verdict, judge, names, posterior
-from .workbench import RunsAway, converge
 
 # shares of the remaining time for the preparation, and for preparation and search; the rest is for the correction
 PREPARATION_SHARE, SEARCH_SHARE = 0.35, 0.7
@@ -119,6 +119,8 @@ def diagnose_in_steps(
     check_limits(simulator, limits)
     tried = (*add_scaled_laws(check_laws(laws), simulator), *((VaryingParameter,) if laws is None else ()))
     deadline = np.inf if time_limit is None else began + float(time_limit)
+    calls, slow = simulator.program_calls, slow_note(simulator, recordings)
+    say = say.under(f"{slow[0].value:.2g} s a simulation: ") if slow else say
     request = Request(
         simulator,
         recordings,
@@ -131,7 +133,8 @@ def diagnose_in_steps(
         deadline,
         say,
         focus,
-        notes=conversions(simulator, given),
+        notes=(*conversions(simulator, given), *slow),
+        calls=calls,
     )
     most = SEARCHED_SAMPLES if search_samples is None else whole(search_samples, "search_samples", FEWEST_SAMPLES)
     request, ready, search = _search_with_focus(_on_stretches(request, most))

@@ -28,9 +28,9 @@ from .._base import InputError
 from ..data import Recording
 from ..linear import steady_state_gain
 from ..simulators import Simulator, discretise, growth_rate
-from .gates import USELESS_FIT, Gate, refit
-from .linearise import linearise_runs
-from .workbench import MOST_GROWTH, Fitted, Workbench
+from .faults.gates import USELESS_FIT, Gate, refit
+from .fits.linearise import linearise_runs
+from .fits.workbench import MOST_GROWTH, Fitted, Workbench
 
 FOCUS = "simulation", "prediction"
 ROUNDING = 1e-9  # share of the largest entry that counts as zero

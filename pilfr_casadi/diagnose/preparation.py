@@ -13,14 +13,14 @@ from functools import partial
 
 import numpy as np
 
-from .._base import InputError, Stages, UntilInterrupted
+from .._base import InputError, Stages, UntilInterrupted, in_words
 from ..data import Recording
+from ..engine import make_engine
 from ..optimise import GaussNewton, Status
-from ..simulators import Simulator, unit_factor, unit_notes
+from ..simulators import Simulator, discretise_for, unit_factor, unit_notes
 from .arguments import stated_hold
-from .channel_faults import accept_best, find_gross_slips, find_slips, open_bench, refit_corrected
-from .floor import Floor, pool, white_part
-from .gates import (
+from .faults.channels import accept_best, find_gross_slips, find_slips, open_bench, refit_corrected
+from .faults.gates import (
     CURED_SHARE,
     EQUAL_RATIO,
     NEAR_NOISE_RATIO,
@@ -29,13 +29,14 @@ from .gates import (
     Gate,
     refit,
 )
-from .linearise import linearise_runs, observer_gain, sample_run
-from .lost_samples import find_gaps, find_output_gaps
-from .offsets import find_offsets, find_wrong_start
+from .faults.lost_samples import find_gaps, find_output_gaps
+from .faults.offsets import find_offsets, find_wrong_start
+from .faults.samples import find_held_outputs, mend_stale_samples, open_unsettled, remove_glitches, unclip
+from .faults.timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps
+from .fits.floor import Floor, pool, white_part
+from .fits.linearise import linearise_runs, observer_gain, sample_run
+from .fits.workbench import THOROUGH, Fitted, Workbench, refine_steps
 from .proof import errors_of
-from .recording_faults import mend_stale_samples, open_unsettled, remove_glitches, unclip
-from .timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps
-from .workbench import THOROUGH, Fitted, Workbench, refine_steps
 
 CHECKED_ABOVE = 4e-4  # mean square error up to which signs and units are not checked
 CHECKS, CHECKED = "checks and refit", 6  # the stage's name, and the number of its parts that are reported
@@ -44,6 +45,8 @@ UNCHECKED = (
     "Some checks of the recordings were left out, because the time was over or somebody interrupted them: a shift, a "
     "gap or an offset of a channel may have been missed."
 )
+TIMED_SAMPLES = 50  # samples whose simulation is timed
+LONG_SIMULATION = 1.0  # seconds that a simulation takes without a note
 OBSERVER_GAINS = (1.0, 0.3, 0.1, 0.03, 0.01)  # gains of the observer, in turn
 
 
@@ -87,9 +90,10 @@ def prepare(
     say(CHECKS, 0, CHECKED)
     recordings, spikes = remove_glitches(recordings)
     recordings, transients = open_unsettled(recordings)
+    slow = find_held_outputs(recordings)
     said = stated_hold(simulator, recordings, hold)
     bench, times = open_bench(simulator, recordings, said or "zero", engine)
-    checks, noted = _Checks(workers, early, say, until), (*spikes, *transients, *times)
+    checks, noted = _Checks(workers, early, say, until), (*spikes, *transients, *slow, *times)
     held: Sequence[Gate] = ()
     try:
         first = checks.begin(bench, noted)
@@ -306,6 +310,32 @@ def conversions(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[
         for name, sentence in unit_notes(simulator, r).items()
     }
     return tuple(found.values())
+
+
+def slow_note(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Gate, ...]:
+    """Note how long a simulation of all recordings takes, if the simulator calls programs and it takes long.
+
+    A short piece is simulated; the value of the note is the time in s.
+    """
+    if not simulator.program_calls:
+        return ()
+    piece = recordings[0].slice(0, TIMED_SAMPLES)
+    try:
+        model = discretise_for(simulator, [piece])
+        engine, drive = make_engine(model, "vm"), model.drive(piece)
+        began = time.perf_counter()
+        engine.simulate(drive, model.parameters.start, np.zeros(model.n_state))
+    except InputError:  # what is wrong is said where all of the recordings are simulated
+        return ()
+    seconds = (time.perf_counter() - began) * sum(map(len, recordings)) / len(piece)
+    if seconds < LONG_SIMULATION:
+        return ()
+    words = (
+        f"A simulation of the training recordings takes about {seconds:.2g} s, because it calls "
+        f"{in_words(list(simulator.program_calls))} at every step, and each fit takes hundreds of simulations. Give "
+        "shorter recordings, or equations, or more time (time_limit, --time-limit)."
+    )
+    return (Gate("simulation", "slow", seconds, words, corrected=False),)
 
 
 def hold_note(simulator: Simulator, hold: str, ratio: float) -> Gate:

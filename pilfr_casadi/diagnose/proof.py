@@ -16,12 +16,12 @@ from ..laws import Law
 from ..models import Model
 from ..optimise import StatePrior
 from ..simulators import Simulator, discretise
-from .evidence import BETTER_RATIO
-from .floor import effective_size
-from .gates import Gate, edited
-from .linearise import linearise_runs, simulate_states
-from .screen import RIDGES, Remainder, held_out
-from .workbench import Fitted, Workbench
+from .faults.gates import Gate, edited
+from .fits.evidence import BETTER_RATIO
+from .fits.floor import effective_size
+from .fits.linearise import linearise_runs, simulate_states
+from .fits.screen import RIDGES, Remainder, held_out
+from .fits.workbench import Fitted, Workbench
 
 PRIOR_SAMPLES = 20_000  # samples of the training runs at most, about, that a prior of initial states is taken from
 AMPLITUDES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest

@@ -35,11 +35,11 @@ from ..identify import regrid
 from ..laws import OPERATORS, Law, Local, display_name, hysteresis_layer, unit_forces
 from ..models import check_size, play
 from ..simulators import Placed, Simulator, discretise, in_series, on_grid
-from .evidence import HeldOut, Sample, held_out_errors, spread
-from .floor import effective_size
-from .force_recovery import signals_along
-from .search import Search
-from .workbench import THOROUGH, Fitted, Workbench
+from .fits.evidence import HeldOut, Sample, held_out_errors, spread
+from .fits.floor import effective_size
+from .fits.force_recovery import signals_along
+from .fits.workbench import THOROUGH, Fitted, Workbench
+from .search.moves import Search
 
 FINE_THRESHOLDS = 40  # thresholds of each of the two fine grids that estimate the density of weights
 BENDS = (-0.2, 0.0, 0.2)  # tried bends of generalized plays, a_2 times the largest |z|, as in the catalogue

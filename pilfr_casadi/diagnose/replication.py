@@ -25,12 +25,13 @@ from ..data import Recording
 from ..laws import Law
 from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
 from .arguments import match_recordings, stated_hold
-from .evidence import FORMULA_ERROR, Sample, deviations, information, log_evidence, log_prior, prior_width
-from .floor import effective_size, measured_floor, third_differences
-from .gates import Checked, refit
-from .linearise import sample_run
-from .trials import Trials
-from .workbench import FINER_STEPS, THOROUGH, Fitted, Workbench
+from .faults.channels import accept_best, find_gross_slips
+from .faults.gates import Checked, refit
+from .fits.evidence import FORMULA_ERROR, Sample, deviations, information, log_evidence, log_prior, prior_width
+from .fits.floor import effective_size, measured_floor, third_differences
+from .fits.linearise import sample_run
+from .fits.workbench import FINER_STEPS, THOROUGH, Fitted, Workbench
+from .search.trials import Trials
 
 STEP_ACCURACY = 0.25  # standard errors by which finer steps may change a value: 3 % of it, added in squares
 THIRD_DIFFERENCES = 2.31  # 1 + 2 Σ ρ² of third differences of white noise
@@ -77,6 +78,23 @@ def refit_error(simulator: Any, recordings: Any, *, hold: str | None = None, eng
     fitted = bench.fit(bench.simulator, solver=THOROUGH)
     bench.interrupt.raise_pending()
     return bench.nrmse(fitted)
+
+
+@one_blas_thread
+def find_channel_faults(
+    simulator: Any, recordings: Any, *, hold: str | None = None, engine: str = "auto"
+) -> tuple[str, ...]:
+    """Describe wrong signs and units and exchanged channels that show at the simulator's values.
+
+    The simulator is refitted only if one is suspected. For arguments and errors see `replicate`.
+    """
+    bench = _bench(simulator, recordings, hold, engine)
+    slips = find_gross_slips(bench)
+    if not slips:
+        return ()
+    now = accept_best(Checked(bench, refit(bench) or bench.run_given(bench.simulator)), slips)
+    bench.interrupt.raise_pending()
+    return tuple(fault.sentence for fault in now.gates)
 
 
 def _bench(simulator: Any, recordings: Any, hold: str | None, engine: str) -> Workbench:

@@ -20,14 +20,14 @@ from ..simulators import ACTUATOR, Simulator, discretise, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
 from .effect import Effect
-from .evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, SURE
-from .floor import ABOVE_NOISE
-from .gates import TEST_FAULT, Gate, edited
-from .learned import Learned
-from .offsets import Offset
+from .faults.gates import TEST_FAULT, Gate, edited
+from .faults.offsets import Offset
+from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, SURE
+from .fits.floor import ABOVE_NOISE
+from .fits.workbench import Fitted, output_deviation
 from .proof import Started
 from .refinement import Refinement, refine
-from .workbench import Fitted, output_deviation
+from .search.learned import Learned
 
 VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
@@ -101,6 +101,8 @@ class Diagnosis:
         among `effects` predict unseen data better than the refit but have no sure name.
     blind_spots : tuple of BlindSpot
         Facts that the recordings cannot reveal, the gravest first; see `check`.
+    calls : dict
+        How often the diagnosis called functions that have no equations, by name; see `Numeric`.
     """
 
     verdict: str
@@ -127,6 +129,7 @@ class Diagnosis:
     freed: str = ""
     correction: Correction | None = None
     blind_spots: tuple[BlindSpot, ...] = ()
+    calls: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def sure(self) -> bool:
@@ -498,7 +501,8 @@ class Diagnosis:
         lines += [f"note: {text}" for text in (*further, *self.warnings())]
         if self.next_experiment:
             lines.append(f"next experiment: {self.next_experiment['sentence']}")
-        lines.append(f"computed in {self.seconds:.{1 if self.seconds < 10 else 0}f} s")
+        calls = "".join(f", {count} calls of {name}" for name, count in self.calls.items() if count)
+        lines.append(f"computed in {self.seconds:.{1 if self.seconds < 10 else 0}f} s{calls}")
         return "\n".join(lines)
 
     __repr__ = __str__

@@ -29,7 +29,9 @@ import numpy as np
 
 from .._base import in_words
 from ..simulators import SENSOR, Placed, name_at, name_at_any, port_name
-from .evidence import (
+from .faults.gates import Gate
+from .faults.samples import find_ringing_mode
+from .fits.evidence import (
     AT_NOISE_RATIO,
     BETTER_RATIO,
     COLOURED_NOISE_RATIO,
@@ -53,12 +55,10 @@ from .evidence import (
     WHITE_NOISE_RATIO,
     significance,
 )
-from .floor import ABOVE_NOISE, Floor, swells_with, times_white, white_part
-from .gates import Gate
-from .hypotheses import Hypotheses
-from .recording_faults import find_ringing_mode
-from .trials import Trial
-from .workbench import Fitted
+from .fits.floor import ABOVE_NOISE, Floor, swells_with, times_white, white_part
+from .fits.workbench import Fitted
+from .search.hypotheses import Hypotheses
+from .search.trials import Trial
 
 Name = tuple[str, str]  # port and law id
 
@@ -445,6 +445,14 @@ def _describe_vanished(search: Hypotheses, found: Posterior) -> str:
     return f" The simulator's own {' and '.join(gone)} {come}." if gone else ""
 
 
+def _which_laws(search: Hypotheses) -> str:
+    """Describe the laws of which none explains the mismatch: after the time limit, only those that were fitted."""
+    if not search.out_of_time or search.tried >= search.selected:
+        return "no law of the catalogue"
+    cases = f"{search.tried} of {search.selected} cases of a law at a port"
+    return f"none of the laws that were fitted before the time limit ({cases})"
+
+
 def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, float], mode: float | None) -> str:
     root, share = search.root, max(shares.values(), default=0.0)
     where = max(shares, key=lambda k: shares[k], default="")
@@ -464,7 +472,7 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
         noise = search.least_floor.nrmse(search.bench.scale)
         least = "at least" if search.floor.source == "estimated" else "about"
         return (
-            "Physics is missing, and no law of the catalogue explains it. The refitted simulator is off by "
+            f"Physics is missing, and {_which_laws(search)} explains it. The refitted simulator is off by "
             f"{100 * search.bench.nrmse(root.fitted):.3g} % of the outputs' deviation; the noise is {least} "
             f"{100 * noise:.3g} %.{at}{rings}"
         )
@@ -479,6 +487,6 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
     if rest > LEAST_EXPLAINED:
         explained = f": a force at a port explains {rest:.0%} of it"
     return (
-        f"Physics is missing, most likely at {port}, and no law of the catalogue explains all of it. The closest "
+        f"Physics is missing, most likely at {port}, and {_which_laws(search)} explains all of it. The closest "
         f"{named} {removed} of the mismatch on the training recordings. The rest is not noise{explained}."
     )

@@ -38,8 +38,8 @@ from platformdirs import user_cache_path
 
 from .._base import InputError, abandoned, one_at_a_time
 from ..models import Model
-from ..simulators import calls_external
-from .external import bind, entry_point, external_names, fill_gaps, suppress_gap_warnings
+from ..simulators import FmuSignals, calls_external, run_in_unit, units
+from .external import bind, external_names, fill_gaps, suppress_gap_warnings
 from .sensitivities import BLOCKS, TARGETS, Engine, Linearization, VirtualMachine, linearize
 
 _SOURCES = {"x": 0, "s": 1, "z": 2, "w": 3}
@@ -354,6 +354,7 @@ def _pointer(array: np.ndarray | None) -> ctypes.c_void_p:
     return ctypes.c_void_p() if array is None else ctypes.c_void_p(array.ctypes.data)
 
 
+@functools.cache
 def _load(library: Path) -> ctypes.CDLL:
     try:
         return ctypes.CDLL(str(library))
@@ -362,58 +363,111 @@ def _load(library: Path) -> ctypes.CDLL:
 
 
 @functools.cache
-def _load_loops(_cache: Path) -> ctypes.CDLL:
-    """Load the time loops, once per cache directory."""
-    return _load(build("\n".join((_read_source("_kernel.h"), _read_source("_kernel.c"))), LOOPS))
+def _build_loops(_cache: Path) -> Path:
+    """Build the time loops, once per cache directory."""
+    return build("\n".join((_read_source("_kernel.h"), _read_source("_kernel.c"))), LOOPS)
 
 
-class Compiled:
-    """Generated C behind the `Engine` protocol; it has no state between calls, so threads may share it."""
+@dataclass(frozen=True)
+class _Runs:
+    """Runs of a library that holds a model's step.
 
-    def __init__(self, model: Model) -> None:
-        self.linear = linearize(model)
-        self.loops = _load_loops(cache_directory())
-        source = source_code(self.linear)
-        self.library = _load(build(source))
-        self.programs = external_names(source)
-        self.model = ctypes.byref(ctypes.c_char.in_dll(self.library, "pilfr_model"))
+    `programs` are the names of the programs that it calls; `unit` is the one that is a functional mock-up unit, if any.
+    """
+
+    loops: Path
+    library: Path
+    sizes: dict[str, int]
+    substeps: int
+    programs: tuple[str, ...]
+    unit: FmuSignals | None
 
     def _call(self, name: str, *arguments: Any) -> None:
+        library = _load(self.library)
+        if self.unit is not None:
+            units.update(dict.fromkeys(self.programs, self.unit))
         if self.programs:
-            bind(self.library, self.programs, build)
-        failed = getattr(self.loops, name)(self.model, *arguments)
+            bind(library, self.programs, build)
+        model = ctypes.byref(ctypes.c_char.in_dll(library, "pilfr_model"))
+        failed = getattr(_load(self.loops), name)(model, *arguments)
         abandoned.raise_pending()
         if failed:
             raise MemoryError("the compiled model found no memory for its slopes")
+
+    def simulate(self, u: np.ndarray, p: np.ndarray, state: np.ndarray, signals: bool) -> tuple[np.ndarray, ...]:
+        """Run the model; results as of `Engine.simulate`."""
+        y, state, *more = self.simulation_results(u, state, signals)
+        z, w = more or (None, None)
+        self._call("pilfr_simulate", ctypes.c_long(len(u)), *map(_pointer, (u, p, state, y, z, w)))
+        return (y, state, *more)
+
+    def simulation_results(self, u: np.ndarray, state: np.ndarray, signals: bool) -> tuple[np.ndarray, ...]:
+        """Make the arrays of a simulation, NaN but for a copy of the state."""
+        m, n = len(u) // self.substeps, self.sizes
+        more = [np.full((m, n["z"]), np.nan) for _ in range(2)] if signals else []
+        return np.full((m, n["y"]), np.nan), state.copy(), *more
+
+    def sensitivity(
+        self, u: np.ndarray, p: np.ndarray, state: np.ndarray, seed: np.ndarray, columns: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Run the model with derivatives; results as of `Engine.sensitivity`."""
+        y, jac, state, slope = self.sensitivity_results(u, state, seed)
+        before, after = map(_pointer, (u, p, state, slope, columns)), map(_pointer, (y, jac))
+        n_c = ctypes.c_long(seed.shape[1])
+        self._call("pilfr_sensitivity", ctypes.c_long(len(u)), *before, n_c, *after)
+        return y, jac, state, slope
+
+    def sensitivity_results(
+        self, u: np.ndarray, state: np.ndarray, seed: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Make the arrays of a run with derivatives, NaN but for copies of the state and its slope."""
+        shape = len(u) // self.substeps, self.sizes["y"]
+        return np.full(shape, np.nan), np.full((*shape, seed.shape[1]), np.nan), state.copy(), seed.copy()
+
+
+class Compiled:
+    """Generated C behind the `Engine` protocol; it has no state between calls, so threads may share it.
+
+    A model that calls a functional mock-up unit runs in a process of the unit; if that fails, the results are NaN.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.linear = linearize(model)
+        source = source_code(self.linear)
+        programs = external_names(source)
+        unit = next((units[name] for name in programs if name in units), None)
+        loops, library = _build_loops(cache_directory()), build(source)
+        self.runs = _Runs(loops, library, self.linear.sizes, self.linear.substeps, programs, unit)
+        if unit is None:
+            assert _load(loops) and _load(library)
 
     def _arguments(self, u: np.ndarray, p: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, ...]:
         n = self.linear.sizes
         u = np.ascontiguousarray(u, dtype=float).reshape(len(u), n["u"])
         p = np.ascontiguousarray(p, dtype=float).reshape(n["p"])
-        y = np.empty((len(u) // self.linear.substeps, n["y"]))
-        return u, p, np.array(state, dtype=float).reshape(n["x"] + n["s"]), y
+        return u, p, np.array(state, dtype=float).reshape(n["x"] + n["s"])
 
     def simulate(
         self, u: np.ndarray, p: np.ndarray, state: np.ndarray, signals: bool = False
     ) -> tuple[np.ndarray, ...]:
         """See `Engine.simulate`."""
-        u, p, state, y = self._arguments(u, p, state)
-        more = [np.empty((len(y), self.linear.sizes["z"])) for _ in range(2)] if signals else []
-        z, w = more or (None, None)
-        self._call("pilfr_simulate", ctypes.c_long(len(u)), *map(_pointer, (u, p, state, y, z, w)))
-        return (y, state, *more)
+        u, p, state = self._arguments(u, p, state)
+        if self.runs.unit is None:
+            return self.runs.simulate(u, p, state, signals)
+        found, _ = run_in_unit(self.runs.unit, _Runs.simulate, (self.runs, u, p, state, signals), len(u))
+        return found or tuple(a * np.nan for a in self.runs.simulation_results(u, state, signals))
 
     def sensitivity(
         self, u: np.ndarray, p: np.ndarray, state: np.ndarray, seed: np.ndarray, columns: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """See `Engine.sensitivity`."""
-        u, p, state, y = self._arguments(u, p, state)
-        n_c = seed.shape[1]
-        slope = np.array(seed, dtype=float, order="C").reshape(len(state), n_c)
+        u, p, state = self._arguments(u, p, state)
+        seed = np.array(seed, dtype=float, order="C").reshape(len(state), seed.shape[1])
         column = np.ascontiguousarray(columns, dtype=ctypes.c_long).reshape(len(p))
-        jac = np.empty((*y.shape, n_c))
-        before, after = map(_pointer, (u, p, state, slope, column)), map(_pointer, (y, jac))
-        self._call("pilfr_sensitivity", ctypes.c_long(len(u)), *before, ctypes.c_long(n_c), *after)
+        if self.runs.unit is None:
+            return self.runs.sensitivity(u, p, state, seed, column)
+        found, _ = run_in_unit(self.runs.unit, _Runs.sensitivity, (self.runs, u, p, state, seed, column), len(u))
+        y, jac, state, slope = found or (a * np.nan for a in self.runs.sensitivity_results(u, state, seed))
         return y, jac, state, slope
 
 
@@ -421,8 +475,7 @@ def make_engine(model: Model, engine: str = "auto") -> Engine:
     """Make the engine for a closed model: "c", "vm", or "auto" (C where there is a compiler that works)."""
     if engine not in ("auto", "c", "vm"):
         raise InputError(f"The engine {engine!r} is unknown; use 'auto', 'c' or 'vm'.")
-    without = compiler() is None or (calls_external(model.step) and entry_point() is None)
-    if engine == "vm" or (engine == "auto" and without):
+    if engine == "vm" or (engine == "auto" and compiler() is None):
         return VirtualMachine(model)
     try:
         return Compiled(model)

@@ -1,8 +1,8 @@
 """Generated C that calls other programs (`simulators.leaves`), for which CasADi cannot write code.
 
-CasADi leaves a gap where a function is a program of its own. `fill_gaps` fills it with a call of the function's buffer
-(`casadi.FunctionBuffer`), and `bind` passes the buffers of a thread to a library. Without CasADi's entry point for
-buffers, only the virtual machine can run the model.
+CasADi leaves a gap where a function is a program of its own. `fill_gaps` fills it with a call of a buffer, and `bind`
+passes the buffers of a thread to a library. A functional mock-up unit is called only in a process of its own, which
+runs the whole library.
 """
 
 from __future__ import annotations
@@ -16,15 +16,13 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from .._base import abandoned
-from ..simulators import FmuInstance, PythonFunction, leaves, units
+from ..simulators import PythonFunction, evaluation, leaves, units
 
-ENTRY = "_ZN6casadi21_function_buffer_evalEPv"  # casadi::_function_buffer_eval(void*), as compilers of Unix name it
 HEAD = r"(/\* (?P<name>\w+):\([^\n]*\n[^\n]*\{\n)"  # comment and first line of a generated function
 GAP = re.compile(HEAD + r" *#error Code generation not supported[^\n]*\n *return 0;")
 CALL = re.compile(HEAD + r" *return call_external\(")
@@ -44,16 +42,6 @@ class _External(ctypes.Structure):
         ("arg_size", ctypes.POINTER(ctypes.c_long)),
         ("res_size", ctypes.POINTER(ctypes.c_long)),
     ]
-
-
-@functools.cache
-def entry_point() -> int | None:
-    """Find the address of CasADi's function that evaluates a buffer; None if there is none."""
-    for suffix in (".so", ".dylib"):
-        with contextlib.suppress(OSError, AttributeError):
-            library = ctypes.CDLL(str(Path(ca.__file__).with_name(f"libcasadi{suffix}")))
-            return ctypes.cast(getattr(library, ENTRY), ctypes.c_void_p).value
-    return None
 
 
 def fill_gaps(code: str) -> str:
@@ -103,48 +91,16 @@ def _buffer(name: str, build: Callable[[str], Path]) -> _External:
 
 def _make_buffer(name: str, build: Callable[[str], Path]) -> tuple[_External, list[object]]:
     """Make a buffer with memory for arguments and results; return it and everything that must stay alive."""
-    function = leaves[name]
-    if name in units and (lease := _Lease.take(name)) is not None:
-        n_arg, n_res = ([size(i) for i in range(n)] for n, size in _shapes(function))
-        unit = lease.unit
-        address = ctypes.addressof(unit.structure)
-        made, tables = _fill_structure(_unit_caller(build), address, (unit.arguments, n_arg), (unit.results, n_res))
-        return made, [lease, tables]
-    if isinstance(function, PythonFunction):
+    if name not in units:
+        function = leaves[name]
+        assert isinstance(function, PythonFunction)
         return _make_python_buffer(function)
-    buffer, _ = function.buffer()
-    memory = []
-    for (count, size), put in zip(_shapes(function), (buffer.set_arg, buffer.set_res), strict=True):
-        sizes = [size(i) for i in range(count)]
-        arrays = [np.zeros(max(n, 1)) for n in sizes]
-        for i, array in enumerate(arrays):
-            put(i, array.data)
-        memory.append((arrays, sizes))
-    get = ctypes.pythonapi.PyCapsule_GetPointer
-    get.restype, get.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
-    made, tables = _fill_structure(entry_point(), get(buffer._self(), None), *memory)
-    return made, [buffer, memory, tables]
-
-
-class _Lease:
-    """An instance of a unit for one thread; after the thread's end another thread takes it."""
-
-    free: ClassVar[dict[str, list[FmuInstance]]] = {}
-
-    def __init__(self, name: str, unit: FmuInstance) -> None:
-        self.name, self.unit = name, unit
-
-    @classmethod
-    def take(cls, name: str) -> _Lease | None:
-        """Take a free instance, or a new one; None if the unit refuses."""
-        try:
-            return cls(name, cls.free.setdefault(name, []).pop())
-        except IndexError:
-            unit = units[name].instantiate()
-            return None if unit is None else cls(name, unit)
-
-    def __del__(self) -> None:
-        self.free[self.name].append(self.unit)
+    signals = units[name]
+    found = evaluation(signals)
+    address = ctypes.addressof(found.structure)
+    arguments, results = (found.arguments, list(signals.sizes)), ([found.result], [signals.results])
+    made, tables = _fill_structure(_unit_caller(build), address, arguments, results)
+    return made, [found, tables]
 
 
 def _make_python_buffer(function: PythonFunction) -> tuple[_External, list[object]]:
@@ -162,10 +118,6 @@ def _make_python_buffer(function: PythonFunction) -> tuple[_External, list[objec
     address = ctypes.cast(callback, ctypes.c_void_p).value
     made, tables = _fill_structure(address, 0, (arguments, list(function.sizes)), ([result], [function.size]))
     return made, [callback, arguments, result, tables]
-
-
-def _shapes(function: ca.Function) -> tuple[tuple[int, Callable[[int], int]], tuple[int, Callable[[int], int]]]:
-    return (function.n_in(), function.nnz_in), (function.n_out(), function.nnz_out)
 
 
 def _fill_structure(

@@ -63,6 +63,10 @@ MOST_PARTS = 100  # combined elements, and largest degree of products; more woul
 HISTORY = ("number", "cost", "seconds", "step", "damping")  # columns of a solver's history
 ELEMENT_FIELDS = {Envelope: ("channels",), Products: ("channels", "degrees"), StaticNetwork: ("hidden", "channels")}
 LIMIT_NUMBERS = ("value", "lower", "upper", "multiplier")
+SIMULATORS = {  # by the end of a file's name, for messages
+    ".fmu": ("a functional mock-up unit", "from_fmu"),
+    **dict.fromkeys((".xml", ".urdf"), ("a mechanism for MuJoCo", "from_mujoco")),
+}
 DEEPEST = 3  # levels of nested lists in an array: no parameter has more than two dimensions
 
 
@@ -246,6 +250,12 @@ def _read_text(path: str) -> str:
         size = file.stat().st_size
         if file.suffix == ".py":
             fault = "is a simulator in Python; read it by `pilfr_casadi.simulators.load_simulator`"
+        elif known := SIMULATORS.get(file.suffix.lower()):
+            what, loader = known
+            fault = (
+                f"is {what}, not a saved model; read it by `pilfr_casadi.{loader}`. `pilfr simulate` and `export` take "
+                f"a Python file with the line simulator = pilfr_casadi.{loader}(...)"
+            )
         elif size > LARGEST_FILE:
             fault = f"has {size / 1e6:.0f} MB, which no model file has; give a file that `save` wrote"
         else:

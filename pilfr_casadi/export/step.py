@@ -227,8 +227,8 @@ class Exported:
         """Refuse to write a step that calls another program."""
         if calls_external(self.one):
             raise InputError(
-                "The equations call another program (an FMU or a Python function), which no file can hold; use `step` "
-                "in this process."
+                "The equations call another program (an FMU or a Python function), which no file can hold; use "
+                "`pilfr_casadi.exported` in Python, whose `step` runs them in the same process."
             )
 
     def names(self) -> dict[str, Any]:

@@ -305,7 +305,7 @@ def _seen_by(base: Any, output: str) -> Any:
         form = f"{base.form}, seen by {output}"
         equation = base.equation.replace("outputs read", f"{output} reads")
         sentence = f"{base.sentence}; {output} alone is on the far side"
-        units = base.units
+        units, strength = base.units, base.strength
         seen_by = output
 
     return _rename(Seen, f"{base.__name__}SeenBy_{output}", f"{base.__doc__}\n\n    {output} alone reads its far side.")

@@ -22,10 +22,25 @@ LARGEST_MODEL = 20_000  # parameters, whose Gauss-Newton Hessian takes 3.2 GB, a
 
 def parameter_within(name: str, value: float, bounds: tuple[float, float], unit: str = "") -> Parameter:
     """Make a parameter of an imported model; an error about its bounds contains its name."""
-    low, high = bounds
-    if not low <= value <= high:
-        raise InputError(f"The parameter {name!r} is {value:g}, outside of its bounds {low:g} to {high:g}; widen them.")
-    return Parameter(value, unit, (low, high))
+    _check_within(name, value, bounds)
+    return Parameter(value, unit, bounds)
+
+
+def _check_within(name: str, value: Any, bounds: Any) -> None:
+    ends = np.ravel(np.asarray(bounds, dtype=object))
+    if len(ends) != 2 or not all(isinstance(end, int | float | np.number) and not np.isnan(end) for end in ends):
+        raise InputError(f"The bounds of {name!r} are {bounds!r}; give a pair of numbers (lower, upper).")
+    low, high = ends
+    if not low <= high:
+        raise InputError(
+            f"The bounds {low:g} to {high:g} of {name!r} are infeasible: the lower one exceeds the upper one; swap "
+            "them."
+        )
+    for entry in np.ravel(value):
+        if not low <= entry <= high:
+            raise InputError(
+                f"The parameter {name!r} is {entry:g}, outside of its bounds {low:g} to {high:g}; widen them."
+            )
 
 
 def check_size(owner: str, count: int) -> None:
@@ -264,6 +279,13 @@ class ParameterSet(Mapping[str, Parameter]):
         if not all(np.all(np.isfinite(value)) for value in values.values()):
             raise InputError("A parameter's value is not finite; give a number.")
         return ParameterSet({n: p._with_value(values[n]) for n, p in self.items()})
+
+    def free_within(self, bounds: Mapping[str, tuple[float, float]]) -> ParameterSet:
+        """Copy with other bounds of some parameters, which are then free; their values must lie inside."""
+        self._require(bounds)
+        for name, ends in bounds.items():
+            _check_within(name, self[name].value, ends)
+        return self.change(**{name: {"bounds": ends, "fixed": False} for name, ends in bounds.items()})
 
     def change(self, **changes: Mapping[str, Any]) -> ParameterSet:
         """Copy with fields of some parameters replaced: `change(A={"fixed": True}, w={"bounds": (0, 1)})`."""

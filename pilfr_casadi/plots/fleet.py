@@ -92,8 +92,8 @@ def machine_trends(trends: Sequence[Mapping[str, Any]]) -> Figure:
     Parameters
     ----------
     trends : sequence of mapping
-        `title`; `name` and `unit` of the value; `times`, `values`, `errors`; `slope`; `regular`, the range (low, high)
-        of regular machines.
+        `title`; `name` and `unit` of the value; `times`, `values`, `errors`; `slope` and `per`, its unit of time;
+        `regular`, the range (low, high) of regular machines.
     """
     figure, rows, columns = _make_grid(len(trends), 1.9)
     for k, r in enumerate(trends):
@@ -105,7 +105,8 @@ def machine_trends(trends: Sequence[Mapping[str, Any]]) -> Figure:
         weight = 1 / e[known] ** 2
         centre = [float(np.sum(weight * a[known]) / np.sum(weight)) for a in (t, v)]
         ax.plot(t, centre[1] + r["slope"] * (t - centre[0]), color=VERMILLION, linewidth=1.2)
-        finish(ax, "time" if k // columns == rows - 1 else "", with_unit(r["name"], r["unit"]), r["title"])
+        time = "recording" if r["per"] == "recording" else "time"
+        finish(ax, time if k // columns == rows - 1 else "", with_unit(r["name"], r["unit"]), r["title"])
     return figure
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .diagnosis import diagnosis_page as diagnosis_page, diagnosis_report as diagnosis_report
     from .diagnosis_tables import corrected_file as corrected_file, usage as usage
     from .fit import fit_page as fit_page, fit_report as fit_report, mode_tables as mode_tables
-    from .fleet import fleet_map as fleet_map, fleet_page as fleet_page
+    from .fleet import fleet_map as fleet_map, fleet_page as fleet_page, machine_page as machine_page
     from .page import (
         Bar as Bar,
         Code as Code,

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from .. import laws
+from .. import identify, laws, simulators
 from .._base import to_json, with_nan
 from ..diagnose import ERROR_NAMES, Diagnosis, Effect, Fitted, Workbench, law_signals, learned_force
 from ..identify import RUN_AWAY
 from ..laws import VaryingParameter, display_name, heated, readable_unit, scaled, scheduled, short_name, varying
 from ..models import Parameter, ParameterSet
-from ..simulators import MECHANICAL, PARAMETER, UNKNOWN, kind_of, name_at, name_at_any
+from ..simulators import MECHANICAL, PARAMETER, UNKNOWN, CoSimulation, kind_of, name_at, name_at_any
 from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
@@ -309,9 +309,35 @@ def usage(diagnosis: Diagnosis) -> str:
     return render("use_diagnosis.txt", **_collect_correction(diagnosis))
 
 
-def corrected_file(diagnosis: Diagnosis, source: str) -> str:
-    """Write a simulator file that corrects the simulator of another file; `source` is its path from this one."""
-    return render("corrected.txt", source=source, **_collect_correction(diagnosis)) + "\n"
+def corrected_file(
+    diagnosis: Diagnosis,
+    source: str,
+    loader: str = "load_simulator",
+    options: Mapping[str, Any] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+) -> str:
+    """Write a simulator file that corrects the simulator of another file.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+    source : str
+        Path of the other file from this one.
+    loader : {"load_simulator", "load", "from_fmu", "from_mujoco"}
+        Function that loads the other file.
+    options : mapping, optional
+        Its options.
+    bounds : mapping, optional
+        Bounds of parameters that had others in the diagnosis than in the other file.
+    """
+    options = {name: value for name, value in (options or {}).items() if value}
+    content = _collect_correction(diagnosis)
+    used = {loader, *(type(v).__name__ for v in options.values() if isinstance(v, CoSimulation))}
+    if loader == "load":
+        used = {"as_simulator"}
+        content["modules"].setdefault(identify.__name__, set()).add(loader)
+    content["modules"].setdefault(simulators.__name__, set()).update(used)
+    return render("corrected.txt", source=source, loader=loader, options=options, bounds=bounds, **content) + "\n"
 
 
 def _collect_correction(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -327,7 +353,8 @@ def _collect_correction(diagnosis: Diagnosis) -> dict[str, Any]:
             modules.setdefault(home, set()).add(part.__name__)
         limits = {k: tuple(np.asarray(end, dtype=float).tolist() for end in ends) for k, ends in e.law.limits.items()}
         elements.append((e, expression, e.own(fitted), limits))
-    values = {k: v for k, v in fitted.items() if k in diagnosis.refitted.parameters}
+    own = diagnosis.refitted.parameters
+    values = {k: v for k, v in fitted.items() if k in own and own[k].value.size}  # a list has no shape (0, 2)
     return {
         "diagnosis": diagnosis,
         "simulator": simulator,

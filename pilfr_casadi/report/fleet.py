@@ -1,4 +1,4 @@
-"""The page of a fleet, from its fleet.json: the physics missing in all machines, and the machines that differ."""
+"""The page of a fleet, and a page of each machine, from the fleet.json of the fleet."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import numpy as np
 
 from .. import plots
 from .._base import with_nan
-from .page import Block, Link, Page, Picture, Section, Table, Text, uncertain_text
+from .page import Block, Link, Page, Picture, Section, Table, Text, number_text, uncertain_text
 
 Column = tuple[str, str, np.ndarray, np.ndarray]  # name, unit, values and standard errors of the machines
 MOST_PICTURES = 12  # small pictures of residuals, and of trends
 MOST_STRIPS = 6  # values drawn as strips
+RESIDUAL = "Error with the common physics, over the output's deviation; the band is two deviations of the noise."
 MOST_ROWS = 30  # machines in an open table; with more, the table is folded
 
 
@@ -33,7 +34,7 @@ def fleet_page(content: Mapping[str, Any], residuals: Mapping[str, Mapping[str, 
         Section("Machines that differ", _differing(content)),
         Section("Map of the machines", _maps(content)),
         Section("What is left", _rest(content, residuals)),
-        Section("Drift", _drift(content)),
+        Section("Drift", _drift(content, machines)),
         Section("Values of regular machines", [_values(content)] if content["values"] else []),
         Section("All machines", [_table(content, machines, folded=len(machines) > MOST_ROWS)]),
     ]
@@ -58,12 +59,16 @@ def _differing(content: Mapping[str, Any]) -> list[Block]:
     if not shown:
         return [Text("No machine differs from the others.")]
     rows = [[_name(m), text, p] for m in shown for text, p in m["reasons"] or [(m["failed"], 1.0)]]
-    note = "A row is shown if it is more likely than not. Names with a link lead to the machine's own report."
+    note = "A row is shown if it is more likely than not. Each name leads to the machine's own page."
     return [Table(["machine", "finding", "probability"], rows, note=note, digits=3)]
 
 
-def _name(machine: Mapping[str, Any]) -> str:
-    return Link(machine["name"], machine["report"].replace(" ", "%20")) if machine["report"] else machine["name"]
+def _name(machine: Mapping[str, Any]) -> Link:
+    return _link(machine["name"], machine["page"])
+
+
+def _link(text: str, path: str) -> Link:
+    return Link(text, path.replace(" ", "%20"))
 
 
 def _columns(content: Mapping[str, Any]) -> list[Column]:
@@ -113,23 +118,23 @@ def _maps(content: Mapping[str, Any]) -> list[Block]:
 
 
 def _rest(content: Mapping[str, Any], residuals: Mapping[str, Mapping[str, Any]]) -> list[Block]:
-    """Draw the residuals of machines with more missing physics, and link their reports."""
+    """Draw the residuals of machines with more missing physics, and link their pages."""
     shown = [m for m in content["machines"] if m["rest"] and m["name"] in residuals][:MOST_PICTURES]
     if not shown:
         return []
     figure = plots.small_multiples([residuals[m["name"]] for m in shown], [m["name"] for m in shown])
-    caption = "Error with the common physics, over the output's deviation; the band is two deviations of the noise."
     rows = [[_name(m), m["rest"].get("verdict", ""), m["rest"].get("sentence", "")] for m in shown]
     return [
-        Picture(figure, caption, "residuals of machines with more missing physics", wide=True),
+        Picture(figure, RESIDUAL, "residuals of machines with more missing physics", wide=len(shown) > 1),
         Table(["machine", "verdict", "diagnosis of the remaining mismatch"], rows),
     ]
 
 
-def _drift(content: Mapping[str, Any]) -> list[Block]:
+def _drift(content: Mapping[str, Any], machines: Sequence[Mapping[str, Any]]) -> list[Block]:
+    """Draw the values of machines that drift."""
     values = {v["name"]: v for v in content["values"]}
     trends = []
-    for m in content["machines"]:
+    for m in machines:
         for label, history in content["histories"].get(m["name"], {}).items():
             population = values[label]["population"]
             mean, deviation = population["mean"], population["deviation"]
@@ -137,6 +142,7 @@ def _drift(content: Mapping[str, Any]) -> list[Block]:
                 {
                     **history,
                     "title": m["name"],
+                    "per": m["trends"][label]["per"],
                     "name": label,
                     "unit": values[label]["unit"],
                     "regular": [mean - 2 * deviation, mean + 2 * deviation],
@@ -149,7 +155,7 @@ def _drift(content: Mapping[str, Any]) -> list[Block]:
     if len(trends) > MOST_PICTURES:
         caption += f" {len(trends) - MOST_PICTURES} more are in the tables."
     figure = plots.machine_trends(trends[:MOST_PICTURES])
-    return [Picture(figure, caption, "values that drift", wide=True)]
+    return [Picture(figure, caption, "values that drift", wide=len(trends) > 1)]
 
 
 def _values(content: Mapping[str, Any]) -> Table:
@@ -157,7 +163,7 @@ def _values(content: Mapping[str, Any]) -> Table:
     for v in content["values"]:
         population = v["population"]
         mean = uncertain_text(with_nan(population["mean"]), with_nan(population["mean_error"]))
-        drifting = sum((m["trends"].get(v["name"], {}).get("probability") or 0) > 0.5 for m in content["machines"])
+        drifting = sum(v["name"] in history for history in content["histories"].values())
         rows.append([v["name"], v["unit"], mean, population["deviation"], population["varies"], v["kind"], drifting])
     columns = ["value", "unit", "mean", "between machines", "probability that it varies", "kind", "machines that drift"]
     note = "Standard deviation between regular machines, and the probability that it is not zero."
@@ -176,3 +182,110 @@ def _table(content: Mapping[str, Any], machines: Sequence[Mapping[str, Any]], fo
     note = "The errors are NRMSE. The log evidence compares the common physics with the simulator as given."
     caption = f"{len(machines)} machines, sorted by the probability that they differ"
     return Table(columns, rows, caption=caption, note=note, emphasis=emphasis, folded=folded, digits=3)
+
+
+def machine_page(content: Mapping[str, Any], name: str, residual: Mapping[str, Any] | None = None) -> Page:
+    """Fill the page of one machine of a fleet; a regular machine has no pictures, which take most of the time.
+
+    Parameters
+    ----------
+    content : mapping
+        The content of fleet.json.
+    name : str
+        Name of the machine.
+    residual : mapping, optional
+        See `fleet_page`.
+    """
+    m = next(m for m in content["machines"] if m["name"] == name)
+    found = [f"{text} (probability {number_text(p, 3)})" for text, p in m["reasons"]]
+    if m["failed"]:
+        tone, answer, status = "bad", "Could not be fitted", m["failed"]
+    elif found:
+        tone, answer, status = "warning", "Differs from regular machines", "; ".join(filter(None, [*found, m["note"]]))
+    else:
+        tone, answer, status = "good", "As the other machines", "No difference is more likely than not."
+    sections = [
+        Section("Values beside the fleet", [_own_values(content, m)] if m["values"] else []),
+        Section("Error beside the fleet", [] if m["failed"] else _own_error(content, m, residual)),
+        Section("Drift", _drift(content, [m])),
+        Section("How it was judged", _judgement(content, m)),
+    ]
+    common = content["common"]["words"] or "nothing"
+    return Page(
+        f"Machine {name}",
+        [s for s in sections if s.blocks],
+        subtitle=f"One of {len(content['machines'])} machines; missing in all: {common}",
+        answer=answer,
+        status=status,
+        tone=tone,
+        facts={"probability of a difference": number_text(m["probability"], 3)},
+    )
+
+
+def _own_values(content: Mapping[str, Any], m: Mapping[str, Any]) -> Table:
+    """Tabulate the values and trends of a machine beside those of regular machines."""
+    per = next((t["per"] for t in m["trends"].values()), "")
+    rows = []
+    for v in content["values"]:
+        label, population = v["name"], v["population"]
+        value, error = (with_nan(m[kind].get(label)) for kind in ("values", "errors"))
+        mean, spread = with_nan(population["mean"]), with_nan(population["deviation"])
+        off = (value - mean) / np.hypot(spread, error) if np.hypot(spread, error) > 0 else np.nan
+        usual = _uncertain(mean, with_nan(population["mean_error"]))
+        row = [label, v["unit"], _uncertain(value, error), usual, spread, float(off), m["differs"].get(label)]
+        if per:
+            t = {k: with_nan(m["trends"].get(label, {}).get(k)) for k in ("slope", "error", "probability")}
+            row += [_uncertain(t["slope"], t["error"]), t["probability"]]
+        rows.append(row)
+    columns = ["value", "unit", "this machine", "mean", "between machines", "deviations off", "differs"]
+    columns += [f"drift per {per}", "drifts"] if per else []
+    note = (
+        "± is one standard error. Mean, and standard deviation between machines, are of regular machines. The distance "
+        "from the mean is in deviations, the standard error included. The other columns are probabilities."
+    )
+    return Table(columns, rows, note=note, digits=3)
+
+
+def _uncertain(value: float, error: float) -> str:
+    return uncertain_text(value, error) if np.isfinite(value) else "–"
+
+
+def _own_error(content: Mapping[str, Any], m: Mapping[str, Any], residual: Mapping[str, Any] | None) -> list[Block]:
+    """Compare the errors of a machine with those of all machines; draw the residual of a machine that differs."""
+    kinds = {
+        "refitted as given": "nrmse_before",
+        "with the common physics": "nrmse_after",
+        "noise": "noise",
+        "error over noise": "ratio",
+    }
+    rows = []
+    for text, key in kinds.items():
+        every = np.array([other[key] for other in content["machines"]], dtype=float)
+        known = every[np.isfinite(every)]
+        rows.append([text, m[key], *(float(q) for q in np.quantile(known, (0.0, 0.5, 1.0)))])
+    table = Table(
+        ["error", "this machine", "smallest", "median", "largest"], rows, note="Errors and noise are NRMSE.", digits=3
+    )
+    if not (m["reasons"] and residual):
+        return [table]
+    return [table, Picture(plots.small_multiples([residual], [m["name"]]), RESIDUAL, "residual of the machine")]
+
+
+def _judgement(content: Mapping[str, Any], m: Mapping[str, Any]) -> list[Block]:
+    """Explain the judgement, and link the page of the fleet and the diagnosis of the machine alone."""
+    text = (
+        "The simulator with the physics that all machines lack was fitted to this machine, and its values, its trends "
+        "and its remaining error were compared with those of the others. Probabilities above one half are findings."
+    )
+    rows: list[list[Any]] = [[_link("all machines", "../../report.html"), "the comparison of all machines"]]
+    diagnosis = _link("diagnosis of this machine", f"../../{m['report']}") if m["report"] else "diagnosis"
+    sampled = "/sample-" in m["report"]
+    if "sentence" in m["rest"]:
+        rows.append(["diagnosis" if sampled else diagnosis, m["rest"]["sentence"]])
+    if sampled:
+        alone = (
+            "used to find the common physics; it assumed constant values, and the judgement above replaces all that it "
+            "names besides the common physics"
+        )
+        rows.append([diagnosis, alone])
+    return [Text(text), Table(["page", "content"], rows)]

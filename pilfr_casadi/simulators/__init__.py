@@ -3,10 +3,11 @@
 `ports` are the places where laws may stand. `equations` evaluates the equations and their ports, and `integration`
 closes them with laws and discretises them to a `Model`. `simulator` holds the class `Simulator`. `domains` infers a
 port's physical domain. `adapters` convert a Python file (`user_file`), a state space or a fitted model to a simulator.
-`fmu` wraps a functional mock-up unit as a simulator (`fmu_description`, `fmu_instance`, for co-simulation
-`fmu_cosimulation`), and `mujoco` writes the equations of a MuJoCo model. `numpy_function` makes a simulator from a
-NumPy function: `tracing` calls the function with `symbols` to obtain its equations. A function that cannot be traced
-is called with numbers (`black_box`). `external` lets equations call such a program.
+`fmu` wraps a functional mock-up unit as a simulator (`fmu_description`, `fmu_instance`, `fmu_process`, for
+co-simulation `fmu_cosimulation`), and `mujoco` writes the equations of a MuJoCo model (`mujoco_model`).
+`numpy_function` makes a simulator from a NumPy function, whose arguments `signature` reads: `tracing` calls the
+function with `symbols` to obtain its equations. A function that cannot be traced is called with numbers (`black_box`).
+`external` lets equations call such a program.
 """
 
 from typing import TYPE_CHECKING
@@ -34,8 +35,13 @@ if TYPE_CHECKING:
     )
     from .fmu import from_fmu as from_fmu
     from .fmu_cosimulation import CoSimulation as CoSimulation
-    from .fmu_description import binary_path as binary_path, fmu_signals as fmu_signals
-    from .fmu_instance import FmuInstance as FmuInstance
+    from .fmu_description import (
+        binary_path as binary_path,
+        fmu_signals as fmu_signals,
+        needs_step_size as needs_step_size,
+    )
+    from .fmu_instance import FmuSignals as FmuSignals, evaluation as evaluation
+    from .fmu_process import run_in_unit as run_in_unit
     from .integration import (
         LARGEST_STEP as LARGEST_STEP,
         MOST_SUBSTEPS as MOST_SUBSTEPS,

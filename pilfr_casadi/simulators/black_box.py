@@ -84,6 +84,11 @@ class BlackBox:
                 self.equal[row] = same
 
     @property
+    def program_calls(self) -> dict[str, int]:
+        """Number of calls by the function's name."""
+        return {self.called: self.leaf.calls}
+
+    @property
     def note(self) -> str:
         """Number of calls and first failure, in words."""
         source = "finite differences" if self.slope is None else f"the given Jacobian, called {self.slope.calls} times"

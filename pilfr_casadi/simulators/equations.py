@@ -333,6 +333,8 @@ class Equations:
             if port.name == name:
                 return port
         kind, own = split_port(name)
+        if kind == EQUATION and own in self.kinematic and not self.ports:  # a user may still put a law there
+            return self._equation_port(own)
         of_law = any(own.startswith(e.prefix) for e in self.elements)
         if kind == PARAMETER and own in self.parameters and not (of_law or self.parameters[own].value.ndim):
             return Port(name, {}, lambda p: p[own], None, self.parameters[own].unit, series=True)
@@ -340,12 +342,16 @@ class Equations:
         raise InputError(f"There is no port {name!r}; there are {known}.")
 
     def all_ports(self) -> tuple[Port, ...]:
-        """List the declared ports (else one for each state's equation), then actuators and sensors."""
+        """List the declared ports, then actuators and sensors.
+
+        Without declared ports there is one for each state's equation that is no definition of a speed.
+        """
         return self._every_port
 
     @cached_property
     def _every_port(self) -> tuple[Port, ...]:
-        inner = self.ports or (() if self.discrete else tuple(map(self._equation_port, self.states)))
+        equations = () if self.discrete else (name for name in self.states if name not in self.kinematic)
+        inner = self.ports or tuple(map(self._equation_port, equations))
         domain = common_domain(port.domain for port in inner)  # also of actuators: a voltage is a signal in all domains
         if not self.ports:
             inner = tuple(replace(port, domain=domain) if port.domain == UNKNOWN else port for port in inner)

@@ -22,22 +22,14 @@ import casadi as ca
 import numpy as np
 
 from .._base import abandoned
-from .fmu_instance import FmuFile
+from .fmu_instance import FmuSignals
 
 RELATIVE_STEP = float(np.sqrt(np.finfo(float).eps))  # at this step rounding and curvature disturb a difference equally
 NOMINAL = 1e-3  # size of an argument that is zero: small compared with values in SI units, far above rounding
 ROUNDING = 1e-9  # relative difference that rounding may cause
 TINY = 1e-100  # against division by zero along a direction of zeros
 leaves: dict[str, ca.Function] = {}  # by name; CasADi itself does not keep callbacks alive
-units: dict[str, FmuFile] = {}  # of leaves that are functional mock-up units
-
-
-def keep_leaf(function: ca.Function, unit: FmuFile | None = None) -> ca.Function:
-    """Enter a function into `leaves`; its name must be unique, and the same in every process for an FMU."""
-    leaves[function.name()] = function
-    if unit is not None:
-        units[function.name()] = unit
-    return function
+units: dict[str, FmuSignals] = {}  # of leaves that are functional mock-up units
 
 
 Expression = Callable[..., Any]
@@ -127,7 +119,7 @@ class PythonFunction(ca.Callback):
         self.calls = 0
         self.failure: Exception | None = None
         self.construct(f"python{len(leaves)}", {})
-        keep_leaf(self)
+        leaves[self.name()] = self
 
     def get_n_in(self) -> int:
         """Return the number of arguments, for CasADi; there is one result."""
@@ -141,9 +133,14 @@ class PythonFunction(ca.Callback):
         """Return the shape of the result."""
         return ca.Sparsity.dense(self.size, 1)
 
-    def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:
+    def has_eval_buffer(self) -> bool:
+        """Let CasADi pass its memory; matrices would cost more time than many functions do."""
+        return True
+
+    def eval_buffer(self, arguments: Sequence[memoryview], results: Sequence[memoryview]) -> int:
         """Call the function, for CasADi."""
-        return [ca.DM(self.evaluate([a.full().ravel() for a in arguments]))]
+        np.frombuffer(results[0])[:] = self.evaluate([np.frombuffer(a) for a in arguments])
+        return 0
 
     def evaluate(self, arguments: list[np.ndarray]) -> np.ndarray:
         """Call the function; a failed point is a failed trial, not the end. In an abandoned run it is not called."""

@@ -2,24 +2,20 @@
 
 Units for co-simulation alone are stepped (`fmu_cosimulation`).
 
-CasADi loads the unit and evaluates its derivatives and outputs. Differences along directions give the Jacobians
-(`external`), because CasADi assumes that neither depends on parameters. If a derivative or an output equals a state at
-every trial point, the equations use the state instead of calling the unit.
+A unit is a program and runs with the rights of the user, in a process of its own (`fmu_process`). Differences along
+directions give the Jacobians (`external`). If a derivative or an output equals a state at every trial point, the
+equations use the state instead of calling the unit.
 
 A force in a port is added to an input of the unit. States are deviations from their start values. Events are not
-located: the integration steps over them.
-
-A unit is a program and runs with the rights of the user. A worker process loads it first, so that a unit that crashes
-ends only that process.
+located: the integration steps over them, which the simulator's print says.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-import pickle
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -28,53 +24,71 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, check_known, run_in_worker
+from .._base import InputError, check_known
 from ..models import Named, Parameter, parameter_within, within_a_factor
-from .external import NOMINAL, ROUNDING, call_external, equal_state, external, keep_leaf
+from .external import NOMINAL, ROUNDING, call_external, equal_state, external, leaves, units
 from .fmu_cosimulation import CoSimulation, SteppedEquations, SteppedUnit, check_force, unknown_signal
-from .fmu_description import Variable, check_file, describe, tidy
-from .fmu_instance import FmuFile, unpack
+from .fmu_description import Description, Variable, check_file
+from .fmu_instance import FmuFile, FmuSignals, unpack
+from .fmu_process import FmuFunction, has_time_event
 from .ports import Port
 from .simulator import Simulator
 
 COMPARED_POINTS = 8  # trial points at which derivatives and outputs are compared with states and with forces in ports
+PORT_KEYS = ("into", "across", "rate", "unit", "across_unit")
 TIMES = (0.0, 0.7, 13.0, 400.0)  # s, at which a dependence on time is looked for
-LOADING_SECONDS = 60.0  # seconds that loading may take
 
 
 @dataclass(frozen=True, eq=False)
 class _Unit:
-    """A loaded unit: its description, and `(t, x, u, p) -> (derivatives, outputs)`."""
+    """A unit with some of its outputs: `(t, x, u, p) -> (derivatives, outputs)`.
+
+    `parameters` are the tunable ones, and fixed ones that the user names.
+    """
 
     path: Path
-    variables: Mapping[str, Variable]
-    leaf: ca.Function
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
+    described: Description
     parameters: tuple[str, ...]
     outputs: tuple[str, ...]
 
-    @classmethod
-    def load(cls, path: Path, outputs: Sequence[str] | None = None) -> _Unit:
-        """Load a unit whose file has been checked, with all or some of its outputs."""
-        folder, key = unpack(path)
-        builder = ca.DaeBuilder("unit", str(folder), {"enable_ls_serialization": False})
-        if outputs is not None:
-            builder.set_y(list(outputs))
-        names = [tuple(getattr(builder, kind)()) for kind in ("x", "u", "p", "y")]
-        key = hashlib.sha256(f"{key} {names}".encode()).hexdigest()[:16]
-        leaf = builder.create(f"fmu_{key}", ["t", "x", "u", "p"], ["ode", "y"])
-        described = describe(path)
-        variables = described.variables
-        roles = zip("xupy", names, strict=True)
-        references = {role: [variables[n].reference for n in found] for role, found in roles}
-        direct = described.states == names[0]  # else the file orders the states in another way
-        file = FmuFile(folder, int(described.version), described.token, described.binary, references)
-        return cls(path, variables, keep_leaf(leaf, file if direct else None), *names)
+    @property
+    def variables(self) -> Mapping[str, Variable]:
+        """Variables by name."""
+        return self.described.variables
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states."""
+        return self.described.states
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.described.of("input")
+
+    @cached_property
+    def leaf(self) -> FmuFunction:
+        """The function that calls the unit."""
+        folder, key = unpack(self.path)
+        key = hashlib.sha256(f"{key} {self.parameters} {self.outputs}".encode()).hexdigest()[:16]
+        name = f"fmu_{key}"
+        if name not in leaves:
+            parameters, inputs, outputs = (
+                tuple(self.variables[n].reference for n in names)
+                for names in (self.parameters, self.inputs, self.outputs)
+            )
+            restarts = any(self.variables[n].variability != "tunable" for n in self.parameters)
+            described = self.described
+            file = FmuFile(folder, int(described.version), described.token, described.binary, parameters, restarts)
+            units[name] = FmuSignals(file, len(self.states), inputs, outputs)
+            leaves[name] = FmuFunction(name, units[name])
+        found = leaves[name]
+        assert isinstance(found, FmuFunction)
+        return found
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Load the file again in another process."""
-        return _Unit.load, (self.path, self.outputs)
+        """Unpack the file again in another process."""
+        return _Unit, (self.path, self.described, self.parameters, self.outputs)
 
     def starts(self, names: Sequence[str]) -> np.ndarray:
         """Start values of variables, zero if the file gives none."""
@@ -98,7 +112,7 @@ class _Unit:
 
     def values(self, t: float, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
         """Evaluate derivatives and outputs by numbers."""
-        return np.concatenate([np.asarray(a.full()).ravel() for a in self.leaf(t, x, u, p)])
+        return self.leaf.evaluate(np.concatenate([[t], x, u, p]).tobytes())
 
 
 def from_fmu(
@@ -121,19 +135,21 @@ def from_fmu(
     ports : mapping, optional
         By name of a port `dict(into=..., across=..., rate=...)` with names of the unit's variables: `into` an input to
         which a law's force is added with the opposite sign (friction opposes motion), or `{input: factor}`; `across` an
-        output or a state, the local coordinate; `rate`, which may be left out, its speed. By default each state's
-        equation is a port. Actuators and sensors are always ports.
+        output or a state, the local coordinate; `rate`, which may be left out, its speed; `unit` and `across_unit`
+        the units of force and coordinate, by default those of the file. By default each state's equation is a port.
+        Actuators and sensors are always ports.
     parameters : names, or mapping from names to Parameter, optional
-        Tunable parameters that a fit may change; by default all. The others keep the unit's values.
+        Parameters that a fit may change; by default all tunable ones. Fixed ones may be named too; each change of
+        their values restarts the unit. The others keep the unit's values.
     bounds : mapping, optional
         `(lower, upper)` by parameter; by default the unit's bounds, else a factor of ten either way.
     inputs, outputs : tuple of str, optional
         Recorded inputs and outputs; by default all outputs, and all inputs that no port uses. Other inputs keep their
-        start values.
+        start values, so name the recorded ones if the recordings lack some.
     hold : {"zero", "linear"}, optional
         As of `Simulator`.
     cosimulation : CoSimulation, optional
-        Step size and states of a unit for co-simulation alone.
+        Step size and states of a unit for co-simulation; a unit for both kinds is then stepped.
 
     Returns
     -------
@@ -147,32 +163,33 @@ def from_fmu(
         no states that can be set.
     """
     path, given, bounds = Path(path), dict(ports or {}), bounds or {}
-    described = check_file(path)
+    described = check_file(path, cosimulation is not None)
     unit: _Unit | SteppedUnit
     if described.identifier:
-        _check_program(path)
-        unit = _Unit.load(path)
+        unit = _load_unit(path, described, (*(parameters or ()), *bounds), outputs)
     else:
         unit = SteppedUnit.load(path, described, cosimulation or CoSimulation())
     for name, port in given.items():
         _check_port(name, port)
     used = [name for port in given.values() for name in _factors(port.get("into"))]
     own = parameters if parameters is not None else unit.parameters
+    _check_types(path, described, (*used, *own, *bounds, *(inputs or ()), *(outputs or ())))
+    all_outputs = described.of("output")
     for names, there, kind in (
         (used, unit.inputs, "inputs"),
         (inputs or (), unit.inputs, "inputs"),
-        (outputs or (), unit.outputs, "outputs"),
-        ((*own, *bounds), unit.parameters, "tunable parameters"),
+        (outputs or (), all_outputs, "outputs"),
+        ((*own, *bounds), unit.parameters, "parameters"),
     ):
         check_known(names, there, kind, path)
     drives = tuple(inputs) if inputs is not None else tuple(n for n in unit.inputs if n not in used)
-    measured = tuple(outputs) if outputs is not None else unit.outputs
+    measured = tuple(outputs) if outputs is not None else all_outputs
     read = {port.get(key) for port in given.values() for key in ("across", "rate")}
-    needed = tuple(n for n in unit.outputs if n in measured or n in read)
+    needed = tuple(n for n in all_outputs if n in measured or n in read)
     made = own if isinstance(own, Mapping) else {n: _make_parameter(unit.variables[n], bounds.get(n)) for n in own}
     equations: _Equations | SteppedEquations
     if isinstance(unit, _Unit):
-        equations = _Equations(_Unit.load(path, needed), drives, tuple(own), measured)
+        equations = _Equations(replace(unit, outputs=needed), drives, tuple(own), measured)
     else:
         symbols = tuple(n for n in unit.inputs if n in drives or n in used)
         equations = SteppedEquations(unit, symbols, made, needed, measured)
@@ -187,6 +204,21 @@ def from_fmu(
         equations.discrete,
         units={n: unit.variables[n].unit for n in (*drives, *measured)},
     )
+
+
+def _load_unit(path: Path, described: Description, named: Sequence[str], outputs: Sequence[str] | None) -> _Unit:
+    """Make a unit with its tunable parameters and named fixed ones."""
+    parameters = tuple(
+        n for n in described.of("parameter") if n in named or described.variables[n].variability == "tunable"
+    )
+    return _Unit(path, described, parameters, tuple(outputs or ()))
+
+
+def _check_types(path: Path, described: Description, names: Sequence[str]) -> None:
+    """Refuse variables that are no single real number."""
+    for name in names:
+        if kind := described.others.get(name):
+            raise InputError(f"{name!r} of {path} is {kind}; name variables that are single numbers of 64 bits.")
 
 
 class _Equations:
@@ -204,7 +236,13 @@ class _Equations:
         self.states, self.discrete = unit.states, False
         rows = (*map(_rate, unit.states), *unit.outputs)
         points = list(self._points())
-        found = np.array([unit.values(*point) for point in points])
+        first = unit.values(*points[0])
+        if unit.leaf.failure:
+            raise InputError(
+                f"The program inside {unit.path} cannot be evaluated: it {unit.leaf.failure}; check it with the tool "
+                "that made it."
+            )
+        found = np.array([first, *(unit.values(*point) for point in points[1:])])
         if not np.all(np.isfinite(found)):
             row = rows[int(np.argmin(np.all(np.isfinite(found), axis=0)))]
             raise InputError(f"{unit.path} gives no finite number for {row!r} near its start values; check it.")
@@ -213,7 +251,8 @@ class _Equations:
         states = np.array([x - unit.starts(unit.states) for _, x, _, _ in points])
         equal = [equal_state(row, states, unit.states) for row in found.T]
         self.equal = {row: same for row, same in zip(rows, equal, strict=True) if same}
-        self.unit = _Unit.load(unit.path, [n for n in unit.outputs if n not in self.equal])
+        self.unit = replace(unit, outputs=tuple(n for n in unit.outputs if n not in self.equal))
+        self.timed_events = has_time_event(unit.leaf.signals)
 
     def _points(self) -> Any:
         """Draw times, states, inputs and parameters near the start values; the first point holds the start values."""
@@ -242,7 +281,24 @@ class _Equations:
         found: Any = call_external(self.unit.function, self._stack(x, u, p, t)) if calls else None
         return [x[self.equal[n]] if n in self.equal else found[rows.index(n)] for n in names]
 
-    def dynamics(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
+    @property
+    def note(self) -> str:
+        """Events of the unit, in words."""
+        count = self.unit.described.event_indicators
+        kinds = [f"{count} event indicator{'s' * (count > 1)}"] * bool(count) + ["events in time"] * self.timed_events
+        if not kinds:
+            return ""
+        return (
+            f"{self.unit.path.name} has {' and '.join(kinds)}; the integration steps over events, so stops, switches "
+            "and dry friction inside the unit are only as exact as the sampling"
+        )
+
+    @property
+    def dynamics(self) -> _Equations:
+        """The dynamics of a `Simulator`, which prints its `note`."""
+        return self
+
+    def __call__(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
         """Evaluate the derivatives by state."""
         rows = self._rows([_rate(n) for n in self.states], x, u, p, t if self.timed else 0.0)
         return dict(zip(self.states, rows, strict=True))
@@ -291,21 +347,28 @@ class _Equations:
 
 def _check_port(name: str, given: Any) -> None:
     """Refuse a port that does not give the names of the unit's variables."""
-    usable = isinstance(given, Mapping) and set(given) <= {"into", "across", "rate"} and _factors(given.get("into"))
-    if not usable or not isinstance(given.get("across"), str) or not isinstance(given.get("rate"), str | None):
-        raise InputError(
-            f"The port {name!r} is {given!r}; give dict(into=INPUT, across=VARIABLE, rate=VARIABLE) with "
-            "names of the unit's variables."
-        )
+    form = (
+        "give dict(into=INPUT, across=VARIABLE, rate=VARIABLE, unit=UNIT, across_unit=UNIT); the last three are free."
+    )
+    if not isinstance(given, Mapping):
+        raise InputError(f"The port {name!r} is {given!r}; {form}")
+    for key in given:
+        if key not in PORT_KEYS:
+            raise InputError(f"The port {name!r} has the unknown key {key!r}; {form}")
+    texts = (given.get("across"), *(given.get(key, "") for key in PORT_KEYS[3:]))
+    usable = all(isinstance(text, str) for text in texts) and isinstance(given.get("rate"), str | None)
+    if not usable or not _factors(given.get("into")):
+        raise InputError(f"The port {name!r} is {given!r}; {form}")
 
 
 def _make_port(equations: _Equations | SteppedEquations, name: str, given: Mapping[str, Any]) -> Port:
-    """Make a port from the names of the unit's variables."""
+    """Make a port from the names of the unit's variables, whose units it has by default."""
     factors, across, rate = _factors(given["into"]), given["across"], given.get("rate")
     z = equations.signal(name, "across", across)
     dz = None if rate is None else equations.signal(name, "rate", rate)
     force, coordinate = (equations.unit.variables[n] for n in (next(iter(factors)), across))
-    return Port(name, equations.into(name, factors), z, dz, force.unit, coordinate.unit)
+    stated = given.get("unit", force.unit), given.get("across_unit", coordinate.unit)
+    return Port(name, equations.into(name, factors), z, dz, *stated)
 
 
 def _rate(state: str) -> str:
@@ -325,26 +388,3 @@ def _make_parameter(variable: Variable, bounds: tuple[float, float] | None) -> P
     usual = within_a_factor(value) if value else (-np.inf, np.inf)
     low, high = (end if np.isnan(given) else given for given, end in zip((low, high), usual, strict=True))
     return parameter_within(variable.name, value, (low, high), variable.unit)
-
-
-def _check_program(path: Path) -> None:
-    """Refuse a unit whose program cannot be loaded and evaluated; a worker process tries it."""
-    job = path.resolve(), unpack(path)[0]
-    reply = run_in_worker(pickle.dumps(_try_unit), pickle.dumps(job), LOADING_SECONDS)
-    if reply.timed_out or reply.lost:
-        what = f"takes more than {LOADING_SECONDS:g} s to load" if reply.timed_out else "ends the process that loads it"
-        raise InputError(f"The program inside {path} {what}; ask its maker for another one.")
-    if reply.result:
-        raise InputError(f"{path} cannot be evaluated ({reply.result}); check it with the tool that made it.")
-
-
-def _try_unit(unpacked: tuple[Path, Path]) -> str:
-    """Load and evaluate a unit that is unpacked in a folder; return the error's message, empty without an error."""
-    path, folder = unpacked
-    try:
-        unpack(path, folder)
-        unit = _Unit.load(path)
-        unit.values(0.0, *(unit.starts(names) for names in (unit.states, unit.inputs, unit.parameters)))
-    except Exception as error:
-        return tidy(error)
-    return ""

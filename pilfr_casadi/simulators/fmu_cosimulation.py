@@ -253,6 +253,11 @@ class SteppedEquations:
         )
 
     @property
+    def program_calls(self) -> dict[str, int]:
+        """Number of calls by the file's name; empty if equations were found."""
+        return self._box.program_calls if self.discrete else {}
+
+    @property
     def dt(self) -> float | None:
         """Length of the steps, s; None if equations were found."""
         return self.unit.dt if self.discrete else None
@@ -386,6 +391,13 @@ class SteppedEquations:
         step = np.array([factors.get(n, 0.0) for n in self.names])
         evaluate = self._derivatives if self.polynomials is not None else (lambda z: self._results(z, self.unit.dt))
         none, once, twice = (evaluate(z + k * step) for k in (0, 1, 2))
+        usable = np.all(np.isfinite(np.hstack([none, once, twice])), axis=1)
+        if not np.any(usable):
+            raise InputError(
+                f"{self.unit.path} fails at all values of its parameters that were tried for port {port!r}, within "
+                "their bounds; give narrower bounds."
+            )
+        none, once, twice = (found[usable] for found in (none, once, twice))
         once, twice = once - none, twice - none
         size = np.max(np.abs(once), axis=0) + NOMINAL * np.max(np.abs(none), axis=0)
         moved = [n for n, change in zip(self.rows, once.T, strict=True) if np.any(np.abs(change) > RELATIVE_STEP)]

@@ -7,7 +7,7 @@ import platform
 import sys
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -54,6 +54,12 @@ class Description:
     states: tuple[str, ...]
     step_size: float
     variable_steps: bool
+    event_indicators: int
+    others: dict[str, str]  # types of the variables that are no single real number of 64 bits
+
+    def of(self, causality: str) -> tuple[str, ...]:
+        """Names of the variables of a causality."""
+        return tuple(v.name for v in self.variables.values() if v.causality == causality)
 
 
 def describe(path: Path) -> Description:
@@ -62,7 +68,8 @@ def describe(path: Path) -> Description:
         with zipfile.ZipFile(existing_file(path)) as archive:
             root = ET.fromstring(archive.read("modelDescription.xml"))
         entries = list(root.iterfind("ModelVariables/*"))
-        variables = {v.name: v for entry in entries if (v := _read_variable(entry)) is not None}
+        types = _read_types(root)
+        variables = {v.name: v for entry in entries if (v := _read_variable(entry, types)) is not None}
     except (zipfile.BadZipFile, KeyError, ET.ParseError, OSError, EOFError, ValueError) as error:
         raise InputError(f"{path} is not a functional mock-up unit ({tidy(error)}); export it again.") from None
     version = root.get("fmiVersion", "").partition(".")[0]
@@ -77,7 +84,10 @@ def describe(path: Path) -> Description:
     except (ValueError, IndexError, KeyError, StopIteration):
         states = ()
     binary = binary_path(identifier or slave, version)
-    return Description(version, token, identifier, slave, binary, variables, states, step_size, varies)
+    others = {n: _type(entry) for entry in entries if (n := entry.get("name", "")) not in variables}
+    events = len(list(root.iterfind("ModelStructure/EventIndicator"))) or int(root.get("numberOfEventIndicators") or 0)
+    numbers = step_size, varies, events
+    return Description(version, token, identifier, slave, binary, variables, states, *numbers, others)
 
 
 def binary_path(identifier: str, version: str) -> str:
@@ -102,16 +112,30 @@ def _state_names(root: ET.Element, entries: list[ET.Element], version: str) -> I
         yield by_reference[state].get("name", "")
 
 
-def _read_variable(entry: ET.Element) -> Variable | None:
-    """Read a real variable; None for one of another type."""
+def _read_types(root: ET.Element) -> dict[str, dict[str, str]]:
+    """Read the attributes of declared types by name."""
+    old = {e.get("name", ""): e.find("Real") for e in root.iterfind("TypeDefinitions/SimpleType")}
+    new = {e.get("name", ""): e for e in root.iterfind("TypeDefinitions/Float64Type")}
+    return {name: dict(e.attrib) for name, e in {**old, **new}.items() if e is not None}
+
+
+def _type(entry: ET.Element) -> str:
+    """Return the type of a variable in words."""
+    if entry.find("Dimension") is not None:
+        return f"an array of {entry.tag}"
+    return next((child.tag for child in entry if child.tag != "Annotations"), entry.tag) if len(entry) else entry.tag
+
+
+def _read_variable(entry: ET.Element, types: dict[str, dict[str, str]]) -> Variable | None:
+    """Read a real variable, with what its declared type states; None for one of another type, and for an array."""
     real = entry.find("Real")
-    if real is None and entry.tag != "Float64":
+    if (real is None and entry.tag != "Float64") or entry.find("Dimension") is not None:
         return None
-    numbers = entry if real is None else real
-    low, high, nominal, start = (_read_number(numbers.get(key)) for key in ("min", "max", "nominal", "start"))
+    own = (entry if real is None else real).attrib
+    stated = {**types.get(own.get("declaredType", ""), {}), **own}
+    low, high, nominal, start = (_read_number(stated.get(key)) for key in ("min", "max", "nominal", "start"))
     name, causality, variability = entry.get("name", ""), entry.get("causality", "local"), entry.get("variability")
-    reference = int(entry.get("valueReference", 0))
-    unit = numbers.get("unit", "")
+    reference, unit = int(entry.get("valueReference", 0)), stated.get("unit", "")
     return Variable(name, causality, variability or "continuous", unit, low, high, nominal, start, reference)
 
 
@@ -122,9 +146,13 @@ def _read_number(text: str | None) -> float:
         return np.nan
 
 
-def check_file(path: Path) -> Description:
-    """Refuse a file that is no unit with a program for this platform; return its description."""
+def check_file(path: Path, stepped: bool = False) -> Description:
+    """Refuse a file that is no unit with a program for this platform, or cannot be stepped; return its description."""
     unit = describe(path)
+    if stepped and not unit.slave and unit.identifier:
+        raise InputError(f"cosimulation was given, but {path} is for model exchange alone; leave it out.")
+    if stepped:
+        unit = replace(unit, identifier="", binary=binary_path(unit.slave, unit.version))
     if unit.version not in ("2", "3"):
         raise InputError(f"{path} is a unit of FMI {unit.version or '(none stated)'}; give one of FMI 2.0 or 3.0.")
     if not (unit.identifier or unit.slave):
@@ -137,6 +165,12 @@ def check_file(path: Path) -> Description:
     if own not in there:
         raise InputError(f"{path} has programs for {listed(sorted(there)) or 'no platform'}; export it for {own}.")
     return unit
+
+
+def needs_step_size(path: str | os.PathLike[str]) -> bool:
+    """Tell whether a functional mock-up unit is for co-simulation alone, so that it has to be stepped."""
+    described = describe(Path(path))
+    return bool(described.slave) and not described.identifier
 
 
 def fmu_signals(path: str | os.PathLike[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -2,38 +2,37 @@
 
 MuJoCo reads the file. The equations of motion
 
-    M(q) dv/dt + c(q, v) = τ_actuators - D v - K (q - q_spring) + w
+    M(q) dv/dt + c(q, v) = τ_actuators - D v - K (q - q_spring) - f(v) + w
 
 (Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 2) are then written for CasADi. So they can be compiled, have
-exact derivatives by states and by all numbers of the model, and accept a force w at every joint. They are compared with
-MuJoCo's own accelerations at several points. Contacts and joint limits are ignored. A model with any other feature that
-the equations lack is refused.
+exact derivatives by states and by all numbers of the model, and accept a force w at every joint. The dry friction f is
+the joint's `frictionloss` while it slides, and `s v` while it sticks, where s is the slope of MuJoCo's own friction at
+rest. They are compared with
+MuJoCo's own accelerations at several points. Contacts and joint limits are left out, with a note. A model with any
+other feature that the equations lack is refused.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, check_known, existing_file
-from ..models import Named, Parameter, parameter_within, within_a_factor
+from .._base import InputError, check_known
+from ..models import Named, Parameter, ParameterSet, parameter_within, within_a_factor
+from .mujoco_model import AXES, MujocoTree
 from .ports import Port
 from .simulator import Simulator
 
 COMPARED_POINTS = 8  # at which the equations are compared with MuJoCo
 AGREE = 1e-8  # relative difference of accelerations that rounding may cause
-AXES = ("x", "y", "z")
 
 
 def from_mujoco(
-    path: str | os.PathLike[str],
+    model: str | os.PathLike[str] | Any,
     *,
     parameters: Sequence[str] | Mapping[str, Parameter] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
@@ -49,20 +48,22 @@ def from_mujoco(
 
     Parameters
     ----------
-    path : path
-        An MJCF or URDF file.
+    model : path, mujoco.MjModel or mujoco.MjSpec
+        An MJCF or URDF file, or a model in memory, which is copied.
     parameters : names, or mapping from names to Parameter, optional
         Numbers of the model that a fit may change: `<body>.mass`, with which the inertia scales; `<body>.inertia`, a
-        factor on the inertia alone; `<body>.com_x`, `com_y`, `com_z`; `<joint>.damping`, `armature`, `stiffness`,
-        `spring`; `<actuator>.gain`; `gravity`. By default all masses and dampings. The others keep the model's values.
+        factor on the inertia alone; `<body>.inertia_x`, `inertia_y`, `inertia_z`, the moments of inertia about the
+        principal axes in the order of MuJoCo; `<body>.com_x`, `com_y`, `com_z`; `<joint>.damping`, `armature`,
+        `stiffness`, `spring`, `frictionloss`; `<actuator>.gain`, `gear`; `gravity`. By default all masses and dampings,
+        friction losses that are not zero, and those with `bounds`. The others keep the model's values.
     bounds : mapping, optional
-        `(lower, upper)` by parameter; by default a factor of ten either way; dampings, armatures, stiffnesses and
-        values of zero are bounded by zero below.
+        `(lower, upper)` by parameter; by default a factor of ten either way; dampings, armatures, stiffnesses,
+        friction losses and values of zero are bounded by zero below.
     inputs : tuple of str, optional
         Recorded actuators; by default all. The others are at zero.
     outputs : tuple of str, optional
-        Recorded sensors of joint positions and speeds, or joints; by default all such sensors, or all joints if there
-        is none.
+        Recorded sensors, or joints; by default all sensors of joint positions and speeds, or all joints if there is
+        none. Sensors of an actuator's force and of the actuators' force on a joint may be given too.
     hold : {"zero", "linear"}, optional
         As of `Simulator`.
 
@@ -70,24 +71,24 @@ def from_mujoco(
     ------
     InputError
         If MuJoCo is not installed or cannot read the file, a name is unknown, or the model has features that the
-        equations lack, such as free bodies, tendons, equality constraints, muscles or dry friction.
+        equations lack, such as free bodies, tendons, equality constraints or muscles.
     """
-    tree, bounds = _Tree.load(Path(path)), bounds or {}
-    own = parameters if parameters is not None else tree.default_parameters
-    for names, there, kind in (
-        ((*own, *bounds), tuple(tree.numbers), "parameters"),
-        (inputs or (), tree.actuators, "actuators"),
-        (outputs or (), tuple(tree.sensors), "joints, and sensors of joints"),
-    ):
-        check_known(names, there, kind, path)
+    tree, bounds = MujocoTree.load(model), bounds or {}
+    given = tree.default_parameters if parameters is None else parameters
+    own = tuple(dict.fromkeys((*given, *bounds)))
+    tree.check_parameters(own)
+    check_known(inputs or (), tree.actuators, "actuators", tree.label)
+    check_known(outputs or (), tuple(tree.sensors), "joints, and sensors of joints and actuators", tree.label)
     ends = {n: bounds.get(n) or _default_bounds(n, tree.numbers[n]) for n in own}
-    made = own if isinstance(own, Mapping) else {n: parameter_within(n, tree.numbers[n], ends[n]) for n in own}
+    made = {n: parameter_within(n, tree.numbers[n], ends[n]) for n in own}
+    if isinstance(given, Mapping):
+        made |= ParameterSet(given).free_within({n: ends[n] for n in bounds if n in given})
     drives = tuple(tree.actuators if inputs is None else inputs)
     measured = tuple(tree.default_outputs if outputs is None else outputs)
     equations = _Equations(tree, tuple(made), drives, measured)
     equations.check()
     return Simulator(
-        equations.dynamics,
+        equations,
         equations.outputs,
         (*tree.joints, *(f"{n}.speed" for n in tree.joints)),
         drives,
@@ -98,175 +99,41 @@ def from_mujoco(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Tree:
-    """A model as MuJoCo has compiled it, with its names."""
-
-    path: Path
-    mujoco: Any
-    model: Any
-
-    @classmethod
-    def load(cls, path: Path) -> _Tree:
-        """Read a file; refuse a model with features that the equations lack."""
-        try:
-            import mujoco
-        except ImportError:
-            raise InputError("mujoco is not installed; install it with `pip install pilfr-casadi[mujoco]`.") from None
-        existing_file(path)
-        try:
-            model = mujoco.MjModel.from_xml_path(str(path))
-        except Exception as error:
-            reason = " ".join(str(error).split())
-            raise InputError(f"MuJoCo cannot read {path} ({reason}); correct the file.") from None
-        tree = cls(path, mujoco, model)
-        if lacks := tree._unsupported_feature():
-            raise InputError(
-                f"{path} has {lacks}, which the equations of a tree of rigid bodies do not hold; remove it."
-            )
-        return tree
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Read the file again in another process."""
-        return _Tree.load, (self.path,)
-
-    def _unsupported_feature(self) -> str:
-        """Name a feature of the model that the equations lack; empty if there is none."""
-        m, mj = self.model, self.mujoco
-        one_axis = (int(mj.mjtJoint.mjJNT_HINGE), int(mj.mjtJoint.mjJNT_SLIDE))
-        cases = {
-            "no joint": m.njnt == 0,
-            "a free or a ball joint": any(kind not in one_axis for kind in m.jnt_type),
-            "an equality constraint": m.neq > 0,
-            "a tendon": m.ntendon > 0,
-            "dry friction in a joint (frictionloss)": np.any(m.dof_frictionloss > 0),
-            "an actuator that acts on something else than a joint": any(
-                kind != int(mj.mjtTrn.mjTRN_JOINT) for kind in m.actuator_trntype
-            ),
-            "an actuator with a state of its own": any(
-                kind != int(mj.mjtDyn.mjDYN_NONE) for kind in m.actuator_dyntype
-            ),
-            "a muscle, or another curved actuator": any(
-                kind > int(mj.mjtBias.mjBIAS_AFFINE) for kind in m.actuator_biastype
-            )
-            or any(kind != int(mj.mjtGain.mjGAIN_FIXED) for kind in m.actuator_gaintype),
-        }
-        return next((what for what, found in cases.items() if found), "")
-
-    def _names(self, kind: str, count: int) -> tuple[str, ...]:
-        number = getattr(self.mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
-        found = [self.mujoco.mj_id2name(self.model, number, i) or f"{kind}{i}" for i in range(count)]
-        return tuple(name.replace(" ", "_") for name in found)
-
-    @cached_property
-    def joints(self) -> tuple[str, ...]:
-        """Names of the joints."""
-        return self._names("joint", self.model.njnt)
-
-    @cached_property
-    def bodies(self) -> tuple[str, ...]:
-        """Names of the bodies, the world first."""
-        return self._names("body", self.model.nbody)
-
-    @cached_property
-    def actuators(self) -> tuple[str, ...]:
-        """Names of the actuators."""
-        return self._names("actuator", self.model.nu)
-
-    @cached_property
-    def sensors(self) -> dict[str, tuple[int, bool]]:
-        """(joint, whether the sensor measures its speed) by name of a joint's sensor or of a joint."""
-        kinds = {int(self.mujoco.mjtSensor.mjSENS_JOINTPOS): False, int(self.mujoco.mjtSensor.mjSENS_JOINTVEL): True}
-        found = {
-            name: (int(self.model.sensor_objid[i]), kinds[int(self.model.sensor_type[i])])
-            for i, name in enumerate(self._names("sensor", self.model.nsensor))
-            if int(self.model.sensor_type[i]) in kinds
-        }
-        return {**{name: (i, False) for i, name in enumerate(self.joints)}, **found}
-
-    @property
-    def default_outputs(self) -> tuple[str, ...]:
-        """The sensors of joints, or the joints if there is none."""
-        return tuple(n for n in self.sensors if n not in self.joints) or self.joints
-
-    def _list_moving_bodies(self) -> list[int]:
-        """List the bodies with a mass that a joint moves."""
-        m, moves = self.model, [False] * self.model.nbody
-        for i in range(1, m.nbody):
-            moves[i] = bool(m.body_jntnum[i]) or moves[m.body_parentid[i]]
-        return [i for i in range(1, m.nbody) if moves[i] and m.body_mass[i] > 0]
-
-    @cached_property
-    def numbers(self) -> dict[str, float]:
-        """Every number that may be a parameter, by name."""
-        m, out = self.model, {"gravity": float(np.linalg.norm(self.model.opt.gravity))}
-        for i in self._list_moving_bodies():
-            out |= {f"{self.bodies[i]}.mass": float(m.body_mass[i]), f"{self.bodies[i]}.inertia": 1.0}
-            out |= {f"{self.bodies[i]}.com_{axis}": float(v) for axis, v in zip(AXES, m.body_ipos[i], strict=True)}
-        for i, name in enumerate(self.joints):
-            spring = float(m.qpos_spring[m.jnt_qposadr[i]])
-            out |= {f"{name}.damping": float(m.dof_damping[i]), f"{name}.armature": float(m.dof_armature[i])}
-            out |= {f"{name}.stiffness": float(m.jnt_stiffness[i]), f"{name}.spring": spring}
-        return out | {f"{name}.gain": 1.0 for name in self.actuators}
-
-    @property
-    def default_parameters(self) -> tuple[str, ...]:
-        """Masses and dampings."""
-        return tuple(n for n in self.numbers if n.endswith((".mass", ".damping")))
-
-    def hinge(self, joint: int) -> bool:
-        """Tell whether a joint is a hinge."""
-        return bool(self.model.jnt_type[joint] == int(self.mujoco.mjtJoint.mjJNT_HINGE))
-
-    def units(self, measured: Sequence[str]) -> dict[str, str]:
-        """Units of outputs."""
-        kinds = {n: (self.hinge(i), speed) for n, (i, speed) in self.sensors.items() if n in measured}
-        return {n: ("rad" if turns else "m") + ("/s" if speed else "") for n, (turns, speed) in kinds.items()}
-
-    def acceleration(self, q: np.ndarray, v: np.ndarray, control: np.ndarray) -> np.ndarray:
-        """Compute MuJoCo's own accelerations (n,), without contacts and joint limits."""
-        m, mj = self.model, self.mujoco
-        data, flags = mj.MjData(m), m.opt.disableflags
-        m.opt.disableflags = flags | mj.mjtDisableBit.mjDSBL_CONSTRAINT
-        try:
-            data.qpos[:], data.qvel[:], data.ctrl[:] = q, v, control
-            mj.mj_forward(m, data)
-            return np.array(data.qacc)
-        finally:
-            m.opt.disableflags = flags
-
-
 class _Equations:
     """The equations of motion of a tree with some of its numbers, actuators and sensors as symbols."""
 
-    def __init__(self, tree: _Tree, free: tuple[str, ...], inputs: tuple[str, ...], measured: tuple[str, ...]) -> None:
+    def __init__(
+        self, tree: MujocoTree, free: tuple[str, ...], inputs: tuple[str, ...], measured: tuple[str, ...]
+    ) -> None:
         self.tree, self.free, self.inputs, self.measured = tree, free, inputs, measured
         n = len(tree.joints)
         q, v, u, p = (ca.SX.sym(name, size) for name, size in zip("qvup", (n, n, len(inputs), len(free)), strict=True))
         controls = {name: u[i] for i, name in enumerate(inputs)}
         numbers = {**tree.numbers, **{name: p[i] for i, name in enumerate(free)}}
-        driven = self._actuator_forces(q, v, controls, numbers)
-        mass, rest = self._motion_terms(q, v, driven, numbers)
-        # M, the rest of the equations M dv/dt = rest, and the actuators' forces on the joints
-        self.motion = ca.Function("motion", [q, v, u, p], [mass, rest, driven])
+        forces, driven = self._actuator_forces(q, v, controls, numbers)
+        sizes = ca.vertcat(*(numbers[f"{name}.frictionloss"] for name in tree.joints))
+        friction = _clip(ca.DM(tree.friction_slopes) * v, -sizes, sizes)
+        mass, rest = self._motion_terms(q, v, driven - friction, numbers)
+        # M, the rest of the equations M dv/dt = rest, the actuators' forces on the joints and their own, the friction
+        self.motion = ca.Function("motion", [q, v, u, p], [mass, rest, driven, forces, friction])
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Write the equations again in another process."""
         return _Equations, (self.tree, self.free, self.inputs, self.measured)
 
     def check(self) -> None:
-        """Compare with MuJoCo's accelerations at several points."""
+        """Compare with MuJoCo's accelerations at several points, without dry friction, which depends on its solver."""
         tree, rng, n = self.tree, np.random.default_rng(0), len(self.tree.joints)
         drives = [tree.actuators.index(name) for name in self.inputs]
         values = [tree.numbers[name] for name in self.free]
         for _ in range(COMPARED_POINTS):
             q, v, u = rng.uniform(-0.7, 0.7, n), rng.normal(0, 1, n), np.zeros(len(tree.actuators))
             u[drives] = rng.uniform(-0.5, 0.5, len(drives))
-            mass, rest, _ = self.motion(q, v, u[drives], values)
-            wanted, found = tree.acceleration(q, v, u), np.linalg.solve(mass.full(), rest.full().ravel())
+            mass, rest, _, _, friction = self.motion(q, v, u[drives], values)
+            wanted, found = tree.acceleration(q, v, u), np.linalg.solve(mass.full(), (rest + friction).full().ravel())
             if not np.max(np.abs(found - wanted)) <= AGREE * max(np.max(np.abs(wanted)), 1.0):
                 raise InputError(
-                    f"{tree.path} moves otherwise than a tree of rigid bodies with linear springs, dampers and "
+                    f"{tree.label} moves otherwise than a tree of rigid bodies with linear springs, dampers and "
                     "actuators; remove its other features, such as a fluid, curved damping, or gravity compensation."
                 )
 
@@ -292,7 +159,7 @@ class _Equations:
                 else:
                     p = p + along * moved
             poses.append((p, r))
-        for i in self.tree._list_moving_bodies():
+        for i in self.tree.list_moving_bodies():
             p, r = poses[i]
             centre = ca.vertcat(*(numbers[f"{self.tree.bodies[i]}.com_{axis}"] for axis in AXES))
             out.append((p + r @ centre, r @ _rotate_by(m.body_iquat[i]), i))
@@ -307,7 +174,7 @@ class _Equations:
         return out
 
     def _motion_terms(self, q: Any, v: Any, driven: Any, numbers: Mapping[str, Any]) -> tuple[Any, Any]:
-        """Return M(q), (n, n), and the rest of the equations M dv/dt = rest, (n,), with the actuators' forces."""
+        """Return M(q), (n, n), and the rest of the equations M dv/dt = rest, (n,), with the forces `driven`."""
         m, n, tree = self.tree.model, len(self.tree.joints), self.tree
         down = m.opt.gravity / (np.linalg.norm(m.opt.gravity) or 1.0)
         fall = numbers["gravity"] * ca.SX(ca.DM(down))
@@ -318,7 +185,8 @@ class _Equations:
             turning = ca.horzcat(*(axis if j in above else ca.SX.zeros(3) for j, axis in enumerate(hinges)))
             moving, weight = ca.jacobian(centre, q), numbers[f"{name}.mass"]
             share = numbers[f"{name}.inertia"] * weight / float(m.body_mass[i])
-            inertia = axes @ ca.diag(ca.SX(ca.DM(m.body_inertia[i])) * share) @ axes.T
+            principal = ca.vertcat(*(numbers[f"{name}.inertia_{axis}"] for axis in AXES))
+            inertia = axes @ ca.diag(principal * share) @ axes.T
             omega = turning @ v
             bias, turned = (ca.jtimes(part @ v, q, v) for part in (moving, turning))
             mass += weight * moving.T @ moving + turning.T @ inertia @ turning
@@ -330,21 +198,25 @@ class _Equations:
             rest[j] -= numbers[f"{name}.stiffness"] * (q[j] - numbers[f"{name}.spring"])
         return mass, rest
 
-    def _actuator_forces(self, q: Any, v: Any, controls: Mapping[str, Any], numbers: Mapping[str, Any]) -> Any:
-        """Return the force or torque of the actuators on every joint, (n,)."""
-        m, out = self.tree.model, ca.SX.zeros(len(self.tree.joints))
+    def _actuator_forces(
+        self, q: Any, v: Any, controls: Mapping[str, Any], numbers: Mapping[str, Any]
+    ) -> tuple[Any, Any]:
+        """Return the force of every actuator, (n_u,), and of all actuators on every joint, (n,)."""
+        m, driven = self.tree.model, ca.SX.zeros(len(self.tree.joints))
+        forces = ca.SX.zeros(len(self.tree.actuators))
         for i, name in enumerate(self.tree.actuators):
-            j, gear = int(m.actuator_trnid[i, 0]), float(m.actuator_gear[i, 0])
+            j, gear = int(m.actuator_trnid[i, 0]), numbers[f"{name}.gear"]
             control = controls.get(name, 0.0)
             if m.actuator_ctrllimited[i]:
-                control = ca.fmin(ca.fmax(control, m.actuator_ctrlrange[i, 0]), m.actuator_ctrlrange[i, 1])
+                control = _clip(control, *m.actuator_ctrlrange[i])
             b0, b1, b2 = m.actuator_biasprm[i, :3]
             gain = m.actuator_gainprm[i, 0] * numbers[f"{name}.gain"]
             force = gain * control + b0 + b1 * gear * q[j] + b2 * gear * v[j]
-            if m.actuator_forcelimited[i]:
-                force = ca.fmin(ca.fmax(force, m.actuator_forcerange[i, 0]), m.actuator_forcerange[i, 1])
-            out[j] += gear * force
-        return out
+            forces[i] = _clip(force, *m.actuator_forcerange[i]) if m.actuator_forcelimited[i] else force
+            driven[j] += gear * forces[i]
+        for j in np.flatnonzero(m.jnt_actfrclimited).tolist():
+            driven[j] = _clip(driven[j], *m.jnt_actfrcrange[j])
+        return forces, driven
 
     def _evaluate(self, x: Named, u: Named, p: Named) -> Any:
         """Evaluate `motion` for the simulator's symbols."""
@@ -356,17 +228,28 @@ class _Equations:
             ca.vertcat(none, *(p[n] for n in self.free)),
         )
 
-    def dynamics(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
-        """Evaluate the derivatives by state."""
+    @property
+    def note(self) -> str:
+        """The features of the model that the equations leave out; a `Simulator` prints it."""
+        return self.tree.omissions
+
+    def __call__(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
+        """Evaluate the derivatives by state: the dynamics of a `Simulator`."""
         names = self.tree.joints
-        mass, rest, _ = self._evaluate(x, u, p)
+        mass, rest = self._evaluate(x, u, p)[:2]
         faster = ca.vertsplit(ca.solve(mass, rest))
         return {n: x[f"{n}.speed"] for n in names} | {f"{n}.speed": a for n, a in zip(names, faster, strict=True)}
 
-    def outputs(self, x: Named) -> dict[str, Any]:
+    def outputs(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
         """Evaluate the outputs by name."""
-        kinds = {n: self.tree.sensors[n] for n in self.measured}
-        return {n: x[self.tree.joints[i] + (".speed" if speed else "")] for n, (i, speed) in kinds.items()}
+        joints, out = self.tree.joints, {}
+        for name in self.measured:
+            what, i = self.tree.sensors[name]
+            if what in ("force", "joint force"):
+                out[name] = self._evaluate(x, u, p)[3 if what == "force" else 2][i]
+            else:
+                out[name] = x[joints[i] + (".speed" if what == "speed" else "")]
+        return out
 
     def port(self, joint: int) -> Port:
         """Make the port of a joint; a positive force opposes motion."""
@@ -407,9 +290,13 @@ def _rotate_by(quaternion: np.ndarray) -> Any:
     return ca.SX(ca.DM.eye(3) + 2 * w * k + 2 * k @ k)
 
 
+def _clip(value: Any, low: Any, high: Any) -> Any:
+    return ca.fmin(ca.fmax(value, low), high)
+
+
 def _default_bounds(name: str, value: float) -> tuple[float, float]:
     if ".com_" in name or name.endswith(".spring"):
         return -np.inf, np.inf
-    if name.endswith((".damping", ".armature", ".stiffness")):  # a joint need not have any
+    if name.endswith((".damping", ".armature", ".stiffness", ".frictionloss")):  # a joint need not have any
         return 0.0, within_a_factor(value)[1] or np.inf
     return within_a_factor(value) if value else (0.0, np.inf)

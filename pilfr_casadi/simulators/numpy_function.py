@@ -8,7 +8,6 @@ longer calls the function. With `numeric=Numeric()`, a function that cannot be t
 
 from __future__ import annotations
 
-import inspect
 import linecache
 import sysconfig
 import traceback
@@ -26,6 +25,7 @@ from .._base import InputError, in_words, listed
 from ..models import Named, Parameter, ParameterSet
 from .black_box import BlackBox, Numeric, nominal_sizes
 from .equations import check_names, check_parameters, stack
+from .signature import read_signature
 from .simulator import Simulator
 from .symbols import NotTraceable, expression, symbols
 from .tracing import Trace, accept_symbols, explore_paths
@@ -34,7 +34,6 @@ COMPARED_POINTS = 40  # at which the equations are compared with the function
 SIZE_DECADES = (-3.0, 2.0)  # range of the powers of ten of states and inputs at these points, in their own units
 PARAMETER_CHANGE = 0.1  # relative change of parameters between these points
 AGREE = 1e-9  # relative difference that rounding may cause, because the order of operations can differ
-ARGUMENTS = ("t", "x", "u", "p")
 
 
 def from_function(
@@ -56,9 +55,11 @@ def from_function(
     ----------
     function : callable
         `function(t, x, u, p)` returns the derivatives of the states, in the order of `states`, as a list or an array.
-        t is the time in s, x and u are arrays in the order of `states` and `inputs`, p is a mapping: `p["k"]`.
+        t is the time in s, x and u are arrays in the order of `states` and `inputs`, p is a mapping: `p["k"]`. Instead
+        of u and p, inputs and parameters may be arguments by their names: `function(t, y, force, k)`.
     outputs : callable, or names of states
-        `outputs(t, x, u, p)` returns `{output: value}`. A name, or a tuple of names, are states that are measured.
+        `outputs(t, x, u, p)`, or with arguments by their names, returns `{output: value}`. A name, or a tuple of names,
+        are states that are measured.
     states, inputs : tuple of str
         Names.
     parameters : mapping
@@ -163,19 +164,12 @@ class _UserFunction:
         self.function, self.kind, self.names = function, kind, names
         self.called = getattr(function, "__name__", type(function).__name__)
         self.rows = names.states if kind == "derivatives" else ()
-        self._check_arguments()
-        self.values = self._evaluate_at_points()
-
-    def _check_arguments(self) -> None:
-        function, called = self.function, self.called
         if not callable(function):
-            raise InputError(f"{function!r} was given for the {self.kind}; give a function of t, x, u and p.")
-        try:
-            inspect.signature(getattr(function, "py_func", function)).bind(*ARGUMENTS)
-        except (TypeError, ValueError):
-            raise InputError(
-                f"{called} cannot be called as {called}(t, x, u, p); give a function of these four."
-            ) from None
+            raise InputError(f"{function!r} was given for the {kind}; give a function of t, x, u and p.")
+        self.signature = read_signature(function, self.called, names.inputs, tuple(names.parameters))
+        if kind == "derivatives":
+            self.signature.check_driven()
+        self.values = self._evaluate_at_points()
 
     def _evaluate_at_points(self) -> list[tuple[Any, np.ndarray]]:
         """Call the function with numbers; a function may fail at points outside its domain."""
@@ -183,7 +177,8 @@ class _UserFunction:
         for point in self.names.points():
             try:
                 with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore"):
-                    row = self.check_result(self.function(*_read_only(point, self.names.parameters)))
+                    given = _read_only(point, self.names.parameters)
+                    row = self.check_result(self.signature.call(self.function, *given))
                 values.append((point, np.array(row, dtype=float)))
             except InputError:
                 raise
@@ -261,7 +256,7 @@ class _UserFunction:
                 "arithmetic and functions of NumPy (np.interp for tables), leave out checks, give numeric=Numeric(...) "
                 "for solvers, or write the equations in CasADi as a Simulator."
             )
-        return f"{place} fails with numbers ({said}); it is called as {self.called}(t, x, u, p) with p[name]."
+        return f"{place} fails with numbers ({said}); {self.signature.describe()}."
 
 
 def _make_equations(own: _UserFunction, numeric: Numeric | None) -> _Equations | BlackBox:
@@ -281,7 +276,8 @@ def _trace(own: _UserFunction) -> _Equations:
             n: symbols(v, names.parameters[n].value.shape, trace) for n, v in names.parameters.symbols(p).items()
         }
         arrays = symbols(x, x.shape[:1], trace), symbols(u, u.shape[:1], trace)
-        result = accepting(symbols(t, (), trace), *arrays, types.MappingProxyType(parameters))
+        given = symbols(t, (), trace), *arrays, types.MappingProxyType(parameters)
+        result = own.signature.call(accepting, *given)
         return ca.vertcat(ca.SX(0, 1), *map(expression, own.check_result(result)))
 
     try:
@@ -290,7 +286,7 @@ def _trace(own: _UserFunction) -> _Equations:
         raise
     except Exception as error:
         raise InputError(own.describe_failure(error, symbolic=True)) from error
-    traced = ca.Function(kind, [t, x, u, p], [equations], [*ARGUMENTS], [kind])
+    traced = ca.Function(kind, [t, x, u, p], [equations], ["t", "x", "u", "p"], [kind])
     own.compare(traced)
     times = f"{calls + COMPARED_POINTS} times ({calls} for its branches, {COMPARED_POINTS} as a check)"
     return _Equations(traced, own.rows, tuple(names.parameters), f"{kind}: equations of {own.called}; called {times}")
@@ -298,7 +294,7 @@ def _trace(own: _UserFunction) -> _Equations:
 
 def _make_black_box(own: _UserFunction, numeric: Numeric) -> BlackBox:
     """Make equations that call a function with numbers."""
-    function, kind, names, rows, jacobian = own.function, own.kind, own.names, own.rows, numeric.jacobian
+    function, signature, kind, names, rows = own.function, own.signature, own.kind, own.names, own.rows
     every = (*names.states, *names.inputs, *names.parameters)
     counts = [*(1 for _ in (*names.states, *names.inputs)), *(p.size for p in names.parameters.values())]
     sizes = nominal_sizes(numeric.nominal, every, counts)
@@ -311,11 +307,13 @@ def _make_black_box(own: _UserFunction, numeric: Numeric) -> BlackBox:
         return float(z[0]), z[1 : at[1]].copy(), z[at[1] : at[2]].copy(), latest[1]
 
     def evaluate(z: np.ndarray) -> np.ndarray:
-        result = function(*arguments(z))
+        result = signature.call(function, *arguments(z))
         result = [result[n] for n in rows] if kind == "outputs" else result
         return np.array(result, dtype=float).reshape(len(rows))
 
-    slope = None if jacobian is None else (lambda z: jacobian(*arguments(z)))
+    jacobian = numeric.jacobian
+    its_own = None if jacobian is None else read_signature(jacobian, "jacobian", names.inputs, tuple(names.parameters))
+    slope = None if its_own is None else (lambda z: its_own.call(jacobian, *arguments(z)))
     made = BlackBox(evaluate, own.called, rows, (names.states, names.inputs, tuple(names.parameters)), slope, sizes)
     made.points = [(np.hstack(point), row) for point, row in own.values if np.all(np.isfinite(row))]
     return made

@@ -7,7 +7,7 @@ like any other.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -92,7 +92,8 @@ class Simulator(Equations):
         if set(recording.inputs) != set(self.inputs):
             raise InputError(
                 f"{recording.label} has the inputs {', '.join(recording.inputs) or 'none'}; the simulator has "
-                f"{', '.join(self.inputs) or 'none'}."
+                f"{', '.join(self.inputs) or 'none'}; give the missing ones as columns, or for an FMU name the "
+                "recorded ones, as in from_fmu(..., inputs=...)."
             )
         columns = [recording.inputs.index(name) for name in self.inputs]
         factors = [unit_factor(self, recording, name) for name in self.inputs]
@@ -129,6 +130,17 @@ class Simulator(Equations):
         matplotlib.figure.Figure
         """
         return later("identify.compare")(recording, self).plot()
+
+    @property
+    def program_calls(self) -> dict[str, int]:
+        """How often functions have been called with numbers, by name; empty if there are equations for all.
+
+        A worker process counts its own calls.
+        """
+        found = dict[str, int]()
+        for part in (self.dynamics, self.outputs):
+            found |= getattr(part, "program_calls", {})
+        return found
 
     def _repr_html_(self) -> str:
         return str(later("report.simulator_card")(self))
@@ -172,15 +184,30 @@ class Simulator(Equations):
         InputError
             If a name is unknown.
         """
+        self._check_parameters(parameters)
         own = self.parameter_set
-        for name in parameters:
-            if name not in own:
-                raise InputError(f"There is no parameter {name!r}; the simulator has {', '.join(own) or 'none'}.")
         given = ParameterSet(
             {k: p if isinstance(p := parameters.get(k, q), Parameter) else replace(q, value=p) for k, q in own.items()}
         )
         alike = all(given[name].shape == own[name].shape for name in own)
         return self._copy_with(parameters=given) if alike else replace(self, parameters=given)
+
+    def _check_parameters(self, names: Iterable[str]) -> None:
+        own = self.parameter_set
+        for name in names:
+            if name not in own:
+                raise InputError(f"There is no parameter {name!r}; the simulator has {', '.join(own) or 'none'}.")
+
+    def with_bounds(self, bounds: Mapping[str, tuple[float, float]]) -> Simulator:
+        """Copy with other bounds `(lower, upper)` of some parameters, which a fit may then change.
+
+        Raises
+        ------
+        InputError
+            If a name is unknown, or a value lies outside its bounds.
+        """
+        self._check_parameters(bounds)
+        return self._copy_with(parameters=self.parameter_set.free_within(bounds))
 
     def with_element(self, port: str, law: Any) -> Simulator:
         """Copy with a law in a port; see `close_loop`."""

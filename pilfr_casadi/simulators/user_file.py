@@ -31,7 +31,7 @@ def user_variable(
     path = Path(path)
     code = _compile(path, _read(path, what), what)
     module = types.ModuleType(f"_{name}_{''.join(c if c.isalnum() else '_' for c in path.stem)}")
-    module.__file__ = str(path)
+    module.__file__ = str(path.absolute())  # as Python does, so that a library beside the file is found
     with _isolate_imports(path.resolve().parent, module):
         try:
             exec(code, module.__dict__)

@@ -301,19 +301,24 @@ class _Execution:
         ready_ids = {j.id for j in ready}
         try:
             for batch in self.runner(store, [j for j in jobs if j.id not in ready_ids]):
-                with deferred_interrupt():  # a finished job must not be lost
-                    store.record(batch)
-                    ready += [job for job, _ in batch]
-                    self.done += [job.id for job, _ in batch]
-                for job, found in batch:
-                    failure = f"no model ({found.entry['status'].lower().replace('_', ' ')})"
-                    self.print_line(f"{job.id}: {found.entry['sentence'] if store.gave_model(job) else failure}")
-                store.write_table((*before, *ready))
-                best = min(store.manifest.entries[j.id].get("train", np.inf) for j in ready)
+                if batch:
+                    with deferred_interrupt():  # a finished job must not be lost
+                        self._record(batch)
+                        ready += [job for job, _ in batch]
+                    store.write_table((*before, *ready))
+                best = min((store.manifest.entries[j.id].get("train", np.inf) for j in ready), default=np.inf)
                 self.progress("jobs", len(before) + len(ready), total, best)
         finally:
             with deferred_interrupt():  # the table has all finished jobs, however the run ends
                 store.write_table((*before, *ready), last=True)
+
+    def _record(self, batch: Batch) -> None:
+        """Record finished jobs, and print a line about each."""
+        self.store.record(batch)
+        self.done += [job.id for job, _ in batch]
+        for job, found in batch:
+            failure = f"no model ({found.entry['status'].lower().replace('_', ' ')})"
+            self.print_line(f"{job.id}: {found.entry['sentence'] if self.store.gave_model(job) else failure}")
 
     def _finish(self, jobs: Sequence[RunJob], selection: Selection | None) -> RunResult:
         """Write the tables, and the model and page of the chosen job."""
@@ -329,11 +334,10 @@ class _Execution:
         note = CHOSEN_ON_TRAINING if len(given.cells) > 1 and selection is None else ""
         manifest.content.pop("choice", None)
         manifest.content |= {"chosen": best, **({"choice": note} if note else {})}
-        manifest.put(TABLE, results_table(scores, jobs, entries, best))
-        manifest.put(MODEL, (store.path / job.model_file).read_text(encoding="utf-8"))
+        model = (store.path / job.model_file).read_text(encoding="utf-8")
+        manifest.put({TABLE: results_table(scores, jobs, entries, best), MODEL: model})
         if store.campaign:
-            manifest.put(SUMMARY, summary_table(given, summary))
-            manifest.put(PICTURE, box_plots(given, jobs, scores))
+            manifest.put({SUMMARY: summary_table(given, summary), PICTURE: box_plots(given, jobs, scores)})
         if given.report:
             self._write_page(fit)
         manifest.content.pop("writing", None)
@@ -367,7 +371,7 @@ class _Execution:
         self.print_line("writing the report")
         self.progress("writing the report", 0, 0, np.nan)
         judged = store.recordings["validation"] + store.recordings["test"]
-        manifest.put(PAGE, fit_page(fit, store.recordings["train"], judged, model_file=MODEL).html())
+        manifest.put({PAGE: fit_page(fit, store.recordings["train"], judged, model_file=MODEL).html()})
         manifest.content["report"] = key
 
 

@@ -6,6 +6,7 @@ on where, when or how often it ran.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
 import logging
@@ -31,6 +32,7 @@ import numpy as np
 from .._base import InputError, Reply, __version__, close_workers, run_in_worker
 
 AHEAD = 64  # jobs submitted to an executor at a time
+PAUSE = 1.0  # seconds without an outcome after which an empty batch lets the caller report the time
 SCHEDULER_TIMEOUT = 10.0  # seconds to wait for a Dask scheduler
 RETRIES = 2  # further trials of a job whose worker was lost
 FAILED, TIMED_OUT, LOST = "FAILED", "TIMED_OUT", "LOST"  # statuses of jobs without a result
@@ -94,7 +96,8 @@ def run_side_by_side(
 ) -> Iterator[Batch]:
     """Run jobs on an executor, else in processes, or in this process (one worker without a time limit).
 
-    Every process receives `work` once, and its jobs one by one.
+    Every process receives `work` once, and its jobs one by one. While other processes work, an empty batch is yielded
+    about every second.
     """
     if executor is not None:
         yield from _collect_outcomes(work, jobs, effort, executor, ahead)
@@ -133,7 +136,7 @@ def _collect_outcomes(
                 running[executor.submit(run_in_worker, shared, _pickle(job), effort.time_limit)] = job, trial
             batch: Batch = []
             stop: Exception | None = None
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
+            for future in wait(running, PAUSE, FIRST_COMPLETED).done:
                 job, trial = running.pop(future)
                 try:
                     outcome = _read_outcome(future, trial > effort.retries, effort.time_limit)
@@ -143,8 +146,7 @@ def _collect_outcomes(
                         batch.append((job, outcome))
                 except (InputError, BrokenExecutor, CancelledError) as error:
                     stop = error
-            if batch:
-                yield batch  # before the error of another job is raised: these results are kept
+            yield batch  # before the error of another job is raised: these results are kept
             if stop is not None:
                 raise stop
     except (BrokenExecutor, CancelledError, RuntimeError, OSError) as error:
@@ -212,12 +214,21 @@ def _pickle(thing: Any) -> bytes:
 def dask_executor(address: str) -> Iterator[tuple[Executor, int, int]]:
     """Yield an executor on a Dask cluster, its number of threads, and the number of jobs to submit at a time."""
     try:
-        from distributed import Client
+        from distributed import Client, Security
+        from distributed.comm import connect
     except ImportError:
         raise InputError("--dask needs the package distributed; install pilfr-casadi[dask].") from None
     for name in [n for n in logging.root.manager.loggerDict if n.startswith("distributed")]:
         logging.getLogger(name).setLevel(logging.CRITICAL)  # errors that matter arrive as outcomes of jobs
+
+    async def reach_scheduler() -> None:
+        given = Security().get_connection_args("client")
+        await (await connect(address, timeout=SCHEDULER_TIMEOUT, **given)).close()
+
     try:
+        # a client that fails to connect waits 20 s more and prints a traceback; this thread may run a loop already
+        with ThreadPoolExecutor(1) as other:
+            other.submit(asyncio.run, reach_scheduler()).result()
         client = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,22 +19,24 @@ from ..data import Recording
 from ..diagnose import SURE, check_laws, replicate
 from ..laws import Law
 from ..simulators import as_simulator, name_at
-from .machines import DONE, PAGE, RESIDUAL, LawAt, MachineWork, measured_entry
+from .machines import DONE, PAGE, RESIDUAL, SAMPLE, LawAt, MachineWork, measured_entry
 from .population import Population, combine, estimate_population, slope
 
-CONTENT, TABLE = "fleet.json", "fleet.csv"
+CONTENT, TABLE, PAGES = "fleet.json", "fleet.csv", "pages"
 SCHEMA = 1
 MOST_SHOWN = 20  # machines in the printed result
 SHARED, OWN = "shared", "per machine"
+PER_RECORDING, PER_TIME = "recording", "unit of time"  # of a trend; the second is the unit of the given times
 
 
 @dataclass(frozen=True, eq=False)
 class Trend:
-    """Change of a value per unit of time, its standard error, and the probability that it is not zero."""
+    """Change of a value, its standard error, the probability that it is not zero, and the unit of time."""
 
     slope: float
     error: float
     probability: float
+    per: str = PER_TIME
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +62,10 @@ class Machine:
     failed : str
         Why the machine could not be fitted; empty if it could.
     rest : mapping
-        The diagnosis of what remains: `verdict`, `sentence`, `effects`; empty if there was none.
+        The diagnosis of what remains: `verdict`, `sentence`, `effects`, and `faults` of the recordings; empty if there
+        was none.
     report : str
-        Path of the machine's own report below the folder of the fleet, if there is one.
+        Path of the machine's own diagnosis below the folder of the fleet, if there is one.
     """
 
     name: str
@@ -90,26 +93,53 @@ class Machine:
     def reasons(self) -> tuple[tuple[str, float], ...]:
         """Findings that are more likely than not, each with its probability; the most probable first."""
         found = [(self._describe_rest(), self.beyond)] if self.beyond > SURE else []
+        if self.rest.get("faults"):  # the values are then of wrong recordings
+            return tuple(found)
         found += [
             (f"{name} = {_with_error(self.values[name], self.errors[name])}", p)
             for name, p in self.differs.items()
             if p > SURE
         ]
         found += [
-            (f"{name} drifts by {_with_error(t.slope, t.error)} per unit of time", t.probability)
+            (f"{name} drifts by {_with_error(t.slope, t.error)} per {t.per}", t.probability)
             for name, t in self.trends.items()
             if t.probability > SURE
         ]
         return tuple(sorted(found, key=lambda r: -r[1]))
 
+    @property
+    def drifts(self) -> bool:
+        """Whether a value drifts; values of faulty recordings say nothing about this."""
+        return not self.rest.get("faults") and any(t.probability > SURE for t in self.trends.values())
+
+    @property
+    def page(self) -> str:
+        """Path of the machine's page below the folder of the fleet."""
+        return f"{PAGES}/{self.name}/{PAGE}"
+
+    @property
+    def note(self) -> str:
+        """Withdraw the diagnosis of a single machine that assumed constant values; empty if there is none."""
+        if not self.drifts or f"/{SAMPLE}-" not in self.report:
+            return ""
+        return "its diagnosis alone assumed constant values and is replaced by this finding"
+
+    @property
+    def findings(self) -> str:
+        """The reasons with their probabilities, and the note; empty if there are none."""
+        return "; ".join(filter(None, (*(f"{text} ({p:.2f})" for text, p in self.reasons), self.note)))
+
     def _describe_rest(self) -> str:
+        if faults := self.rest.get("faults"):
+            return f"its error is {self.ratio:.3g} times the noise. {' '.join(faults).rstrip('.')}"
         text = f"lacks more: its error is {self.ratio:.3g} times the noise"
         named = ", ".join(name_at(e["port"], e["law"], e.get("form", "")) for e in self.rest.get("effects", ()))
         return f"{text}; {named}" if named else text
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for JSON."""
-        content: dict[str, Any] = to_json({**asdict(self), "probability": self.probability})
+        derived = {"probability": self.probability, "page": self.page, "note": self.note}
+        content: dict[str, Any] = to_json({**asdict(self), **derived})
         return content
 
     @classmethod
@@ -201,7 +231,7 @@ class Fleet:
     @property
     def drifting(self) -> tuple[Machine, ...]:
         """Machines with a value that drifts."""
-        return tuple(m for m in self.machines if any(t.probability > SURE for t in m.trends.values()))
+        return tuple(m for m in self.machines if m.drifts)
 
     @property
     def summary(self) -> str:
@@ -241,7 +271,9 @@ class Fleet:
         """
         work, laws = self.work, self.work.build(self.common.laws)
         found = replicate(work.simulator, recordings, laws, self.common.starts, hold=work.hold, engine=work.engine)
-        return judge_entry(name, measured_entry(found), self.values, self.remainder, times)
+        judged = judge_entry(name, measured_entry(found), self.values, self.remainder, times)
+        faults = work.channel_faults(self.common.laws, recordings) if judged.beyond > SURE else []
+        return replace(judged, rest={"faults": faults}) if faults else judged
 
     def table(self) -> list[dict[str, Any]]:
         """List the machines as the rows of fleet.csv, the most probable to differ first."""
@@ -290,8 +322,8 @@ class Fleet:
         return content
 
     def documents(self) -> dict[str, str]:
-        """Make the contents of fleet.json, fleet.csv and report.html."""
-        from ..report import fleet_page
+        """Make the contents of fleet.json, fleet.csv, report.html and the page of each machine."""
+        from ..report import fleet_page, machine_page
 
         content, rows = self.to_dict(), self.table()
         names = list(dict.fromkeys(key for row in rows for key in row))
@@ -304,10 +336,11 @@ class Fleet:
             CONTENT: json_text(content),
             TABLE: csv_text([names, *([row.get(name, "") for name in names] for row in rows)]),
             PAGE: fleet_page(content, residuals).html(),
+            **{m.page: machine_page(content, m.name, residuals.get(m.name)).html() for m in self.machines},
         }
 
     def report(self, folder: Any) -> Path:
-        """Write fleet.json, fleet.csv, report.html and the machines' own reports; return the page's path."""
+        """Write fleet.json, fleet.csv, report.html and the pages of the machines; return the page's path."""
         target = make_folder(folder)
         contents: dict[str, str | bytes] = {**self.files, **self.documents()}
         for name, data in contents.items():
@@ -324,7 +357,7 @@ class Fleet:
         shown = [m for m in self.machines if m.failed or m.reasons]
         lines += ["machines that differ or drift, the surest first:"] if shown else []
         for m in shown[:MOST_SHOWN]:
-            lines.append(f"  {m.name}: {m.failed or '; '.join(f'{text} ({p:.2f})' for text, p in m.reasons)}")
+            lines.append(f"  {m.name}: {m.failed or m.findings}")
         return "\n".join([*lines, f"  and {len(shown) - MOST_SHOWN} more"] if len(shown) > MOST_SHOWN else lines)
 
     __repr__ = __str__
@@ -345,7 +378,9 @@ def judge_entry(
 
     found = {v.name: trend_of(entry, v.name, times) for v in values}
     trends = {
-        v.name: Trend(*found[v.name][:2], compare(v.trends, *found[v.name]))
+        v.name: Trend(
+            *found[v.name][:2], compare(v.trends, *found[v.name]), PER_RECORDING if times is None else PER_TIME
+        )
         for v in values
         if np.isfinite(found[v.name][0])
     }

@@ -10,7 +10,8 @@ The steps:
    several recordings, each is also fitted alone.
 4. `population` estimates the distributions of each value, of its trend in time, and of the remaining error over the
    machines, and the probability that each machine differs.
-5. Machines whose error shows that they lack more are diagnosed alone, from the simulator with the common physics.
+5. Machines whose error shows that they lack more are checked for a wrong sign or unit of a channel. If there is none,
+   they are diagnosed alone, from the simulator with the common physics.
 
 A step at a machine is a job. Jobs run side by side and are recorded in the folder, as in a campaign: however a fleet
 ends, the same call continues from there, and gives the same bytes with any executor and any number of workers.
@@ -48,7 +49,17 @@ from ..laws import Law
 from ..simulators import Simulator, as_simulator
 from .execution import NoModel, PrintLine, RunInterrupted
 from .executor import AHEAD, LOST, Effort, run_side_by_side, versions
-from .fleet_result import CONTENT, TABLE, Common, Fleet, Machine, distributions, judge_entry, values_by_recording
+from .fleet_result import (
+    CONTENT,
+    PAGES,
+    TABLE,
+    Common,
+    Fleet,
+    Machine,
+    distributions,
+    judge_entry,
+    values_by_recording,
+)
 from .folder import JOBS, Layout, Manifest, check_own, lock_folder, refuse_other_versions
 from .machines import (
     CONTENT as DIAGNOSIS,
@@ -67,7 +78,13 @@ from .machines import (
 
 SAMPLE_SIZE = 4  # machines that are diagnosed to find the common physics
 FEWEST_MACHINES = 2
-FLEET = Layout("fleet", "simulator file", (CONTENT, TABLE, PAGE), (PAGE, DIAGNOSIS, RESIDUAL))
+FLEET = Layout("fleet", "simulator file", (CONTENT, TABLE, PAGE, PAGES), (PAGE, DIAGNOSIS, RESIDUAL))
+STAGES = {  # of each step at some machines, in words
+    REFIT: "refit of the simulator as given, machine by machine",
+    SAMPLE: "diagnosis of single machines, to find the common physics",
+    MEASURE: "fit with the common physics, machine by machine",
+    REST: "diagnosis of machines that lack more",
+}
 Recordings = Recording | Sequence[Recording]
 
 
@@ -289,13 +306,19 @@ class _FleetExecution:
         ready = {job.id for job in jobs if self._is_complete(job)}
         self.done += len(ready)
         missing = [job for job in jobs if job.id not in ready]
+        if jobs:
+            self.print_line(f"{step}: {STAGES[step]}; {len(ready)} of {len(jobs)} already done")
+        done = len(ready)
+        self.progress(step, done, len(jobs), np.nan)
         for batch in run_side_by_side(self.work, missing, self.effort, self.executor, self.ahead):
-            with deferred_interrupt():  # a finished job must not be lost
-                self.manifest.record(batch)
-                self.done += len(batch)
+            if batch:
+                with deferred_interrupt():  # a finished job must not be lost
+                    self.manifest.record(batch)
+                    self.done += len(batch)
+            done += len(batch)
             for job, found in batch:
                 self.print_line(f"{job.id}: {found.entry['sentence']}")
-            self.progress(step, len(ready) + sum(j.id in self.manifest.entries for j in missing), len(jobs), np.nan)
+            self.progress(step, done, len(jobs), np.nan)
         text = json.dumps({job.machine: self.manifest.entries[job.id] for job in jobs}, sort_keys=True)
         entries: dict[str, dict[str, Any]] = json.loads(text)  # in the order in which a resumed fleet reads them
         return entries
@@ -327,19 +350,17 @@ class _FleetExecution:
         found = self._run_step(REST, names, laws, values)
         out = dict(judged)
         for name, m in judged.items():
-            step = REST if name in found and found[name]["status"] == DONE else SAMPLE if name in sampled else ""
+            diagnosed = "fit" in found.get(name, {})  # rather than failed, or a faulty recording
+            step = REST if diagnosed else SAMPLE if name in sampled else ""
             page = f"{JOBS}/{step}-{name}/{PAGE}"
-            keys = ("status", "verdict", "sentence", "effects")
+            keys = ("status", "verdict", "sentence", "effects", "faults")
             rest = {k: found[name][k] for k in keys if k in found[name]} if name in found else {}
             out[name] = replace(m, rest=rest, report=page if page in self.manifest.content["files"] else "")
         return out
 
     def _units(self, laws: Sequence[LawAt]) -> dict[str, str]:
         """Return the unit of each parameter by label, in the order of the simulator with the laws."""
-        placed = self.work.simulator
-        for port, law in self.work.build(laws):
-            placed = placed.with_element(port, law)
-        own = placed.readable_parameters()
+        own = self.work.place(laws).readable_parameters()
         return {label: own[label.partition("[")[0]].unit for label in own.labels}
 
     def _read_files(self) -> dict[str, bytes]:
@@ -349,8 +370,7 @@ class _FleetExecution:
     def _write(self, result: Fleet) -> None:
         """Write the files of the whole fleet; drop the entries of jobs that no longer belong to it."""
         self.manifest.content["jobs"] = {k: v for k, v in self.manifest.entries.items() if k in self.jobs}
-        for name, text in result.documents().items():
-            self.manifest.put(name, text)
+        self.manifest.put(result.documents())
         self.manifest.content.pop("writing", None)
         self.manifest.write()
 
@@ -414,7 +434,7 @@ def _collect_histories(
     """Collect the values over time of machines that drift: machine -> parameter -> times, values, errors."""
     out: dict[str, dict[str, Any]] = {}
     for m in machines:
-        for label in (label for label, t in m.trends.items() if t.probability > SURE):
+        for label in (label for label, t in m.trends.items() if m.drifts and t.probability > SURE):
             values, errors = values_by_recording(entries[m.name], label)
             history = {"times": list(times.get(m.name, range(len(values)))), "values": values, "errors": errors}
             out.setdefault(m.name, {})[label] = history

@@ -104,7 +104,7 @@ def lock_folder(folder: Path, layout: Layout = RUN) -> Iterator[None]:
                 raise InputError(
                     f"Another {layout.kind} is at work in {folder}; wait for it, or give another --out."
                 ) from None
-        for path in (*folder.iterdir(), *folder.glob(f"{JOBS}/*/.*")):
+        for path in (*folder.iterdir(), *folder.glob("*/*/.*")):
             if layout.is_half_written(path.name):
                 path.unlink(missing_ok=True)
         yield
@@ -171,15 +171,17 @@ class Manifest:
             )
         return True
 
-    def put(self, name: str, content: str | bytes) -> None:
-        """Write a file of the study and its digest in the manifest, unless both are up to date."""
-        data = content.encode() if isinstance(content, str) else content
-        if self.content["files"].get(name) != digest(data) or not self.holds(name):
-            self.put_all({name: data})
+    def put(self, contents: Mapping[str, str | bytes]) -> None:
+        """Write files of the study and their digests in the manifest, except those that are up to date."""
+        data = {name: text.encode() if isinstance(text, str) else text for name, text in contents.items()}
+        known = self.content["files"]
+        self.put_all({k: d for k, d in data.items() if known.get(k) != digest(d) or not self.holds(k)})
 
     def put_all(self, contents: Mapping[str, bytes], jobs: Mapping[str, Any] | None = None) -> None:
         """Announce files in the manifest, write them, then record their digests and the entries of the jobs."""
         found = {name: digest(data) for name, data in contents.items()}
+        if not contents and not jobs:
+            return
         if contents:
             self.content["writing"] = found
             self.write()
@@ -276,7 +278,7 @@ class Store:
         """Write the errors so far of a running campaign, at most once per `TABLE_PAUSE` except the last time."""
         if not self.campaign or (not last and time.monotonic() < self.written + TABLE_PAUSE) or not jobs:
             return
-        self.manifest.put(TABLE, results_table(self.scores(jobs), jobs, self.manifest.entries, ""))
+        self.manifest.put({TABLE: results_table(self.scores(jobs), jobs, self.manifest.entries, "")})
         self.written = time.monotonic()
 
 

@@ -17,9 +17,17 @@ import numpy as np
 
 from .._base import InputError, digest, json_text, to_json
 from ..data import Recording, fingerprint
-from ..diagnose import Diagnosis, Replication, add_scaled_laws, diagnose, refit_error, replicate
+from ..diagnose import (
+    Diagnosis,
+    Replication,
+    add_scaled_laws,
+    diagnose,
+    find_channel_faults,
+    refit_error,
+    replicate,
+)
 from ..laws import Law
-from ..simulators import Simulator
+from ..simulators import Simulator, name_at
 from .executor import Outcome
 
 REFIT, SAMPLE, MEASURE, REST = "refit", "sample", "measure", "rest"  # the steps at a machine
@@ -99,6 +107,17 @@ class MachineWork:
         known = self.known
         return [law.build(known) for law in laws]
 
+    def place(self, laws: Sequence[LawAt]) -> Simulator:
+        """Return the simulator with the laws in its ports."""
+        placed = self.simulator
+        for port, law in self.build(laws):
+            placed = placed.with_element(port, law)
+        return placed
+
+    def channel_faults(self, laws: Sequence[LawAt], recordings: Any) -> list[str]:
+        """Describe wrong signs and units and exchanged channels, which the usual values of the fleet reveal."""
+        return list(find_channel_faults(self.place(laws), recordings, hold=self.hold, engine=self.engine))
+
     def __call__(self, job: MachineJob) -> Outcome:
         """Execute a step at a machine."""
         step = {REFIT: self._refit, SAMPLE: self._sample, MEASURE: self._measure, REST: self._rest}[job.step]
@@ -124,9 +143,11 @@ class MachineWork:
 
     def _sample(self, job: MachineJob) -> Outcome:
         found = self._diagnose(self.simulator, job.recordings)
-        return Outcome(
-            {**_diagnosis_entry(found), "hypotheses": self._hypotheses(found)}, files=_diagnosis_files(found)
-        )
+        named = " and ".join(name_at(e.port, e.law, e.form) for e in found.effects) or "no law"
+        sentence = f"Diagnosed alone, it suggests {named}; the comparison with the other machines decides."
+        sentence = " ".join([sentence, *found.corrected_faults])
+        entry = {**_diagnosis_entry(found), "sentence": sentence, "hypotheses": self._hypotheses(found)}
+        return Outcome(entry, files=_diagnosis_files(found))
 
     def _measure(self, job: MachineJob) -> Outcome:
         laws = self.build(job.laws)
@@ -134,10 +155,14 @@ class MachineWork:
         return Outcome(measured_entry(found), files={RESIDUAL: _bin_residual(found, job.recordings)})
 
     def _rest(self, job: MachineJob) -> Outcome:
-        """Diagnose a machine that lacks more than the common physics, from the simulator with that physics."""
-        corrected = self.simulator
-        for port, law in self.build(job.laws):
-            corrected = corrected.with_element(port, law)
+        """Diagnose a machine that lacks more than the common physics, from the simulator with that physics.
+
+        Its fitted values have followed a wrong unit or sign as far as they can, so that is sought first, without them.
+        """
+        if faults := self.channel_faults(job.laws, job.recordings):
+            entry = {"status": DONE, "verdict": "recording-fault", "effects": [], "faults": faults}
+            return Outcome({**entry, "sentence": " ".join(faults)})
+        corrected = self.place(job.laws)
         own = corrected.parameter_set
         corrected = corrected.with_parameters(own.at(own.pack(job.starts[0])))
         found = self._diagnose(corrected, job.recordings)

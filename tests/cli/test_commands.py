@@ -253,6 +253,7 @@ def test_messages_name_options_of_the_command_line(capsys, tmp_path, train, monk
         ("run in a script, or use workers=1.", "run in a script, or use --workers 1."),
         ("give `period=`.", "give --period PERIOD."),
         ("as in columns={'force': 'u_vir_V'}.", "as in --column force=u_vir_V."),
+        ("as in columns={'t': 'Zeit [s]'}.", 'as in --column "t=Zeit [s]".'),
         ("allow more with time_tolerance=STEPS.", "allow more with --time-tolerance STEPS."),
         ("resample with resample=STEP, or", "resample with --resample STEP, or"),
         ("the file /data/run_dt=0.1.csv is empty", "the file /data/run_dt=0.1.csv is empty"),

@@ -24,6 +24,7 @@ from pilfr_casadi.laws import (
     Saturation,
     display_name,
 )
+from pilfr_casadi.simulators import load_simulator
 
 RIG = """
 from pilfr_casadi import Parameter, Port, Simulator
@@ -116,7 +117,7 @@ def arguments(folder, *more, simulator="rig.py", train="train.csv", test="test.c
 @pytest.mark.usefixtures("blank_figures")
 def test_a_whole_diagnosis(capsys, files, catalogue):
     catalogue(Backlash, CoulombFriction, CubicStiffness, Power)
-    given = arguments(files, "--hold", "zero", "--initial", "zero")
+    given = arguments(files, "--hold", "zero", "--initial", "zero", "--bound", "k=50:1000")
     status, out, err = run(capsys, *given)
     assert status == 0 and "pilfr: " not in err
     found = json.loads((files / "out" / "diagnosis.json").read_text(), parse_constant=lambda c: pytest.fail(c))
@@ -142,6 +143,7 @@ def test_a_whole_diagnosis(capsys, files, catalogue):
     assert len(tried) > 5 and all(display_name(c["law"]) in page and c["port"] in page for c in tried)
     corrected = files / "out" / "corrected.py"
     assert f"corrected simulator: {corrected}" in out
+    assert load_simulator(corrected).parameters["k"].bounds == (50, 1000)
     simulated = ("simulate", corrected, files / "test.csv", "--initial", "zero", "--out", files / "y.csv")
     status, out, err = run(capsys, *simulated)
     assert status == 0, err
@@ -176,6 +178,29 @@ BAD_SIMULATORS = {
         ("derivative of the state 'vel' is not finite", "m = 0;", "by the argument `initial` of Recording"),
     ),
 }
+
+
+@pytest.mark.parametrize(
+    "bound, says",
+    [
+        ("k=100:200", ("'k' is 90, outside of its bounds 100 to 200", "widen")),
+        ("q=1:2", ("no parameter 'q'", "m, k, d")),
+        ("k=200:100", ("infeasible",)),
+        ("k=100", ("LOW:HIGH",)),
+    ],
+)
+def test_bad_bounds_are_refused(capsys, files, bound, says):
+    refused(capsys, *arguments(files, "--bound", bound), says=says)
+    assert not (files / "out").exists()
+
+
+def test_bounds_are_for_parameters_with_names(capsys, files):
+    system = "import control\nsimulator = control.ss([[-1.0]], [[2.0]], [[1.0]], [[0.0]])\n"
+    (files / "system.py").write_text(system)
+    given = arguments(files, "--bound", "A11=-2:0", simulator="system.py")
+    refused(capsys, *given, says=("a StateSpace, whose numbers have no names", "give a Simulator"))
+    given = arguments(files, "--bound", "k=50:1000", simulator=None)
+    refused(capsys, *given, says=("--bound was given", "not for --simulated"))
 
 
 def test_a_pipe_is_no_simulator_file(capsys, files):
@@ -335,6 +360,11 @@ def test_a_saved_model_is_diagnosed_to_the_end(capsys, files, truth, catalogue):
     assert status == 0 and "the simulator's own values, refitted" in out, out + err
     found = json.loads((files / "out" / "diagnosis.json").read_text())
     assert np.shape(found["parameters"]["A"]["refit_with"]) == (2, 2) and found["candidates"]
+    corrected, y = files / "out" / "corrected.py", files / "y.csv"
+    status, out, err = run(capsys, "simulate", corrected, files / "test.csv", "--initial", "zero", "--out", y)
+    assert status == 0, err
+    error = float(re.search(r"NRMSE on test: ([\d.]+)", out)[1])
+    assert error == pytest.approx(found["fit"]["test"]["after"], rel=1e-2)
     assert (files / "out" / "report.html").exists()
 
 

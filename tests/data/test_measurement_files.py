@@ -35,7 +35,8 @@ def mdf(tmp_path):
     def write(*groups, name="rig.mf4"):
         with asammdf.MDF(version="4.10") as file:
             for t, channels in groups:
-                file.append([asammdf.Signal(samples=v, timestamps=t, name=k) for k, v in channels.items()])
+                signals = [(k, *((v, "") if isinstance(v, np.ndarray) else v)) for k, v in channels.items()]
+                file.append([asammdf.Signal(samples=v, timestamps=t, name=k, unit=unit) for k, v, unit in signals])
             path = tmp_path / name
             file.save(path, overwrite=True)
         return path
@@ -77,12 +78,32 @@ def test_an_mdf_file_is_read(mdf):
     path = mdf((T, {"force": FORCE, "x2": X2}), (T[::2], {"slow": FORCE[::2]}))
     same(read(path, "force", "x2"))
     assert set(column_names(path)) == {"t", "force", "x2", "slow"}
+    assert read(path, "force", "x2").units == {}
+
+
+def test_an_mdf_file_states_units(mdf):
+    r = read(mdf((T, {"force": (FORCE, "N"), "x2 [m]": (X2, "mm")})), "force", "x2 [m]")
+    assert r.units == {"force": "N", "x2 [m]": "mm"}
+
+
+def test_mdf_channels_of_several_rates_are_brought_to_one_step(mdf):
+    fast, slow = np.arange(2000) * 1e-3, 0.0123 + np.arange(390) * 5e-3
+    path = mdf((fast, {"force": np.sin(20 * fast)}), (slow, {"x2": np.cos(20 * slow)}))
+    r = read(path, "force", "x2", resample=2e-3)
+    t = slow[0] + r.t
+    assert r.dt == 2e-3 and slow[-1] - t[-1] < 2e-3
+    np.testing.assert_allclose(r.u[20:-20, 0], np.sin(20 * t[20:-20]), atol=1e-3)
+    np.testing.assert_allclose(r.y[20:-20, 0], np.cos(20 * t[20:-20]), atol=1e-3)
 
 
 def test_unusable_mdf_files_are_refused(mdf, tmp_path):
     path = mdf((T, {"force": FORCE}), (T[::2], {"slow": FORCE[::2]}))
     refused(path, "has no column 'x2'")
-    refused(path, "'force' and 'slow' have different times (5 and 3 samples)", outputs="slow")
+    refused(
+        path,
+        "'force' and 'slow' have different times (5 and 3 samples); bring all channels to one step",
+        outputs="slow",
+    )
     refused(mdf((T**2, {"force": FORCE, "x2": X2})), "is not uniform")
     damaged = tmp_path / "damaged.mf4"
     damaged.write_bytes(b"MDF and no more")

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.signal import lsim, lti
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Recording
@@ -100,7 +101,7 @@ def test_too_few_samples_for_a_filter(tones):
 @pytest.mark.parametrize("dt", [4e-3, 2.5e-3, np.pi * 1e-3], ids=["whole", "ratio", "irrational"])
 def test_resampling_keeps_slow_tones_and_lets_none_fold(tones, dt):
     """180 Hz folds to 70, 180 and 138 Hz at the three steps; the anti-alias filter removes it where it would fold."""
-    coarse = tones.with_(skip=400).resample(dt)
+    coarse = tones.with_(skip=400, hold="linear").resample(dt)
     t = np.arange(len(coarse)) * dt
     assert coarse.dt == dt and t[-1] <= T[-1] < t[-1] + 1.01 * dt
     np.testing.assert_allclose(middle(coarse.y[:, 0]), middle(2 * np.sin(2 * np.pi * 5 * t) + 3), atol=0.02)
@@ -109,9 +110,26 @@ def test_resampling_keeps_slow_tones_and_lets_none_fold(tones, dt):
         np.testing.assert_allclose(middle(coarse.u[:, 0]), middle(np.sin(2 * np.pi * 5 * t)), atol=0.03)
 
 
+@pytest.mark.parametrize("dt", [0.25e-3, 4e-3], ids=["finer", "coarser"])
+def test_a_held_input_stays_held_and_moves_a_linear_system_alike(dt):
+    """Interpolation would delay the force by half a sample, an error of 1.5 % in this mode of 5 Hz."""
+    levels = np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], 174), 23)[:4000]
+    rig = lti([1], [(2 * np.pi * 5) ** -2, 0.1 / (2 * np.pi * 5), 1])
+    x = lsim(rig, levels, T, interp=False)[1]
+    r = Recording(levels, x, DT, ("force",), ("x",), hold="zero")
+    other = r.resample(dt)
+    again = lsim(rig, other.u[:, 0], other.t, interp=False)[1]
+    assert other.hold == "zero" and np.std(again - other.y[:, 0]) < 5e-3 * np.std(x)
+    within = np.isclose(np.floor(other.t / 23e-3 + 1e-6), np.floor((other.t + dt) / 23e-3 - 1e-6))
+    assert set(other.u[within, 0]) == {-1.0, 1.0} and within.mean() > 0.8
+    merged = merge(r, Recording(x, np.empty((len(T), 0)), DT, ("copy",)), dt=dt, inputs="force", outputs="x")
+    np.testing.assert_allclose(merged.u[:-1], other.u[: len(merged) - 1], atol=1e-12)
+    assert merged.hold == "zero"
+
+
 def test_resampling_to_a_finer_step_and_to_its_own(tones):
     assert tones.resample(DT) is tones
-    fine = tones.resample(DT / 2)
+    fine = tones.with_(hold=None).resample(DT / 2)
     assert len(fine) == 2 * len(T) - 1
     np.testing.assert_allclose(middle(fine.y[::2]), middle(tones.y), atol=0.02)
 
@@ -179,6 +197,76 @@ def test_uneven_times_are_resampled_on_request(tmp_path):
         read_csv(path, "force", "x", resample=0.01)
 
 
+def test_held_steps_stay_held_at_uneven_times():
+    t = np.cumsum(np.random.default_rng(0).uniform(0.5e-3, 1.5e-3, 4000))
+    levels = np.where(np.arange(4000) % 100 < 50, 1.0, -1.0)
+    frame = pd.DataFrame({"t": t, "force": levels, "x": np.sin(20 * t)})
+    r = read_frame(frame, "force", "x", resample=1e-3, hold="zero")
+    assert np.mean(np.abs(r.u[:, 0]) == 1) > 0.97 and np.max(np.abs(r.u)) == 1
+    begin, end = 1000, 3000  # the same impulse
+    last, after = np.searchsorted(t, t[0] + r.t[[begin, end]], "right") - 1
+    between = np.sum(levels[last:after] * np.diff(t[last : after + 1]))
+    between += levels[after] * (t[0] + r.t[end] - t[after]) - levels[last] * (t[0] + r.t[begin] - t[last])
+    assert np.sum(r.u[begin:end]) * r.dt == pytest.approx(between, abs=1e-9)
+
+
+# ------------------------------------------------------------------------------------------- channels of several rates
+
+
+def slow_frame(every=5, count=2000):
+    """A force at 1 kHz; a position at a slower rate, nan between its samples."""
+    t = np.arange(count) * 1e-3
+    x = np.where(np.arange(count) % every == 0, np.cos(30 * t), np.nan)
+    return pd.DataFrame({"t": t, "force": np.sin(20 * t) + np.sin(2 * np.pi * 230 * t), "x": x})
+
+
+def test_channels_of_several_rates_are_brought_to_one_step(tmp_path):
+    frame, path = slow_frame(), tmp_path / "rig.csv"
+    frame.to_csv(path, index=False)
+    for read in (lambda **k: read_frame(frame, "force", "x", **k), lambda **k: read_csv(path, "force", "x", **k)):
+        with pytest.raises(InputError, match=r"'x' has numbers in 400 of 2000 rows.* one step with resample=STEP\.$"):
+            read()
+        slow, fast = read(resample=5e-3), read(resample=1e-3)
+        np.testing.assert_allclose(slow.y[:, 0], np.cos(30 * slow.t), atol=1e-9)
+        np.testing.assert_allclose(middle(slow.u[:, 0]), middle(np.sin(20 * slow.t)), atol=5e-3)  # 230 Hz is filtered
+        np.testing.assert_allclose(middle(fast.y[:, 0]), middle(np.cos(30 * fast.t)), atol=1e-4)
+        np.testing.assert_allclose(fast.u[:, 0], frame.force[: len(fast)], atol=1e-9)
+        assert slow.dt == 5e-3 and len(slow) == 400 and len(fast) == 1996  # up to the last position
+
+
+def test_a_slow_held_input_stays_held():
+    frame = slow_frame().rename(columns={"force": "x", "x": "force"})
+    r = read_frame(frame, "force", "x", resample=1e-3, hold="zero")
+    np.testing.assert_array_equal(r.u[:-1, 0], frame.force.ffill()[: len(r) - 1])
+    assert r.hold == "zero"
+
+
+def test_missing_samples_of_one_rate_are_no_other_rate():
+    frame = slow_frame(1)
+    frame.loc[[500, 501], "x"] = np.nan
+    with pytest.raises(InputError, match="'x', sample 500 is nan"):
+        read_frame(frame, "force", "x")
+    r = read_frame(frame, "force", "x", resample=1e-3)
+    np.testing.assert_allclose(r.y[:, 0], np.cos(30 * r.t), atol=1e-3)
+    frame.loc[500:600, "x"] = np.nan
+    with pytest.raises(InputError, match=r"'x' has a gap of 0\.102 s after 0\.499 s"):
+        read_frame(frame, "force", "x", resample=1e-3)
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (lambda f: f.assign(x=np.nan), r"'x' has 0 number\(s\); at least 2"),
+        (lambda f: f.assign(x=np.inf), "'x', sample 0 is inf"),
+        (lambda f: f.assign(t=f.t.where(f.t != 0.5)), "'t', sample 500 is nan"),
+        (lambda f: f.assign(x=f.x[:1000], force=f.force[1000:]), "begin by 1 s and end from 0.995 s on"),
+    ],
+)
+def test_channels_that_cannot_be_brought_to_one_step(change, said):
+    with pytest.raises(InputError, match=said):
+        read_frame(change(slow_frame()), "force", "x", resample=5e-3)
+
+
 # --------------------------------------------------------------------------------------------------------- frames
 
 
@@ -231,3 +319,45 @@ def test_any_table_of_named_columns_is_a_frame():
 def test_frames_that_cannot_be_used(frame, said):
     with pytest.raises(InputError, match=said):
         read_frame(frame, "u", "y")
+
+
+def test_an_input_that_is_faster_than_the_new_step_is_filtered_as_the_outputs_are():
+    u = np.random.default_rng(0).standard_normal(2000)  # a level for each sample
+    r = Recording(u, u, 1e-3, ("u",), ("y",), hold="zero")
+    slow = r.resample(1e-2)
+    assert slow.hold == "linear" and np.allclose(slow.u, slow.y)
+    assert r.with_(u=u[np.arange(2000) // 20 * 20]).resample(1e-2).hold == "zero"
+
+
+def test_an_input_of_unknown_hold_keeps_its_levels_between_uneven_samples(tmp_path):
+    rng = np.random.default_rng(0)
+    t = 0.01 * (np.arange(400) + 0.2 * rng.uniform(-1, 1, 400))
+    u = np.sign(rng.standard_normal(400))
+    path = tmp_path / "run.csv"
+    np.savetxt(path, np.column_stack([t, u, np.cumsum(u)]), delimiter=",", header="t,u,y", comments="")
+    assert np.max(np.abs(read_csv(path, inputs="u", outputs="y", resample=0.009).u)) <= 1.0
+
+
+def test_a_held_input_that_is_written_when_it_changes_lasts_to_the_end(tmp_path):
+    rows = [f"{0.01 * k:.2f},{k // 50 if k in (0, 50) else ''},{np.sin(k)}" for k in range(100)]
+    path = tmp_path / "events.csv"
+    path.write_text("\n".join(["t,u,y", *rows]), encoding="utf-8")
+    r = read_csv(path, inputs="u", outputs="y", resample=0.01, hold="zero")
+    assert len(r) == 100 and r.hold == "zero" and np.array_equal(r.u[:, 0], np.arange(100) // 50)
+
+
+def test_a_stated_start_that_would_move_is_refused(tmp_path):
+    rows = [f"{0.01 * k:.2f},{np.cos(k)},{np.sin(k) if k % 4 == 3 else ''}" for k in range(100)]
+    path = tmp_path / "late.csv"
+    path.write_text("\n".join(["t,u,y", *rows]), encoding="utf-8")
+    with pytest.raises(InputError, match=r"from 0\.03 s on, but initial was stated for 0 s"):
+        read_csv(path, inputs="u", outputs="y", resample=0.01, initial=[1.0])
+    assert read_csv(path, inputs="u", outputs="y", resample=0.01).begins == "estimate"
+
+
+def test_a_merged_input_is_linear_where_one_of_the_records_is():
+    u = np.random.default_rng(0).standard_normal((500, 2))
+    held = Recording(u[np.arange(500) // 50 * 50, :1], np.empty((500, 0)), 0.01, ("a",), (), hold="zero")
+    smooth = Recording(u[:, 1:], u[:, 1:], 0.02, ("b",), ("y",), hold="linear")
+    assert pilfr.merge(held, smooth).hold == "linear"
+    assert pilfr.merge(held, smooth, inputs="a", outputs="y").hold == "zero"

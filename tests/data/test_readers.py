@@ -68,6 +68,9 @@ def sentence(caught):
         .replace("0.1,", "2024-05-02,")
         .replace("0.2,", "2024-05-02 00:00:00.1,")
         .replace("0.3,", "2024-05-02 00:00:00.2,"),
+        GOOD.replace(",", ";").replace(".", ","),
+        GOOD.replace(",", "\t").replace(".", ",").replace("1\t10", '"1,0"\t1,0e1'),
+        "t;force;x2;note\n0;1;10;2,5 or 3.5\n0,1;2,0;20;v1.2\n0,2;3;30;\n0,3;4;40;\n",
         "temp °C,t,force,x2\n1,0,1,10\n1,0.1,2,20\n1,0.2,3,30\n1,0.3,4,40\n".encode("latin-1"),
     ],
 )
@@ -120,6 +123,25 @@ def test_names_and_times_are_found_below_a_title(write):
     path = write("Recorder 7, serial 12\n" + GOOD.replace("t,force", "time,force").replace("\n0", "\n10"))
     assert column_names(path) == ("time", "force", "x2")
     assert written_times(path, wanted=["force"]) == written_times(path) == ["10", "10.1", "10.2", "10.3"]
+
+
+@pytest.mark.parametrize(
+    ("header", "likely"),
+    [
+        ("Zeit [s],force,travel", "Zeit [s]"),
+        ("top,force,temps", "temps"),
+        ("count,force,travel", "count"),
+        ("travel,count,force", "count"),
+        ("travel,force,track", "COLUMN"),
+    ],
+)
+def test_the_likeliest_time_column_is_suggested(write, header, likely):
+    columns = {"count": [0.0, 0.1, 0.2, 0.3], "force": [1, 3, 2, 4], "travel": [5, 8, 6, 7]}
+    rows = zip(*(columns.get(name, [1, 1, 2, 1]) for name in header.split(",")), strict=True)
+    path = write("\n".join([header, *(",".join(map(str, row)) for row in rows)]))
+    with pytest.raises(InputError, match="no time column") as caught:
+        read_csv(path, "force", ())
+    assert f"columns={{'t': '{likely}'}}" in sentence(caught)
 
 
 def test_a_row_of_units_states_the_units(write):
@@ -203,6 +225,8 @@ BAD_FILES = {
     "word": (GOOD.replace("0.2,3", "0.2,high"), "column 'force', line 4 reads 'high', which is not a number"),
     "underscore": (GOOD.replace("0.2,3,30", "0.2,3,3_0"), "column 'x2', line 4 reads '3_0'"),
     "decimal comma": (GOOD.replace(",", ";").replace("0.2;3", "0.2;3,5"), "line 4 reads '3,5'.* with a point"),
+    "thousands": (GOOD.replace(",", ";").replace(".", ",").replace("40", "1,234,567"), "line 5 reads '1,234,567'"),
+    "thousands and a point": (GOOD.replace(",", ";").replace("0;1;10", "0;1;1,234.5"), "line 2 reads '1,234.5'"),
     "decimal commas between commas": ("t,force,x2\n0,1,5,10\n0,1,2,20\n", "line 2 has 4 cell.*with points"),
     "units in milliseconds": (GOOD.replace("x2\n", "x2\nms,N,m\n"), r"'t \[ms\]' is named as time in ms"),
     "second row of names": (GOOD.replace("x2\n", "x2\ntime,in,out\n"), "column 'force', line 2 reads 'in'"),
@@ -271,7 +295,7 @@ def test_bad_columns_and_options_are_refused(write):
         (dict(columns={"force": "u"}), "no column 'u'; .*as in columns={'force': 'COLUMN'}"),
         (dict(dt=0.0), "above zero"),
         (dict(dt=float("nan")), "above zero"),
-        (dict(inputs=()), "at least one input"),
+        (dict(inputs=()), "at least one input.* sensors only, read these as inputs with outputs=()"),
         (dict(inputs=[1]), "give the names of the columns"),
         (dict(columns=["force"]), "give columns={'NAME': 'COLUMN'}"),
         (dict(outputs="t"), "column 't' holds the time"),
@@ -518,3 +542,8 @@ def test_a_column_may_say_its_unit_in_brackets(tmp_path):
     assert np.array_equal(r.y[:, 0], [2, 5, 8]) and dict(r.units) == {"road": "mm", "speed": "m/s"}
     with pytest.raises(InputError, match=r"columns=\{'spee': 'speed"):
         read_csv(path, inputs="road", outputs="spee")
+
+
+def test_numbers_that_may_have_thousands_separators_are_refused(write):
+    with pytest.raises(InputError, match="line 3 reads '1,001'"):
+        read_csv(write("u;y\n999;1\n1,001;2\n"), inputs="u", outputs="y", dt=1.0)

@@ -234,3 +234,13 @@ def test_a_piece_keeps_the_time_of_its_recording():
 def test_the_start_is_a_time(start):
     with pytest.raises(InputError, match=r"start of the recording is .*; give the time of its first sample in seconds"):
         Recording(np.ones(4), np.zeros(4), 0.1, start=start)
+
+
+def test_recordings_of_one_name_are_numbered_in_messages():
+    slow = recording().with_(dt=recording().dt * 2)
+    for name, first, second in (
+        ("", "recording 1", "recording 2"),
+        ("day", r"recording 1 \('day'\)", "recording 2 .*"),
+    ):
+        with pytest.raises(InputError, match=rf"^{second} has a step of .* and {first} one of .*; resample"):
+            check_for_identification([recording().with_(name=name), slow.with_(name=name)])

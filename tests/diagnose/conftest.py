@@ -10,9 +10,9 @@ from cart import GROUND, cart
 from pilfr_casadi import Recording, multisine
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.floor import Floor
-from pilfr_casadi.diagnose.hypotheses import Findings, Hypotheses
-from pilfr_casadi.diagnose.trials import Trial
+from pilfr_casadi.diagnose.fits.floor import Floor
+from pilfr_casadi.diagnose.search.hypotheses import Findings, Hypotheses
+from pilfr_casadi.diagnose.search.trials import Trial
 from pilfr_casadi.laws import CubicStiffness, Delay
 
 DT, SAMPLES = 0.05, 200

@@ -10,7 +10,7 @@ from diagnosis_example import recorded, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.workbench import converge
+from pilfr_casadi.diagnose.fits.workbench import converge
 from pilfr_casadi.optimise import GaussNewton, Status
 
 

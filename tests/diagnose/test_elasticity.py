@@ -143,6 +143,7 @@ def test_one_of_two_sensors_is_on_the_far_side():
     tried = [law.form for law in add_scaled_laws((ElasticDrive,), rig)]
     assert tried == ["elastic drive", "elastic drive, seen by load", "elastic drive, seen by motor"]
     assert [law.form for law in add_scaled_laws((ElasticDrive,), axis(("motor",)))] == ["elastic drive"]
+    assert seen_by(ElasticDrive, "load").strength == ElasticDrive.strength  # the force is not linear in k
     with pytest.raises(InputError, match="laws that outputs see"):
         seen_by(LineGap, "motor")
 

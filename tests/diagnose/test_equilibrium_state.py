@@ -6,7 +6,7 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.offsets import Offset
+from pilfr_casadi.diagnose.faults.offsets import Offset
 from pilfr_casadi.diagnose.preparation import prepare
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (

@@ -1,5 +1,6 @@
 """Forms of laws that their nearest relatives do not follow."""
 
+import numpy as np
 import pytest
 from diagnosis_example import recorded, rig
 
@@ -9,7 +10,9 @@ from pilfr_casadi.laws import (
     BoucWen,
     CoulombFriction,
     CubicStiffness,
+    HertzContact,
     OffCentreClearance,
+    PiecewiseStiffness,
     QuadraticStiffness,
     StiffeningBoucWen,
 )
@@ -39,3 +42,15 @@ def test_a_spring_that_hardens_and_differs_between_the_directions_is_one_law():
     assert [(e.port, e.law, e.form) for e in found.effects] == [("ground", "cubic_stiffness", "asymmetric")]
     values = {name: p["value"] for name, p in found.effects[0].parameters.items()}
     assert values == pytest.approx({"k_3": 3e4, "b": -0.04}, rel=0.05)
+
+
+def test_forms_that_follow_alike_are_told():
+    """A contact that is hardly touched, in noise: with which power its force grows remains open."""
+    true = rig().with_element("ground", PiecewiseStiffness().at({"k_c": 600.0, "g": 0.02}))
+    noise = 4e-3 * np.random.default_rng(5).standard_normal((500, 1))
+    train = recorded(true, 0, samples=500)
+    train = train.with_(y=train.y + noise)
+    found = pilfr.diagnose(rig(430.0, 5.0), train, laws=(PiecewiseStiffness, HertzContact), effects=1, workers=1)
+    (effect,) = found.effects
+    other = {"above": "Hertz", "hertz": "above"}[effect.form]
+    assert f"piecewise stiffness ({other}) is about as likely" in effect.sentence

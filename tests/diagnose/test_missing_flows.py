@@ -7,8 +7,8 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.linearise import Probe, locals_of, run
-from pilfr_casadi.diagnose.screen import _gain
+from pilfr_casadi.diagnose.fits.linearise import Probe, locals_of, run
+from pilfr_casadi.diagnose.fits.screen import _gain
 from pilfr_casadi.laws import (
     BoucWen,
     CubicStiffness,

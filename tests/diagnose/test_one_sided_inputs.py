@@ -5,8 +5,8 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
+from pilfr_casadi.diagnose.faults.samples import find_clipped_input, find_clipping
 from pilfr_casadi.diagnose.preparation import prepare
-from pilfr_casadi.diagnose.recording_faults import find_clipped_input, find_clipping
 
 DT = 0.02
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from diagnosis_example import recorded, rig as cart_rig
 from diagnosis_rig import OFF, recordings, rig
-from test_timing import shaken, spring
+from spring_rig import shaken, spring
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator, laws
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose.arguments import Request
-from pilfr_casadi.diagnose.gates import Gate
-from pilfr_casadi.diagnose.offsets import WrongStart
+from pilfr_casadi.diagnose.faults.gates import Gate
+from pilfr_casadi.diagnose.faults.offsets import WrongStart
 from pilfr_casadi.diagnose.pipeline import _search_once
 from pilfr_casadi.diagnose.preparation import prepare
 

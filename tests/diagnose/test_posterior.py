@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pilfr_casadi.diagnose.evidence import STRAINED_ODDS, significance
-from pilfr_casadi.diagnose.offsets import Offset
+from pilfr_casadi.diagnose.faults.offsets import Offset
+from pilfr_casadi.diagnose.fits.evidence import STRAINED_ODDS, significance
 from pilfr_casadi.diagnose.verdict import closest_law, explainable_remainder, judge, posterior, share_named
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Delay, DirectionalFriction, QuadraticDrag
 

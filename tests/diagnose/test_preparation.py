@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from diagnosis_rig import OFF, recordings, refitted, rig
 from tank import tank
-from test_slips import DT, recorded, tanks
+from tanks_rig import DT, recorded, tanks
 
 from pilfr_casadi import InputError, Parameter, Recording, Simulator, multisine
 from pilfr_casadi.diagnose import Workbench, preparation
-from pilfr_casadi.diagnose.gates import Checked
-from pilfr_casadi.diagnose.offsets import find_offsets, list_offsets, share_of_constants, update_offsets
+from pilfr_casadi.diagnose.faults.gates import Checked
+from pilfr_casadi.diagnose.faults.offsets import find_offsets, list_offsets, share_of_constants, update_offsets
 from pilfr_casadi.diagnose.preparation import prepare
 from pilfr_casadi.laws import AsymmetricSaturation
 from pilfr_casadi.optimise import Status

@@ -14,7 +14,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
 from pilfr_casadi.data import nrmse
 from pilfr_casadi.diagnose import BlindSpot, Effect, Workbench
-from pilfr_casadi.diagnose.offsets import Offset
+from pilfr_casadi.diagnose.faults.offsets import Offset
 from pilfr_casadi.diagnose.proof import Started, compare_errors, next_experiment
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.identify import run_free

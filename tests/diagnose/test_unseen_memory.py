@@ -6,7 +6,7 @@ from cart import cart
 
 from pilfr_casadi import Recording, diagnose
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.force_recovery import is_curve, signals_along
+from pilfr_casadi.diagnose.fits.force_recovery import is_curve, signals_along
 from pilfr_casadi.laws import Backlash, StopHysteresis
 
 DT = 0.02

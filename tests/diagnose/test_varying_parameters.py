@@ -8,10 +8,10 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench, port_signals
-from pilfr_casadi.diagnose.evidence import log_prior
-from pilfr_casadi.diagnose.floor import Floor
+from pilfr_casadi.diagnose.fits.evidence import log_prior
+from pilfr_casadi.diagnose.fits.floor import Floor
 from pilfr_casadi.diagnose.proof import placebo
-from pilfr_casadi.diagnose.search import Search
+from pilfr_casadi.diagnose.search.moves import Search
 from pilfr_casadi.laws import (
     VARIATIONS,
     CoulombFriction,

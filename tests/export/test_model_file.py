@@ -226,6 +226,8 @@ def test_what_is_not_a_model_file_is_one_sentence(tmp_path):
         "half": (good[: len(good) // 2], "is incomplete"),
         "binary": (bytes(range(256)), "not text"),
         "rig.py": (b"simulator = None", "is a simulator in Python; read it by"),
+        "plant.fmu": (b"PK", "is a functional mock-up unit, not a saved model; read it by .*from_fmu"),
+        "arm.xml": (b"<mujoco/>", "is a mechanism for MuJoCo, not a saved model; read it by .*from_mujoco"),
         "csv": (b"t,u,y\n0,1,2\n", "not valid JSON"),
         "list": (b"[1, 2]", "not a model file"),
         "deep": (b"[" * 100_000, "not a model file"),

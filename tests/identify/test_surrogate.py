@@ -171,7 +171,7 @@ def test_a_state_space_is_a_simulator():
     record = simulation(m=200)
     expected = control.forced_response(control.sample_system(control.ss(a, b, c, 0), 0.02), U=record.u[:, 0]).outputs
     assert np.max(np.abs(run(simulator, record, substeps=40)[:, 0] - expected)) < 1e-8
-    assert [p.name for p in simulator.all_ports()][:2] == ["equation:pos", "equation:vel"]
+    assert [p.name for p in simulator.all_ports()][:2] == ["equation:vel", "actuator:force"]
 
 
 def test_names_come_from_the_recording_where_the_system_has_none():

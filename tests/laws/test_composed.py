@@ -9,7 +9,7 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
 from pilfr_casadi.diagnose import add_scaled_laws
-from pilfr_casadi.diagnose.screen import start_values
+from pilfr_casadi.diagnose.fits.screen import start_values
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
     CATALOGUE,

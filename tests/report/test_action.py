@@ -7,7 +7,7 @@ import pytest
 from diagnosis_rig import recordings, rig
 
 from pilfr_casadi.diagnose import Effect, Workbench
-from pilfr_casadi.diagnose.offsets import Offset
+from pilfr_casadi.diagnose.faults.offsets import Offset
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness
 from pilfr_casadi.report.diagnosis_tables import element_of, measure_action
 

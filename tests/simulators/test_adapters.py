@@ -58,6 +58,12 @@ def test_two_files_of_one_name_do_not_mix(tmp_path):
     assert [float(load_simulator(f / "rig.py").parameters["k"].value) for f in (one, two)] == [900.0, 800.0]
 
 
+def test_a_file_finds_its_own_folder_from_any_other(tmp_path, monkeypatch):
+    path = write(tmp_path, RIG + "\nimport os\n\nassert os.path.isabs(__file__), __file__\n")
+    monkeypatch.chdir(tmp_path)
+    assert load_simulator(path.name).states == ("pos", "vel")
+
+
 def test_a_dataclass_may_be_defined_in_the_file(tmp_path):
     extra = "from __future__ import annotations\nfrom dataclasses import dataclass\n"
     extra += "@dataclass\nclass A:\n    b: int = 1\n"

@@ -2,12 +2,16 @@
 
 import re
 import signal
+import time
+import timeit
 
+import casadi as ca
 import cloudpickle
 import numpy as np
 import pytest
+from command_line import refused
 
-from pilfr_casadi import InputError, Parameter, Recording, fit
+from pilfr_casadi import InputError, Parameter, Recording, diagnose, fit
 from pilfr_casadi.engine import compiler, make_engine
 from pilfr_casadi.simulators import Numeric, PythonFunction, discretise, from_function
 
@@ -23,6 +27,10 @@ def swing_jacobian(t, x, u, p):
     pos, vel = x
     slope = [-p["k"], -3 * p["d"] * vel**2, 1.0, -pos, -(vel**3)]
     return np.array([[0.0, 1.0, 0.0, 0.0, 0.0], np.array(slope) / 2.0])
+
+
+def jacobian_by_name(t, y, k, d):
+    return swing_jacobian(t, y, None, {"k": k, "d": d})
 
 
 SWING = dict(
@@ -43,7 +51,10 @@ def sensitivities(simulator, engine):
 
 
 @pytest.mark.parametrize("engine", ["vm", pytest.param("c", marks=needs_compiler)])
-@pytest.mark.parametrize("numeric, exact", [(Numeric(), 1e-6), (Numeric(jacobian=swing_jacobian), 1e-12)])
+@pytest.mark.parametrize(
+    "numeric, exact",
+    [(Numeric(), 1e-6), (Numeric(jacobian=swing_jacobian), 1e-12), (Numeric(jacobian=jacobian_by_name), 1e-12)],
+)
 def test_a_function_called_with_numbers_has_the_derivatives_of_its_equations(engine, numeric, exact):
     y_equations, jac_equations = sensitivities(from_function(swing, "pos", **SWING), "vm")
     made = from_function(swing, "pos", numeric=numeric, **SWING)
@@ -98,6 +109,44 @@ def test_a_function_that_fails_at_a_point_is_a_failed_trial():
     assert "it failed first with ValueError('too far')" in str(made)
 
 
+def test_a_diagnosis_says_how_often_it_calls_and_how_long_a_simulation_takes():
+    left = 0
+
+    def slow_at_first(t, x, u, p):
+        nonlocal left
+        left -= 1
+        if left > 0:
+            time.sleep(0.002)
+        return swing(t, x, u, p)
+
+    made = from_function(slow_at_first, "pos", numeric=Numeric(), **SWING)
+    u = 20 * np.sin(0.05 * np.arange(200) + np.sin(0.013 * np.arange(200)))[:, None]
+    given = Recording(u, np.zeros((200, 1)), 0.01, ("force",), ("pos",), initial="zero", hold="zero")
+    given = given.with_(y=made.simulate(given) + 1e-3 * np.random.default_rng(0).standard_normal((200, 1)))
+    before, left, stages = made.program_calls["slow_at_first"], 300, set()
+    found = diagnose(made, given, laws=(), effects=0, workers=1, progress=lambda stage, *_: stages.add(stage))
+    counted = made.program_calls["slow_at_first"] - before
+    assert all("s a simulation: " in stage for stage in stages) and "calls slow_at_first at every step" in str(found)
+    said = int(re.search(r"computed in .* s, (\d+) calls of slow_at_first$", str(found))[1])
+    assert 1000 < said == found.calls["slow_at_first"] <= counted
+
+
+def test_a_call_costs_little_beside_the_function():
+    leaf = PythonFunction(lambda z: z[:2], (9,), 2)
+    many, points = leaf.map(2000), ca.DM(np.ones((9, 2000)))
+    one, matrix = np.ones(9), ca.DM(np.ones(9))
+
+    def convert():
+        for _ in range(2000):
+            ca.DM(one)
+            matrix.full()
+
+    def fastest(run):
+        return min(timeit.repeat(run, number=1, repeat=5))
+
+    assert fastest(lambda: many(points)) < fastest(convert)
+
+
 @pytest.mark.parametrize(
     "numeric, says",
     [
@@ -109,6 +158,20 @@ def test_wrong_sizes_are_refused_in_one_sentence(numeric, says):
     with pytest.raises(InputError, match=says) as error:
         from_function(swing, "pos", numeric=numeric, **SWING)
     assert str(error.value).count(".") <= 3 and "\n" not in str(error.value)
+
+
+def test_the_command_says_how_to_use_what_it_cannot_export(tmp_path, capsys):
+    text = """\
+from pilfr_casadi import from_function
+from pilfr_casadi.simulators import Numeric
+
+simulator = from_function(lambda t, y, flow: [flow - y[0]], "h", states="h", inputs="flow", numeric=Numeric())
+"""
+    (tmp_path / "tank.py").write_text(text)
+    out = tmp_path / "c"
+    says = ("no file can hold", "use `pilfr_casadi.exported` in Python")
+    refused(capsys, "export", tmp_path / "tank.py", "--dt", 0.1, "--c", "--out", out, says=says)
+    assert not out.exists()
 
 
 def test_it_survives_another_process():

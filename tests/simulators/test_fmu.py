@@ -1,20 +1,24 @@
 """Simulators from functional mock-up units: the numbers of their equations, ports, parameters, error messages."""
 
 import pickle
+import shutil
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 
 import cloudpickle
 import numpy as np
 import pytest
 from command_line import refused, run
+from diagnosis_example import example
 from exported_fits import one_sentence
 
-from pilfr_casadi import InputError, Parameter, exported, from_fmu
+from pilfr_casadi import InputError, Parameter, exported, fit, from_fmu
 from pilfr_casadi.engine import VirtualMachine, compiler, make_engine
 from pilfr_casadi.laws import CoulombFriction
-from pilfr_casadi.simulators import discretise
+from pilfr_casadi.report import corrected_file
+from pilfr_casadi.simulators import CoSimulation, discretise, load_simulator
 from problems.fmu_rig import FOLDER, GUIDE, PARAMETERS, c_rig, casadi_rig, description, recording, rig
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler")
@@ -85,7 +89,7 @@ ELSEWHERE = """
 import pickle, sys
 import numpy as np
 from pilfr_casadi.engine import make_engine
-from pilfr_casadi.simulators import discretise
+from pilfr_casadi.simulators import CoSimulation, discretise
 simulator, given = pickle.load(sys.stdin.buffer)
 model = discretise(simulator, given.dt, "zero", 1)
 y = make_engine(model).simulate(model.drive(given), model.parameters.start, np.zeros(model.n_state))[0]
@@ -111,7 +115,7 @@ def test_a_port_enters_an_input_and_reads_outputs(unit):
     assert guided(unit).inputs == ("force",)
     pair = {"both": {"into": {"force": -1.0, "guide_force": 0.5}, "across": "x2"}}
     assert from_fmu(unit, ports=pair, outputs=("pos1",)).port("both").into == pytest.approx({"v1": -0.5 / 1.2})
-    assert [q.name for q in from_fmu(unit).all_ports()][:4] == [f"equation:{n}" for n in ("x1", "v1", "x2", "v2")]
+    assert [q.name for q in from_fmu(unit).all_ports()][:2] == ["equation:v1", "equation:v2"]
 
 
 def test_parameters_and_bounds_can_be_chosen(unit):
@@ -128,7 +132,8 @@ def test_parameters_and_bounds_can_be_chosen(unit):
 @pytest.mark.parametrize(
     "more, says",
     [
-        ({"parameters": ("m1",)}, "has no 'm1' among its tunable parameters; they are k1"),
+        ({"parameters": ("m3",)}, "has no 'm3' among its parameters; they are k1"),
+        ({"cosimulation": CoSimulation(dt=0.01)}, "is for model exchange alone; leave it out"),
         ({"inputs": ("moment",)}, "has no 'moment' among its inputs; they are force"),
         ({"outputs": ("acc",)}, "has no 'acc' among its outputs"),
         ({"bounds": {"k1": (1, 2)}}, "'k1' is 380, outside of its bounds 1 to 2"),
@@ -136,7 +141,7 @@ def test_parameters_and_bounds_can_be_chosen(unit):
         ({"ports": {"guide": {"into": "guide_force", "across": "pos"}}}, "`across` of port 'guide' is 'pos'"),
         ({"ports": {"guide": {"into": "guide_force"}}}, "give dict"),
         ({"ports": {"guide": "guide_force"}}, "give dict"),
-        ({"ports": {"guide": {"into": "force", "across": "pos1", "speed": "v1"}}}, "give dict"),
+        ({"ports": {"guide": {"into": "force", "across": "pos1", "speed": "v1"}}}, "the unknown key 'speed'"),
     ],
 )
 def test_wrong_names_are_refused_in_one_sentence(units, more, says):
@@ -182,7 +187,7 @@ def test_files_that_are_no_units_are_refused(tmp_path, units):
         ): "neither for model exchange",
         zipped("old.fmu", **{"modelDescription.xml": description(version="1.0")}): "FMI 1; give one of FMI 2.0",
         c_rig(tmp_path / "other.fmu", folder="win32"): f"has programs for win32; export it for {FOLDER}",
-        c_rig(tmp_path / "crash.fmu", "CRASHES"): "ends the process that loads it",
+        c_rig(tmp_path / "crash.fmu", "CRASHES"): "ends the process that runs it",
     }
     for path, says in cases.items():
         with pytest.raises(InputError) as error:
@@ -207,11 +212,126 @@ def test_what_calls_a_unit_cannot_become_a_file(tmp_path, units):
     assert not list(tmp_path.iterdir())
 
 
+def changed(path, *changes):
+    """Change texts of a unit's description."""
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    text = files["modelDescription.xml"].decode()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in {**files, "modelDescription.xml": text}.items():
+            archive.writestr(name, content)
+    return path
+
+
+def runs(simulator, given, **values):
+    """Outputs by both engines at values of parameters."""
+    own = simulator.parameter_set.change(**{name: {"value": value} for name, value in values.items()})
+    model = discretise(simulator.with_parameters(own), given.dt, "zero", 1)
+    job = model.drive(given), model.parameters.start, np.zeros(model.n_state)
+    return [make_engine(model, engine).simulate(*job)[0] for engine in ("c", "vm")]
+
+
+@pytest.mark.parametrize("failure", ["abort()", "exit(3)", pytest.param("for (;;)", marks=pytest.mark.slow)])
+def test_a_parameter_at_which_the_unit_crashes_or_hangs_is_a_failed_trial(tmp_path, failure):
+    given, unit = recording(6, samples=40), guided(c_rig(tmp_path / "a.fmu", f"FAILURE={failure}"))
+    for y in runs(unit, given, k1=700.0):
+        assert np.all(np.isnan(y[2:]))
+    for y in runs(unit, given, k1=500.0):  # a new process
+        assert np.all(np.isfinite(y))
+
+
+def test_a_unit_that_crashes_at_some_parameters_can_be_fitted(tmp_path):
+    given, unit = recording(7, samples=200), guided(c_rig(tmp_path / "a.fmu", "FAILURE=abort()"))
+    start = unit.with_parameters(unit.parameter_set.change(k1={"value": 590.0}))
+    assert fit(start, given).parameters["k1"] == pytest.approx(380.0, rel=0.01)
+
+
+def test_errors_of_all_getters_are_no_numbers(tmp_path):
+    given = recording(6, samples=40)
+    unit = guided(c_rig(tmp_path / "a.fmu", "FAILED=3"))
+    for y in runs(unit, given, k1=700.0):
+        assert np.all(np.isnan(y[2:]))
+    for y in runs(unit, given, k1=500.0):
+        assert np.all(np.isfinite(y))
+
+
+def test_parameters_change_in_event_mode_and_fixed_ones_by_a_restart(tmp_path):
+    given, unit = recording(2, samples=60), c_rig(tmp_path / "a.fmu", "STRICT")
+    for y in runs(guided(unit), given, k1=450.0):
+        changed_rig = rig().with_parameters(rig().parameter_set.change(k1={"value": 450.0}))
+        assert np.abs(y - changed_rig.simulate(given)).max() <= 1e-12 * np.ptp(given.y)
+    light = guided(unit, parameters=("m1", "k1"))
+    for y in runs(light, given, m1=1.0):
+        assert np.abs(y - given.y).max() > 0.01 * np.ptp(given.y)
+    for y in runs(light, given, m1=1.2):
+        assert np.abs(y - rig().simulate(given)).max() <= 1e-12 * np.ptp(given.y)
+
+
+def test_a_declared_type_gives_unit_and_bounds(tmp_path):
+    declared = '<TypeDefinitions><SimpleType name="K"><Real unit="N/m" min="100" max="2000"/></SimpleType>'
+    unit = changed(
+        c_rig(tmp_path / "a.fmu"),
+        ("<ModelVariables>", f"{declared}</TypeDefinitions><ModelVariables>"),
+        ('<Real unit="N/m" start="380.0" min="100" max="2000"/>', '<Real declaredType="K" start="380.0"/>'),
+    )
+    p = guided(unit).parameters["k1"]
+    assert p.unit == "N/m" and tuple(map(float, p.bounds)) == (100, 2000)
+
+
+def test_events_are_told(tmp_path, capfd):
+    unit = changed(c_rig(tmp_path / "a.fmu"), ('numberOfEventIndicators="0"', 'numberOfEventIndicators="2"'))
+    assert "a.fmu has 2 event indicators; the integration steps over events" in str(guided(unit))
+    assert capfd.readouterr().err == ""
+
+
+def test_an_array_is_named_as_such(tmp_path, units):
+    array = (
+        '<Float64 name="tbl" valueReference="999" causality="parameter" start="1 2"><Dimension start="2"/></Float64>'
+    )
+    copy = tmp_path / "a.fmu"
+    copy.write_bytes(units["casadi"].read_bytes())
+    unit = changed(copy, ("</ModelVariables>", f"{array}</ModelVariables>"))
+    assert "tbl" not in from_fmu(unit).parameters
+    with pytest.raises(InputError, match=r"'tbl' of .* is an array of Float64") as error:
+        from_fmu(unit, parameters=("tbl",))
+    one_sentence(error)
+
+
+def test_a_port_has_units(units):
+    given = {"guide": {**GUIDE["guide"], "unit": "kN", "across_unit": "mm"}}
+    port = from_fmu(units["c"], ports=given).port("guide")
+    assert (port.unit, port.position_unit) == ("kN", "mm")
+    assert guided(units["c"]).port("guide").unit == "N"
+
+
+def test_the_message_about_inputs_names_the_cure(units):
+    with pytest.raises(InputError, match=r"name the recorded ones, as in from_fmu\(\.\.\., inputs=\.\.\.\)"):
+        from_fmu(units["c"]).simulate(recording(0, samples=20))
+
+
 def write_table(path, given):
     columns = np.column_stack([np.arange(len(given)) * given.dt, given.u, given.y])
     rows = "\n".join(",".join(map(repr, row)) for row in columns.tolist())
     path.write_text(f"t,force [N],pos1 [m],pos2\n{rows}\n")
     return path
+
+
+def test_the_corrected_simulator_of_a_unit_is_a_file(tmp_path, units):
+    ports = {"guide": {"into": "guide_force", "across": "pos1", "rate": "vel1"}}
+    options = {"ports": ports, "bounds": {"k1": (300.0, 500.0)}, "inputs": ("force",), "outputs": ("pos1", "pos2")}
+    unit = from_fmu(units["c"], **options).with_parameters({"k1": 390.0})
+    law = CoulombFriction({"F_c": 3.0, "v_0": 0.002})
+    found = replace(example(), corrected=unit.with_element("guide", law), refitted=unit)
+    shutil.copy(units["c"], tmp_path / "unit.fmu")
+    (tmp_path / "out").mkdir()
+    file = tmp_path / "out" / "corrected.py"
+    file.write_text(corrected_file(found, "../unit.fmu", "from_fmu", options))
+    again, given = load_simulator(file), recording(4, samples=200)
+    assert np.array_equal(again.simulate(given), found.corrected.simulate(given))
+    assert again.parameters["k1"].bounds == (300.0, 500.0) and again.hold == found.hold
 
 
 def test_the_command_checks_a_unit(tmp_path, capsys, units):
@@ -229,7 +349,7 @@ def test_the_command_checks_a_unit(tmp_path, capsys, units):
     refused(capsys, "check", units["c"], train, "--bound", "k1=2:1", says="infeasible")
     model = tmp_path / "model.py"
     model.write_text("simulator = 1\n")
-    refused(capsys, "check", model, train, "--bound", "k1=1:2", says="--bound was given, which is for an FMU")
+    refused(capsys, "check", model, train, "--port", "a=b:c", says="--port was given, which is for an FMU")
     table = tmp_path / "other.csv"
     table.write_text("t,a,b\n0,1,2\n1,2,3\n")
     refused(capsys, "check", units["c"], table, says="has no column for any input")

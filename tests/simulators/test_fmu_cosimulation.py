@@ -209,3 +209,11 @@ def test_options_are_checked(built):
         squared = {"odd": {"into": "push", "across": "pos"}}
         body = "self.vel += h * self.push ** 2\nself.pos += h * self.vel"
         from_fmu(built(body), ports=squared, cosimulation=CoSimulation(dt=DT))
+
+
+@pytest.mark.slow
+def test_a_unit_that_fails_at_most_parameters_names_them(built):
+    path = built("if self.g > 9.5:\n    raise ValueError\n" + SWING)
+    with pytest.raises(InputError, match="fails at all values of its parameters") as error:
+        from_fmu(path, ports=PORT, outputs=("pos",), bounds={"g": (9.0, 900.0)}, cosimulation=CoSimulation(dt=DT))
+    one_sentence(error)

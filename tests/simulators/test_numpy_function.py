@@ -1,5 +1,6 @@
 """NumPy functions as simulators: the equations agree with the function, or one sentence says why not."""
 
+import functools
 import itertools
 import math
 import random
@@ -14,7 +15,7 @@ from scipy.optimize import brentq
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Simulator
-from pilfr_casadi.simulators import from_function, load_simulator
+from pilfr_casadi.simulators import Numeric, from_function, load_simulator
 
 K = np.array([[3.0, -1.0], [-1.0, 2.0]])
 PARAMETERS = {
@@ -124,6 +125,56 @@ def test_equations_are_those_of_the_function(case):
         t, k, u, x = rng.uniform(0, 9), rng.uniform(0.5, 2), rng.normal(size=1), rng.normal(size=2)
         expected = np.ravel(np.asarray(function(t, x, u, {"k": k}), dtype=float))
         assert np.allclose(traced(t, *x, *u, k).full().ravel(), expected, rtol=1e-12, atol=1e-13)
+
+
+def force(t):
+    return 10 * np.interp(t, [0, 5, 10], [0, 1, -1])
+
+
+def ivp_with_force(t, y, force, m, k, d):
+    pos, vel = y
+    return [vel, (force - k * pos - d * vel) / m]
+
+
+def ivp_with_all_inputs(t, y, u, m, k=1.0, d=1.0, note="not a parameter"):
+    return np.array([y[1], (u[0] - k * y[0] - d * y[1]) / m])
+
+
+def ivp_with_mapping(t, y, p, force):
+    return [y[1], (force - p["k"] * y[0] - p["d"] * y[1]) / p["m"]]
+
+
+@pytest.mark.parametrize("numeric", [None, Numeric()])
+@pytest.mark.parametrize(
+    "function",
+    [
+        ivp_with_force,
+        ivp_with_all_inputs,
+        ivp_with_mapping,
+        functools.partial(ivp_with_force, m=PARAMETERS["m"].value),
+        lambda *given: rhs(*given),
+        lambda time, state, forces, values: rhs(time, state, forces, values),
+        lambda time, state, u, values: rhs(time, state, u, values),
+    ],
+    ids=["names", "inputs in u", "parameters in p", "partial", "open-ended", "positions", "one position"],
+)
+def test_arguments_may_be_inputs_and_parameters_by_name(function, numeric):
+    made = from_function(function, lambda t, y, k, d: {"load": k * y[0] + d * y[1]}, numeric=numeric, **NAMES)
+    u = 5 * np.random.default_rng(0).normal(size=(100, 1))
+    record = pilfr.Recording(u, u, 5e-3, inputs=("force",), outputs=("load",), initial="zero", hold="zero")
+    for other in ({}, {"k": 700.0, "d": 40.0}):
+        expected = from_function(
+            rhs, lambda t, x, u, p: {"load": p["k"] * x[0] + p["d"] * x[1]}, **NAMES
+        ).with_parameters(other)
+        found = made.with_parameters(other).simulate(record)
+        assert np.allclose(found, expected.simulate(record), rtol=1e-9, atol=1e-12)
+
+
+def test_a_function_of_time_and_states_alone_has_no_inputs():
+    made = from_function(lambda t, y: [force(t) - y[0]], "level", states="level")
+    x, u, p, t = made.symbols()
+    assert made.inputs == () and made.derivatives(x, u, p, t).size1() == 1
+    assert float(ca.Function("f", [t, x.level], [made.derivatives(x, u, p, t)])(2.5, 1.0)) == 4.0
 
 
 def outflow(t, x, u, p):
@@ -265,7 +316,15 @@ def finds_a_root(t, x, u, p):
 randn = np.random.randn
 BAD = {
     "not callable": (3, ("3", "function of t, x, u and p")),
-    "other arguments": (lambda t, x: x, ("(t, x, u, p)",)),
+    "one argument": (lambda x: x, ("(t, x, u, p)",)),
+    "input inside": (lambda t, y: [y[1], force(t)], ("(t, y) does not take f", "recording", "as an argument", "y, f)")),
+    "input inside, parameters": (lambda t, y, k: [y[1], force(t) - k], ("(t, y, k) does not take f",)),
+    "undeclared argument": (lambda t, y, f, k, d: y, ("(t, y, f, k, d)", "'d'", "input (f)", "parameter (k)")),
+    "undeclared arguments": (
+        lambda t, y, d, m: [y[1], -m * y[0]],
+        ("because d and m are no names", "u is the array of the inputs"),
+    ),
+    "time behind the states": (lambda y, t, f: y, ("(y, t, f) takes the time behind", "<lambda>(t, y, ...)")),
     "too few": (lambda t, x, u, p: [x[0]], ("1 value;", "derivatives a, b")),
     "too many": (lambda t, x, u, p: [x[0], x[1], 0], ("3 values;", "derivatives a, b")),
     "a matrix": (lambda t, x, u, p: np.outer(x, x)[:, :1] * x, ("shape (2, 2)", "derivatives a, b")),

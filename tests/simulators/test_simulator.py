@@ -408,7 +408,7 @@ def test_a_discrete_simulator_steps_once_a_sample(record):
 def test_equation_ports_stand_in_for_declared_ones(record):
     free = rig(ports=())
     names = [p.name for p in free.all_ports()]
-    assert names[:2] == ["equation:pos", "equation:vel"]
+    assert names[:2] == ["equation:vel", "actuator:force"]  # that of the position only defines the speed
     cubic = free.with_element("equation:vel", CubicStiffness(values={"k_3": 700.0 / 1.3}))  # z is the position there
     whole = rig().with_element("ground", CubicStiffness(values={"k_3": 700.0}))
     assert np.allclose(run(cubic, record), run(whole, record), rtol=0, atol=1e-12)
@@ -418,7 +418,6 @@ def test_equation_ports_have_the_units_of_outputs_that_show_their_coordinate():
     free = rig(ports=(), units={"position": "mm", "force": "N"})
     shown = {p.name: (p.unit, p.across_unit, p.domain) for p in free.all_ports()}
     assert shown["equation:vel"] == ("mm/s^2", "mm", "mechanical")
-    assert shown["equation:pos"] == ("mm/s", "mm", "mechanical")  # of its own it may be a level
     oven = Simulator(
         lambda x, u: dict(air=u.heat - x.air + x.wall, wall=x.air - x.wall),
         lambda x: dict(temperature=x.air),
@@ -526,3 +525,17 @@ def test_other_values_check_no_equation_again(record):
     whole = rig(parameters={**rig().parameters, "k": Parameter(95.0)})
     expected = run(whole.with_element("ground", CubicStiffness(values={"k_3": 700.0})), record)
     assert np.array_equal(run(law, record), expected)
+
+
+def test_other_bounds_free_a_parameter():
+    own = {"k": Parameter(2.0, "N/m", (1, 3), fixed=True), "d": Parameter([1.0, 2.0], bounds=(0, 5))}
+    simulator = Simulator(lambda x, p: {"x": -p.k * x.x - p.d[0]}, lambda x: {"y": x.x}, ("x",), parameters=own)
+    changed = simulator.with_bounds({"k": (0.5, 50), "d": (0, 9)}).parameters
+    assert changed["k"].bounds == (0.5, 50) and not changed["k"].fixed and changed["k"].unit == "N/m"
+    assert np.all(changed["d"].bounds[1] == 9) and simulator.parameters["k"].fixed
+    with pytest.raises(InputError, match=r"'d' is 2, outside of its bounds 0 to 1\.5; widen them"):
+        simulator.with_bounds({"d": (0, 1.5)})
+    with pytest.raises(InputError, match="bounds 3 to 1 of 'k' are infeasible"):
+        simulator.with_bounds({"k": (3, 1)})
+    with pytest.raises(InputError, match="There is no parameter 'm'; the simulator has k, d"):
+        simulator.with_bounds({"m": (0, 1)})

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -26,6 +27,7 @@ from pilfr_casadi.studies.machines import simulator_digest
 
 OPTIONS = {"laws": LAWS, "effects": 1, "sample": 1}
 FRICTION = f"{PORT}.F_c"
+COMMAND = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
 
 
 def contents(out):
@@ -102,10 +104,64 @@ def test_the_folder_holds_table_content_and_page(found):
     content = json.loads((folder / "fleet.json").read_text())
     assert content["differing"] == ["e"] and content["drifting"] == ["b"]
     page = (folder / "report.html").read_text()
-    assert f'href="{fleet["e"].report}"' in page and "default-src" in page and "<script" not in page
+    assert "default-src" in page and "<script" not in page
     assert page.count("<img") == 4  # map, strips, what is left, drift
     assert fleet.plot()._repr_png_()[:4] == b"\x89PNG"
     assert str(read_fleet(folder, rig(), laws=LAWS)) == str(fleet)
+
+
+def test_every_machine_has_a_page(found):
+    fleet, folder = found
+    overview = (folder / "report.html").read_text()
+    pages = {}
+    for m in fleet.machines:
+        assert f'href="{m.page}"' in overview
+        page = pages[m.name] = (folder / m.page).read_text()
+        assert "default-src" in page and "<script" not in page
+        links = [link for link in re.findall(r'href="([^"]*)"', page) if not link.startswith(("data:", "#"))]
+        assert "../../report.html" in links and all((folder / m.page).parent.joinpath(link).is_file() for link in links)
+    assert f'href="../../{fleet["e"].report}"' in pages["e"] and "cubic stiffness" in pages["e"]
+    assert "As the other machines" in pages["a"] and "0.003" in pages["a"]  # the noise
+    # drift and residual, residual, and none of a regular machine
+    assert [pages[name].count("<img") for name in "bea"] == [2, 1, 0]
+    assert re.search(r"k drifts by [^;]* per recording \(probability 1\)", pages["b"])
+
+
+def test_a_drift_withdraws_the_diagnosis_of_the_machine_alone(found):
+    fleet, folder = found
+    entries = Manifest.read(folder, pilfr.studies.FLEET).entries
+    (sentence,) = (e["sentence"] for e in entries.values() if e["step"] == "sample")
+    assert re.fullmatch(r"Diagnosed alone, it suggests .*; the comparison with the other machines decides\.", sentence)
+    assert "per recording (1.00)" in fleet["b"].findings and not fleet["b"].note
+    sampled = replace(fleet["b"], report="jobs/sample-b/report.html")
+    assert sampled.findings.startswith(fleet["b"].findings) and "is replaced by this finding" in sampled.findings
+    assert not replace(fleet["a"], report="jobs/sample-a/report.html").findings
+
+
+def test_a_drift_is_per_recording_unless_times_are_given(found):
+    fleet, _ = found
+    worn = machines()["b"]
+    (unnamed,), (named,) = (fleet.judge("b", worn, times).reasons for times in (None, [0.0, 10.0]))
+    assert unnamed[0].endswith("per recording") and named[0].endswith("per unit of time")
+    slopes = [float(re.search(r"drifts by (\S+)", text)[1]) for text in (unnamed[0], named[0])]
+    assert slopes[0] == pytest.approx(10 * slopes[1], rel=1e-3)
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_a_wrong_unit_is_named(found, days, tmp_path):
+    """Without a diagnosis, for a new machine, and for one that is added to the fleet."""
+    fleet, folder = found
+    wrong = [r.with_(y=1e3 * r.y) for r in days["a"]]
+    (reason,) = fleet.judge("f", wrong).reasons
+    assert "position is too large by a factor of 1000, as from a wrong unit" in reason[0]
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    lines = []
+    more = pilfr.fleet(rig(), {**days, "f": wrong}, **OPTIONS, workers=1, out=copy, tell=lines.append)
+    assert [line.partition(":")[0] for line in lines if "already" not in line] == ["refit-f", "measure-f", "rest-f"]
+    assert "position is too large by a factor of 1000" in more["f"].findings and not more["f"].report
+    assert [m.name for m in more.drifting] == ["b"]
+    assert "position is too large" in (copy / more["f"].page).read_text()
 
 
 @pytest.mark.usefixtures("blank_figures")
@@ -126,10 +182,20 @@ def test_only_missing_jobs_are_executed_again(found, days, tmp_path, monkeypatch
         del manifest.content["jobs"][job]
     manifest.write()
     (copy / "fleet.csv").unlink()
-    done = []
+    lines, stages = [], []
     monkeypatch.setattr(report, "diagnosis_page", None)  # no diagnosis is due
-    pilfr.fleet(rig(), days, **OPTIONS, workers=1, out=copy, tell=done.append)
-    assert [line.partition(":")[0] for line in done] == ["refit-a", "measure-c"]
+    pilfr.fleet(
+        rig(), days, **OPTIONS, workers=1, out=copy, tell=lines.append, progress=lambda *now: stages.append(now[:3])
+    )
+    begun = [line for line in lines if line.endswith("already done")]
+    assert [line.partition(":")[0] for line in lines if line not in begun] == ["refit-a", "measure-c"]
+    assert [re.sub(r"(\w+):.*; ", r"\1 ", line) for line in begun] == [
+        "refit 4 of 5 already done",
+        "sample 1 of 1 already done",
+        "measure 4 of 5 already done",
+        "rest 1 of 1 already done",
+    ]
+    assert stages[:3] == [("refit", 4, 5), ("refit", 5, 5), ("sample", 1, 1)]
     assert contents(copy) == contents(folder)
     (copy / "jobs" / "measure-a" / "residual.json").write_text("{}")
     with pytest.raises(InputError, match="was changed after the fleet wrote it"):
@@ -240,6 +306,14 @@ def test_bad_commands(tmp_path, days, capsys):
     assert [p.name for p in out.iterdir()] == ["precious.txt"]
 
 
+def test_a_bad_address_of_a_cluster_is_refused_at_once(tmp_path):
+    command = [sys.executable, "-c", COMMAND, "fleet", "rig.py", "data", "--dask", "nonsense", "--out", "out"]
+    folder = write_machines(tmp_path, {name: [recording(1200.0, 1)] for name in "ab"})
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=15, check=False)
+    assert done.returncode == 2 and not (folder / "out").exists()
+    assert done.stderr.startswith("pilfr: No Dask scheduler") and len(done.stderr.splitlines()) == 1
+
+
 @pytest.mark.slow
 def test_the_bytes_do_not_depend_on_the_executor(days, tmp_path):
     """Pages of diagnoses are made here, in other processes."""
@@ -250,9 +324,6 @@ def test_the_bytes_do_not_depend_on_the_executor(days, tmp_path):
         pilfr.fleet(rig(), days, **OPTIONS, executor=pool, out=tmp_path / "pool")
     close_workers()
     assert contents(one) == contents(tmp_path / "two") == contents(tmp_path / "pool")
-
-
-COMMAND = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
 
 
 def started(folder, *more):

@@ -1,0 +1,350 @@
+"""Constant errors of recordings: offsets of channels, and wrong initial states.
+
+An offset that all recordings share becomes a parameter of the simulator, because a constant load has the same effect.
+Offsets that differ between the recordings are subtracted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ...data import Recording
+from ...laws import Law
+from ...simulators import ACTUATOR, SENSOR, Simulator, kind_of, port_name, split_port
+from ..fits.evidence import FORMULA_ERROR
+from ..fits.floor import ABOVE_NOISE, noise_floor
+from ..fits.screen import block_diagonal, lengths
+from ..fits.workbench import FEW, THOROUGH, Fitted, Workbench
+from .gates import (
+    CERTAIN_ERRORS,
+    CURED_SHARE,
+    EQUAL_RATIO,
+    EXCEPTION_SHARE,
+    LEAST_GAIN,
+    NEAR_NOISE_RATIO,
+    Checked,
+    FirstOrder,
+    Gate,
+    accept,
+    correct,
+    gain,
+    refit,
+    settle,
+)
+
+KEPT_OFFSET = 0.1  # share of its first value that an offset must keep beside effects to be reported
+VISIBLE_SHARE = 1e-6  # share of a constant's response above which initial states cannot follow it
+
+
+@dataclass(frozen=True)
+class WrongStart(Gate):
+    """Initial states that are not as stated; other physics may remain beside it.
+
+    Attributes
+    ----------
+    otherwise : WrongStart
+        Finding to report instead if a search with estimated initial states follows better.
+    """
+
+    otherwise: WrongStart | None = None
+
+    most_left: ClassVar[float] = 1.0
+    remedy: ClassVar[str] = "with them estimated"
+
+
+def find_wrong_start(now: Checked) -> Checked:
+    """Estimate the initial states if the stated ones contradict the first samples more than a sensor's zero could.
+
+    Missing dynamics cannot contradict a first sample. If the sensor's zero is wrong instead, it is wrong by that miss.
+    So both explanations begin at the first sample, and the one with which the refit follows better is told.
+    """
+    bench, misses = now.bench, _missed_starts(now)
+    stated = [r for r in bench.recordings if r.begins in ("zero", "given")]
+    # the states of other recordings come out as stated
+    unknown = sum(map(np.any, misses)) * len(bench.simulator.states)
+    if not unknown:
+        return now
+    missed = _describe_miss(now, misses)
+    words = f"The initial states are not as stated: {missed}"
+    fault = WrongStart("initial state", "start", stated[0].begins, words, change=_with_unknown_start)
+    after = correct(now, fault, [now.fitted.values, {}])
+    if after is None or gain(now.cost, after.cost, after.residuals, unknown) < LEAST_GAIN:
+        return now
+    zeroed = [r.with_(y=r.y + miss) for r, miss in zip(bench.recordings, misses, strict=True)]
+    rival = refit(bench.on(zeroed), [now.fitted.values, {}], states=now.fitted.begin)
+    left = np.inf if rival is None else _error_at_own_zero(bench, rival, misses)
+    if left > EQUAL_RATIO * after.cost:
+        return accept(now, after, fault)
+    if EQUAL_RATIO * left > after.cost:
+        words = f"{words}; a wrong zero of the sensor explains that as well"
+        return accept(now, after, replace(fault, sentence=words))
+    searched = f"{words}; a search with them estimated follows better than one with a wrong zero of the sensor."
+    otherwise = replace(fault, sentence=searched, fault=True)
+    words = "a wrong zero of the sensor explains that better than another start. If the machine did begin elsewhere"
+    words = f"As stated, {missed}; {words}, give each state's value, or leave the start unknown."
+    zero = replace(fault, sentence=words, corrected=False, change=None, otherwise=otherwise)
+    return now.then(bench, now.fitted, zero)
+
+
+def _error_at_own_zero(bench: Workbench, zeroed: Fitted, misses: Sequence[np.ndarray]) -> float:
+    """Compute the mean square error without the constants that are left where one noisy sample has set the zero."""
+    residuals = bench.scored(zeroed.residual)
+    most = CERTAIN_ERRORS * noise_floor(bench.recordings, residuals).deviation
+    left = [np.clip(np.mean(e, axis=0), -most, most) * (miss != 0) for e, miss in zip(residuals, misses, strict=True)]
+    errors = np.concatenate([e - constant for e, constant in zip(residuals, left, strict=True)])
+    return bench.pool(np.mean(errors**2, axis=0) / bench.scale**2)
+
+
+def _missed_starts(now: Checked) -> list[np.ndarray]:
+    """Compute by how much a run from its stated start misses each recording's first sample, (n_y,); noise is zero."""
+    least, both = CERTAIN_ERRORS * now.floor.deviation, zip(now.bench.recordings, now.fitted.residual, strict=True)
+    first = (e[0] if r.begins in ("zero", "given") else np.zeros(r.n_y) for r, e in both)
+    return [np.where(np.abs(e) > least, e, 0.0) for e in first]
+
+
+def _describe_miss(now: Checked, misses: Sequence[np.ndarray]) -> str:
+    """Describe the first sample that is missed most."""
+    i, k = divmod(int(np.argmax(np.abs(np.array(misses)) / now.bench.scale)), len(now.bench.scale))
+    r, name = now.bench.recordings[i], now.bench.simulator.output_names[k]
+    stated, first = r.y[0, k] + misses[i][k], r.y[0, k]
+    of = f" of {r.name or f'recording {i + 1}'}" if len(misses) > 1 else ""
+    scaled = f", unless the scale of {name} is wrong" if abs(stated) > FORMULA_ERROR * abs(first) else ""
+    return f"{name} would begin at {stated:.3g}, but its first sample{of} is {first:.3g}{scaled}"
+
+
+def _with_unknown_start(r: Recording) -> Recording:
+    return r.with_(initial="estimate") if r.begins in ("zero", "given") else r
+
+
+class Offset(Law):
+    """A constant added to a signal; it stays a parameter of the simulator and is fitted together with the laws."""
+
+    id = "offset"
+    equation = "w = w_0"
+    source = "Ljung (1999), System Identification, sec. 14.1"
+    sentence = "a constant offset of the signal"
+    units: ClassVar[Mapping[str, str]] = {"w_0": "w"}
+    strength: ClassVar[tuple[str, ...]] = ("w_0",)
+    places: ClassVar[tuple[str, ...]] = ("series",)
+
+    def force(self, p: Any) -> Any:
+        """Return the constant."""
+        return p.w_0
+
+
+@dataclass(frozen=True)
+class Constant(Gate):
+    """A constant at an input or an output, a parameter of the simulator; other physics may remain beside it."""
+
+    port: str = ""
+    parameters: ClassVar[int] = 1
+    most_left: ClassVar[float] = 1.0
+    remedy: ClassVar[str] = "with it as a parameter"
+
+    def apply(self, bench: Workbench) -> Workbench:
+        """Return the bench with the constant in its simulator."""
+        return replace(bench, simulator=bench.simulator.with_element(self.port, Offset()))
+
+
+def describe_constant(port: str, value: float = 0.0, parameter: str = "", unit: str = "") -> Constant:
+    """Return the fault that a channel has a constant offset."""
+    kind, name = split_port(port)
+    alike = ", or a constant load acts like one, as do dry friction and a dead zone while the input keeps its sign"
+    where, load = ("input", alike) if kind == ACTUATOR else ("output", "")
+    words = f"The {where} {name} has a constant offset of about {f'{value:.3g} {unit}'.rstrip()}{load}"
+    return Constant(name, "offset", value, words, parameter=parameter, port=port)
+
+
+def find_offsets(now: Checked) -> Checked:
+    """Find constants at inputs and outputs, the most useful first, and keep them as parameters of the simulator.
+
+    They count as a fault if they explain most of the mismatch. Offsets of each recording's own take their place where
+    more than noise is left and they gain enough.
+    """
+    begin, ports = now, _channels(now.bench.simulator)
+    while ports:
+        share = share_of_constants(now.bench, now.fitted, ports)
+        largest = max(share.values())
+        if largest < EXCEPTION_SHARE:
+            break
+        alike = [name for name in ports if np.isclose(share[name], largest)]  # as at an input and an output behind it
+        tried = [
+            (name, correct(now, describe_constant(name), [now.fitted.values], now.fitted.initial, THOROUGH))
+            for name in alike
+        ]
+        settled = [(name, found) for name, found in tried if found is not None]
+        if not settled:
+            break
+        port, after = min(settled, key=lambda pair: pair[1].cost)
+        name = f"{after.bench.simulator.elements[-1].prefix}w_0"
+        value, unit = float(after.fitted.values[name]), now.bench.simulator.port(port).unit
+        before, now = now, accept(now, after, describe_constant(port, value, name, unit))
+        if now.bench is before.bench:
+            break
+        ports.remove(port)
+    fault = now.cost < CURED_SHARE * begin.cost
+    # a constant load acts alike, so that the share that is left does not prove a fault
+    found = (replace(g, fault=fault, left=1.0) for g in now.gates[len(begin.gates) :])
+    shared = begin.then(now.bench, now.fitted, *found)
+    if shared.cost < NEAR_NOISE_RATIO**2 * shared.noise2:
+        return shared
+    each = find_varying_offset(begin)
+    more = len(begin.bench.recordings) - len(shared.gates) + len(begin.gates)
+    return each if gain(shared.cost, each.cost, each.residuals, more) > LEAST_GAIN else shared
+
+
+@dataclass(frozen=True)
+class VaryingOffset(Gate):
+    """Constants of a channel that differ between the recordings, as of a sensor that is zeroed before each.
+
+    `value` has one constant for each recording; `port` is the channel's port.
+    """
+
+    port: str = ""
+
+    @property
+    def parameters(self) -> int:  # type: ignore[override]
+        """Number of the constants."""
+        return len(self.value)
+
+    def apply(self, bench: Workbench) -> Workbench:
+        """Return the bench with the constants subtracted from its recordings."""
+        return replace(bench, recordings=tuple(map(self.subtract, bench.recordings, self.value)))
+
+    def apply_to_whole(self, whole: list[Recording], places: Sequence[tuple[int, int]]) -> list[Recording]:
+        """Subtract from each recording the mean of the constants of its stretches; none if gaps have cut stretches."""
+        if len(self.value) != len(places):
+            return whole
+        each = [[v for v, (k, _) in zip(self.value, places, strict=True) if k == i] for i in range(len(whole))]
+        return [self.subtract(r, float(np.mean(v))) if v else r for r, v in zip(whole, each, strict=True)]
+
+    def subtract(self, r: Recording, value: float) -> Recording:
+        """Subtract a constant from the channel of a recording."""
+        kind, name = split_port(self.port)
+        side, names = ("u", r.inputs) if kind == ACTUATOR else ("y", r.outputs)
+        at = np.array([one == name for one in names], dtype=float)
+        return r.with_(**{side: getattr(r, side) - value * at})
+
+    def relocate(self, now: Checked, after: Checked) -> VaryingOffset:
+        """Return the constants that follow best to first order at the corrected refit."""
+        first = FirstOrder.of(after.bench, after.fitted)
+        return self.at(np.add(self.value, _constants_of_each(first, self.port)[1]))
+
+    def at(self, values: np.ndarray) -> VaryingOffset:
+        """Return it with other constants."""
+        value = [float(f"{v:.6g}") for v in values]
+        listed_values = ", ".join(f"{v:.3g}" for v in value)
+        words = (
+            f"{self.channel} has an offset that differs between the recordings, {listed_values}, and may be another in "
+            "further ones"
+        )
+        return replace(self, value=value, sentence=words)
+
+
+def _constants_of_each(first: FirstOrder, port: str) -> tuple[float, np.ndarray]:
+    """Compute the share of the mean square that a constant of each recording's own removes, and the constants."""
+    recordings = first.bench.recordings
+    ends = np.cumsum([r.y[r.skip :].size for r in recordings])
+    response = first.response([port], [np.ones((len(r), 1)) for r in recordings])
+    rest, seen = _visible(first, block_diagonal(np.split(response, ends[:-1]), 0))
+    found = np.zeros(len(recordings))
+    found[seen] = np.linalg.lstsq(rest[:, seen], first.error, rcond=1e-8)[0]
+    left = first.project_off(first.error)
+    share = 1 - np.sum((left - rest @ found) ** 2) / max(left @ left, 1e-300)
+    return float(share), found if kind_of(port) == ACTUATOR else -found
+
+
+def _visible(first: FirstOrder, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the parts of responses that parameters and initial states cannot follow, and mark the visible ones."""
+    rest = first.project_off(columns)
+    return rest, lengths(rest) > VISIBLE_SHARE * lengths(columns)
+
+
+def find_varying_offset(now: Checked) -> Checked:
+    """Subtract constants that differ between the recordings if the rule accepts them and only noise is left.
+
+    The mean effect of missing physics may differ between the recordings as well.
+    """
+    if len(now.bench.recordings) < 2:
+        return now
+    first = FirstOrder.of(now.bench, now.fitted)
+    found = {port: _constants_of_each(first, port) for port in _channels(now.bench.simulator)}
+    likely = sorted(found, key=lambda port: -found[port][0])[:FEW]
+    faults = (VaryingOffset(split_port(p)[1], "offset", (), port=p).at(found[p][1]) for p in likely)
+    settled = [pair for fault in faults if (pair := settle(now, fault)) is not None]
+    if not settled:
+        return now
+    fault, after = min(settled, key=lambda pair: pair[1].cost)
+    return accept(now, after, fault) if after.cost < ABOVE_NOISE**2 * after.noise2 else now
+
+
+def _channels(simulator: Simulator) -> list[str]:
+    """List the ports of the inputs and outputs that have no element yet."""
+    ports = [port_name(ACTUATOR, n) for n in simulator.inputs]
+    ports += [port_name(SENSOR, n) for n in simulator.output_names]
+    return [port for port in ports if port not in {e.port for e in simulator.elements}]
+
+
+def share_of_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[str, float]:
+    """Compute the share of the mean square that a constant at each port removes, to first order."""
+    first = FirstOrder.of(bench, fitted)
+    rest, seen = _visible(first, first.response(ports, [np.ones((len(r), 1)) for r in bench.recordings]))
+    along = np.where(seen, rest.T @ first.error / np.maximum(lengths(rest), 1e-150), 0.0)
+    return dict(zip(ports, (along**2 / max(first.error @ first.error, 1e-300)).tolist(), strict=True))
+
+
+def list_offsets(elements: Sequence[Any], values: Mapping[str, Any], simulator: Simulator | None = None) -> list[Gate]:
+    """List the offsets among fitted laws as findings, with the units that the simulator knows."""
+    placed = [(e.port, f"{e.prefix}w_0") for e in elements if isinstance(e.law, Offset)]
+    units = {port: simulator.port(port).unit if simulator else "" for port, _ in placed}
+    found = [describe_constant(port, float(values[name]), name, units[port]) for port, name in placed]
+    return [replace(c, sentence=f"{c.sentence}; it is a parameter of the corrected simulator.") for c in found]
+
+
+def fix_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
+    """Fix offsets at zero that gain nothing beside effects, because an effect may have looked like an offset."""
+    before = len(bench.simulator.elements)
+    placed = fitted.simulator.elements
+    for offset in list_offsets(placed[:before], fitted.values) if len(placed) > before else ():
+        name = offset.parameter
+        zero = replace(fitted.simulator.parameters[name], value=0.0, fixed=True)
+        simulator = fitted.simulator.with_parameters({**fitted.simulator.parameters, name: zero})
+        start = {k: v for k, v in fitted.values.items() if k != name}
+        found = refit(bench, [start], simulator, states=fitted.initial, solver=THOROUGH)
+        if found is not None and gain(found.cost, fitted.cost, bench.scored(fitted.residual)) <= LEAST_GAIN:
+            fitted = found
+    return fitted
+
+
+def remove_idle_offsets(simulator: Simulator, own: int) -> Simulator:
+    """Return a simulator without the offsets that `fix_idle_offsets` has fixed; the first `own` elements are kept."""
+    for i in reversed(range(own, len(simulator.elements))):
+        e = simulator.elements[i]
+        if isinstance(e.law, Offset) and np.all(simulator.parameters[f"{e.prefix}w_0"].fixed):
+            simulator = simulator.without_element(i)
+    return simulator
+
+
+def update_offsets(
+    gates: Sequence[Gate], after: Fitted, std: Mapping[str, np.ndarray], effects: bool, sure: bool
+) -> tuple[Gate, ...]:
+    """Return the findings with the offsets at their fitted values; drop offsets that the effects have replaced."""
+    fitted = {g.parameter: g for g in list_offsets(after.simulator.elements, after.values, after.simulator)}
+    out = []
+    for gate in gates:
+        if not gate.parameter:
+            out.append(gate)
+            continue
+        remaining = fitted[gate.parameter]
+        uncertain = abs(remaining.value) <= CERTAIN_ERRORS * float(std[gate.parameter])  # an unknown error says nothing
+        if uncertain or not abs(remaining.value) > KEPT_OFFSET * abs(gate.value):
+            continue
+        sentence = remaining.sentence if effects else gate.sentence  # the value before the effects says little
+        if not sure:
+            sentence += " As long as the mismatch has no sure name, it may be a part of that."
+        out.append(replace(gate, value=remaining.value, sentence=sentence))
+    return tuple(out)

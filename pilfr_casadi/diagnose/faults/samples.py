@@ -1,0 +1,513 @@
+"""Faults visible in the recorded samples themselves: glitches, stale, clipped and unsettled samples, and steady tones.
+
+- Glitches, for example from a lost bit or a loose contact: a sample far off the cubic through its four neighbours,
+  relative to the distances nearby. Once the cubic replaces it, its neighbours are inconspicuous; at a step or a shock
+  they are not.
+- Stale samples: a channel that otherwise never repeats a value sometimes repeats its last one. Interpolation replaces
+  them. Other repeats are not stale: a coarse converter, or an encoder that moves by no more than its step, has few
+  values; a machine at rest repeats one value for long; a clipped channel repeats its limit.
+- Held outputs: an output that changes at every k-th sample alone was measured at that rate and held in between, which
+  looks like a delay of (k - 1) / 2 samples. The values between cannot be told, so that this is only noted.
+- Clipped channels: exactly repeated extremes. A clipped output can be compared with an equally clipped simulation; the
+  part of a clipped input beyond its limit is lost.
+- Unsettled periods: the rms differences of neighbouring periods are all equal if only noise differs, and larger at
+  first if a transient decays. Then the first sample is not on the steady cycle, and the differences do not measure the
+  noise.
+- Tones, for example from mains hum, a fan or an unbalanced motor: a line of the residual's spectrum far above its
+  neighbours (Fisher 1929). Its amplitude and phase are constant over the record, and it is neither in an input nor a
+  harmonic or a mixture of an input's few lines. A residual at one of the simulator's own frequencies is not noise
+  either: an unrecorded force causes it, and no law at any port explains it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+
+from ...data import Recording
+from ...laws import AsymmetricSaturation
+from ...simulators import ACTUATOR, SENSOR, port_name
+from ..fits.floor import DISTINCT_SHARE, FEWEST_LEVELS
+from ..fits.linearise import linearise_runs
+from ..fits.screen import folds, held_out
+from ..fits.workbench import Fitted, Workbench
+from .gates import (
+    CURED_SHARE,
+    EXCEPTION_SHARE,
+    LEAST_GAIN,
+    Checked,
+    FirstOrder,
+    Gate,
+    accept,
+    correct,
+    open_start,
+    robust_deviation,
+)
+
+NEIGHBOURHOOD = 6  # widths on either side of a glitch or a spectral line with which it is compared
+
+CUBIC, STENCIL = np.array([-1, 4, 0, 4, -1]) / 6, 2  # through the neighbours at -2, -1, 1, 2
+GLITCH_SIZE = 0.1  # least distance of a glitch over the output's deviation
+FEWEST_STEPS = 2.0  # least distance of a glitch over the resolution of a quantised signal, whose rounding leaves 1.4
+ISOLATED_SHARE = 0.12  # distance of neighbours, and deviation nearby, over a glitch's distance; a kink leaves 1/6
+
+ROUNDING = 1e-6  # bound on the relative rounding of distances
+
+FEWEST_CHANGES = 20  # of an output, from which chance hardly puts all of them on one raster
+ON_RASTER = 0.98  # least share of an output's changes that lie on the raster of a held output
+
+LONGEST_REST = 5  # longest rest of an encoder or a machine, in samples
+LARGEST_MOTION = 5  # largest motion of an encoder in a sample, in steps
+MOST_LEFT = 0.5  # largest share of the mismatch that the guessed course of an input beyond its limit may leave
+ON_STEP = 1e-3  # distance from a step of a coarse sensor, over the step, that rounding makes at most
+CHANCE_FACTOR = 3.0  # factor on the number of repeats that noise causes
+
+TONE_LINES = 5  # spectral lines on either side that may belong to a tone
+AMPLITUDE_CHANGE = 0.5  # largest change of the amplitude in a quarter of the record, over the amplitude
+# for mixtures of an input's lines: most lines; highest order of mixtures, and of harmonics
+LINES, ORDER, HARMONICS = 3, 7, 60
+LIGHT_DAMPING = 0.15  # damping ratio below which a mode rings
+
+
+# glitches
+
+
+def remove_glitches(recordings: Sequence[Recording]) -> tuple[tuple[Recording, ...], list[Gate]]:
+    """Replace glitches by interpolation between their neighbours; return the recordings and the findings."""
+    gates = list[Gate]()
+    mended = tuple(map(mend, recordings))
+    for i, name in enumerate(recordings[0].outputs):
+        pairs = [(r.y[:, i], clean.y[:, i]) for r, clean in zip(recordings, mended, strict=True)]
+        places = [np.flatnonzero(y != clean) for y, clean in pairs]
+        count = sum(map(len, places))
+        if not count:
+            continue
+        first = next(r.dt * k[0] for r, k in zip(recordings, places, strict=True) if len(k))
+        sentence = (
+            f"Single samples of {name} are far off their neighbours, as from glitches: {count}, the first at "
+            f"t = {first:.6g} s. Values interpolated between their neighbours replace them."
+        )
+        before, after = (sum(float(np.sum(distances(y) ** 2)) for y in ys) for ys in zip(*pairs, strict=True))
+        gates.append(Gate(name, "glitch", count, sentence, fault=after < CURED_SHARE * before, change=mend))
+    return (mended if gates else tuple(recordings)), gates
+
+
+def mend(r: Recording) -> Recording:
+    """Replace each glitch of a recording's outputs by the cubic through its neighbours."""
+    return r.with_(y=np.column_stack([find_glitches(column)[1] for column in r.y.T]))
+
+
+def find_glitches(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find single samples far off their neighbours, shape (k,); return them and the output without them."""
+    clean, found = np.array(y), np.zeros(0, dtype=int)
+    least = max(GLITCH_SIZE * float(np.std(y)), FEWEST_STEPS * _resolution(y))
+    while len(y) > 4 * NEIGHBOURHOOD * STENCIL and len(found) < EXCEPTION_SHARE * len(y):
+        d = distances(clean)
+        large = np.flatnonzero(np.abs(d) > least)
+        more = [k for k in large[_may_stand_alone(d, large)] if _stands_alone(clean, d, int(k))]
+        if not more:
+            return np.sort(found), clean
+        clean[more] -= d[more]
+        found = np.append(found, more)
+    return np.zeros(0, dtype=int), np.array(y)
+
+
+def _resolution(y: np.ndarray) -> float:
+    """Return the smallest step of a quantised signal; zero for a continuous one, or one of a few levels."""
+    steps = np.diff(np.unique(y))
+    steps = steps[steps > ROUNDING * np.ptp(y)]
+    return float(np.min(steps)) if len(steps) >= FEWEST_LEVELS else 0.0
+
+
+def distances(y: np.ndarray) -> np.ndarray:
+    """Compute the distance of each sample from the cubic through its four neighbours; none at the ends."""
+    d = np.zeros(len(y))
+    d[STENCIL:-STENCIL] = y[STENCIL:-STENCIL] - np.convolve(y, CUBIC, mode="valid")
+    return d
+
+
+def _may_stand_alone(d: np.ndarray, large: np.ndarray) -> np.ndarray:
+    """Mark the samples whose replacement may make both neighbours inconspicuous; a fast test by distances."""
+    possible = np.ones(len(large), dtype=bool)
+    for step in (-1, 1):
+        beside = large + step
+        inside = (beside >= STENCIL) & (beside < len(d) - STENCIL)  # the ends have no distance
+        after = d[beside] + CUBIC[STENCIL + step] * d[large]
+        possible &= ~inside | (np.abs(after) < (1 + ROUNDING) * ISOLATED_SHARE * np.abs(d[large]))
+    return possible
+
+
+def _stands_alone(y: np.ndarray, d: np.ndarray, k: int) -> bool:
+    """Tell whether a sample stands out, and its neighbours do not once it is replaced."""
+    around = np.arange(
+        max(k - NEIGHBOURHOOD * STENCIL, STENCIL), min(k + NEIGHBOURHOOD * STENCIL + 1, len(y) - STENCIL)
+    )
+    if robust_deviation(d[around[np.abs(around - k) > STENCIL]]) >= ISOLATED_SHARE * abs(d[k]):
+        return False
+    whole = slice(max(k - 2 * STENCIL, 0), min(k + 2 * STENCIL + 1, len(y)))
+    other = np.array(y[whole])
+    other[k - whole.start] -= d[k]
+    return bool(np.max(np.abs(distances(other))) < ISOLATED_SHARE * abs(d[k]))
+
+
+# stale samples
+
+
+@dataclass(frozen=True)
+class Stale(Gate):
+    """A channel that repeats samples: interpolation between the others replaces them."""
+
+    remedy: ClassVar[str] = "with these samples interpolated"
+
+
+def mend_stale_samples(now: Checked) -> Checked:
+    """Interpolate stale samples if the rule accepts it; else note stale outputs."""
+    first = now.bench.recordings[0]
+    for side, names in (("u", first.inputs), ("y", first.outputs)):
+        for i, name in enumerate(names):
+            repeated = share_of_repeats([getattr(r, side)[r.skip :, i] for r in now.bench.recordings])
+            if not repeated:
+                continue
+            words = f"{repeated:.0%} of the samples of {name} repeat the one before, as from lost or stale samples"
+            fault = Stale(name, "stale", repeated, words, change=partial(_interpolate_repeats, side=side, column=i))
+            found = accept(now, correct(now, fault, [{}, now.fitted.values], now.fitted.begin), fault)
+            if len(found.gates) == len(now.gates) and side == "y":
+                words = f"{words}; the error that this causes counts as noise: record again, or leave them out."
+                found = found.then(found.bench, found.fitted, Gate(name, "stale", repeated, words, False))
+            now = found
+    return now
+
+
+def _interpolate_repeats(r: Recording, side: str, column: int) -> Recording:
+    """Replace repeated samples of a channel by a cubic spline through the others."""
+    from scipy.interpolate import CubicSpline
+
+    v, k = np.array(getattr(r, side)), np.arange(len(r))
+    fresh = ~_find_repeats(v[:, column], _smallest_step(v[:, column]))
+    v[~fresh, column] = CubicSpline(k[fresh], v[fresh, column])(k[~fresh])
+    return r.with_(**{side: v})
+
+
+def share_of_repeats(columns: Sequence[np.ndarray]) -> float:
+    """Compute the share of the samples of a channel that repeat the one before; zero if chance or rest explains it.
+
+    In a resampled record of a coarse sensor, repeats lie on its steps, and most other samples between them.
+    """
+    together = np.concatenate(columns)
+    step = _smallest_step(together)
+    same = np.concatenate([_find_repeats(v, step) for v in columns])
+    repeated = float(np.mean(same))
+    coarse = _smallest_step(together[same])
+    if np.isfinite(coarse):
+        steps = (together - together[same][0]) / coarse
+        on_steps = np.abs(steps - np.round(steps)) < ON_STEP
+        if np.all(on_steps[same]) and np.mean(on_steps[~same]) < DISTINCT_SHARE:
+            return 0.0
+    by_chance = float(np.mean(np.abs(np.concatenate(list(map(np.diff, columns))) - step) < 0.5 * step))
+    many = len(np.unique(together)) > DISTINCT_SHARE * len(together)
+    return repeated if many and repeated > max(EXCEPTION_SHARE, CHANCE_FACTOR * by_chance) else 0.0
+
+
+def _smallest_step(v: np.ndarray) -> float:
+    """Return the smallest distance between two values of a signal."""
+    return float(np.min(np.diff(np.unique(v)), initial=np.inf))
+
+
+def find_stretches(mask: np.ndarray) -> np.ndarray:
+    """Find begin and end of each stretch in which a mask (M,) is true, shape (n, 2)."""
+    return np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]]))).reshape(-1, 2)
+
+
+def _find_repeats(y: np.ndarray, step: float) -> np.ndarray:
+    """Mark samples that repeat the one before, away from the limits, in short runs followed by a jump."""
+    same = np.append(False, y[1:] == y[:-1]) & (y > np.min(y)) & (y < np.max(y))
+    for begin, end in find_stretches(same):
+        if end - begin > LONGEST_REST or abs(y[min(end, len(y) - 1)] - y[begin]) < LARGEST_MOTION * step:
+            same[begin:end] = False
+    return same
+
+
+# held outputs
+
+
+def find_held_outputs(recordings: Sequence[Recording]) -> list[Gate]:
+    """Note each output that was measured at a slower rate than it was recorded."""
+    found, dt = list[Gate](), recordings[0].dt
+    for i, name in enumerate(recordings[0].outputs):
+        k = min(_samples_between_changes(r.y[:, i], r.u) for r in recordings)
+        if k > 1:
+            sentence = (
+                f"{name} changes only once in {k} samples, as if it were measured every {k * dt:.3g} s and held in "
+                f"between, which looks like a delay of about {(k - 1) / 2 * dt:.3g} s. Leave its repeated values out "
+                f"(empty cells), and read the file with resample={dt:.6g}."
+            )
+            found.append(Gate(name, "held", k, sentence, corrected=False))
+    return found
+
+
+def _samples_between_changes(y: np.ndarray, u: np.ndarray) -> int:
+    """Return the largest number of samples on whose raster an output changes; 1 if there is none.
+
+    So does an encoder at constant speed, but by a few of its steps; and a static machine without noise, but with
+    inputs that are held on the same raster.
+    """
+    motions, driven = np.abs(np.diff(y)), np.flatnonzero(np.any(np.diff(u, axis=0) != 0, axis=1))
+    changes = np.flatnonzero(motions)
+    if len(changes) < FEWEST_CHANGES or np.median(motions[changes]) < LARGEST_MOTION * _smallest_step(y):
+        return 1
+    usual = int(np.argmax(np.bincount(np.diff(changes))))
+    k = next((k for k in range(usual, 1, -1) if usual % k == 0 and _on_raster(changes, k)), 1)
+    with_inputs = max(np.mean(np.isin(changes - late, driven)) for late in (0, 1)) >= ON_RASTER
+    return 1 if with_inputs and _on_raster(driven, k) else k
+
+
+def _on_raster(places: np.ndarray, k: int) -> bool:
+    return bool(np.max(np.bincount(places % k), initial=0) >= ON_RASTER * len(places))
+
+
+# clipped channels
+
+
+@dataclass(frozen=True)
+class Clipping(Gate):
+    """A channel that repeats its extremes exactly: its column, and the limits (infinite where there is none)."""
+
+    column: int = 0
+    low: float = -np.inf
+    high: float = np.inf
+    most_left: ClassVar[float] = 1.0  # the repeated extremes show the fault, whatever else is wrong
+    remedy: ClassVar[str] = "with the simulator's output clipped alike"
+
+    def apply(self, bench: Workbench) -> Workbench:
+        """Return the bench with the simulator's output clipped like the recorded one, so that the rest still counts."""
+        law = AsymmetricSaturation().at({"low": max(self.low, -1e300), "high": min(self.high, 1e300)})
+        placed = bench.simulator.with_element(port_name(SENSOR, self.channel), law)
+        prefix = placed.elements[-1].prefix
+        fixed = {k: replace(p, fixed=True) if k.startswith(prefix) else p for k, p in placed.parameters.items()}
+        return replace(bench, simulator=placed.with_parameters(fixed))
+
+
+def unclip(now: Checked) -> Checked:
+    """Clip the simulator's outputs like the recorded ones."""
+    for fault in find_clipping(now.bench.recordings, "y"):
+        now = accept(now, correct(now, fault, [{}, now.fitted.values], now.fitted.begin), fault)
+    return now
+
+
+def find_clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gate | None:
+    """Find a clipped input that explains most of the mismatch, unless a law leaves a smaller share (`remains`).
+
+    The true input beyond the limit is not recorded; a smooth continuation replaces it (`_beyond_limit`).
+    """
+    for fault in find_clipping(bench.recordings, "u"):
+        explained = _explained_beyond(bench, without, fault)
+        if 1 - explained < min(MOST_LEFT, remains):
+            sentence = (
+                f"{fault.sentence}, and its likely course beyond the limit explains {explained:.0%} of the mismatch: "
+                "the recording does not contain the true input there. Record it with a larger range."
+            )
+            return replace(fault, sentence=sentence, corrected=False, fault=True)
+    return None
+
+
+def _explained_beyond(bench: Workbench, without: Fitted, fault: Clipping) -> float:
+    """Compute the held-out share of the error that an input's continuation beyond its limits explains."""
+    first = FirstOrder.of(bench, without)
+    signs = [(v, 1.0 if v == fault.high else -1.0) for v in fault.value]
+    inputs = [r.u[:, fault.column] for r in bench.recordings]
+    beyond = [np.column_stack([sign * _beyond_limit(u, v) for v, sign in signs]) for u in inputs]
+    left = first.project_off(first.error)
+    columns = first.project_off(first.response([port_name(ACTUATOR, fault.channel)], beyond))
+    # a positive coefficient would put the input inside its limit
+    if np.any(np.linalg.lstsq(columns, left, rcond=1e-8)[0] > 0):
+        return 0.0
+    whole = [slice(r.skip, len(r)) for r in bench.recordings]
+    return held_out(columns, left, folds(bench.recordings, whole))
+
+
+def _beyond_limit(u: np.ndarray, limit: float) -> np.ndarray:
+    """Estimate the part of a signal beyond a limit: the cubic with the slopes of the signal before and after."""
+    out, rise = np.zeros(len(u)), np.abs(np.diff(u, prepend=u[0], append=u[-1]))
+    for begin, end in find_stretches(u == limit):  # the step to the limit is cut short, and perhaps the step before it
+        leaves, back = np.max(rise[max(begin - 1, 0) : begin + 1]), np.max(rise[end : end + 2])
+        t = (np.arange(end - begin) + 0.5) / (end - begin)
+        out[begin:end] = (end - begin) * t * (1 - t) * (leaves * (1 - t) + back * t)
+    return out
+
+
+def find_clipping(recordings: Sequence[Recording], kind: str) -> list[Clipping]:
+    """Find inputs (`kind` "u") or outputs ("y") that repeat their extremes exactly over several samples."""
+    out = []
+    for i, name in enumerate(recordings[0].inputs if kind == "u" else recordings[0].outputs):
+        y = np.concatenate([getattr(r, kind)[:, i] for r in recordings])
+        if np.mean(np.diff(y) == 0) >= DISTINCT_SHARE:
+            continue
+        limits, count = [-np.inf, np.inf], 0
+        for j, extreme in enumerate((y.min(), y.max())):
+            at = y == extreme
+            runs = np.diff(find_stretches(at)).ravel()
+            if runs.max() >= 3 and np.sum(runs > 1) > 1 and at.mean() > CHANCE_FACTOR * _share_at_level(y):
+                limits[j], count = float(extreme), count + int(at.sum())
+        if count:
+            finite = [v for v in limits if np.isfinite(v)]
+            at_limits = " and ".join(f"{v:.6g}" for v in finite)
+            words = f"{name} is clipped at {at_limits} ({count} samples at the limit)"
+            out.append(Clipping(name, "clipping", finite, words, column=i, low=limits[0], high=limits[1]))
+    return out
+
+
+def _share_at_level(y: np.ndarray) -> float:
+    """Compute the share of samples at a level of a quantised signal near its extremes; 0 for a continuous one."""
+    values, counts = np.unique(y, return_counts=True)
+    if len(values) > DISTINCT_SHARE * len(y):
+        return 0.0
+    return float(np.median(np.concatenate([counts[1:6], counts[-6:-1]])) / len(y))
+
+
+# unsettled periods
+
+
+def open_unsettled(recordings: Sequence[Recording]) -> tuple[tuple[Recording, ...], list[Gate]]:
+    """Estimate the initial states of recordings that settle only within the record, and note this."""
+    pairs = ((r, zip(r.outputs, _settled_shares(r), strict=True)) for r in recordings)
+    share, name, r = min(((float(s), name, r) for r, shares in pairs for name, s in shares), key=lambda f: f[0])
+    if share > CURED_SHARE:
+        return tuple(recordings), []
+    ratio = share**-0.5
+    sentence = (
+        f"{name} has not settled{f' in {r.name}' if r.name else ''}: its first two periods differ {ratio:.2g} times as "
+        "much as later ones; initial states are estimated, and the periods do not tell the noise."
+    )
+    return tuple(map(open_start, recordings)), [Gate(name, "transient", ratio, sentence, change=open_start)]
+
+
+def _settled_shares(r: Recording) -> np.ndarray:
+    """Divide the least mean square difference of neighbouring periods by the first two's, by output; 1 if unknown."""
+    count = (len(r) - r.skip) // r.period if r.period and r.begins == "periodic" else 0
+    if count < 3 or not r.period:
+        return np.ones(r.n_y)
+    periods = r.y[r.skip :][: count * r.period].reshape(count, r.period, r.n_y)
+    steps = np.mean(np.diff(periods, axis=0) ** 2, axis=1)
+    rounding = (1e-9 * np.std(r.y, axis=0)) ** 2 + 1e-300
+    return np.asarray(np.maximum(steps.min(axis=0), rounding) / np.maximum(steps[0], rounding))
+
+
+# tones, and ringing modes
+
+
+def find_tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
+    """Note each output whose residual holds the same tone in every recording."""
+    found = []
+    for i, name in enumerate(bench.simulator.output_names):
+        pairs = zip(fitted.residual, bench.recordings, strict=True)
+        each = [find_tone(e[r.skip :, i], r) for e, r in pairs if len(r) - r.skip >= 8 * NEIGHBOURHOOD * TONE_LINES]
+        steady = [t for t in each if t is not None]
+        longest = max((len(r) for r in bench.recordings), default=0) * bench.dt
+        if not steady or len(steady) < len(each) or np.ptp([f for f, _ in steady]) > 2 / longest:
+            continue
+        f, amplitude = (float(v) for v in np.mean(steady, axis=0))
+        unit = bench.recordings[0].units.get(name, "")
+        sentence = (
+            f"{name} holds a steady tone of {f:.4g} Hz, amplitude {amplitude:.3g}{f' {unit}' if unit else ''}, that is "
+            "in no input, as from mains hum or a fan: shield or filter it, or record what causes it."
+        )
+        scale = bench.balanced(fitted).scale
+        share = amplitude**2 / 2 / scale[i] ** 2 / len(scale) / fitted.cost
+        found.append(Gate(name, "tone", f, sentence, corrected=False, left=1 - min(share, 1.0)))
+    return found
+
+
+def find_tone(e: np.ndarray, r: Recording) -> tuple[float, float] | None:
+    """Find frequency, Hz, and amplitude of the tone in the residual of one output; None if there is none."""
+    n, e = len(e), e - np.mean(e)
+    power = _spectrum(e)
+    k = 2 * TONE_LINES + int(np.argmax(power[2 * TONE_LINES : -TONE_LINES]))
+    if not _stands_out(power, k, TONE_LINES, len(power)):
+        return None
+    f = _refine_frequency(e, k)
+    whole = _fit_wave(e, f, slice(None))
+    quarters = [_fit_wave(e, f, slice(q * n // 4, (q + 1) * n // 4)) for q in range(4)]
+    unsteady = max(abs(q - whole) for q in quarters) > AMPLITUDE_CHANGE * abs(whole)
+    if unsteady or abs(whole) ** 2 / 2 < EXCEPTION_SHARE * float(np.mean(e**2)):
+        return None
+    return None if any(_comes_from_input(u, f, r) for u in r.u[r.skip :].T) else (f / r.dt, abs(whole))
+
+
+def _spectrum(v: np.ndarray) -> np.ndarray:
+    return np.asarray(np.abs(np.fft.rfft((v - np.mean(v)) * np.hanning(len(v)))) ** 2)
+
+
+def _stands_out(power: np.ndarray, k: int, width: int, tried: int = 1) -> bool:
+    """Tell whether a spectrum at line k, the largest of `tried` lines, is above its level on both sides.
+
+    The power of noise is exponentially distributed about its level, so that the ratio is the gain in nats.
+    """
+    below = power[max(k - NEIGHBOURHOOD * width, 1) : max(k - width, 1)]
+    above = power[k + width + 1 : k + NEIGHBOURHOOD * width + 1]
+    level = max(float(np.median(v)) for v in (below, above) if len(v)) / np.log(2)
+    return bool(power[k] > (LEAST_GAIN + np.log(tried)) * level)
+
+
+def _fit_wave(e: np.ndarray, f: float, part: slice) -> complex:
+    """Fit amplitude and phase of the frequency f, a share of the sampling rate, in a part of e."""
+    angle = 2 * np.pi * f * np.arange(len(e))[part]
+    a, b, _ = np.linalg.lstsq(np.column_stack([np.cos(angle), np.sin(angle), np.ones(len(angle))]), e[part])[0]
+    return complex(a, -b)
+
+
+def _refine_frequency(e: np.ndarray, k: int) -> float:
+    """Find the frequency of the strongest wave near line k, as a share of the sampling rate."""
+    from scipy.optimize import minimize_scalar
+
+    ends = (k - 1) / len(e), (k + 1) / len(e)
+    found = minimize_scalar(lambda f: -abs(_fit_wave(e, f, slice(None))), bounds=ends, options={"xatol": 1e-3 / len(e)})
+    return float(found.x)
+
+
+def _comes_from_input(u: np.ndarray, f: float, r: Recording) -> bool:
+    """Tell whether an input holds the frequency, or can make it by harmonics or mixtures of its few lines."""
+    from scipy.signal import find_peaks
+
+    n, power = len(u), _spectrum(u)
+    k = round(f * n)
+    if _stands_out(power, max(k - 1, 0) + int(np.argmax(power[max(k - 1, 0) : k + 2])), TONE_LINES):
+        return True
+    if r.period and abs(f * r.period - round(f * r.period)) * n < r.period:
+        return True
+    strong = find_peaks(power, EXCEPTION_SHARE * np.max(power), distance=2 * TONE_LINES)[0]
+    lines = [_refine_frequency(u, j) for j in strong[: LINES + 1]]
+    order = ORDER
+    if lines and all(abs(v / lines[0] - round(v / lines[0])) < 0.05 for v in lines):
+        lines, order = lines[:1], HARMONICS if lines[0] * n > NEIGHBOURHOOD * TONE_LINES else ORDER
+    if not 0 < len(lines) <= LINES:
+        return False
+    orders = itertools.product(range(-order, order + 1), repeat=len(lines))
+    made = np.array([np.dot(c, lines) for c in orders if sum(map(abs, c)) <= order])
+    # orders above half the sampling rate fold back
+    return bool(np.any(np.abs(np.abs(made - np.round(made)) - f) * n < 2))
+
+
+def find_ringing_mode(bench: Workbench, fitted: Fitted) -> float | None:
+    """Find the frequency, Hz, of a lightly damped mode that is visible in the residual of a fit, or None."""
+    a = linearise_runs(bench, fitted)[1][0].mean[0]
+    with np.errstate(divide="ignore"):
+        poles = np.log(np.linalg.eigvals(a).astype(complex)) * fitted.model.substeps / bench.dt
+    modes = [abs(s) / (2 * np.pi) for s in poles if s.imag > 0 and -s.real < LIGHT_DAMPING * abs(s)]
+    rest = [e[r.skip :, i] for e, r in zip(fitted.residual, bench.recordings, strict=True) for i in range(r.n_y)]
+    return next((f for f in sorted(modes) if any(_rings(e, f * bench.dt) for e in rest)), None)
+
+
+def _rings(e: np.ndarray, f: float) -> bool:
+    """Tell whether a mode at the frequency f, a share of the sampling rate, stands out of the spectrum of e."""
+    k = round(f * len(e))
+    width = int(LIGHT_DAMPING * k)  # lines of a mode on either side
+    if k < 2 * TONE_LINES or k + 2 * width >= len(e) // 2:
+        return False
+    power = np.convolve(_spectrum(e), np.ones(width) / width, mode="same")
+    highest = k - width + int(np.argmax(power[k - width : k + width + 1]))
+    return _stands_out(power, highest, width, 2 * width + 1)

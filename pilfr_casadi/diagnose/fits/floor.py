@@ -1,0 +1,262 @@
+"""The noise floor: from repeated periods, from repeated recordings, or estimated from a residual.
+
+What repeats is rounded alike, so that a measured floor is at least the error of rounding to the sensor's steps. A
+machine that wears, warms up or is set otherwise does not repeat: then the input drives the differences between the
+repeats, which are no noise.
+
+The estimate takes third differences of the residual (normalised by √20): they remove slow model error and keep white
+noise. They underestimate coloured noise. If a fit's residual cannot be told from noise (no local signal explains any of
+it on held-out data), the residual itself is the floor.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+
+from ...data import Recording
+
+CORRELATED, P_VALUE = 0.5, 1e-4  # rank correlation, and its p-value, from which a residual's power depends on a signal
+REFUTED = 0.01  # probability under measured noise below which an error is not that noise
+ABOVE_NOISE = 2.0  # ratio of the error to the noise from which results say that more is missing
+FEWEST = 30.0  # effective samples that a residual has at least
+LONGEST = 400  # longest correlation of a residual, in samples
+DISTINCT_SHARE = 0.5  # share of the samples with distinct values above which a signal is not quantised
+FEWEST_LEVELS = 10  # of a quantised signal; one with fewer is a switch
+DRIVEN = 0.5  # share of the differences between repeats that the input explains, above which they are no noise
+RESPONSE, SPANS, COMPARED = 150, 30, 6000  # lags of the input that are tried one by one, longer spans, and samples
+NARROW_BAND, LEAST_RANK = 1e-3, 4  # least share of a direction of the input, and the directions of a sine or a ramp
+SENSOR_RESOLUTION = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
+HUGE2 = 1e20  # mean square error, over an output's variance, of a run that diverges
+MODEL_ERRORS = 200  # sizes of the model error that are tried where outputs with unequal noise are pooled
+SAME_LEVEL = 1e-9  # distance of two values, over the range, below which they are one level
+
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """Standard deviation of each output's noise (n_y,), and its source."""
+
+    deviation: np.ndarray
+    source: str
+    # number of periods, or of recordings with the same input, on which the noise is measured; 1 if it is not
+    repeats: int = 1
+    # (n_y,), independent samples of each output's noise in a repeat
+    independent: np.ndarray = field(default_factory=lambda: np.ones(1))
+
+    def may_be(self, rms: np.ndarray) -> bool:
+        """Tell whether a residual with the rms errors (n_y,) can be a measured noise, in every output.
+
+        Of n repeats, noise s leaves the power s² (n - 1)/n within them, and s²/n in their mean, where all that the
+        simulator lacks is as well. Of noise alone, the second over the first has an F distribution, each over its
+        independent samples. False for an estimated noise, and for an error that is clearly larger.
+        """
+        from scipy.stats import f
+
+        if self.repeats < 2:
+            return False
+        chance = REFUTED / len(self.deviation)  # that noise exceeds the limit in any output
+        most = f.isf(chance, self.independent, (self.repeats - 1) * self.independent)
+        limit = np.minimum(1 + (most - 1) / self.repeats, ABOVE_NOISE**2)
+        return bool(np.all(np.square(rms) < limit * np.square(self.deviation)))
+
+    def beside(self, deviation: np.ndarray) -> Floor:
+        """Return the floor with another independent error added, such as a surrogate's."""
+        return replace(self, deviation=np.hypot(self.deviation, deviation))
+
+    def squares(self, scale: np.ndarray) -> np.ndarray:
+        """Compute each output's mean square noise in units of its variance, (n_y,)."""
+        return np.asarray((self.deviation / scale) ** 2)
+
+    def nrmse(self, scale: np.ndarray) -> float:
+        """Compute the noise over the outputs' deviation, averaged over outputs."""
+        return float(np.mean(self.deviation / scale))
+
+
+def pool(squares: np.ndarray, noise2: np.ndarray | None) -> tuple[float, np.ndarray]:
+    """Pool mean square errors of the outputs (n_y,): return one mean square, and what variances it rests on.
+
+    A wrong model is about as wrong in all outputs, in units of their deviation; noise is not. So the errors e have
+    variances in proportion to noise2 + m, with a model error m common to the outputs; the variances, b, are scaled to
+    the geometric mean 1. The pooled mean square is the mean of e² / b at the likeliest m: with -n/2 times its logarithm
+    as log likelihood, it is the determinant criterion (Bard 1974, Nonlinear Parameter Estimation, sec. 4-9) for
+    variances of this form. For one output, equal noise, or unknown noise, it is the mean.
+    """
+    mean = float(np.mean(squares))
+    if noise2 is None or np.ptp(noise2) <= 0 or not 0 < mean < HUGE2:
+        return mean, np.ones(len(squares))
+    return _pool_unequal(tuple(squares.tolist()), tuple(noise2.tolist()))
+
+
+@functools.lru_cache(maxsize=1 << 14)  # each ranking of hypotheses pools the errors of all
+def _pool_unequal(squares: tuple[float, ...], noises2: tuple[float, ...]) -> tuple[float, np.ndarray]:
+    """Pool mean square errors of outputs with unequal noise."""
+    noise2 = np.maximum(noises2, SENSOR_RESOLUTION**2)
+    common = np.append(0.0, np.geomspace(1e-3 * np.min(noise2), 1e3 * max(*noise2, *squares), MODEL_ERRORS))
+    variances = noise2 + common[:, None]
+    balances = variances / np.exp(np.mean(np.log(variances), axis=1, keepdims=True))
+    pooled = np.mean(squares / balances, axis=1)
+    k, mean = int(np.argmin(pooled)), float(np.mean(squares))
+    balance = balances[k].copy() if pooled[k] < mean else np.ones(len(squares))
+    balance.flags.writeable = False  # all callers share it
+    return min(float(pooled[k]), mean), balance
+
+
+def noise_floor(recordings: Sequence[Recording], residuals: Sequence[np.ndarray]) -> Floor:
+    """Measure the floor on repeated data, or estimate it from residuals if nothing repeats."""
+    return measured_floor(recordings) or Floor(white_part(residuals), "estimated")
+
+
+def measured_floor(recordings: Sequence[Recording]) -> Floor | None:
+    """Measure the floor on periods, else on recordings with the same input; None if there are neither."""
+    groups: dict[bytes, list[Recording]] = {}
+    for r in recordings:
+        groups.setdefault(r.u.tobytes(), []).append(r)
+    periods = [y for r in recordings if (y := _fold(r)) is not None]
+    alike = [y for g in groups.values() if (y := _stack(g)) is not None]
+    repeated = periods or alike
+    if not repeated:
+        return None
+    square = np.mean(np.concatenate([np.var(y, axis=0, ddof=1) for y in repeated]), axis=0)
+    deviation = np.maximum(np.sqrt(square), _sensor_steps(recordings) / np.sqrt(12))
+    noise = [y[0] - np.mean(y, axis=0) for y in repeated]
+    independent = np.array([effective_size([e[:, [i]] for e in noise]) for i in range(len(deviation))])
+    source = "periods" if periods else "repeats"
+    return Floor(deviation, source, min(map(len, repeated)), np.maximum(independent, 1.0))
+
+
+def _sensor_steps(recordings: Sequence[Recording]) -> np.ndarray:
+    """Find the step of each output's values, (n_y,); zero if most samples have a value of their own."""
+    y = np.concatenate([r.y for r in recordings])
+    out = np.zeros(y.shape[1])
+    for i, column in enumerate(y.T):
+        levels = np.unique(column)
+        gaps = np.diff(levels)
+        gaps = gaps[gaps > SAME_LEVEL * np.ptp(column)]
+        if FEWEST_LEVELS <= len(levels) < DISTINCT_SHARE * len(column):
+            out[i] = gaps.min()
+    return out
+
+
+def _is_driven(differences: np.ndarray, u: np.ndarray, before: np.ndarray) -> bool:
+    """Tell whether the input u (N, n_u) drives the differences (P, N, n_y) of repeats from their mean.
+
+    The response of each output to the input, and to the inputs `before`, is fitted to the first half of each repeat. It
+    has to explain most of the second half. Noise has no such response; but an input like a sine cannot be told from
+    noise of that frequency, and shows nothing.
+    """
+    every = max(len(u) // COMPARED, 1)
+    columns = _responses(np.vstack([before, u]))[len(before) :: every]
+    columns = columns - np.mean(columns, axis=0)
+    half, left, total = len(columns) // 2, 0.0, 0.0
+    settled = columns[half // 2 : half]  # all lags are within the recording there
+    if not settled.size or np.linalg.matrix_rank(settled, NARROW_BAND * np.linalg.norm(settled)) <= LEAST_RANK:
+        return False
+    for e in differences[:, ::every] - np.mean(differences[:, ::every], axis=1, keepdims=True):
+        response = np.linalg.lstsq(columns[:half], e[:half], rcond=1e-6)[0]
+        left = left + np.sum((e[half:] - columns[half:] @ response) ** 2, axis=0)
+        total = total + np.sum(e[half:] ** 2, axis=0)
+    return bool(np.any(left < (1 - DRIVEN) * np.asarray(total)))
+
+
+def _responses(u: np.ndarray) -> np.ndarray:
+    """Compute sums of the input (N, n_u), (N, n): over each of the last samples, and over ever longer spans before."""
+    n, n_u = u.shape
+    single = min(RESPONSE, n // (16 * n_u))
+    spans = np.geomspace(max(single, 1), max(n / 4, 2.0), min(SPANS, n // (32 * n_u)) + 1)
+    edges = np.unique(np.append(np.arange(single + 1), spans.astype(int)))
+    total = np.vstack([np.zeros((1, n_u)), np.cumsum(u, axis=0)])
+    until = [total[np.maximum(np.arange(1, n + 1) - edge, 0)] for edge in edges]
+    return np.hstack([a - b for a, b in pairwise(until)]) if len(edges) > 1 else np.zeros((n, 0))
+
+
+def _stack(group: Sequence[Recording]) -> np.ndarray | None:
+    """Stack the outputs of recordings of one input, (P, N, n_y); None if they do not repeat an experiment.
+
+    They do not if the input drives their differences. Unknown initial states may differ, so that only the second half
+    is compared; and where the input rests there, as in free decays from different heights, they decide what follows.
+    """
+    if len(group) < 2:
+        return None
+    first, u = max(r.skip for r in group), group[0].u
+    if not all(r.begins in ("zero", "periodic") for r in group):
+        first = max(first, len(u) // 2)
+        if not np.any(np.ptp(u[first:], axis=0) > 0):
+            return None
+    y = np.stack([r.y[first:] for r in group])
+    return None if _is_driven(y - np.mean(y, axis=0), u[first:], u[:first]) else y
+
+
+def _fold(r: Recording) -> np.ndarray | None:
+    """Stack the outputs' periods, (P, N, n_y); None if there are not two, or the input drives their differences."""
+    n = r.period
+    if not n or r.begins != "periodic":
+        return None
+    y, u = r.y[r.skip :], r.u[r.skip :][:n]
+    count = len(y) // n
+    if count < 2:
+        return None
+    folded = y[: count * n].reshape(count, n, -1)
+    return None if _is_driven(folded - np.mean(folded, axis=0), u, u) else folded
+
+
+def third_differences(residual: np.ndarray) -> np.ndarray:
+    """Return third differences (M - 3, n_y), normalised so that white noise keeps its deviation."""
+    return np.asarray(np.diff(residual, 3, axis=0) / np.sqrt(20))
+
+
+def white_part(residuals: Sequence[np.ndarray]) -> np.ndarray:
+    """Estimate the white noise inside residuals, (n_y,): third differences, the smallest over recordings.
+
+    Recordings with too few samples for such a difference say nothing, unless there are no others.
+    """
+    long = [third_differences(e) for e in residuals if len(e) > 3] or residuals
+    return np.asarray(np.min([np.sqrt(np.mean(e**2, axis=0)) for e in long], axis=0))
+
+
+def times_white(residual: np.ndarray) -> float:
+    """Compute the ratio of a residual's rms to that of the white noise in it, the largest of all outputs."""
+    rms, white = np.sqrt(np.mean(residual**2, axis=0)), white_part([residual])
+    return float(np.max(rms / np.maximum(white, 1e-9 * np.max(rms, initial=1e-300))))
+
+
+def effective_size(residuals: Sequence[np.ndarray]) -> float:
+    """Count the independent samples: all samples over the residuals' correlation time `1 + 2 Σ ρ²`."""
+    total = 0.0
+    for e in residuals:
+        for column in (e - e.mean(axis=0)).T:
+            n = len(column)
+            spectrum = np.abs(np.fft.rfft(column, 2 * n)) ** 2
+            rho = np.fft.irfft(spectrum)[: min(LONGEST, max(n // 4, 1))]
+            rho = rho / rho[0] if rho[0] > 0 else np.zeros(1)
+            total += n / (1 + 2 * float(np.sum(rho[1:] ** 2)))
+    return total
+
+
+def swells_with(residuals: Sequence[np.ndarray], signals: Sequence[np.ndarray]) -> bool:
+    """Tell whether a residual's power follows any column of signals of the same length; that of noise does not.
+
+    Test the rank correlation (Spearman 1904) of their powers over blocks longer than the residual's correlation time.
+    """
+    from scipy.stats import spearmanr
+
+    def powers(v: np.ndarray, block: int) -> np.ndarray:
+        count = len(v) // block
+        return np.asarray(np.mean(v[: count * block].reshape(count, block) ** 2, axis=1))
+
+    for k in range(residuals[0].shape[1]):
+        own = [e[:, [k]] for e in residuals]
+        memory = sum(map(len, own)) / max(effective_size(own), 1.0)
+        blocks = [int(np.clip(4 * memory, 10, max(len(e) // 12, 10))) for e in own]
+        loud = np.concatenate([powers(e[:, 0], b) for e, b in zip(own, blocks, strict=True)])
+        for j in range(signals[0].shape[1]):
+            other = np.concatenate([powers(v[:, j] - v[:, j].mean(), b) for v, b in zip(signals, blocks, strict=True)])
+            if len(loud) < 8 or not np.ptp(other) > 0:
+                continue
+            rank, chance = spearmanr(loud, other)
+            if rank > CORRELATED and chance < P_VALUE:
+                return True
+    return False

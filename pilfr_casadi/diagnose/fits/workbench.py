@@ -1,0 +1,571 @@
+"""The data shared by all steps of a diagnosis: the simulator, its recordings, its integration and its fit.
+
+Integration steps are chosen at the start of a recording. A force with a sharp reversal, such as a friction already in
+the simulator, needs finer steps later; the error of coarse steps would look like missing physics. `refine_steps` makes
+them finer if the answer depends on them. `refit_on_finer_steps` lets the data decide how sharp the knee of a friction
+law is. On steps too long for its knee, a stuck simulation chatters, and in fast motion each passage falls between two
+steps. The cost then has spurious minima, and no other term of a law should make up for them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ..._base import InputError, Interrupt, one_at_a_time
+from ...data import Recording, nrmse
+from ...engine import Engine, make_engine
+from ...identify import match_channels, solve_within_bounds
+from ...laws import Local
+from ...linear import INJECTION, with_output_injection
+from ...models import Model
+from ...optimise import GaussNewton, Problem, Status
+from ...simulators import (
+    LARGEST_STEP,
+    MOST_SUBSTEPS,
+    Placed,
+    Simulator,
+    choose_substeps,
+    discretise,
+    fastest_rates,
+    growth_rate,
+    least_substeps,
+    needed_substeps,
+    rate_at_start,
+)
+from .floor import pool, white_part
+
+# Solvers: of the fits that results are based on; of other fits; of the first fit of a law, to rank the laws
+THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
+QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
+BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
+LAST = GaussNewton(max_iterations=1000, tolerance=1e-6, patience=6)  # of the fit whose values an answer states
+FEW = 3  # ports, laws, starts or fits that are tried at each choice of a search, which saves time
+COMPARED_SAMPLES = 8000  # samples on which fits and forces are compared first
+
+# Steps of the integration
+FINER_STEPS = 4  # largest factor on the sub-steps for a law, and factor of each refinement of steps and knees
+STEP_ERROR = 0.3  # least change by finer steps, over the noise, for which they are used
+LEAST_NOISE = 3e-4  # least noise, over the outputs' deviation, that the steps are compared with
+COST_CHANGE = 0.1  # share by which finer steps may change the mean square
+SHARP_KNEE = 0.05  # share of the widest knee that is tried, below which a knee is sharp
+
+# Fits of outputs with unequal noise
+MOST_BALANCES = 4  # fits with other weights at most
+NEAR_BALANCE = 1.2  # ratio of two weights that counts as equal
+
+# Diverging runs
+HUGE, DIVERGED = 1e6, 1e20  # bounds: output over the largest measured value, and mean square error
+RUNAWAY = 10.0  # over the outputs' deviation; a bounded oscillation about another point is off by less
+# growth within a recording, in e-folds, above which no estimated initial state can keep the run bounded
+MOST_GROWTH = 20.0
+
+
+class RunsAway(InputError):
+    """The simulator is unstable, and no values within its bounds keep it near the recordings."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Fitted:
+    """A simulator fitted to recordings."""
+
+    simulator: Simulator
+    model: Model
+    engine: Engine
+    values: dict[str, np.ndarray]  # parameters by name
+    initial: list[np.ndarray]  # state with memory at each recording's first sample
+    # (M, n_y), simulated minus measured outputs of each recording, unscored samples included
+    residual: list[np.ndarray]
+    cost: float  # mean square of the scored residuals, each output in units of its deviation; see `floor.pool`
+    squares: np.ndarray  # (n_y,), the same of each output
+    balance: np.ndarray  # (n_y,), relative variances of the outputs' errors, with which they are pooled
+    status: Status = Status.CONVERGED  # how the fit ended; a run at given values counts as converged
+
+    @property
+    def vector(self) -> np.ndarray:
+        """Parameter vector of the model."""
+        return self.model.parameters.pack(self.values)
+
+    @property
+    def fitted_model(self) -> Model:
+        """The model with the fitted values as start values."""
+        return self.model.with_parameters(self.model.parameters.at(self.vector))
+
+    @property
+    def at_bounds(self) -> float:
+        """Share of the free parameters at a bound."""
+        p, at = self.model.parameters, self.vector
+        return float(np.mean(((at <= p.lower) | (at >= p.upper))[p.free])) if np.any(p.free) else 0.0
+
+    def at_bound(self, name: str) -> np.ndarray:
+        """Mark the entries of a parameter that are at one of its bounds."""
+        (low, high), value = self.model.parameters[name].bounds, self.values[name]
+        return np.asarray((value <= low) | (value >= high))
+
+    def strained(self, names: Iterable[str]) -> bool:
+        """Tell whether a free parameter of some is at a bound other than zero, so that the fit wants it beyond."""
+        free = (name for name in names if not np.all(self.model.parameters[name].fixed))
+        return any(bool(np.any(self.at_bound(name) & (self.values[name] != 0))) for name in free)
+
+    @property
+    def begin(self) -> list[np.ndarray]:
+        """The simulator's own states at each recording's first sample, without those of laws."""
+        return [state[: len(self.simulator.states)] for state in self.initial]
+
+    def last_elements(self, count: int) -> tuple[Placed, ...]:
+        """Return the elements that were added last, in their order."""
+        return self.simulator.elements[len(self.simulator.elements) - count :]
+
+    def corrected(self) -> Simulator:
+        """Return the simulator with the fitted values as start values."""
+        own = self.simulator.parameter_set
+        vector = own.pack({k: v for k, v in self.values.items() if k in own})
+        return self.simulator.with_parameters(own.at(vector))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Workbench:
+    """The data of one diagnosis, with the settings for running and fitting simulators on it.
+
+    The outputs' errors are in units of `scale`, their deviation. With `noise2`, the mean square noise of each output in
+    units of its variance, errors are pooled and fits are weighted as `floor.pool` tells; otherwise all outputs are
+    alike.
+    """
+
+    simulator: Simulator
+    recordings: tuple[Recording, ...]
+    hold: str
+    substeps: int
+    scale: np.ndarray
+    engine: str = "auto"
+    at_least: int = 1  # sub-steps of simulators with laws
+    typical: tuple[np.ndarray, np.ndarray] | None = None  # states and inputs along the refitted run
+    chosen: int = 1  # sub-steps first chosen for the simulator, on which limits are based
+    interrupt: Interrupt = field(default_factory=Interrupt)  # shared by all benches of a search
+    deadline: float = np.inf  # time (of `time.perf_counter`) at which every fit ends
+    noise2: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str = "auto") -> Workbench:
+        """Put the recordings' channels into the simulator's order, and choose the sub-steps."""
+        ordered = tuple(match_channels(simulator, r) for r in recordings)
+        chosen = choose_substeps(simulator, ordered)
+        return cls(simulator, ordered, hold, chosen, output_deviation(ordered), engine, chosen=chosen)
+
+    @property
+    def dt(self) -> float:
+        """Sampling interval, s."""
+        return self.recordings[0].dt
+
+    def with_other_hold(self) -> Workbench:
+        """Return the bench with the other hold of the inputs between samples."""
+        return replace(self, hold="linear" if self.hold == "zero" else "zero")
+
+    def on(self, recordings: Sequence[Recording]) -> Workbench:
+        """Return the bench with other recordings; errors stay in units of the training outputs' deviation."""
+        return replace(self, recordings=tuple(match_channels(self.simulator, r) for r in recordings))
+
+    def renewed(self, recordings: Sequence[Recording]) -> Workbench:
+        """Return a bench for other recordings, with sub-steps and the unit of errors chosen for them."""
+        bench = Workbench.of(self.simulator, recordings, self.hold, self.engine)
+        return replace(bench, deadline=self.deadline, interrupt=self.interrupt, noise2=self.noise2)
+
+    def nrmse(self, fitted: Fitted) -> float:
+        """Compute the NRMSE averaged over outputs and recordings.
+
+        Where an output rests in a recording, its deviation over all recordings counts.
+        """
+        pairs = zip(fitted.residual, self.recordings, strict=True)
+        return float(np.mean([nrmse(r.y, r.y + e, skip=r.skip, resting=self.scale) for e, r in pairs]))
+
+    def pool(self, squares: np.ndarray) -> float:
+        """Pool mean square errors of the outputs (n_y,), in units of their variance; see `floor.pool`."""
+        return pool(squares, self.noise2)[0]
+
+    def balanced(self, fitted: Fitted) -> Workbench:
+        """Return the bench with outputs in units in which the errors of a fit are about alike."""
+        if np.all(fitted.balance == 1):
+            return self
+        return replace(self, scale=self.scale * np.sqrt(fitted.balance), noise2=None)
+
+    @one_at_a_time
+    def model(self, simulator: Simulator, gain: np.ndarray | None = None) -> Model:
+        """Discretise a simulator, with output injection if a gain is given."""
+        model = discretise(simulator, self.dt, self.hold, self._substeps(simulator))
+        return model if gain is None else with_output_injection(model, gain)
+
+    def compile(self, simulator: Simulator, gain: np.ndarray | None = None) -> tuple[Model, Engine]:
+        """Discretise and compile a simulator, with output injection if a gain is given."""
+        model = self.model(simulator, gain)
+        return model, make_engine(model, self.engine)
+
+    def _substeps(self, simulator: Simulator) -> int:
+        """Choose more sub-steps for a fast law, up to a limit: a stiff start of a law is not worth a fine grid."""
+        if not simulator.elements:
+            return self.substeps
+        wanted = needed_substeps(simulator, self.recordings)[0]
+        wanted = wanted if wanted <= MOST_SUBSTEPS else 0
+        # passed at every reversal, even if not at rest there
+        if any(getattr(e.law, "knee", "") for e in simulator.elements):
+            wanted = max(wanted, int(np.ceil(rate_at_start(simulator, self.recordings[0]) * self.dt / LARGEST_STEP)))
+        if self.typical is not None:  # a contact is not active at rest
+            p = simulator.parameter_set.start
+            rates = fastest_rates(simulator, *self.typical, p)
+            if np.any(np.isfinite(rates)):
+                wanted = max(wanted, int(np.ceil(float(np.nanquantile(rates, 0.95)) * self.dt / LARGEST_STEP)))
+        least = max(self.substeps, self.at_least, least_substeps(simulator))
+        if any(getattr(e.law, "shifts", False) for e in simulator.elements):  # its memory has an entry for every step
+            least = min(least, FINER_STEPS * self.chosen)
+        return int(np.clip(wanted, least, max(FINER_STEPS * self.chosen, least)))
+
+    def problem(
+        self,
+        model: Model,
+        engine: Engine,
+        scored: Sequence[np.ndarray] | None = None,
+        balance: np.ndarray | float = 1.0,
+    ) -> Problem:
+        """Make the simulation-error problem of a model.
+
+        `scored` marks the samples that count, all by default; `balance` are relative variances of the outputs' errors.
+        """
+        return Problem(model, self.recordings, engine=engine, scale=self.scale * np.sqrt(balance), scored=scored)
+
+    def problem_at(self, fitted: Fitted, scored: Sequence[np.ndarray] | None = None) -> tuple[Problem, np.ndarray]:
+        """Make the simulation-error problem of a fitted simulator; return it and its variables at the fitted values."""
+        problem = self.problem(fitted.fitted_model, fitted.engine, scored, fitted.balance)
+        states = [s for r, s in zip(self.recordings, fitted.initial, strict=True) if r.begins == "estimate"]
+        return problem, np.concatenate([problem.start[: problem.n_free], *states])
+
+    def fit(
+        self,
+        simulator: Simulator,
+        starts: Sequence[Mapping[str, Any]] = ({},),
+        *,
+        states: Sequence[np.ndarray] = (),
+        anneal: Sequence[float] = (),
+        solver: GaussNewton = QUICK,
+        model: Model | None = None,
+        engine: Engine | None = None,
+    ) -> Fitted:
+        """Fit from several starts (values by name), each through the sequence of injection gains `anneal`.
+
+        `states` are initial guesses of each recording's initial state, without the states of new laws at its end.
+
+        Raises
+        ------
+        InputError
+            If the simulation diverges from every start.
+        """
+        model = model or self.model(simulator)
+        engine = engine or make_engine(model, self.engine)
+        estimated = any(r.begins == "estimate" for r in self.recordings)
+        if not np.any(model.parameters.free) and not (estimated and model.n_state):
+            return self._run_fixed(simulator, model, engine)
+        best: tuple[float, np.ndarray, Problem, Status] | None = None
+        for start in starts:
+            if best is not None and time.perf_counter() > self.deadline:
+                break
+            found = self._run(simulator, model, engine, start, states, tuple(anneal), solver)
+            if found is not None and (best is None or found[0] < best[0]):
+                best = found
+        if best is None:
+            unstable = self._describe_instability(simulator)
+            raise (RunsAway if unstable else InputError)(
+                f"The simulation diverges at the start values{self._describe_divergence(model, engine, starts[0])}; "
+                + (unstable or "check the parameters' values and units, and the hold.")
+            )
+        _, theta, problem, status = best
+        values = problem.values(theta)
+        values.pop(INJECTION, None)
+        return replace(self.result(simulator, values, problem.first_states(theta), engine, model), status=status)
+
+    def _describe_divergence(self, model: Model, engine: Engine, start: Mapping[str, Any]) -> str:
+        """Describe where a run from rest exceeds every bound."""
+        vector = start_vector(model, start)
+        for r in self.recordings:
+            with np.errstate(all="ignore"):
+                y = engine.simulate(model.drive(r), vector, np.zeros(model.n_state))[0]
+                off = ~(np.abs(y) < HUGE * np.max(np.abs(r.y), axis=0))
+            if np.any(off):
+                k = int(np.argmax(np.any(off, axis=1)))
+                name = self.simulator.output_names[int(np.argmax(off[k]))]
+                return f" ({name} is out of all bounds {k * r.dt:.3g} s into {r.label})"
+        return ""
+
+    def check_followed(self, fitted: Fitted, most: float = RUNAWAY**2) -> None:
+        """Refuse a fit of an unstable simulator that leaves more than `most` of the mean square.
+
+        A fit that an interrupt may have ended is not refused.
+        """
+        if fitted.cost > most and not self.interrupt.pressed and (why := self._describe_instability(self.simulator)):
+            off = f"{fitted.cost**0.5:.3g} times the outputs' deviation"
+            raise RunsAway(f"Refitted, the simulation runs away from the recordings, by {off}; {why}")
+
+    def _describe_instability(self, simulator: Simulator) -> str:
+        """Say what to do about a simulator too unstable to follow a controlled machine; empty if it is not."""
+        rate = growth_rate(simulator, self.recordings[0]) if simulator.observer is None else 0.0
+        if rate * max(len(r) for r in self.recordings) * self.dt < MOST_GROWTH:
+            return ""
+        return (
+            f"it is unstable (it grows e-fold in {1 / rate:.2g} s) and cannot be run by its own inputs alone: put the "
+            "controller into the simulator, with its reference as the input; or let the recordings lead it, by the "
+            "focus 'prediction' of a diagnosis."
+        )
+
+    def run_given(self, simulator: Simulator, model: Model | None = None, engine: Engine | None = None) -> Fitted:
+        """Run a simulator as it stands, with the states in which a fit begins; the cost of a diverging run is infinite.
+
+        A model or an engine that is not given is made.
+        """
+        model = model or self.model(simulator)
+        engine = engine or make_engine(model, self.engine)
+        freed = model.parameters.change(**{name: {"fixed": False} for name in model.parameters})
+        problem = self.problem(model.with_parameters(freed), engine)  # which needs variables
+        values = {k: p.value for k, p in model.parameters.items()}
+        return self.result(simulator, values, problem.first_states(problem.start), engine, model)
+
+    def _run_fixed(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:
+        """Run the simulator as it stands, because there is nothing to estimate."""
+        found = self.run_given(simulator, model, engine)
+        if not np.isfinite(found.cost):
+            raise InputError("The simulation diverges at the given values; check the parameters' values and units.")
+        return found
+
+    def _run(
+        self,
+        simulator: Simulator,
+        model: Model,
+        engine: Engine,
+        start: Mapping[str, Any],
+        guess: Sequence[np.ndarray],
+        path: tuple[float, ...],
+        solver: GaussNewton,
+    ) -> tuple[float, np.ndarray, Problem, Status] | None:
+        parameters = model.parameters
+        vector = start_vector(model, start)
+        states = None
+        if len(guess):
+            unknown = zip(self.recordings, self.initial_states(model, vector, guess), strict=True)
+            states = np.concatenate([np.zeros(0), *(state for r, state in unknown if r.begins == "estimate")])
+        problem: Problem | None = None
+        status = Status.SOLVER_FAILED
+        for gamma in (*path, 0.0):
+            at = parameters.at(vector)
+            if INJECTION in parameters:
+                at = at.change(**{INJECTION: {"value": gamma}})
+            problem = self.problem(model.with_parameters(at), engine)
+            n_free = int(problem.free.sum())
+            theta = problem.start.copy()
+            if states is not None:
+                theta[n_free:] = states
+            if not np.isfinite(problem.cost(theta)):
+                if gamma == 0.0 and not path:
+                    return None
+                continue
+            problem, theta, status = self._solve(problem, theta, solver)
+            if np.all(np.isfinite(theta)):
+                vector, states = problem.parameters(theta), theta[n_free:]
+        if problem is None:
+            return None
+        theta = np.concatenate([vector[problem.free], states if states is not None else problem.start[n_free:]])
+        balance = self._balance(problem, theta)
+        if not near_balance(balance, (problem.scale / self.scale) ** 2):
+            problem = self.problem(problem.model, engine, balance=balance)
+        cost = problem.cost(theta)  # starts are compared with the weights of where they end
+        return (cost, theta, problem, status) if cost < DIVERGED else None
+
+    def _solve(self, problem: Problem, theta: np.ndarray, solver: GaussNewton) -> tuple[Problem, np.ndarray, Status]:
+        """Solve a problem, and again while its outputs are out of balance (iteratively reweighted least squares)."""
+        status, until = Status.SOLVER_FAILED, min(time.perf_counter() + solver.time_limit, self.deadline)
+        for done in range(MOST_BALANCES):
+            balance = self._balance(problem, theta)
+            near = near_balance(balance, (problem.scale / self.scale) ** 2)
+            if done and (near or status is not Status.CONVERGED):
+                break
+            if not near:
+                problem = self.problem(problem.model, problem.engine, balance=balance)
+            try:
+                timed = replace(solver, time_limit=until - time.perf_counter())
+                with np.errstate(all="ignore"):
+                    solution = solve_within_bounds(problem, theta, timed)
+            except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
+                break
+            theta, status = solution.theta, solution.status
+            if status is Status.INTERRUPTED:
+                self.interrupt.pressed = True
+        return problem, theta, status
+
+    def _balance(self, problem: Problem, theta: np.ndarray) -> np.ndarray:
+        """Compute the balance of the outputs at some variables of a problem."""
+        now = (problem.scale / self.scale) ** 2
+        if self.noise2 is None or len(now) == 1:
+            return now
+        squares = np.mean(problem.residual(theta).reshape(-1, len(now)) ** 2, axis=0)
+        return pool(squares * now, self.noise2)[1]
+
+    def initial_states(self, model: Model, vector: np.ndarray, states: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Complete initial states (n_state,) from their first entries; laws begin at rest at the first inputs."""
+        out, n = [], model.n_state
+        for r, given in zip(self.recordings, states, strict=True):
+            state = np.asarray(given, dtype=float)[:n]
+            if r.begins in ("estimate", "given"):
+                state = model.rest_at(state, r.u[0], vector)
+            out.append(np.append(state, np.zeros(n - len(state))))
+        return out
+
+    def by_cost(
+        self,
+        simulator: Simulator,
+        model: Model,
+        engine: Engine,
+        starts: Sequence[Mapping[str, Any]],
+        states: Sequence[np.ndarray],
+    ) -> list[Mapping[str, Any]]:
+        """Order starts by their error before a fit, from the same initial states."""
+        initial = self.initial_states(model, start_vector(model, starts[0]), states)
+
+        def cost(start: Mapping[str, Any]) -> float:
+            values = model.parameters.unpack(start_vector(model, start))
+            found = self.result(simulator, values, initial, engine, model).cost
+            return found if np.isfinite(found) else np.inf
+
+        return sorted(starts, key=cost)
+
+    def local(self, z: np.ndarray, dz: np.ndarray) -> Local:
+        """Return the local signals of a port along all recordings, with the time and the inputs."""
+        inputs = self.signals_of([r.u for r in self.recordings])
+        lengths, rest = tuple(map(len, self.recordings)), tuple(r.begins == "zero" for r in self.recordings)
+        return Local(z, dz, self.dt, lengths, inputs=inputs, from_zero=rest)
+
+    def signals_of(self, inputs: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the inputs and the time `t`, also if an input has its name, along all recordings.
+
+        `inputs` holds those (M, n_u) of each recording.
+        """
+        time = np.concatenate(
+            [r.start + self.dt * np.arange(len(u)) for r, u in zip(self.recordings, inputs, strict=True)]
+        )
+        return {**dict(zip(self.simulator.inputs, np.concatenate(inputs).T, strict=True)), "t": time}
+
+    def run(self, simulator: Simulator, values: Mapping[str, Any], states: Sequence[np.ndarray]) -> Fitted:
+        """Run a simulator at values by name, from the simulator's own initial states."""
+        model, engine = self.compile(simulator)
+        vector = start_vector(model, values)
+        initial = self.initial_states(model, vector, states)
+        return self.result(simulator, model.parameters.unpack(vector), initial, engine, model)
+
+    def scored(self, residual: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Return the residual of each recording (M, n_y) without the samples that do not count."""
+        return [e[r.skip :] for e, r in zip(residual, self.recordings, strict=True)]
+
+    def result(
+        self,
+        simulator: Simulator,
+        values: dict[str, np.ndarray],
+        initial: list[np.ndarray],
+        engine: Engine,
+        model: Model,
+    ) -> Fitted:
+        """Compute the residuals at given values and initial states."""
+        vector = model.parameters.pack(values)
+        with np.errstate(over="ignore", invalid="ignore"):  # a diverging run has an infinite cost
+            runs = zip(self.recordings, initial, strict=True)
+            residual = [engine.simulate(model.drive(r), vector, state)[0] - r.y for r, state in runs]
+            squares = np.mean((np.concatenate(self.scored(residual)) / self.scale) ** 2, axis=0)
+            cost, balance = pool(squares, self.noise2)
+        cost = cost if np.isfinite(cost) else np.inf
+        return Fitted(simulator, model, engine, values, initial, residual, cost, squares, balance)
+
+
+def near_balance(one: np.ndarray, other: np.ndarray) -> bool:
+    """Tell whether two balances of the outputs give fits about the same weights."""
+    return bool(np.max(np.abs(np.log(one / other))) < 2 * np.log(NEAR_BALANCE))
+
+
+def output_deviation(recordings: Sequence[Recording]) -> np.ndarray:
+    """Compute the standard deviation of each output over the scored samples of all recordings, (n_y,)."""
+    return np.asarray(np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0))
+
+
+def start_vector(model: Model, start: Mapping[str, Any]) -> np.ndarray:
+    """Return the parameter vector at start values by name, clipped to the bounds; unknown names are ignored."""
+    p = model.parameters
+    return np.asarray(np.clip(p.pack({k: v for k, v in start.items() if k in p}), p.lower, p.upper))
+
+
+def refine_steps(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
+    """Refine the steps until their error is less than the noise; return the bench and the fit there."""
+    noise = np.maximum(white_part(bench.scored(fitted.residual)), LEAST_NOISE * bench.scale)
+    most, steps = min(FINER_STEPS**2 * bench.chosen, MOST_SUBSTEPS), fitted.model.substeps
+    while FINER_STEPS * steps <= most and not fitted.simulator.discrete:
+        steps = FINER_STEPS * steps
+        tried = replace(bench, substeps=steps)
+        try:
+            there = tried.run(fitted.simulator, fitted.values, fitted.begin)
+            moved = [(a - b) / noise for a, b in zip(there.residual, fitted.residual, strict=True)]
+            if np.mean(np.concatenate(bench.scored(moved)) ** 2) < STEP_ERROR**2:
+                break
+            fitted = tried.fit(
+                fitted.simulator,
+                [fitted.values, {}],
+                states=fitted.begin,
+                solver=THOROUGH,
+                model=there.model,
+                engine=there.engine,
+            )
+        except InputError:
+            break
+        bench = tried
+    return bench, fitted
+
+
+def converge(bench: Workbench, fitted: Fitted, seconds: float) -> Fitted:
+    """Continue a fit that was stopped by its limit of iterations, for at most so many seconds."""
+    if fitted.status is not Status.MAX_ITERATIONS or seconds <= 0:
+        return fitted
+    solver, model, engine = replace(LAST, time_limit=seconds), fitted.model, fitted.engine
+    try:
+        found = bench.fit(
+            fitted.simulator, [fitted.values], states=fitted.initial, solver=solver, model=model, engine=engine
+        )
+    except InputError:
+        return fitted
+    return found if found.cost < fitted.cost else fitted
+
+
+def knee_starts(fitted: Fitted, knee: str) -> list[dict[str, Any]]:
+    """Return the fitted values, and if there is a sharp knee also those with a sharper and a wider one."""
+    values = fitted.values
+    if not knee or values[knee] > SHARP_KNEE * fitted.model.parameters[knee].bounds[1]:
+        return [values]
+    return [values, *({**values, knee: times * values[knee]} for times in (1 / FINER_STEPS, FINER_STEPS))]
+
+
+def refit_on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
+    """Refit on finer steps if the simulation depends on them, or if the present steps limit the knee.
+
+    The knee may be sharper there, as far as these steps can follow it at rest.
+    """
+    given = fitted.simulator.parameters[knee]
+    low, high = given.bounds
+    if fitted.model.substeps * FINER_STEPS > FINER_STEPS**2 * bench.chosen:
+        return fitted
+    finer, placed = replace(bench, at_least=FINER_STEPS * fitted.model.substeps), fitted.corrected()
+    sharper = replace(given, value=fitted.values[knee], bounds=(low / FINER_STEPS, high))
+    placed = placed.with_parameters({**placed.parameters, knee: sharper})
+    there = finer.run(placed, fitted.values, fitted.begin)
+    held = fitted.values[knee] <= low
+    if not held and abs(there.cost / fitted.cost - 1) < COST_CHANGE:
+        return fitted
+    starts = [fitted.values, *([{**fitted.values, knee: low / 2}] if held else [])]
+    states, model, engine = fitted.begin, there.model, there.engine
+    try:
+        found = finer.fit(placed, starts, states=states, solver=THOROUGH, model=model, engine=engine)
+    except InputError:
+        return fitted
+    return found if found.cost < max(fitted.cost, there.cost) else fitted

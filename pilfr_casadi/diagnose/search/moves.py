@@ -1,0 +1,552 @@
+"""The moves of the search from hypothesis to hypothesis, each a set of laws in ports.
+
+Moves lead from one hypothesis to others: *add* a law to the present ones; *exchange* one of several laws for another,
+the others fixed in place; *add two* at once, if neither helps alone; *refine* a law: fit it in a finer form, or with a
+strength that varies with a signal; *vary a parameter* of the simulator with a signal; *name a learned force*: fit the
+laws nearest to a force that was learned beside a hypothesis. A move starts from the most promising hypothesis. The
+search ends if a move brings no better one, if the error is at the noise, or at the time limit. All fits are kept and
+count in the posterior (`hypotheses`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ..._base import InputError, side_by_side
+from ...laws import (
+    FINER,
+    LINEAR,
+    SCALABLE,
+    VARIATIONS,
+    Law,
+    VaryingParameter,
+    constant,
+    heated,
+    likely_profiles,
+    scheduled,
+    varying,
+)
+from ...simulators import ACTUATOR, PARAMETER, SENSOR, Placed, kind_of, name_at, port_name
+from ..faults.gates import CLEARLY_BETTER, Checked, Gate, refit
+from ..faults.timing import TimeShift, find_time_shift
+from ..fits.evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR, NEAR_RATIO
+from ..fits.floor import ABOVE_NOISE
+from ..fits.linearise import linearise_runs
+from ..fits.screen import Pair, Remainder, Scored, screen, usable
+from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted
+from .hypotheses import Hypotheses
+from .learned import learn_forces, nearest_to_learned
+from .relatives import choose_pairs, complements, fit_pair, in_place_of_variation, relatives
+from .trials import Key, Trial, place_law, select_pairs
+
+# Effort
+MOST_CONVERGED = 5  # trials of a step that are fitted to convergence at most
+NEARLY_EXPLAINED = 0.05  # share of the excess left by one law below which far worse laws are not refined
+TWO = "two at once"  # a stage, entered once
+MOST_LEARNED = 2  # learned forces that are kept: those with the smallest error
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One move of the search: its parent hypothesis, the screen's scores, and the trials, best first."""
+
+    parent: Trial
+    scored: tuple[Scored, ...]
+    trials: tuple[Trial, ...]
+
+
+@dataclass(eq=False, repr=False)
+class Search(Hypotheses):
+    """A search, filled by `run`."""
+
+    steps: list[Step] = field(default_factory=list)  # the moves, in their order
+    aligned: bool = False  # whether the times of the channels are settled, so that no shift is looked for
+    shift: Gate | None = None  # the shift of a channel that ended the search, because it shows only beside a law
+
+    def run(self, effects: float) -> Search:
+        """Search for up to `effects` effects; an interrupt ends the search with the present results."""
+        self.keep(Trial.of(self.without, 0, thorough=True))
+        with self.until_interrupted():
+            self.estimate_noise()
+            if not self.interrupted and self._grow(effects) and self._name_rest(effects):
+                if len(self.best.effects) < effects:
+                    self._grow_to_noise()
+                self._every_sensor()
+                self._leave_out_each()
+                self.judge_on_held_out_data()
+        if self.interrupted:
+            self.forget_held_out()
+        return self
+
+    def resume(self, effects: float) -> Search:
+        """Continue with the present hold because the other is no better, unless the search was interrupted."""
+        self.hold_said = True
+        return self if self.interrupted else self.run(effects)
+
+    def adopt(self, other: Trial) -> None:
+        """Fit the laws of another search's hypothesis to these recordings, from its values, and keep the fit."""
+        with self.until_interrupted(), suppress(InputError):
+            there = self.run_laws(other.laws, other)
+            if there.mean_square < DIVERGED:
+                self.keep(self.fits.polish(there))
+
+    @property
+    def passes(self) -> list[Step]:
+        """The moves, those from one hypothesis together, with the best fit of each trial once, smallest error first."""
+        found = dict[Key, tuple[Trial, dict[Key, Trial]]]()
+        for step in self.steps:
+            own = found.setdefault(step.parent.key, (step.parent, {}))[1]
+            own |= {t.key: self.memo.get(t.key, t) for t in step.trials}
+        ranked = ((parent, sorted(trials.values(), key=lambda t: t.error)) for parent, trials in found.values())
+        return [Step(parent, (), tuple(trials)) for parent, trials in ranked if trials]
+
+    def _grow(self, effects: float, varied: bool = False) -> bool:
+        """Add effects while that pays; return False as soon as the other hold, or a channel's shift, proves better.
+
+        A parameter that varies can imitate many laws. So hypotheses with one are a basis for more only if `varied`.
+        The first law is fitted even if the preparation took all the time.
+        """
+        while (
+            self.can_improve(self.best)
+            and len((parent := self._parent(varied)).effects) < effects
+            and self._pays(parent)
+            and (self.in_time() or not self.steps)
+        ):
+            self.add(parent)
+            if not parent.laws and self.in_time() and self._escape_local_minimum():
+                self.add(self.root)
+            if (not self.hold_said and self.prefers_other_hold()) or (not parent.laws and self._finds_shift()):
+                return False
+            if not parent.laws and self.can_improve(self.best) and self.in_time():
+                self.vary_parameters(self.root)
+            if len(self._parent(varied).effects) > len(parent.effects) >= 1:
+                self.exchange()
+            if len(self._parent(varied).laws) <= len(parent.laws):  # no added law is worth its prior
+                break
+        if effects > 1 and TWO not in self.times and self.can_improve(self.best) and self.in_time():
+            best = self.best
+            self.add_two()
+            return self.best is best or self._grow(effects, varied)
+        return True
+
+    def _parent(self, varied: bool) -> Trial:
+        """Return the best hypothesis, or the best one in which no parameter varies."""
+        if varied:
+            return self.best
+        fixed = [t for t in self.memo.values() if all(kind_of(e.port) != PARAMETER for e in t.laws)]
+        return max(fixed, key=self.optimistic_evidence)
+
+    def _grow_to_noise(self) -> None:
+        """Add a law for a rest as small as the formula error of the laws before it.
+
+        An inexact formula can look like one more effect. So it counts only if what is left can be white noise, and no
+        rest counts that even the right formulas may leave.
+        """
+        base, least = self.best, LEAST_FORMULA_ERROR * self.root.mean_square
+        is_noise = base.mean_square < ABOVE_NOISE**2 * self.least_noise2 + least
+        if not base.laws or is_noise or base.mean_square > self.may_leave() or not self.in_time():
+            return
+        noise = self.floor, self.count
+        self.mismatch2, found = float(np.mean(base.fitted.squares)), False
+        try:
+            if self.can_improve(base):
+                self.add(base, again=True)
+            at_noise = self.best.mean_square < ABOVE_NOISE**2 * self.least_noise2
+            found = at_noise and len(self.best.effects) > len(base.effects)
+        finally:
+            if not found:
+                self.mismatch2, (self.floor, self.count) = None, noise
+        if found:  # other laws may stand beside the new one in place of those before
+            self.exchange()
+
+    def _name_rest(self, effects: float) -> bool:
+        """Name what is left beside the simulator, the best hypothesis, and that without its weakest effect.
+
+        A parameter may vary with a signal; or a force that is learned there is nearly a law.
+
+        The weakest of several effects may imitate a law that only a learned force shows, such as a gain that varies
+        with the position. Go on if one of the laws leads.
+        """
+        best = self._parent(varied=False)
+        fewer = [t for t in self.memo.values() if t.effects and t.key < best.key]
+        without_weakest = sorted(fewer, key=lambda t: (-len(t.effects), t.mean_square))[:1]
+        for name_rest in (self.vary_parameters, self.name_learned):
+            for base in {t.key: t for t in (self.root, best, *without_weakest)}.values():
+                if len(base.effects) < effects and self.can_improve(self.best) and self.in_time():
+                    name_rest(base)
+        if self.best is best:
+            return True
+        self.exchange()  # laws that were found before may have made up for this one
+        return self._grow(effects, varied=True)
+
+    def _pays(self, trial: Trial) -> bool:
+        """Tell whether the last of several laws was worth it; a wrong model can always use one more."""
+        fewer = [t for t in self.memo.values() if t.laws and len(t.effects) < len(trial.effects)]
+        return len(trial.effects) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
+
+    def prefers_other_hold(self) -> bool:
+        """Tell whether the best hypothesis follows the recordings better with the other hold of the inputs."""
+        best = self.best.fitted
+        if self.interrupted or not self.in_time():
+            return False
+        held = self.bench.with_other_hold()
+        found = refit(held, [best.values], best.simulator, states=best.initial, solver=THOROUGH)
+        return found is not None and not self.interrupted and found.cost * BETTER_RATIO**2 < best.cost
+
+    def _finds_shift(self) -> bool:
+        """Look beside each of the first laws for an output that comes before its cause; their absence may hide it.
+
+        Filters and laws with memory are left out: they imitate a shift. A delay is a law itself.
+        """
+        if self.aligned or not self.can_improve(self.best):
+            return False
+        first_move = {t.key for s in self.steps if not s.parent.laws for t in s.trials}
+        kept = [self.memo[key] for key in first_move]
+        plain = [t for t in kept if not (t.law.order or t.law.memory)]
+        first = dict[tuple[str, str], Trial]()  # of each law the likeliest form, the likeliest laws first
+        for trial in sorted(plain, key=self.optimistic_evidence, reverse=True):
+            first.setdefault((trial.port, trial.law.id), trial)
+        best, part = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_said else 0.5
+        with self.stage("shifts beside a law"):
+            for trial in list(first.values())[:FEW] if self.in_time() else ():
+                bench = replace(self.bench, simulator=trial.fitted.simulator)
+                found = find_time_shift(Checked(bench, trial.fitted), part, given=False)
+                shift = found.gates[0] if found.gates else None
+                if isinstance(shift, TimeShift) and shift.leads and found.cost < best:
+                    beside = name_at(trial.port, trial.law.id, trial.law.form)
+                    sentence = f"{shift.sentence.rstrip('.')} (beside {beside})."
+                    best, self.shift = found.cost, replace(shift, sentence=sentence)
+        self.aligned = True
+        return self.shift is not None
+
+    def add(self, parent: Trial, again: bool = False) -> None:
+        """Fit the laws that the screen selects beside a hypothesis, fewer if `again`; polish those that may win."""
+        scored, gain = self._standing(parent)
+        if self.steps and not self.in_time():
+            return
+        enough = float(np.sqrt(self.floor2 + NEARLY_EXPLAINED * max(parent.mean_square - self.floor2, 0.0)))
+        trials = self._with_relatives(parent, scored, scored, gain, enough, again)
+        with self.stage("choice"):
+            self._record(parent, scored, trials)
+            self.estimate_noise()
+            best = self.best
+            self._finer(parent)
+            if self.best is not best:
+                self.estimate_noise()
+
+    def _standing(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
+        """Return what was screened beside a hypothesis and may stand beside its laws, and the observer's gain."""
+        scored, gain = self.screened(parent)
+        return [s for s in scored if _may_stand_beside(parent.laws, s.port, s.law)], gain
+
+    def _with_relatives(
+        self,
+        parent: Trial,
+        selected: Sequence[Scored],
+        scored: Sequence[Scored],
+        gain: np.ndarray | None,
+        enough: float,
+        again: bool,
+    ) -> list[Trial]:
+        """Fit some of the pairs screened, then those to which the best fits of these hypotheses point."""
+        found = self._fitted(parent, selected, gain, enough, again)
+        trials = sorted(map(self._best_known, found), key=lambda t: t.error)
+        more = relatives(self.bench, trials, scored) if self.in_time() else []
+        if more:
+            trials = sorted([*trials, *self._fitted(parent, more, gain, enough, again)], key=lambda t: t.error)
+        return trials
+
+    def _best_known(self, trial: Trial) -> Trial:
+        """Return the best fit of a trial's hypothesis, whose laws may have been found in another order."""
+        known = self.memo.get(trial.key, trial)
+        if not known.error < trial.error:
+            return trial
+        return self._with_last(known, trial.pair)
+
+    def _with_last(self, trial: Trial, pair: Pair) -> Trial:
+        """Return a hypothesis with one of its laws as the last."""
+        if trial.pair == pair:
+            return trial
+        return self.run_laws(sorted(trial.laws, key=lambda e: (e.port, type(e.law)) == pair), trial)
+
+    def _best_with_one_more(self, parent: Trial) -> Trial | None:
+        """Return the best hypothesis, its further law as the last, if it has one law more than a parent."""
+        best = self.best
+        added = best.key - parent.key
+        return self._with_last(best, *added) if len(added) == 1 and parent.key < best.key else None
+
+    def _record(self, parent: Trial, scored: Sequence[Scored], trials: Sequence[Trial]) -> None:
+        """Keep the trials of a move, and note the move."""
+        self._keep_all(trials)
+        self.steps.append(Step(parent, tuple(scored), tuple(trials)))
+
+    def _fitted(
+        self, parent: Trial, scored: Sequence[Scored], gain: np.ndarray | None, enough: float, again: bool
+    ) -> list[Trial]:
+        began = time.perf_counter()
+        stage = f"fits, effect {len(parent.laws) + 1}" if parent.laws else "fits"
+        pairs = select_pairs(scored, again)
+        trials, tried = self.fits.fit_pairs(parent, pairs, gain, enough, partial(self.say, stage), again)
+        if not parent.laws:
+            self.tried, self.selected = self.tried + tried, self.selected + len(pairs)
+        self.times["fits"] = self.times.get("fits", 0.0) + time.perf_counter() - began
+        self.bench.interrupt.raise_pending()
+        return trials
+
+    def _keep_all(self, trials: Sequence[Trial]) -> None:
+        """Keep trials, and fit those that may win to convergence."""
+        for trial in trials:
+            self.keep(trial)
+        kept = {t.key: self.memo[t.key] for t in trials}.values()
+        ranked = sorted(kept, key=self.optimistic_evidence, reverse=True)
+        most = min(NEAR_RATIO * ranked[0].error if ranked else np.inf, FAR_RATIO * self.best.error)
+        near = [t for t in ranked[:MOST_CONVERGED] if not t.thorough and t.error < most]
+        converged = side_by_side(self.fits.converge, near, self.workers)
+        for trial in converged:
+            self.keep(trial)
+        # finer steps are slow, and bring no hypothesis that is far behind to the front
+        least = min([t.error for t in (*converged, self.best)])
+        near = [t for t in converged if t.error < NEAR_RATIO * least]
+        for trial in side_by_side(self.fits.sharpen, near, self.workers):
+            self.keep(trial)
+
+    def _finer(self, parent: Trial) -> None:
+        """Fit the best law of a step in its finer forms; then let the strength of the best that may vary do so."""
+        best = self._best_with_one_more(parent)
+        if best is not None:
+            self._refine(best, FINER.get(type(best.law), ()))
+        self._vary_strength()
+        best = self._best_with_one_more(parent)
+        by = (best.law.scheduled_by or best.law.scaled_by) if best is not None else ""
+        if best is not None and by and "parallel" in best.law.places and self.in_time():
+            kind = constant(type(best.law))
+            self._refine(best, [scheduled(kind, by, p) for p in likely_profiles(kind) if p != best.law.profile])
+        self.replace_variation(parent)
+
+    def _vary_strength(self) -> None:
+        """Let the strength of the likeliest law of the last step that may vary do so, with every signal.
+
+        With the signal found, its other forms may be the physics. A linear law was screened with every signal.
+        """
+        may_vary = [kind for kind in SCALABLE if kind.id not in LINEAR]
+        added = [t for t in self.steps[-1].trials if constant(type(t.law)) in may_vary]
+        kept = [self.memo[t.key] for t in added]  # perhaps found before, with these laws added in another order
+        step = [new if known.pair != new.pair else known for new, known in zip(added, kept, strict=True)]
+        # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
+        if not step or not self.can_improve(self.best, self.least_floor) or not self.in_time():
+            return
+        likeliest = max(step, key=self.optimistic_evidence)
+        forms = [t for t in step if t.law.id == likeliest.law.id and t is not likeliest]
+        entry = self._entry(likeliest)
+        self._vary([likeliest], ("z", *entry.local.inputs) if entry else ())
+        if self.best.laws and self.best.law.scheduled_by:
+            self._vary(forms, (self.best.law.scheduled_by,))
+
+    def _vary(self, trials: Sequence[Trial], signals: Sequence[str]) -> None:
+        """Fit hypotheses with the strength of their last law varying with each signal."""
+        for trial in trials:
+            kind = constant(type(trial.law))
+            self._refine(trial, [scheduled(kind, by, likely_profiles(kind)[0]) for by in signals])
+
+    def _entry(self, trial: Trial) -> Scored | None:
+        """Return how the last law of a trial, or another with the same sense, was first screened at its port.
+
+        None if none was there: the hypothesis comes from another search.
+        """
+        there = [s for step in self.steps for s in step.scored if s.port == trial.port]
+        return min(there, key=lambda s: s.law.dissipative != trial.law.dissipative, default=None)
+
+    def _refine(self, trial: Trial, kinds: Sequence[Any]) -> None:
+        """Fit a hypothesis with its last law in other forms, which start from its values and oppose motion alike."""
+        entry, base, law = self._entry(trial), trial.fitted, trial.law
+        if entry is None or not kinds:
+            return
+        if law.dissipative and not entry.sense:
+            total = sum(np.sum(trial.own[name]) for name in law.strength if name not in law.signed)
+            entry = replace(entry, sense=int(np.sign(total)))
+        bare = base.simulator.without_element()
+
+        def fit(kind: Any) -> Trial | None:
+            starts = list(kind.finer_starts(trial.law.at(trial.own), entry.local))
+            placed = [place_law(bare, replace(entry, law=kind()), own) for own in starts]
+            values = [{**base.values, **named} for _, named in placed]
+            return self.fits.fit(placed[0][0], values, len(trial.laws), states=base.begin)
+
+        found = side_by_side(fit, [kind for kind in kinds if usable(kind(), entry.local)], self.workers)
+        self._keep_all([t for t in found if t is not None])
+
+    def learned(self, base: Trial) -> list[Fitted]:
+        """Fit learned forces beside a hypothesis, at the most promising ports, to a part of the recordings."""
+        known = self.findings[base.key]
+        if known.learned is None:
+            with self.stage("learned force"):
+                shares = self.flexible(base)
+                ports = sorted(shares, key=lambda name: -shares[name])[:FEW]
+                try:
+                    known.learned = learn_forces(self.fits.part, base.fitted, ports, self.workers)[:MOST_LEARNED]
+                except (InputError, np.linalg.LinAlgError):
+                    known.learned = []
+        return known.learned
+
+    def name_learned(self, base: Trial) -> None:
+        """Fit the laws whose forces are nearest to those learned beside a hypothesis."""
+        entries, scored = list[Scored](), self._standing(base)[0]
+        for fitted in self.learned(base):
+            port = fitted.simulator.elements[-1].port
+            for near in nearest_to_learned(self.fits.part, fitted, self.laws):
+                alike = [s for s in scored if s.port == port and s.law.dissipative == near.kind.dissipative]
+                if alike and _may_stand_beside(base.laws, port, near.kind):
+                    entries.append(replace(alike[0], law=near.kind, starts=(near.start,)))
+        if not entries:
+            return
+        noise = float(np.sqrt(self.floor2))
+        trials = self._with_relatives(base, entries, [*entries, *scored], None, noise, True)
+        self._record(base, entries, trials)
+
+    def vary_parameters(self, base: Trial) -> None:
+        """Let parameters of the simulator vary with a signal beside a hypothesis: fit those that explain most."""
+        formulas_leave = self.may_leave()  # no machine follows one exactly
+        known = self.findings[base.key]
+        if VaryingParameter not in self.laws or self.best.mean_square < formulas_leave or known.varied:
+            return
+        known.varied = True
+        signals = ("t", *self.bench.simulator.inputs, *self.bench.simulator.states)
+        laws = [varying(by, profile) for by in dict.fromkeys(signals) for profile in VARIATIONS[:2]]
+        laws += [heated(by) for by in dict.fromkeys(signals[1:])]
+        with self.stage("varying parameters"):
+            scored, gain = screen(self.bench, base.fitted, laws, self.floor.deviation, self.workers)
+            self.note_alternatives(scored)
+        best = list(dict.fromkeys((s.port, s.law.form) for s in scored))[:FEW]
+        taken = {e.port for e in base.laws}
+        entries = [s for s in scored if (s.port, s.law.form) in best and s.port not in taken]
+        if not entries:
+            return
+        self._record(base, entries, self._fitted(base, entries, gain, float(np.sqrt(self.floor2)), True))
+        self.replace_variation(base)
+        last = self.best.laws[-1] if self.best.laws else None
+        if last and kind_of(last.port) == PARAMETER and last.law.scheduled_by:
+            self._curve(base, [s for s in entries if s.pair == (last.port, type(last.law))], gain)
+
+    def replace_variation(self, base: Trial) -> None:
+        """Fit laws with constant parameters whose force is like that of the best hypothesis' last law, which varies."""
+        best = self.best
+        known = self.findings[best.key]
+        if known.replaced or not best.laws or best.key - base.key != {best.pair} or base.key - best.key:
+            return
+        if not best.law.scheduled_by or not self.in_time():
+            return
+        known.replaced = True
+        entries = in_place_of_variation(self.bench, best, self._standing(base)[0])
+        if entries:
+            self._record(base, entries, self._fitted(base, entries, None, float(np.sqrt(self.floor2)), True))
+
+    def _curve(self, base: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> None:
+        """Let the parameter that varies in the best hypothesis follow a curve of higher degree."""
+        best = self.best
+        # what the curve misses is in no force at a port, so that it may have passed for noise
+        if not (self.can_improve(best, self.least_floor) and self.in_time()):
+            return
+        law = varying(best.law.scheduled_by, VARIATIONS[-1])()
+        finer = [replace(s, law=law, starts=(law.starts_as(best.law, best.own),)) for s in entries]
+        self.note_alternatives(finer)
+        self._record(base, finer, self._fitted(base, finer, gain, float(np.sqrt(self.floor2)), True))
+
+    def exchange(self) -> None:
+        """Try all other laws, and none, in place of each of several laws, the rest in place, until none changes."""
+        for _ in range(FEW):
+            best = self.best
+            for element in best.effects if len(best.effects) > 1 else ():
+                rest = self.run_laws([e for e in best.laws if e is not element], best)
+                if not rest.mean_square < DIVERGED:
+                    continue
+                if self.in_time() and not self._expanded(rest):  # from the values of all laws, which may be right
+                    self.keep(rest)
+                    self.add(rest, again=True)
+                found = self.leave_out(best, [element])
+                wrong = found is not None and not self._expanded(found, FAR_RATIO)  # it had been in a wrong minimum
+                if found is not None and wrong and self.can_improve(self.best) and self.in_time():
+                    self.add(found, again=True)
+            if self.best.key == best.key:
+                return
+
+    def _leave_out_each(self) -> None:
+        """Fit the best hypothesis without each of its effects, and with each strength that varies held constant.
+
+        A later effect can make an earlier one, or its variation, idle.
+        """
+        with self.stage("without each effect"):
+            while len((best := self.best).effects) > 1 and not self.past_deadline:
+                for element in best.effects:
+                    self.leave_out(best, [element])
+                    plain = constant(type(element.law))
+                    if plain is not type(element.law) and kind_of(element.port) != PARAMETER:
+                        others = [e for e in best.laws if e is not element]
+                        self._refine(self.run_laws([*others, element], best), [plain])
+                if self.best.key == best.key:
+                    return
+
+    def _expanded(self, trial: Trial, ratio: float = np.inf) -> bool:
+        """Tell whether laws were added to a hypothesis, at an error of at most `ratio` times the present one."""
+        return any(s.parent.key == trial.key and s.parent.error <= ratio * trial.error for s in self.steps)
+
+    def add_two(self) -> None:
+        """Fit two laws at once beside the simulator alone, because one after the other may hide each other."""
+        with self.stage(TWO):
+            rest = Remainder.of(self.bench, *linearise_runs(self.bench, self.root.fitted), self.laws)
+            fits, before = self.fits, self.best
+            found = side_by_side(
+                lambda pair: fit_pair(fits, self.root.fitted, rest, pair), choose_pairs(rest), self.workers
+            )
+            self._keep_all([t for t in found if t is not None])
+        if self.best is not before:
+            self.exchange()
+
+    def _every_sensor(self) -> None:
+        """Move a filter of the best hypothesis from an actuator to every sensor, as data loggers have them.
+
+        Linear time-invariant systems commute (Oppenheim & Willsky 1997, Signals and Systems, sec. 2.3).
+        """
+        best, names = self.best, self.bench.simulator.output_names
+        filters = [e for e in best.laws if kind_of(e.port) == ACTUATOR and (e.law.order or e.law.shifts)]
+        if len(names) < 2 or len(filters) != 1 or not self.in_time():
+            return
+        source = filters[0]
+        others = [e for e in best.laws if e is not source]
+        if not all(_may_stand_beside(others, port_name(SENSOR, name), source.law) for name in names):
+            return
+        with self.stage("every sensor"):
+            joint = self.run_laws(others, best)
+            simulator, named = joint.fitted.simulator, dict[str, object](joint.fitted.values)
+            for name in names:
+                simulator = simulator.with_element(port_name(SENSOR, name), source.law)
+                named |= simulator.elements[-1].named(source.own(best.fitted.values))
+            found = self.fits.fit(simulator, [named], len(joint.laws) + len(names), states=joint.fitted.begin)
+            if found is not None:
+                self.keep(self.fits.polish(found))
+
+    def _escape_local_minimum(self) -> bool:
+        """Refit the simulator alone from the best law's parameters; if far better, restart the search and return True.
+
+        The first refit was in a local minimum, and the law has compensated for that.
+        """
+        best, bench = self.best.fitted, self.bench
+        with self.stage("look back"):
+            alone = refit(bench, [best.values], states=best.begin, solver=THOROUGH)
+        if alone is None or alone.cost > CLEARLY_BETTER * self.root.mean_square:
+            return False
+        self.without, self.memo, self.steps = alone, {}, []
+        self.findings.clear()
+        self.keep(Trial.of(alone, 0, thorough=True))
+        return True
+
+
+def _may_stand_beside(laws: Sequence[Placed], port: str, law: Law) -> bool:
+    """Tell whether a law at a port may be a further effect beside some laws."""
+    return all(e.port != port or complements(e.law, law) for e in laws)

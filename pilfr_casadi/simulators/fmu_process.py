@@ -1,0 +1,299 @@
+"""Evaluations of functional mock-up units for model exchange, in processes of their own.
+
+Units crash and hang, mostly at some values of their parameters. An evaluation that ends or blocks the process gives
+NaN, and the next one starts a new process. One message asks for one point, or for a whole run of a compiled model that
+calls the unit (`run_in_unit`). A message and its reply take some 15 µs: nothing beside a run, and ten times as long as
+a small unit itself needs for one point. So single points are evaluated in this process, as soon as the unit's own has
+answered with the same values of the parameters.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import math
+import os
+import pickle
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .._base import abandoned
+from .fmu_description import tidy
+from .fmu_instance import FmuFile, FmuSignals, UnitError, evaluation
+
+LOADING_SECONDS = 60.0  # further seconds that the first job of a unit may take
+CALL_SECONDS = 5.0  # seconds that another job may take
+PACE = 20.0  # further seconds, over those of the slowest job of its kind and length
+MOST_IDLE = 4  # processes that wait for their next job
+MOST_LOSSES = 3  # processes that a point's parameters may end before they count as failed
+WATCH_SECONDS = 0.1  # interval at which limits are checked
+HEAD = struct.Struct("<cQ")  # kind and length of a message
+POINT, CALL = b"p", b"c"
+
+
+class _UnitProcess:
+    """A process that holds one instance of one unit."""
+
+    def __init__(self, file: FmuFile) -> None:
+        self.file, self.owner = file, os.getpid()
+        self.signals: FmuSignals | None = None  # evaluated by POINT
+        self.deadline, self.expired, self.jobs = np.inf, False, 0
+        self.errors = tempfile.TemporaryFile()  # noqa: SIM115
+        path = os.pathsep.join(p or os.getcwd() for p in sys.path)
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", f"from {__name__} import serve; serve()"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self.errors,
+            env={**os.environ, "PYTHONPATH": path},
+            start_new_session=True,  # Ctrl-C is for the process that waits for the results
+        )
+        self.inbox: Any = self.process.stdin
+        self.outbox: Any = self.process.stdout
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def _watch(self) -> None:
+        while self.process.poll() is None:
+            if time.monotonic() > self.deadline:
+                self.expired = True
+                self.process.kill()
+            time.sleep(WATCH_SECONDS)
+
+    def ask(self, kind: bytes, body: bytes, limit: float) -> bytes:
+        """Send a job; return the reply."""
+        begin = time.monotonic()
+        self.deadline = begin + limit + (0.0 if self.jobs else _loading.get(self.file, LOADING_SECONDS))
+        self.inbox.write(HEAD.pack(kind, len(body)) + body)
+        self.inbox.flush()
+        _, reply = _receive(self.outbox)
+        self.deadline = np.inf
+        if not self.jobs:
+            _loading.setdefault(self.file, CALL_SECONDS + time.monotonic() - begin)
+        self.jobs += 1
+        return reply
+
+    def describe_end(self) -> str:
+        """Describe in words how the process ended."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(5)
+        code = self.process.poll()
+        if self.expired:
+            return "takes too long"
+        how = f"signal {-code}" if code is not None and code < 0 else f"status {code}"
+        return f"ends the process that runs it ({how})"
+
+    def close(self) -> None:
+        """Kill the process and close its pipes."""
+        self.process.kill()
+        self.process.wait()
+        for pipe in (self.inbox, self.outbox, self.errors):
+            with contextlib.suppress(OSError, ValueError):
+                pipe.close()
+
+
+_loading: dict[FmuFile, float] = {}  # further seconds for the first job of another process of a unit
+_idle: list[_UnitProcess] = []
+_lock, _here = threading.Lock(), threading.Lock()
+
+
+def _take(file: FmuFile) -> _UnitProcess:
+    """Take an idle process of a unit, or a new one; a forked process leaves those of its parent alone."""
+    with _lock:
+        for process in _idle:
+            if process.file == file and process.owner == os.getpid():
+                _idle.remove(process)
+                return process
+    return _UnitProcess(file)
+
+
+def _give_back(process: _UnitProcess) -> None:
+    with _lock:
+        _idle.append(process)
+        excess = _idle.pop(0) if len(_idle) > MOST_IDLE else None
+    if excess is not None and excess.owner == os.getpid():
+        excess.close()
+
+
+def _ask(signals: FmuSignals, kind: bytes, body: bytes, limit: float) -> tuple[bytes, str]:
+    """Send a job to a process of the unit; return the reply, or how the process failed."""
+    process = _take(signals.file)
+    try:
+        if kind == POINT and process.signals != signals:
+            process.ask(CALL, pickle.dumps((_select, (signals,))), limit)
+            process.signals = signals
+        reply = process.ask(kind, body, limit)
+    except (OSError, EOFError, ValueError):
+        failure = process.describe_end()
+        process.close()
+        return b"", failure
+    except BaseException:
+        process.close()  # its reply is still to come
+        raise
+    _give_back(process)
+    return reply, ""
+
+
+def run_in_unit(
+    signals: FmuSignals, function: Callable[..., Any], arguments: tuple[Any, ...], size: int
+) -> tuple[Any, str]:
+    """Call a function of a module in a process of the unit; return its result, or None and the failure.
+
+    `size` is the length of the job, such as its number of samples, by which earlier jobs of the same function limit its
+    time.
+    """
+    key = signals, function
+    limit = LOADING_SECONDS if key not in _pace else CALL_SECONDS + PACE * size * _pace[key]
+    begin = time.monotonic()
+    reply, failure = _ask(signals, CALL, pickle.dumps((function, arguments)), limit)
+    if failure:
+        return None, failure
+    _pace[key] = max(_pace.get(key, 0.0), (time.monotonic() - begin) / max(size, 1))
+    result, failure = pickle.loads(reply)
+    if isinstance(failure, Exception):
+        raise failure
+    return result, failure
+
+
+_pace: dict[Any, float] = {}  # most seconds by length, by unit and function
+
+
+class FmuFunction(ca.Callback):
+    """A unit as a `casadi.Function` `(t, x, u, p) -> (derivatives, outputs)`; if it fails, its results are NaN.
+
+    Attributes
+    ----------
+    failure : str
+        How its process failed first.
+    """
+
+    def __init__(self, name: str, signals: FmuSignals) -> None:
+        ca.Callback.__init__(self)
+        self.signals, self.failure = signals, ""
+        self._losses: dict[bytes, int] = {}  # lost processes by parameter values
+        self._answered: set[bytes] = set()  # parameter values at which a process has answered
+        self._latest: bytes | None = None  # the latest of these, before rounding
+        self.construct(name, {})
+
+    def get_n_in(self) -> int:
+        """Return the number of arguments, for CasADi; there is one result."""
+        return 4
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Return the shape of an argument."""
+        return ca.Sparsity.dense(self.signals.sizes[i], 1)
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Return the shape of the result."""
+        return ca.Sparsity.dense(self.signals.results, 1)
+
+    def has_eval_buffer(self) -> bool:
+        """Ask CasADi for its memory instead of matrices, which take ten times as long."""
+        return True
+
+    def eval_buffer(self, arguments: list[memoryview], results: list[memoryview]) -> int:
+        """Evaluate one point, for CasADi."""
+        z = b"".join(bytes(a) for a in arguments)
+        np.frombuffer(results[0])[:] = self.evaluate(z)
+        return 0
+
+    def evaluate(self, z: bytes) -> np.ndarray:
+        """Evaluate one point, in a process of the unit until it has answered with these parameters.
+
+        The unit is not called in an abandoned run or by a diverged simulation, nor again with parameters at which it
+        has ended `MOST_LOSSES` processes.
+        """
+        point, none = np.frombuffer(z), np.full(self.signals.results, np.nan)
+        if abandoned.pending or not math.isfinite(point.sum()):
+            return none
+        values = z[len(z) - 8 * self.signals.sizes[3] :]
+        known = values == self._latest
+        parameters = values if known else np.frombuffer(values).astype(np.float32).tobytes()
+        if known or parameters in self._answered:
+            self._latest = values
+            with _here:  # the unit has one instance in this process
+                return np.array(evaluation(self.signals).evaluate(point))
+        if self._losses.get(parameters, 0) >= MOST_LOSSES:
+            return none
+        reply, failure = _ask(self.signals, POINT, z, CALL_SECONDS)
+        if not failure and len(reply) == 8 * self.signals.results:
+            self._answered.add(parameters)
+            return np.frombuffer(reply)
+        if failure:
+            self._losses[parameters] = self._losses.get(parameters, 0) + 1
+        self.failure = self.failure or failure or f"fails ({reply.decode()})"
+        return none
+
+
+def has_time_event(signals: FmuSignals) -> bool:
+    """Tell whether a unit has announced an event in time."""
+    found, _ = run_in_unit(signals, _has_time_event, (signals,), 1)
+    return bool(found)
+
+
+def _has_time_event(signals: FmuSignals) -> bool:
+    return evaluation(signals).instance.has_time_event
+
+
+def serve() -> None:
+    """Do jobs in the child process: read them from standard input, write results to standard output."""
+    replies, inbox = os.fdopen(os.dup(1), "wb"), sys.stdin.buffer
+    os.dup2(2, 1)  # a unit that prints must not write into the replies
+    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
+    while True:
+        try:
+            kind, body = _receive(inbox)
+        except EOFError:
+            os._exit(0)
+        try:
+            if kind == POINT:
+                found = evaluation(_selected[0]).evaluate(np.frombuffer(body)).tobytes()
+            else:
+                function, arguments = pickle.loads(body)
+                found = pickle.dumps((function(*arguments), ""))
+        except (UnitError, OSError, AttributeError) as error:
+            found = tidy(error).encode() if kind == POINT else pickle.dumps((None, tidy(error)))
+        except Exception as error:
+            found = pickle.dumps((None, error))
+        replies.write(HEAD.pack(kind, len(found)) + found)
+        replies.flush()
+
+
+_selected: list[FmuSignals] = []  # in the child process: the signals that POINT evaluates
+
+
+def _select(signals: FmuSignals) -> None:
+    _selected[:] = [signals]
+
+
+def _end_with_parent(parent: int) -> None:
+    """End this process after its parent, also while the unit hangs."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(0)
+
+
+def _receive(pipe: Any) -> tuple[bytes, bytes]:
+    head = pipe.read(HEAD.size)
+    if len(head) < HEAD.size:
+        raise EOFError
+    kind, size = HEAD.unpack(head)
+    body = pipe.read(size)
+    if len(body) < size:
+        raise EOFError
+    return kind, body
+
+
+@atexit.register
+def _close_idle() -> None:
+    for process in _idle:
+        if process.owner == os.getpid():
+            process.close()
