@@ -1,4 +1,4 @@
-"""An instance of a functional mock-up unit for model exchange, called directly; only the unit's own process holds one.
+"""An instance of a functional mock-up unit for model exchange, called directly; each process has at most one.
 
 Parameters are changed where the standard allows it: tunable ones in event mode, fixed ones by a restart with new
 initial values. A unit that reports an error is restarted before the next evaluation. An evaluation with an error gives
