@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import functools
 import math
 import os
 import pickle
@@ -28,7 +29,7 @@ import numpy as np
 
 from .._base import abandoned
 from .fmu_description import tidy
-from .fmu_instance import FmuFile, FmuSignals, UnitError, evaluation
+from .fmu_instance import FmuEvaluation, FmuFile, FmuSignals, UnitError, evaluation
 
 LOADING_SECONDS = 60.0  # further seconds that the first job of a unit may take
 CALL_SECONDS = 5.0  # seconds that another job may take
@@ -214,9 +215,10 @@ class FmuFunction(ca.Callback):
         if abandoned.pending or not math.isfinite(point.sum()):
             return none
         parameters = point[len(point) - self.signals.sizes[3] :].astype(np.float32).tobytes()
-        if parameters in self._answered:
+        if parameters in self._answered and (here := _evaluation_here(self.signals)) is not None:
             with _here:  # the unit has one instance in this process
-                return np.array(evaluation(self.signals).evaluate(point))
+                if not here.instance.failed[0]:  # a restart may end the process
+                    return np.array(here.evaluate(point))
         if self._losses.get(parameters, 0) >= MOST_LOSSES:
             return none
         reply, failure = _ask(self.signals, POINT, z, CALL_SECONDS)
@@ -227,6 +229,16 @@ class FmuFunction(ca.Callback):
             self._losses[parameters] = self._losses.get(parameters, 0) + 1
         self.failure = self.failure or failure or f"fails ({reply.decode()})"
         return none
+
+
+@functools.cache
+def _evaluation_here(signals: FmuSignals) -> FmuEvaluation | None:
+    """Return the evaluations of a unit in this process; None if it cannot be loaded here, or is often restarted."""
+    if signals.file.restarts:
+        return None
+    with contextlib.suppress(UnitError, OSError, AttributeError):
+        return evaluation(signals)
+    return None
 
 
 def has_time_event(signals: FmuSignals) -> bool:

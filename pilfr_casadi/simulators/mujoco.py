@@ -7,9 +7,8 @@ MuJoCo reads the file. The equations of motion
 (Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 2) are then written for CasADi. So they can be compiled, have
 exact derivatives by states and by all numbers of the model, and accept a force w at every joint. The dry friction f is
 the joint's `frictionloss` while it slides, and `s v` while it sticks, where s is the slope of MuJoCo's own friction at
-rest. They are compared with
-MuJoCo's own accelerations at several points. Contacts and joint limits are left out, with a note. A model with any
-other feature that the equations lack is refused.
+rest. They are compared with MuJoCo's own accelerations at several points. Contacts and joint limits are left out, with
+a note. A model with any other feature that the equations lack is refused.
 """
 
 from __future__ import annotations
