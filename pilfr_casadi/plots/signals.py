@@ -92,7 +92,7 @@ def time(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes | N
     measured = "measured output" + (f" less its mean {level:.6g} {unit}".rstrip() if level else "")
     line(ax, t, (y - level) / size, measured, BLUE, linewidth=0.9)
     for label, residual, colour in _residuals(fit, recording, output):
-        shifted, note = _subtract_offset(mask_divergence(residual, np.ptp(y)), np.ptp(y), unit)
+        shifted, note = _error_to_draw(residual, np.ptp(y), unit)
         line(ax, t, shifted / size, label + note, colour, linewidth=1.1)
     return _finish_over_time(ax, recording, axis)
 
@@ -111,7 +111,7 @@ def traces(
     size, label = scale_axis(recording.outputs[output], y[part], unit)
     line(ax, recording.t, y / size, "measured", BLUE, part=part, linewidth=3.2, alpha=0.55)
     for model, simulated, colour in _simulations(fit, recording):
-        error, note = _subtract_offset(mask_divergence(simulated[:, output] - y, np.ptp(y)), np.ptp(y), unit)
+        error, note = _error_to_draw(simulated[:, output] - y, np.ptp(y), unit)
         line(ax, recording.t, (y + error) / size, model + note, colour, part=part)
     ax.margins(x=0.01)
     return finish(ax, "time [s]", label, recording.name, 3)
@@ -152,7 +152,7 @@ def output_over_input(
     name, simulated = recording.outputs[output], fit.simulate(recording)[:, output]
     u, y, simulated = (column[as_scored(fit, recording).skip :] for column in (u, y, simulated))
     size, up = scale_axis(name, y, _unit(fit, recording, name))
-    error, note = _subtract_offset(mask_divergence(simulated - y, np.ptp(y)), np.ptp(y), _unit(fit, recording, name))
+    error, note = _error_to_draw(simulated - y, np.ptp(y), _unit(fit, recording, name))
     ax.plot(u, y / size, color=BLUE, linewidth=3.0, alpha=0.4, label="measured", rasterized=True)
     ax.plot(u, (y + error) / size, color=INK, linewidth=0.5, label=plain(f"this model{note}"), rasterized=True)
     across = recording.inputs[input]
@@ -270,8 +270,9 @@ def _finish_over_time(ax: Axes, recording: Recording, label: str) -> Axes:
     return finish(ax, "time [s]", label, recording.name)
 
 
-def _subtract_offset(error: np.ndarray, span: float, unit: str) -> tuple[np.ndarray, str]:
-    """Subtract the offset of an error (M,) if it exceeds the measured span and dominates the error; return a note."""
+def _error_to_draw(error: np.ndarray, span: float, unit: str) -> tuple[np.ndarray, str]:
+    """Mask where an error (M,) diverges, and subtract an offset beyond the measured span; also return a note on it."""
+    error = mask_divergence(error, span)
     known = error[np.isfinite(error)]
     if not known.size or abs(np.mean(known)) <= span or np.ptp(known) > 3 * span or not span:
         return error, ""
