@@ -35,10 +35,10 @@ from ..optimise import (
 from ..simulators import Simulator, discretise_for
 from .context import FitContext, Stage, check_recordings, mark_interrupted, rms_error, without_density_prior
 from .lagged import check_lagged_options, fit_lagged
+from .linear_start import known_entries, linear_model, transform_to_known_basis
 from .multistart import DEFAULT_SOLVER, MOST_POLISHED, START_KINDS, StartSearch, search_starts
 from .penalty import check_penalty, solve_with_penalty
 from .result import Fit, FitOptions, match_channels, with_solution
-from .start import known_entries, linear_model, transform_to_known_basis
 
 DEAD_WORKER = (
     "A worker process ended before it returned a result (it may have run out of memory); use fewer workers, or "
