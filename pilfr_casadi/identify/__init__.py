@@ -4,7 +4,7 @@
 which a search begins, `start` computes start values, `multistart` chooses which of them are tried and polishes the
 best, `context` solves with the options that all fits share, `penalty` adds the L1 penalty, and `lagged` trains NARX and
 NOE models. `result` is the `Fit`, `uncertainty` its standard errors, `undetermined` says what the recordings do not
-determine, and `sparse` makes fits with fewer operators. `surrogates` identifies a linear modal model
+determine, and `sparse` makes fits with fewer operators. `surrogates` identifies a linear model in modes (`modal_form`)
 from a table of simulated inputs and outputs. `comparison` simulates models of any kind beside one recording.
 """
 
