@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..data import Recording
-from ..linear import resolvent
+from ..linear import resolvent, spectral_radius
 from ..models import (
     PILFR,
     Element,
@@ -245,7 +245,7 @@ def envelope_start(
 def _gain(linear: Values) -> Array:
     """Compute the static gain (n_y, n_u); 0 for an integrator."""
     a = linear["A"]
-    if len(a) and np.max(np.abs(np.linalg.eigvals(a))) > 0.9999:
+    if spectral_radius(a) > 0.9999:
         return np.zeros_like(linear["D_yu"])
     return linear["C_y"] @ np.linalg.solve(np.eye(len(a)) - a, linear["B_u"]) + linear["D_yu"]
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         modal as modal,
         propagate as propagate,
         resolvent as resolvent,
+        spectral_radius as spectral_radius,
         states_from_rest as states_from_rest,
         steady_state_gain as steady_state_gain,
         with_output_injection as with_output_injection,

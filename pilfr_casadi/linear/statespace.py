@@ -59,11 +59,16 @@ def resolvent(A: Array, C: Array, z: Array) -> Array:
     return X @ V.conj().T
 
 
+def spectral_radius(matrix: Array) -> float:
+    """Return the largest modulus of the eigenvalues; zero for a matrix without rows."""
+    return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
+
+
 def reflect_poles(A: Array) -> Array:
     """Move eigenvalues outside the unit circle (or on it) to ``1 / conj(lambda)``, strictly inside."""
     from scipy.linalg import schur
 
-    if np.max(np.abs(np.linalg.eigvals(A))) < 1:
+    if spectral_radius(A) < 1:
         return A
     T, V = schur(A, output="real")
     k = 0
@@ -203,7 +208,7 @@ def steady_state_gain(a: Array, c: Array, q: Array, r: Array) -> Array:
             with np.errstate(over="ignore", invalid="ignore"):  # balancing may overflow; the gain is checked below
                 p = solve_discrete_are(fading * a.T, c.T, q + 1e-12 * np.trace(q) / n * np.eye(n), r)
                 gain = innovation_gain(c @ p @ c.T + r, p, c, a)
-                radius = np.max(np.abs(np.linalg.eigvals(a - gain @ c)))
+                radius = spectral_radius(a - gain @ c)
         except (np.linalg.LinAlgError, ValueError):
             continue
         if radius < 1 + 1e-6 and np.all(np.isfinite(gain)):
