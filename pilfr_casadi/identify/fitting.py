@@ -277,7 +277,7 @@ def _search(structure: PILFR, context: FitContext, original: FitContext, starts:
 
 def model_at_values(structure: PILFR, first: Recording, values: Mapping[str, Any]) -> Model:
     """Make the model of a structure at values by name, with a recording's names of inputs and outputs."""
-    model = structure.model(first.n_u, first.n_y, inputs=first.inputs, outputs=first.outputs)
+    model = structure.model_for(first)
     unknown = sorted(set(values) - set(model.parameters))
     if unknown:
         raise InputError(
@@ -325,8 +325,7 @@ def _solve_and_refine(
 def _fit_linear(structure: PILFR, fitted: Model, context: FitContext) -> Fit:
     """Fit a linear model with the structure's bounds and fixed blocks, starting from the model without them."""
     values = {k: p.value for k, p in fitted.parameters.items()}
-    first = context.recordings[0]
-    model = structure.model(first.n_u, first.n_y, values, inputs=fitted.inputs, outputs=fitted.outputs)
+    model = structure.model_for(fitted, values)
     problem = context.problem(model)
     return _solve_and_refine(model, structure, problem, problem.start, context)
 

@@ -95,7 +95,7 @@ def _linear_start(recordings: Sequence[Recording], structure: PILFR, given: Any,
     blocks, form = {"A": a, "B_u": b, "C_y": c, "D_yu": d, "y_0": offset}, structure.linear()
     if is_modal(structure.fixed, structure.nx):
         blocks, form = in_modal_coordinates(blocks, tuple(recordings)), replace(form, fixed={"A": structure.fixed["A"]})
-    return form.model(first.n_u, first.n_y, blocks, inputs=first.inputs, outputs=first.outputs)
+    return form.model_for(first, blocks)
 
 
 def best_linear_matrices(recordings: Sequence[Recording], nx: int) -> tuple[Array, Array, Array, Array]:
@@ -151,7 +151,7 @@ def transform_to_known_basis(structure: PILFR, linear: Model, context: FitContex
     spread = np.sqrt(np.mean(simulate_states(blocks, np.concatenate([r.u for r in context.recordings])) ** 2, axis=0))
     blocks = find_nearest_basis(change_basis(blocks, np.diag(or_one(spread))), known)
     form = replace(structure.linear(), fixed=known)
-    model = form.model(linear.n_u, linear.n_y, blocks, inputs=linear.inputs, outputs=linear.outputs)
+    model = form.model_for(linear, blocks)
     problem = replace(context, constraints=stability_limits(structure, context.options.stable)[:1]).problem(model)
     if not np.isfinite(problem.cost(problem.start)):
         return model

@@ -81,8 +81,7 @@ class StartSearch:
 
     def model(self, values: dict[str, Any]) -> Model:
         """Make the closed model that starts at `values`."""
-        first = self.context.recordings[0]
-        return self.structure.model(first.n_u, first.n_y, values, inputs=first.inputs, outputs=first.outputs)
+        return self.structure.model_for(self.context.recordings[0], values)
 
 
 @one_blas_thread
