@@ -23,7 +23,15 @@ import numpy as np
 
 from .._base import InputError, Progress
 from ..data import Recording
-from ..linear import FrequencyProblem, in_modal_coordinates, is_modal, robust_bla, states_from_rest, subspace_matrices
+from ..linear import (
+    FrequencyProblem,
+    change_basis,
+    in_modal_coordinates,
+    is_modal,
+    robust_bla,
+    states_from_rest,
+    subspace_matrices,
+)
 from ..models import PILFR, Model, or_one
 from ..optimise import Constraint, GaussNewton, Problem, Solution, Status, stability_limits
 from .context import FitContext, report_iterations
@@ -156,12 +164,6 @@ def transform_to_known_basis(structure: PILFR, linear: Model, context: FitContex
     if not np.isfinite(problem.cost(problem.start)):
         return model
     return with_solution(model, problem, context.solve(problem, "linear model"))
-
-
-def change_basis(blocks: Values, t: Array) -> Blocks:
-    """Return the blocks with `x = T x'`."""
-    back = np.linalg.inv(t)
-    return {**blocks, "A": back @ blocks["A"] @ t, "B_u": back @ blocks["B_u"], "C_y": blocks["C_y"] @ t}
 
 
 def find_nearest_basis(blocks: Blocks, known: Values) -> Blocks:

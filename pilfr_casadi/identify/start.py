@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..data import Recording
-from ..linear import resolvent, spectral_radius
+from ..linear import resolvent, scale_states, spectral_radius
 from ..models import (
     PILFR,
     Element,
@@ -58,8 +58,7 @@ def unit_states(blocks: Values, inputs: Signals, free: bool = True) -> tuple[Blo
     if not free:
         return dict(blocks), states
     spread = or_one(np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0)))
-    scaled = {"A": blocks["A"] * spread / spread[:, None], "B_u": blocks["B_u"] / spread[:, None]}
-    return {**blocks, **scaled, "C_y": blocks["C_y"] * spread}, [x / spread for x in states]
+    return scale_states(blocks, spread), [x / spread for x in states]
 
 
 def paper_start(structure: PILFR, linear: Values, inputs: Signals, states: Signals, rng: np.random.Generator) -> Blocks:

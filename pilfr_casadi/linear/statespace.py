@@ -160,15 +160,24 @@ def modal_basis(a: Array) -> Array:
     return basis
 
 
+def change_basis(blocks: Mapping[str, Array], t: Array) -> dict[str, Array]:
+    """Return the blocks with `x = T x'`."""
+    back = np.linalg.inv(t)
+    return {**blocks, "A": back @ blocks["A"] @ t, "B_u": back @ blocks["B_u"], "C_y": blocks["C_y"] @ t}
+
+
+def scale_states(blocks: Mapping[str, Array], size: Array) -> dict[str, Array]:
+    """Return the blocks with each state in units of its size, (nx,)."""
+    a, b = blocks["A"] * size / size[:, None], blocks["B_u"] / size[:, None]
+    return {**blocks, "A": a, "B_u": b, "C_y": blocks["C_y"] * size}
+
+
 def in_modal_coordinates(blocks: Mapping[str, Array], recordings: tuple[Recording, ...]) -> dict[str, Array]:
     """Transform `A`, `B_u`, `C_y` to modal coordinates, with states of unit rms over the recordings."""
-    t = modal_basis(blocks["A"])
-    back = np.linalg.inv(t)
-    a, b = back @ blocks["A"] @ t, back @ blocks["B_u"]
-    a = np.where(np.isnan(modal(len(a))), a, 0.0)
-    states = [states_from_rest(a, b, r.u) for r in recordings]
-    spread = or_one(np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0)))
-    return {**blocks, "A": a * spread / spread[:, None], "B_u": b / spread[:, None], "C_y": blocks["C_y"] @ t * spread}
+    out = change_basis(blocks, modal_basis(blocks["A"]))
+    out["A"] = np.where(np.isnan(modal(len(out["A"]))), out["A"], 0.0)
+    states = [states_from_rest(out["A"], out["B_u"], r.u) for r in recordings]
+    return scale_states(out, or_one(np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0))))
 
 
 def innovation_gain(S: Any, P: Any, C: Any, A: Any = None) -> Any:
