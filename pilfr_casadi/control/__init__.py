@@ -13,7 +13,6 @@ if TYPE_CHECKING:
         ekf_step as ekf_step,
         kalman_filter as kalman_filter,
         roll_out as roll_out,
-        visibility as visibility,
     )
     from .inverse import (
         Feedforward as Feedforward,
@@ -21,5 +20,6 @@ if TYPE_CHECKING:
         feedforward as feedforward,
     )
     from .mpc import PredictiveController as PredictiveController
+    from .observability import visibility as visibility
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

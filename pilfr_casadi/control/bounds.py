@@ -19,6 +19,7 @@ import numpy as np
 
 from .._base import InputError, numbers
 from ..identify import Fit
+from ..linear import spectral_radius
 from ..models import element_bound
 
 Array = np.ndarray
@@ -84,7 +85,7 @@ def response_bound(fit: Fit, largest_input: Any) -> ResponseBound:
     if np.any(u < 0):
         raise InputError(f"The largest input is {u.min():g}; give a number of 0 or more.")
     A, element = p["A"], fit.structure.element
-    radius = float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0))
+    radius = spectral_radius(A)
     forces = np.zeros(0)
     if element is not None:
         fed_back = np.any(p["C_z"] != 0, axis=1)

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, numbers
-from .mpc import NO_LIMIT, as_step_function, check_task, penalty_weight
+from .control_task import NO_LIMIT, as_step_function, check_task, penalty_weight
 
 Array = np.ndarray
 

@@ -33,6 +33,7 @@ import numpy as np
 from .._base import InputError, is_whole, listed, numbers
 from ..data import Recording
 from ..identify import Fit, covariance, variance
+from ..linear import spectral_radius
 from ..optimise import Problem
 from .estimation import KalmanFilter, ModelSource, Rollout, build_jacobians, observer_function, roll_out
 
@@ -261,7 +262,7 @@ def _gain_and_radius(run: Rollout, recording: Recording, response: Response, d: 
         if gain:
             feedback = -np.hstack([g_x[:, run.linear], g_before]) / gain
             inverse = np.vstack([np.hstack([a, np.zeros((n, 1))]) + b @ feedback, feedback])
-            radii.append((abs(gain), float(np.max(np.abs(np.linalg.eigvals(inverse))))))
+            radii.append((abs(gain), spectral_radius(inverse)))
     # where a play sticks the gain may vanish, as in a dead zone; there the input jumps, within its bracket
     median = float(np.median(gains))
     radius = max((radius for gain, radius in radii if gain > SMALL_GAIN * median), default=0.0)
@@ -285,7 +286,7 @@ def _unstable_zeros(response: Response) -> Array:
 
 def _stability_limit(response: Response) -> float:
     """Return the spectral radius below which an inverse is stable; slow poles raise it, since zeros may cancel them."""
-    slowest = max(float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) for a, *_ in response.linear)
+    slowest = max(spectral_radius(a) for a, *_ in response.linear)
     return max(STABLE_RADIUS, 1 - (1 - min(slowest, 1.0)) / 10)
 
 

@@ -1,9 +1,10 @@
 """`fit`: identify a model from recordings.
 
-`fitting` holds `fit`, which checks its arguments and chooses the method. `start` computes start values, `multistart`
-chooses which of them are tried and polishes the best, `context` solves with the options that all fits share,
-`penalty` adds the L1 penalty, and `lagged` trains NARX and NOE models. `result` is the `Fit`, `uncertainty` its
-standard errors, and `sparse` makes fits with fewer operators from it. `surrogates` identifies a linear modal model
+`fitting` holds `fit`, which checks its arguments and chooses the method. `linear_start` finds the linear model from
+which a search begins, `start` computes start values, `multistart` chooses which of them are tried and polishes the
+best, `context` solves with the options that all fits share, `penalty` adds the L1 penalty, and `lagged` trains NARX and
+NOE models. `result` is the `Fit`, `uncertainty` its standard errors, `undetermined` says what the recordings do not
+determine, and `sparse` makes fits with fewer operators. `surrogates` identifies a linear model in modes (`modal_form`)
 from a table of simulated inputs and outputs. `comparison` simulates models of any kind beside one recording.
 """
 
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from .context import (
         FitContext as FitContext,
         check_recordings as check_recordings,
-        describe_reached_gain as describe_reached_gain,
         solve_within_bounds as solve_within_bounds,
     )
     from .fitting import fit as fit
@@ -31,6 +31,12 @@ if TYPE_CHECKING:
         one_step as one_step,
         solve_with_early_stopping as solve_with_early_stopping,
         split_validation as split_validation,
+    )
+    from .linear_start import (
+        BLA_OPTION as BLA_OPTION,
+        change_basis as change_basis,
+        find_nearest_basis as find_nearest_basis,
+        linear_model as linear_model,
     )
     from .multistart import (
         DEFAULT_SOLVER as DEFAULT_SOLVER,
@@ -62,14 +68,10 @@ if TYPE_CHECKING:
         thin_operators as thin_operators,
     )
     from .start import (
-        BLA_OPTION as BLA_OPTION,
-        change_basis as change_basis,
         deconvolve_inputs as deconvolve_inputs,
         envelope_start as envelope_start,
-        find_nearest_basis as find_nearest_basis,
         fit_envelope as fit_envelope,
         grid_start as grid_start,
-        linear_model as linear_model,
         loop_outline as loop_outline,
         network_start as network_start,
         paper_start as paper_start,
@@ -88,6 +90,6 @@ if TYPE_CHECKING:
         standard_errors as standard_errors,
         variance as variance,
     )
-
+    from .undetermined import describe_reached_gain as describe_reached_gain
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -35,10 +35,10 @@ from ..optimise import (
 from ..simulators import Simulator, discretise_for
 from .context import FitContext, Stage, check_recordings, mark_interrupted, rms_error, without_density_prior
 from .lagged import check_lagged_options, fit_lagged
+from .linear_start import known_entries, linear_model, transform_to_known_basis
 from .multistart import DEFAULT_SOLVER, MOST_POLISHED, START_KINDS, StartSearch, search_starts
 from .penalty import check_penalty, solve_with_penalty
 from .result import Fit, FitOptions, match_channels, with_solution
-from .start import known_entries, linear_model, transform_to_known_basis
 
 DEAD_WORKER = (
     "A worker process ended before it returned a result (it may have run out of memory); use fewer workers, or "
@@ -277,7 +277,7 @@ def _search(structure: PILFR, context: FitContext, original: FitContext, starts:
 
 def model_at_values(structure: PILFR, first: Recording, values: Mapping[str, Any]) -> Model:
     """Make the model of a structure at values by name, with a recording's names of inputs and outputs."""
-    model = structure.model(first.n_u, first.n_y, inputs=first.inputs, outputs=first.outputs)
+    model = structure.model_for(first)
     unknown = sorted(set(values) - set(model.parameters))
     if unknown:
         raise InputError(
@@ -325,8 +325,7 @@ def _solve_and_refine(
 def _fit_linear(structure: PILFR, fitted: Model, context: FitContext) -> Fit:
     """Fit a linear model with the structure's bounds and fixed blocks, starting from the model without them."""
     values = {k: p.value for k, p in fitted.parameters.items()}
-    first = context.recordings[0]
-    model = structure.model(first.n_u, first.n_y, values, inputs=fitted.inputs, outputs=fitted.outputs)
+    model = structure.model_for(fitted, values)
     problem = context.problem(model)
     return _solve_and_refine(model, structure, problem, problem.start, context)
 

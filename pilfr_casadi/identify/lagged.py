@@ -121,10 +121,8 @@ def fit_lagged(
 @one_blas_thread
 def explore_lagged(search: LaggedSearch, seed: int, sequence: np.random.SeedSequence) -> Candidate:
     """Run one start to its end."""
-    first = search.training[0]
     values = lagged_start(search.lagged, search.structure, search.training, np.random.default_rng(sequence))
-    names = {"inputs": first.inputs, "outputs": first.outputs}
-    model = search.structure.model(first.n_u, first.n_y, values, **names)
+    model = search.structure.model_for(search.training[0], values)
     solution, engine = None, None
     shares = OUTPUT_SHARES[:1] if isinstance(search.lagged, NARX) else OUTPUT_SHARES
     for share in shares:

@@ -43,8 +43,9 @@ from ..models import (
 )
 from ..optimise import Candidate, GaussNewton, Problem, Solution, Status, at_active_radius, loosen_radii
 from .context import FitContext, solve_within_bounds
+from .linear_start import Blocks
 from .result import DENSITY_PRIOR
-from .start import Blocks, envelope_start, grid_start, has_networks, network_start, paper_start, unit_states
+from .start import envelope_start, grid_start, has_networks, network_start, paper_start, unit_states
 
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
 DEFAULT_SOLVER: GaussNewton = GaussNewton(max_iterations=200, tolerance=1e-4)  # of `fit`, and of every polish
@@ -80,8 +81,7 @@ class StartSearch:
 
     def model(self, values: dict[str, Any]) -> Model:
         """Make the closed model that starts at `values`."""
-        first = self.context.recordings[0]
-        return self.structure.model(first.n_u, first.n_y, values, inputs=first.inputs, outputs=first.outputs)
+        return self.structure.model_for(self.context.recordings[0], values)
 
 
 @one_blas_thread

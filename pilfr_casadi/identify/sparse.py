@@ -126,11 +126,10 @@ def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> F
         bounds={k: (select(v[0]), select(v[1])) if k in LAYER else v for k, v in structure.bounds.items()},
         priors={k: (select(v[0]), select(v[1])) if k in LAYER else v for k, v in structure.priors.items()},
     )
-    old = fit.model
     values = {k: select(v) if k in LAYER else v for k, v in fit.parameters.items()}
-    model = smaller.model(old.n_u, old.n_y, values, inputs=old.inputs, outputs=old.outputs)
+    model, n_x = smaller.model_for(fit.model, values), fit.model.n_x
     memory = (np.arange(element.channels)[:, None] * element.n + kept).ravel()
-    initial = {key: np.concatenate([s[: old.n_x], s[old.n_x :][memory]]) for key, s in fit.initial.items()}
+    initial = {key: np.concatenate([s[:n_x], s[n_x:][memory]]) for key, s in fit.initial.items()}
     fitted = identify(replace(fit, model=model, structure=smaller, initial=initial), train, **options)
     return fitted if fitted.status is Status.INTERRUPTED else polish_fit(fitted, train, **options)
 
@@ -292,18 +291,17 @@ def thin_operators(
     bound = structure is None or set(LAYER) & {*structure.fixed, *structure.bounds, *structure.priors}
     if structure is None or bound or not isinstance(structure.element, PrandtlIshlinskii):
         return ()
-    smaller, old = replace(structure, element=replace(structure.element, n=n)), fit.model
+    smaller = replace(structure, element=replace(structure.element, n=n))
     z = np.concatenate([fit.signals(r)["z"] for r in recordings])
     states = [fit.initial_state(r) for r in recordings if r.begins == "estimate"]
-    states = [np.concatenate([s[: old.n_x], np.zeros(n * structure.element.channels)]) for s in states]
+    states = [np.concatenate([s[: fit.model.n_x], np.zeros(n * structure.element.channels)]) for s in states]
     fits: list[Fit] = []
     for extent, spacing in SPREADINGS:
         context = context_of_fit(
             replace(fit, structure=smaller), recordings, solver=solver or DEFAULT_SOLVER, **options
         )
         values = regrid_channels(structure, fit.parameters, z, extent=extent, spacing=spacing, count=n)
-        model = smaller.model(old.n_u, old.n_y, values, inputs=old.inputs, outputs=old.outputs)
-        model = hold_near_density(model, values, SPREAD)
+        model = hold_near_density(smaller.model_for(fit.model, values), values, SPREAD)
         problem = context.problem(model, float(np.mean(fit.train_nrmse)))
         begin = np.concatenate([problem.start[: problem.n_free], *states])
         if not np.isfinite(problem.cost(begin)):

@@ -282,7 +282,7 @@ class Law:
         own = vars(cls)
         if "applies" in own and "why_not" not in own:  # the old name of the method
             cls.why_not = own["applies"]  # type: ignore[method-assign]
-        if "units" in vars(cls) and "strength" not in vars(cls):
+        if "units" in own and "strength" not in own:
             cls.strength = tuple(name for name, unit in cls.units.items() if re.match(r"w\b", unit))
 
     def __post_init__(self) -> None:

@@ -15,12 +15,15 @@ if TYPE_CHECKING:
     from .parts import LinearPart as LinearPart, linear_parts as linear_parts
     from .statespace import (
         INJECTION as INJECTION,
+        change_basis as change_basis,
         in_modal_coordinates as in_modal_coordinates,
         is_modal as is_modal,
         measurement_update as measurement_update,
         modal as modal,
         propagate as propagate,
         resolvent as resolvent,
+        scale_states as scale_states,
+        spectral_radius as spectral_radius,
         states_from_rest as states_from_rest,
         steady_state_gain as steady_state_gain,
         with_output_injection as with_output_injection,

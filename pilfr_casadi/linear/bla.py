@@ -256,22 +256,9 @@ def plain_bla(
             "cannot be estimated, leave it out."
         )
     lines = [_excited_spectrum(r, scale, floor) for r in records]
-    shortest = min(range(len(lines)), key=lambda r: len(lines[r][0]))
-    available = len(lines[shortest][0])
-    n_u, n_rec, n_poly = len(scale), len(records), order + 1
-    step = max(1, -(-available // n_frequencies))
-    if window is None:
-        need = n_poly + -(-(n_poly * n_u + max(10, (n_poly * (n_u + n_rec)) // 2)) // n_rec)
-        window = max(need, step)
-    if window > available or n_rec * window <= n_poly * (n_u + n_rec):
-        raise InputError(
-            f"{n_rec} recording(s) with at least {available} excited lines cannot fill windows of {window} lines for "
-            f"polynomials of order {order} and {n_u} input(s); record longer or lower the order."
-        )
-    grid = lines[shortest][0][step // 2 :: step]
-    share = [max(window, min(len(f), round(window * len(f) / available))) for f, _, _ in lines]
-    per_frequency = sum(share) * n_poly * (n_u + n_rec)
-    chunk = max(1, CHUNK // per_frequency)
+    grid, share = _choose_windows(lines, order, window, n_frequencies)
+    n_u = len(scale)
+    chunk = max(1, CHUNK // (sum(share) * (order + 1) * (n_u + len(records))))
     parts = [_local_polynomials(grid[k : k + chunk], lines, share, order) for k in range(0, len(grid), chunk)]
     G, var, good, inflation = (np.concatenate(p) for p in zip(*parts, strict=True))
     if not good.any():
@@ -396,6 +383,25 @@ def _excited_spectrum(r: Recording, scale: Array, floor: float) -> tuple[Array, 
     size = np.abs(U)
     excited = np.flatnonzero(np.any(size > floor * size.max(axis=0), axis=1))
     return excited / (N * r.dt), U[excited], Y[excited]
+
+
+def _choose_windows(
+    lines: list[tuple[Array, Array, Array]], order: int, window: int | None, n_frequencies: int
+) -> tuple[Array, list[int]]:
+    """Choose the frequencies to return, and the number of excited lines of each recording in a window around them."""
+    shortest = min(lines, key=lambda spectrum: len(spectrum[0]))[0]
+    available, n_u, n_rec, n_poly = len(shortest), lines[0][1].shape[1], len(lines), order + 1
+    step = max(1, -(-available // n_frequencies))
+    if window is None:
+        need = n_poly + -(-(n_poly * n_u + max(10, (n_poly * (n_u + n_rec)) // 2)) // n_rec)
+        window = max(need, step)
+    if window > available or n_rec * window <= n_poly * (n_u + n_rec):
+        raise InputError(
+            f"{n_rec} recording(s) with at least {available} excited lines cannot fill windows of {window} lines for "
+            f"polynomials of order {order} and {n_u} input(s); record longer or lower the order."
+        )
+    share = [max(window, min(len(f), round(window * len(f) / available))) for f, _, _ in lines]
+    return shortest[step // 2 :: step], share
 
 
 def _local_polynomials(

@@ -59,11 +59,16 @@ def resolvent(A: Array, C: Array, z: Array) -> Array:
     return X @ V.conj().T
 
 
+def spectral_radius(matrix: Array) -> float:
+    """Return the largest modulus of the eigenvalues; zero for a matrix without rows."""
+    return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
+
+
 def reflect_poles(A: Array) -> Array:
     """Move eigenvalues outside the unit circle (or on it) to ``1 / conj(lambda)``, strictly inside."""
     from scipy.linalg import schur
 
-    if np.max(np.abs(np.linalg.eigvals(A))) < 1:
+    if spectral_radius(A) < 1:
         return A
     T, V = schur(A, output="real")
     k = 0
@@ -155,15 +160,24 @@ def modal_basis(a: Array) -> Array:
     return basis
 
 
+def change_basis(blocks: Mapping[str, Array], t: Array) -> dict[str, Array]:
+    """Return the blocks with `x = T x'`."""
+    back = np.linalg.inv(t)
+    return {**blocks, "A": back @ blocks["A"] @ t, "B_u": back @ blocks["B_u"], "C_y": blocks["C_y"] @ t}
+
+
+def scale_states(blocks: Mapping[str, Array], size: Array) -> dict[str, Array]:
+    """Return the blocks with each state in units of its size, (nx,)."""
+    a, b = blocks["A"] * size / size[:, None], blocks["B_u"] / size[:, None]
+    return {**blocks, "A": a, "B_u": b, "C_y": blocks["C_y"] * size}
+
+
 def in_modal_coordinates(blocks: Mapping[str, Array], recordings: tuple[Recording, ...]) -> dict[str, Array]:
     """Transform `A`, `B_u`, `C_y` to modal coordinates, with states of unit rms over the recordings."""
-    t = modal_basis(blocks["A"])
-    back = np.linalg.inv(t)
-    a, b = back @ blocks["A"] @ t, back @ blocks["B_u"]
-    a = np.where(np.isnan(modal(len(a))), a, 0.0)
-    states = [states_from_rest(a, b, r.u) for r in recordings]
-    spread = or_one(np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0)))
-    return {**blocks, "A": a * spread / spread[:, None], "B_u": b / spread[:, None], "C_y": blocks["C_y"] @ t * spread}
+    out = change_basis(blocks, modal_basis(blocks["A"]))
+    out["A"] = np.where(np.isnan(modal(len(out["A"]))), out["A"], 0.0)
+    states = [states_from_rest(out["A"], out["B_u"], r.u) for r in recordings]
+    return scale_states(out, or_one(np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0))))
 
 
 def innovation_gain(S: Any, P: Any, C: Any, A: Any = None) -> Any:
@@ -203,7 +217,7 @@ def steady_state_gain(a: Array, c: Array, q: Array, r: Array) -> Array:
             with np.errstate(over="ignore", invalid="ignore"):  # balancing may overflow; the gain is checked below
                 p = solve_discrete_are(fading * a.T, c.T, q + 1e-12 * np.trace(q) / n * np.eye(n), r)
                 gain = innovation_gain(c @ p @ c.T + r, p, c, a)
-                radius = np.max(np.abs(np.linalg.eigvals(a - gain @ c)))
+                radius = spectral_radius(a - gain @ c)
         except (np.linalg.LinAlgError, ValueError):
             continue
         if radius < 1 + 1e-6 and np.all(np.isfinite(gain)):

@@ -25,10 +25,10 @@ import numpy as np
 from .._base import InputError
 from .elements import PrandtlIshlinskii
 from .operators import Play, Stop
-from .pilfr import PILFR, is_zero
+from .pilfr import PILFR, is_zero, with_port_gain
 
 Array = np.ndarray
-# each block that takes up a slope, and the two blocks whose product it takes up
+# each block that takes up a slope (in the order of `with_port_gain`), and the two blocks whose product it takes up
 SLOPES = {"A": ("B_w", "C_z"), "B_u": ("B_w", "D_zu"), "C_y": ("D_yw", "C_z"), "D_yu": ("D_yw", "D_zu")}
 MIRRORED = ("B_w", "D_yw")
 
@@ -36,9 +36,7 @@ MIRRORED = ("B_w", "D_yw")
 def complement(values: Mapping[str, Any]) -> dict[str, Array]:
     """Convert the blocks and weights of a PI-LFR from plays to stops or back; further names are passed on."""
     out = {name: np.array(value, dtype=float) for name, value in values.items()}
-    total = out["w"].sum(axis=1)
-    for name, (into, out_of) in SLOPES.items():
-        out[name] = out[name] + (values[into] * total) @ values[out_of]
+    out |= dict(zip(SLOPES, with_port_gain(out, np.diag(out["w"].sum(axis=1))), strict=True))
     for name in MIRRORED:
         out[name] = -out[name]
     return out

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, filled, whole
+from ..data import Recording
 from .elements import Element, is_element
 from .model import Model, close_loop, open_model
 from .parameters import Parameter, ParameterSet, check_size
@@ -149,6 +150,10 @@ class PILFR:
             model = close_loop(model, self.element)
         changes = {name: self._fields(name, p, values) for name, p in model.parameters.items()}
         return model.with_parameters(model.parameters.change(**changes))
+
+    def model_for(self, signals: Recording | Model, values: Mapping[str, Any] | None = None) -> Model:
+        """Build the closed model for the inputs and outputs of a recording or of another model, with their names."""
+        return self.model(signals.n_u, signals.n_y, values, inputs=signals.inputs, outputs=signals.outputs)
 
     def _fields(self, name: str, p: Parameter, values: Mapping[str, Any]) -> dict[str, Any]:
         """Make the fields of a parameter from the structure's options and the start values."""

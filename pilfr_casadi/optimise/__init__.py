@@ -1,11 +1,11 @@
 """The simulation-error problem, its constraints, and the solvers.
 
-`problem` states the problem and computes its derivatives, `constraints` holds constraints on named parameters,
-`gauss_newton` is the default solver (its damping is the class `Damping`, the first value `GaussNewton(damping=...)`),
-`ipopt` the other one. `initial_state` estimates the state in which a further recording begins; in a fit such states are
-variables of the problem. `steady_state` finds the state of a periodic recording. `exact_limits` solves at exact bounds
-on spectral radii and moves results into the feasible set. `solution` holds the result of a solver, its status and its
-active limits.
+`problem` states the problem and computes its derivatives, `penalties` adds priors and L1 terms, `constraints` holds
+constraints on named parameters. `gauss_newton` is the default solver (its damping is the class `Damping`, the first
+value `GaussNewton(damping=...)`) and solves a `quadratic_program` for each step; `ipopt` is the other solver.
+`initial_state` estimates the state in which a further recording begins; in a fit such states are variables of the
+problem. `steady_state` finds the state of a periodic recording. `exact_limits` solves at exact bounds on spectral radii
+and moves results into the feasible set. `solution` holds the result of a solver, its status and its active limits.
 """
 
 from typing import TYPE_CHECKING
@@ -32,10 +32,7 @@ if TYPE_CHECKING:
         solve_within_radii as solve_within_radii,
         violated_exact as violated_exact,
     )
-    from .gauss_newton import (
-        GaussNewton as GaussNewton,
-        unconstrained_step as unconstrained_step,
-    )
+    from .gauss_newton import GaussNewton as GaussNewton
     from .initial_state import (
         StatePrior as StatePrior,
         estimate_initial_state as estimate_initial_state,
@@ -43,7 +40,9 @@ if TYPE_CHECKING:
         samples_to_start as samples_to_start,
     )
     from .ipopt import Ipopt as Ipopt
-    from .problem import Problem as Problem, check_penalised as check_penalised, check_weights as check_weights
+    from .penalties import check_penalised as check_penalised
+    from .problem import Problem as Problem, check_weights as check_weights
+    from .quadratic_program import unconstrained_step as unconstrained_step
     from .solution import (
         Candidate as Candidate,
         Iteration as Iteration,

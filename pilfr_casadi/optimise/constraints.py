@@ -27,6 +27,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, filled, numbers
+from ..linear import spectral_radius
 from ..models import (
     PILFR,
     GeneralizedPlay,
@@ -115,8 +116,7 @@ class RadiusExcess:
 
     def __call__(self, p: Mapping[str, Any]) -> float:
         """Return the excess; 0 or less where the bound holds."""
-        numbers = np.asarray(ca.DM(self.matrix({name: ca.DM(value) for name, value in p.items()})))
-        return float(np.max(np.abs(np.linalg.eigvals(numbers)), initial=0.0)) - self.radius
+        return spectral_radius(np.asarray(ca.DM(self.matrix({k: ca.DM(v) for k, v in p.items()})))) - self.radius
 
 
 def stable(
@@ -197,7 +197,7 @@ def describe_unbounded(structure: PILFR | None, constraints: Iterable[Constraint
     worst = 0.0
     for side in "lr":
         slope = np.diag(np.sum(p["w"], axis=1) * element.operator.steepest(side, p))
-        worst = max(worst, float(np.max(np.abs(np.linalg.eigvals(p["A"] + p["B_w"] @ slope @ p["C_z"])))))
+        worst = max(worst, spectral_radius(p["A"] + p["B_w"] @ slope @ p["C_z"]))
     if worst <= min(radii):
         return ""
     return (
@@ -232,7 +232,7 @@ def least_radius(low: np.ndarray, high: np.ndarray) -> float:
     least = max(low_trace, -high_trace, 0.0) / max(len(low), 1)
     for bound, sign in ((low, 1.0), (high, -1.0)):
         if np.all(np.isfinite(bound)) and np.all(sign * bound >= 0):
-            least = max(least, float(np.max(np.abs(np.linalg.eigvals(bound)), initial=0.0)))
+            least = max(least, spectral_radius(bound))
     return least
 
 

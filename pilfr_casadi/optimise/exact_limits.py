@@ -44,8 +44,9 @@ import numpy as np
 
 from ..models import Neighbours, or_one
 from .constraints import FEASIBILITY_TOLERANCE, Constraint, RadiusExcess, loosen_radii
-from .gauss_newton import GaussNewton, QuadraticProgram, replace_rounding
+from .gauss_newton import GaussNewton, replace_rounding
 from .problem import Problem
+from .quadratic_program import QuadraticProgram
 from .solution import ACTIVE_MULTIPLIER, IterationCallback, Solution, Status
 
 Array = np.ndarray

@@ -1,7 +1,7 @@
 """The initial state of a recording at known parameters: given, at rest, in steady state, or estimated.
 
 In a fit, initial states that are to be estimated are variables of the problem (`place_recordings` in `problem`), with
-the same prior (`state_precision` there).
+the same prior (`state_precision` in `penalties`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from ..data import Recording
 from ..engine import Engine
 from ..models import Model
 from .gauss_newton import GaussNewton
-from .problem import STATE_NOISE, Penalties, Problem, state_precision
+from .penalties import STATE_NOISE, Penalties, state_precision
+from .problem import Problem
 from .steady_state import steady_state
 
 STATE_ROUNDS = 20  # most solves for a first state, each with a wider prior

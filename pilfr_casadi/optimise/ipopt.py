@@ -24,8 +24,9 @@ import numpy as np
 
 from .._base import InputError, handled_interrupt
 from ..models import or_one
-from .gauss_newton import ACCEPTED_RATIO, LEAST_DAMPING, MOST_DAMPING, SMALLEST_DIVISOR, ZERO_COLUMN, Damping
+from .gauss_newton import ACCEPTED_RATIO, LEAST_DAMPING, MOST_DAMPING, ZERO_COLUMN, Damping
 from .problem import Problem
+from .quadratic_program import SMALLEST_DIVISOR
 from .solution import Iteration, IterationCallback, Solution, Status, check_solver_options
 
 SETTINGS = {

@@ -25,6 +25,16 @@ if TYPE_CHECKING:
         refined_hysteresis as refined_hysteresis,
         strength_over_signal as strength_over_signal,
     )
+    from .fit_signals import (
+        as_scored as as_scored,
+        compares_linear as compares_linear,
+        linear_simulation as linear_simulation,
+        output_over_input as output_over_input,
+        remains as remains,
+        spectrum as spectrum,
+        time as time,
+        traces as traces,
+    )
     from .fits import (
         convergence as convergence,
         loading_curve as loading_curve,
@@ -43,19 +53,11 @@ if TYPE_CHECKING:
     from .signals import (
         Simulated as Simulated,
         amplitude_density as amplitude_density,
-        as_scored as as_scored,
         compared_residuals as compared_residuals,
         compared_spectra as compared_spectra,
         compared_traces as compared_traces,
-        compares_linear as compares_linear,
-        linear_simulation as linear_simulation,
-        output_over_input as output_over_input,
         plot_comparison as plot_comparison,
         plot_recording as plot_recording,
-        remains as remains,
-        spectrum as spectrum,
-        time as time,
-        traces as traces,
     )
     from .statistics import (
         best_linear_approximation as best_linear_approximation,

@@ -22,7 +22,6 @@ from .canvas import (
     PALE_GREY,
     SKY,
     VERMILLION,
-    axes_or_new,
     choose_scale,
     finish,
     line,
@@ -42,7 +41,7 @@ LINE_POINTS = 400  # samples along which laws are drawn over a learned force: a 
 
 def mismatch_map(found: Mapping[str, Any], unit: str = "") -> Axes:
     """Draw the residual over frequency and amplitude (`diagnose.mismatch`), in % of the outputs' deviation."""
-    ax = axes_or_new(None)
+    ax = new_figure().add_subplot()
     data, (size, label) = found["map"], _scale_outputs(found, unit)
     edges, rms = np.asarray(data["edges"]) * size, 100 * np.array(data["rms"], dtype=float)
     top = max(float(np.nanmax(rms, initial=0.0)), 1e-12)
@@ -78,7 +77,7 @@ def _scale_outputs(found: Mapping[str, Any], unit: str, kind: str = "amplitude")
 
 def mismatch_bands(found: Mapping[str, Any]) -> Axes:
     """Draw the residual and the noise floor of each frequency band; fill bands with a tenth or more of the mismatch."""
-    ax = axes_or_new(None)
+    ax = new_figure().add_subplot()
     data = found["frequency"]
     edges = _log_edges(data["low"], data["high"])
     rms, floor = (100 * np.sqrt(np.asarray(data[k])) for k in ("power", "floor"))
@@ -97,7 +96,7 @@ def mismatch_bands(found: Mapping[str, Any]) -> Axes:
 
 def mismatch_growth(found: Mapping[str, Any], unit: str = "", kind: str = "amplitude") -> Axes:
     """Draw the residual over the `amplitude` or the `rate` of the output, and a proportional error to compare with."""
-    ax = axes_or_new(None)
+    ax = new_figure().add_subplot()
     data, (size, label) = found[kind], _scale_outputs(found, unit, kind)
     edges = np.asarray(data["edges"])
     middle = (edges[1:] + edges[:-1]) / 2
@@ -115,7 +114,7 @@ def mismatch_growth(found: Mapping[str, Any], unit: str = "", kind: str = "ampli
 
 def mismatch_level(found: Mapping[str, Any], unit: str = "") -> Axes:
     """Draw the residual over the value of the output that shows most of it, to reveal an asymmetry."""
-    ax = axes_or_new(None)
+    ax = new_figure().add_subplot()
     data = found["level"]
     edges = found["scale"][data["output"]] * np.asarray(data["edges"])
     size, across = scale_axis(data["output"], edges, unit)
@@ -127,7 +126,7 @@ def mismatch_level(found: Mapping[str, Any], unit: str = "") -> Axes:
 
 def mismatch_time(found: Mapping[str, Any]) -> Axes:
     """Draw residual and motion over time, one recording after the other."""
-    ax = axes_or_new(None)
+    ax = new_figure().add_subplot()
     at = 0.0
     for k, part in enumerate(found["time"]):
         t = np.asarray(part["t"])
@@ -191,7 +190,7 @@ def force_cloud(
     A law that is a curve of the signal is drawn from left to right; drawn in time order, its samples would be joined by
     chords.
     """
-    ax = axes_or_new(None)
+    ax = new_figure().add_subplot()
     sx, sy, across, up = _draw_cloud(ax, x, force, alpha=0.55, label="recovered from the recording")
     order = np.argsort(law_x, kind="stable")
     if np.sum(np.abs(np.diff(law[order]))) <= np.sum(np.abs(np.diff(law))):
@@ -218,7 +217,7 @@ def learned_force(x: Signal, force: Signal, laws: Sequence[tuple[str, np.ndarray
     laws : sequence of (name, force)
         Forces (K,) along the same signal; non-finite samples are left out.
     """
-    ax = axes_or_new(None)
+    ax = new_figure().add_subplot()
     sx, sy, across, up = _draw_cloud(ax, x, force, alpha=0.35, label="learned force")
     known = np.flatnonzero(np.all([np.isfinite(f) for _, f in laws], axis=0)) if laws else np.zeros(0, dtype=int)
     if len(known):
@@ -234,7 +233,7 @@ def learned_force(x: Signal, force: Signal, laws: Sequence[tuple[str, np.ndarray
 
 def strength_over_signal(signal: Signal, strength: Signal, seen: np.ndarray, *, title: str = "") -> Axes:
     """Draw the strength (G,) of a law over the signal (G,) that varies it, and the values `seen` in recordings (M,)."""
-    ax = axes_or_new(None)
+    ax = new_figure().add_subplot()
     (sx, across), (sy, up) = signal.scale_axis(), strength.scale_axis()
     ax.plot(signal.values / sx, strength.values / sy, color=VERMILLION, linewidth=1.6, label="fitted strength")
     share, edges = np.histogram(seen, STRENGTH_BINS, (float(signal.values[0]), float(signal.values[-1])))
@@ -295,7 +294,7 @@ def refined_hysteresis(
 
 def force_time(t: np.ndarray, recovered: Signal, std: np.ndarray, law: np.ndarray, name: str = "law") -> Axes:
     """Draw a recovered force over time with its uncertainty, around its largest value, and the law's force."""
-    ax, force = axes_or_new(None), recovered.values
+    ax, force = new_figure().add_subplot(), recovered.values
     size, up = recovered.scale_axis()
     window = max(min(len(force), 400), len(force) // 12)
     peak = int(np.argmax(np.abs(force)))
@@ -313,7 +312,7 @@ def force_time(t: np.ndarray, recovered: Signal, std: np.ndarray, law: np.ndarra
 
 def force_remainder(x: Signal, left: Signal, std: np.ndarray) -> Axes:
     """Draw a recovered force minus the law over the local coordinate as points, with the mean."""
-    ax = axes_or_new(None)
+    ax = new_figure().add_subplot()
     sx, sy, across, up = _draw_cloud(ax, x, left, alpha=0.4)
     edges = np.quantile(x.values, np.linspace(0, 1, 21))
     index = np.clip(np.searchsorted(edges, x.values, side="right") - 1, 0, 19)

@@ -17,7 +17,7 @@ from ..data import Recording, as_recordings
 from ..models import weight_density
 from ..optimise import Iteration
 from .canvas import BLUE, GREY, PALE_BLUE, SKY, VERMILLION, axes_or_new, finish, new_figure, with_unit
-from .signals import PlottedFit, as_scored, spectrum, time
+from .fit_signals import PlottedFit, as_scored, spectrum, time
 
 Records = Recording | Sequence[Recording]
 FEWEST_FOR_DENSITY = 4  # operators in use; fewer weights do not sample a density

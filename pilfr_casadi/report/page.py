@@ -209,7 +209,7 @@ Block = Text | Code | Table | Picture
 
 @dataclass(frozen=True)
 class Section:
-    """A read_asset of a page under its own heading."""
+    """A part of a page under its own heading."""
 
     title: str
     blocks: Sequence[Block]

@@ -1,8 +1,8 @@
 """Studies of many jobs in a folder of results: runs and campaigns, which a run file describes, and fleets of machines.
 
 `executor` runs jobs of any kind side by side, `folder` keeps their results. Runs: `schema` (the tables of the file),
-`run_file`, `jobs`, `execution`, `summary`. Fleets: `fleets` (the steps), `machines` (the steps at one machine),
-`population` (statistics over machines), `fleet_result`.
+`run_file`, `jobs`, `execution`, `store`, `summary`. Fleets: `fleets` (the steps), `machines` (the steps at one
+machine), `population` (statistics over machines), `fleet_result`.
 """
 
 from typing import TYPE_CHECKING

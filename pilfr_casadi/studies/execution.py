@@ -26,9 +26,10 @@ from ..identify import Fit, is_drawn
 from ..models import PILFR, places
 from ..optimise import Status
 from .executor import AHEAD, Batch, Effort, run_side_by_side
-from .folder import PAGE, PICTURE, SUMMARY, TABLE, Store, check_own, lock_folder, read_times
+from .folder import PAGE, PICTURE, SUMMARY, TABLE, check_own, lock_folder, read_times
 from .jobs import MODEL, RunJob, execute_job, fold, input_digests, jobs_of
 from .run_file import ROLES, Cell, Run, read_run
+from .store import Store
 from .summary import (
     CellSummary,
     Score,

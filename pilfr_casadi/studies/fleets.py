@@ -259,7 +259,7 @@ class _FleetExecution:
         common, hold = common_physics(self._run_step(SAMPLE, names))
         if self.work.hold is None and self.work.simulator.hold is None:
             self.work = replace(self.work, hold=hold)
-        entries = self._run_step(MEASURE, list(self.machines), common.laws, common.starts)
+        entries = self._run_step(MEASURE, list(self.machines), common.laws, dict.fromkeys(self.machines, common.starts))
         values, remainder = distributions(entries, self._units(common.laws), times)
         if not values and not np.isfinite(remainder.mean):
             raise NoModel(f"No machine could be fitted; {entries[next(iter(entries))]['sentence']}")
@@ -291,16 +291,15 @@ class _FleetExecution:
         step: str,
         names: Sequence[str],
         laws: tuple[LawAt, ...] = (),
-        starts: Sequence[Mapping[str, Any]] | Mapping[str, Any] = (),
+        starts: Mapping[str, tuple[Mapping[str, Any], ...]] | None = None,
     ) -> dict[str, dict[str, Any]]:
         """Execute a step at some machines, unless it is complete there; return the entries.
 
-        `starts` are the start values of all machines, or a mapping from each machine to its own.
+        `starts` are the start values by machine.
         """
         jobs = []
         for name in names:
-            own = (starts[name],) if isinstance(starts, Mapping) else tuple(starts)
-            job = MachineJob(step, name, "", self.machines[name], laws, own)
+            job = MachineJob(step, name, "", self.machines[name], laws, starts[name] if starts else ())
             jobs.append(replace(job, key=digest([self.work.key(job), versions()])))
         self.jobs |= {job.id: job for job in jobs}
         ready = {job.id for job in jobs if self._is_complete(job)}
@@ -346,8 +345,8 @@ class _FleetExecution:
         """
         names = sorted((n for n, m in judged.items() if m.beyond > SURE), key=lambda n: (-judged[n].ratio, n))
         self.total += len(names)
-        values = {n: {k: np.asarray(v, dtype=float) for k, v in entries[n]["parameters"].items()} for n in names}
-        found = self._run_step(REST, names, laws, values)
+        starts = {n: ({k: np.asarray(v, dtype=float) for k, v in entries[n]["parameters"].items()},) for n in names}
+        found = self._run_step(REST, names, laws, starts)
         out = dict(judged)
         for name, m in judged.items():
             diagnosed = "fit" in found.get(name, {})  # rather than failed, or a faulty recording

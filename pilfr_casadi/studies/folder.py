@@ -1,4 +1,4 @@
-"""The folder of a study: its lock, manifest, models and tables, and which jobs are complete.
+"""The folder of a study: the names of its files, its lock, and its manifest.
 
 The manifest lists the jobs, the inputs, the versions, and the SHA-256 of every file. It includes its own digest, which
 reveals an edited manifest, as the digests of the files reveal edited models and tables. It has no times: on one
@@ -11,26 +11,18 @@ import contextlib
 import json
 import os
 import re
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from .._base import InputError, digest, listed, make_folder, read_bytes, write_atomically
-from ..identify import load
-from ..models import Model
-from .executor import FAILED, LOST, TIMED_OUT, Batch, versions
-from .jobs import MODEL, WITHOUT_MODEL, Recordings, RunJob, error_of, scored_files
-from .run_file import Run
-from .summary import Score, results_table
+from .executor import Batch, versions
+from .jobs import MODEL
 
 VERSION, MANIFEST = 1, "manifest.json"
 TABLE, PAGE, TIMES, JOBS, LOCK = "results.csv", "report.html", "times.json", "jobs", ".lock"
 SUMMARY, PICTURE = "summary.csv", "spread.png"  # of a campaign
-TABLE_PAUSE = 1.0  # least seconds between two updates of the table of a running campaign
 ADVICE = "restore it, or give --overwrite to compute everything again"
 
 
@@ -62,7 +54,7 @@ class Layout:
         return re.fullmatch(rf"\.({names})\.[0-9a-f]{{8}}\.tmp", name) is not None
 
 
-RUN = Layout("run", "run file", (TABLE, PAGE, MODEL, SUMMARY, PICTURE), (MODEL,))
+RUN = Layout("run", "run file", (TABLE, MODEL, PAGE, SUMMARY, PICTURE), (MODEL,))
 
 
 def check_own(folder: Path, file: Path | None, overwrite: bool, layout: Layout = RUN) -> None:
@@ -199,87 +191,6 @@ class Manifest:
         files = {f"{JOBS}/{job.id}/{name}": text for job, found in batch for name, text in found.files.items()}
         data = {name: text.encode() if isinstance(text, str) else text for name, text in files.items()}
         self.put_all(data, {job.id: {**job.parameters, "key": job.key, **found.entry} for job, found in batch})
-
-
-class Store:
-    """Read and write the results of a run; refuse edited files."""
-
-    def __init__(
-        self, path: Path, run: Run, inputs: Mapping[str, str], recordings: Recordings, overwrite: bool, campaign: bool
-    ) -> None:
-        self.path, self.run, self.inputs, self.recordings, self.campaign = path, run, inputs, recordings, campaign
-        self.manifest = Manifest(path) if overwrite else Manifest.read(path)
-        for name in (TABLE, MODEL, PAGE, SUMMARY, PICTURE):
-            self.manifest.holds(name)
-        if campaign:
-            refuse_other_versions(self.manifest)
-        described = {"file": run.file.name, "said": run.plain_tables}
-        self.manifest.content |= {"run": described, "versions": versions(), "inputs": dict(inputs)}
-        self.manifest.write()
-        self.written = -np.inf
-
-    def is_complete(self, job: RunJob) -> bool:
-        """Tell whether a job finished with the same inputs, and its model is unchanged on disk."""
-        entry = self.manifest.entries.get(job.id, {})
-        if entry.get("key") != job.key or entry["status"] == LOST:
-            return False
-        if entry["status"] == TIMED_OUT:  # a longer limit runs the job again
-            return self.campaign and self.run.time_limit is not None and self.run.time_limit <= entry["time_limit"]
-        if entry["status"] == FAILED:
-            return self.campaign
-        return not self.has_model(job) or self.manifest.holds(job.model_file)
-
-    def gave_model(self, job: RunJob) -> bool:
-        """Tell whether a job gave a model that meets its constraints."""
-        return self.manifest.entries[job.id]["status"] not in WITHOUT_MODEL
-
-    def has_model(self, job: RunJob) -> bool:
-        """Tell whether the folder has a model of a job; models of a cross-validation are not kept."""
-        return job.fold is None and self.gave_model(job)
-
-    def record(self, batch: Batch) -> None:
-        """Record finished jobs and their errors in the manifest."""
-        for _, found in batch:
-            for name, error in found.errors.items():
-                model = digest(str(found.files[MODEL]).encode())
-                self.manifest.content["scores"][self._score_key(model, name)] = error
-        self.manifest.record(batch)
-
-    def scores(self, jobs: Sequence[RunJob], last: bool = False) -> list[Score]:
-        """Return the errors of the jobs' models; compute missing ones. `last` drops the entries of other models."""
-        out, used, known = [], set(), self.manifest.content["scores"]
-        for job in (j for j in jobs if self.gave_model(j)):
-            if job.fold is not None:
-                entry, name = self.manifest.entries[job.id], f"fold {job.fold}"
-                out += [Score(job.id, "train", name, entry["train"]), Score(job.id, "held", name, entry["held"])]
-                continue
-            fit = None
-            for role, name, recording in scored_files(self.run, self.recordings):
-                key = self._score_key(self.manifest.content["files"][job.model_file], name)
-                if key not in known:
-                    fit = fit or self.load(job)
-                    known[key] = error_of(replace(fit, engine=self.run.engine), recording)
-                used.add(key)
-                out.append(Score(job.id, role, name, np.nan if known[key] is None else float(known[key])))
-        if last:
-            self.manifest.content["scores"] = {key: error for key, error in known.items() if key in used}
-        return out
-
-    def load(self, job: RunJob) -> Any:
-        """Load the model of a job."""
-        own = self.run.cells[job.cell].model
-        return load(self.path / job.model_file, model=own if isinstance(own, Model) else None)
-
-    def _score_key(self, model: str, name: str) -> str:
-        reading = {k: str(v) for k, v in self.run.reading.items()}
-        return digest({"model": model, "data": self.inputs[name], "reading": reading})
-
-    def write_table(self, jobs: Sequence[RunJob], last: bool = False) -> None:
-        """Write the errors so far of a running campaign, at most once per `TABLE_PAUSE` except the last time."""
-        if not self.campaign or (not last and time.monotonic() < self.written + TABLE_PAUSE) or not jobs:
-            return
-        self.manifest.put({TABLE: results_table(self.scores(jobs), jobs, self.manifest.entries, "")})
-        self.written = time.monotonic()
 
 
 def refuse_other_versions(manifest: Manifest) -> None:

@@ -12,7 +12,8 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Recording, multisine
 from pilfr_casadi.engine import VirtualMachine
 from pilfr_casadi.identify import POOR_SURROGATE, fit, surrogate, surrogate_warning
-from pilfr_casadi.identify.surrogates import modal_simulator, modes, to_continuous
+from pilfr_casadi.identify.modal_form import modes, to_continuous
+from pilfr_casadi.identify.surrogates import modal_simulator
 from pilfr_casadi.simulators import as_simulator, discretise
 
 DT = 0.01

@@ -295,6 +295,17 @@ def test_friction_that_reverses_over_most_speeds_is_hardly_dry(kind):
     assert law.doubtful({"v_0": 0.3}) and not law.doubtful({"v_0": 0.1})
 
 
+@pytest.mark.parametrize(
+    ("law", "widest"), [(laws.CoulombFriction, 0.5), (laws.DirectionalFriction, 0.5), (StribeckFriction, 0.3)]
+)
+def test_a_broad_reversal_is_told(law, widest):
+    """The largest speed is 1 m/s, and the limits of the reversal are shares of it."""
+    placed = law().at({"v_0": 0.05}, {"v_0": (1e-3, widest)})
+    assert "over 20% of the largest speed" in placed.remark({"v_0": 0.2})
+    assert placed.remark({"v_0": 0.05}) == ""
+    assert law().remark({"v_0": 0.2}) == ""  # nobody knows the speed
+
+
 def test_a_mode_that_is_damped_more_than_machines_are_is_hardly_a_mode():
     law = Mode().at({}, {"D": (1e-3, 1.0), "W": (1.0, 800.0)})
     assert law.doubtful({"D": 1.0, "W": 50.0}) and not law.doubtful({"D": 0.1, "W": 50.0})

@@ -9,8 +9,9 @@ from pilfr_casadi.data import Recording
 from pilfr_casadi.identify import fit, linear_model
 from pilfr_casadi.linear import subspace_matrices
 from pilfr_casadi.models import PILFR, Neighbours, Play
-from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, Status, stable
-from pilfr_casadi.optimise.gauss_newton import Step, _Run, replace_rounding
+from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, Status, stable, unconstrained_step
+from pilfr_casadi.optimise.gauss_newton import _Run, replace_rounding
+from pilfr_casadi.optimise.quadratic_program import QuadraticProgram, Step
 
 
 @pytest.fixture(scope="module")
@@ -269,3 +270,34 @@ def test_interrupted_between_two_iterations(case, wrapped):
     problem = Problem(model, record)
     found = GaussNewton(tolerance=1e-12).solve(problem, problem.start * 1.05, strike)
     assert found.status is Status.INTERRUPTED and np.isfinite(found.cost)
+
+
+def test_a_step_inside_its_limits_solves_the_quadratic_program():
+    rng = np.random.default_rng(0)
+    for case in range(30):
+        n, n_g = int(rng.integers(1, 8)), int(rng.integers(0, 3))
+        root = rng.standard_normal((n, n))
+        h, g, a = root @ root.T + 0.1 * np.eye(n), rng.standard_normal(n), rng.standard_normal((n_g, n))
+        room = 10.0 ** rng.uniform(-1, 3)
+        limits = (np.full(n, -room), np.full(n, room), a, np.full(n_g, -room), np.full(n_g, room))
+        ours, qrqp = QuadraticProgram(n, n_g, "daqp"), QuadraticProgram(n, n_g, "qrqp")
+        d, multipliers, good = ours(h, g, *limits)
+        expected = np.asarray(
+            qrqp._solver(h=h, g=g, lbx=limits[0], ubx=limits[1], a=a, lba=limits[3], uba=limits[4])["x"]
+        ).ravel()
+        assert good, case
+        np.testing.assert_allclose(d, expected, atol=1e-7 * max(1.0, np.max(np.abs(expected))))
+        gradient = h @ d + g + multipliers[:n] + a.T @ multipliers[n:]
+        np.testing.assert_allclose(gradient, 0, atol=1e-7 * max(1.0, np.max(np.abs(multipliers), initial=0.0)))
+
+
+def test_an_indefinite_or_nan_matrix_has_no_unconstrained_step():
+    assert unconstrained_step(-np.eye(2), np.ones(2)) is None
+    assert unconstrained_step(np.full((2, 2), np.nan), np.ones(2)) is None
+
+
+def test_infinite_or_nan_limits_give_no_step():
+    h, g, a, low, high = np.eye(1), np.ones(1), np.ones((1, 1)), np.full(1, -np.inf), np.full(1, np.inf)
+    for upper in (-np.inf, np.nan):
+        d, multipliers, good = QuadraticProgram(1, 1, "daqp")(h, g, low, high, a, low, np.full(1, upper))
+        assert not good and np.all(d == 0) and multipliers.shape == (2,)

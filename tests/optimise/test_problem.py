@@ -13,6 +13,7 @@ from pilfr_casadi.data import Recording
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.models import Parameter, ParameterSet, Play, open_model
 from pilfr_casadi.optimise import Constraint, Problem, problem as module, stable
+from pilfr_casadi.optimise.penalties import state_precision
 
 
 def recording(seed=0, length=80, n_u=1, n_y=1, **options):
@@ -199,7 +200,7 @@ def test_a_prior_of_initial_states_runs_whole_samples():
     model = engine.linear.sizes
     p = structure.model(1, 1, values).parameters.start
     drive = random_input(1, 3 * 1000, 1)
-    assert module.state_precision(Counting(), drive, p, model["x"], model["s"]) is not None
+    assert state_precision(Counting(), drive, p, model["x"], model["s"]) is not None
     assert sum(lengths) == 3000 and all(n % 3 == 0 for n in lengths)
 
 
