@@ -166,12 +166,12 @@ class Stale(Gate):
 
 
 def mend_stale_samples(now: Checked) -> Checked:
-    """Interpolate stale samples if the rule accepts it; else note stale outputs."""
-    first = now.bench.recordings[0]
+    """Interpolate stale samples if the rule accepts it; else note stale outputs. Held outputs repeat for a reason."""
+    first, held = now.bench.recordings[0], {g.channel for g in now.gates if g.finding == "held"}
     for side, names in (("u", first.inputs), ("y", first.outputs)):
         for i, name in enumerate(names):
             repeated = share_of_repeats([getattr(r, side)[r.skip :, i] for r in now.bench.recordings])
-            if not repeated:
+            if not repeated or name in held:
                 continue
             words = f"{repeated:.0%} of the samples of {name} repeat the one before, as from lost or stale samples"
             fault = Stale(name, "stale", repeated, words, change=partial(_interpolate_repeats, side=side, column=i))

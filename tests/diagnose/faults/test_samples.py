@@ -1,5 +1,7 @@
 """Glitches, stale samples, and periods that have not settled."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from diagnosis_rig import OFF, recordings, refitted, rig
@@ -152,6 +154,14 @@ def test_an_output_that_was_measured_at_a_slower_rate_is_told():
     checked = pilfr.check(rig(OFF), held(r, 5))
     assert gate.sentence in [spot.sentence for spot in checked.blind_spots]
     assert checked.next_record == "Leave the repeated values of x2 out first."
+
+
+def test_an_output_that_was_measured_at_half_the_rate_is_not_stale_as_well():
+    (r,) = recordings(count=1)
+    r = held(r.slice(0, 1001), 2)  # of an odd number of samples, more than half differ
+    now = refitted(Workbench.of(rig(OFF), [r], "zero"))
+    now = replace(now, gates=tuple(find_held_outputs([r])))
+    assert [gate.finding for gate in mend_stale_samples(now).gates] == ["held"]
 
 
 @pytest.mark.parametrize("kind", ["noise", "encoder", "driven"])
