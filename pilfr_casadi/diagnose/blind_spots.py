@@ -21,12 +21,12 @@ from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings, stated_hold
 from .faults.channels import accept_best, find_gross_slips, refit_corrected
-from .faults.gates import USELESS_FIT, Checked, refit
+from .faults.gates import USELESS_FIT, Checked
 from .faults.offsets import WrongStart, find_wrong_start
 from .faults.samples import find_held_outputs
 from .fits.floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor, noise_floor
 from .fits.linearise import Probe, Run, linearise_runs
-from .fits.workbench import QUICK, Fitted, Workbench
+from .fits.workbench import QUICK, Fitted, Workbench, refit
 from .identifiability import (
     SMALL_SHARE,
     LawRow,
@@ -369,7 +369,7 @@ def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[Param
     if not doubtful:
         return ()
     values = {k: p.value for k, p in fitted.model.parameters.items()}
-    given = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model)
+    given = bench.rerun(fitted, values)
     if not np.isfinite(given.cost):
         return ()
     response = Sensitivity.of(bench, given, linearise_runs(bench, given)[1])

@@ -31,7 +31,7 @@ from ..simulators import ACTUATOR, EQUATION, Port, Simulator, port_name, split_p
 from .fits.evidence import prior_width
 from .fits.linearise import Probe, Run, sample_run
 from .fits.screen import Remainder, Task, lengths, orthonormal, own_changes, project_off
-from .fits.workbench import Fitted, Workbench
+from .fits.workbench import Fitted, Workbench, pack_known
 
 LARGEST_EXPONENT = 3  # in numerators and denominators; physical laws have small exponents
 TRIAL_FACTOR = 1.1  # factor of a trial step that distinguishes a product from a sum; they differ by a twentieth of it
@@ -286,7 +286,7 @@ def _finite_change(response: Sensitivity, group: np.ndarray, rows: np.ndarray, l
         vector = fitted.vector.copy()
         vector[response.places[group]] = value * TRIAL_FACTOR**along if logarithmic else value + step * along
         values = fitted.model.parameters.unpack(vector)
-        there = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model)
+        there = bench.rerun(fitted, values)
         if not np.isfinite(there.cost):
             return np.inf
         pairs = zip(there.residual, fitted.residual, bench.recordings, strict=True)
@@ -477,8 +477,7 @@ def _local_levels(bench: Workbench, fitted: Fitted, runs: list[Run]) -> list[flo
     the deviation of the signal. Ports where nothing moves have None.
     """
     simulator, z, at = bench.simulator, np.concatenate([r.z for r in runs]), sample_run(bench, fitted)
-    own = simulator.parameter_set
-    values = own.pack({k: v for k, v in fitted.values.items() if k in own})
+    values = pack_known(simulator.parameter_set, fitted.values)
     symbols = x, u, p, _ = (*simulator.symbols()[:3], ca.SX(0))
     vectors = stack(x), stack(u), stack(p)
     changes = ca.vertsplit(simulator.derivatives(*symbols)) if simulator.states else []

@@ -28,9 +28,9 @@ from .._base import InputError
 from ..data import Recording
 from ..linear import steady_state_gain
 from ..simulators import Simulator, discretise, growth_rate
-from .faults.gates import USELESS_FIT, Gate, refit
+from .faults.gates import USELESS_FIT, Gate
 from .fits.linearise import linearise_runs
-from .fits.workbench import MOST_GROWTH, Fitted, Workbench
+from .fits.workbench import MOST_GROWTH, Fitted, Workbench, refit
 
 FOCUS = "simulation", "prediction"
 ROUNDING = 1e-9  # share of the largest entry that counts as zero

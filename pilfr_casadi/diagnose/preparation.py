@@ -27,7 +27,6 @@ from .faults.gates import (
     POOR_FIT,
     Checked,
     Gate,
-    refit,
 )
 from .faults.lost_samples import find_gaps, find_output_gaps
 from .faults.offsets import find_offsets, find_wrong_start
@@ -35,7 +34,8 @@ from .faults.samples import find_held_outputs, mend_stale_samples, open_unsettle
 from .faults.timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps
 from .fits.floor import Floor, pool, white_part
 from .fits.linearise import linearise_runs, observer_gain, sample_run
-from .fits.workbench import THOROUGH, Fitted, Workbench, refine_steps
+from .fits.step_refinement import refine_steps
+from .fits.workbench import THOROUGH, Fitted, Workbench, refit
 from .proof import errors_of
 
 CHECKED_ABOVE = 4e-4  # mean square error up to which signs and units are not checked

@@ -199,10 +199,7 @@ def next_experiment(
             u=drive, y=np.zeros((len(drive), len(noise))), initial="zero", period=None, skip=0
         )
         with np.errstate(all="ignore"):
-            y = [
-                f.engine.simulate(f.model.drive(recording), f.vector, np.zeros(f.model.n_state))[0]
-                for f in (one, other)
-            ]
+            y = [f.simulate(recording, np.zeros(f.model.n_state)) for f in (one, other)]
             value = float(np.sqrt(np.mean(((y[0] - y[1]) / np.maximum(noise, 1e-300)) ** 2)))
         return value if np.isfinite(value) else 0.0
 

@@ -26,11 +26,11 @@ from ..laws import Law
 from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
 from .arguments import match_recordings, stated_hold
 from .faults.channels import accept_best, find_gross_slips
-from .faults.gates import Checked, refit
+from .faults.gates import Checked
 from .fits.evidence import FORMULA_ERROR, Sample, deviations, information, log_evidence, log_prior, prior_width
 from .fits.floor import effective_size, measured_floor, third_differences
 from .fits.linearise import sample_run
-from .fits.workbench import FINER_STEPS, THOROUGH, Fitted, Workbench
+from .fits.workbench import FINER_STEPS, THOROUGH, Fitted, Workbench, refit
 from .search.trials import Trials
 
 STEP_ACCURACY = 0.25  # standard errors by which finer steps may change a value: 3 % of it, added in squares

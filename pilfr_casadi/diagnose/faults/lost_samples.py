@@ -80,7 +80,7 @@ class _Gap(Gate):
     def run_whole(self, bench: Workbench, fitted: Fitted) -> Fitted:
         """Run the whole recording at the values of a fit to its two pieces."""
         initial = [x for i, x in enumerate(fitted.initial) if i != self.value[0] + 1]
-        return bench.result(bench.simulator, fitted.values, initial, fitted.engine, fitted.model)
+        return bench.rerun(fitted, initial=initial)
 
 
 @dataclass(frozen=True, eq=False)

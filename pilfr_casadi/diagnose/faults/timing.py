@@ -17,7 +17,7 @@ import numpy as np
 from ...data import Recording
 from ...laws import Lag
 from ..fits.floor import ABOVE_NOISE
-from ..fits.workbench import RUNAWAY, Fitted, Workbench
+from ..fits.workbench import RUNAWAY, Fitted, Workbench, refit
 from .gates import (
     CLEARLY_BETTER,
     EQUAL_RATIO,
@@ -27,7 +27,6 @@ from .gates import (
     Gate,
     accept,
     correct,
-    refit,
     settle,
 )
 
@@ -113,14 +112,11 @@ class TimeShift(Gate):
         """
         bench = first.bench
 
-        def simulate(r: Recording, state: np.ndarray) -> np.ndarray:
-            return np.asarray(fitted.engine.simulate(fitted.model.drive(r), fitted.vector, state)[0])
-
         @np.errstate(over="ignore", invalid="ignore")  # a diverging run leaves everything
         def left(value: float) -> float:
             moved = self.at(value, bench.dt)
             others = [moved.read(r, False, own) for r, own in zip(bench.recordings, curves, strict=True)]
-            runs = as_recorded or list(map(simulate, others, fitted.initial))
+            runs = as_recorded or list(map(fitted.simulate, others, fitted.initial))
             pairs = zip(runs, others, strict=True)
             error = np.concatenate([((y - other.y) / bench.scale)[other.skip :].ravel() for y, other in pairs])
             inside = zip(map(moved._recorded, bench.recordings), others, strict=True)
@@ -131,7 +127,7 @@ class TimeShift(Gate):
             return float(after / before) if np.isfinite(after) and before > 0 else np.inf
 
         curves = list(map(self.curves, bench.recordings))
-        as_recorded = [] if self.kind == "u" else list(map(simulate, bench.recordings, fitted.initial))
+        as_recorded = [] if self.kind == "u" else list(map(fitted.simulate, bench.recordings, fitted.initial))
         return left
 
     def relocate(self, now: Checked, after: Checked) -> Self:

@@ -46,7 +46,7 @@ from .workbench import DIVERGED, RUNAWAY, Fitted, Workbench
 # The priors and thresholds on which every answer of a search rests. Elsewhere are those of the noise (`floor`), of
 # faults (in `faults`: `gates`, `channels`, `offsets`, `timing`, `lost_samples`, `samples`), the memories of an
 # observer (`prediction`), the bases of flexible forces (`screen`, `learned`) and the accuracy of integration
-# (`workbench`). All other numbers limit the effort or keep numbers finite.
+# (`workbench`, `step_refinement`). All other numbers limit the effort or keep numbers finite.
 
 # Prior probabilities
 EFFECT_PRIOR = np.log(0.5)  # log probability of each further effect: one more effect is as likely as not
@@ -199,7 +199,7 @@ def runs_away(bench: Workbench, fitted: Fitted, refitted: Fitted) -> bool:
     def reach(one: Fitted, u: np.ndarray) -> tuple[float, float]:
         held = r.with_(u=np.tile(u, (len(r), 1)))
         with np.errstate(all="ignore"):
-            y = one.engine.simulate(one.model.drive(held), one.vector, one.initial[k])[0]
+            y = one.simulate(held, one.initial[k])
             off = np.max(np.abs(y - np.mean(r.y, axis=0)) / bench.scale, axis=1)
             return float(np.max(off[: len(r) // 2])), float(np.max(off))
 

@@ -34,13 +34,13 @@ from ...laws import (
     varying,
 )
 from ...simulators import ACTUATOR, PARAMETER, SENSOR, Placed, kind_of, name_at, port_name
-from ..faults.gates import CLEARLY_BETTER, Checked, Gate, refit
+from ..faults.gates import CLEARLY_BETTER, Checked, Gate
 from ..faults.timing import TimeShift, find_time_shift
 from ..fits.evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR, NEAR_RATIO
 from ..fits.floor import ABOVE_NOISE
 from ..fits.linearise import linearise_runs
 from ..fits.screen import Pair, Remainder, Scored, screen, usable
-from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted
+from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted, refit
 from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
 from .relatives import choose_pairs, complements, fit_pair, in_place_of_variation, relatives

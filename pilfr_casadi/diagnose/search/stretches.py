@@ -35,10 +35,10 @@ from ...laws import Creep, StopHysteresis
 from ...models import Model
 from ...optimise import GaussNewton, estimate_initial_state, samples_for_state
 from ...simulators import Simulator
-from ..faults.gates import Gate, refit
+from ..faults.gates import Gate
 from ..fits.linearise import Probe, loudest_stretch, run
 from ..fits.screen import Dose, Remainder, Surface, orthonormal
-from ..fits.workbench import DIVERGED, FEW, Fitted, Workbench, output_deviation
+from ..fits.workbench import DIVERGED, FEW, Fitted, Workbench, output_deviation, refit
 from .hypotheses import Findings, count_samples, likeliest
 from .moves import Search
 from .trials import Trial
@@ -276,7 +276,7 @@ def fit_to_all(bench: Workbench, fitted: Fitted, time_limit: float = np.inf) -> 
     if time_limit > 0:
         solver = replace(FINAL, time_limit=time_limit)
         found = refit(bench, start, fitted.simulator, states=states, solver=solver, like=fitted)
-    return found or bench.result(fitted.simulator, fitted.values, states, fitted.engine, fitted.model)
+    return found or bench.rerun(fitted, initial=states)
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,4 +334,4 @@ def back_on_stretches(bench: Workbench, fitted: Fitted, states: Sequence[np.ndar
     parameters = fitted.fitted_model.parameters
     held = fitted.model.with_parameters(parameters.change(**{k: {"fixed": True} for k in parameters}))
     found = bench.fit(fitted.simulator, [fitted.values], states=states, model=held, engine=fitted.engine)
-    return bench.result(fitted.simulator, fitted.values, found.initial, fitted.engine, fitted.model)
+    return bench.rerun(fitted, initial=found.initial)

@@ -24,6 +24,7 @@ from ..faults.gates import EQUAL_RATIO, open_start
 from ..faults.offsets import Offset
 from ..fits.evidence import FAR_RATIO, FORMULA_ERROR
 from ..fits.screen import Pair, Scored
+from ..fits.step_refinement import knee_starts, refit_on_finer_steps
 from ..fits.workbench import (
     BRIEF,
     COMPARED_SAMPLES,
@@ -33,8 +34,6 @@ from ..fits.workbench import (
     THOROUGH,
     Fitted,
     Workbench,
-    knee_starts,
-    refit_on_finer_steps,
 )
 
 # Effort: pairs of each list of the screen that are fitted, besides the best of each port; the same if `again`
@@ -175,8 +174,7 @@ class Trials:
         """Make a trial of a fit to a part of the recordings."""
         whole = found
         if self.part is not self.bench:
-            whole = self.bench.result(found.simulator, found.values, found.initial, found.engine, found.model)
-            whole = replace(whole, status=found.status)
+            whole = replace(self.bench.rerun(found), status=found.status)
         return Trial(found.last_elements(count), whole, found.cost, whole.cost if np.isfinite(whole.cost) else np.inf)
 
     def polish(self, trial: Trial) -> Trial:

@@ -8,7 +8,8 @@ from diagnosis_rig import DT
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.fits.workbench import FINER_STEPS, THOROUGH, refine_steps
+from pilfr_casadi.diagnose.fits.step_refinement import refine_steps
+from pilfr_casadi.diagnose.fits.workbench import FINER_STEPS, THOROUGH
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import CoulombFriction, Delay, Polynomial
 from pilfr_casadi.simulators import Simulator, discretise
