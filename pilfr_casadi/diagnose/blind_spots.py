@@ -20,13 +20,13 @@ from ..data import Recording
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings, stated_hold
-from .faults.channels import accept_best, find_gross_slips, refit_corrected
-from .faults.gates import USELESS_FIT, Checked
+from .faults.channels import correct_gross_slips, refit_corrected
+from .faults.gates import USELESS_FIT, Checked, Gate
 from .faults.offsets import WrongStart, find_wrong_start
 from .faults.samples import find_held_outputs
-from .fits.floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor, noise_floor
+from .fits.floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor
 from .fits.linearise import Probe, Run, linearise_runs
-from .fits.workbench import QUICK, Fitted, Workbench, refit
+from .fits.workbench import QUICK, Fitted, Workbench
 from .identifiability import (
     SMALL_SHARE,
     LawRow,
@@ -293,27 +293,33 @@ def check(
     simulator, recordings = match_recordings(simulator, train, hold, excited=False)
     check_laws(laws)
     stated = stated_hold(simulator, recordings, hold)
-    bench = Workbench.of(simulator, recordings, stated or "zero", engine)
-    slips = find_gross_slips(bench)
-    plain = refit(bench) if slips else None
-    now = accept_best(Checked(bench, plain or bench.run_given(simulator)), slips)
-    if now.gates:
+    now = _refit(Workbench.of(simulator, recordings, stated or "zero", engine), hold_said=stated is not None)
+    found = assess_recordings(now.bench, now.fitted, now.floor, stated or "", laws)
+    slow = find_held_outputs(recordings)
+    return _with_faults(found, now.gates, slow, recordings) if now.gates or slow else found
+
+
+def _refit(bench: Workbench, hold_said: bool) -> Checked:
+    """Refit with channels and start corrected if they are wrong, and with the better hold unless it is stated."""
+    now = correct_gross_slips(bench)
+    if now is not None and now.gates:
         now = refit_corrected(now)
-    elif plain is None:
-        now = Checked(bench, bench.fit(simulator))
-    if not stated:
+    elif now is None or not np.isfinite(now.cost):
+        now = Checked(bench, bench.fit(bench.simulator))
+    if not hold_said:
         now = choose_hold(now, QUICK)[0]
     now = find_wrong_start(now)
-    bench, fitted, faults = now.bench, now.fitted, now.gates
-    slow = find_held_outputs(recordings)
-    bench.interrupt.raise_pending()  # half a fit would tell wrong things
-    bench.check_followed(fitted)
-    floor = noise_floor(bench.recordings, bench.scored(fitted.residual))
-    found = assess_recordings(bench, fitted, floor, stated or "", laws)
-    if not (faults or slow):
-        return found
-    told = [f.sentence + " Below, it is corrected." * f.corrected for f in (*faults, *slow)]
-    spots = (BlindSpot("recording-fault", (f.channel,), text) for f, text in zip((*faults, *slow), told, strict=True))
+    now.bench.interrupt.raise_pending()  # half a fit would tell wrong things
+    now.bench.check_followed(now.fitted)
+    return now
+
+
+def _with_faults(found: Check, faults: Sequence[Gate], slow: Sequence[Gate], recordings: Sequence[Recording]) -> Check:
+    """Put faults and held outputs of the recordings before the blind spots, and the advice to correct them first."""
+    spots = [
+        BlindSpot("recording-fault", (f.channel,), f.sentence + " Below, it is corrected." * f.corrected)
+        for f in (*faults, *slow)
+    ]
     wired = [f.channel for f in faults if not isinstance(f, WrongStart)]
     advice = [f"Correct the recordings first: check wiring, sign and unit of {in_words(wired)}."] if wired else []
     if len(wired) < len(faults):

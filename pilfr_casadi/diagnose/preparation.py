@@ -157,7 +157,7 @@ class _Checks:
         if bench.interrupt.pressed:  # half a fit accepts wrong faults
             return now if np.isfinite(now.cost) else None
         found = replace(found, bench=self.patient(found.bench))
-        if len(found.gates) > len(gates):
+        if found.adds_to(now):
             return refit_corrected(found)
         if not np.isfinite(found.cost):
             return None
@@ -200,12 +200,12 @@ class _Checks:
         if now.cost <= NEAR_NOISE_RATIO**2 * now.noise2 or np.mean(now.fitted.squares) <= CHECKED_ABOVE:
             return now
         found = self._find_slips(now, part)
-        return found if len(found.gates) == len(now.gates) else refit_corrected(found)
+        return refit_corrected(found) if found.adds_to(now) else found
 
     def _find_slips(self, now: Checked, part: float) -> Checked:
         """Find wrong signs, units and exchanged channels; or a shift, because half a period late looks like a sign."""
         found = find_slips(now, self.workers)
-        if len(found.gates) == len(now.gates) or found.cost <= POOR_FIT:
+        if not found.adds_to(now) or found.cost <= POOR_FIT:
             return found
         late = find_time_shift(now, part, self.early)
         return late if late.cost < CURED_SHARE * found.cost else found

@@ -16,7 +16,7 @@ from ..._base import InputError, side_by_side
 from ...data import Recording, dimension
 from ...optimise import GaussNewton
 from ...simulators import SENSOR, Simulator, port_name
-from ..fits.workbench import THOROUGH, Workbench
+from ..fits.workbench import THOROUGH, Workbench, refit
 from .gates import CLEARLY_BETTER, CURED_SHARE, POOR_FIT, USELESS_FIT, Checked, Gate, accept, correct
 from .offsets import describe_constant
 
@@ -128,6 +128,14 @@ def find_gross_slips(bench: Workbench, workers: int = 1) -> list[Gate]:
     return [replace(slips[i], left=float(left[i])) for i in np.argsort(left, kind="stable") if near[i]]
 
 
+def correct_gross_slips(bench: Workbench) -> Checked | None:
+    """Refit from the user's values, and correct the likeliest gross fault if the rule accepts it; None without one."""
+    slips = find_gross_slips(bench)
+    if not slips:
+        return None
+    return accept_best(Checked(bench, refit(bench) or bench.run_given(bench.simulator)), slips)
+
+
 def _run_corrected(given: Checked, fault: Gate) -> float:
     """Return what a run at the given values does not follow once a fault is corrected; see `_unfollowed`.
 
@@ -176,7 +184,7 @@ def find_slips(now: Checked, workers: int) -> Checked:
         factors = [f for f in (-1.0, *_mistakes(unit, UNITS | FAHRENHEIT)) if f < 0 or near("y", [i], f)]
         faults = [scale_channels("y", bench.simulator.output_names, [i], f, " and an offset") for f in factors]
         beside = accept_best(level, faults, workers)
-        if len(beside.gates) > len(now.gates) and beside.cost < CURED_SHARE * found.cost:
+        if beside.adds_to(now) and beside.cost < CURED_SHARE * found.cost:
             found = replace(beside, bench=replace(beside.bench, simulator=bench.simulator))
     return found
 

@@ -137,7 +137,7 @@ def find_gaps(now: Checked) -> Checked:
         sharp = jump.beats(jump.neighbour, CLEARLY_BETTER) or last.cost < NEAR_NOISE_RATIO**2 * noise2
         if sharp and jump.beats(jump.rival, CURED_SHARE):
             accepted = accept(now, _name_pieces(last, origins), _describe_gaps(jump, origins))
-            found = accepted if len(accepted.gates) > len(now.gates) else found
+            found = accepted if accepted.adds_to(now) else found
     return found
 
 

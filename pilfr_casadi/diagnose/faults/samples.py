@@ -176,7 +176,7 @@ def mend_stale_samples(now: Checked) -> Checked:
             words = f"{repeated:.0%} of the samples of {name} repeat the one before, as from lost or stale samples"
             fault = Stale(name, "stale", repeated, words, change=partial(_interpolate_repeats, side=side, column=i))
             found = accept(now, correct(now, fault, [{}, now.fitted.values], now.fitted.begin), fault)
-            if len(found.gates) == len(now.gates) and side == "y":
+            if not found.adds_to(now) and side == "y":
                 words = f"{words}; the error that this causes counts as noise: record again, or leave them out."
                 found = found.then(found.bench, found.fitted, Gate(name, "stale", repeated, words, False))
             now = found

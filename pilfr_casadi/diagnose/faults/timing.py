@@ -211,7 +211,7 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: 
         return now
     fault, after = best
     found = accept(now, after, fault)
-    if len(found.gates) == len(now.gates):
+    if not found.adds_to(now):
         return found
     more_is_wrong = after.cost > NEAR_NOISE_RATIO**2 * noise2  # then a delay or a slow clock may be physics
     may_be_physics = fault.is_like_delay(bench.dt, part) or (more_is_wrong and not (fault.leads and early))
