@@ -144,7 +144,7 @@ def diagnose_in_steps(
             everything = Everything.of(search, request.stretches, ready.gates)
         request = replace(request, notes=(request.stretches.note(everything is not None), *request.notes))
     found = _concluded(search, (*request.notes, *ready.gates))
-    if found.verdict.kind == "unexplained" and request.focus is None and not (search.interrupted or search.out_of_time):
+    if found.verdict.kind == "unexplained" and request.focus is None and not search.cut_short:
         with search.until_interrupted():
             found = _name_in_predictions(request, search, found)
     final = _final_fits(request, ready, search, found, everything)
@@ -233,10 +233,10 @@ def _search(request: Request) -> tuple[Prepared, Search]:
     if search.shift is not None:
         return _search_realigned(request, ready, search, search.shift)
     start = next((g.otherwise for g in ready.gates if isinstance(g, WrongStart) and g.otherwise), None)
-    if start is not None and not (search.interrupted or search.out_of_time):
+    if start is not None and not search.cut_short:
         request, ready, search = _search_from_unknown_start(request, ready, search, start)
     leads = any(isinstance(g, TimeShift) and g.leads for g in ready.gates)
-    if not leads or search.interrupted or search.out_of_time or not search.can_improve(search.best):
+    if not leads or search.cut_short or not search.can_improve(search.best):
         return ready, search
     found = _again(search, partial(_search_once, request, shift_early=False))
     if found is None:
@@ -261,7 +261,7 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
     if found is None:
         return ready, search if search.interrupted else search.run(request.most_effects)
     other, again = found
-    if again.can_improve(again.best) and not (again.interrupted or again.out_of_time):
+    if again.can_improve(again.best) and not again.cut_short:
         search.run(request.most_effects)
     before2, after2 = _comparable(search, again)
     if before2 < AS_GIVEN_RATIO * after2:
@@ -364,7 +364,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     found stays; otherwise the refitted simulator is returned.
     """
     answer, interrupted = posterior(search), search.interrupted
-    finished, elsewhere = not (interrupted or search.out_of_time), tuple[Gate, ...]()
+    finished, elsewhere = not search.cut_short, tuple[Gate, ...]()
     given, gates = gates, with_tones(search, answer, gates)
     verdict = judge(search, answer, gates)
     if verdict.kind in ("missing-physics", "unexplained") and not (interrupted or search.past_deadline):
@@ -492,5 +492,5 @@ def _final_fits(
         whole, pair = everything.bench, (without, after)
         to_all = [everything.fit(search, one) for one in pair]
         drawn = [back_on_stretches(bench, f, one.initial) for f, one in zip(to_all, pair, strict=True)]
-        nominal = errors_of(whole, whole.model(request.simulator), whole=True)
+        nominal = errors_of(whole, whole.model(request.simulator))
     return FinalFits(whole, to_all[0], to_all[1], nominal, (drawn[0], drawn[1]), partial(everything.fit, search))

@@ -103,7 +103,7 @@ def prepare(
         first = checks.begin(bench.with_other_hold(), noted)
     if not said:
         first, held = choose_hold(replace(first, bench=checks.patient(first.bench)))
-    nominal = errors_of(replace(bench, hold=first.bench.hold), first.fitted.model, whole=True)
+    nominal = errors_of(replace(bench, hold=first.bench.hold), first.fitted.model)
     say(CHECKS, 1, CHECKED)
     now = checks.run(first, 1.0 if said else 0.5)
     faulty = any(g.fault for g in now.gates[len(first.gates) :])

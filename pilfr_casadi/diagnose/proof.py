@@ -60,9 +60,9 @@ def _rests_after(recording: Recording, first: int) -> bool:
     return bool(np.any(scored < LEAST_MOTION * whole))
 
 
-def errors_of(bench: Workbench, model: Model, *, whole: bool = False) -> float:
-    """Compute the NRMSE of a model at its start values; see `compare_errors`."""
-    return compare_errors(bench, {"": Started(model)}, whole=whole).errors[""]
+def errors_of(bench: Workbench, model: Model) -> float:
+    """Compute the NRMSE of a model at its start values on all samples; see `compare_errors`."""
+    return compare_errors(bench, {"": Started(model)}, whole=True).errors[""]
 
 
 def compare_errors(bench: Workbench, models: Mapping[str, Started], *, whole: bool = False) -> Comparison:

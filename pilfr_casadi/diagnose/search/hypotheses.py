@@ -102,6 +102,11 @@ class Hypotheses:
         return self.bench.interrupt.pressed
 
     @property
+    def cut_short(self) -> bool:
+        """Whether an interrupt or the time limit ended the search."""
+        return self.interrupted or self.out_of_time
+
+    @property
     def samples(self) -> float:
         """Effective samples, shared by all hypotheses."""
         return self.sample.effective(self._least_tolerant())
