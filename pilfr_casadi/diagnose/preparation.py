@@ -151,7 +151,7 @@ class _Checks:
         cannot follow. It goes on if there is no fault.
         """
         brief = replace(bench, deadline=(time.perf_counter() + bench.deadline) / 2)
-        plain = refit(brief, solver=THOROUGH) or brief.run_given(brief.simulator)
+        plain = refit(brief, solver=THOROUGH) or brief.run_given()
         now = replace(with_observer(Checked(brief, plain, gates)), bench=bench)
         found = accept_best(now, () if bench.interrupt.pressed else slips, self.workers)
         if bench.interrupt.pressed:  # half a fit accepts wrong faults
@@ -259,7 +259,7 @@ def with_observer(now: Checked) -> Checked:
     if now.cost < POOR_FIT:
         return now
     bench = now.bench
-    given = bench.run_given(bench.simulator, now.fitted.model, now.fitted.engine)
+    given = bench.run_given(now.fitted)
     if not np.isfinite(given.cost):
         return now
     probe, runs = linearise_runs(bench, given)

@@ -48,16 +48,15 @@ class Comparison:
 
         Samples before served to estimate the initial state. Relative errors on the rest are large.
         """
-        return [(r.name, first) for r, first in self.scored if _rests_after(r, first)]
+        found = []
+        for r, first in self.scored:
+            whole, scored = (np.std(r.y[k:], axis=0) for k in (r.skip, first))
+            found += [(r.name, first)] if np.any(scored < LEAST_MOTION * whole) else []
+        return found
 
     def noise(self, deviation: np.ndarray, resting: np.ndarray) -> float:
         """Compute the NRMSE of noise with the deviations (n_y,); `resting` is the scale of an output that rests."""
         return float(np.mean([nrmse(r.y, r.y + deviation, first, resting) for r, first in self.scored]))
-
-
-def _rests_after(recording: Recording, first: int) -> bool:
-    whole, scored = (np.std(recording.y[k:], axis=0) for k in (recording.skip, first))
-    return bool(np.any(scored < LEAST_MOTION * whole))
 
 
 def errors_of(bench: Workbench, model: Model) -> float:

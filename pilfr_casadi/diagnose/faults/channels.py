@@ -118,7 +118,7 @@ def find_gross_slips(bench: Workbench, workers: int = 1) -> list[Gate]:
 
     The run at these values has to be off by more than its own size, and with the channel corrected by less.
     """
-    given = Checked(bench, bench.run_given(bench.simulator))
+    given = Checked(bench, bench.run_given())
     before = _unfollowed(bench, given.fitted.residual)
     if not before > 1:
         return []
@@ -133,7 +133,7 @@ def correct_gross_slips(bench: Workbench) -> Checked | None:
     slips = find_gross_slips(bench)
     if not slips:
         return None
-    return accept_best(Checked(bench, refit(bench) or bench.run_given(bench.simulator)), slips)
+    return accept_best(Checked(bench, refit(bench) or bench.run_given()), slips)
 
 
 def _run_corrected(given: Checked, fault: Gate) -> float:
@@ -146,7 +146,7 @@ def _run_corrected(given: Checked, fault: Gate) -> float:
     bench, now = fault.apply(given.bench), given.fitted
     pairs = list(zip(given.bench.recordings, bench.recordings, strict=True))
     if now.simulator.observer is not None or any(not np.array_equal(was.u, r.u) for was, r in pairs):
-        return _unfollowed(bench, bench.run_given(now.simulator, now.model, now.engine).residual)
+        return _unfollowed(bench, bench.run_given(now).residual)
     return _unfollowed(bench, [e + was.y - r.y for e, (was, r) in zip(now.residual, pairs, strict=True)])
 
 
@@ -171,7 +171,7 @@ def find_slips(now: Checked, workers: int) -> Checked:
     If the error stays large, try each output with an offset as well; `find_offsets` reports the offset and keeps it.
     """
     bench = now.bench
-    given = bench.run_given(bench.simulator, now.fitted.model, now.fitted.engine).residual
+    given = bench.run_given(now.fitted).residual
     found = accept_best(now, _possible_slips(now, given), workers)
     # with an offset there is a working point, which a run from the stated start would have to reach first
     for i, name in enumerate(bench.simulator.output_names if found.cost > POOR_FIT else ()):

@@ -244,7 +244,7 @@ def _screen_shifts(bench: Workbench, plain: Fitted, also_given: bool = True) -> 
     if len(inputs) > 1:
         channels += [("u", (i,), name) for i, name in enumerate(inputs)]
     found = list[tuple[float, TimeShift]]()
-    given = [bench.run_given(bench.simulator, plain.model, plain.engine)] if also_given else []
+    given = [bench.run_given(plain)] if also_given else []
     for reference in (plain, *(one for one in given if one.cost < RUNAWAY**2)):
         first = FirstOrder.of(bench, reference)
         for kind, columns, name in channels:

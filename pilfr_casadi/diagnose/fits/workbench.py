@@ -256,14 +256,17 @@ class Workbench:
         engine = engine or make_engine(model, self.engine)
         estimated = any(r.begins == "estimate" for r in self.recordings)
         if not np.any(model.parameters.free) and not (estimated and model.n_state):
-            return self._run_fixed(simulator, model, engine)
+            found = self._run_as_given(simulator, model, engine)
+            if not np.isfinite(found.cost):
+                raise InputError("The simulation diverges at the given values; check the parameters' values and units.")
+            return found
         best: tuple[float, np.ndarray, Problem, Status] | None = None
         for start in starts:
             if best is not None and time.perf_counter() > self.deadline:
                 break
-            found = self._run(simulator, model, engine, start, states, tuple(anneal), solver)
-            if found is not None and (best is None or found[0] < best[0]):
-                best = found
+            one = self._fit_from(simulator, model, engine, start, states, tuple(anneal), solver)
+            if one is not None and (best is None or one[0] < best[0]):
+                best = one
         if best is None:
             unstable = self._describe_instability(simulator)
             raise (RunsAway if unstable else InputError)(
@@ -308,26 +311,21 @@ class Workbench:
             "focus 'prediction' of a diagnosis."
         )
 
-    def run_given(self, simulator: Simulator, model: Model | None = None, engine: Engine | None = None) -> Fitted:
-        """Run a simulator as it stands, with the states in which a fit begins; the cost of a diverging run is infinite.
+    def run_given(self, like: Fitted | None = None) -> Fitted:
+        """Run the simulator at the given values, with the states in which a fit begins.
 
-        A model or an engine that is not given is made.
+        The cost of a diverging run is infinite. The compiled model of `like` is reused.
         """
-        model = model or self.model(simulator)
-        engine = engine or make_engine(model, self.engine)
+        model, engine = (like.model, like.engine) if like else self.compile(self.simulator)
+        return self._run_as_given(self.simulator, model, engine)
+
+    def _run_as_given(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:
         freed = model.parameters.change(**{name: {"fixed": False} for name in model.parameters})
         problem = self.problem(model.with_parameters(freed), engine)  # which needs variables
         values = {k: p.value for k, p in model.parameters.items()}
         return self.result(simulator, values, problem.first_states(problem.start), engine, model)
 
-    def _run_fixed(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:
-        """Run the simulator as it stands, because there is nothing to estimate."""
-        found = self.run_given(simulator, model, engine)
-        if not np.isfinite(found.cost):
-            raise InputError("The simulation diverges at the given values; check the parameters' values and units.")
-        return found
-
-    def _run(
+    def _fit_from(
         self,
         simulator: Simulator,
         model: Model,
