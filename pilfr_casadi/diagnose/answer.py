@@ -18,6 +18,7 @@ from ..simulators import Placed, in_series, name_at, split_port
 from .arguments import Request
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction
+from .detectability import port_units
 from .effect import Effect
 from .faults.channels import IN_RECORDINGS, find_gross_slips
 from .faults.gates import EQUAL_RATIO, TEST_FAULT, Gate, edited
@@ -26,17 +27,9 @@ from .fits.evidence import FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, SURE, 
 from .fits.floor import Floor
 from .fits.force_recovery import is_curve_along
 from .fits.workbench import Fitted, Workbench
-from .identifiability import port_units
 from .mismatch_map import mismatch
 from .preparation import Prepared
-from .proof import (
-    Comparison,
-    free_run_errors,
-    next_experiment,
-    parameter_table,
-    placebo,
-    test_errors,
-)
+from .proof import Comparison, free_run_errors, next_experiment, parameter_table, placebo, test_errors
 from .result import Diagnosis
 from .search.moves import Search
 from .search.trials import Trial

@@ -11,17 +11,7 @@ import numpy as np
 from .._base import InputError, Stages, listed
 from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
 from ..identify import match_channels
-from ..laws import (
-    CATALOGUE,
-    SCALABLE,
-    Law,
-    LinearStiffness,
-    UnreadInput,
-    ViscousDamping,
-    scaled,
-    scheduled,
-    seen_by,
-)
+from ..laws import CATALOGUE, SCALABLE, Law, LinearStiffness, UnreadInput, ViscousDamping, scaled, scheduled, seen_by
 from ..simulators import Simulator, as_simulator
 from .faults.gates import Gate, edited
 from .search.stretches import Stretches

@@ -1,9 +1,9 @@
 """Find blind spots of recordings and sensors: facts that they cannot reveal, without fitting a law (`pilfr check`).
 
-The simulator's own parameters are refitted once. `identifiability` then tells which parameters are identifiable and
-which laws are detectable at which ports, and `excitations` counts reversals and amplitudes of the motion. A parameter
-or law that is not identifiable or detectable is a blind spot, and so is a motion without reversals. The gravest blind
-spot that another recording can remove decides what to record next.
+The simulator's own parameters are refitted once. `identifiability` then tells which parameters are identifiable,
+`detectability` which laws are detectable at which ports, and `excitations` counts reversals and amplitudes of the
+motion. A parameter or law that is not identifiable or detectable is a blind spot, and so is a motion without reversals.
+The gravest blind spot that another recording can remove decides what to record next.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from ..data import Recording
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings, stated_hold
+from .detectability import SMALL_SHARE, LawRow, assess_laws, group_alike, live_ports, port_units
 from .faults.channels import correct_gross_slips, refit_corrected
 from .faults.gates import USELESS_FIT, Checked, Gate
 from .faults.offsets import WrongStart, find_wrong_start
@@ -27,19 +28,7 @@ from .faults.samples import find_held_outputs
 from .fits.floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor
 from .fits.linearise import Probe, Run, linearise_runs
 from .fits.workbench import QUICK, Fitted, Workbench
-from .identifiability import (
-    SMALL_SHARE,
-    LawRow,
-    ParameterRow,
-    Sensitivity,
-    Tie,
-    assess_laws,
-    assess_parameters,
-    group_alike,
-    helpful_sensors,
-    live_ports,
-    port_units,
-)
+from .identifiability import ParameterRow, Sensitivity, Tie, assess_parameters, helpful_sensors
 from .preparation import choose_hold
 
 SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest

@@ -62,8 +62,9 @@ from .arguments import (
 from .correction import find_correction, named_correction
 from .faults.gates import EQUAL_RATIO, LEAST_GAIN, USELESS_FIT, Checked, Gate, gain
 from .faults.offsets import Offset, WrongStart, fix_idle_offsets, list_offsets
-from .faults.samples import find_clipped_input, find_tones, open_unsettled, remove_glitches
+from .faults.samples import find_clipped_input, open_unsettled, remove_glitches
 from .faults.timing import TimeShift
+from .faults.tones import find_tones
 from .fits.evidence import AS_GIVEN_RATIO, SURE
 from .fits.floor import Floor, measured_floor
 from .fits.workbench import RunsAway, converge

@@ -20,14 +20,7 @@ from ..optimise import GaussNewton, Status
 from ..simulators import Simulator, discretise_for, unit_factor, unit_notes
 from .arguments import stated_hold
 from .faults.channels import accept_best, find_gross_slips, find_slips, open_bench, refit_corrected
-from .faults.gates import (
-    CURED_SHARE,
-    EQUAL_RATIO,
-    NEAR_NOISE_RATIO,
-    POOR_FIT,
-    Checked,
-    Gate,
-)
+from .faults.gates import CURED_SHARE, EQUAL_RATIO, NEAR_NOISE_RATIO, POOR_FIT, Checked, Gate
 from .faults.lost_samples import find_gaps, find_output_gaps
 from .faults.offsets import find_offsets, find_wrong_start
 from .faults.samples import find_held_outputs, mend_stale_samples, open_unsettled, remove_glitches, unclip

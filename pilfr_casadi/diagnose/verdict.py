@@ -30,7 +30,7 @@ import numpy as np
 from .._base import in_words
 from ..simulators import SENSOR, Placed, name_at, name_at_any, port_name
 from .faults.gates import Gate
-from .faults.samples import find_ringing_mode
+from .faults.tones import find_ringing_mode
 from .fits.evidence import (
     AT_NOISE_RATIO,
     BETTER_RATIO,

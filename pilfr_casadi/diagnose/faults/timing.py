@@ -18,17 +18,7 @@ from ...data import Recording
 from ...laws import Lag
 from ..fits.floor import ABOVE_NOISE
 from ..fits.workbench import RUNAWAY, Fitted, Workbench, refit
-from .gates import (
-    CLEARLY_BETTER,
-    EQUAL_RATIO,
-    NEAR_NOISE_RATIO,
-    Checked,
-    FirstOrder,
-    Gate,
-    accept,
-    correct,
-    settle,
-)
+from .gates import CLEARLY_BETTER, EQUAL_RATIO, NEAR_NOISE_RATIO, Checked, FirstOrder, Gate, accept, correct, settle
 
 LARGEST_SHIFT = 64  # largest shift that is tried, and largest number of lost samples of an output
 SHIFTS = np.union1d(np.arange(-LARGEST_SHIFT, LARGEST_SHIFT + 1.0), np.linspace(-2.0, 2.0, 17))  # samples

@@ -44,8 +44,8 @@ from .floor import effective_size
 from .workbench import DIVERGED, RUNAWAY, Fitted, Workbench
 
 # The priors and thresholds on which every answer of a search rests. Elsewhere are those of the noise (`floor`), of
-# faults (in `faults`: `gates`, `channels`, `offsets`, `timing`, `lost_samples`, `samples`), the memories of an
-# observer (`prediction`), the bases of flexible forces (`screen`, `learned`) and the accuracy of integration
+# faults (in `faults`: `gates`, `channels`, `offsets`, `timing`, `lost_samples`, `samples`, `tones`), the memories of an
+# observer (`prediction`), the bases of flexible forces (`flexible_forces`, `learned`) and the accuracy of integration
 # (`workbench`, `step_refinement`). All other numbers limit the effort or keep numbers finite.
 
 # Prior probabilities

@@ -36,8 +36,9 @@ from ...models import Model
 from ...optimise import GaussNewton, estimate_initial_state, samples_for_state
 from ...simulators import Simulator
 from ..faults.gates import Gate
+from ..fits.flexible_forces import Surface
 from ..fits.linearise import Probe, loudest_stretch, run
-from ..fits.screen import Dose, Remainder, Surface, orthonormal
+from ..fits.screen import Dose, Remainder, orthonormal
 from ..fits.workbench import DIVERGED, FEW, Fitted, Workbench, output_deviation, refit
 from .hypotheses import Findings, count_samples, likeliest
 from .moves import Search

@@ -25,16 +25,7 @@ from ..faults.offsets import Offset
 from ..fits.evidence import FAR_RATIO, FORMULA_ERROR
 from ..fits.screen import Pair, Scored
 from ..fits.step_refinement import knee_starts, refit_on_finer_steps
-from ..fits.workbench import (
-    BRIEF,
-    COMPARED_SAMPLES,
-    DIVERGED,
-    FEW,
-    QUICK,
-    THOROUGH,
-    Fitted,
-    Workbench,
-)
+from ..fits.workbench import BRIEF, COMPARED_SAMPLES, DIVERGED, FEW, QUICK, THOROUGH, Fitted, Workbench
 
 # Effort: pairs of each list of the screen that are fitted, besides the best of each port; the same if `again`
 BEST, BEST_AGAIN = 10, 4

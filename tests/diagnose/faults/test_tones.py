@@ -9,7 +9,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import laws
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.faults.samples import find_ringing_mode, find_tone, find_tones
+from pilfr_casadi.diagnose.faults.tones import find_ringing_mode, find_tone, find_tones
 from pilfr_casadi.diagnose.fits.floor import Floor
 from pilfr_casadi.diagnose.pipeline import with_tones
 from pilfr_casadi.diagnose.search.moves import Search
