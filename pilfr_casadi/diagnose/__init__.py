@@ -17,7 +17,7 @@ about. Folders and files by stage:
   puts a Prandtl-Ishlinskii layer in place of the hysteresis that was found.
 - After a diagnosis: `replication` fits laws that were found to the recordings of further machines.
 - Before a diagnosis: `blind_spots` (`check`: what the recordings cannot reveal), based on `identifiability` (of
-  parameters) and `detectability` (of laws).
+  parameters), `detectability` (of laws) and `excitation` (of motions).
 """
 
 from __future__ import annotations

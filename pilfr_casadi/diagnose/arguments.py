@@ -162,6 +162,14 @@ def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[ty
     return (*laws, *by_input, *varying, *(seen_by(law, name) for law in laws if law.sensed for name in sensors))
 
 
+def check_time_and_focus(time_limit: float | None, focus: str | None) -> None:
+    """Refuse a time limit that is not positive, and an unknown focus."""
+    if time_limit is not None and not time_limit > 0:
+        raise InputError(f"time_limit={time_limit!r} was given; give seconds, a positive number.")
+    if focus not in (None, "simulation", "prediction"):
+        raise InputError(f"focus={focus!r} was given; use 'simulation', 'prediction' or None.")
+
+
 def check_limits(simulator: Simulator, limits: Mapping[str, float] | None) -> None:
     """Refuse a limit on a name that is not an input, and a limit that is not positive."""
     for name, most in (limits or {}).items():

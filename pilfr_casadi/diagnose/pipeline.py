@@ -55,6 +55,7 @@ from .arguments import (
     add_scaled_laws,
     check_laws,
     check_limits,
+    check_time_and_focus,
     match_recordings,
     match_tests,
     stated_hold,
@@ -75,7 +76,7 @@ from .other_explanations import (
     find_varying_values,
     may_act_elsewhere,
 )
-from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
+from .prediction import can_be_led, drift_note, drifts, prediction_note, predictor
 from .preparation import CHECKS, Prepared, conversions, hold_note, prepare, slow_note
 from .proof import errors_of
 from .result import Diagnosis
@@ -109,10 +110,7 @@ def diagnose_in_steps(
     began = time.perf_counter()
     workers = min(processors(), 4) if workers is None else whole(workers, "workers", 1)
     most_effects = np.inf if effects is None else whole(effects, "effects", 0)
-    if time_limit is not None and not time_limit > 0:
-        raise InputError(f"time_limit={time_limit!r} was given; give seconds, a positive number.")
-    if focus not in (None, *FOCUS):
-        raise InputError(f"focus={focus!r} was given; use 'simulation', 'prediction' or None.")
+    check_time_and_focus(time_limit, focus)
     say = Stages(progress or (lambda stage, done, total, best: None))
     given = as_recordings(train)
     simulator, recordings = match_recordings(simulator, given, hold)
@@ -139,11 +137,7 @@ def diagnose_in_steps(
     )
     most = SEARCHED_SAMPLES if search_samples is None else whole(search_samples, "search_samples", FEWEST_SAMPLES)
     request, ready, search = _search_with_focus(_on_stretches(request, most))
-    everything: Everything | None = None
-    if request.stretches is not None:
-        with search.stage("fits to all recordings"):
-            everything = Everything.of(search, request.stretches, ready.gates)
-        request = replace(request, notes=(request.stretches.note(everything is not None), *request.notes))
+    request, everything = _fit_to_everything(request, ready, search)
     found = _concluded(search, (*request.notes, *ready.gates))
     if found.verdict.kind == "unexplained" and request.focus is None and not search.cut_short:
         with search.until_interrupted():
@@ -168,6 +162,16 @@ def _on_stretches(request: Request, most: int) -> Request:
     request.say("choice of stretches", 1, 1)
     notes = (*request.notes, *spikes, *transients)
     return replace(request, recordings=stretches.cut(), stretches=stretches, notes=notes)
+
+
+def _fit_to_everything(request: Request, ready: Prepared, search: Search) -> tuple[Request, Everything | None]:
+    """Fit the leading hypotheses to all recordings if the search ran on stretches of them, and note that."""
+    if request.stretches is None:
+        return request, None
+    with search.stage("fits to all recordings"):
+        everything = Everything.of(search, request.stretches, ready.gates)
+    note = request.stretches.note(everything is not None)
+    return replace(request, notes=(note, *request.notes)), everything
 
 
 def _search_with_focus(request: Request) -> tuple[Request, Prepared, Search]:

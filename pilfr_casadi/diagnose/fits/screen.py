@@ -317,7 +317,7 @@ class Scored:
 
 
 def screen(
-    bench: Workbench, fitted: Fitted, laws: Sequence[type[Law]], noise: np.ndarray, workers: int = 1
+    bench: Workbench, fitted: Fitted, laws: Sequence[type[Law]], noise: np.ndarray, workers: int
 ) -> tuple[list[Scored], np.ndarray | None]:
     """Score every port and law along the simulation and along the observer, best first.
 

@@ -185,7 +185,7 @@ def force_features(
     stretches: Sequence[Stretch],
     hold: str,
     engine: str,
-    workers: int = 1,
+    workers: int,
 ) -> np.ndarray | None:
     """Compute the size of the residual that each family of forces explains at each port in each stretch, (n, k).
 
@@ -267,7 +267,7 @@ def _first_state(model: Model, engine: Engine, r: Recording) -> np.ndarray:
 # final fits
 
 
-def fit_to_all(bench: Workbench, fitted: Fitted, time_limit: float = np.inf) -> Fitted:
+def fit_to_all(bench: Workbench, fitted: Fitted, time_limit: float) -> Fitted:
     """Fit a simulator to all recordings of a bench from its values on stretches of them.
 
     Without time, or if the run diverges, the values stay as they are.
