@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from diagnosis_rig import OFF, recordings, refitted, rig
+from simulated import outputs_of
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
@@ -207,12 +208,8 @@ def test_a_diagnosis_of_recordings_that_have_not_settled_finds_nothing_missing()
     """From rest, the rig takes some periods to settle; said to be periodic, it is not yet."""
     (one,) = recordings(count=1, seed=3)
     force = np.tile(one.u[:625], (4, 1))
-    from pilfr_casadi.engine import make_engine
-    from pilfr_casadi.simulators import discretise
-
-    model = discretise(rig(), one.dt, "zero", 8)
     r = one.with_(u=force, y=np.zeros((2500, 1)))
-    y = make_engine(model).simulate(model.drive(r), model.parameters.start, np.zeros(model.n_state))[0]
+    y = outputs_of(rig(), r, substeps=8)
     noise = 1e-3 * np.std(y) * np.random.default_rng(1).standard_normal(y.shape)
     found = pilfr.diagnose(rig(OFF), r.with_(y=y + noise, initial="periodic", period=625))
     assert found.verdict == "complete"
