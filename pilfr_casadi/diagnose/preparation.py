@@ -95,7 +95,7 @@ def prepare(
             raise
         first = checks.begin(bench.with_other_hold(), noted)
     if not said:
-        first, held = choose_hold(replace(first, bench=checks.patient(first.bench)))
+        first, held = choose_hold(first.with_deadline(checks.deadline))
     nominal = errors_of(replace(bench, hold=first.bench.hold), first.fitted.model)
     say(CHECKS, 1, CHECKED)
     now = checks.run(first, 1.0 if said else 0.5)
@@ -125,17 +125,18 @@ class _Checks:
     until: float
     left_out: list[Callable[[Checked], Checked]] = field(default_factory=list)
 
-    def patient(self, bench: Workbench) -> Workbench:
-        """Return the bench with time for a first refit: until the checks end, and a few seconds in any case."""
-        return replace(bench, deadline=max(self.until, time.perf_counter() + LEAST_REFIT))
+    @property
+    def deadline(self) -> float:
+        """When a first refit ends: with the checks, and after a few seconds in any case."""
+        return max(self.until, time.perf_counter() + LEAST_REFIT)
 
     def begin(self, bench: Workbench, gates: tuple[Gate, ...]) -> Checked:
         """Refit from the user's values; correct a fault of a channel that shows at these values."""
         found: Checked | None = None
         with UntilInterrupted(bench.interrupt, self.say.interrupted):
-            slips = find_gross_slips(self.patient(bench), self.workers)
-            found = self._try_gross_slips(self.patient(bench), slips, gates) if slips else None
-        return found or first_refit(self.patient(bench), gates)
+            slips = find_gross_slips(replace(bench, deadline=self.deadline), self.workers)
+            found = self._try_gross_slips(replace(bench, deadline=self.deadline), slips, gates) if slips else None
+        return found or first_refit(replace(bench, deadline=self.deadline), gates)
 
     def _try_gross_slips(self, bench: Workbench, slips: Sequence[Gate], gates: tuple[Gate, ...]) -> Checked | None:
         """Correct the likeliest fault if the rule accepts it; None if there is no fault and every run diverges.
@@ -149,7 +150,7 @@ class _Checks:
         found = accept_best(now, () if bench.interrupt.pressed else slips, self.workers)
         if bench.interrupt.pressed:  # half a fit accepts wrong faults
             return now if np.isfinite(now.cost) else None
-        found = replace(found, bench=self.patient(found.bench))
+        found = found.with_deadline(self.deadline)
         if found.adds_to(now):
             return refit_corrected(found)
         if not np.isfinite(found.cost):
@@ -159,9 +160,9 @@ class _Checks:
 
     def run(self, first: Checked, part: float) -> Checked:
         """Correct one fault after the other from the first refit on; `part` is the unit of shifts, see `timing`."""
-        now = with_observer(replace(first, bench=self.patient(first.bench))).weighted()
+        now = with_observer(first.with_deadline(self.deadline)).weighted()
         now = self._in_turn(now, find_wrong_start, in_any_case=True)
-        now = replace(now, bench=replace(now.bench, deadline=self.until))
+        now = now.with_deadline(self.until)
         slips, shift = partial(self._correct_slips, part=part), partial(find_time_shift, part=part, early=self.early)
         now = self._in_turn(now, self._report(2), slips, in_any_case=True)
         now = self._in_turn(now, self._report(3), unclip, mend_stale_samples, find_gaps)
@@ -216,7 +217,7 @@ def _with_better_hold(
     If inputs are taken as held but were interpolated, a late channel is late by half a sample more or less.
     """
     try:
-        again = _with_other_hold(replace(first, bench=checks.patient(first.bench)))
+        again = _with_other_hold(first.with_deadline(checks.deadline))
         both = now, checks.run(again, 0.5)
     except InputError:
         return now, held

@@ -172,6 +172,10 @@ class Checked:
         """Return the next state: another bench and refit, with further findings added."""
         return Checked(bench, fitted, (*self.gates, *gates))
 
+    def with_deadline(self, deadline: float) -> Checked:
+        """Return the same state with another time at which its fits end."""
+        return replace(self, bench=replace(self.bench, deadline=deadline))
+
     def adds_to(self, before: Checked) -> bool:
         """Tell whether it has more findings than a state before."""
         return len(self.gates) > len(before.gates)

@@ -123,7 +123,7 @@ def find_ringing_mode(bench: Workbench, fitted: Fitted) -> float | None:
     with np.errstate(divide="ignore"):
         poles = np.log(np.linalg.eigvals(a).astype(complex)) * fitted.model.substeps / bench.dt
     modes = [abs(s) / (2 * np.pi) for s in poles if s.imag > 0 and -s.real < LIGHT_DAMPING * abs(s)]
-    rest = [e[r.skip :, i] for e, r in zip(fitted.residual, bench.recordings, strict=True) for i in range(r.n_y)]
+    rest = [column for e in bench.scored(fitted.residual) for column in e.T]
     return next((f for f in sorted(modes) if any(_rings(e, f * bench.dt) for e in rest)), None)
 
 

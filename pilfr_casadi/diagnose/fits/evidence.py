@@ -122,8 +122,9 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
     if not laws_at.size:
         return np.zeros(0)
     problem, _, hessian = _hessian(bench, fitted)
+    infinite = np.full(shared.shape[1], np.inf)
     if not np.all(np.isfinite(hessian)):  # a run at the edge of divergence has no derivatives
-        return np.full(shared.shape[1], np.inf)
+        return infinite
     rest = np.setdiff1d(np.arange(len(hessian)), laws_at)
     width = _widths(fitted, laws, problem.free, np.diag(hessian)[: len(numbers)])[laws_at]
     with np.errstate(all="ignore"):
@@ -133,12 +134,10 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
         across = hessian[np.ix_(rest, laws_at)] * width / size[:, None]
         inner = hessian[np.ix_(rest, rest)] / np.outer(size, size)
         if not np.all(np.isfinite(inner)):  # so has one whose derivatives overflow
-            return np.full(shared.shape[1], np.inf)
+            return infinite
         block = block - across.T @ np.linalg.pinv(inner, rcond=1e-10, hermitian=True) @ across
         block = shared.T @ block @ shared
-    if not np.all(np.isfinite(block)):
-        return np.full(len(block), np.inf)
-    return np.maximum(np.linalg.eigvalsh(block), 0.0)
+    return np.maximum(np.linalg.eigvalsh(block), 0.0) if np.all(np.isfinite(block)) else infinite
 
 
 def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n: float) -> float:
