@@ -147,9 +147,10 @@ class Machine:
     @classmethod
     def of(cls, content: Mapping[str, Any]) -> Machine:
         """Make a machine from its JSON content."""
-        own = {f.name: content[f.name] if f.name == "rest" else with_nan(content[f.name]) for f in fields(cls)}
+        given = {f.name: content[f.name] for f in fields(cls) if f.name != "faults" or "faults" in content}
+        own = {name: value if name == "rest" else with_nan(value) for name, value in given.items()}
         trends = {name: Trend(**t) for name, t in own["trends"].items()}
-        return cls(**{**own, "trends": trends, "faults": tuple(own["faults"])})
+        return cls(**{**own, "trends": trends, "faults": tuple(own.get("faults", ()))})
 
 
 @dataclass(frozen=True, eq=False)

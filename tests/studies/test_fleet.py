@@ -163,6 +163,11 @@ def test_a_wrong_unit_is_named(found, days, tmp_path):
     assert [line.partition(":")[0] for line in lines if "already" not in line] == ["refit-f", "measure-f", "rest-f"]
     assert "position is too large by a factor of 1000" in more["f"].findings and not more["f"].report
     assert more["f"].faults == read_fleet(copy, rig(), laws=LAWS)["f"].faults == judged.faults
+    content = json.loads((copy / "fleet.json").read_text())
+    for machine in content["machines"]:
+        del machine["faults"]  # as in a file of an earlier release
+    (tmp_path / "earlier.json").write_text(json.dumps(content))
+    assert not read_fleet(tmp_path / "earlier.json", rig(), laws=LAWS)["f"].faults
     assert [m.name for m in more.drifting] == ["b"]
     assert "position is too large" in (copy / more["f"].page).read_text()
 
