@@ -1,12 +1,12 @@
 """A 2-DOF rig with one law hidden in a port, for the tests of the diagnosis."""
 
 import numpy as np
+from simulated import outputs_of
 
 from pilfr_casadi.data import Recording
 from pilfr_casadi.diagnose.preparation import first_refit, with_observer
-from pilfr_casadi.engine import make_engine
 from pilfr_casadi.models import Parameter
-from pilfr_casadi.simulators import Port, Simulator, choose_substeps, discretise
+from pilfr_casadi.simulators import Port, Simulator, choose_substeps
 
 DT, SAMPLES = 2e-3, 2500
 
@@ -71,7 +71,6 @@ def recordings(*laws, port="ground-m1", seed=0, count=2, noise=1e-3, hold="zero"
         v = np.sum(np.cos(2 * np.pi * f[:, None] * t + phase[:, None]), axis=0)
         u = (40 * v / np.std(v) * (0.3 + 0.7 * np.sin(np.pi * t / t[-1])))[:, None]
         blank = Recording(u, u, DT, inputs=("force",), outputs=("x2",), initial="zero", hold=hold)
-        model = discretise(true, DT, hold, max(4, choose_substeps(true, [blank])))
-        y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(model.n_state))[0]
+        y = outputs_of(true, blank, hold, max(4, choose_substeps(true, [blank])))
         out.append(blank.with_(y=y + noise * np.std(y) * rng.standard_normal(y.shape)))
     return out

@@ -16,8 +16,8 @@ about. Folders and files by stage:
 - Result: `answer` puts it together, `result` is what users hold, an `effect` is a law that was found, and `refinement`
   puts a Prandtl-Ishlinskii layer in place of the hysteresis that was found.
 - After a diagnosis: `replication` fits laws that were found to the recordings of further machines.
-- Before a diagnosis: `blind_spots` (`check`: what the recordings cannot reveal), based on `identifiability` (which
-  parameters are identifiable, and which laws detectable).
+- Before a diagnosis: `blind_spots` (`check`: what the recordings cannot reveal), based on `identifiability` (of
+  parameters), `detectability` (of laws) and `excitation` (of motions).
 """
 
 from __future__ import annotations

@@ -18,28 +18,22 @@ from ..simulators import Placed, in_series, name_at, split_port
 from .arguments import Request
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction
+from .detectability import port_units
 from .effect import Effect
 from .faults.channels import IN_RECORDINGS, find_gross_slips
 from .faults.gates import EQUAL_RATIO, TEST_FAULT, Gate, edited
 from .faults.offsets import Offset, remove_idle_offsets, update_offsets
 from .fits.evidence import FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, SURE, deviations
+from .fits.floor import Floor
 from .fits.force_recovery import is_curve_along
 from .fits.workbench import Fitted, Workbench
-from .identifiability import port_units
 from .mismatch_map import mismatch
 from .preparation import Prepared
-from .proof import (
-    Comparison,
-    free_run_errors,
-    next_experiment,
-    parameter_table,
-    placebo,
-    test_errors,
-)
+from .proof import Comparison, free_run_errors, next_experiment, parameter_table, placebo, test_errors
 from .result import Diagnosis
 from .search.moves import Search
 from .search.trials import Trial
-from .verdict import NamedEffect, Verdict, names
+from .verdict import NamedEffect, Verdict, hypotheses_named, names
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +82,6 @@ def build_diagnosis(
     forms = {e: _other_forms(decided, found.effects, e) for e in found.effects}
     effects = tuple(_make_effect(search, e, final, std, forms[e], fewer.get(e, np.nan)) for e in found.effects)
     floor = search.least_floor if found.verdict.kind == "unexplained" else search.floor
-    floors = {"nrmse": floor, "white": search.least_floor}
-    settled = found.verdict.kind in ("complete", "recording-fault") or (
-        min((e.confidence for e in effects), default=0) > SURE
-    )
     simulated = [e + r.y for e, r in zip(without.residual, bench.recordings, strict=True)]
     experiment = _design_experiment(decided, found.effects, limits)
     blind_spots = _blind_spots(request, ready, search)
@@ -107,16 +97,12 @@ def build_diagnosis(
             *_convergence_note(after),
             *test_notes,
             *_combination_note(after, std, blind_spots),
-            *update_offsets(found.gates, after, std, bool(effects), settled),
+            *update_offsets(found.gates, after, std, bool(effects), _is_sure(found)),
         ),
         mismatch=mismatch(bench.recordings, without.residual, simulated, floor.deviation, bench.scale),
         parameters=parameter_table(request.simulator, without, after, std),
         errors=errors,
-        floor={
-            **{name: f.nrmse(bench.scale) for name, f in floors.items()},
-            "source": floor.source,
-            "test": compared and {name: compared.noise(f.deviation, bench.scale) for name, f in floors.items()},
-        },
+        floor=_describe_noise(floor, search.least_floor, bench, compared),
         corrected=replace(
             remove_idle_offsets(after.corrected(), len(request.simulator.elements)), substeps=after.model.substeps
         ),
@@ -136,6 +122,22 @@ def build_diagnosis(
         blind_spots=blind_spots,
         calls={n: count - request.calls[n] for n, count in request.simulator.program_calls.items()},
     )
+
+
+def _is_sure(found: Conclusion) -> bool:
+    """Tell whether every named effect is sure, or there is none because nothing is missing."""
+    sure = min((e.confidence for e in found.effects), default=0.0) > SURE
+    return sure or found.verdict.kind in ("complete", "recording-fault")
+
+
+def _describe_noise(floor: Floor, white: Floor, bench: Workbench, compared: Comparison | None) -> dict[str, Any]:
+    """Describe the noise relative to the training recordings, and to the test recordings if there are any."""
+    floors = {"nrmse": floor, "white": white}
+    return {
+        **{name: f.nrmse(bench.scale) for name, f in floors.items()},
+        "source": floor.source,
+        "test": compared and {name: compared.noise(f.deviation, bench.scale) for name, f in floors.items()},
+    }
 
 
 def _compute_errors(
@@ -330,7 +332,7 @@ def _make_effect(
 def _other_forms(search: Search, effects: Sequence[NamedEffect], effect: NamedEffect) -> list[Law]:
     """List the laws of no more parameters that make another form of an effect about as likely, the likeliest first."""
     stated, law = {e.name for e in effects}, effect.element.law
-    alike = [t for t in search.memo.values() if names(t) == stated]
+    alike = hypotheses_named(search, stated)
     own = [t for t in alike if any(type(e.law) is type(law) for e in t.effects)]
     least = max(map(search.evidence, own), default=np.inf) - INDISTINGUISHABLE_NATS
     found = dict[str, Law]()
@@ -359,7 +361,7 @@ def _design_experiment(
     for effect in effects:
         if effect.alike:
             name, other = next(iter(effect.alike.items()))
-            stated = [t for t in search.memo.values() if names(t) == {e.name for e in effects}]
+            stated = hypotheses_named(search, {e.name for e in effects})
             having = stated or [t for t in search.memo.values() if effect.name in names(t)]
             one = max(having, key=search.evidence)
             rivals = in_words([name_at(*pair, brief=True) for pair in (effect.name, name)])

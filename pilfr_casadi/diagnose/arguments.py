@@ -11,17 +11,7 @@ import numpy as np
 from .._base import InputError, Stages, listed
 from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
 from ..identify import match_channels
-from ..laws import (
-    CATALOGUE,
-    SCALABLE,
-    Law,
-    LinearStiffness,
-    UnreadInput,
-    ViscousDamping,
-    scaled,
-    scheduled,
-    seen_by,
-)
+from ..laws import CATALOGUE, SCALABLE, Law, LinearStiffness, UnreadInput, ViscousDamping, scaled, scheduled, seen_by
 from ..simulators import Simulator, as_simulator
 from .faults.gates import Gate, edited
 from .search.stretches import Stretches
@@ -170,6 +160,14 @@ def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[ty
     read = [names for port in simulator.all_ports() if len(names := simulator.readers(port)) > 1]
     sensors = sorted({name for names in read for name in names})
     return (*laws, *by_input, *varying, *(seen_by(law, name) for law in laws if law.sensed for name in sensors))
+
+
+def check_time_and_focus(time_limit: float | None, focus: str | None) -> None:
+    """Refuse a time limit that is not positive, and an unknown focus."""
+    if time_limit is not None and not time_limit > 0:
+        raise InputError(f"time_limit={time_limit!r} was given; give seconds, a positive number.")
+    if focus not in (None, "simulation", "prediction"):
+        raise InputError(f"focus={focus!r} was given; use 'simulation', 'prediction' or None.")
 
 
 def check_limits(simulator: Simulator, limits: Mapping[str, float] | None) -> None:

@@ -1,9 +1,9 @@
 """Find blind spots of recordings and sensors: facts that they cannot reveal, without fitting a law (`pilfr check`).
 
-The simulator's own parameters are refitted once. `identifiability` then tells which parameters are identifiable and
-which laws are detectable at which ports, and `excitations` counts reversals and amplitudes of the motion. A parameter
-or law that is not identifiable or detectable is a blind spot, and so is a motion without reversals. The gravest blind
-spot that another recording can remove decides what to record next.
+The simulator's own parameters are refitted once. `identifiability` then tells which parameters are identifiable,
+`detectability` which laws are detectable at which ports, and `excitation` counts reversals and amplitudes of the
+motion. A parameter or law that is not identifiable or detectable is a blind spot, and so is a motion without reversals.
+The gravest blind spot that another recording can remove decides what to record next.
 """
 
 from __future__ import annotations
@@ -20,29 +20,17 @@ from ..data import Recording
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings, stated_hold
-from .faults.channels import accept_best, find_gross_slips, refit_corrected
-from .faults.gates import USELESS_FIT, Checked, refit
+from .detectability import LawRow, assess_laws, group_alike
+from .excitation import Excitation, excitations
+from .faults.channels import correct_gross_slips, refit_corrected
+from .faults.gates import USELESS_FIT, Checked, Gate
 from .faults.offsets import WrongStart, find_wrong_start
 from .faults.samples import find_held_outputs
-from .fits.floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor, noise_floor
-from .fits.linearise import Probe, Run, linearise_runs
+from .fits.floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor
+from .fits.linearise import linearise_runs
 from .fits.workbench import QUICK, Fitted, Workbench
-from .identifiability import (
-    SMALL_SHARE,
-    LawRow,
-    ParameterRow,
-    Sensitivity,
-    Tie,
-    assess_laws,
-    assess_parameters,
-    group_alike,
-    helpful_sensors,
-    live_ports,
-    port_units,
-)
+from .identifiability import ParameterRow, Sensitivity, Tie, assess_parameters, helpful_sensors
 from .preparation import choose_hold
-
-SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
 
 IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the blind spot
     "identifiable": ("yes", ""),
@@ -78,30 +66,6 @@ class BlindSpot:
     kind: str
     names: tuple[str, ...]
     sentence: str
-
-
-@dataclass(frozen=True)
-class Excitation:
-    """Motion of a port's local coordinate.
-
-    Attributes
-    ----------
-    travel : float
-        Largest minus smallest value, in `unit`.
-    reversals : int
-        Turning points with swings of at least a twentieth of the travel on both sides.
-    amplitudes : int
-        Distinct amplitudes of nine tenths of the swings; amplitudes closer than a tenth of the largest count once.
-    rests : int
-        Stretches longer than two typical swings in which the coordinate stays within a twentieth of the travel.
-    """
-
-    port: str
-    travel: float
-    unit: str
-    reversals: int
-    amplitudes: int
-    rests: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,27 +257,33 @@ def check(
     simulator, recordings = match_recordings(simulator, train, hold, excited=False)
     check_laws(laws)
     stated = stated_hold(simulator, recordings, hold)
-    bench = Workbench.of(simulator, recordings, stated or "zero", engine)
-    slips = find_gross_slips(bench)
-    plain = refit(bench) if slips else None
-    now = accept_best(Checked(bench, plain or bench.run_given(simulator)), slips)
-    if now.gates:
+    now = _refit(Workbench.of(simulator, recordings, stated or "zero", engine), hold_said=stated is not None)
+    found = assess_recordings(now.bench, now.fitted, now.floor, stated or "", laws)
+    slow = find_held_outputs(recordings)
+    return _with_faults(found, now.gates, slow, recordings) if now.gates or slow else found
+
+
+def _refit(bench: Workbench, hold_said: bool) -> Checked:
+    """Refit with channels and start corrected if they are wrong, and with the better hold unless it is stated."""
+    now = correct_gross_slips(bench)
+    if now is not None and now.gates:
         now = refit_corrected(now)
-    elif plain is None:
-        now = Checked(bench, bench.fit(simulator))
-    if not stated:
+    elif now is None or not np.isfinite(now.cost):
+        now = Checked(bench, bench.fit(bench.simulator))
+    if not hold_said:
         now = choose_hold(now, QUICK)[0]
     now = find_wrong_start(now)
-    bench, fitted, faults = now.bench, now.fitted, now.gates
-    slow = find_held_outputs(recordings)
-    bench.interrupt.raise_pending()  # half a fit would tell wrong things
-    bench.check_followed(fitted)
-    floor = noise_floor(bench.recordings, bench.scored(fitted.residual))
-    found = assess_recordings(bench, fitted, floor, stated or "", laws)
-    if not (faults or slow):
-        return found
-    told = [f.sentence + " Below, it is corrected." * f.corrected for f in (*faults, *slow)]
-    spots = (BlindSpot("recording-fault", (f.channel,), text) for f, text in zip((*faults, *slow), told, strict=True))
+    now.bench.interrupt.raise_pending()  # half a fit would tell wrong things
+    now.bench.check_followed(now.fitted)
+    return now
+
+
+def _with_faults(found: Check, faults: Sequence[Gate], slow: Sequence[Gate], recordings: Sequence[Recording]) -> Check:
+    """Put faults and held outputs of the recordings before the blind spots, and the advice to correct them first."""
+    spots = [
+        BlindSpot("recording-fault", (f.channel,), f.sentence + " Below, it is corrected." * f.corrected)
+        for f in (*faults, *slow)
+    ]
     wired = [f.channel for f in faults if not isinstance(f, WrongStart)]
     advice = [f"Correct the recordings first: check wiring, sign and unit of {in_words(wired)}."] if wired else []
     if len(wired) < len(faults):
@@ -369,7 +339,7 @@ def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[Param
     if not doubtful:
         return ()
     values = {k: p.value for k, p in fitted.model.parameters.items()}
-    given = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model)
+    given = bench.rerun(fitted, values)
     if not np.isfinite(given.cost):
         return ()
     response = Sensitivity.of(bench, given, linearise_runs(bench, given)[1])
@@ -473,63 +443,6 @@ def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) ->
     if found.ties:
         return f"No further record of these signals helps: measure {found.ties[0].names[0]} separately and fix it."
     return "These recordings tell most things. For the test, take amplitudes that the training recordings do not have."
-
-
-def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator[Excitation]:
-    """Count reversals, distinct amplitudes and rests of every live port's local coordinate along the refitted run."""
-    for port in live_ports(bench.simulator):
-        signals = [r.z[:, probe.ports.index(port.name)] for r in runs]
-        travel = float(np.ptp(np.concatenate(signals)))
-        least = SMALLEST_SWING * travel
-        reversals, rests, swings = 0, 0, list[float]()
-        for z in signals if travel > 0 else ():
-            turns = _turning_points(z, least)
-            reversals += max(len(turns) - 2, 0)
-            swings += np.abs(np.diff(z[turns])).tolist()
-            longest = 2 * float(np.median(np.diff(turns))) if len(turns) > 2 else SMALL_SHARE * len(z)
-            rests += _count_rests(z, least, longest)
-        unit = port.across_unit or port_units(port, bench.recordings[0])[1]
-        yield Excitation(port.name, travel, unit, reversals, _count_distinct(np.array(swings)), rests)
-
-
-def _turning_points(z: np.ndarray, least: float) -> list[int]:
-    """Find the turning points of z (M,) between swings of at least `least`, the first and the last included."""
-    turns, extreme, direction = [0], 0, 0.0
-    for k, value in enumerate(z.tolist()):
-        if direction == 0:
-            if abs(value - z[0]) >= least:
-                direction, extreme = np.sign(value - z[0]), k
-        elif direction * (value - z[extreme]) >= 0:
-            extreme = k
-        elif direction * (z[extreme] - value) >= least:
-            turns.append(extreme)
-            direction, extreme = -direction, k
-    return [*turns, extreme] if extreme > turns[-1] else turns
-
-
-def _count_distinct(swings: np.ndarray) -> int:
-    """Count the distinct sizes of nine tenths of the swings; sizes within a tenth of the largest count once."""
-    if not len(swings):
-        return 0
-    left, counts = np.sort(swings)[::-1], list[int]()
-    apart = SMALL_SHARE * float(left[0])
-    while len(left):
-        own = left > left[0] - apart
-        counts.append(int(np.sum(own)))
-        left = left[~own]
-    share = np.cumsum(sorted(counts, reverse=True)) / sum(counts)
-    return int(np.searchsorted(share, 1 - SMALL_SHARE - 1e-9) + 1)
-
-
-def _count_rests(z: np.ndarray, least: float, samples: float) -> int:
-    """Count the stretches of more than `samples` samples in which z stays within `least`."""
-    count, begin, low, high = 0, 0, z[0], z[0]
-    for k, value in enumerate(z):
-        low, high = min(low, value), max(high, value)
-        if high - low > least or k == len(z) - 1:
-            count += k - begin > samples
-            begin, low, high = k, value, value
-    return count
 
 
 def _describe_change(parameter: str) -> str:

@@ -28,7 +28,7 @@ from .search.hypotheses import likeliest
 from .search.learned import Learned, LearnedForce, describe_learned, refit_learned
 from .search.moves import Search
 from .search.trials import Trial
-from .verdict import Posterior, explainable_remainder, names, share_left
+from .verdict import Posterior, explainable_remainder, hypotheses_named, share_left
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +187,7 @@ def _choose(predicted: Sequence[_Predicted]) -> _Predicted:
 def _named_hypotheses(search: Search, answer: Posterior) -> list[Trial]:
     """List the likeliest hypothesis, and the one without the effects whose names are not certain."""
     sure = frozenset(e.name for e in answer.effects if e.confidence > SURE)
-    fewer = [t for t in search.memo.values() if names(t) == sure] if sure else []
+    fewer = hypotheses_named(search, sure) if sure else []
     tried = {t.key: t for t in (answer.best, *sorted(fewer, key=lambda t: t.mean_square)[:1])}
     return [search.thorough(t) for t in tried.values()]
 

@@ -31,11 +31,10 @@ from .faults.gates import (
     describe_fall,
     gain,
     open_start,
-    refit,
 )
 from .fits.evidence import AT_NOISE_RATIO, BETTER_RATIO, CONTENDING_NATS, FAR_RATIO, NEAR_RATIO, SURE, deviations
 from .fits.linearise import simulate_states
-from .fits.workbench import FEW, THOROUGH, Fitted, Workbench
+from .fits.workbench import FEW, THOROUGH, Fitted, Workbench, refit
 from .search.moves import Search
 from .search.trials import Trial
 from .verdict import Posterior, posterior, strained

@@ -55,6 +55,7 @@ from .arguments import (
     add_scaled_laws,
     check_laws,
     check_limits,
+    check_time_and_focus,
     match_recordings,
     match_tests,
     stated_hold,
@@ -62,8 +63,9 @@ from .arguments import (
 from .correction import find_correction, named_correction
 from .faults.gates import EQUAL_RATIO, LEAST_GAIN, USELESS_FIT, Checked, Gate, gain
 from .faults.offsets import Offset, WrongStart, fix_idle_offsets, list_offsets
-from .faults.samples import find_clipped_input, find_tones, open_unsettled, remove_glitches
+from .faults.samples import find_clipped_input, open_unsettled, remove_glitches
 from .faults.timing import TimeShift
+from .faults.tones import find_tones
 from .fits.evidence import AS_GIVEN_RATIO, SURE
 from .fits.floor import Floor, measured_floor
 from .fits.workbench import RunsAway, converge
@@ -74,7 +76,7 @@ from .other_explanations import (
     find_varying_values,
     may_act_elsewhere,
 )
-from .prediction import FOCUS, can_be_led, drift_note, drifts, prediction_note, predictor
+from .prediction import can_be_led, drift_note, drifts, prediction_note, predictor
 from .preparation import CHECKS, Prepared, conversions, hold_note, prepare, slow_note
 from .proof import errors_of
 from .result import Diagnosis
@@ -108,10 +110,7 @@ def diagnose_in_steps(
     began = time.perf_counter()
     workers = min(processors(), 4) if workers is None else whole(workers, "workers", 1)
     most_effects = np.inf if effects is None else whole(effects, "effects", 0)
-    if time_limit is not None and not time_limit > 0:
-        raise InputError(f"time_limit={time_limit!r} was given; give seconds, a positive number.")
-    if focus not in (None, *FOCUS):
-        raise InputError(f"focus={focus!r} was given; use 'simulation', 'prediction' or None.")
+    check_time_and_focus(time_limit, focus)
     say = Stages(progress or (lambda stage, done, total, best: None))
     given = as_recordings(train)
     simulator, recordings = match_recordings(simulator, given, hold)
@@ -138,13 +137,9 @@ def diagnose_in_steps(
     )
     most = SEARCHED_SAMPLES if search_samples is None else whole(search_samples, "search_samples", FEWEST_SAMPLES)
     request, ready, search = _search_with_focus(_on_stretches(request, most))
-    everything: Everything | None = None
-    if request.stretches is not None:
-        with search.stage("fits to all recordings"):
-            everything = Everything.of(search, request.stretches, ready.gates)
-        request = replace(request, notes=(request.stretches.note(everything is not None), *request.notes))
+    request, everything = _fit_to_everything(request, ready, search)
     found = _concluded(search, (*request.notes, *ready.gates))
-    if found.verdict.kind == "unexplained" and request.focus is None and not (search.interrupted or search.out_of_time):
+    if found.verdict.kind == "unexplained" and request.focus is None and not search.cut_short:
         with search.until_interrupted():
             found = _name_in_predictions(request, search, found)
     final = _final_fits(request, ready, search, found, everything)
@@ -167,6 +162,16 @@ def _on_stretches(request: Request, most: int) -> Request:
     request.say("choice of stretches", 1, 1)
     notes = (*request.notes, *spikes, *transients)
     return replace(request, recordings=stretches.cut(), stretches=stretches, notes=notes)
+
+
+def _fit_to_everything(request: Request, ready: Prepared, search: Search) -> tuple[Request, Everything | None]:
+    """Fit the leading hypotheses to all recordings if the search ran on stretches of them, and note that."""
+    if request.stretches is None:
+        return request, None
+    with search.stage("fits to all recordings"):
+        everything = Everything.of(search, request.stretches, ready.gates)
+    note = request.stretches.note(everything is not None)
+    return replace(request, notes=(note, *request.notes)), everything
 
 
 def _search_with_focus(request: Request) -> tuple[Request, Prepared, Search]:
@@ -233,10 +238,10 @@ def _search(request: Request) -> tuple[Prepared, Search]:
     if search.shift is not None:
         return _search_realigned(request, ready, search, search.shift)
     start = next((g.otherwise for g in ready.gates if isinstance(g, WrongStart) and g.otherwise), None)
-    if start is not None and not (search.interrupted or search.out_of_time):
+    if start is not None and not search.cut_short:
         request, ready, search = _search_from_unknown_start(request, ready, search, start)
     leads = any(isinstance(g, TimeShift) and g.leads for g in ready.gates)
-    if not leads or search.interrupted or search.out_of_time or not search.can_improve(search.best):
+    if not leads or search.cut_short or not search.can_improve(search.best):
         return ready, search
     found = _again(search, partial(_search_once, request, shift_early=False))
     if found is None:
@@ -261,7 +266,7 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
     if found is None:
         return ready, search if search.interrupted else search.run(request.most_effects)
     other, again = found
-    if again.can_improve(again.best) and not (again.interrupted or again.out_of_time):
+    if again.can_improve(again.best) and not again.cut_short:
         search.run(request.most_effects)
     before2, after2 = _comparable(search, again)
     if before2 < AS_GIVEN_RATIO * after2:
@@ -364,7 +369,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     found stays; otherwise the refitted simulator is returned.
     """
     answer, interrupted = posterior(search), search.interrupted
-    finished, elsewhere = not (interrupted or search.out_of_time), tuple[Gate, ...]()
+    finished, elsewhere = not search.cut_short, tuple[Gate, ...]()
     given, gates = gates, with_tones(search, answer, gates)
     verdict = judge(search, answer, gates)
     if verdict.kind in ("missing-physics", "unexplained") and not (interrupted or search.past_deadline):
@@ -492,5 +497,5 @@ def _final_fits(
         whole, pair = everything.bench, (without, after)
         to_all = [everything.fit(search, one) for one in pair]
         drawn = [back_on_stretches(bench, f, one.initial) for f, one in zip(to_all, pair, strict=True)]
-        nominal = errors_of(whole, whole.model(request.simulator), whole=True)
+        nominal = errors_of(whole, whole.model(request.simulator))
     return FinalFits(whole, to_all[0], to_all[1], nominal, (drawn[0], drawn[1]), partial(everything.fit, search))

@@ -28,11 +28,10 @@ from .._base import InputError
 from ..data import Recording
 from ..linear import steady_state_gain
 from ..simulators import Simulator, discretise, growth_rate
-from .faults.gates import USELESS_FIT, Gate, refit
+from .faults.gates import USELESS_FIT, Gate
 from .fits.linearise import linearise_runs
-from .fits.workbench import MOST_GROWTH, Fitted, Workbench
+from .fits.workbench import MOST_GROWTH, Fitted, Workbench, refit
 
-FOCUS = "simulation", "prediction"
 ROUNDING = 1e-9  # share of the largest entry that counts as zero
 # memories that are tried in turn, in half decades: times the time of e-fold growth (a longer one leaves the unstable
 # eigenvalue of the observer as it is); for a stable simulator times the longest recording's duration

@@ -20,22 +20,15 @@ from ..optimise import GaussNewton, Status
 from ..simulators import Simulator, discretise_for, unit_factor, unit_notes
 from .arguments import stated_hold
 from .faults.channels import accept_best, find_gross_slips, find_slips, open_bench, refit_corrected
-from .faults.gates import (
-    CURED_SHARE,
-    EQUAL_RATIO,
-    NEAR_NOISE_RATIO,
-    POOR_FIT,
-    Checked,
-    Gate,
-    refit,
-)
+from .faults.gates import CURED_SHARE, EQUAL_RATIO, NEAR_NOISE_RATIO, POOR_FIT, Checked, Gate
 from .faults.lost_samples import find_gaps, find_output_gaps
 from .faults.offsets import find_offsets, find_wrong_start
 from .faults.samples import find_held_outputs, mend_stale_samples, open_unsettled, remove_glitches, unclip
 from .faults.timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps
 from .fits.floor import Floor, pool, white_part
 from .fits.linearise import linearise_runs, observer_gain, sample_run
-from .fits.workbench import THOROUGH, Fitted, Workbench, refine_steps
+from .fits.step_refinement import refine_steps
+from .fits.workbench import THOROUGH, Fitted, Workbench, refit
 from .proof import errors_of
 
 CHECKED_ABOVE = 4e-4  # mean square error up to which signs and units are not checked
@@ -102,8 +95,8 @@ def prepare(
             raise
         first = checks.begin(bench.with_other_hold(), noted)
     if not said:
-        first, held = choose_hold(replace(first, bench=checks.patient(first.bench)))
-    nominal = errors_of(replace(bench, hold=first.bench.hold), first.fitted.model, whole=True)
+        first, held = choose_hold(first.with_deadline(checks.deadline))
+    nominal = errors_of(replace(bench, hold=first.bench.hold), first.fitted.model)
     say(CHECKS, 1, CHECKED)
     now = checks.run(first, 1.0 if said else 0.5)
     faulty = any(g.fault for g in now.gates[len(first.gates) :])
@@ -132,17 +125,18 @@ class _Checks:
     until: float
     left_out: list[Callable[[Checked], Checked]] = field(default_factory=list)
 
-    def patient(self, bench: Workbench) -> Workbench:
-        """Return the bench with time for a first refit: until the checks end, and a few seconds in any case."""
-        return replace(bench, deadline=max(self.until, time.perf_counter() + LEAST_REFIT))
+    @property
+    def deadline(self) -> float:
+        """When a first refit ends: with the checks, and after a few seconds in any case."""
+        return max(self.until, time.perf_counter() + LEAST_REFIT)
 
     def begin(self, bench: Workbench, gates: tuple[Gate, ...]) -> Checked:
         """Refit from the user's values; correct a fault of a channel that shows at these values."""
         found: Checked | None = None
         with UntilInterrupted(bench.interrupt, self.say.interrupted):
-            slips = find_gross_slips(self.patient(bench), self.workers)
-            found = self._try_gross_slips(self.patient(bench), slips, gates) if slips else None
-        return found or first_refit(self.patient(bench), gates)
+            slips = find_gross_slips(replace(bench, deadline=self.deadline), self.workers)
+            found = self._try_gross_slips(replace(bench, deadline=self.deadline), slips, gates) if slips else None
+        return found or first_refit(replace(bench, deadline=self.deadline), gates)
 
     def _try_gross_slips(self, bench: Workbench, slips: Sequence[Gate], gates: tuple[Gate, ...]) -> Checked | None:
         """Correct the likeliest fault if the rule accepts it; None if there is no fault and every run diverges.
@@ -151,13 +145,13 @@ class _Checks:
         cannot follow. It goes on if there is no fault.
         """
         brief = replace(bench, deadline=(time.perf_counter() + bench.deadline) / 2)
-        plain = refit(brief, solver=THOROUGH) or brief.run_given(brief.simulator)
+        plain = refit(brief, solver=THOROUGH) or brief.run_given()
         now = replace(with_observer(Checked(brief, plain, gates)), bench=bench)
         found = accept_best(now, () if bench.interrupt.pressed else slips, self.workers)
         if bench.interrupt.pressed:  # half a fit accepts wrong faults
             return now if np.isfinite(now.cost) else None
-        found = replace(found, bench=self.patient(found.bench))
-        if len(found.gates) > len(gates):
+        found = found.with_deadline(self.deadline)
+        if found.adds_to(now):
             return refit_corrected(found)
         if not np.isfinite(found.cost):
             return None
@@ -166,9 +160,9 @@ class _Checks:
 
     def run(self, first: Checked, part: float) -> Checked:
         """Correct one fault after the other from the first refit on; `part` is the unit of shifts, see `timing`."""
-        now = with_observer(replace(first, bench=self.patient(first.bench))).weighted()
+        now = with_observer(first.with_deadline(self.deadline)).weighted()
         now = self._in_turn(now, find_wrong_start, in_any_case=True)
-        now = replace(now, bench=replace(now.bench, deadline=self.until))
+        now = now.with_deadline(self.until)
         slips, shift = partial(self._correct_slips, part=part), partial(find_time_shift, part=part, early=self.early)
         now = self._in_turn(now, self._report(2), slips, in_any_case=True)
         now = self._in_turn(now, self._report(3), unclip, mend_stale_samples, find_gaps)
@@ -200,12 +194,12 @@ class _Checks:
         if now.cost <= NEAR_NOISE_RATIO**2 * now.noise2 or np.mean(now.fitted.squares) <= CHECKED_ABOVE:
             return now
         found = self._find_slips(now, part)
-        return found if len(found.gates) == len(now.gates) else refit_corrected(found)
+        return refit_corrected(found) if found.adds_to(now) else found
 
     def _find_slips(self, now: Checked, part: float) -> Checked:
         """Find wrong signs, units and exchanged channels; or a shift, because half a period late looks like a sign."""
         found = find_slips(now, self.workers)
-        if len(found.gates) == len(now.gates) or found.cost <= POOR_FIT:
+        if not found.adds_to(now) or found.cost <= POOR_FIT:
             return found
         late = find_time_shift(now, part, self.early)
         return late if late.cost < CURED_SHARE * found.cost else found
@@ -223,7 +217,7 @@ def _with_better_hold(
     If inputs are taken as held but were interpolated, a late channel is late by half a sample more or less.
     """
     try:
-        again = _with_other_hold(replace(first, bench=checks.patient(first.bench)))
+        again = _with_other_hold(first.with_deadline(checks.deadline))
         both = now, checks.run(again, 0.5)
     except InputError:
         return now, held
@@ -259,7 +253,7 @@ def with_observer(now: Checked) -> Checked:
     if now.cost < POOR_FIT:
         return now
     bench = now.bench
-    given = bench.run_given(bench.simulator, now.fitted.model, now.fitted.engine)
+    given = bench.run_given(now.fitted)
     if not np.isfinite(given.cost):
         return now
     probe, runs = linearise_runs(bench, given)

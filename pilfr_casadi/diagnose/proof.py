@@ -48,21 +48,20 @@ class Comparison:
 
         Samples before served to estimate the initial state. Relative errors on the rest are large.
         """
-        return [(r.name, first) for r, first in self.scored if _rests_after(r, first)]
+        found = []
+        for r, first in self.scored:
+            whole, scored = (np.std(r.y[k:], axis=0) for k in (r.skip, first))
+            found += [(r.name, first)] if np.any(scored < LEAST_MOTION * whole) else []
+        return found
 
     def noise(self, deviation: np.ndarray, resting: np.ndarray) -> float:
         """Compute the NRMSE of noise with the deviations (n_y,); `resting` is the scale of an output that rests."""
         return float(np.mean([nrmse(r.y, r.y + deviation, first, resting) for r, first in self.scored]))
 
 
-def _rests_after(recording: Recording, first: int) -> bool:
-    whole, scored = (np.std(recording.y[k:], axis=0) for k in (recording.skip, first))
-    return bool(np.any(scored < LEAST_MOTION * whole))
-
-
-def errors_of(bench: Workbench, model: Model, *, whole: bool = False) -> float:
-    """Compute the NRMSE of a model at its start values; see `compare_errors`."""
-    return compare_errors(bench, {"": Started(model)}, whole=whole).errors[""]
+def errors_of(bench: Workbench, model: Model) -> float:
+    """Compute the NRMSE of a model at its start values on all samples; see `compare_errors`."""
+    return compare_errors(bench, {"": Started(model)}, whole=True).errors[""]
 
 
 def compare_errors(bench: Workbench, models: Mapping[str, Started], *, whole: bool = False) -> Comparison:
@@ -199,10 +198,7 @@ def next_experiment(
             u=drive, y=np.zeros((len(drive), len(noise))), initial="zero", period=None, skip=0
         )
         with np.errstate(all="ignore"):
-            y = [
-                f.engine.simulate(f.model.drive(recording), f.vector, np.zeros(f.model.n_state))[0]
-                for f in (one, other)
-            ]
+            y = [f.simulate(recording, np.zeros(f.model.n_state)) for f in (one, other)]
             value = float(np.sqrt(np.mean(((y[0] - y[1]) / np.maximum(noise, 1e-300)) ** 2)))
         return value if np.isfinite(value) else 0.0
 

@@ -34,7 +34,7 @@ from ..engine import make_engine
 from ..identify import regrid
 from ..laws import OPERATORS, Law, Local, display_name, hysteresis_layer, unit_forces
 from ..models import check_size, play
-from ..simulators import Placed, Simulator, discretise, in_series, on_grid
+from ..simulators import Simulator, discretise, in_series, on_grid
 from .fits.evidence import HeldOut, Sample, held_out_errors, spread
 from .fits.floor import effective_size
 from .fits.force_recovery import signals_along
@@ -348,15 +348,12 @@ def _initial_state(after: Fitted, state: np.ndarray, number: int, law: Law, z: f
     """Return an initial state in which the layer's memory is z, so that no operator is saturated."""
     own = len(after.simulator.states)
     elements = on_grid(after.simulator, h).elements  # the memory of a delay depends on the step
-    sizes = [int(getattr(e.law, "order", 0)) for e in elements] + [_memory(e) for e in elements]
+    memories = [int(e.law.memory) if hasattr(e.law, "step") else 0 for e in elements]
+    sizes = [*(int(getattr(e.law, "order", 0)) for e in elements), *memories]
     parts = np.split(np.asarray(state, dtype=float)[own:], np.cumsum(sizes)[:-1])
     parts[number] = np.zeros(0)
     parts[len(elements) + number] = np.full(law.memory, z)
     return np.concatenate([state[:own], *parts])
-
-
-def _memory(element: Placed) -> int:
-    return int(element.law.memory) if hasattr(element.law, "step") else 0
 
 
 def _build_refinement(

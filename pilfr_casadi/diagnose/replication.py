@@ -25,12 +25,12 @@ from ..data import Recording
 from ..laws import Law
 from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
 from .arguments import match_recordings, stated_hold
-from .faults.channels import accept_best, find_gross_slips
-from .faults.gates import Checked, refit
+from .faults.channels import correct_gross_slips
+from .faults.gates import Checked
 from .fits.evidence import FORMULA_ERROR, Sample, deviations, information, log_evidence, log_prior, prior_width
 from .fits.floor import effective_size, measured_floor, third_differences
 from .fits.linearise import sample_run
-from .fits.workbench import FINER_STEPS, THOROUGH, Fitted, Workbench
+from .fits.workbench import FINER_STEPS, THOROUGH, Fitted, Workbench, refit
 from .search.trials import Trials
 
 STEP_ACCURACY = 0.25  # standard errors by which finer steps may change a value: 3 % of it, added in squares
@@ -89,12 +89,9 @@ def find_channel_faults(
     The simulator is refitted only if one is suspected. For arguments and errors see `replicate`.
     """
     bench = _bench(simulator, recordings, hold, engine)
-    slips = find_gross_slips(bench)
-    if not slips:
-        return ()
-    now = accept_best(Checked(bench, refit(bench) or bench.run_given(bench.simulator)), slips)
+    now = correct_gross_slips(bench)
     bench.interrupt.raise_pending()
-    return tuple(fault.sentence for fault in now.gates)
+    return tuple(fault.sentence for fault in now.gates) if now else ()
 
 
 def _bench(simulator: Any, recordings: Any, hold: str | None, engine: str) -> Workbench:

@@ -30,7 +30,7 @@ import numpy as np
 from .._base import in_words
 from ..simulators import SENSOR, Placed, name_at, name_at_any, port_name
 from .faults.gates import Gate
-from .faults.samples import find_ringing_mode
+from .faults.tones import find_ringing_mode
 from .fits.evidence import (
     AT_NOISE_RATIO,
     BETTER_RATIO,
@@ -131,6 +131,11 @@ def names(trial: Trial) -> frozenset[Name]:
     return frozenset((e.port, e.law.id) for e in trial.effects)
 
 
+def hypotheses_named(search: Hypotheses, said: Collection[Name]) -> list[Trial]:
+    """List the hypotheses whose effects have these ports and law ids; an effect may have several forms."""
+    return [t for t in search.memo.values() if names(t) == said]
+
+
 def explainable_remainder(search: Hypotheses, trial: Trial, before: Trial | None = None) -> float:
     """Compute the share s of the mismatch that a hypothesis leaves and that a flexible force would explain.
 
@@ -178,7 +183,7 @@ def posterior(search: Hypotheses) -> Posterior:
         by_names[names(t)] = by_names.get(names(t), 0.0) + float(w)
     said = max(by_names, key=lambda n: by_names[n])
     while True:
-        best = _plainest(search, [t for t in trials if names(t) == said])
+        best = _plainest(search, hypotheses_named(search, said))
         if not said:
             return Posterior(best, 0.0, (), by_names[said])
         found = [_make_effect(search, best, e, by_names) for e in best.effects]
@@ -219,7 +224,7 @@ def _acts(search: Hypotheses, best: Trial, element: Placed) -> float:
 def _without(search: Hypotheses, best: Trial, effect: NamedEffect) -> Trial | None:
     """Return the hypothesis without one of several effects, if it was fitted."""
     others = names(best) - {effect.name}
-    fitted = [t for t in search.memo.values() if names(t) == others] if others else []
+    fitted = hypotheses_named(search, others) if others else []
     return min(fitted, key=lambda t: t.mean_square, default=None)
 
 

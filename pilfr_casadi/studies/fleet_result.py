@@ -62,8 +62,9 @@ class Machine:
     failed : str
         Why the machine could not be fitted; empty if it could.
     rest : mapping
-        The diagnosis of what remains: `verdict`, `sentence`, `effects`, and `faults` of the recordings; empty if there
-        was none.
+        The diagnosis of what remains: `verdict`, `sentence` and `effects`; empty if there was none.
+    faults : tuple of str
+        Faults of the recordings that show beside the common physics, each a sentence.
     report : str
         Path of the machine's own diagnosis below the folder of the fleet, if there is one.
     """
@@ -81,6 +82,7 @@ class Machine:
     noise: float = np.nan
     failed: str = ""
     rest: Mapping[str, Any] = field(default_factory=dict)
+    faults: tuple[str, ...] = ()
     report: str = ""
 
     @property
@@ -93,7 +95,7 @@ class Machine:
     def reasons(self) -> tuple[tuple[str, float], ...]:
         """Findings that are more likely than not, each with its probability; the most probable first."""
         found = [(self._describe_rest(), self.beyond)] if self.beyond > SURE else []
-        if self.rest.get("faults"):  # the values are then of wrong recordings
+        if self.faults:  # the values are then of wrong recordings
             return tuple(found)
         found += [
             (f"{name} = {_with_error(self.values[name], self.errors[name])}", p)
@@ -110,7 +112,7 @@ class Machine:
     @property
     def drifts(self) -> bool:
         """Whether a value drifts; values of faulty recordings say nothing about this."""
-        return not self.rest.get("faults") and any(t.probability > SURE for t in self.trends.values())
+        return not self.faults and any(t.probability > SURE for t in self.trends.values())
 
     @property
     def page(self) -> str:
@@ -130,8 +132,8 @@ class Machine:
         return "; ".join(filter(None, (*(f"{text} ({p:.2f})" for text, p in self.reasons), self.note)))
 
     def _describe_rest(self) -> str:
-        if faults := self.rest.get("faults"):
-            return f"its error is {self.ratio:.3g} times the noise. {' '.join(faults).rstrip('.')}"
+        if self.faults:
+            return f"its error is {self.ratio:.3g} times the noise. {' '.join(self.faults).rstrip('.')}"
         text = f"lacks more: its error is {self.ratio:.3g} times the noise"
         named = ", ".join(name_at(e["port"], e["law"], e.get("form", "")) for e in self.rest.get("effects", ()))
         return f"{text}; {named}" if named else text
@@ -145,8 +147,10 @@ class Machine:
     @classmethod
     def of(cls, content: Mapping[str, Any]) -> Machine:
         """Make a machine from its JSON content."""
-        own = {f.name: content[f.name] if f.name == "rest" else with_nan(content[f.name]) for f in fields(cls)}
-        return cls(**{**own, "trends": {name: Trend(**t) for name, t in own["trends"].items()}})
+        given = {f.name: content[f.name] for f in fields(cls) if f.name != "faults" or "faults" in content}
+        own = {name: value if name == "rest" else with_nan(value) for name, value in given.items()}
+        trends = {name: Trend(**t) for name, t in own["trends"].items()}
+        return cls(**{**own, "trends": trends, "faults": tuple(own.get("faults", ()))})
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,7 +277,7 @@ class Fleet:
         found = replicate(work.simulator, recordings, laws, self.common.starts, hold=work.hold, engine=work.engine)
         judged = judge_entry(name, measured_entry(found), self.values, self.remainder, times)
         faults = work.channel_faults(self.common.laws, recordings) if judged.beyond > SURE else []
-        return replace(judged, rest={"faults": faults}) if faults else judged
+        return replace(judged, faults=tuple(faults))
 
     def table(self) -> list[dict[str, Any]]:
         """List the machines as the rows of fleet.csv, the most probable to differ first."""

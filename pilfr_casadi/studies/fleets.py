@@ -349,12 +349,14 @@ class _FleetExecution:
         found = self._run_step(REST, names, laws, starts)
         out = dict(judged)
         for name, m in judged.items():
-            diagnosed = "fit" in found.get(name, {})  # rather than failed, or a faulty recording
+            entry = found.get(name, {})
+            diagnosed = "fit" in entry  # rather than failed, or a faulty recording
             step = REST if diagnosed else SAMPLE if name in sampled else ""
             page = f"{JOBS}/{step}-{name}/{PAGE}"
-            keys = ("status", "verdict", "sentence", "effects", "faults")
-            rest = {k: found[name][k] for k in keys if k in found[name]} if name in found else {}
-            out[name] = replace(m, rest=rest, report=page if page in self.manifest.content["files"] else "")
+            keys: Sequence[str] = ("status", "verdict", "sentence", "effects")
+            rest = {k: entry[k] for k in keys if k in entry}
+            report = page if page in self.manifest.content["files"] else ""
+            out[name] = replace(m, rest=rest, faults=tuple(entry.get("faults", ())), report=report)
         return out
 
     def _units(self, laws: Sequence[LawAt]) -> dict[str, str]:

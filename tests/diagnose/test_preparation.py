@@ -170,7 +170,7 @@ def test_a_hold_with_which_the_simulation_diverges_is_not_used(monkeypatch):
     with pytest.raises(InputError, match="diverges"):
         prepare(given.simulator, given.recordings, "zero", "auto")
     monkeypatch.setattr(Workbench, "fit", lambda *_, **__: diverging(replace(given, hold="zero")))
-    (note,) = preparation.choose_hold(Checked(given, given.run_given(given.simulator)))[1]
+    (note,) = preparation.choose_hold(Checked(given, given.run_given()))[1]
     assert (note.finding, note.value) == ("hold", "linear") and "otherwise it diverges" in note.sentence
 
 

@@ -152,14 +152,22 @@ def test_a_wrong_unit_is_named(found, days, tmp_path):
     """Without a diagnosis, for a new machine, and for one that is added to the fleet."""
     fleet, folder = found
     wrong = [r.with_(y=1e3 * r.y) for r in days["a"]]
-    (reason,) = fleet.judge("f", wrong).reasons
+    judged = fleet.judge("f", wrong)
+    (reason,) = judged.reasons
     assert "position is too large by a factor of 1000, as from a wrong unit" in reason[0]
+    assert judged.faults and not judged.rest
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)
     lines = []
     more = pilfr.fleet(rig(), {**days, "f": wrong}, **OPTIONS, workers=1, out=copy, tell=lines.append)
     assert [line.partition(":")[0] for line in lines if "already" not in line] == ["refit-f", "measure-f", "rest-f"]
     assert "position is too large by a factor of 1000" in more["f"].findings and not more["f"].report
+    assert more["f"].faults == read_fleet(copy, rig(), laws=LAWS)["f"].faults == judged.faults
+    content = json.loads((copy / "fleet.json").read_text())
+    for machine in content["machines"]:
+        del machine["faults"]  # as in a file of an earlier release
+    (tmp_path / "earlier.json").write_text(json.dumps(content))
+    assert not read_fleet(tmp_path / "earlier.json", rig(), laws=LAWS)["f"].faults
     assert [m.name for m in more.drifting] == ["b"]
     assert "position is too large" in (copy / more["f"].page).read_text()
 

@@ -16,7 +16,7 @@ from ..._base import InputError, side_by_side
 from ...data import Recording, dimension
 from ...optimise import GaussNewton
 from ...simulators import SENSOR, Simulator, port_name
-from ..fits.workbench import THOROUGH, Workbench
+from ..fits.workbench import THOROUGH, Workbench, refit
 from .gates import CLEARLY_BETTER, CURED_SHARE, POOR_FIT, USELESS_FIT, Checked, Gate, accept, correct
 from .offsets import describe_constant
 
@@ -118,7 +118,7 @@ def find_gross_slips(bench: Workbench, workers: int = 1) -> list[Gate]:
 
     The run at these values has to be off by more than its own size, and with the channel corrected by less.
     """
-    given = Checked(bench, bench.run_given(bench.simulator))
+    given = Checked(bench, bench.run_given())
     before = _unfollowed(bench, given.fitted.residual)
     if not before > 1:
         return []
@@ -126,6 +126,14 @@ def find_gross_slips(bench: Workbench, workers: int = 1) -> list[Gate]:
     left = np.array(side_by_side(partial(_run_corrected, given), slips, workers))
     near = (left < min(CURED_SHARE * before, 1.0)) & (CURED_SHARE * left <= np.min(left))
     return [replace(slips[i], left=float(left[i])) for i in np.argsort(left, kind="stable") if near[i]]
+
+
+def correct_gross_slips(bench: Workbench) -> Checked | None:
+    """Refit from the user's values, and correct the likeliest gross fault if the rule accepts it; None without one."""
+    slips = find_gross_slips(bench)
+    if not slips:
+        return None
+    return accept_best(Checked(bench, refit(bench) or bench.run_given()), slips)
 
 
 def _run_corrected(given: Checked, fault: Gate) -> float:
@@ -138,7 +146,7 @@ def _run_corrected(given: Checked, fault: Gate) -> float:
     bench, now = fault.apply(given.bench), given.fitted
     pairs = list(zip(given.bench.recordings, bench.recordings, strict=True))
     if now.simulator.observer is not None or any(not np.array_equal(was.u, r.u) for was, r in pairs):
-        return _unfollowed(bench, bench.run_given(now.simulator, now.model, now.engine).residual)
+        return _unfollowed(bench, bench.run_given(now).residual)
     return _unfollowed(bench, [e + was.y - r.y for e, (was, r) in zip(now.residual, pairs, strict=True)])
 
 
@@ -163,7 +171,7 @@ def find_slips(now: Checked, workers: int) -> Checked:
     If the error stays large, try each output with an offset as well; `find_offsets` reports the offset and keeps it.
     """
     bench = now.bench
-    given = bench.run_given(bench.simulator, now.fitted.model, now.fitted.engine).residual
+    given = bench.run_given(now.fitted).residual
     found = accept_best(now, _possible_slips(now, given), workers)
     # with an offset there is a working point, which a run from the stated start would have to reach first
     for i, name in enumerate(bench.simulator.output_names if found.cost > POOR_FIT else ()):
@@ -176,7 +184,7 @@ def find_slips(now: Checked, workers: int) -> Checked:
         factors = [f for f in (-1.0, *_mistakes(unit, UNITS | FAHRENHEIT)) if f < 0 or near("y", [i], f)]
         faults = [scale_channels("y", bench.simulator.output_names, [i], f, " and an offset") for f in factors]
         beside = accept_best(level, faults, workers)
-        if len(beside.gates) > len(now.gates) and beside.cost < CURED_SHARE * found.cost:
+        if beside.adds_to(now) and beside.cost < CURED_SHARE * found.cost:
             found = replace(beside, bench=replace(beside.bench, simulator=bench.simulator))
     return found
 

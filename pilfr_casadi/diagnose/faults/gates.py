@@ -24,12 +24,11 @@ import numpy as np
 from ..._base import InputError
 from ...data import Recording
 from ...optimise import GaussNewton
-from ...simulators import Simulator
 from ..fits.evidence import FORMULA_ERROR
 from ..fits.floor import FEWEST, Floor, effective_size, noise_floor, pool
 from ..fits.linearise import Probe, Run, linearise_runs
 from ..fits.screen import block_diagonal, in_deviations, moved, orthonormal, project_off
-from ..fits.workbench import QUICK, THOROUGH, Fitted, Workbench, near_balance, output_deviation
+from ..fits.workbench import QUICK, THOROUGH, Fitted, Workbench, near_balance, output_deviation, refit
 
 Change = Callable[[Recording], Recording]
 
@@ -173,6 +172,14 @@ class Checked:
         """Return the next state: another bench and refit, with further findings added."""
         return Checked(bench, fitted, (*self.gates, *gates))
 
+    def with_deadline(self, deadline: float) -> Checked:
+        """Return the same state with another time at which its fits end."""
+        return replace(self, bench=replace(self.bench, deadline=deadline))
+
+    def adds_to(self, before: Checked) -> bool:
+        """Tell whether it has more findings than a state before."""
+        return len(self.gates) > len(before.gates)
+
 
 # the one rule
 
@@ -191,24 +198,6 @@ def describe_fall(before: float, after: float) -> str:
     if not np.isfinite(before):
         return f"the refitted error is {after:.3g} times the outputs' deviation, where the simulation diverged before"
     return f"the refitted error falls from {before:.3g} to {after:.3g} times the outputs' deviation"
-
-
-def refit(
-    bench: Workbench,
-    starts: Sequence[Mapping[str, Any]] = ({},),
-    simulator: Simulator | None = None,
-    *,
-    states: Sequence[np.ndarray] = (),
-    solver: GaussNewton = QUICK,
-    like: Fitted | None = None,
-) -> Fitted | None:
-    """Fit a simulator, by default the bench's; None if it diverges. The compiled model of `like` is reused."""
-    model, engine = (like.model, like.engine) if like else (None, None)
-    simulator = simulator or bench.simulator
-    try:
-        return bench.fit(simulator, starts, states=states, solver=solver, model=model, engine=engine)
-    except InputError:
-        return None
 
 
 def correct(
@@ -297,9 +286,9 @@ class FirstOrder:
     @cached_property
     def error(self) -> np.ndarray:
         """The stacked error in units of the outputs' deviation, (R,)."""
-        f, bench = self.fitted, self.bench
-        found = bench.result(f.simulator, f.values, f.initial, f.engine, f.model)
-        return np.asarray((np.concatenate(bench.scored(found.residual)) / bench.scale).ravel())
+        bench = self.bench
+        residual = bench.rerun(self.fitted).residual
+        return np.asarray((np.concatenate(bench.scored(residual)) / bench.scale).ravel())
 
     @cached_property
     def base(self) -> np.ndarray:

@@ -80,7 +80,7 @@ class _Gap(Gate):
     def run_whole(self, bench: Workbench, fitted: Fitted) -> Fitted:
         """Run the whole recording at the values of a fit to its two pieces."""
         initial = [x for i, x in enumerate(fitted.initial) if i != self.value[0] + 1]
-        return bench.result(bench.simulator, fitted.values, initial, fitted.engine, fitted.model)
+        return bench.rerun(fitted, initial=initial)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ def find_gaps(now: Checked) -> Checked:
         sharp = jump.beats(jump.neighbour, CLEARLY_BETTER) or last.cost < NEAR_NOISE_RATIO**2 * noise2
         if sharp and jump.beats(jump.rival, CURED_SHARE):
             accepted = accept(now, _name_pieces(last, origins), _describe_gaps(jump, origins))
-            found = accepted if len(accepted.gates) > len(now.gates) else found
+            found = accepted if accepted.adds_to(now) else found
     return found
 
 

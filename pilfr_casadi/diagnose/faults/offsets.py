@@ -18,7 +18,7 @@ from ...simulators import ACTUATOR, SENSOR, Simulator, kind_of, port_name, split
 from ..fits.evidence import FORMULA_ERROR
 from ..fits.floor import ABOVE_NOISE, noise_floor
 from ..fits.screen import block_diagonal, lengths
-from ..fits.workbench import FEW, THOROUGH, Fitted, Workbench
+from ..fits.workbench import FEW, THOROUGH, Fitted, Workbench, refit
 from .gates import (
     CERTAIN_ERRORS,
     CURED_SHARE,
@@ -32,7 +32,6 @@ from .gates import (
     accept,
     correct,
     gain,
-    refit,
     settle,
 )
 

@@ -17,19 +17,8 @@ import numpy as np
 from ...data import Recording
 from ...laws import Lag
 from ..fits.floor import ABOVE_NOISE
-from ..fits.workbench import RUNAWAY, Fitted, Workbench
-from .gates import (
-    CLEARLY_BETTER,
-    EQUAL_RATIO,
-    NEAR_NOISE_RATIO,
-    Checked,
-    FirstOrder,
-    Gate,
-    accept,
-    correct,
-    refit,
-    settle,
-)
+from ..fits.workbench import RUNAWAY, Fitted, Workbench, refit
+from .gates import CLEARLY_BETTER, EQUAL_RATIO, NEAR_NOISE_RATIO, Checked, FirstOrder, Gate, accept, correct, settle
 
 LARGEST_SHIFT = 64  # largest shift that is tried, and largest number of lost samples of an output
 SHIFTS = np.union1d(np.arange(-LARGEST_SHIFT, LARGEST_SHIFT + 1.0), np.linspace(-2.0, 2.0, 17))  # samples
@@ -113,14 +102,11 @@ class TimeShift(Gate):
         """
         bench = first.bench
 
-        def simulate(r: Recording, state: np.ndarray) -> np.ndarray:
-            return np.asarray(fitted.engine.simulate(fitted.model.drive(r), fitted.vector, state)[0])
-
         @np.errstate(over="ignore", invalid="ignore")  # a diverging run leaves everything
         def left(value: float) -> float:
             moved = self.at(value, bench.dt)
             others = [moved.read(r, False, own) for r, own in zip(bench.recordings, curves, strict=True)]
-            runs = as_recorded or list(map(simulate, others, fitted.initial))
+            runs = as_recorded or list(map(fitted.simulate, others, fitted.initial))
             pairs = zip(runs, others, strict=True)
             error = np.concatenate([((y - other.y) / bench.scale)[other.skip :].ravel() for y, other in pairs])
             inside = zip(map(moved._recorded, bench.recordings), others, strict=True)
@@ -131,7 +117,7 @@ class TimeShift(Gate):
             return float(after / before) if np.isfinite(after) and before > 0 else np.inf
 
         curves = list(map(self.curves, bench.recordings))
-        as_recorded = [] if self.kind == "u" else list(map(simulate, bench.recordings, fitted.initial))
+        as_recorded = [] if self.kind == "u" else list(map(fitted.simulate, bench.recordings, fitted.initial))
         return left
 
     def relocate(self, now: Checked, after: Checked) -> Self:
@@ -215,7 +201,7 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: 
         return now
     fault, after = best
     found = accept(now, after, fault)
-    if len(found.gates) == len(now.gates):
+    if not found.adds_to(now):
         return found
     more_is_wrong = after.cost > NEAR_NOISE_RATIO**2 * noise2  # then a delay or a slow clock may be physics
     may_be_physics = fault.is_like_delay(bench.dt, part) or (more_is_wrong and not (fault.leads and early))
@@ -248,7 +234,7 @@ def _screen_shifts(bench: Workbench, plain: Fitted, also_given: bool = True) -> 
     if len(inputs) > 1:
         channels += [("u", (i,), name) for i, name in enumerate(inputs)]
     found = list[tuple[float, TimeShift]]()
-    given = [bench.run_given(bench.simulator, plain.model, plain.engine)] if also_given else []
+    given = [bench.run_given(plain)] if also_given else []
     for reference in (plain, *(one for one in given if one.cost < RUNAWAY**2)):
         first = FirstOrder.of(bench, reference)
         for kind, columns, name in channels:

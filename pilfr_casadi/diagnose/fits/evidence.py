@@ -44,9 +44,9 @@ from .floor import effective_size
 from .workbench import DIVERGED, RUNAWAY, Fitted, Workbench
 
 # The priors and thresholds on which every answer of a search rests. Elsewhere are those of the noise (`floor`), of
-# faults (in `faults`: `gates`, `channels`, `offsets`, `timing`, `lost_samples`, `samples`), the memories of an
-# observer (`prediction`), the bases of flexible forces (`screen`, `learned`) and the accuracy of integration
-# (`workbench`). All other numbers limit the effort or keep numbers finite.
+# faults (in `faults`: `gates`, `channels`, `offsets`, `timing`, `lost_samples`, `samples`, `tones`), the memories of an
+# observer (`prediction`), the bases of flexible forces (`flexible_forces`, `learned`) and the accuracy of integration
+# (`workbench`, `step_refinement`). All other numbers limit the effort or keep numbers finite.
 
 # Prior probabilities
 EFFECT_PRIOR = np.log(0.5)  # log probability of each further effect: one more effect is as likely as not
@@ -122,8 +122,9 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
     if not laws_at.size:
         return np.zeros(0)
     problem, _, hessian = _hessian(bench, fitted)
+    infinite = np.full(shared.shape[1], np.inf)
     if not np.all(np.isfinite(hessian)):  # a run at the edge of divergence has no derivatives
-        return np.full(shared.shape[1], np.inf)
+        return infinite
     rest = np.setdiff1d(np.arange(len(hessian)), laws_at)
     width = _widths(fitted, laws, problem.free, np.diag(hessian)[: len(numbers)])[laws_at]
     with np.errstate(all="ignore"):
@@ -133,12 +134,10 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
         across = hessian[np.ix_(rest, laws_at)] * width / size[:, None]
         inner = hessian[np.ix_(rest, rest)] / np.outer(size, size)
         if not np.all(np.isfinite(inner)):  # so has one whose derivatives overflow
-            return np.full(shared.shape[1], np.inf)
+            return infinite
         block = block - across.T @ np.linalg.pinv(inner, rcond=1e-10, hermitian=True) @ across
         block = shared.T @ block @ shared
-    if not np.all(np.isfinite(block)):
-        return np.full(len(block), np.inf)
-    return np.maximum(np.linalg.eigvalsh(block), 0.0)
+    return np.maximum(np.linalg.eigvalsh(block), 0.0) if np.all(np.isfinite(block)) else infinite
 
 
 def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n: float) -> float:
@@ -199,7 +198,7 @@ def runs_away(bench: Workbench, fitted: Fitted, refitted: Fitted) -> bool:
     def reach(one: Fitted, u: np.ndarray) -> tuple[float, float]:
         held = r.with_(u=np.tile(u, (len(r), 1)))
         with np.errstate(all="ignore"):
-            y = one.engine.simulate(one.model.drive(held), one.vector, one.initial[k])[0]
+            y = one.simulate(held, one.initial[k])
             off = np.max(np.abs(y - np.mean(r.y, axis=0)) / bench.scale, axis=1)
             return float(np.max(off[: len(r) // 2])), float(np.max(off))
 

@@ -41,7 +41,7 @@ from ...simulators import (
 )
 from .evidence import FORMULA_ERROR
 from .linearise import Constant, compose_substeps, input_slope, local_signals, loudest_stretch, simulate_states
-from .workbench import Fitted, Workbench
+from .workbench import Fitted, Workbench, pack_known
 
 NOISE_FACTORS = (1.0, 3.0, 9.0)  # factors on the given noise that are tried
 SMOOTHED_SAMPLES = 4000  # longest stretch of a recording that is smoothed: the one with the most energy
@@ -292,7 +292,7 @@ def forces_of_change(bench: Workbench, fitted: Fitted, port: str, change: np.nda
     runs = zip(bench.recordings, fitted.initial, strict=True)
     states = np.concatenate([simulate_states(fitted, r, state)[:, : len(simulator.states)] for r, state in runs])
     inputs, clock = (np.concatenate(part) for part in zip(*((r.u, r.clock) for r in bench.recordings), strict=True))
-    values = simulator.parameter_set.pack({k: v for k, v in fitted.values.items() if k in simulator.parameter_set})
+    values = pack_known(simulator.parameter_set, fitted.values)
     total, *by_port = map_points(function, states, inputs, values, clock[:, None], change[:, None])
     found = {}
     for one, factor in zip(ports, by_port, strict=True):
@@ -389,8 +389,6 @@ def _local_motion(
     bench: Workbench, base: Simulator, values: dict[str, Any], port: str, states: np.ndarray, r: Recording
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute local coordinate and rate, (M,) each, of a port along states (M, n_x)."""
-    own = base.parameter_set
-    vector = own.pack({k: v for k, v in values.items() if k in own})
-    z, dz, *_ = local_signals(bench, signals(base), states, r, vector)
+    z, dz, *_ = local_signals(bench, signals(base), states, r, pack_known(base.parameter_set, values))
     index = [known.name for known in base.all_ports()].index(port)
     return z[:, index], dz[:, index]

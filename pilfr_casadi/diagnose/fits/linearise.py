@@ -23,17 +23,8 @@ from ...data import Recording
 from ...laws import Law, Local
 from ...linear import steady_state_gain, with_output_injection
 from ...models import Model, map_points
-from ...simulators import (
-    PARAMETER,
-    Port,
-    Simulator,
-    discretise,
-    signals,
-    split_port,
-    states_along,
-    term_function,
-)
-from .workbench import FINER_STEPS, Fitted, Workbench
+from ...simulators import PARAMETER, Port, Simulator, discretise, signals, split_port, states_along, term_function
+from .workbench import FINER_STEPS, Fitted, Workbench, pack_known
 
 WALL = 1.0  # largest |λ| h of a contact on the finest steps
 
@@ -78,10 +69,9 @@ class Probe:
         model = discretise(probed, bench.dt, bench.hold, fitted.model.substeps)
         x, (u, p) = ca.SX.sym("x", model.n_state), model.symbols()[2:]
         following, y = model.closed(x, u, p)
-        parameters = model.parameters
-        values = parameters.pack({k: v for k, v in fitted.values.items() if k in parameters})
+        values = pack_known(model.parameters, fitted.values)
         names = tuple(port.name for port in simulator.all_ports())
-        free = np.flatnonzero(parameters.free)
+        free = np.flatnonzero(model.parameters.free)
         picked = p[free.tolist()]
         blocks = [ca.jacobian(e, v) for e, v in ((following, x), (following, picked), (y, x), (y, picked))]
         at = ca.substitute([y, *map(ca.densify, blocks)], [p], [ca.SX(values)])  # fold constants

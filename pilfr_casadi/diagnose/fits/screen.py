@@ -9,27 +9,20 @@ where φ holds the outputs' changes by a small dose of each law at a port, a col
 shape parameters lie on a grid. Each port is processed separately: its columns are the largest arrays of a diagnosis.
 The test is done twice: along the refitted simulation, and along an observer with process noise at every port, on its
 innovations.
-
-The same test is done for any force at a port: a flexible surface `w(z, ż)` of Chebyshev terms up to the fourth degree,
-with stops, plays and relaxations beside it. Its response is linear in its coefficients, which are fitted to every
-second block of the record by ridge regression and judged on the others, so that noise is not explained. This tells
-noise from missing structure without knowing the floor, and a right name from one that only comes near.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from ..._base import side_by_side
 from ...data import Recording
-from ...laws import Creep, Law, Local, PlayHysteresis, Relaxation, StopHysteresis, chebyshev, count_columns, unit_forces
-from ...models import Parameter
+from ...laws import Law, Local, count_columns, unit_forces
 from ...simulators import EQUATION, PARAMETER, SENSOR, Port, kind_of, port_name
-from .coloured_noise import whiten, whitening_filters
 from .linearise import (
     Probe,
     Run,
@@ -48,11 +41,6 @@ SCREENED_SAMPLES = 6000  # samples used at most
 HUGE = 1e60  # ratio to an output's deviation above which a response diverges
 BLOCKS = 10  # blocks a recording; every second block is held out in turn
 RIDGES = (1e-6, 1e-3)  # strengths of the ridge regression of flexible forces, relative to a column of unit length
-DEGREE = 4  # of the flexible surface
-# degrees in z and dz/dt of the surface's terms
-TERMS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j)
-# product of samples and squared number of states for a flexible force: that of more than LEAST_SAMPLES, and of any
-MOST_WORK, LEAST_SAMPLES, MOST_MEMORY = 600_000, 2500, 100_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,11 +235,11 @@ def folds(recordings: Sequence[Recording], windows: Sequence[slice]) -> np.ndarr
 
 def held_out(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: Sequence[float] = RIDGES[:1]) -> float:
     """Compute the share of `left` that the columns explain on blocks that they were not fitted to."""
-    rest = _held_out_rest(phi, left, odd, ridges)
+    rest = least_rest(phi, left, odd, ridges)
     return max(0.0, 1 - float(rest @ rest) / max(float(left @ left), 1e-300))
 
 
-def _held_out_rest(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: Sequence[float]) -> np.ndarray:
+def least_rest(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: Sequence[float]) -> np.ndarray:
     """Compute what the columns leave of `left` on blocks that they were not fitted to, with the best penalty."""
     size = lengths(phi)
     if not np.any(size > 0):
@@ -329,7 +317,7 @@ class Scored:
 
 
 def screen(
-    bench: Workbench, fitted: Fitted, laws: Sequence[type[Law]], noise: np.ndarray, workers: int = 1
+    bench: Workbench, fitted: Fitted, laws: Sequence[type[Law]], noise: np.ndarray, workers: int
 ) -> tuple[list[Scored], np.ndarray | None]:
     """Score every port and law along the simulation and along the observer, best first.
 
@@ -421,85 +409,3 @@ def _gain(phi: np.ndarray, left: np.ndarray, law: Law, sense: int) -> tuple[floa
             coefficients = np.zeros(1)
     share = float(2 * coefficients @ (right / size) - coefficients @ ridge @ coefficients)
     return share, coefficients / size
-
-
-class Surface(Law):
-    """A smooth force of the local coordinate and its rate."""
-
-    id = "surface"
-    equation = "w = sum_ij c_ij T_i(z) T_j(dz/dt)"
-    units: ClassVar[Mapping[str, str]] = {"c": "w", "z_m": "z", "z_s": "z", "v_s": "z/s"}
-    strength: ClassVar[tuple[str, ...]] = ("c",)
-    places: ClassVar[tuple[str, ...]] = ("parallel", "series")
-
-    def force(self, z: Any, dz: Any, p: Any) -> Any:
-        """Compute the sum of Chebyshev terms."""
-        a, b = chebyshev((z - p.z_m) / p.z_s, DEGREE), chebyshev(dz / p.v_s, DEGREE)
-        return sum(p.c[k] * a[i] * b[j] for k, (i, j) in enumerate(TERMS))
-
-    def parameters(self) -> dict[str, Parameter]:
-        """Return coefficients and scales."""
-        scales = {k: Parameter(float(self.values.get(k, 1.0))) for k in ("z_m", "z_s", "v_s")}
-        return {"c": Parameter(np.zeros(len(TERMS))), **scales}
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        """Generate the scales of the data."""
-        yield {
-            "z_m": (local.low + local.high) / 2,
-            "z_s": 1.1 * local.half,
-            "v_s": 1.5 * local.speed if np.any(local.dz) else 1.0,
-        }
-
-
-# forces that together follow any force at a port
-FLEXIBLE = (Surface, StopHysteresis, PlayHysteresis, Relaxation, Creep)
-
-
-def flexible_shares(bench: Workbench, fitted: Fitted) -> dict[str, float]:
-    """Compute the held-out share of the residual's power that any force at a port explains, by port."""
-    rest = _remainder_for_flexible_forces(bench, fitted)
-    return {t.port.name: held_out(rest.columns(t)[0], rest.left, rest.odd, RIDGES) for t in rest.tasks}
-
-
-def innovation_share(bench: Workbench, fitted: Fitted) -> float:
-    """Compute the largest held-out share that a force at any port explains of the innovations of any output's residual.
-
-    A force seems to explain slow noise on held-out blocks, because a block is known from its neighbours. The
-    innovations have no such neighbours; see `coloured_noise`. The noise is what the force leaves (Cochrane & Orcutt
-    1949): a filter made for the whole residual would also predict slow physics. Each output counts in units of its own
-    noise, so that a noisy sensor does not hide what a quiet one shows.
-    """
-    rest, n_y = _remainder_for_flexible_forces(bench, fitted), bench.recordings[0].n_y
-    sizes = [len(r.z) for r in rest.runs]
-    found = [0.0]
-    for task in rest.tasks:
-        phi = rest.columns(task)[0]
-        noise = _held_out_rest(phi, rest.left, rest.odd, RIDGES)
-        noise = noise if noise @ noise < rest.left @ rest.left else rest.left
-        filters = whitening_filters(np.split(noise.reshape(-1, n_y), np.cumsum(sizes)[:-1]))
-        unit = lengths(whiten(noise[:, None], filters, sizes).reshape(-1, n_y))
-        filters = [taps / (size or 1.0) for taps, size in zip(filters, unit, strict=True)]
-        base = orthonormal(whiten(rest.base, filters, sizes))
-        left, phi = (project_off(whiten(a, filters, sizes), base) for a in (rest.left[:, None], phi))
-        after = _held_out_rest(phi, left[:, 0], rest.odd, RIDGES)
-        if after @ after < left[:, 0] @ left[:, 0]:
-            whole, rest_of = (lengths(e.reshape(-1, n_y)) for e in (left, after))
-            found.append(float(1 - np.min(rest_of[whole > 0] / whole[whole > 0]) ** 2))
-    return max(found)
-
-
-def _remainder_for_flexible_forces(bench: Workbench, fitted: Fitted) -> Remainder:
-    """Project the error along the stretches of the recordings with the largest error that memory and time allow."""
-    bench = bench.balanced(fitted)
-    size = max(fitted.model.n_state, 1) ** 2  # hundreds of states if a law holds a long delay
-    most = max(MOST_WORK // size, min(LEAST_SAMPLES, MOST_MEMORY // size)) // len(bench.recordings)
-    if any(len(r) > most for r in bench.recordings):
-        pieces, states = list[Recording](), list[np.ndarray]()
-        for r, e, state in zip(bench.recordings, fitted.residual, fitted.initial, strict=True):
-            part = loudest_stretch(np.sum((e / bench.scale) ** 2, axis=1), max(most, LEAST_SAMPLES // 10), r.skip)
-            begin = part.start if part.start > r.skip else 0
-            pieces.append(r.slice(begin, part.stop))
-            before = fitted.model.drive(r)[: begin * fitted.model.substeps]
-            states.append(fitted.engine.simulate(before, fitted.vector, state)[1] if begin else state)
-        bench, fitted = bench.on(pieces), replace(fitted, initial=states)
-    return Remainder.of(bench, *linearise_runs(bench, fitted), FLEXIBLE)

@@ -1,11 +1,4 @@
-"""The data shared by all steps of a diagnosis: the simulator, its recordings, its integration and its fit.
-
-Integration steps are chosen at the start of a recording. A force with a sharp reversal, such as a friction already in
-the simulator, needs finer steps later; the error of coarse steps would look like missing physics. `refine_steps` makes
-them finer if the answer depends on them. `refit_on_finer_steps` lets the data decide how sharp the knee of a friction
-law is. On steps too long for its knee, a stuck simulation chatters, and in fast motion each passage falls between two
-steps. The cost then has spurious minima, and no other term of a law should make up for them.
-"""
+"""The data shared by all steps of a diagnosis: the simulator, its recordings, its integration and its fit."""
 
 from __future__ import annotations
 
@@ -22,7 +15,7 @@ from ...engine import Engine, make_engine
 from ...identify import match_channels, solve_within_bounds
 from ...laws import Local
 from ...linear import INJECTION, with_output_injection
-from ...models import Model
+from ...models import Model, ParameterSet
 from ...optimise import GaussNewton, Problem, Status
 from ...simulators import (
     LARGEST_STEP,
@@ -37,7 +30,7 @@ from ...simulators import (
     needed_substeps,
     rate_at_start,
 )
-from .floor import pool, white_part
+from .floor import pool
 
 # Solvers: of the fits that results are based on; of other fits; of the first fit of a law, to rank the laws
 THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
@@ -47,12 +40,7 @@ LAST = GaussNewton(max_iterations=1000, tolerance=1e-6, patience=6)  # of the fi
 FEW = 3  # ports, laws, starts or fits that are tried at each choice of a search, which saves time
 COMPARED_SAMPLES = 8000  # samples on which fits and forces are compared first
 
-# Steps of the integration
 FINER_STEPS = 4  # largest factor on the sub-steps for a law, and factor of each refinement of steps and knees
-STEP_ERROR = 0.3  # least change by finer steps, over the noise, for which they are used
-LEAST_NOISE = 3e-4  # least noise, over the outputs' deviation, that the steps are compared with
-COST_CHANGE = 0.1  # share by which finer steps may change the mean square
-SHARP_KNEE = 0.05  # share of the widest knee that is tried, below which a knee is sharp
 
 # Fits of outputs with unequal noise
 MOST_BALANCES = 4  # fits with other weights at most
@@ -123,8 +111,11 @@ class Fitted:
     def corrected(self) -> Simulator:
         """Return the simulator with the fitted values as start values."""
         own = self.simulator.parameter_set
-        vector = own.pack({k: v for k, v in self.values.items() if k in own})
-        return self.simulator.with_parameters(own.at(vector))
+        return self.simulator.with_parameters(own.at(pack_known(own, self.values)))
+
+    def simulate(self, r: Recording, state: np.ndarray) -> np.ndarray:
+        """Simulate at the fitted values along a recording's inputs from an initial state; return the outputs."""
+        return np.asarray(self.engine.simulate(self.model.drive(r), self.vector, state)[0])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -265,14 +256,17 @@ class Workbench:
         engine = engine or make_engine(model, self.engine)
         estimated = any(r.begins == "estimate" for r in self.recordings)
         if not np.any(model.parameters.free) and not (estimated and model.n_state):
-            return self._run_fixed(simulator, model, engine)
+            found = self._run_as_given(simulator, model, engine)
+            if not np.isfinite(found.cost):
+                raise InputError("The simulation diverges at the given values; check the parameters' values and units.")
+            return found
         best: tuple[float, np.ndarray, Problem, Status] | None = None
         for start in starts:
             if best is not None and time.perf_counter() > self.deadline:
                 break
-            found = self._run(simulator, model, engine, start, states, tuple(anneal), solver)
-            if found is not None and (best is None or found[0] < best[0]):
-                best = found
+            one = self._fit_from(simulator, model, engine, start, states, tuple(anneal), solver)
+            if one is not None and (best is None or one[0] < best[0]):
+                best = one
         if best is None:
             unstable = self._describe_instability(simulator)
             raise (RunsAway if unstable else InputError)(
@@ -317,26 +311,21 @@ class Workbench:
             "focus 'prediction' of a diagnosis."
         )
 
-    def run_given(self, simulator: Simulator, model: Model | None = None, engine: Engine | None = None) -> Fitted:
-        """Run a simulator as it stands, with the states in which a fit begins; the cost of a diverging run is infinite.
+    def run_given(self, like: Fitted | None = None) -> Fitted:
+        """Run the simulator at the given values, with the states in which a fit begins.
 
-        A model or an engine that is not given is made.
+        The cost of a diverging run is infinite. The compiled model of `like` is reused.
         """
-        model = model or self.model(simulator)
-        engine = engine or make_engine(model, self.engine)
+        model, engine = (like.model, like.engine) if like else self.compile(self.simulator)
+        return self._run_as_given(self.simulator, model, engine)
+
+    def _run_as_given(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:
         freed = model.parameters.change(**{name: {"fixed": False} for name in model.parameters})
         problem = self.problem(model.with_parameters(freed), engine)  # which needs variables
         values = {k: p.value for k, p in model.parameters.items()}
         return self.result(simulator, values, problem.first_states(problem.start), engine, model)
 
-    def _run_fixed(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:
-        """Run the simulator as it stands, because there is nothing to estimate."""
-        found = self.run_given(simulator, model, engine)
-        if not np.isfinite(found.cost):
-            raise InputError("The simulation diverges at the given values; check the parameters' values and units.")
-        return found
-
-    def _run(
+    def _fit_from(
         self,
         simulator: Simulator,
         model: Model,
@@ -463,6 +452,17 @@ class Workbench:
         """Return the residual of each recording (M, n_y) without the samples that do not count."""
         return [e[r.skip :] for e, r in zip(residual, self.recordings, strict=True)]
 
+    def rerun(
+        self,
+        fitted: Fitted,
+        values: dict[str, np.ndarray] | None = None,
+        initial: list[np.ndarray] | None = None,
+    ) -> Fitted:
+        """Run a fitted simulator along these recordings, at its own values and initial states or at others."""
+        values = fitted.values if values is None else values
+        initial = fitted.initial if initial is None else initial
+        return self.result(fitted.simulator, values, initial, fitted.engine, fitted.model)
+
     def result(
         self,
         simulator: Simulator,
@@ -492,80 +492,39 @@ def output_deviation(recordings: Sequence[Recording]) -> np.ndarray:
     return np.asarray(np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0))
 
 
+def pack_known(parameters: ParameterSet, values: Mapping[str, Any]) -> np.ndarray:
+    """Return the parameter vector at values by name; names of other parameters are ignored."""
+    return parameters.pack({k: v for k, v in values.items() if k in parameters})
+
+
 def start_vector(model: Model, start: Mapping[str, Any]) -> np.ndarray:
-    """Return the parameter vector at start values by name, clipped to the bounds; unknown names are ignored."""
+    """Return the parameter vector at start values by name, clipped to the bounds; see `pack_known`."""
     p = model.parameters
-    return np.asarray(np.clip(p.pack({k: v for k, v in start.items() if k in p}), p.lower, p.upper))
+    return np.asarray(np.clip(pack_known(p, start), p.lower, p.upper))
 
 
-def refine_steps(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
-    """Refine the steps until their error is less than the noise; return the bench and the fit there."""
-    noise = np.maximum(white_part(bench.scored(fitted.residual)), LEAST_NOISE * bench.scale)
-    most, steps = min(FINER_STEPS**2 * bench.chosen, MOST_SUBSTEPS), fitted.model.substeps
-    while FINER_STEPS * steps <= most and not fitted.simulator.discrete:
-        steps = FINER_STEPS * steps
-        tried = replace(bench, substeps=steps)
-        try:
-            there = tried.run(fitted.simulator, fitted.values, fitted.begin)
-            moved = [(a - b) / noise for a, b in zip(there.residual, fitted.residual, strict=True)]
-            if np.mean(np.concatenate(bench.scored(moved)) ** 2) < STEP_ERROR**2:
-                break
-            fitted = tried.fit(
-                fitted.simulator,
-                [fitted.values, {}],
-                states=fitted.begin,
-                solver=THOROUGH,
-                model=there.model,
-                engine=there.engine,
-            )
-        except InputError:
-            break
-        bench = tried
-    return bench, fitted
+def refit(
+    bench: Workbench,
+    starts: Sequence[Mapping[str, Any]] = ({},),
+    simulator: Simulator | None = None,
+    *,
+    states: Sequence[np.ndarray] = (),
+    solver: GaussNewton = QUICK,
+    like: Fitted | None = None,
+) -> Fitted | None:
+    """Fit a simulator, by default the bench's; None if it diverges. The compiled model of `like` is reused."""
+    model, engine = (like.model, like.engine) if like else (None, None)
+    simulator = simulator or bench.simulator
+    try:
+        return bench.fit(simulator, starts, states=states, solver=solver, model=model, engine=engine)
+    except InputError:
+        return None
 
 
 def converge(bench: Workbench, fitted: Fitted, seconds: float) -> Fitted:
     """Continue a fit that was stopped by its limit of iterations, for at most so many seconds."""
     if fitted.status is not Status.MAX_ITERATIONS or seconds <= 0:
         return fitted
-    solver, model, engine = replace(LAST, time_limit=seconds), fitted.model, fitted.engine
-    try:
-        found = bench.fit(
-            fitted.simulator, [fitted.values], states=fitted.initial, solver=solver, model=model, engine=engine
-        )
-    except InputError:
-        return fitted
-    return found if found.cost < fitted.cost else fitted
-
-
-def knee_starts(fitted: Fitted, knee: str) -> list[dict[str, Any]]:
-    """Return the fitted values, and if there is a sharp knee also those with a sharper and a wider one."""
-    values = fitted.values
-    if not knee or values[knee] > SHARP_KNEE * fitted.model.parameters[knee].bounds[1]:
-        return [values]
-    return [values, *({**values, knee: times * values[knee]} for times in (1 / FINER_STEPS, FINER_STEPS))]
-
-
-def refit_on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
-    """Refit on finer steps if the simulation depends on them, or if the present steps limit the knee.
-
-    The knee may be sharper there, as far as these steps can follow it at rest.
-    """
-    given = fitted.simulator.parameters[knee]
-    low, high = given.bounds
-    if fitted.model.substeps * FINER_STEPS > FINER_STEPS**2 * bench.chosen:
-        return fitted
-    finer, placed = replace(bench, at_least=FINER_STEPS * fitted.model.substeps), fitted.corrected()
-    sharper = replace(given, value=fitted.values[knee], bounds=(low / FINER_STEPS, high))
-    placed = placed.with_parameters({**placed.parameters, knee: sharper})
-    there = finer.run(placed, fitted.values, fitted.begin)
-    held = fitted.values[knee] <= low
-    if not held and abs(there.cost / fitted.cost - 1) < COST_CHANGE:
-        return fitted
-    starts = [fitted.values, *([{**fitted.values, knee: low / 2}] if held else [])]
-    states, model, engine = fitted.begin, there.model, there.engine
-    try:
-        found = finer.fit(placed, starts, states=states, solver=THOROUGH, model=model, engine=engine)
-    except InputError:
-        return fitted
-    return found if found.cost < max(fitted.cost, there.cost) else fitted
+    solver = replace(LAST, time_limit=seconds)
+    found = refit(bench, [fitted.values], fitted.simulator, states=fitted.initial, solver=solver, like=fitted)
+    return found if found is not None and found.cost < fitted.cost else fitted

@@ -36,9 +36,10 @@ from ..fits.evidence import (
     log_prior_of_states,
     spread,
 )
+from ..fits.flexible_forces import flexible_shares, innovation_share
 from ..fits.floor import FEWEST, Floor, effective_size, white_part
 from ..fits.force_recovery import is_curve_along
-from ..fits.screen import Scored, flexible_shares, innovation_share, screen
+from ..fits.screen import Scored, screen
 from ..fits.workbench import DIVERGED, Fitted, Workbench
 from .trials import Key, Trial, Trials
 
@@ -100,6 +101,11 @@ class Hypotheses:
     def interrupted(self) -> bool:
         """Whether Ctrl-C was pressed: nothing more is fitted, and the answer says so."""
         return self.bench.interrupt.pressed
+
+    @property
+    def cut_short(self) -> bool:
+        """Whether an interrupt or the time limit ended the search."""
+        return self.interrupted or self.out_of_time
 
     @property
     def samples(self) -> float:

@@ -237,12 +237,11 @@ def refit_learned(bench: Workbench, found: Fitted) -> Fitted:
     InputError
         If the simulation diverges.
     """
-    placed, model, engine = found.simulator, found.model, found.engine
-    fitted = bench.fit(placed, [found.values], states=found.initial, model=model, engine=engine)
+    placed = found.simulator
+    fitted = bench.fit(placed, [found.values], states=found.initial, model=found.model, engine=found.engine)
     z, dz, _ = signals_along(bench, fitted)
     seen = {f"{placed.elements[-1].prefix}{k}": np.array(v) for k, v in _ranges(EXTENSION, z=z, v=dz).items()}
-    whole = bench.result(placed, {**fitted.values, **seen}, fitted.initial, engine, model)
-    return replace(whole, status=fitted.status)
+    return replace(bench.rerun(fitted, {**fitted.values, **seen}), status=fitted.status)
 
 
 @dataclass(frozen=True, eq=False)

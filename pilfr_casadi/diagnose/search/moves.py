@@ -34,13 +34,13 @@ from ...laws import (
     varying,
 )
 from ...simulators import ACTUATOR, PARAMETER, SENSOR, Placed, kind_of, name_at, port_name
-from ..faults.gates import CLEARLY_BETTER, Checked, Gate, refit
+from ..faults.gates import CLEARLY_BETTER, Checked, Gate
 from ..faults.timing import TimeShift, find_time_shift
 from ..fits.evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR, NEAR_RATIO
 from ..fits.floor import ABOVE_NOISE
 from ..fits.linearise import linearise_runs
 from ..fits.screen import Pair, Remainder, Scored, screen, usable
-from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted
+from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted, refit
 from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
 from .relatives import choose_pairs, complements, fit_pair, in_place_of_variation, relatives
@@ -287,6 +287,10 @@ class Search(Hypotheses):
         self._keep_all(trials)
         self.steps.append(Step(parent, tuple(scored), tuple(trials)))
 
+    def _try(self, base: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> None:
+        """Fit some pairs beside a hypothesis, none of their relatives, and note the move."""
+        self._record(base, entries, self._fitted(base, entries, gain, float(np.sqrt(self.floor2)), True))
+
     def _fitted(
         self, parent: Trial, scored: Sequence[Scored], gain: np.ndarray | None, enough: float, again: bool
     ) -> list[Trial]:
@@ -404,11 +408,9 @@ class Search(Hypotheses):
                 alike = [s for s in scored if s.port == port and s.law.dissipative == near.kind.dissipative]
                 if alike and _may_stand_beside(base.laws, port, near.kind):
                     entries.append(replace(alike[0], law=near.kind, starts=(near.start,)))
-        if not entries:
-            return
-        noise = float(np.sqrt(self.floor2))
-        trials = self._with_relatives(base, entries, [*entries, *scored], None, noise, True)
-        self._record(base, entries, trials)
+        if entries:
+            noise = float(np.sqrt(self.floor2))
+            self._record(base, entries, self._with_relatives(base, entries, [*entries, *scored], None, noise, True))
 
     def vary_parameters(self, base: Trial) -> None:
         """Let parameters of the simulator vary with a signal beside a hypothesis: fit those that explain most."""
@@ -428,7 +430,7 @@ class Search(Hypotheses):
         entries = [s for s in scored if (s.port, s.law.form) in best and s.port not in taken]
         if not entries:
             return
-        self._record(base, entries, self._fitted(base, entries, gain, float(np.sqrt(self.floor2)), True))
+        self._try(base, entries, gain)
         self.replace_variation(base)
         last = self.best.laws[-1] if self.best.laws else None
         if last and kind_of(last.port) == PARAMETER and last.law.scheduled_by:
@@ -445,7 +447,7 @@ class Search(Hypotheses):
         known.replaced = True
         entries = in_place_of_variation(self.bench, best, self._standing(base)[0])
         if entries:
-            self._record(base, entries, self._fitted(base, entries, None, float(np.sqrt(self.floor2)), True))
+            self._try(base, entries, None)
 
     def _curve(self, base: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> None:
         """Let the parameter that varies in the best hypothesis follow a curve of higher degree."""
@@ -456,7 +458,7 @@ class Search(Hypotheses):
         law = varying(best.law.scheduled_by, VARIATIONS[-1])()
         finer = [replace(s, law=law, starts=(law.starts_as(best.law, best.own),)) for s in entries]
         self.note_alternatives(finer)
-        self._record(base, finer, self._fitted(base, finer, gain, float(np.sqrt(self.floor2)), True))
+        self._try(base, finer, gain)
 
     def exchange(self) -> None:
         """Try all other laws, and none, in place of each of several laws, the rest in place, until none changes."""

@@ -35,10 +35,11 @@ from ...laws import Creep, StopHysteresis
 from ...models import Model
 from ...optimise import GaussNewton, estimate_initial_state, samples_for_state
 from ...simulators import Simulator
-from ..faults.gates import Gate, refit
+from ..faults.gates import Gate
+from ..fits.flexible_forces import Surface
 from ..fits.linearise import Probe, loudest_stretch, run
-from ..fits.screen import Dose, Remainder, Surface, orthonormal
-from ..fits.workbench import DIVERGED, FEW, Fitted, Workbench, output_deviation
+from ..fits.screen import Dose, Remainder, orthonormal
+from ..fits.workbench import DIVERGED, FEW, Fitted, Workbench, output_deviation, refit
 from .hypotheses import Findings, count_samples, likeliest
 from .moves import Search
 from .trials import Trial
@@ -184,7 +185,7 @@ def force_features(
     stretches: Sequence[Stretch],
     hold: str,
     engine: str,
-    workers: int = 1,
+    workers: int,
 ) -> np.ndarray | None:
     """Compute the size of the residual that each family of forces explains at each port in each stretch, (n, k).
 
@@ -266,7 +267,7 @@ def _first_state(model: Model, engine: Engine, r: Recording) -> np.ndarray:
 # final fits
 
 
-def fit_to_all(bench: Workbench, fitted: Fitted, time_limit: float = np.inf) -> Fitted:
+def fit_to_all(bench: Workbench, fitted: Fitted, time_limit: float) -> Fitted:
     """Fit a simulator to all recordings of a bench from its values on stretches of them.
 
     Without time, or if the run diverges, the values stay as they are.
@@ -276,7 +277,7 @@ def fit_to_all(bench: Workbench, fitted: Fitted, time_limit: float = np.inf) -> 
     if time_limit > 0:
         solver = replace(FINAL, time_limit=time_limit)
         found = refit(bench, start, fitted.simulator, states=states, solver=solver, like=fitted)
-    return found or bench.result(fitted.simulator, fitted.values, states, fitted.engine, fitted.model)
+    return found or bench.rerun(fitted, initial=states)
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,4 +335,4 @@ def back_on_stretches(bench: Workbench, fitted: Fitted, states: Sequence[np.ndar
     parameters = fitted.fitted_model.parameters
     held = fitted.model.with_parameters(parameters.change(**{k: {"fixed": True} for k in parameters}))
     found = bench.fit(fitted.simulator, [fitted.values], states=states, model=held, engine=fitted.engine)
-    return bench.result(fitted.simulator, fitted.values, found.initial, fitted.engine, fitted.model)
+    return bench.rerun(fitted, initial=found.initial)

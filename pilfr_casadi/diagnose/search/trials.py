@@ -24,18 +24,8 @@ from ..faults.gates import EQUAL_RATIO, open_start
 from ..faults.offsets import Offset
 from ..fits.evidence import FAR_RATIO, FORMULA_ERROR
 from ..fits.screen import Pair, Scored
-from ..fits.workbench import (
-    BRIEF,
-    COMPARED_SAMPLES,
-    DIVERGED,
-    FEW,
-    QUICK,
-    THOROUGH,
-    Fitted,
-    Workbench,
-    knee_starts,
-    refit_on_finer_steps,
-)
+from ..fits.step_refinement import knee_starts, refit_on_finer_steps
+from ..fits.workbench import BRIEF, COMPARED_SAMPLES, DIVERGED, FEW, QUICK, THOROUGH, Fitted, Workbench
 
 # Effort: pairs of each list of the screen that are fitted, besides the best of each port; the same if `again`
 BEST, BEST_AGAIN = 10, 4
@@ -175,8 +165,7 @@ class Trials:
         """Make a trial of a fit to a part of the recordings."""
         whole = found
         if self.part is not self.bench:
-            whole = self.bench.result(found.simulator, found.values, found.initial, found.engine, found.model)
-            whole = replace(whole, status=found.status)
+            whole = replace(self.bench.rerun(found), status=found.status)
         return Trial(found.last_elements(count), whole, found.cost, whole.cost if np.isfinite(whole.cost) else np.inf)
 
     def polish(self, trial: Trial) -> Trial:
@@ -212,7 +201,7 @@ class Trials:
         gain: np.ndarray | None,
         enough: float,
         report: Callable[[int, int, float], None],
-        again: bool = False,
+        again: bool,
     ) -> tuple[list[Trial], int]:
         """Fit every selected pair of port and law beside a parent's laws; return the fits, smallest error first.
 
@@ -223,10 +212,13 @@ class Trials:
         most = FEW if again else MOST_REFINED
         done, total = 0, len(pairs) + min(len(pairs), most)
 
+        def least(found: Sequence[Trial | None]) -> float:
+            return min((t.error for t in found if t), default=np.inf)
+
         def step(found: Sequence[Trial | None]) -> None:
             nonlocal done
             done += 1
-            report(done, total, min((t.error for t in found if t), default=np.inf))
+            report(done, total, least(found))
 
         pool = ThreadPoolExecutor(self.workers)
         try:
@@ -240,7 +232,7 @@ class Trials:
             prepared.sort(key=lambda p: p.trial.error if p.trial else np.inf)
             found: list[Trial | None] = []
             for group in (prepared[:FEW], prepared[FEW:most]):
-                best = min((t.error for t in found if t), default=np.inf)
+                best = least(found)
                 near = [p for p in group if best > enough or (p.trial and p.trial.error < FAR_RATIO * best)]
                 near = [] if self.over else near
                 found += [p.trial for p in group if p not in near]
@@ -248,7 +240,7 @@ class Trials:
                     found.append(refined)
                     step(found)
             found += [p.trial for p in prepared[most:]]
-            report(done if self.over else total, total, min((t.error for t in found if t), default=np.inf))
+            report(done if self.over else total, total, least(found))
         finally:
             pool.shutdown(cancel_futures=True)
         return sorted((t for t in found if t is not None), key=lambda t: t.error), len(prepared)
@@ -353,7 +345,7 @@ def _head(r: Recording, share: float, power: np.ndarray) -> Recording:
     return r if cut >= len(r) else open_start(r.slice(0, cut))
 
 
-def select_pairs(scored: Sequence[Scored], again: bool = False) -> list[list[Scored]]:
+def select_pairs(scored: Sequence[Scored], again: bool) -> list[list[Scored]]:
     """Select the pairs worth a full fit: the best of both lists and of each port, and some whatever their score.
 
     With `again`, which looks for a law in place of a known one, there are fewer.

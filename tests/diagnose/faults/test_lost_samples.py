@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from diagnosis_contract import SCHEMA, problems
 from diagnosis_rig import OFF, recordings, refitted, rig
+from simulated import outputs_of
 from spring_rig import shaken, spring
 
 import pilfr_casadi as pilfr
@@ -18,8 +19,6 @@ from pilfr_casadi.diagnose.faults import lost_samples
 from pilfr_casadi.diagnose.faults.gates import CURED_SHARE, Checked
 from pilfr_casadi.diagnose.faults.lost_samples import OutputGap, find_gaps, find_jump, find_output_gaps, settle_jump
 from pilfr_casadi.diagnose.preparation import prepare
-from pilfr_casadi.engine import make_engine
-from pilfr_casadi.simulators import discretise
 
 SOME = (laws.CoulombFriction, laws.CubicStiffness, laws.QuadraticDrag)
 
@@ -84,12 +83,9 @@ def test_friction_is_named_beside_a_gap(force):
 
 def pushed(push, count=1):
     """Recordings of the rig with a force that is not recorded."""
-    true = rig()
-    model = discretise(true, 2e-3, "zero", 4)
-    engine, out = make_engine(model), []
+    out = []
     for r in recordings(count=count):
-        whole = r.with_(u=r.u + push)
-        y = engine.simulate(model.drive(whole), model.parameters.start, np.zeros(model.n_state))[0]
+        y = outputs_of(rig(), r.with_(u=r.u + push), substeps=4)
         out.append(r.with_(y=y + 1e-3 * np.std(y) * np.random.default_rng(1).standard_normal(y.shape)))
     return out
 

@@ -1,8 +1,11 @@
 """Glitches, stale samples, and periods that have not settled."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from diagnosis_rig import OFF, recordings, refitted, rig
+from simulated import outputs_of
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
@@ -154,6 +157,14 @@ def test_an_output_that_was_measured_at_a_slower_rate_is_told():
     assert checked.next_record == "Leave the repeated values of x2 out first."
 
 
+def test_an_output_that_was_measured_at_half_the_rate_is_not_stale_as_well():
+    (r,) = recordings(count=1)
+    r = held(r.slice(0, 1001), 2)  # of an odd number of samples, more than half differ
+    now = refitted(Workbench.of(rig(OFF), [r], "zero"))
+    now = replace(now, gates=tuple(find_held_outputs([r])))
+    assert [gate.finding for gate in mend_stale_samples(now).gates] == ["held"]
+
+
 @pytest.mark.parametrize("kind", ["noise", "encoder", "driven"])
 def test_outputs_that_change_regularly_for_other_reasons_are_not(kind):
     (r,) = recordings(count=1)
@@ -197,12 +208,8 @@ def test_a_diagnosis_of_recordings_that_have_not_settled_finds_nothing_missing()
     """From rest, the rig takes some periods to settle; said to be periodic, it is not yet."""
     (one,) = recordings(count=1, seed=3)
     force = np.tile(one.u[:625], (4, 1))
-    from pilfr_casadi.engine import make_engine
-    from pilfr_casadi.simulators import discretise
-
-    model = discretise(rig(), one.dt, "zero", 8)
     r = one.with_(u=force, y=np.zeros((2500, 1)))
-    y = make_engine(model).simulate(model.drive(r), model.parameters.start, np.zeros(model.n_state))[0]
+    y = outputs_of(rig(), r, substeps=8)
     noise = 1e-3 * np.std(y) * np.random.default_rng(1).standard_normal(y.shape)
     found = pilfr.diagnose(rig(OFF), r.with_(y=y + noise, initial="periodic", period=625))
     assert found.verdict == "complete"

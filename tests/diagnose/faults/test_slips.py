@@ -178,7 +178,7 @@ def test_the_cost_of_a_run_that_diverges_is_infinite():
     u = 1e3 * np.ones((M, 1))
     r = Recording(u, np.linspace(0, 1, M), DT, ("force",), ("pos",), initial="zero", hold="zero")
     bench = Workbench.of(cart(d=-30.0, d_bounds=(-50, 5)), [r], "zero")
-    assert bench.run_given(bench.simulator).cost == np.inf
+    assert bench.run_given().cost == np.inf
 
 
 def test_an_interrupt_in_the_first_fit_leaves_the_recordings_as_they_are(monkeypatch):

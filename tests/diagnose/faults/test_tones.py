@@ -2,21 +2,20 @@
 
 import numpy as np
 import pytest
-from diagnosis_rig import DT, OFF, recordings, rig
+from diagnosis_rig import OFF, recordings, rig
 from scipy.signal import lfilter
+from simulated import outputs_of
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.faults.samples import find_ringing_mode, find_tone, find_tones
+from pilfr_casadi.diagnose.faults.tones import find_ringing_mode, find_tone, find_tones
 from pilfr_casadi.diagnose.fits.floor import Floor
 from pilfr_casadi.diagnose.pipeline import with_tones
 from pilfr_casadi.diagnose.search.moves import Search
 from pilfr_casadi.diagnose.search.trials import Trial
 from pilfr_casadi.diagnose.verdict import Posterior, judge
-from pilfr_casadi.engine import make_engine
-from pilfr_casadi.simulators import discretise
 
 # steady tones
 
@@ -120,9 +119,7 @@ def disturbed(size, seed=5):
     rng = np.random.default_rng(seed)
     (r,) = recordings(count=1)
     extra = size * np.std(r.u) * rng.standard_normal(r.u.shape)
-    model = discretise(rig(), DT, "zero", 4)
-    y = make_engine(model).simulate(model.drive(r.with_(u=extra)), model.parameters.start, np.zeros(model.n_state))[0]
-    return r.with_(y=r.y + y)
+    return r.with_(y=r.y + outputs_of(rig(), r.with_(u=extra), substeps=4))
 
 
 def test_a_rest_that_swings_at_an_own_frequency_is_told_from_noise():

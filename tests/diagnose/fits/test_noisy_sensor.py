@@ -8,7 +8,7 @@ from pilfr_casadi import Parameter, Port, Recording, Simulator, multisine
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.faults.gates import Checked
 from pilfr_casadi.diagnose.fits.evidence import deviations
-from pilfr_casadi.diagnose.fits.screen import innovation_share
+from pilfr_casadi.diagnose.fits.flexible_forces import innovation_share
 from pilfr_casadi.diagnose.fits.workbench import THOROUGH
 from pilfr_casadi.laws import CoulombFriction
 

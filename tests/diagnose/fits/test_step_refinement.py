@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from diagnosis_rig import DT
+from simulated import outputs_of
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.fits.workbench import FINER_STEPS, THOROUGH, refine_steps
-from pilfr_casadi.engine import make_engine
+from pilfr_casadi.diagnose.fits.step_refinement import refine_steps
+from pilfr_casadi.diagnose.fits.workbench import FINER_STEPS, THOROUGH
 from pilfr_casadi.laws import CoulombFriction, Delay, Polynomial
-from pilfr_casadi.simulators import Simulator, discretise
+from pilfr_casadi.simulators import Simulator
 
 F_C = 6.0
 
@@ -43,8 +44,7 @@ def ran(seed, v_0):
     rng, m = np.random.default_rng(seed), 1500
     force = 25 * pilfr.multisine(m, f_max=15.0, fs=1 / DT, rng=rng)
     blank = pilfr.Recording(force, force, DT, ("force",), ("position",), initial="zero", hold="zero")
-    model = discretise(carriage(lambda v, p: F_C * ca.tanh(v / v_0)), DT, "zero", 40)
-    y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(2))[0]
+    y = outputs_of(carriage(lambda v, p: F_C * ca.tanh(v / v_0)), blank, substeps=40)
     return blank.with_(y=y + 5e-4 * np.std(y) * rng.standard_normal(y.shape))
 
 

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from diagnosis_rig import OFF, recordings, rig
 from scipy.signal import butter, lfilter
+from simulated import outputs_of
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
-from pilfr_casadi.engine import make_engine
-from pilfr_casadi.simulators import discretise
 
 TRIED = [laws.Lag, laws.Resonance, laws.Delay, laws.CubicStiffness]
 
@@ -25,8 +24,7 @@ def filtered(order, cutoff, outputs=(0, 1), law=None):
     rng = np.random.default_rng(4)
     (r,) = recordings(count=1, hold="zero")
     true = both(rig()) if law is None else both(rig()).with_element("ground-m1", law)
-    model = discretise(true, r.dt, "zero", 8)
-    y = make_engine(model).simulate(model.drive(r), model.parameters.start, np.zeros(model.n_state))[0]
+    y = outputs_of(true, r, substeps=8)
     for i in outputs:
         y[:, i] = lfilter(*butter(order, cutoff, fs=1 / r.dt), y[:, i])
     return r.with_(y=y + 2e-3 * np.std(y, axis=0) * rng.standard_normal(y.shape), outputs=("x1", "x2"))

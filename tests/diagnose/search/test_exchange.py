@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
+from simulated import outputs_of
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Simulator, laws
-from pilfr_casadi.engine import make_engine
-from pilfr_casadi.simulators import discretise
 
 DT, SAMPLES = 4e-3, 3000
 
@@ -56,8 +55,7 @@ def recorded(seed):
     blank = pilfr.Recording(
         u, np.zeros((SAMPLES, 2)), DT, ("force",), ("motor", "carriage"), initial="zero", hold="zero"
     )
-    model = discretise(true, DT, "zero", 12)
-    y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(model.n_state))[0]
+    y = outputs_of(true, blank, substeps=12)
     return blank.with_(y=y + 4e-3 * np.std(y, axis=0) * rng.standard_normal(y.shape))
 
 
@@ -87,8 +85,7 @@ def test_a_law_that_only_asks_for_finer_steps_is_no_effect():
         ports=(Port("ground", {"v": -1.0}, lambda x: x.x, lambda x: x.v, "N", "m"),),
     )
     true = mass.with_element("actuator:force", laws.DeadZone(values={"g": 1.2}))
-    model = discretise(true, DT, "linear", 40)
-    y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(model.n_state))[0]
+    y = outputs_of(true, blank, "linear", 40)
     recording = blank.with_(y=y + 2e-4 * np.std(y) * rng.standard_normal(y.shape))
     found = pilfr.diagnose(mass, recording, laws=[laws.DeadZone, laws.Mode, laws.Attached], workers=1)
     assert [(e.port, e.law) for e in found.effects] == [("actuator:force", "dead_zone")]

@@ -13,8 +13,9 @@ from pilfr_casadi import laws
 from pilfr_casadi._base import Interrupt, Stages
 from pilfr_casadi.diagnose import Workbench, correction, preparation
 from pilfr_casadi.diagnose.faults.gates import Checked
+from pilfr_casadi.diagnose.fits import flexible_forces
+from pilfr_casadi.diagnose.fits.flexible_forces import flexible_shares
 from pilfr_casadi.diagnose.fits.floor import Floor
-from pilfr_casadi.diagnose.fits.screen import flexible_shares
 from pilfr_casadi.diagnose.search import hypotheses
 from pilfr_casadi.diagnose.search.moves import Search
 from pilfr_casadi.diagnose.search.trials import Trial, Trials
@@ -214,9 +215,8 @@ def test_brief_fits_see_more_than_a_long_rest_before_the_motion(monkeypatch):
 
 def test_a_flexible_force_is_looked_for_where_the_error_is(monkeypatch):
     """With many states a part of a long recording has to do."""
-    screen = sys.modules[flexible_shares.__module__]
-    monkeypatch.setattr(screen, "MOST_WORK", 0)
-    monkeypatch.setattr(screen, "LEAST_SAMPLES", 400)
+    monkeypatch.setattr(flexible_forces, "MOST_WORK", 0)
+    monkeypatch.setattr(flexible_forces, "LEAST_SAMPLES", 400)
     search = searching([at_rest_first(600)])
     assert max(flexible_shares(search.bench, search.without).values()) > 0.9
 

@@ -9,6 +9,7 @@ import pytest
 from cart import GROUND, cart
 from diagnosis_contract import SCHEMA, problems
 from diagnosis_rig import OFF, recordings, rig
+from simulated import outputs_of
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Recording, laws
@@ -21,8 +22,6 @@ from pilfr_casadi.diagnose.fits.floor import noise_floor
 from pilfr_casadi.diagnose.search.moves import Search
 from pilfr_casadi.diagnose.search.stretches import Everything, Stretch, Stretches, choose_stretches, divide, spread_out
 from pilfr_casadi.diagnose.search.trials import Trial
-from pilfr_casadi.engine import make_engine
-from pilfr_casadi.simulators import discretise
 
 DT, CUBIC = 0.02, 4000.0
 
@@ -42,8 +41,7 @@ def shaken(samples, *bursts, seed=0, initial="zero"):
     force = size * np.convolve(rng.standard_normal(samples + 4), np.ones(5) / 5**0.5, mode="valid")
     true = spring(100.0, 2.0).with_element("ground", laws.CubicStiffness().at({"k_3": CUBIC}))
     blank = Recording(force, force, DT, ("force",), ("position",), initial="zero", hold="zero")
-    model = discretise(true, DT, "zero", 4)
-    y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(model.n_state))[0]
+    y = outputs_of(true, blank, substeps=4)
     return blank.with_(y=y + 1e-3 * np.std(y) * rng.standard_normal(y.shape), initial=initial)
 
 

@@ -1,0 +1,95 @@
+"""Count reversals, distinct amplitudes and rests of the motion at each port."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .detectability import SMALL_SHARE, live_ports, port_units
+from .fits.linearise import Probe, Run
+from .fits.workbench import Workbench
+
+SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """Motion of a port's local coordinate.
+
+    Attributes
+    ----------
+    travel : float
+        Largest minus smallest value, in `unit`.
+    reversals : int
+        Turning points with swings of at least a twentieth of the travel on both sides.
+    amplitudes : int
+        Distinct amplitudes of nine tenths of the swings; amplitudes closer than a tenth of the largest count once.
+    rests : int
+        Stretches longer than two typical swings in which the coordinate stays within a twentieth of the travel.
+    """
+
+    port: str
+    travel: float
+    unit: str
+    reversals: int
+    amplitudes: int
+    rests: int
+
+
+def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator[Excitation]:
+    """Count reversals, distinct amplitudes and rests of every live port's local coordinate along the refitted run."""
+    for port in live_ports(bench.simulator):
+        signals = [r.z[:, probe.ports.index(port.name)] for r in runs]
+        travel = float(np.ptp(np.concatenate(signals)))
+        least = SMALLEST_SWING * travel
+        reversals, rests, swings = 0, 0, list[float]()
+        for z in signals if travel > 0 else ():
+            turns = _turning_points(z, least)
+            reversals += max(len(turns) - 2, 0)
+            swings += np.abs(np.diff(z[turns])).tolist()
+            longest = 2 * float(np.median(np.diff(turns))) if len(turns) > 2 else SMALL_SHARE * len(z)
+            rests += _count_rests(z, least, longest)
+        unit = port.across_unit or port_units(port, bench.recordings[0])[1]
+        yield Excitation(port.name, travel, unit, reversals, _count_distinct(np.array(swings)), rests)
+
+
+def _turning_points(z: np.ndarray, least: float) -> list[int]:
+    """Find the turning points of z (M,) between swings of at least `least`, the first and the last included."""
+    turns, extreme, direction = [0], 0, 0.0
+    for k, value in enumerate(z.tolist()):
+        if direction == 0:
+            if abs(value - z[0]) >= least:
+                direction, extreme = np.sign(value - z[0]), k
+        elif direction * (value - z[extreme]) >= 0:
+            extreme = k
+        elif direction * (z[extreme] - value) >= least:
+            turns.append(extreme)
+            direction, extreme = -direction, k
+    return [*turns, extreme] if extreme > turns[-1] else turns
+
+
+def _count_distinct(swings: np.ndarray) -> int:
+    """Count the distinct sizes of nine tenths of the swings; sizes within a tenth of the largest count once."""
+    if not len(swings):
+        return 0
+    left, counts = np.sort(swings)[::-1], list[int]()
+    apart = SMALL_SHARE * float(left[0])
+    while len(left):
+        own = left > left[0] - apart
+        counts.append(int(np.sum(own)))
+        left = left[~own]
+    share = np.cumsum(sorted(counts, reverse=True)) / sum(counts)
+    return int(np.searchsorted(share, 1 - SMALL_SHARE - 1e-9) + 1)
+
+
+def _count_rests(z: np.ndarray, least: float, samples: float) -> int:
+    """Count the stretches of more than `samples` samples in which z stays within `least`."""
+    count, begin, low, high = 0, 0, z[0], z[0]
+    for k, value in enumerate(z):
+        low, high = min(low, value), max(high, value)
+        if high - low > least or k == len(z) - 1:
+            count += k - begin > samples
+            begin, low, high = k, value, value
+    return count
