@@ -164,6 +164,7 @@ def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[ty
     alone = [UnreadInput] if given >= {law.__name__ for law in CATALOGUE} else []
     may_scale = [*(law for law in SCALABLE if law in laws), *alone]
     by_input = [scaled(law, by) for law in may_scale for by in simulator.idle_inputs]
+    by_input += [scheduled(law, by) for law in alone for by in simulator.idle_inputs]  # with a constant beside it
     signals = ["t", *simulator.inputs, *sorted({name for port in simulator.ports for name in port.signals})]
     pairs = [(law, by) for law in (LinearStiffness, ViscousDamping) for by in signals] + [(ViscousDamping, "z")]
     varying = [scheduled(law, by, "quadratic") for law, by in pairs if law in laws]

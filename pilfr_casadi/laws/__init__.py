@@ -52,6 +52,7 @@ if TYPE_CHECKING:
         DeadZone as DeadZone,
         Exponential as Exponential,
         FreeCurve as FreeCurve,
+        Gain as Gain,
         GradualSaturation as GradualSaturation,
         Magnitude as Magnitude,
         Orifice as Orifice,

@@ -115,13 +115,17 @@ def scaled(law: type[Law], by: str) -> type[Law]:
 
 
 class UnreadInput(Law):
-    """The effect of a recorded input that the equations do not read, such as a load or the sun; `scaled` names it."""
+    """The effect of a recorded input that the equations do not read, such as a load or the sun; `scaled` names it.
+
+    At a sensor it is cross-sensitivity, as of a strain gauge to temperature.
+    """
 
     id = "unread_input"
     form = "{by}"
     equation = "w = a {by}"
-    sentence = "{by} acts here, in proportion; it is recorded, and the equations do not read it"
+    sentence = "{by} acts here; it is recorded, and the equations do not read it"
     units = {"a": "w"}
+    places = ("parallel", "series")
 
     def force(self, p: Any) -> Any:
         return p.a
@@ -325,7 +329,7 @@ def _scaled(base: Any, by: str) -> Any:
         form, equation, sentence = words
         sentences = {domain: f"{text}; {by} scales its strength" for domain, text in base.sentences.items()}
         units, strength = strengths, base.strength
-        places = ("parallel",)
+        places = base.places
         dissipative = restoring = False  # the signal may have either sign
         scaled_by = by
 
@@ -352,13 +356,16 @@ def _levels(found: Law, own: str, by: str, limits: Mapping[str, float]) -> np.nd
     return levels if found.scheduled_by == by else np.array([levels.mean(axis=0)] * 3)
 
 
-def _in_words(base: Any, varies: Profile, by: str, words: str) -> tuple[str, str]:
-    """Return equation and sentence of a law whose strength varies."""
+def _in_words(base: Any, varies: Profile, by: str, words: str) -> tuple[str, str, str]:
+    """Return form, equation and sentence of a law whose strength varies."""
     course = varies.course.format(by=by)
+    if "{by}" in base.equation:
+        return f"{by}{varies.how}, with an offset", f"w = a  with a {course}", base.sentence.format(by=words)
+    form = f"{base.form}, scheduled{varies.how} by {by}".removeprefix(", ")
     if "parameter" in base.places:
-        return course, base.sentence.format(by=words)
+        return form, course, base.sentence.format(by=words)
     equation = f"{base.equation}  with {', '.join(base.strength)} {course}"
-    return equation, f"{base.sentence}; its strength varies{varies.how} with {words}"
+    return form, equation, f"{base.sentence}; its strength varies{varies.how} with {words}"
 
 
 @functools.cache
@@ -380,8 +387,7 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
         return own | {k: sum(w * p[v] for w, v in zip(weights, names, strict=True)) for k, names in ends.items()}
 
     class Scheduled(base):
-        form = f"{base.form}, scheduled{varies.how} by {by}".removeprefix(", ")
-        equation, sentence = _in_words(base, varies, by, words)
+        form, equation, sentence = _in_words(base, varies, by, words)
         sentences = {k: f"{v}; its strength varies{varies.how} with {words}" for k, v in base.sentences.items()}
         units = {**base.units, **further, **shape, "low": unit, "high": unit}
         strength = (*base.strength, *further)
