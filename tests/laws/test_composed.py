@@ -352,7 +352,7 @@ def test_a_wrong_gain_is_named_where_no_parameter_can_take_it(monkeypatch):
     true = rig().with_element("actuator:force", Gain().at({"g": 0.06}))
     found = pilfr.diagnose(rig(1000.0, 7.5), recorded(true, 0), workers=1)
     assert [e.law for e in found.effects] == ["gain"], str(found)
-    named = {found.effects[0].port, *(other["port"] for other in found.effects[0].indistinguishable)}
+    named = {found.effects[0].port, *(port for port, _ in found.effects[0].indistinguishable)}
     assert named == {"actuator:force", "sensor:position"}  # of a linear machine with one of each
     assert found.effects[0].confidence > 0.8
     assert found.effects[0].parameters["g"]["value"] == pytest.approx(0.06, rel=0.02)
