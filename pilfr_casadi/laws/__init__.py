@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         PROFILES as PROFILES,
         SCHEDULES as SCHEDULES,
         VARIATIONS as VARIATIONS,
+        Feedthrough as Feedthrough,
         UnreadInput as UnreadInput,
         VaryingParameter as VaryingParameter,
         behind_gap as behind_gap,

@@ -9,7 +9,7 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -125,10 +125,19 @@ class UnreadInput(Law):
     equation = "w = a {by}"
     sentence = "{by} acts here; it is recorded, and the equations do not read it"
     units = {"a": "w"}
-    places = ("parallel", "series")
+    places: ClassVar[tuple[str, ...]] = ("parallel", "series")
 
     def force(self, p: Any) -> Any:
         return p.a
+
+
+class Feedthrough(UnreadInput):
+    """An input that reaches a sensor, or the channel of another input, directly; `scaled` names it."""
+
+    id = "feedthrough"
+    source = "Franklin, Powell & Emami-Naeini (2015), Feedback Control of Dynamic Systems, sec. 7.3"
+    sentence = "{by} passes straight through to here, as by a resistance in series, or by cross-talk of channels"
+    places = ("series",)
 
 
 def scheduled(law: type[Law], by: str, profile: str = "linear") -> type[Law]:
@@ -260,7 +269,7 @@ def behind_gap(law: type[Law]) -> type[Law]:
 def _check_force(law: Any) -> Any:
     if not (isinstance(law, type) and issubclass(law, Law)):
         raise InputError(f"A composed law is made of a class of laws, such as CoulombFriction; got {law!r}.")
-    if "parallel" not in law.places:
+    if "parallel" not in law.places and not issubclass(law, UnreadInput):
         raise InputError(f"The law {law.id!r} stands in series with a signal; only a force can be composed.")
     return law
 

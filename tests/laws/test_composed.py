@@ -18,6 +18,7 @@ from pilfr_casadi.laws import (
     CoulombFriction,
     CubicStiffness,
     Drift,
+    Feedthrough,
     Gain,
     Local,
     Power,
@@ -356,6 +357,21 @@ def test_a_wrong_gain_is_named_where_no_parameter_can_take_it(monkeypatch):
     assert named == {"actuator:force", "sensor:position"}  # of a linear machine with one of each
     assert found.effects[0].confidence > 0.8
     assert found.effects[0].parameters["g"]["value"] == pytest.approx(0.06, rel=0.02)
+
+
+def test_an_input_may_reach_a_sensor_directly(monkeypatch):
+    """As the drop at a series resistance that a battery's simulator leaves out."""
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.arguments"), "CATALOGUE", (Saturation,))
+    true = rig().with_element("sensor:position", scaled(Feedthrough, "force")().at({"a": 2e-4}))
+    found = pilfr.diagnose(rig(1000.0, 7.5), recorded(true, 0), effects=1, workers=1)
+    assert [(e.port, e.law, e.form) for e in found.effects] == [("sensor:position", "feedthrough", "force")], str(found)
+    assert found.effects[0].parameters["a"]["value"] == pytest.approx(2e-4, rel=0.02)
+
+
+def test_an_input_is_not_led_to_its_own_channel():
+    """There, feedthrough is a gain."""
+    ports = {port.name for port in rig().all_ports() if port.admits(scaled(Feedthrough, "force"))}
+    assert ports == {"actuator:voltage", "sensor:position"}
 
 
 def test_a_worker_tries_the_input_that_the_equations_do_not_read():
