@@ -11,7 +11,18 @@ import numpy as np
 from .._base import InputError, Stages, listed
 from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
 from ..identify import match_channels
-from ..laws import CATALOGUE, SCALABLE, Law, LinearStiffness, UnreadInput, ViscousDamping, scaled, scheduled, seen_by
+from ..laws import (
+    CATALOGUE,
+    SCALABLE,
+    Feedthrough,
+    Law,
+    LinearStiffness,
+    UnreadInput,
+    ViscousDamping,
+    scaled,
+    scheduled,
+    seen_by,
+)
 from ..simulators import Simulator, as_simulator
 from .faults.gates import Gate, edited
 from .search.stretches import Stretches
@@ -145,15 +156,18 @@ def check_laws(laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
 def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[type[Law], ...]:
     """Return the laws, and versions of some of them whose strength varies with a signal.
 
-    An input that the equations do not read may act itself, or scale a law. A spring or damper of the simulator's own
-    may vary with the time, an input, or a port's own signal, and a damper with the position. Other laws are found
-    first, and then let vary (`Search`). Of several sensors at an elastic joint or drive, one alone may be on the far
-    side.
+    An input that the equations do not read may act itself, or scale a law; any other may reach a sensor, or the channel
+    of another input, directly. A spring or damper of the simulator's own may vary with the time, an input, or a port's
+    own signal, and a damper with the position. Other laws are found first, and then let vary (`Search`). Of several
+    sensors at an elastic joint or drive, one alone may be on the far side.
     """
     given = {law.__name__ for law in laws}  # in a worker, classes made at run time are others of the same name
-    alone = [UnreadInput] if given >= {law.__name__ for law in CATALOGUE} else []
+    all_laws = given >= {law.__name__ for law in CATALOGUE}
+    alone = [UnreadInput] if all_laws else []
     may_scale = [*(law for law in SCALABLE if law in laws), *alone]
     by_input = [scaled(law, by) for law in may_scale for by in simulator.idle_inputs]
+    by_input += [scheduled(law, by) for law in alone for by in simulator.idle_inputs]  # with a constant beside it
+    by_input += [scaled(Feedthrough, by) for by in simulator.inputs if all_laws and by not in simulator.idle_inputs]
     signals = ["t", *simulator.inputs, *sorted({name for port in simulator.ports for name in port.signals})]
     pairs = [(law, by) for law in (LinearStiffness, ViscousDamping) for by in signals] + [(ViscousDamping, "z")]
     varying = [scheduled(law, by, "quadratic") for law, by in pairs if law in laws]

@@ -9,7 +9,7 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -115,16 +115,29 @@ def scaled(law: type[Law], by: str) -> type[Law]:
 
 
 class UnreadInput(Law):
-    """The effect of a recorded input that the equations do not read, such as a load or the sun; `scaled` names it."""
+    """The effect of a recorded input that the equations do not read, such as a load or the sun; `scaled` names it.
+
+    At a sensor it is cross-sensitivity, as of a strain gauge to temperature.
+    """
 
     id = "unread_input"
     form = "{by}"
     equation = "w = a {by}"
-    sentence = "{by} acts here, in proportion; it is recorded, and the equations do not read it"
+    sentence = "{by} acts here; it is recorded, and the equations do not read it"
     units = {"a": "w"}
+    places: ClassVar[tuple[str, ...]] = ("parallel", "series")
 
     def force(self, p: Any) -> Any:
         return p.a
+
+
+class Feedthrough(UnreadInput):
+    """An input that reaches a sensor, or the channel of another input, directly; `scaled` names it."""
+
+    id = "feedthrough"
+    source = "Franklin, Powell & Emami-Naeini (2015), Feedback Control of Dynamic Systems, sec. 7.3"
+    sentence = "{by} passes straight through to here, as by a resistance in series, or by cross-talk of channels"
+    places = ("series",)
 
 
 def scheduled(law: type[Law], by: str, profile: str = "linear") -> type[Law]:
@@ -256,7 +269,7 @@ def behind_gap(law: type[Law]) -> type[Law]:
 def _check_force(law: Any) -> Any:
     if not (isinstance(law, type) and issubclass(law, Law)):
         raise InputError(f"A composed law is made of a class of laws, such as CoulombFriction; got {law!r}.")
-    if "parallel" not in law.places:
+    if "parallel" not in law.places and not issubclass(law, UnreadInput):
         raise InputError(f"The law {law.id!r} stands in series with a signal; only a force can be composed.")
     return law
 
@@ -325,7 +338,7 @@ def _scaled(base: Any, by: str) -> Any:
         form, equation, sentence = words
         sentences = {domain: f"{text}; {by} scales its strength" for domain, text in base.sentences.items()}
         units, strength = strengths, base.strength
-        places = ("parallel",)
+        places = base.places
         dissipative = restoring = False  # the signal may have either sign
         scaled_by = by
 
@@ -352,13 +365,16 @@ def _levels(found: Law, own: str, by: str, limits: Mapping[str, float]) -> np.nd
     return levels if found.scheduled_by == by else np.array([levels.mean(axis=0)] * 3)
 
 
-def _in_words(base: Any, varies: Profile, by: str, words: str) -> tuple[str, str]:
-    """Return equation and sentence of a law whose strength varies."""
+def _in_words(base: Any, varies: Profile, by: str, words: str) -> tuple[str, str, str]:
+    """Return form, equation and sentence of a law whose strength varies."""
     course = varies.course.format(by=by)
+    if "{by}" in base.equation:
+        return f"{by}{varies.how}, with an offset", f"w = a  with a {course}", base.sentence.format(by=words)
+    form = f"{base.form}, scheduled{varies.how} by {by}".removeprefix(", ")
     if "parameter" in base.places:
-        return course, base.sentence.format(by=words)
+        return form, course, base.sentence.format(by=words)
     equation = f"{base.equation}  with {', '.join(base.strength)} {course}"
-    return equation, f"{base.sentence}; its strength varies{varies.how} with {words}"
+    return form, equation, f"{base.sentence}; its strength varies{varies.how} with {words}"
 
 
 @functools.cache
@@ -380,8 +396,7 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
         return own | {k: sum(w * p[v] for w, v in zip(weights, names, strict=True)) for k, names in ends.items()}
 
     class Scheduled(base):
-        form = f"{base.form}, scheduled{varies.how} by {by}".removeprefix(", ")
-        equation, sentence = _in_words(base, varies, by, words)
+        form, equation, sentence = _in_words(base, varies, by, words)
         sentences = {k: f"{v}; its strength varies{varies.how} with {words}" for k, v in base.sentences.items()}
         units = {**base.units, **further, **shape, "low": unit, "high": unit}
         strength = (*base.strength, *further)

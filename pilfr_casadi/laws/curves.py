@@ -1,4 +1,4 @@
-"""Memoryless curves of an actuator or a sensor: powers, saturation and dead zone."""
+"""Memoryless curves of an actuator or a sensor: gain, powers, saturation and dead zone."""
 
 from __future__ import annotations
 
@@ -14,6 +14,23 @@ from .base import Law, Local, size_to_power
 
 LINEAR_POWER = 0.03  # difference of a power from one, below which it is a gain
 NARROW_RANGE = 0.05  # half the range over its middle, below which any curve is a gain and an offset
+
+
+class Gain(Law):
+    """A wrong gain: a calibration, or a constant of the equations that scales the signal."""
+
+    id = "gain"
+    equation = "w = g z"
+    source = "Ljung (1999), System Identification, sec. 4.2"
+    sentence = (
+        "a wrong gain: the signal passes times 1 + g, as after a wrong calibration, or with a wrong constant in the "
+        "equations that scales it, such as a mass"
+    )
+    units = {"g": "w/z"}
+    places = ("series",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.g * z
 
 
 class Polynomial(Law):

@@ -18,7 +18,11 @@ from pilfr_casadi.laws import (
     CoulombFriction,
     CubicStiffness,
     Drift,
+    Feedthrough,
+    Gain,
     Local,
+    Power,
+    PowerWithGain,
     PreslidingFriction,
     Relaxation,
     Saturation,
@@ -327,11 +331,51 @@ def test_an_input_that_the_equations_do_not_read_may_act_itself(monkeypatch):
     found = pilfr.diagnose(rig(1000.0, 7.5), recorded(true, 0), effects=1, workers=1)
     assert [(e.port, e.law, e.form) for e in found.effects] == [("damper", "unread_input", "voltage")], str(found)
     assert found.effects[0].parameters["a"]["value"] == pytest.approx(3.0, rel=0.01)
-    assert "voltage acts here, in proportion" in str(found)
+    assert "voltage acts here; it is recorded" in str(found)
+
+
+def test_an_input_that_the_equations_do_not_read_may_disturb_a_sensor(monkeypatch):
+    """A sensor that drifts with a recorded signal is right at another level of the signal than zero."""
+    drift = scheduled(UnreadInput, "voltage")().at({"a": -0.012, "a_high": 0.03, "low": 0.5, "high": 4.0})
+    true = rig().with_element("sensor:position", drift)
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.arguments"), "CATALOGUE", (UnreadInput,))
+    found = pilfr.diagnose(rig(1000.0, 7.5), recorded(true, 0), effects=1, workers=1)
+    assert [(e.port, e.law, e.form) for e in found.effects] == [
+        ("sensor:position", "unread_input", "voltage, with an offset")
+    ], str(found)
+    own = {name: entry["value"] for name, entry in found.effects[0].parameters.items()}
+    assert (own["a_high"] - own["a"]) / (own["high"] - own["low"]) == pytest.approx(0.042 / 3.5, rel=0.02)
+
+
+def test_a_wrong_gain_is_named_where_no_parameter_can_take_it(monkeypatch):
+    few = (Gain, Power, PowerWithGain, Saturation)
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.arguments"), "CATALOGUE", few)
+    true = rig().with_element("actuator:force", Gain().at({"g": 0.06}))
+    found = pilfr.diagnose(rig(1000.0, 7.5), recorded(true, 0), workers=1)
+    assert [e.law for e in found.effects] == ["gain"], str(found)
+    named = {found.effects[0].port, *(port for port, _ in found.effects[0].indistinguishable)}
+    assert named == {"actuator:force", "sensor:position"}  # of a linear machine with one of each
+    assert found.effects[0].confidence > 0.8
+    assert found.effects[0].parameters["g"]["value"] == pytest.approx(0.06, rel=0.02)
+
+
+def test_an_input_may_reach_a_sensor_directly(monkeypatch):
+    """As the drop at a series resistance that a battery's simulator leaves out."""
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.arguments"), "CATALOGUE", (Saturation,))
+    true = rig().with_element("sensor:position", scaled(Feedthrough, "force")().at({"a": 2e-4}))
+    found = pilfr.diagnose(rig(1000.0, 7.5), recorded(true, 0), effects=1, workers=1)
+    assert [(e.port, e.law, e.form) for e in found.effects] == [("sensor:position", "feedthrough", "force")], str(found)
+    assert found.effects[0].parameters["a"]["value"] == pytest.approx(2e-4, rel=0.02)
+
+
+def test_an_input_is_not_led_to_its_own_channel():
+    """There, feedthrough is a gain."""
+    ports = {port.name for port in rig().all_ports() if port.admits(scaled(Feedthrough, "force"))}
+    assert ports == {"actuator:voltage", "sensor:position"}
 
 
 def test_a_worker_tries_the_input_that_the_equations_do_not_read():
     """There, classes that were made at run time are others of the same name."""
     other = type(CATALOGUE[-1].__name__, (CATALOGUE[-1],), {})
     tried = add_scaled_laws((*CATALOGUE[:-1], other), rig())
-    assert [law.form for law in tried if law.id == "unread_input"] == list(rig().idle_inputs) != []
+    assert [law.form for law in tried if law.id == "unread_input"] == ["voltage", "voltage, with an offset"]
