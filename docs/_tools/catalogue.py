@@ -201,7 +201,7 @@ def page(law_id: str, laws: list[type[Law]], alike: dict[type[Law], list[tuple[s
         text.append(f"It is a special case of {', '.join(map(link, general))}.\n")
     if law_id in LINEAR:
         text.append(
-            "It is tried only where the simulator has no free spring or damper of its own at that port: otherwise it "
+            "It is tried only where the simulator has no free spring, damper or gain of its own there: otherwise it "
             "is the same as another value of that parameter.\n"
         )
     for law in laws:

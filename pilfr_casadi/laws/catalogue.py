@@ -26,8 +26,9 @@ CATALOGUE: tuple[type[Law], ...] = (
     behind_gap(friction.CoulombFriction),
 )
 
-# ids of laws that are equivalent to other values of the simulator's own parameters, if it has a spring or damper there
-LINEAR = (stiffness.LinearStiffness.id, friction.ViscousDamping.id)
+# ids of laws that are equivalent to other values of the simulator's own parameters, if it has a spring or damper there,
+# or a gain of the signal
+LINEAR = (stiffness.LinearStiffness.id, friction.ViscousDamping.id, curves.Gain.id)
 
 # ids of dry friction, and of drags that grow with speed; a bearing or a seal may have one of each
 DRY = (friction.CoulombFriction.id, friction.StribeckFriction.id)
