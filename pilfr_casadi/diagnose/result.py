@@ -436,7 +436,7 @@ class Diagnosis:
                 f"Refitted, the simulator alone is hardly better than a constant (error {train['before']:.2g} of the "
                 "outputs' deviation). Check its values, units and bounds before you trust a name."
             )
-        if train and self.effects:
+        if train and self.verdict != "unexplained":
             out += self._remaining_error(train["after"])
         far = test and train and test["after"] > FAR_RATIO * max(train["after"], self.noise_on_tests["nrmse"])
         if far and self.outcome != "worse":
@@ -449,12 +449,18 @@ class Diagnosis:
     def _remaining_error(self, after: float) -> Iterator[str]:
         """Generate a note if the corrected simulator does not follow to the noise, or only to an uncertain one."""
         noise, white = (max(value, 1e-300) for value in (self.floor["nrmse"], _white(self.floor)))
+        tried = () if self.effects or after < ABOVE_NOISE * white else self.candidates
+        at_noise = [c for c in tried if c["nrmse_train"] < NEAR_RATIO * white]
+        best = min(at_noise, key=lambda c: c["nrmse_train"], default=None)
+        law = best and f"{name_at(best['port'], best['law'], best['form'])} follows to {best['nrmse_train']:.3g}"
         if after > ABOVE_NOISE * noise:
-            yield f"The remaining error is {after / noise:.2g} times the noise: more is missing, or a law is only near."
-        elif after > FAR_RATIO * white:
+            rest = f"more may be missing ({law})" if law else "more is missing, or a law is only near"
+            yield f"The remaining error is {after / noise:.2g} times the noise: {rest}."
+        elif law or after > FAR_RATIO * white:
+            rest = f"missing physics: {law}" if law else "physics that no law here explains"
             yield (
                 f"The remaining error is {after / white:.2g} times the white noise. Its slow part may be noise too, or "
-                "physics that no law here explains."
+                f"{rest}."
             )
 
     @property

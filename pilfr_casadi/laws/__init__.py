@@ -144,6 +144,7 @@ if TYPE_CHECKING:
         QuadraticStiffness as QuadraticStiffness,
         QuinticStiffness as QuinticStiffness,
         Ripple as Ripple,
+        SaturatingSpring as SaturatingSpring,
         SlackCoupling as SlackCoupling,
         SlackSpring as SlackSpring,
         SoftClearance as SoftClearance,

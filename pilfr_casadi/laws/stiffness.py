@@ -197,11 +197,30 @@ class Clearance(Law):
     units = {"k_g": "w/z", "g": "z"}
     absent = ("thermal",)  # heat flows at any difference
     two_sided = True
+    restoring = True  # a spring beyond a gap that pushed outwards would be a force that saturates
     starts = {"g": ("reach", 0.03, 0.08, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8)}
     ranges = {"g": ("reach", 0.001, 0.97), "k_g": ("max_stiffness", -1.0, 1.0)}
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_g * (ca.fmax(z - p.g, 0) - ca.fmax(-z - p.g, 0))
+
+
+class SaturatingSpring(Law):
+    """A modelled spring whose force approaches a limit, such as the lateral force of a tyre over its slip angle."""
+
+    id = "saturation"
+    form = "of a force"
+    equation = "w = -k_s (z - L tanh(z / L))"
+    source = "Pacejka (2012), Tire and Vehicle Dynamics, ch. 1"
+    sentence = "a force that saturates: of the modelled spring, k_s z does not grow beyond k_s L"
+    units = {"k_s": "w/z", "L": "z"}
+    domains = ("mechanical",)
+    restoring = True  # it reduces a modelled spring
+    starts = {"L": ("reach", 0.3, 0.6, 1.0)}
+    ranges = {"L": ("reach", 0.05, 3.0), "k_s": ("max_stiffness", -1.0, 1.0)}
+
+    def force(self, z: Any, p: Any) -> Any:
+        return -p.k_s * (z - p.L * ca.tanh(z / p.L))
 
 
 class SlackSpring(Clearance):

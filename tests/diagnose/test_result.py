@@ -44,6 +44,14 @@ def diagnosed():
     return found, test, reports
 
 
+def test_a_fault_that_leaves_more_than_the_noise_tells_which_law_follows_to_it(diagnosed):
+    found, _, _ = diagnosed
+    errors = {**found.errors, "train": {**found.errors["train"], "after": 3 * found.floor["nrmse"]}}
+    fault = replace(found, verdict="recording-fault", effects=(), errors=errors)
+    told = [note for note in fault.warnings() if "times the noise" in note]
+    assert len(told) == 1 and "3 times the noise" in told[0] and "cubic stiffness at ground follows to" in told[0], told
+
+
 def test_the_verbs_tell_what_the_diagnosis_told(diagnosed):
     found, test, _ = diagnosed
     assert [(e.port, e.law) for e in found.effects] == [("ground", "cubic_stiffness")]
