@@ -70,8 +70,17 @@ class Interrupt:
         """Mark that Ctrl-C was pressed, and that the work has ended because of it."""
         self.pressed = self.handled = True
 
-    def raise_pending(self) -> None:
-        """Raise KeyboardInterrupt if Ctrl-C was pressed and the work still goes on."""
+    @contextlib.contextmanager
+    def marked(self) -> Iterator[None]:
+        """Mark an interrupt as soon as it leaves the context, so that fits in other threads end (`raise_pending`)."""
+        try:
+            yield
+        except BaseException as error:
+            self.pressed = self.pressed or is_interrupt(error)
+            raise
+
+    def raise_pending(self, *_: object) -> None:
+        """Raise KeyboardInterrupt if Ctrl-C was pressed and the work still goes on; also as a fit's progress."""
         if self.pressed and not self.handled:
             raise KeyboardInterrupt
 

@@ -35,6 +35,7 @@ from dataclasses import dataclass
 from typing import Any, ParamSpec, TypeVar
 
 from .errors import InputError
+from .interrupts import Interrupt
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -83,9 +84,14 @@ def processors() -> int:
     return len(allowed(0)) if allowed else os.cpu_count() or 1
 
 
-def side_by_side(function: Callable[[T], R], items: Iterable[T], workers: int) -> list[R]:
-    """Apply a function to each item in threads; return the results in order. A failure cancels waiting items."""
-    with ThreadPoolExecutor(workers) as pool:
+def side_by_side(
+    function: Callable[[T], R], items: Iterable[T], workers: int, interrupt: Interrupt | None = None
+) -> list[R]:
+    """Apply a function to each item in threads; return the results in order. A failure cancels waiting items.
+
+    An interrupt is marked before the threads that still run are waited for.
+    """
+    with ThreadPoolExecutor(workers) as pool, (interrupt or Interrupt()).marked():
         return list(pool.map(function, items))
 
 

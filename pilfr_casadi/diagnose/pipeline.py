@@ -394,13 +394,14 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
         elsewhere = elsewhere or find_undeclared_port(search)[0]
         gates = (*gates, *elsewhere, *find_untried_laws(search), *find_varying_values(search))
     refitted = search.root.fitted
-    if interrupted and verdict.kind != "recording-fault":
-        sentence = (
-            "The search was interrupted before it came to an answer; refitted, the simulator is off by "
-            f"{search.bench.nrmse(refitted):.3g} of the outputs' deviation."
-        )
-        verdict = Verdict(verdict.kind, sentence)
-    elif verdict.kind == "unexplained" and not search.interrupted:
+    if search.interrupted and verdict.kind != "recording-fault":
+        search.bench = replace(search.bench, deadline=-np.inf)  # so that nothing more is fitted
+        correction, fitted = find_correction(search, answer)
+        off = f"Refitted, the simulator is off by {search.bench.nrmse(refitted):.3g} of the outputs' deviation."
+        said = correction.sentence if correction.elements else off
+        sentence = f"The search was interrupted before it came to an answer. {said}"
+        return Conclusion(Verdict(verdict.kind, sentence), gates, fitted, correction)
+    if verdict.kind == "unexplained":
         correction, fitted = find_correction(search, answer)
         verdict = judge(search, answer, gates, correction.closest)
         where = [f"{g.value} in the equation of {g.channel} explains it" for g in elsewhere]

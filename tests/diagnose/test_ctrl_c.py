@@ -9,7 +9,7 @@ from diagnosis_example import recorded, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import progress_bar
-from pilfr_casadi.laws import CoulombFriction, Law
+from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Law
 
 
 def friction() -> pilfr.Recording:
@@ -37,4 +37,21 @@ def test_ctrl_c_once_gives_an_answer(stage: str) -> None:
     assert pressed and found.interrupted
     assert "interrupted" in str(found)
     named = [e.law for e in found.effects]
-    assert named == (["coulomb_friction"] if stage in ("conclusion", "proof") else [])
+    assert named == (["coulomb_friction"] if stage in ("fits", "conclusion", "proof") else [])
+
+
+def test_what_follows_far_better_corrects_although_it_has_no_name() -> None:
+    laws: tuple[type[Law], ...] = (CubicStiffness,)
+    both = rig().with_element("ground", CoulombFriction().at({"F_c": 2.0, "v_0": 0.01}))
+    both = both.with_element("ground", CubicStiffness().at({"k_3": 2e4}))
+    pressed = list[str]()
+
+    def press(name: str, *_: object) -> None:
+        if name == "fits" and not pressed:
+            pressed.append(name)
+            signal.raise_signal(signal.SIGINT)
+
+    found = pilfr.diagnose(rig(430.0, 5.0), recorded(both, 0), laws=laws, hold="zero", workers=1, progress=press)
+    assert found.interrupted and not found.effects
+    assert "The corrected simulator has cubic stiffness at ground" in found.sentence
+    assert found.errors["train"]["after"] < 0.5 * found.errors["train"]["before"]

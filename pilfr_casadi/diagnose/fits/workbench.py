@@ -381,7 +381,7 @@ class Workbench:
             try:
                 timed = replace(solver, time_limit=until - time.perf_counter())
                 with np.errstate(all="ignore"):
-                    solution = solve_within_bounds(problem, theta, timed)
+                    solution = solve_within_bounds(problem, theta, timed, progress=self.interrupt.raise_pending)
             except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
                 break
             theta, status = solution.theta, solution.status

@@ -301,6 +301,8 @@ class Search(Hypotheses):
         if not parent.laws:
             self.tried, self.selected = self.tried + tried, self.selected + len(pairs)
         self.times["fits"] = self.times.get("fits", 0.0) + time.perf_counter() - began
+        for trial in trials[:FEW] if self.interrupted else ():
+            self.keep(trial)
         self.bench.interrupt.raise_pending()
         return trials
 
@@ -312,13 +314,13 @@ class Search(Hypotheses):
         ranked = sorted(kept, key=self.optimistic_evidence, reverse=True)
         most = min(NEAR_RATIO * ranked[0].error if ranked else np.inf, FAR_RATIO * self.best.error)
         near = [t for t in ranked[:MOST_CONVERGED] if not t.thorough and t.error < most]
-        converged = side_by_side(self.fits.converge, near, self.workers)
+        converged = side_by_side(self.fits.converge, near, self.workers, self.bench.interrupt)
         for trial in converged:
             self.keep(trial)
         # finer steps are slow, and bring no hypothesis that is far behind to the front
         least = min([t.error for t in (*converged, self.best)])
         near = [t for t in converged if t.error < NEAR_RATIO * least]
-        for trial in side_by_side(self.fits.sharpen, near, self.workers):
+        for trial in side_by_side(self.fits.sharpen, near, self.workers, self.bench.interrupt):
             self.keep(trial)
 
     def _finer(self, parent: Trial) -> None:

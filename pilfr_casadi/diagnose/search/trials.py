@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._base import InputError
+from ..._base import InputError, is_interrupt
 from ...data import Recording
 from ...laws import Law
 from ...simulators import Placed, Simulator
@@ -207,7 +207,8 @@ class Trials:
 
         Also returns how many pairs were tried before the time was over, with those whose every fit diverges.
         If one of the first pairs has an error below `enough`, pairs far behind it are not refined. With `again`, which
-        looks for a law in place of a known one, fewer pairs are refined.
+        looks for a law in place of a known one, fewer pairs are refined. An interrupt ends the fits; it is marked, and
+        what was found is returned.
         """
         most = FEW if again else MOST_REFINED
         done, total = 0, len(pairs) + min(len(pairs), most)
@@ -220,17 +221,16 @@ class Trials:
             done += 1
             report(done, total, least(found))
 
+        prepared, found = list[_BriefFit](), list[Trial | None]()
         pool = ThreadPoolExecutor(self.workers)
         try:
             tasks = [pool.submit(self._fit_briefly, parent, entries, gain) for entries in pairs]
-            prepared: list[_BriefFit] = []
             for task in tasks:
                 if self.over and prepared:
                     break
                 prepared.append(task.result())
                 step([p.trial for p in prepared])
             prepared.sort(key=lambda p: p.trial.error if p.trial else np.inf)
-            found: list[Trial | None] = []
             for group in (prepared[:FEW], prepared[FEW:most]):
                 best = least(found)
                 near = [p for p in group if best > enough or (p.trial and p.trial.error < FAR_RATIO * best)]
@@ -241,6 +241,11 @@ class Trials:
                     step(found)
             found += [p.trial for p in prepared[most:]]
             report(done if self.over else total, total, least(found))
+        except (KeyboardInterrupt, SystemError, RuntimeError) as error:
+            if not is_interrupt(error):
+                raise
+            self.bench.interrupt.pressed = True  # so that running fits end; what was found stays
+            found += [p.trial for p in prepared]
         finally:
             pool.shutdown(cancel_futures=True)
         return sorted((t for t in found if t is not None), key=lambda t: t.error), len(prepared)

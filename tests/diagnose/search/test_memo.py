@@ -75,4 +75,4 @@ def test_an_interrupt_of_a_fit_keeps_what_there_is(monkeypatch):
     monkeypatch.setattr(Trials, "make_trial", struck)
     found = searched(recordings(CUBIC, count=1), 2)
     assert found.interrupted and found.root.key in found.memo
-    assert found.best is found.root
+    assert {len(key) for key in found.memo} == {0, 1}  # the laws that were fitted are kept, and no second one was tried
