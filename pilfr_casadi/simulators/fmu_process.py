@@ -15,10 +15,7 @@ import functools
 import math
 import os
 import pickle
-import struct
-import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -27,7 +24,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import abandoned
+from .._base import ChildProcess, abandoned, open_replies, read_message, write_message
 from .fmu_description import tidy
 from .fmu_instance import FmuEvaluation, FmuFile, FmuSignals, UnitError, evaluation
 
@@ -36,47 +33,24 @@ CALL_SECONDS = 5.0  # seconds that another job may take
 PACE = 20.0  # further seconds, over those of the slowest job of its kind and length
 MOST_IDLE = 4  # processes that wait for their next job
 MOST_LOSSES = 3  # processes that a point's parameters may end before they count as failed
-WATCH_SECONDS = 0.1  # interval at which limits are checked
-HEAD = struct.Struct("<cQ")  # kind and length of a message
-POINT, CALL = b"p", b"c"
+POINT, CALL = b"p", b"c"  # kinds of jobs, the first byte of a message
 
 
-class _UnitProcess:
+class _UnitProcess(ChildProcess):
     """A process that holds one instance of one unit."""
 
     def __init__(self, file: FmuFile) -> None:
-        self.file, self.owner = file, os.getpid()
+        super().__init__(serve)
+        self.file, self.owner, self.jobs = file, os.getpid(), 0
         self.signals: FmuSignals | None = None  # evaluated by POINT
-        self.deadline, self.expired, self.jobs = np.inf, False, 0
-        self.errors = tempfile.TemporaryFile()  # noqa: SIM115
-        path = os.pathsep.join(p or os.getcwd() for p in sys.path)
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", f"from {__name__} import serve; serve()"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self.errors,
-            env={**os.environ, "PYTHONPATH": path},
-            start_new_session=True,  # Ctrl-C is for the process that waits for the results
-        )
-        self.inbox: Any = self.process.stdin
-        self.outbox: Any = self.process.stdout
-        threading.Thread(target=self._watch, daemon=True).start()
-
-    def _watch(self) -> None:
-        while self.process.poll() is None:
-            if time.monotonic() > self.deadline:
-                self.expired = True
-                self.process.kill()
-            time.sleep(WATCH_SECONDS)
 
     def ask(self, kind: bytes, body: bytes, limit: float) -> bytes:
         """Send a job; return the reply."""
         begin = time.monotonic()
         self.deadline = begin + limit + (0.0 if self.jobs else _loading.get(self.file, LOADING_SECONDS))
-        self.inbox.write(HEAD.pack(kind, len(body)) + body)
-        self.inbox.flush()
-        _, reply = _receive(self.outbox)
-        self.deadline = np.inf
+        write_message(self.inbox, kind + body)
+        reply = read_message(self.outbox)
+        self.deadline = math.inf
         if not self.jobs:
             _loading.setdefault(self.file, CALL_SECONDS + time.monotonic() - begin)
         self.jobs += 1
@@ -84,21 +58,11 @@ class _UnitProcess:
 
     def describe_end(self) -> str:
         """Describe in words how the process ended."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(5)
-        code = self.process.poll()
+        code = self.exit_status()
         if self.expired:
             return "takes too long"
         how = f"signal {-code}" if code is not None and code < 0 else f"status {code}"
         return f"ends the process that runs it ({how})"
-
-    def close(self) -> None:
-        """Kill the process and close its pipes."""
-        self.process.kill()
-        self.process.wait()
-        for pipe in (self.inbox, self.outbox, self.errors):
-            with contextlib.suppress(OSError, ValueError):
-                pipe.close()
 
 
 _loading: dict[FmuFile, float] = {}  # further seconds for the first job of another process of a unit
@@ -253,14 +217,14 @@ def _has_time_event(signals: FmuSignals) -> bool:
 
 def serve() -> None:
     """Do jobs in the child process: read them from standard input, write results to standard output."""
-    replies, inbox = os.fdopen(os.dup(1), "wb"), sys.stdin.buffer
-    os.dup2(2, 1)  # a unit that prints must not write into the replies
+    replies = open_replies()
     threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
     while True:
         try:
-            kind, body = _receive(inbox)
+            job = read_message(sys.stdin.buffer)
         except EOFError:
             os._exit(0)
+        kind, body = job[:1], job[1:]
         try:
             if kind == POINT:
                 found = evaluation(_selected[0]).evaluate(np.frombuffer(body)).tobytes()
@@ -271,8 +235,7 @@ def serve() -> None:
             found = tidy(error).encode() if kind == POINT else pickle.dumps((None, tidy(error)))
         except Exception as error:
             found = pickle.dumps((None, error))
-        replies.write(HEAD.pack(kind, len(found)) + found)
-        replies.flush()
+        write_message(replies, found)
 
 
 _selected: list[FmuSignals] = []  # in the child process: the signals that POINT evaluates
@@ -287,17 +250,6 @@ def _end_with_parent(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(1.0)
     os._exit(0)
-
-
-def _receive(pipe: Any) -> tuple[bytes, bytes]:
-    head = pipe.read(HEAD.size)
-    if len(head) < HEAD.size:
-        raise EOFError
-    kind, size = HEAD.unpack(head)
-    body = pipe.read(size)
-    if len(body) < size:
-        raise EOFError
-    return kind, body
 
 
 @atexit.register
