@@ -243,6 +243,24 @@ def test_a_parameter_at_which_the_unit_crashes_or_hangs_is_a_failed_trial(tmp_pa
         assert np.all(np.isfinite(y))
 
 
+FINITE_SAMPLES = """
+import pickle, sys
+import numpy as np
+simulator, recordings = pickle.load(sys.stdin.buffer)
+print([int(np.sum(np.isfinite(simulator.simulate(r)[:, 0]))) for r in recordings])
+"""
+
+
+def test_a_unit_that_refuses_a_second_instance_does_not_end_the_process_of_its_user(tmp_path):
+    given = recording(6, samples=40)
+    pushed = given.with_(u=given.u + 1e5)
+    job = cloudpickle.dumps((guided(c_rig(tmp_path / "a.fmu", "SINGLE")), (given, pushed, given)))
+    done = subprocess.run([sys.executable, "-c", FINITE_SAMPLES], input=job, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr.decode()
+    whole, part, again = map(int, done.stdout.decode().strip("[]\n").split(","))
+    assert whole == again == len(given) and 0 < part < len(given)
+
+
 def test_a_unit_that_crashes_at_some_parameters_can_be_fitted(tmp_path):
     given, unit = recording(7, samples=200), guided(c_rig(tmp_path / "a.fmu", "FAILURE=abort()"))
     start = unit.with_parameters(unit.parameter_set.change(k1={"value": 590.0}))
