@@ -10,7 +10,7 @@ actuator or a sensor a law acts in series: it adds `w = law(u) - u` to the signa
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Self, cast
@@ -564,6 +564,20 @@ def check_parameters(given: Any) -> ParameterSet:
         if not isinstance(value, Parameter):
             raise InputError(f"The simulator's parameter {name!r} is {value!r}; give Parameter(value, ...).")
     return ParameterSet(dict(given))
+
+
+def choose_parameters(
+    given: Sequence[str] | Mapping[str, Parameter],
+    bounds: Mapping[str, tuple[float, float]],
+    make: Callable[[str, tuple[float, float] | None], Parameter],
+) -> dict[str, Parameter]:
+    """Return the parameters of an imported model: those given, and those with bounds, which are free.
+
+    `make` makes a parameter of which no more than the name and perhaps bounds were given.
+    """
+    own = check_parameters(given if isinstance(given, Mapping) else {})
+    made = {n: make(n, bounds.get(n)) for n in dict.fromkeys((*given, *bounds)) if n not in own}
+    return {**own.free_within({n: ends for n, ends in bounds.items() if n in own}), **made}
 
 
 def check_names(given: Any, kind: str) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ import numpy as np
 
 from .._base import InputError, check_known
 from ..models import Named, Parameter, parameter_within, within_a_factor
+from .equations import choose_parameters
 from .external import NOMINAL, ROUNDING, call_external, equal_state, external, leaves, units
 from .fmu_cosimulation import CoSimulation, SteppedEquations, SteppedUnit, check_force, unknown_signal
 from .fmu_description import Description, Variable, check_file
@@ -140,7 +141,7 @@ def from_fmu(
         Actuators and sensors are always ports.
     parameters : names, or mapping from names to Parameter, optional
         Parameters that a fit may change; by default all tunable ones. Fixed ones may be named too; each change of
-        their values restarts the unit. The others keep the unit's values.
+        their values restarts the unit. Those with `bounds` are free too; the others keep the unit's values.
     bounds : mapping, optional
         `(lower, upper)` by parameter; by default the unit's bounds, else a factor of ten either way.
     inputs, outputs : tuple of str, optional
@@ -186,10 +187,10 @@ def from_fmu(
     measured = tuple(outputs) if outputs is not None else all_outputs
     read = {port.get(key) for port in given.values() for key in ("across", "rate")}
     needed = tuple(n for n in all_outputs if n in measured or n in read)
-    made = own if isinstance(own, Mapping) else {n: _make_parameter(unit.variables[n], bounds.get(n)) for n in own}
+    made = choose_parameters(own, bounds, lambda n, ends: _make_parameter(unit.variables[n], ends))
     equations: _Equations | SteppedEquations
     if isinstance(unit, _Unit):
-        equations = _Equations(replace(unit, outputs=needed), drives, tuple(own), measured)
+        equations = _Equations(replace(unit, outputs=needed), drives, tuple(made), measured)
     else:
         symbols = tuple(n for n in unit.inputs if n in drives or n in used)
         equations = SteppedEquations(unit, symbols, made, needed, measured)

@@ -21,7 +21,8 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, check_known
-from ..models import Named, Parameter, ParameterSet, parameter_within, within_a_factor
+from ..models import Named, Parameter, parameter_within, within_a_factor
+from .equations import choose_parameters
 from .mujoco_model import AXES, MujocoTree
 from .ports import Port
 from .simulator import Simulator
@@ -74,14 +75,13 @@ def from_mujoco(
     """
     tree, bounds = MujocoTree.load(model), bounds or {}
     given = tree.default_parameters if parameters is None else parameters
-    own = tuple(dict.fromkeys((*given, *bounds)))
-    tree.check_parameters(own)
+    tree.check_parameters((*given, *bounds))
     check_known(inputs or (), tree.actuators, "actuators", tree.label)
     check_known(outputs or (), tuple(tree.sensors), "joints, and sensors of joints and actuators", tree.label)
-    ends = {n: bounds.get(n) or _default_bounds(n, tree.numbers[n]) for n in own}
-    made = {n: parameter_within(n, tree.numbers[n], ends[n]) for n in own}
-    if isinstance(given, Mapping):
-        made |= ParameterSet(given).free_within({n: ends[n] for n in bounds if n in given})
+    numbers = tree.numbers
+    made = choose_parameters(
+        given, bounds, lambda n, ends: parameter_within(n, numbers[n], ends or _default_bounds(n, numbers[n]))
+    )
     drives = tuple(tree.actuators if inputs is None else inputs)
     measured = tuple(tree.default_outputs if outputs is None else outputs)
     equations = _Equations(tree, tuple(made), drives, measured)

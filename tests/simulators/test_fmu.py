@@ -121,6 +121,11 @@ def test_a_port_enters_an_input_and_reads_outputs(unit):
 def test_parameters_and_bounds_can_be_chosen(unit):
     chosen = guided(unit, parameters=("k1",), bounds={"k1": (300, 500)})
     assert list(chosen.parameters) == ["k1"] and tuple(map(float, chosen.parameters["k1"].bounds)) == (300, 500)
+    both = guided(unit, parameters=("k1",), bounds={"d1": (1, 3)}).parameters
+    assert list(both) == ["k1", "d1"] and both["d1"].bounds == (1, 3)
+    own = {"d1": Parameter(2.0, fixed=True), "k1": Parameter(380.0, fixed=True)}
+    both = guided(unit, parameters=own, bounds={"d1": (1, 3), "k2": (900, 1100)}).parameters
+    assert list(both) == ["d1", "k1", "k2"] and [bool(p.fixed) for p in both.values()] == [False, True, False]
     own = guided(unit, parameters={"d2": Parameter(2.0, fixed=True)})
     assert list(own.parameters) == ["d2"] and float(own.parameters["d2"].value) == 2.0
     given = recording(2, samples=100)
