@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
+    from .columns import TIME_NAMES as TIME_NAMES, is_time as is_time
     from .common_clock import merge as merge
     from .excitation import (
         excited_bins as excited_bins,
@@ -35,9 +36,7 @@ if TYPE_CHECKING:
         same_input as same_input,
     )
     from .readers import (
-        TIME_NAMES as TIME_NAMES,
         column_names as column_names,
-        is_time as is_time,
         read as read,
         read_csv as read_csv,
         read_frame as read_frame,

@@ -15,28 +15,21 @@ from typing import Any, overload
 import numpy as np
 
 from .._base import InputError, listed, positive
+from .columns import TIME_NAMES, find_column, find_time_column, refuse_other_unit
+from .csv_table import CsvTable
 from .preprocessing import LONGEST_GAP, check_times, common_times, hold_at, interpolate_at, levels_last
 from .recording import Recording, as_tuple
-from .tables import (
-    TIME_NAMES,
-    ArrayTable,
-    CsvTable,
-    find_column,
-    frame_table,
-    is_time,
-    open_table,
-)
+from .tables import ArrayTable, frame_table, open_table
 
 PathLike = str | Path
+Paths = PathLike | Iterable[PathLike]
 Names = Sequence[str] | str
+Recordings = Recording | tuple[Recording, ...]  # a tuple if several paths were given
 
 TOLERANCE = 1e-4  # allowed deviation of a sample from the grid, in steps; recorders' clocks drift less in a record
 AGREEMENT = 1e-3  # allowed relative difference of a stated step from the times; a wrong unit differs by far more
 TIME_WORDS = ("time", "zeit", "temps", "tiempo", "tempo", "clock", "seconds")  # parts of the names of time columns
 MOST_TRIED = 5  # columns that are read to find an unnamed time, at most
-_UNITS = r"ns|us|µs|μs|ms|min|h|d|nanoseconds?|microseconds?|milliseconds?|minutes?|hours?|days?"
-_OTHER_UNIT = re.compile(rf"(?:t|time)[\s_\-\[(]+({_UNITS})[\])]?", re.IGNORECASE)
-_IN_OTHER_UNIT = re.compile(rf".*[\[(]\s*({_UNITS})\s*[\])]", re.IGNORECASE)  # of a column that is chosen as the time
 
 
 @overload
@@ -44,7 +37,7 @@ def read_csv(path: PathLike, inputs: Names, outputs: Names, **options: Any) -> R
 @overload
 def read_csv(path: Iterable[PathLike], inputs: Names, outputs: Names, **options: Any) -> tuple[Recording, ...]: ...
 def read_csv(
-    path: PathLike | Iterable[PathLike],
+    path: Paths,
     inputs: Names,
     outputs: Names,
     *,
@@ -53,7 +46,7 @@ def read_csv(
     time_tolerance: float | None = None,
     resample: float | None = None,
     **recording_options: Any,
-) -> Recording | tuple[Recording, ...]:
+) -> Recordings:
     """Read recordings from CSV files with a header row.
 
     Lines of a title may stand above the header, and a row of units below it. Times may be dates such as
@@ -101,9 +94,7 @@ def read_csv(
 def read_mat(path: PathLike, inputs: Names, outputs: Names, **options: Any) -> Recording: ...
 @overload
 def read_mat(path: Iterable[PathLike], inputs: Names, outputs: Names, **options: Any) -> tuple[Recording, ...]: ...
-def read_mat(
-    path: PathLike | Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
-) -> Recording | tuple[Recording, ...]:
+def read_mat(path: Paths, inputs: Names, outputs: Names, **options: Any) -> Recordings:
     """Read recordings from MATLAB files (up to version 7.2): one vector for time and for each input and output.
 
     Parameters, returned values and errors are the same as for :func:`read_csv`. A matrix with one row per sample holds
@@ -116,9 +107,7 @@ def read_mat(
 def read_npz(path: PathLike, inputs: Names, outputs: Names, **options: Any) -> Recording: ...
 @overload
 def read_npz(path: Iterable[PathLike], inputs: Names, outputs: Names, **options: Any) -> tuple[Recording, ...]: ...
-def read_npz(
-    path: PathLike | Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
-) -> Recording | tuple[Recording, ...]:
+def read_npz(path: Paths, inputs: Names, outputs: Names, **options: Any) -> Recordings:
     """Read recordings from NumPy archives (``numpy.savez``); otherwise as :func:`read_mat`."""
     return _read_each(path, _Request(inputs, outputs, **options), ".npz")
 
@@ -127,9 +116,7 @@ def read_npz(
 def read(path: PathLike, inputs: Names, outputs: Names, **options: Any) -> Recording: ...
 @overload
 def read(path: Iterable[PathLike], inputs: Names, outputs: Names, **options: Any) -> tuple[Recording, ...]: ...
-def read(
-    path: PathLike | Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
-) -> Recording | tuple[Recording, ...]:
+def read(path: Paths, inputs: Names, outputs: Names, **options: Any) -> Recordings:
     """Read recordings with the reader for the file's suffix.
 
     The suffixes are .csv, .tsv, .txt or .dat, .mat, .npz, .parquet, .mf4 and .mdf. Parquet files need
@@ -160,7 +147,7 @@ def read_frame(
         If `frame` is not a data frame, or a column or a value cannot be used.
     """
     request = _Request(inputs, outputs, columns=columns, **{"name": "", **options})
-    return request.recording(frame_table(frame, TIME_NAMES, request.wanted))
+    return request.recording(frame_table(frame, request.wanted))
 
 
 def column_names(path: PathLike, wanted: Sequence[str] = ()) -> tuple[str, ...]:
@@ -183,7 +170,7 @@ def written_times(
     columns = columns or {}
     chosen = next((columns[name] for name in TIME_NAMES if name in columns), None)
     table = open_table(Path(path), [*wanted, chosen] if chosen else wanted)
-    time = _find_time_column(table.names, chosen, str(path))
+    time = find_time_column(table.names, chosen, str(path))
     return table.texts(time) if time else None
 
 
@@ -251,7 +238,7 @@ class _Request:
         """Return the time column, or None, and the columns of the inputs and outputs."""
         names, source = table.names, str(table.path)
         mapped = [column for name, column in self.columns.items() if name in TIME_NAMES]
-        time = _find_time_column(names, mapped[0] if mapped else None, source)
+        time = find_time_column(names, mapped[0] if mapped else None, source)
         wanted = [find_column(column, names) for column in self.wanted]
         both = sorted({*map(self.column, self.inputs)} & {*map(self.column, self.outputs)})
         if both:
@@ -276,7 +263,7 @@ class _Request:
             if list(names).count(name) > 1:
                 raise InputError(f"{source} has {list(names).count(name)} columns named {name!r}; rename all but one.")
         if time is None and self.dt is None:
-            _refuse_other_unit(names, source)
+            refuse_other_unit(names, source)
             raise InputError(
                 f"{source} has no time column; it has {listed(names)}: name one {' or '.join(TIME_NAMES)}, in seconds, "
                 f"map one, as in columns={{'t': {_guess_time(table, wanted)!r}}}, or state the step with dt=STEP."
@@ -349,9 +336,7 @@ def _check_names(given: Any, role: str) -> tuple[str, ...]:
     return names
 
 
-def _read_each(
-    path: PathLike | Iterable[PathLike], request: _Request, suffix: str = ""
-) -> Recording | tuple[Recording, ...]:
+def _read_each(path: Paths, request: _Request, suffix: str = "") -> Recordings:
     """Read one file, or several into a tuple; a `suffix` overrides that of the files."""
     if isinstance(path, PathLike):
         return request.recording(open_table(Path(path), request.sought, suffix))
@@ -367,23 +352,6 @@ def _channel_names(names: Sequence[str], parts: Sequence[np.ndarray]) -> tuple[s
     return tuple(f"{n}{i + 1}" if p.shape[1] > 1 else n for n, p in pairs for i in range(p.shape[1]))
 
 
-def _find_time_column(names: Sequence[str], chosen: str | None, source: str) -> str | None:
-    """Return the time column among the names: the chosen one, or one that `is_time`; None if there is none."""
-    found = [chosen] if chosen is not None else [*dict.fromkeys(name for name in names if is_time(name))]
-    if not found:
-        return None
-    if len(found) > 1:
-        raise InputError(
-            f"{source} has several time columns ({', '.join(found)}); choose one, as in columns={{'t': '{found[0]}'}}."
-        )
-    found[0] = find_column(found[0], names)
-    if found[0] not in names:
-        raise InputError(f"{source} has no column {found[0]!r} for the time; its columns are {listed(names)}.")
-    _refuse_other_unit(found, source)
-    _refuse_other_unit(found, source, _IN_OTHER_UNIT)
-    return found[0]
-
-
 def _guess_time(table: CsvTable | ArrayTable, wanted: Sequence[str]) -> str:
     """Return the column that most likely holds the time: by its name, else the first one that rises evenly."""
     others = [name for name in table.names if name not in wanted]
@@ -397,17 +365,6 @@ def _guess_time(table: CsvTable | ArrayTable, wanted: Sequence[str]) -> str:
             continue
         return name
     return "COLUMN"
-
-
-def _refuse_other_unit(names: Sequence[str], source: str, pattern: re.Pattern[str] = _OTHER_UNIT) -> None:
-    """Refuse a name such as ``t_ms`` or ``Time [min]``, which states a unit other than seconds."""
-    for name in names:
-        unit = pattern.fullmatch(name.strip())
-        if unit:
-            raise InputError(
-                f"{source}: column {name!r} is named as time in {unit.group(1)}, but time must be in seconds; "
-                "convert it and name it t_s, or leave it out and state the step in seconds with dt=STEP."
-            )
 
 
 def step_of(
