@@ -29,7 +29,7 @@ from ..models import Named, Parameter, parameter_within, within_a_factor
 from .equations import choose_parameters
 from .external import NOMINAL, ROUNDING, call_external, equal_state, external, leaves, units
 from .fmu_cosimulation import CoSimulation, SteppedEquations, SteppedUnit, check_force, unknown_signal
-from .fmu_description import Description, Variable, check_file
+from .fmu_description import Description, Unit, Variable, check_file
 from .fmu_instance import FmuFile, FmuSignals, unpack
 from .fmu_process import FmuFunction, has_time_event
 from .ports import Port
@@ -41,31 +41,19 @@ TIMES = (0.0, 0.7, 13.0, 400.0)  # s, at which a dependence on time is looked fo
 
 
 @dataclass(frozen=True, eq=False)
-class _Unit:
+class _Unit(Unit):
     """A unit with some of its outputs: `(t, x, u, p) -> (derivatives, outputs)`.
 
     `parameters` are the tunable ones, and fixed ones that the user names.
     """
 
-    path: Path
-    described: Description
     parameters: tuple[str, ...]
     outputs: tuple[str, ...]
-
-    @property
-    def variables(self) -> Mapping[str, Variable]:
-        """Variables by name."""
-        return self.described.variables
 
     @property
     def states(self) -> tuple[str, ...]:
         """Names of the states."""
         return self.described.states
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs."""
-        return self.described.of("input")
 
     @cached_property
     def leaf(self) -> FmuFunction:
@@ -82,7 +70,7 @@ class _Unit:
             described = self.described
             file = FmuFile(folder, int(described.version), described.token, described.binary, parameters, restarts)
             units[name] = FmuSignals(file, len(self.states), inputs, outputs)
-            leaves[name] = FmuFunction(name, units[name])
+            FmuFunction(name, units[name])
         found = leaves[name]
         assert isinstance(found, FmuFunction)
         return found
@@ -95,21 +83,16 @@ class _Unit:
         """Start values of variables, zero if the file gives none."""
         return np.nan_to_num(np.array([self.variables[n].start for n in names]))
 
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Numbers of t, x, u and p."""
-        return 1, len(self.states), len(self.inputs), len(self.parameters)
-
     @cached_property
     def function(self) -> ca.Function:
         """`z -> (derivatives, outputs)` in one vector, for expressions; z holds t, x, u and p."""
 
         def evaluate(z: Any) -> Any:
-            return call_external(self.leaf, *(z[a:b] for a, b in pairwise(np.cumsum([0, *self.sizes]).tolist())))
+            return call_external(self.leaf, *(z[a:b] for a, b in pairwise(np.cumsum([0, *self.leaf.sizes]).tolist())))
 
         nominal = [1.0, *(self.variables[n].nominal for n in (*self.states, *self.inputs, *self.parameters))]
         sizes = NOMINAL * np.nan_to_num(np.array(nominal), nan=1.0)
-        return external(evaluate, sizes, len(self.states) + len(self.outputs))
+        return external(evaluate, sizes, self.leaf.size)
 
     def values(self, t: float, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
         """Evaluate derivatives and outputs by numbers."""

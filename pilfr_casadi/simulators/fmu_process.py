@@ -21,10 +21,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from .._base import ChildProcess, abandoned, open_replies, read_message, write_message
+from .external import Leaf
 from .fmu_description import tidy
 from .fmu_instance import FmuEvaluation, FmuFile, FmuSignals, UnitError, evaluation
 
@@ -131,7 +131,7 @@ def run_in_unit(
 _pace: dict[Any, float] = {}  # most seconds by length, by unit and function
 
 
-class FmuFunction(ca.Callback):
+class FmuFunction(Leaf):
     """A unit as a `casadi.Function` `(t, x, u, p) -> (derivatives, outputs)`; if it fails, its results are NaN.
 
     Attributes
@@ -141,27 +141,10 @@ class FmuFunction(ca.Callback):
     """
 
     def __init__(self, name: str, signals: FmuSignals) -> None:
-        ca.Callback.__init__(self)
         self.signals, self.failure = signals, ""
         self._losses: dict[bytes, int] = {}  # lost processes by parameter values
         self._answered: set[bytes] = set()  # parameter values at which a process has answered
-        self.construct(name, {})
-
-    def get_n_in(self) -> int:
-        """Return the number of arguments, for CasADi; there is one result."""
-        return 4
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Return the shape of an argument."""
-        return ca.Sparsity.dense(self.signals.sizes[i], 1)
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Return the shape of the result."""
-        return ca.Sparsity.dense(self.signals.results, 1)
-
-    def has_eval_buffer(self) -> bool:
-        """Ask CasADi for its memory instead of matrices, which take ten times as long."""
-        return True
+        super().__init__(name, signals.sizes, signals.results)
 
     def eval_buffer(self, arguments: list[memoryview], results: list[memoryview]) -> int:
         """Evaluate one point, for CasADi."""
