@@ -2,12 +2,12 @@
 
 `ports` are the places where laws may stand. `equations` evaluates the equations and their ports, and `integration`
 closes them with laws and discretises them to a `Model`. `simulator` holds the class `Simulator`. `domains` infers a
-port's physical domain. `adapters` convert a Python file (`user_file`), a state space or a fitted model to a simulator.
-`fmu` wraps a functional mock-up unit as a simulator (`fmu_description`, `fmu_instance`, `fmu_process`, for
-co-simulation `fmu_cosimulation`), and `mujoco` writes the equations of a MuJoCo model (`mujoco_model`).
-`numpy_function` makes a simulator from a NumPy function, whose arguments `signature` reads: `tracing` calls the
-function with `symbols` to obtain its equations. A function that cannot be traced is called with numbers (`black_box`).
-`external` lets equations call such a program.
+port's physical domain, and `user_arguments` checks what a user gives. `adapters` convert a Python file (`user_file`), a
+state space or a fitted model to a simulator. `fmu` wraps a functional mock-up unit as a simulator (`fmu_description`,
+`fmu_instance`, `fmu_process`, for co-simulation `fmu_cosimulation`), and `mujoco` writes the equations of a MuJoCo
+model (`mujoco_model`). `numpy_function` makes a simulator from a NumPy function, whose arguments `signature` reads:
+`tracing` calls the function with `symbols` to obtain its equations. A function that cannot be traced is called with
+numbers (`black_box`). `external` lets equations call such a program.
 """
 
 from typing import TYPE_CHECKING

@@ -26,7 +26,6 @@ import numpy as np
 
 from .._base import InputError, check_known
 from ..models import Named, Parameter, parameter_within, within_a_factor
-from .equations import choose_parameters
 from .external import NOMINAL, ROUNDING, call_external, equal_state, external, leaves, units
 from .fmu_cosimulation import CoSimulation, SteppedEquations, SteppedUnit, check_force, unknown_signal
 from .fmu_description import Description, Unit, Variable, check_file
@@ -34,6 +33,7 @@ from .fmu_instance import FmuFile, FmuSignals, unpack
 from .fmu_process import FmuFunction, has_time_event
 from .ports import Port
 from .simulator import Simulator
+from .user_arguments import choose_parameters
 
 COMPARED_POINTS = 8  # trial points at which derivatives and outputs are compared with states and with forces in ports
 PORT_KEYS = ("into", "across", "rate", "unit", "across_unit")

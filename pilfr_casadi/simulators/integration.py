@@ -28,8 +28,9 @@ import numpy as np
 from .._base import InputError, one_at_a_time
 from ..data import SAME_STEP, Recording
 from ..models import Model, accumulate_steps, inject_outputs, map_points, model_functions
-from .equations import Equations, Named, call, stack
+from .equations import Equations, Named, stack
 from .ports import ACTUATOR, PARAMETER, SENSOR, Expression, Placed, Port, split_port
+from .user_arguments import call
 
 LARGEST_STEP = 0.25  # largest |λ| h: a phase error of (λh)⁴/120 = 3e-5 of the angle of a cycle
 MOST_SUBSTEPS = 200  # per sample

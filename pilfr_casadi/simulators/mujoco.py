@@ -22,10 +22,10 @@ import numpy as np
 
 from .._base import InputError, check_known
 from ..models import Named, Parameter, parameter_within, within_a_factor
-from .equations import choose_parameters
 from .mujoco_model import AXES, MujocoTree
 from .ports import Port
 from .simulator import Simulator
+from .user_arguments import choose_parameters
 
 COMPARED_POINTS = 8  # at which the equations are compared with MuJoCo
 AGREE = 1e-8  # relative difference of accelerations that rounding may cause
