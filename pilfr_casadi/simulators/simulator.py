@@ -18,8 +18,8 @@ from ..data import Recording, conversion
 from ..laws import readable_unit
 from ..models import Parameter, ParameterSet, accumulate_steps
 from .equations import Equations
-from .integration import discretise_for
 from .ports import Placed
+from .substeps import discretise_for
 
 
 @dataclass(frozen=True, eq=False, repr=False)
