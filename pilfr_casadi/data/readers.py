@@ -230,7 +230,7 @@ class _Request:
         return [self.column(name) for name in (*self.inputs, *self.outputs)]
 
     @property
-    def sought(self) -> list[str]:
+    def wanted_and_time(self) -> list[str]:
         """These columns, and that of the time if it has another name."""
         return [*self.wanted, *(column for name, column in self.columns.items() if name in TIME_NAMES)]
 
@@ -339,11 +339,11 @@ def _check_names(given: Any, role: str) -> tuple[str, ...]:
 def _read_each(path: Paths, request: _Request, suffix: str = "") -> Recordings:
     """Read one file, or several into a tuple; a `suffix` overrides that of the files."""
     if isinstance(path, PathLike):
-        return request.recording(open_table(Path(path), request.sought, suffix))
+        return request.recording(open_table(Path(path), request.wanted_and_time, suffix))
     paths = tuple(path) if isinstance(path, Iterable) else (path,)
     if not all(isinstance(p, PathLike) for p in paths):
         raise InputError(f"the file {path!r} was given; give its path as text, or a list of paths.")
-    return tuple(request.recording(open_table(Path(p), request.sought, suffix)) for p in paths)
+    return tuple(request.recording(open_table(Path(p), request.wanted_and_time, suffix)) for p in paths)
 
 
 def _channel_names(names: Sequence[str], parts: Sequence[np.ndarray]) -> tuple[str, ...]:

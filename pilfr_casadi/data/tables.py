@@ -168,10 +168,10 @@ def open_table(path: Path, wanted: Sequence[str] = (), suffix: str = "") -> CsvT
 
 
 def _open_csv(path: Path, wanted: Sequence[str]) -> CsvTable:
-    return parse_csv(path, _text(path), wanted)
+    return parse_csv(path, _read_text(path), wanted)
 
 
-def _open_mat(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:
+def _open_mat(path: Path, _wanted: Sequence[str]) -> ArrayTable:
     """Read the variables of a MATLAB file (up to version 7.2)."""
     from scipy.io import loadmat
 
@@ -198,7 +198,7 @@ def _open_npz(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:
     return ArrayTable(path, tuple(arrays), arrays)
 
 
-def _open_parquet(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:
+def _open_parquet(path: Path, _wanted: Sequence[str]) -> ArrayTable:
     """Read the names of a Parquet file's columns; a column is read when it is needed."""
     with _report_parser_errors(path, "a Parquet file", "write it again"):
         try:
@@ -217,7 +217,7 @@ def _parquet_column(path: Path, index: int) -> Array:
         return _seconds(np.asarray(file.read([name]).column(0).to_numpy()))
 
 
-def _open_mdf(path: Path, wanted: Sequence[str] = ()) -> ArrayTable:
+def _open_mdf(path: Path, wanted: Sequence[str]) -> ArrayTable:
     """Read the `wanted` channels of an MDF file, in physical units, and the times of the first as ``t``."""
     with _report_parser_errors(path, "an MDF file", "save it again as MDF 4"):
         try:
@@ -323,7 +323,7 @@ def _reason(error: Exception) -> str:
     return "it holds Python objects, which are not read because they can run code" if "pickle" in text else text
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     raw = read_bytes(path)
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise InputError(f"{path} is UTF-16 text; save it as UTF-8.")

@@ -320,10 +320,10 @@ class Equations:
 
         Without declared ports there is one for each state's equation that is no definition of a speed.
         """
-        return self._every_port
+        return self._all_ports
 
     @cached_property
-    def _every_port(self) -> tuple[Port, ...]:
+    def _all_ports(self) -> tuple[Port, ...]:
         equations = () if self.discrete else (name for name in self.states if name not in self.kinematic)
         inner = self.ports or tuple(map(self._equation_port, equations))
         domain = common_domain(port.domain for port in inner)  # also of actuators: a voltage is a signal in all domains

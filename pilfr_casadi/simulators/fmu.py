@@ -178,7 +178,7 @@ def from_fmu(
         symbols = tuple(n for n in unit.inputs if n in drives or n in used)
         equations = SteppedEquations(unit, symbols, made, needed, measured)
     return Simulator(
-        equations.dynamics,
+        equations,
         equations.measured,
         equations.states,
         drives,
@@ -267,7 +267,7 @@ class _Equations:
 
     @property
     def note(self) -> str:
-        """Events of the unit, in words."""
+        """Events of the unit, in words; a `Simulator` prints it."""
         count = self.unit.described.event_indicators
         kinds = [f"{count} event indicator{'s' * (count > 1)}"] * bool(count) + ["events in time"] * self.timed_events
         if not kinds:
@@ -277,13 +277,8 @@ class _Equations:
             "and dry friction inside the unit are only as exact as the sampling"
         )
 
-    @property
-    def dynamics(self) -> _Equations:
-        """The dynamics of a `Simulator`, which prints its `note`."""
-        return self
-
     def __call__(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
-        """Evaluate the derivatives by state."""
+        """Evaluate the derivatives by state: the dynamics of a `Simulator`."""
         rows = self._rows([_rate(n) for n in self.states], x, u, p, t if self.timed else 0.0)
         return dict(zip(self.states, rows, strict=True))
 

@@ -228,7 +228,7 @@ class SteppedEquations:
 
     @property
     def note(self) -> str:
-        """Origin of the equations, in words."""
+        """Origin of the equations, in words; a `Simulator` prints it."""
         if self.discrete:
             why = (
                 "no equations were found"
@@ -349,13 +349,8 @@ class SteppedEquations:
         found = dict(zip(self.rows, ca.vertsplit(rows), strict=True))
         return {n: found[n] for n in names}
 
-    @property
-    def dynamics(self) -> SteppedEquations:
-        """The dynamics of a `Simulator`, which prints its `note`."""
-        return self
-
     def __call__(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
-        """Evaluate the derivatives, or the next states, by name."""
+        """Evaluate the derivatives, or the next states, by name: the dynamics of a `Simulator`."""
         found = self._evaluate(x, u._values, p)
         return {n: found[n] for n in self.states}
 

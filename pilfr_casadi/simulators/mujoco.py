@@ -234,10 +234,10 @@ class _Equations:
 
     def __call__(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
         """Evaluate the derivatives by state: the dynamics of a `Simulator`."""
-        names = self.tree.joints
+        names, speeds = self.tree.joints, [f"{n}.speed" for n in self.tree.joints]
         mass, rest = self._evaluate(x, u, p)[:2]
-        faster = ca.vertsplit(ca.solve(mass, rest))
-        return {n: x[f"{n}.speed"] for n in names} | {f"{n}.speed": a for n, a in zip(names, faster, strict=True)}
+        accelerations = dict(zip(speeds, ca.vertsplit(ca.solve(mass, rest)), strict=True))
+        return {n: x[speed] for n, speed in zip(names, speeds, strict=True)} | accelerations
 
     def outputs(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
         """Evaluate the outputs by name."""
