@@ -3,8 +3,8 @@
 Units crash and hang, mostly at some values of their parameters. An evaluation that ends or blocks the process gives
 NaN, and the next one starts a new process. One message asks for one point, or for a whole run of a compiled model that
 calls the unit (`run_in_unit`). A message and its reply take some 15 µs: nothing beside a run, and ten times as long as
-a small unit itself needs for one point. So single points are evaluated in this process, as soon as the unit's own has
-answered with the same values of the parameters; a unit that crashes there at some states ends this process as well.
+a small unit itself needs for one point. So single points are evaluated in the user's process once the unit's own
+process has answered with the same parameters; a unit that crashes at some states then ends the user's process as well.
 """
 
 from __future__ import annotations
@@ -67,12 +67,13 @@ class _UnitProcess(ChildProcess):
 
 _loading: dict[FmuFile, float] = {}  # further seconds for the first job of another process of a unit
 _idle: list[_UnitProcess] = []
-_lock, _here = threading.Lock(), threading.Lock()
+_idle_lock = threading.Lock()
+_evaluation_lock = threading.Lock()  # the unit has one instance in this process
 
 
 def _take(file: FmuFile) -> _UnitProcess:
     """Take an idle process of a unit, or a new one; a forked process leaves those of its parent alone."""
-    with _lock:
+    with _idle_lock:
         for process in _idle:
             if process.file == file and process.owner == os.getpid():
                 _idle.remove(process)
@@ -81,7 +82,7 @@ def _take(file: FmuFile) -> _UnitProcess:
 
 
 def _give_back(process: _UnitProcess) -> None:
-    with _lock:
+    with _idle_lock:
         _idle.append(process)
         excess = _idle.pop(0) if len(_idle) > MOST_IDLE else None
     if excess is not None and excess.owner == os.getpid():
@@ -163,7 +164,7 @@ class FmuFunction(Leaf):
             return none
         parameters = point[len(point) - self.signals.sizes[3] :].astype(np.float32).tobytes()
         if parameters in self._answered and (here := _evaluation_here(self.signals)) is not None:
-            with _here:  # the unit has one instance in this process
+            with _evaluation_lock:
                 if not here.instance.failed[0]:  # a restart may end the process
                     return np.array(here.evaluate(point))
         if self._losses.get(parameters, 0) >= MOST_LOSSES:
