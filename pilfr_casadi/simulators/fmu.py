@@ -157,15 +157,8 @@ def from_fmu(
         _check_port(name, port)
     used = [name for port in given.values() for name in _factors(port.get("into"))]
     own = parameters if parameters is not None else unit.parameters
-    _check_types(path, described, (*used, *own, *bounds, *(inputs or ()), *(outputs or ())))
+    _check_names(unit, (*used, *(inputs or ())), outputs or (), (*own, *bounds))
     all_outputs = described.of("output")
-    for names, there, kind in (
-        (used, unit.inputs, "inputs"),
-        (inputs or (), unit.inputs, "inputs"),
-        (outputs or (), all_outputs, "outputs"),
-        ((*own, *bounds), unit.parameters, "parameters"),
-    ):
-        check_known(names, there, kind, path)
     drives = tuple(inputs) if inputs is not None else tuple(n for n in unit.inputs if n not in used)
     measured = tuple(outputs) if outputs is not None else all_outputs
     read = {port.get(key) for port in given.values() for key in ("across", "rate")}
@@ -198,11 +191,22 @@ def _load_unit(path: Path, described: Description, named: Sequence[str], outputs
     return _Unit(path, described, parameters, tuple(outputs or ()))
 
 
-def _check_types(path: Path, described: Description, names: Sequence[str]) -> None:
-    """Refuse variables that are no single real number."""
-    for name in names:
-        if kind := described.others.get(name):
-            raise InputError(f"{name!r} of {path} is {kind}; name variables that are single numbers of 64 bits.")
+def _check_names(
+    unit: _Unit | SteppedUnit, inputs: Sequence[str], outputs: Sequence[str], parameters: Sequence[str]
+) -> None:
+    """Refuse names of inputs, outputs and parameters that the unit does not have as numbers."""
+    roles = (
+        (inputs, unit.inputs, "inputs"),
+        (outputs, unit.described.of("output"), "outputs"),
+        (parameters, unit.parameters, "parameters"),
+    )
+    for names, known, kind in roles:
+        for name in names:
+            if found := unit.described.others.get(name):
+                raise InputError(
+                    f"{name!r} of {unit.path} is {found}; name variables that are single numbers of 64 bits."
+                )
+        check_known(names, known, kind, unit.path)
 
 
 class _Equations:
