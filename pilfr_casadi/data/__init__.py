@@ -42,7 +42,6 @@ if TYPE_CHECKING:
         read_frame as read_frame,
         read_mat as read_mat,
         read_npz as read_npz,
-        step_of as step_of,
         written_times as written_times,
     )
     from .recording import (
@@ -56,6 +55,7 @@ if TYPE_CHECKING:
         fingerprint as fingerprint,
     )
     from .tables import STACK_SUFFIXES as STACK_SUFFIXES, TABLE_SUFFIXES as TABLE_SUFFIXES, read_stack as read_stack
+    from .time_grid import step_of as step_of
     from .units import (
         conversion as conversion,
         dimension as dimension,
