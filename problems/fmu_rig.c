@@ -2,7 +2,8 @@
  *
  * Value references are places in `v`: parameters, states, derivatives, inputs, outputs. It keeps neither time nor events.
  * Macros make variants: CRASHES on instantiation; FAILURE, a statement, and FAILED, a status of the
- * getters, at stiffnesses above 600 N/m; STRICT refuses parameters in continuous-time mode.
+ * getters, at stiffnesses above 600 N/m; STRICT refuses parameters in continuous-time mode; SINGLE makes one instance,
+ * which cannot be reset and fails at positions above 1 m.
  */
 #include <stdlib.h>
 #include <string.h>
@@ -45,6 +46,10 @@ EXPORT void *fmi2Instantiate(const char *name, int type, const char *guid, const
 #ifdef CRASHES
   abort();
 #endif
+#ifdef SINGLE
+  static int made;
+  if (made++) return NULL;
+#endif
   if (type != 0 || strcmp(guid, "rig")) return NULL;
   m = malloc(sizeof *m);
   if (m) memcpy(m->v, start, sizeof start);
@@ -57,6 +62,9 @@ EXPORT int fmi2EnterInitializationMode(void *c) { return 0; }
 EXPORT int fmi2ExitInitializationMode(void *c) { return 0; }
 EXPORT int fmi2Terminate(void *c) { return 0; }
 EXPORT int fmi2Reset(void *c) {
+#ifdef SINGLE
+  return 3;
+#endif
   ((rig_t *)c)->continuous = 0;
   return 0;
 }
@@ -126,6 +134,9 @@ EXPORT int fmi2GetContinuousStates(void *c, double x[], size_t n) {
 EXPORT int fmi2GetDerivatives(void *c, double xdot[], size_t n) {
 #ifdef FAILED
   if (((rig_t *)c)->v[K1] > 600) return FAILED;
+#endif
+#ifdef SINGLE
+  if (((rig_t *)c)->v[X1] > 1) return 3;
 #endif
   evaluate(((rig_t *)c)->v);
   memcpy(xdot, ((rig_t *)c)->v + DX1, n * sizeof(double));

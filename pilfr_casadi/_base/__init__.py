@@ -57,15 +57,19 @@ if TYPE_CHECKING:
         shown_progress as shown_progress,
     )
     from .workers import (
+        ChildProcess as ChildProcess,
         Reply as Reply,
         check_executor as check_executor,
         close_workers as close_workers,
         one_at_a_time as one_at_a_time,
         one_blas_thread as one_blas_thread,
+        open_replies as open_replies,
         processors as processors,
+        read_message as read_message,
         run_in_worker as run_in_worker,
         side_by_side as side_by_side,
         worker_pool as worker_pool,
+        write_message as write_message,
     )
 
 __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

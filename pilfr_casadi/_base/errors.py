@@ -28,10 +28,10 @@ def check_known(names: Sequence[str], known: Sequence[str], kind: str, owner: An
             raise InputError(f"{owner} has no {name!r} among its {kind}; they are {listed(known) or 'none'}.")
 
 
-def in_words(names: Sequence[str], most: int = 8) -> str:
-    """Join names as in a sentence, "a, b and c"; abbreviate more than `most` names."""
-    if len(names) > most:
-        return listed(names, most)
+def in_words(names: Sequence[str]) -> str:
+    """Join names as in a sentence, "a, b and c"; abbreviate more than eight names."""
+    if len(names) > 8:
+        return listed(names, 8)
     return " and ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else "".join(names)
 
 

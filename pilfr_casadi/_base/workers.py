@@ -19,6 +19,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import functools
+import math
 import multiprocessing
 import os
 import pickle
@@ -28,7 +29,8 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -44,6 +46,7 @@ SYMBOLIC = threading.RLock()
 MANAGER_TIMEOUT = 2.0  # seconds for a pool's own thread to end after its processes have ended
 CANCEL_TIMEOUT = 10.0  # seconds for a pool to drop tasks that have not begun
 IDLE_SECONDS = 60.0  # after which a child, about 100 MB, ends
+WATCH_SECONDS = 0.1  # interval at which time limits are checked
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
@@ -182,61 +185,40 @@ def close_workers() -> None:
         child.close()
 
 
-class WorkerProcess:
-    """A child process, as its worker sees it."""
+class ChildProcess:
+    """A Python process that runs `serve` of some file: it reads jobs from its input and writes replies to its output.
 
-    def __init__(self) -> None:
+    It is killed if it has not replied at the `deadline`, a time of the monotonic clock; it has then `expired`.
+    """
+
+    def __init__(self, serve: Callable[[], None], environment: Mapping[str, str] | None = None) -> None:
+        self.deadline, self.expired = math.inf, False
         self.errors = tempfile.TemporaryFile()  # noqa: SIM115
         path = os.pathsep.join(p or os.getcwd() for p in sys.path)
         self.process = subprocess.Popen(
-            [sys.executable, "-c", f"from {__name__} import serve; serve()"],
+            [sys.executable, "-c", f"from {serve.__module__} import {serve.__name__} as serve; serve()"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self.errors,
-            env={**os.environ, **ONE_THREAD, "PYTHONPATH": path},
+            env={**os.environ, **(environment or {}), "PYTHONPATH": path},
             start_new_session=True,  # Ctrl-C is for the process that waits for the results
         )
         self.inbox: Any = self.process.stdin
         self.outbox: Any = self.process.stdout
-        self.function: bytes | None = None  # the pickled function that the child has
-        _children.add(self)
+        threading.Thread(target=self._watch, daemon=True).start()
 
-    def run(self, shared: bytes, job: bytes, limit: float | None) -> Reply:
-        """Run one job; see `run_in_worker`."""
-        expired = threading.Event()
+    def _watch(self) -> None:
+        while self.process.poll() is None:
+            if time.monotonic() > self.deadline:
+                self.expired = True
+                self.process.kill()
+            time.sleep(WATCH_SECONDS)
 
-        def end() -> None:
-            expired.set()
-            self.process.kill()
-
-        timer = threading.Timer(limit or 0.0, end)
-        timer.daemon = True
-        begun = False
-        try:
-            _write(self.inbox, (None if shared == self.function else shared, job))
-            self.function = shared
-            _read(self.outbox)  # the child has received everything
-            begun = True
-            if limit is not None:
-                timer.start()
-            try:
-                return Reply(_read(self.outbox))
-            finally:
-                timer.cancel()
-        except (OSError, EOFError, ValueError):
-            lost = self._describe_end()
-            self.close()
-            return Reply(timed_out=True) if expired.is_set() else Reply(lost=lost, begun=begun)
-
-    def _describe_end(self) -> str:
+    def exit_status(self) -> int | None:
+        """Return the exit status of a process that no longer answers, or minus the signal that ended it."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(5)
-        code = self.process.poll()
-        if code is not None and code < 0:
-            return f"its process was ended by signal {-code}"
-        self.errors.seek(0)
-        lines = self.errors.read().decode(errors="replace").strip().splitlines()
-        return f"its process ended: {lines[-1]}" if lines else f"its process ended with status {code}"
+        return self.process.poll()
 
     def close(self) -> None:
         """Kill the process and close its pipes."""
@@ -245,6 +227,45 @@ class WorkerProcess:
         for pipe in (self.inbox, self.outbox, self.errors):
             with contextlib.suppress(OSError, ValueError):
                 pipe.close()
+
+
+class WorkerProcess(ChildProcess):
+    """A child process of a worker, for `run_in_worker`."""
+
+    def __init__(self) -> None:
+        super().__init__(serve, ONE_THREAD)
+        self.function: bytes | None = None  # the pickled function that the child has
+        _children.add(self)
+
+    def run(self, shared: bytes, job: bytes, limit: float | None) -> Reply:
+        """Run one job; see `run_in_worker`."""
+        begun = False
+        try:
+            _write(self.inbox, (None if shared == self.function else shared, job))
+            self.function = shared
+            _read(self.outbox)  # the child has received everything
+            begun = True
+            if limit is not None:
+                self.deadline = time.monotonic() + limit
+            reply = Reply(_read(self.outbox))
+            self.deadline = math.inf
+            return reply
+        except (OSError, EOFError, ValueError):
+            lost = self._describe_end()
+            self.close()
+            return Reply(timed_out=True) if begun and self.expired else Reply(lost=lost, begun=begun)
+
+    def _describe_end(self) -> str:
+        code = self.exit_status()
+        if code is not None and code < 0:
+            return f"its process was ended by signal {-code}"
+        self.errors.seek(0)
+        lines = self.errors.read().decode(errors="replace").strip().splitlines()
+        return f"its process ended: {lines[-1]}" if lines else f"its process ended with status {code}"
+
+    def close(self) -> None:
+        """Kill the process and close its pipes."""
+        super().close()
         _children.discard(self)
 
 
@@ -255,8 +276,7 @@ atexit.register(close_workers)
 
 def serve() -> None:
     """Run jobs in the child process: read them from standard input, write results to standard output."""
-    replies = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # a job that prints must not write into the replies
+    replies = open_replies()
     inbox: queue.SimpleQueue[tuple[bytes | None, bytes]] = queue.SimpleQueue()
 
     def listen() -> None:
@@ -282,17 +302,35 @@ def serve() -> None:
         os._exit(1)  # skip the interpreter's shutdown, which the listening thread would disturb
 
 
-def _write(pipe: Any, content: Any) -> None:
-    data = pickle.dumps(content)
-    pipe.write(len(data).to_bytes(8, "big") + data)
+def open_replies() -> Any:
+    """Open the pipe of the replies in a child process, in which nothing that a job prints may appear."""
+    replies = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    return replies
+
+
+def write_message(pipe: Any, message: bytes) -> None:
+    """Write a message with its length before it."""
+    pipe.write(len(message).to_bytes(8, "big") + message)
     pipe.flush()
 
 
-def _read(pipe: Any) -> Any:
-    size = pipe.read(8)
-    if len(size) < 8:
+def read_message(pipe: Any) -> bytes:
+    """Read a message; EOFError is raised if the pipe ends before it does."""
+    head = pipe.read(8)
+    size = int.from_bytes(head, "big")
+    message: bytes = pipe.read(size) if len(head) == 8 else b""
+    if len(head) < 8 or len(message) < size:
         raise EOFError
-    return pickle.loads(pipe.read(int.from_bytes(size, "big")))
+    return message
+
+
+def _write(pipe: Any, content: Any) -> None:
+    write_message(pipe, pickle.dumps(content))
+
+
+def _read(pipe: Any) -> Any:
+    return pickle.loads(read_message(pipe))
 
 
 def check_executor(executor: Any) -> None:

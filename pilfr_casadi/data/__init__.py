@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
+    from .columns import TIME_NAMES as TIME_NAMES, is_time as is_time
     from .common_clock import merge as merge
     from .excitation import (
         excited_bins as excited_bins,
@@ -35,15 +36,12 @@ if TYPE_CHECKING:
         same_input as same_input,
     )
     from .readers import (
-        TIME_NAMES as TIME_NAMES,
         column_names as column_names,
-        is_time as is_time,
         read as read,
         read_csv as read_csv,
         read_frame as read_frame,
         read_mat as read_mat,
         read_npz as read_npz,
-        step_of as step_of,
         written_times as written_times,
     )
     from .recording import (
@@ -57,6 +55,7 @@ if TYPE_CHECKING:
         fingerprint as fingerprint,
     )
     from .tables import STACK_SUFFIXES as STACK_SUFFIXES, TABLE_SUFFIXES as TABLE_SUFFIXES, read_stack as read_stack
+    from .time_grid import step_of as step_of
     from .units import (
         conversion as conversion,
         dimension as dimension,

@@ -6,7 +6,7 @@ columns are ignored. One sentence reports a fault of a file; it names the file, 
 """
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -15,28 +15,20 @@ from typing import Any, overload
 import numpy as np
 
 from .._base import InputError, listed, positive
-from .preprocessing import LONGEST_GAP, check_times, common_times, hold_at, interpolate_at, levels_last
+from .columns import TIME_NAMES, find_column, find_time_column, refuse_other_unit
+from .csv_table import CsvTable
+from .preprocessing import check_times, common_times, hold_at, interpolate_at, levels_last
 from .recording import Recording, as_tuple
-from .tables import (
-    TIME_NAMES,
-    ArrayTable,
-    CsvTable,
-    find_column,
-    frame_table,
-    is_time,
-    open_table,
-)
+from .tables import ArrayTable, frame_table, open_table
+from .time_grid import step_of
 
 PathLike = str | Path
+Paths = PathLike | Iterable[PathLike]
 Names = Sequence[str] | str
+Recordings = Recording | tuple[Recording, ...]  # a tuple if several paths were given
 
-TOLERANCE = 1e-4  # allowed deviation of a sample from the grid, in steps; recorders' clocks drift less in a record
-AGREEMENT = 1e-3  # allowed relative difference of a stated step from the times; a wrong unit differs by far more
 TIME_WORDS = ("time", "zeit", "temps", "tiempo", "tempo", "clock", "seconds")  # parts of the names of time columns
 MOST_TRIED = 5  # columns that are read to find an unnamed time, at most
-_UNITS = r"ns|us|µs|μs|ms|min|h|d|nanoseconds?|microseconds?|milliseconds?|minutes?|hours?|days?"
-_OTHER_UNIT = re.compile(rf"(?:t|time)[\s_\-\[(]+({_UNITS})[\])]?", re.IGNORECASE)
-_IN_OTHER_UNIT = re.compile(rf".*[\[(]\s*({_UNITS})\s*[\])]", re.IGNORECASE)  # of a column that is chosen as the time
 
 
 @overload
@@ -44,7 +36,7 @@ def read_csv(path: PathLike, inputs: Names, outputs: Names, **options: Any) -> R
 @overload
 def read_csv(path: Iterable[PathLike], inputs: Names, outputs: Names, **options: Any) -> tuple[Recording, ...]: ...
 def read_csv(
-    path: PathLike | Iterable[PathLike],
+    path: Paths,
     inputs: Names,
     outputs: Names,
     *,
@@ -53,7 +45,7 @@ def read_csv(
     time_tolerance: float | None = None,
     resample: float | None = None,
     **recording_options: Any,
-) -> Recording | tuple[Recording, ...]:
+) -> Recordings:
     """Read recordings from CSV files with a header row.
 
     Lines of a title may stand above the header, and a row of units below it. Times may be dates such as
@@ -101,9 +93,7 @@ def read_csv(
 def read_mat(path: PathLike, inputs: Names, outputs: Names, **options: Any) -> Recording: ...
 @overload
 def read_mat(path: Iterable[PathLike], inputs: Names, outputs: Names, **options: Any) -> tuple[Recording, ...]: ...
-def read_mat(
-    path: PathLike | Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
-) -> Recording | tuple[Recording, ...]:
+def read_mat(path: Paths, inputs: Names, outputs: Names, **options: Any) -> Recordings:
     """Read recordings from MATLAB files (up to version 7.2): one vector for time and for each input and output.
 
     Parameters, returned values and errors are the same as for :func:`read_csv`. A matrix with one row per sample holds
@@ -116,9 +106,7 @@ def read_mat(
 def read_npz(path: PathLike, inputs: Names, outputs: Names, **options: Any) -> Recording: ...
 @overload
 def read_npz(path: Iterable[PathLike], inputs: Names, outputs: Names, **options: Any) -> tuple[Recording, ...]: ...
-def read_npz(
-    path: PathLike | Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
-) -> Recording | tuple[Recording, ...]:
+def read_npz(path: Paths, inputs: Names, outputs: Names, **options: Any) -> Recordings:
     """Read recordings from NumPy archives (``numpy.savez``); otherwise as :func:`read_mat`."""
     return _read_each(path, _Request(inputs, outputs, **options), ".npz")
 
@@ -127,9 +115,7 @@ def read_npz(
 def read(path: PathLike, inputs: Names, outputs: Names, **options: Any) -> Recording: ...
 @overload
 def read(path: Iterable[PathLike], inputs: Names, outputs: Names, **options: Any) -> tuple[Recording, ...]: ...
-def read(
-    path: PathLike | Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
-) -> Recording | tuple[Recording, ...]:
+def read(path: Paths, inputs: Names, outputs: Names, **options: Any) -> Recordings:
     """Read recordings with the reader for the file's suffix.
 
     The suffixes are .csv, .tsv, .txt or .dat, .mat, .npz, .parquet, .mf4 and .mdf. Parquet files need
@@ -160,7 +146,7 @@ def read_frame(
         If `frame` is not a data frame, or a column or a value cannot be used.
     """
     request = _Request(inputs, outputs, columns=columns, **{"name": "", **options})
-    return request.recording(frame_table(frame, TIME_NAMES, request.wanted))
+    return request.recording(frame_table(frame, request.wanted))
 
 
 def column_names(path: PathLike, wanted: Sequence[str] = ()) -> tuple[str, ...]:
@@ -183,7 +169,7 @@ def written_times(
     columns = columns or {}
     chosen = next((columns[name] for name in TIME_NAMES if name in columns), None)
     table = open_table(Path(path), [*wanted, chosen] if chosen else wanted)
-    time = _find_time_column(table.names, chosen, str(path))
+    time = find_time_column(table.names, chosen, str(path))
     return table.texts(time) if time else None
 
 
@@ -243,7 +229,7 @@ class _Request:
         return [self.column(name) for name in (*self.inputs, *self.outputs)]
 
     @property
-    def sought(self) -> list[str]:
+    def wanted_and_time(self) -> list[str]:
         """These columns, and that of the time if it has another name."""
         return [*self.wanted, *(column for name, column in self.columns.items() if name in TIME_NAMES)]
 
@@ -251,7 +237,7 @@ class _Request:
         """Return the time column, or None, and the columns of the inputs and outputs."""
         names, source = table.names, str(table.path)
         mapped = [column for name, column in self.columns.items() if name in TIME_NAMES]
-        time = _find_time_column(names, mapped[0] if mapped else None, source)
+        time = find_time_column(names, mapped[0] if mapped else None, source)
         wanted = [find_column(column, names) for column in self.wanted]
         both = sorted({*map(self.column, self.inputs)} & {*map(self.column, self.outputs)})
         if both:
@@ -276,7 +262,7 @@ class _Request:
             if list(names).count(name) > 1:
                 raise InputError(f"{source} has {list(names).count(name)} columns named {name!r}; rename all but one.")
         if time is None and self.dt is None:
-            _refuse_other_unit(names, source)
+            refuse_other_unit(names, source)
             raise InputError(
                 f"{source} has no time column; it has {listed(names)}: name one {' or '.join(TIME_NAMES)}, in seconds, "
                 f"map one, as in columns={{'t': {_guess_time(table, wanted)!r}}}, or state the step with dt=STEP."
@@ -349,39 +335,20 @@ def _check_names(given: Any, role: str) -> tuple[str, ...]:
     return names
 
 
-def _read_each(
-    path: PathLike | Iterable[PathLike], request: _Request, suffix: str = ""
-) -> Recording | tuple[Recording, ...]:
+def _read_each(path: Paths, request: _Request, suffix: str = "") -> Recordings:
     """Read one file, or several into a tuple; a `suffix` overrides that of the files."""
     if isinstance(path, PathLike):
-        return request.recording(open_table(Path(path), request.sought, suffix))
+        return request.recording(open_table(Path(path), request.wanted_and_time, suffix))
     paths = tuple(path) if isinstance(path, Iterable) else (path,)
     if not all(isinstance(p, PathLike) for p in paths):
         raise InputError(f"the file {path!r} was given; give its path as text, or a list of paths.")
-    return tuple(request.recording(open_table(Path(p), request.sought, suffix)) for p in paths)
+    return tuple(request.recording(open_table(Path(p), request.wanted_and_time, suffix)) for p in paths)
 
 
 def _channel_names(names: Sequence[str], parts: Sequence[np.ndarray]) -> tuple[str, ...]:
     """Number the channels of a matrix: `u1, u2` for `u`."""
     pairs = zip(names, parts, strict=True)
     return tuple(f"{n}{i + 1}" if p.shape[1] > 1 else n for n, p in pairs for i in range(p.shape[1]))
-
-
-def _find_time_column(names: Sequence[str], chosen: str | None, source: str) -> str | None:
-    """Return the time column among the names: the chosen one, or one that `is_time`; None if there is none."""
-    found = [chosen] if chosen is not None else [*dict.fromkeys(name for name in names if is_time(name))]
-    if not found:
-        return None
-    if len(found) > 1:
-        raise InputError(
-            f"{source} has several time columns ({', '.join(found)}); choose one, as in columns={{'t': '{found[0]}'}}."
-        )
-    found[0] = find_column(found[0], names)
-    if found[0] not in names:
-        raise InputError(f"{source} has no column {found[0]!r} for the time; its columns are {listed(names)}.")
-    _refuse_other_unit(found, source)
-    _refuse_other_unit(found, source, _IN_OTHER_UNIT)
-    return found[0]
 
 
 def _guess_time(table: CsvTable | ArrayTable, wanted: Sequence[str]) -> str:
@@ -397,90 +364,3 @@ def _guess_time(table: CsvTable | ArrayTable, wanted: Sequence[str]) -> str:
             continue
         return name
     return "COLUMN"
-
-
-def _refuse_other_unit(names: Sequence[str], source: str, pattern: re.Pattern[str] = _OTHER_UNIT) -> None:
-    """Refuse a name such as ``t_ms`` or ``Time [min]``, which states a unit other than seconds."""
-    for name in names:
-        unit = pattern.fullmatch(name.strip())
-        if unit:
-            raise InputError(
-                f"{source}: column {name!r} is named as time in {unit.group(1)}, but time must be in seconds; "
-                "convert it and name it t_s, or leave it out and state the step in seconds with dt=STEP."
-            )
-
-
-def step_of(
-    t: np.ndarray,
-    column: str,
-    place: Callable[[int], str],
-    *,
-    dt: float | None = None,
-    tolerance: float | None = None,
-) -> float:
-    """Return the step of a uniform time grid, in seconds.
-
-    A grid is uniform if every sample is within `tolerance` steps of ``t(0) + k dt``, plus the rounding of the written
-    digits: a grid of 1/120 s written with six decimals is uniform. A stated step `dt` must agree with the times, and is
-    returned as it is. For messages, `column` names the file and the column, and `place` returns the place of a sample,
-    such as ``"line 17"``.
-    """
-    if len(t) < 2:
-        raise InputError(f"{column} has only one sample; at least 2 are needed.")
-    gaps = np.diff(t)
-    if np.any(gaps <= 0):
-        k = int(np.argmax(gaps <= 0)) + 1
-        raise InputError(
-            f"{column}: {place(k)} is {t[k]:.10g} s, after {t[k - 1]:.10g} s; time must increase from sample to sample."
-        )
-    step = (t[-1] - t[0]) / (len(t) - 1)
-    deviation = np.abs(t - t[0] - np.arange(len(t)) * step)
-    allowed = (TOLERANCE if tolerance is None else tolerance) * step
-    if (deviation > allowed).any() and (deviation > allowed + _bound_rounding(t, step)).any():
-        median = float(np.median(gaps))
-        error = np.abs(gaps - median)
-        k = int(np.argmax(error > 0.5 * error.max())) + 1
-        raise InputError(
-            f"{column} is not uniform: {place(k)} comes {gaps[k - 1]:.6g} s after the sample before it where "
-            f"{median:.6g} s is usual, and samples lie up to {deviation.max() / step:.2g} steps off a uniform grid; "
-            + (
-                "cut the record at such gaps."
-                if gaps.max() > LONGEST_GAP * median
-                else "resample with resample=STEP, or allow more with time_tolerance=STEPS."
-            )
-        )
-    step = float(f"{step:.12g}")
-    if dt is None:
-        return step
-    if abs(step - dt) > AGREEMENT * dt:
-        raise InputError(
-            f"{column} has a step of {step:.6g} s, but dt={dt:.6g} was stated, a ratio of {step / dt:.4g}; "
-            "time must be in seconds, so check its unit."
-        )
-    return float(dt)
-
-
-def _bound_rounding(t: np.ndarray, step: float) -> np.ndarray:
-    """Bound the deviation of samples from the grid by the rounding of written times, (M,), in seconds.
-
-    Times are rounded to D decimals or to S significant digits, whichever is coarser at a sample. The errors of the
-    first and last time shift and stretch the grid. The bound is at most a tenth of a step, so it never hides a missing
-    sample.
-    """
-    size = np.abs(t)
-    exponent = np.floor(np.log10(size, where=size > 0, out=np.full(len(t), -np.inf)))
-    exponent[~np.isfinite(exponent)] = exponent[np.isfinite(exponent)].min()
-    digits = _count_digits(lambda n: size * 10.0 ** (n - 1 - exponent))
-    decimals = _count_digits(lambda n: size * 10.0**n)
-    own = 0.5 * np.maximum(10.0 ** (exponent + 1 - digits), 10.0**-decimals)
-    return np.minimum(own + own[0] + own[-1], 0.1 * step)
-
-
-def _count_digits(scaled: Callable[[float], np.ndarray]) -> float:
-    """Return the smallest n for which all scaled times are whole numbers; infinite if there is none below 15."""
-    for n in range(15):
-        times = scaled(float(n))
-        near = np.abs(times - np.rint(times)) <= 4 * np.finfo(float).eps * np.abs(times)
-        if near.all():
-            return float(n)
-    return np.inf

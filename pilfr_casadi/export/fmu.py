@@ -12,7 +12,7 @@ import os
 import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -90,7 +90,7 @@ class FmuContent:
         by_rank = sorted(range(len(found)), key=lambda i: found[i].causality == "local")
         unique = make_unique(_clean(found[i].name) for i in by_rank)
         names = dict(zip(by_rank, unique, strict=True))
-        return [_Variable(names[i], *list(vars(v).values())[1:]) for i, v in enumerate(found)]
+        return [replace(v, name=names[i]) for i, v in enumerate(found)]
 
     def _list_variables(self) -> Iterator[_Variable]:
         units, thresholds = self.names["units"], self.names["thresholds"]

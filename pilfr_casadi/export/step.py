@@ -223,7 +223,7 @@ class Exported:
             out.append(stack(*(columns[name] for name in self.reads)))
         return out
 
-    def _check_closed(self) -> None:
+    def _refuse_external_calls(self) -> None:
         """Refuse to write a step that calls another program."""
         if calls_external(self.one):
             raise InputError(
@@ -258,7 +258,7 @@ class Exported:
         InputError
             If a file cannot be written, or the equations call another program.
         """
-        self._check_closed()
+        self._refuse_external_calls()
         text = json.dumps(self.names(), indent=1, allow_nan=False) + "\n"
         write_atomically(f"{path_text(path, 'file')}{NAMES}", text)
         with tempfile.TemporaryDirectory() as folder:
@@ -281,7 +281,7 @@ class Exported:
         InputError
             If the folder cannot be made or written, or the equations call another program.
         """
-        self._check_closed()
+        self._refuse_external_calls()
         return write_c(folder, self.step, self.names(), self.interpolated)
 
     def to_fmu(self, path: str | os.PathLike[str], fmi: str = "2.0") -> Path:
@@ -310,7 +310,7 @@ class Exported:
         InputError
             If there is no working C compiler, the file cannot be written, or the equations call another program.
         """
-        self._check_closed()
+        self._refuse_external_calls()
         time = len(self.states) - 1 if self.timed else None
         step = self.step_with_parameters(f"{self.name.rstrip('_')}_casadi")
         return write_fmu(path, FmuContent(step, self.names(), self.parameters, self.interpolated, time), fmi)

@@ -1,13 +1,13 @@
 """The user's equations with ports for missing physics.
 
 `ports` are the places where laws may stand. `equations` evaluates the equations and their ports, and `integration`
-closes them with laws and discretises them to a `Model`. `simulator` holds the class `Simulator`. `domains` infers a
-port's physical domain. `adapters` convert a Python file (`user_file`), a state space or a fitted model to a simulator.
-`fmu` wraps a functional mock-up unit as a simulator (`fmu_description`, `fmu_instance`, `fmu_process`, for
-co-simulation `fmu_cosimulation`), and `mujoco` writes the equations of a MuJoCo model (`mujoco_model`).
-`numpy_function` makes a simulator from a NumPy function, whose arguments `signature` reads: `tracing` calls the
-function with `symbols` to obtain its equations. A function that cannot be traced is called with numbers (`black_box`).
-`external` lets equations call such a program.
+closes them with laws and discretises them to a `Model` with enough `substeps`. `simulator` holds the class `Simulator`.
+`domains` infers a port's physical domain, and `user_arguments` checks what a user gives. `adapters` convert a Python
+file (`user_file`), a state space or a fitted model to a simulator. `fmu` wraps a functional mock-up unit as a simulator
+(`fmu_description`, `fmu_instance`, `fmu_process`, for co-simulation `fmu_cosimulation`), and `mujoco` writes the
+equations of a MuJoCo model (`mujoco_model`). `numpy_function` makes a simulator from a NumPy function, whose arguments
+`signature` reads: `tracing` calls the function with `symbols` to obtain its equations. A function that cannot be traced
+is called with numbers (`black_box`). `external` lets equations call such a program.
 """
 
 from typing import TYPE_CHECKING
@@ -43,21 +43,11 @@ if TYPE_CHECKING:
     from .fmu_instance import FmuSignals as FmuSignals, evaluation as evaluation
     from .fmu_process import run_in_unit as run_in_unit
     from .integration import (
-        LARGEST_STEP as LARGEST_STEP,
-        MOST_SUBSTEPS as MOST_SUBSTEPS,
         ClosedEquations as ClosedEquations,
         Instant as Instant,
-        choose_substeps as choose_substeps,
         discretise as discretise,
-        discretise_for as discretise_for,
-        fastest_rates as fastest_rates,
-        growth_rate as growth_rate,
-        least_substeps as least_substeps,
-        needed_substeps as needed_substeps,
         on_grid as on_grid,
-        rate_at_start as rate_at_start,
         signals as signals,
-        states_along as states_along,
         term_function as term_function,
     )
     from .mujoco import from_mujoco as from_mujoco
@@ -77,6 +67,18 @@ if TYPE_CHECKING:
         split_port as split_port,
     )
     from .simulator import Simulator as Simulator, unit_factor as unit_factor, unit_notes as unit_notes
+    from .substeps import (
+        LARGEST_STEP as LARGEST_STEP,
+        MOST_SUBSTEPS as MOST_SUBSTEPS,
+        choose_substeps as choose_substeps,
+        discretise_for as discretise_for,
+        fastest_rates as fastest_rates,
+        growth_rate as growth_rate,
+        least_substeps as least_substeps,
+        needed_substeps as needed_substeps,
+        rate_at_start as rate_at_start,
+        states_along as states_along,
+    )
     from .user_file import user_variable as user_variable
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

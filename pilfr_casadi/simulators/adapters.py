@@ -115,10 +115,10 @@ def _from_system(system: Any, recordings: Sequence[Recording]) -> Simulator:
     inputs = _choose_names(system.input_labels, "u", first.inputs if first else ())
     outputs = _choose_names(system.output_labels, "y", first.outputs if first else ())
     states = _choose_names(system.state_labels, "x", ())
-    return linear_simulator(matrices, states, inputs, outputs, discrete)
+    return _linear_simulator(matrices, states, inputs, outputs, discrete)
 
 
-def linear_simulator(
+def _linear_simulator(
     matrices: Mapping[str, np.ndarray],
     states: tuple[str, ...],
     inputs: tuple[str, ...],

@@ -18,14 +18,12 @@ from typing import Any, Self, cast
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, listed, whole
-from ..data import as_tuple
+from .._base import InputError, whole
 from ..models import Named, Parameter, ParameterSet
 from .domains import MECHANICAL, UNKNOWN, common_domain, is_motion, may_be_speed
 from .external import calls_external
 from .ports import (
     ACTUATOR,
-    BUILT_IN,
     EQUATION,
     PARAMETER,
     SENSOR,
@@ -36,34 +34,10 @@ from .ports import (
     port_name,
     split_port,
 )
+from .user_arguments import as_scalar, as_scalars, call, check_expressions, check_names, check_parameters, check_ports
 
 EQUAL_DEPTH = 5  # levels of two expressions that are compared
 COMPARED_POINTS = 3  # random points at which expressions are compared
-
-
-def call(function: Expression, name: str, **available: Any) -> Any:
-    """Call a user's function with the available symbols that its arguments name; messages call it `name`."""
-    try:
-        arguments = inspect.signature(function).parameters.items()
-    except (TypeError, ValueError):
-        raise InputError(f"The {name} is {function!r}; give a function of {', '.join(available)} by name.") from None
-    wanted = [
-        key for key, p in arguments if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) and p.default is p.empty
-    ]
-    for key in wanted:
-        if key not in available:
-            raise InputError(f"The {name} asks for {key!r}; it can have {', '.join(available)}.")
-    try:
-        return function(**{key: available[key] for key in wanted})
-    except InputError as error:
-        raise InputError(f"In the {name}: {error}") from None
-    except Exception as error:
-        if "truth value" in str(error):
-            raise InputError(
-                f"The {name} decides by the value of a symbol (if, and, or, min, max), which has none yet; "
-                "use casadi.if_else, casadi.fmin and casadi.fmax."
-            ) from error
-        raise InputError(f"The {name} fails: {type(error).__name__}: {error}.") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,10 +69,10 @@ class Equations:
         if not isinstance(self.units, Mapping):
             raise InputError(f"The simulator's units are {self.units!r}; give {{name: unit}}.")
         object.__setattr__(self, "parameters", check_parameters(self.parameters))
-        object.__setattr__(self, "ports", _check_ports(self.ports))
+        object.__setattr__(self, "ports", check_ports(self.ports))
         x, u, p, t = self.symbols()
         found = self.by_state(self.derivatives(x, u, p, t)) | self.measured(x, u, p, t)
-        _check_expressions(found, ca.vertcat(stack(x, u, p), t))
+        check_expressions(found, ca.vertcat(stack(x, u, p), t))
         for port in self.ports:
             self.into(port, x, u, p, t)
             self.across(port, x, u, p, t)
@@ -162,7 +136,7 @@ class Equations:
                 raise InputError(
                     f"The simulator's dynamics give {name!r}, which is not a state; there are {', '.join(self.states)}."
                 )
-        checked = _as_scalars(found, "dynamics", "derivative")
+        checked = as_scalars(found, "dynamics", "derivative")
         return ca.vertcat(*(checked[name] for name in self.states))
 
     def by_state(self, vector: Any) -> dict[str, Any]:
@@ -178,7 +152,7 @@ class Equations:
         found = call(self.outputs, "simulator's outputs", x=x, u=u, p=p, t=t, **more)
         if not isinstance(found, Mapping) or not found:
             raise InputError("The simulator's outputs must be a dict {output: expression} with at least one entry.")
-        return _as_scalars(found, "outputs", "expression")
+        return as_scalars(found, "outputs", "expression")
 
     @cached_property
     def output_names(self) -> tuple[str, ...]:
@@ -239,7 +213,7 @@ class Equations:
             what = f"signal {name!r} of port {port.name!r}"
             if name in self.inputs:
                 raise InputError(f"The {what} has the name of an input; give it another one.")
-            found[name] = _as_scalar(call(signal, what, x=x, u=u, p=p, t=t), what)
+            found[name] = as_scalar(call(signal, what, x=x, u=u, p=p, t=t), what)
         return found
 
     def into(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
@@ -252,7 +226,7 @@ class Equations:
         for target in found:
             if target not in known:
                 raise InputError(f"Port {port.name!r} goes into {target!r}; there are {', '.join(known)}.")
-        given = _as_scalars(found, f"port {port.name!r}", "factor")
+        given = as_scalars(found, f"port {port.name!r}", "factor")
         through = ca.mtimes(self._derivative_feedthrough(x, u, p, t), self.state_factors(given))
         rates = dict(zip(self.output_names, ca.vertsplit(through), strict=True))
         return given | {k: v for k, v in rates.items() if k not in given and not v.is_zero()}
@@ -264,13 +238,13 @@ class Equations:
     def across(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Any:
         """Evaluate the local coordinate z."""
         name = f"`across` of port {port.name!r}"
-        return _as_scalar(call(port.across, name, x=x, u=u, p=p, t=t), name)
+        return as_scalar(call(port.across, name, x=x, u=u, p=p, t=t), name)
 
     def term(self, port: Port, z: Any, dz: Any, x: Named, u: Named, p: Named) -> Any:
         """Evaluate a port's term at another coordinate and rate."""
         assert port.term is not None
         name = f"`term` of port {port.name!r}"
-        return _as_scalar(call(port.term, name, z=ca.SX(z), dz=ca.SX(dz), x=x, u=u, p=p), name)
+        return as_scalar(call(port.term, name, z=ca.SX(z), dz=ca.SX(dz), x=x, u=u, p=p), name)
 
     def term_parameters(self, name: str) -> tuple[str, ...]:
         """List the parameters that a port's term depends on."""
@@ -281,7 +255,7 @@ class Equations:
     def rate(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Any:
         """Evaluate the rate dz/dt of a port inside the equations, with constant inputs."""
         if port.rate is not None:
-            return _as_scalar(call(port.rate, f"`rate` of port {port.name!r}", x=x, u=u, p=p, t=t), "rate")
+            return as_scalar(call(port.rate, f"`rate` of port {port.name!r}", x=x, u=u, p=p, t=t), "rate")
         return ca.jtimes(self.across(port, x, u, p, t), stack(x), self.derivatives(x, u, p, t))
 
     def _check_term(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> None:
@@ -346,10 +320,10 @@ class Equations:
 
         Without declared ports there is one for each state's equation that is no definition of a speed.
         """
-        return self._every_port
+        return self._all_ports
 
     @cached_property
-    def _every_port(self) -> tuple[Port, ...]:
+    def _all_ports(self) -> tuple[Port, ...]:
         equations = () if self.discrete else (name for name in self.states if name not in self.kinematic)
         inner = self.ports or tuple(map(self._equation_port, equations))
         domain = common_domain(port.domain for port in inner)  # also of actuators: a voltage is a signal in all domains
@@ -524,69 +498,3 @@ def _evaluate_at_random_points(function: ca.Function) -> list[np.ndarray]:
     with np.errstate(all="ignore"):
         results = zip(*(function.call([point]) for point in points), strict=True)
         return [np.array([value.full().ravel() for value in column]) for column in results]
-
-
-def _check_expressions(found: Mapping[str, Any], known: Any) -> None:
-    """Refuse foreign symbols, and the NaN that `math.sin(symbol)` gives without an error."""
-    names, expressions = list(found), list(found.values())
-    f = ca.Function("equations", [known], expressions, {"allow_free": True})
-    if f.has_free():
-        raise InputError(f"The simulator's equations hold a symbol {f.get_free()[0]!r}; use x, u, p and t alone.")
-    k = range(f.n_instructions())
-    if any(f.instruction_id(i) == ca.OP_CONST and f.instruction_constant(i) != f.instruction_constant(i) for i in k):
-        for name in names:
-            _check_expressions({name: found[name]}, known) if len(names) > 1 else None
-        raise InputError(
-            f"The equation of {names[0]!r} holds a number that is none (NaN); use CasADi's functions on symbols, "
-            "as in ca.sin(x.pos) rather than math.sin(x.pos), and check constants."
-        )
-
-
-def _as_scalar(value: Any, name: str) -> Any:
-    try:
-        value = ca.SX(value)
-    except Exception:
-        raise InputError(f"The {name} gave {value!r}; give a number or a CasADi expression.") from None
-    if value.shape != (1, 1):
-        raise InputError(f"The {name} has the shape {value.shape}; give one number or expression.")
-    return value
-
-
-def _as_scalars(found: Mapping[str, Any], where: str, kind: str) -> dict[str, Any]:
-    return {name: _as_scalar(value, f"{kind} of {name!r} in the {where}") for name, value in found.items()}
-
-
-def check_parameters(given: Any) -> ParameterSet:
-    """Check a mapping of parameters by name and lay out their vector."""
-    if not isinstance(given, Mapping):
-        raise InputError(f"The simulator's parameters are {given!r}; give {{name: Parameter(value, ...)}}.")
-    for name, value in given.items():
-        if not isinstance(value, Parameter):
-            raise InputError(f"The simulator's parameter {name!r} is {value!r}; give Parameter(value, ...).")
-    return ParameterSet(dict(given))
-
-
-def check_names(given: Any, kind: str) -> tuple[str, ...]:
-    """Return one name or several as a tuple; refuse anything else, and repeated names."""
-    names = as_tuple(given)
-    if not all(isinstance(name, str) and name for name in names):
-        raise InputError(f"The simulator's {kind} are {given!r}; give their names, such as ('pos', 'vel').")
-    if len(set(names)) != len(names):
-        raise InputError(f"The simulator's {kind} {', '.join(names)} are not unique; name each once.")
-    return names
-
-
-def _check_ports(given: Any) -> tuple[Port, ...]:
-    ports = as_tuple(given)
-    if not all(isinstance(port, Port) for port in ports):
-        raise InputError(f"The simulator's ports are {given!r}; give Port(name, into, across) or a tuple of several.")
-    names = [port.name for port in ports]
-    if len(set(names)) != len(names):
-        raise InputError(f"The port names {listed(names)} are not unique; name each port once.")
-    for name in names:
-        if kind_of(name):
-            raise InputError(
-                f"The port {name!r} is declared with a name that begins like those of the built-in ports "
-                f"({', '.join(f'{kind}:' for kind in BUILT_IN)}), which need no declaration; call it something else."
-            )
-    return ports

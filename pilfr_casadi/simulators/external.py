@@ -28,7 +28,7 @@ RELATIVE_STEP = float(np.sqrt(np.finfo(float).eps))  # at this step rounding and
 NOMINAL = 1e-3  # size of an argument that is zero: small compared with values in SI units, far above rounding
 ROUNDING = 1e-9  # relative difference that rounding may cause
 TINY = 1e-100  # against division by zero along a direction of zeros
-leaves: dict[str, ca.Function] = {}  # by name; CasADi itself does not keep callbacks alive
+leaves: dict[str, Leaf] = {}  # by name; CasADi itself does not keep callbacks alive
 units: dict[str, FmuSignals] = {}  # of leaves that are functional mock-up units
 
 
@@ -102,24 +102,14 @@ def equal_state(values: np.ndarray, states: np.ndarray, names: Sequence[str]) ->
     return names[int(np.argmax(same))] if np.any(same) else ""
 
 
-class PythonFunction(ca.Callback):
-    """A Python function of arrays as a `casadi.Function`; if it fails, its results are NaN.
+class Leaf(ca.Callback):
+    """A program of its own as a `casadi.Function`, from vectors of these `sizes` to one of `size` numbers."""
 
-    Attributes
-    ----------
-    calls : int
-        How often it was called.
-    failure : Exception or None
-        Its first error.
-    """
-
-    def __init__(self, function: Callable[..., np.ndarray], n_in: tuple[int, ...], n_out: int) -> None:
+    def __init__(self, name: str, sizes: tuple[int, ...], size: int) -> None:
         ca.Callback.__init__(self)
-        self.function, self.sizes, self.size = function, n_in, n_out
-        self.calls = 0
-        self.failure: Exception | None = None
-        self.construct(f"python{len(leaves)}", {})
-        leaves[self.name()] = self
+        self.sizes, self.size = sizes, size
+        self.construct(name, {})
+        leaves[name] = self
 
     def get_n_in(self) -> int:
         """Return the number of arguments, for CasADi; there is one result."""
@@ -136,6 +126,23 @@ class PythonFunction(ca.Callback):
     def has_eval_buffer(self) -> bool:
         """Let CasADi pass its memory; matrices would cost more time than many functions do."""
         return True
+
+
+class PythonFunction(Leaf):
+    """A Python function of arrays as a `casadi.Function`; if it fails, its results are NaN.
+
+    Attributes
+    ----------
+    calls : int
+        How often it was called.
+    failure : Exception or None
+        Its first error.
+    """
+
+    def __init__(self, function: Callable[..., np.ndarray], sizes: tuple[int, ...], size: int) -> None:
+        self.function, self.calls = function, 0
+        self.failure: Exception | None = None
+        super().__init__(f"python{len(leaves)}", sizes, size)
 
     def eval_buffer(self, arguments: Sequence[memoryview], results: Sequence[memoryview]) -> int:
         """Call the function, for CasADi."""

@@ -28,11 +28,12 @@ from .._base import InputError, check_known
 from ..models import Named, Parameter, parameter_within, within_a_factor
 from .external import NOMINAL, ROUNDING, call_external, equal_state, external, leaves, units
 from .fmu_cosimulation import CoSimulation, SteppedEquations, SteppedUnit, check_force, unknown_signal
-from .fmu_description import Description, Variable, check_file
+from .fmu_description import Description, Unit, Variable, check_file
 from .fmu_instance import FmuFile, FmuSignals, unpack
 from .fmu_process import FmuFunction, has_time_event
 from .ports import Port
 from .simulator import Simulator
+from .user_arguments import choose_parameters
 
 COMPARED_POINTS = 8  # trial points at which derivatives and outputs are compared with states and with forces in ports
 PORT_KEYS = ("into", "across", "rate", "unit", "across_unit")
@@ -40,31 +41,19 @@ TIMES = (0.0, 0.7, 13.0, 400.0)  # s, at which a dependence on time is looked fo
 
 
 @dataclass(frozen=True, eq=False)
-class _Unit:
+class _Unit(Unit):
     """A unit with some of its outputs: `(t, x, u, p) -> (derivatives, outputs)`.
 
     `parameters` are the tunable ones, and fixed ones that the user names.
     """
 
-    path: Path
-    described: Description
     parameters: tuple[str, ...]
     outputs: tuple[str, ...]
-
-    @property
-    def variables(self) -> Mapping[str, Variable]:
-        """Variables by name."""
-        return self.described.variables
 
     @property
     def states(self) -> tuple[str, ...]:
         """Names of the states."""
         return self.described.states
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs."""
-        return self.described.of("input")
 
     @cached_property
     def leaf(self) -> FmuFunction:
@@ -81,7 +70,7 @@ class _Unit:
             described = self.described
             file = FmuFile(folder, int(described.version), described.token, described.binary, parameters, restarts)
             units[name] = FmuSignals(file, len(self.states), inputs, outputs)
-            leaves[name] = FmuFunction(name, units[name])
+            FmuFunction(name, units[name])
         found = leaves[name]
         assert isinstance(found, FmuFunction)
         return found
@@ -94,21 +83,16 @@ class _Unit:
         """Start values of variables, zero if the file gives none."""
         return np.nan_to_num(np.array([self.variables[n].start for n in names]))
 
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Numbers of t, x, u and p."""
-        return 1, len(self.states), len(self.inputs), len(self.parameters)
-
     @cached_property
     def function(self) -> ca.Function:
         """`z -> (derivatives, outputs)` in one vector, for expressions; z holds t, x, u and p."""
 
         def evaluate(z: Any) -> Any:
-            return call_external(self.leaf, *(z[a:b] for a, b in pairwise(np.cumsum([0, *self.sizes]).tolist())))
+            return call_external(self.leaf, *(z[a:b] for a, b in pairwise(np.cumsum([0, *self.leaf.sizes]).tolist())))
 
         nominal = [1.0, *(self.variables[n].nominal for n in (*self.states, *self.inputs, *self.parameters))]
         sizes = NOMINAL * np.nan_to_num(np.array(nominal), nan=1.0)
-        return external(evaluate, sizes, len(self.states) + len(self.outputs))
+        return external(evaluate, sizes, self.leaf.size)
 
     def values(self, t: float, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
         """Evaluate derivatives and outputs by numbers."""
@@ -140,7 +124,7 @@ def from_fmu(
         Actuators and sensors are always ports.
     parameters : names, or mapping from names to Parameter, optional
         Parameters that a fit may change; by default all tunable ones. Fixed ones may be named too; each change of
-        their values restarts the unit. The others keep the unit's values.
+        their values restarts the unit. Those with `bounds` are free too; the others keep the unit's values.
     bounds : mapping, optional
         `(lower, upper)` by parameter; by default the unit's bounds, else a factor of ten either way.
     inputs, outputs : tuple of str, optional
@@ -173,28 +157,21 @@ def from_fmu(
         _check_port(name, port)
     used = [name for port in given.values() for name in _factors(port.get("into"))]
     own = parameters if parameters is not None else unit.parameters
-    _check_types(path, described, (*used, *own, *bounds, *(inputs or ()), *(outputs or ())))
+    _check_names(unit, (*used, *(inputs or ())), outputs or (), (*own, *bounds))
     all_outputs = described.of("output")
-    for names, there, kind in (
-        (used, unit.inputs, "inputs"),
-        (inputs or (), unit.inputs, "inputs"),
-        (outputs or (), all_outputs, "outputs"),
-        ((*own, *bounds), unit.parameters, "parameters"),
-    ):
-        check_known(names, there, kind, path)
     drives = tuple(inputs) if inputs is not None else tuple(n for n in unit.inputs if n not in used)
     measured = tuple(outputs) if outputs is not None else all_outputs
     read = {port.get(key) for port in given.values() for key in ("across", "rate")}
     needed = tuple(n for n in all_outputs if n in measured or n in read)
-    made = own if isinstance(own, Mapping) else {n: _make_parameter(unit.variables[n], bounds.get(n)) for n in own}
+    made = choose_parameters(own, bounds, lambda n, ends: _make_parameter(unit.variables[n], ends))
     equations: _Equations | SteppedEquations
     if isinstance(unit, _Unit):
-        equations = _Equations(replace(unit, outputs=needed), drives, tuple(own), measured)
+        equations = _Equations(replace(unit, outputs=needed), drives, tuple(made), measured)
     else:
         symbols = tuple(n for n in unit.inputs if n in drives or n in used)
         equations = SteppedEquations(unit, symbols, made, needed, measured)
     return Simulator(
-        equations.dynamics,
+        equations,
         equations.measured,
         equations.states,
         drives,
@@ -214,11 +191,22 @@ def _load_unit(path: Path, described: Description, named: Sequence[str], outputs
     return _Unit(path, described, parameters, tuple(outputs or ()))
 
 
-def _check_types(path: Path, described: Description, names: Sequence[str]) -> None:
-    """Refuse variables that are no single real number."""
-    for name in names:
-        if kind := described.others.get(name):
-            raise InputError(f"{name!r} of {path} is {kind}; name variables that are single numbers of 64 bits.")
+def _check_names(
+    unit: _Unit | SteppedUnit, inputs: Sequence[str], outputs: Sequence[str], parameters: Sequence[str]
+) -> None:
+    """Refuse names of inputs, outputs and parameters that the unit does not have as numbers."""
+    roles = (
+        (inputs, unit.inputs, "inputs"),
+        (outputs, unit.described.of("output"), "outputs"),
+        (parameters, unit.parameters, "parameters"),
+    )
+    for names, known, kind in roles:
+        for name in names:
+            if found := unit.described.others.get(name):
+                raise InputError(
+                    f"{name!r} of {unit.path} is {found}; name variables that are single numbers of 64 bits."
+                )
+        check_known(names, known, kind, unit.path)
 
 
 class _Equations:
@@ -283,7 +271,7 @@ class _Equations:
 
     @property
     def note(self) -> str:
-        """Events of the unit, in words."""
+        """Events of the unit, in words; a `Simulator` prints it."""
         count = self.unit.described.event_indicators
         kinds = [f"{count} event indicator{'s' * (count > 1)}"] * bool(count) + ["events in time"] * self.timed_events
         if not kinds:
@@ -293,13 +281,8 @@ class _Equations:
             "and dry friction inside the unit are only as exact as the sampling"
         )
 
-    @property
-    def dynamics(self) -> _Equations:
-        """The dynamics of a `Simulator`, which prints its `note`."""
-        return self
-
     def __call__(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
-        """Evaluate the derivatives by state."""
+        """Evaluate the derivatives by state: the dynamics of a `Simulator`."""
         rows = self._rows([_rate(n) for n in self.states], x, u, p, t if self.timed else 0.0)
         return dict(zip(self.states, rows, strict=True))
 

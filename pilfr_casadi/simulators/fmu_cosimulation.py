@@ -26,7 +26,7 @@ from .._base import InputError, check_known, listed, positive
 from ..models import Named, Parameter
 from .black_box import BlackBox
 from .external import NOMINAL, RELATIVE_STEP
-from .fmu_description import Description, Variable
+from .fmu_description import Description, Unit
 from .fmu_slave import Slave
 from .polynomial_equations import find_polynomials
 
@@ -56,14 +56,11 @@ class CoSimulation:
 
 
 @dataclass(frozen=True, eq=False)
-class SteppedUnit:
+class SteppedUnit(Unit):
     """A unit for co-simulation with known states."""
 
-    path: Path
-    variables: Mapping[str, Variable]
     slave: Slave
     dt: float
-    variable_steps: bool
     begin: Mapping[str, float]  # values of variables after the start of the program
     states: tuple[str, ...] = ()
 
@@ -77,8 +74,8 @@ class SteppedUnit:
                 "from_fmu(..., cosimulation=CoSimulation(dt=0.001))."
             )
         slave = Slave(path, described.version, described.token, described.slave)
-        unit = cls(path, described.variables, slave, positive(dt, "dt"), described.variable_steps, {})
-        candidates = unit._candidates(described)
+        unit = cls(path, described, slave, positive(dt, "dt"), {})
+        candidates = unit._candidates()
         names = tuple(dict.fromkeys((*candidates, *unit.inputs, *unit.parameters, *unit.outputs)))
         begin, failure = unit.steps((), np.zeros((1, 0)), 0.0, names)
         if not failure:
@@ -102,33 +99,25 @@ class SteppedUnit:
             "exchange or with states that can be set, or give a table of what it simulates."
         )
 
-    def _role(self, causality: str) -> tuple[str, ...]:
-        return tuple(v.name for v in self.variables.values() if v.causality == causality)
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs."""
-        return self._role("input")
-
     @property
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs."""
-        return self._role("output")
+        return self.described.of("output")
 
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the tunable parameters."""
-        return tuple(n for n in self._role("parameter") if self.variables[n].variability == "tunable")
+        return tuple(n for n in self.described.of("parameter") if self.variables[n].variability == "tunable")
 
     def steps(self, names: Sequence[str], values: np.ndarray, h: float, read: Sequence[str]) -> tuple[np.ndarray, str]:
         """Set variables by name and step; see `Slave.steps`."""
         sets, reads = ([self.variables[n].reference for n in each] for each in (names, read))
         return self.slave.steps(sets, values, np.full(len(values), h), reads)
 
-    def _candidates(self, described: Description) -> tuple[str, ...]:
+    def _candidates(self) -> tuple[str, ...]:
         """List the states that the file names, or else all outputs and local variables."""
         local = (v.name for v in self.variables.values() if v.causality == "local" and v.variability == "continuous")
-        return described.states or (*self.outputs, *local)
+        return self.described.states or (*self.outputs, *local)
 
     def _with_states(self, names: tuple[str, ...], given: bool) -> SteppedUnit | None:
         """Copy with the states among some variables: they can be set and, if not `given`, change a step."""
@@ -226,7 +215,7 @@ class SteppedEquations:
         self._start = np.array([unit.begin[n] for n in self.names])
         self._sizes = np.nan_to_num(np.array([unit.variables[n].nominal for n in self.names]), nan=1.0)
         inverse = [j for j, n in enumerate(self.names) if n in parameters and np.prod(self._range(n)) > 0]
-        found = find_polynomials(self._derivatives, self._draw, inverse) if unit.variable_steps else None
+        found = find_polynomials(self._derivatives, self._draw, inverse) if unit.described.variable_steps else None
         self.polynomials = found
         # an output that is no state is read after a step, so it belongs to the next sample and is kept as a state
         self.states = unit.states if found is not None else self.rows
@@ -239,9 +228,13 @@ class SteppedEquations:
 
     @property
     def note(self) -> str:
-        """Origin of the equations, in words."""
+        """Origin of the equations, in words; a `Simulator` prints it."""
         if self.discrete:
-            why = "no equations were found" if self.unit.variable_steps else "the length of its steps cannot be changed"
+            why = (
+                "no equations were found"
+                if self.unit.described.variable_steps
+                else "the length of its steps cannot be changed"
+            )
             return (
                 f"steps of {self.unit.dt:g} s, because {why}; so the unit is called at every sample, and a diagnosis "
                 "may take hours. Equations are polynomials in states, inputs and parameters; nominal values in the "
@@ -356,13 +349,8 @@ class SteppedEquations:
         found = dict(zip(self.rows, ca.vertsplit(rows), strict=True))
         return {n: found[n] for n in names}
 
-    @property
-    def dynamics(self) -> SteppedEquations:
-        """The dynamics of a `Simulator`, which prints its `note`."""
-        return self
-
     def __call__(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
-        """Evaluate the derivatives, or the next states, by name."""
+        """Evaluate the derivatives, or the next states, by name: the dynamics of a `Simulator`."""
         found = self._evaluate(x, u._values, p)
         return {n: found[n] for n in self.states}
 

@@ -62,6 +62,24 @@ class Description:
         return tuple(v.name for v in self.variables.values() if v.causality == causality)
 
 
+@dataclass(frozen=True, eq=False)
+class Unit:
+    """A unit with the content of its description."""
+
+    path: Path
+    described: Description
+
+    @property
+    def variables(self) -> dict[str, Variable]:
+        """Variables by name."""
+        return self.described.variables
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.described.of("input")
+
+
 def describe(path: Path) -> Description:
     """Read modelDescription.xml."""
     try:
@@ -175,9 +193,8 @@ def needs_step_size(path: str | os.PathLike[str]) -> bool:
 
 def fmu_signals(path: str | os.PathLike[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """List the inputs and the outputs of a functional mock-up unit, without running it."""
-    variables = describe(Path(path)).variables.values()
-    inputs, outputs = (tuple(v.name for v in variables if v.causality == role) for role in ("input", "output"))
-    return inputs, outputs
+    described = describe(Path(path))
+    return described.of("input"), described.of("output")
 
 
 def tidy(error: Exception) -> str:

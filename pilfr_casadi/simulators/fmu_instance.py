@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-OK, DISCARD = 1, 2  # largest status of a successful call, with or without a warning; of one that may be repeated
+OK, DISCARD = 1, 2  # statuses of FMI: up to 1 success, perhaps with a warning; 2 a refused value; above an error
 MOST_ITERATIONS = 100  # updates of discrete states in one event
 _LOGGER = ctypes.CFUNCTYPE(None)  # called with any arguments, which it ignores
 _log = _LOGGER(lambda: None)

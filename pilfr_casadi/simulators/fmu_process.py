@@ -3,8 +3,8 @@
 Units crash and hang, mostly at some values of their parameters. An evaluation that ends or blocks the process gives
 NaN, and the next one starts a new process. One message asks for one point, or for a whole run of a compiled model that
 calls the unit (`run_in_unit`). A message and its reply take some 15 µs: nothing beside a run, and ten times as long as
-a small unit itself needs for one point. So single points are evaluated in this process, as soon as the unit's own has
-answered with the same values of the parameters; a unit that crashes there at some states ends this process as well.
+a small unit itself needs for one point. So single points are evaluated in the user's process once the unit's own
+process has answered with the same parameters; a unit that crashes at some states then ends the user's process as well.
 """
 
 from __future__ import annotations
@@ -15,19 +15,16 @@ import functools
 import math
 import os
 import pickle
-import struct
-import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
-from .._base import abandoned
+from .._base import ChildProcess, abandoned, open_replies, read_message, write_message
+from .external import Leaf
 from .fmu_description import tidy
 from .fmu_instance import FmuEvaluation, FmuFile, FmuSignals, UnitError, evaluation
 
@@ -36,47 +33,24 @@ CALL_SECONDS = 5.0  # seconds that another job may take
 PACE = 20.0  # further seconds, over those of the slowest job of its kind and length
 MOST_IDLE = 4  # processes that wait for their next job
 MOST_LOSSES = 3  # processes that a point's parameters may end before they count as failed
-WATCH_SECONDS = 0.1  # interval at which limits are checked
-HEAD = struct.Struct("<cQ")  # kind and length of a message
-POINT, CALL = b"p", b"c"
+POINT, CALL = b"p", b"c"  # kinds of jobs, the first byte of a message
 
 
-class _UnitProcess:
+class _UnitProcess(ChildProcess):
     """A process that holds one instance of one unit."""
 
     def __init__(self, file: FmuFile) -> None:
-        self.file, self.owner = file, os.getpid()
+        super().__init__(serve)
+        self.file, self.owner, self.jobs = file, os.getpid(), 0
         self.signals: FmuSignals | None = None  # evaluated by POINT
-        self.deadline, self.expired, self.jobs = np.inf, False, 0
-        self.errors = tempfile.TemporaryFile()  # noqa: SIM115
-        path = os.pathsep.join(p or os.getcwd() for p in sys.path)
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", f"from {__name__} import serve; serve()"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self.errors,
-            env={**os.environ, "PYTHONPATH": path},
-            start_new_session=True,  # Ctrl-C is for the process that waits for the results
-        )
-        self.inbox: Any = self.process.stdin
-        self.outbox: Any = self.process.stdout
-        threading.Thread(target=self._watch, daemon=True).start()
-
-    def _watch(self) -> None:
-        while self.process.poll() is None:
-            if time.monotonic() > self.deadline:
-                self.expired = True
-                self.process.kill()
-            time.sleep(WATCH_SECONDS)
 
     def ask(self, kind: bytes, body: bytes, limit: float) -> bytes:
         """Send a job; return the reply."""
         begin = time.monotonic()
         self.deadline = begin + limit + (0.0 if self.jobs else _loading.get(self.file, LOADING_SECONDS))
-        self.inbox.write(HEAD.pack(kind, len(body)) + body)
-        self.inbox.flush()
-        _, reply = _receive(self.outbox)
-        self.deadline = np.inf
+        write_message(self.inbox, kind + body)
+        reply = read_message(self.outbox)
+        self.deadline = math.inf
         if not self.jobs:
             _loading.setdefault(self.file, CALL_SECONDS + time.monotonic() - begin)
         self.jobs += 1
@@ -84,31 +58,22 @@ class _UnitProcess:
 
     def describe_end(self) -> str:
         """Describe in words how the process ended."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(5)
-        code = self.process.poll()
+        code = self.exit_status()
         if self.expired:
             return "takes too long"
         how = f"signal {-code}" if code is not None and code < 0 else f"status {code}"
         return f"ends the process that runs it ({how})"
 
-    def close(self) -> None:
-        """Kill the process and close its pipes."""
-        self.process.kill()
-        self.process.wait()
-        for pipe in (self.inbox, self.outbox, self.errors):
-            with contextlib.suppress(OSError, ValueError):
-                pipe.close()
-
 
 _loading: dict[FmuFile, float] = {}  # further seconds for the first job of another process of a unit
 _idle: list[_UnitProcess] = []
-_lock, _here = threading.Lock(), threading.Lock()
+_idle_lock = threading.Lock()
+_evaluation_lock = threading.Lock()  # the unit has one instance in this process
 
 
 def _take(file: FmuFile) -> _UnitProcess:
     """Take an idle process of a unit, or a new one; a forked process leaves those of its parent alone."""
-    with _lock:
+    with _idle_lock:
         for process in _idle:
             if process.file == file and process.owner == os.getpid():
                 _idle.remove(process)
@@ -117,7 +82,7 @@ def _take(file: FmuFile) -> _UnitProcess:
 
 
 def _give_back(process: _UnitProcess) -> None:
-    with _lock:
+    with _idle_lock:
         _idle.append(process)
         excess = _idle.pop(0) if len(_idle) > MOST_IDLE else None
     if excess is not None and excess.owner == os.getpid():
@@ -167,7 +132,7 @@ def run_in_unit(
 _pace: dict[Any, float] = {}  # most seconds by length, by unit and function
 
 
-class FmuFunction(ca.Callback):
+class FmuFunction(Leaf):
     """A unit as a `casadi.Function` `(t, x, u, p) -> (derivatives, outputs)`; if it fails, its results are NaN.
 
     Attributes
@@ -177,27 +142,10 @@ class FmuFunction(ca.Callback):
     """
 
     def __init__(self, name: str, signals: FmuSignals) -> None:
-        ca.Callback.__init__(self)
         self.signals, self.failure = signals, ""
         self._losses: dict[bytes, int] = {}  # lost processes by parameter values
         self._answered: set[bytes] = set()  # parameter values at which a process has answered
-        self.construct(name, {})
-
-    def get_n_in(self) -> int:
-        """Return the number of arguments, for CasADi; there is one result."""
-        return 4
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Return the shape of an argument."""
-        return ca.Sparsity.dense(self.signals.sizes[i], 1)
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Return the shape of the result."""
-        return ca.Sparsity.dense(self.signals.results, 1)
-
-    def has_eval_buffer(self) -> bool:
-        """Ask CasADi for its memory instead of matrices, which take ten times as long."""
-        return True
+        super().__init__(name, signals.sizes, signals.results)
 
     def eval_buffer(self, arguments: list[memoryview], results: list[memoryview]) -> int:
         """Evaluate one point, for CasADi."""
@@ -216,7 +164,7 @@ class FmuFunction(ca.Callback):
             return none
         parameters = point[len(point) - self.signals.sizes[3] :].astype(np.float32).tobytes()
         if parameters in self._answered and (here := _evaluation_here(self.signals)) is not None:
-            with _here:  # the unit has one instance in this process
+            with _evaluation_lock:
                 if not here.instance.failed[0]:  # a restart may end the process
                     return np.array(here.evaluate(point))
         if self._losses.get(parameters, 0) >= MOST_LOSSES:
@@ -253,14 +201,14 @@ def _has_time_event(signals: FmuSignals) -> bool:
 
 def serve() -> None:
     """Do jobs in the child process: read them from standard input, write results to standard output."""
-    replies, inbox = os.fdopen(os.dup(1), "wb"), sys.stdin.buffer
-    os.dup2(2, 1)  # a unit that prints must not write into the replies
+    replies = open_replies()
     threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
     while True:
         try:
-            kind, body = _receive(inbox)
+            job = read_message(sys.stdin.buffer)
         except EOFError:
             os._exit(0)
+        kind, body = job[:1], job[1:]
         try:
             if kind == POINT:
                 found = evaluation(_selected[0]).evaluate(np.frombuffer(body)).tobytes()
@@ -271,8 +219,7 @@ def serve() -> None:
             found = tidy(error).encode() if kind == POINT else pickle.dumps((None, tidy(error)))
         except Exception as error:
             found = pickle.dumps((None, error))
-        replies.write(HEAD.pack(kind, len(found)) + found)
-        replies.flush()
+        write_message(replies, found)
 
 
 _selected: list[FmuSignals] = []  # in the child process: the signals that POINT evaluates
@@ -287,17 +234,6 @@ def _end_with_parent(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(1.0)
     os._exit(0)
-
-
-def _receive(pipe: Any) -> tuple[bytes, bytes]:
-    head = pipe.read(HEAD.size)
-    if len(head) < HEAD.size:
-        raise EOFError
-    kind, size = HEAD.unpack(head)
-    body = pipe.read(size)
-    if len(body) < size:
-        raise EOFError
-    return kind, body
 
 
 @atexit.register

@@ -21,10 +21,11 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, check_known
-from ..models import Named, Parameter, ParameterSet, parameter_within, within_a_factor
+from ..models import Named, Parameter, parameter_within, within_a_factor
 from .mujoco_model import AXES, MujocoTree
 from .ports import Port
 from .simulator import Simulator
+from .user_arguments import choose_parameters
 
 COMPARED_POINTS = 8  # at which the equations are compared with MuJoCo
 AGREE = 1e-8  # relative difference of accelerations that rounding may cause
@@ -74,14 +75,13 @@ def from_mujoco(
     """
     tree, bounds = MujocoTree.load(model), bounds or {}
     given = tree.default_parameters if parameters is None else parameters
-    own = tuple(dict.fromkeys((*given, *bounds)))
-    tree.check_parameters(own)
+    tree.check_parameters((*given, *bounds))
     check_known(inputs or (), tree.actuators, "actuators", tree.label)
     check_known(outputs or (), tuple(tree.sensors), "joints, and sensors of joints and actuators", tree.label)
-    ends = {n: bounds.get(n) or _default_bounds(n, tree.numbers[n]) for n in own}
-    made = {n: parameter_within(n, tree.numbers[n], ends[n]) for n in own}
-    if isinstance(given, Mapping):
-        made |= ParameterSet(given).free_within({n: ends[n] for n in bounds if n in given})
+    numbers = tree.numbers
+    made = choose_parameters(
+        given, bounds, lambda n, ends: parameter_within(n, numbers[n], ends or _default_bounds(n, numbers[n]))
+    )
     drives = tuple(tree.actuators if inputs is None else inputs)
     measured = tuple(tree.default_outputs if outputs is None else outputs)
     equations = _Equations(tree, tuple(made), drives, measured)
@@ -234,10 +234,10 @@ class _Equations:
 
     def __call__(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
         """Evaluate the derivatives by state: the dynamics of a `Simulator`."""
-        names = self.tree.joints
+        names, speeds = self.tree.joints, [f"{n}.speed" for n in self.tree.joints]
         mass, rest = self._evaluate(x, u, p)[:2]
-        faster = ca.vertsplit(ca.solve(mass, rest))
-        return {n: x[f"{n}.speed"] for n in names} | {f"{n}.speed": a for n, a in zip(names, faster, strict=True)}
+        accelerations = dict(zip(speeds, ca.vertsplit(ca.solve(mass, rest)), strict=True))
+        return {n: x[speed] for n, speed in zip(names, speeds, strict=True)} | accelerations
 
     def outputs(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
         """Evaluate the outputs by name."""

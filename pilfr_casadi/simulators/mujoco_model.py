@@ -166,9 +166,8 @@ class MujocoTree:
     @property
     def frictionless(self) -> bool:
         """Whether a flag of the model disables the dry friction of its joints."""
-        from mujoco import mjtDisableBit as flags
-
-        return bool(self.model.opt.disableflags & (flags.mjDSBL_FRICTIONLOSS | flags.mjDSBL_CONSTRAINT))
+        bits = self.mujoco.mjtDisableBit
+        return bool(self.model.opt.disableflags & (bits.mjDSBL_FRICTIONLOSS | bits.mjDSBL_CONSTRAINT))
 
     @cached_property
     def numbers(self) -> dict[str, float]:

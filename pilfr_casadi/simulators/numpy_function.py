@@ -24,11 +24,12 @@ import numpy as np
 from .._base import InputError, in_words, listed
 from ..models import Named, Parameter, ParameterSet
 from .black_box import BlackBox, Numeric, nominal_sizes
-from .equations import check_names, check_parameters, stack
+from .equations import stack
 from .signature import read_signature
 from .simulator import Simulator
 from .symbols import NotTraceable, expression, symbols
 from .tracing import Trace, accept_symbols, explore_paths
+from .user_arguments import check_names, check_parameters
 
 COMPARED_POINTS = 40  # at which the equations are compared with the function
 SIZE_DECADES = (-3.0, 2.0)  # range of the powers of ten of states and inputs at these points, in their own units

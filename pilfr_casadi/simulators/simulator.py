@@ -18,8 +18,8 @@ from ..data import Recording, conversion
 from ..laws import readable_unit
 from ..models import Parameter, ParameterSet, accumulate_steps
 from .equations import Equations
-from .integration import discretise_for
 from .ports import Placed
+from .substeps import discretise_for
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -256,11 +256,8 @@ def unit_notes(simulator: Simulator, recording: Recording) -> dict[str, str]:
     """Describe, by channel, the conversions of a recording's values to the simulator's units, and unknown units."""
     out = {}
     for name in (n for n in (*simulator.inputs, *simulator.output_names) if n in recording.units):
-        unit, wanted, factor = (
-            recording.units[name],
-            simulator.units.get(name, ""),
-            unit_factor(simulator, recording, name),
-        )
+        unit, wanted = recording.units[name], simulator.units.get(name, "")
+        factor = unit_factor(simulator, recording, name)
         said = f"{name} is recorded in {unit}, and the simulator has it in {wanted}"
         if factor != 1:
             out[name] = f"{said}: its values were multiplied by {factor:g}."

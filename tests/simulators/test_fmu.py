@@ -121,6 +121,11 @@ def test_a_port_enters_an_input_and_reads_outputs(unit):
 def test_parameters_and_bounds_can_be_chosen(unit):
     chosen = guided(unit, parameters=("k1",), bounds={"k1": (300, 500)})
     assert list(chosen.parameters) == ["k1"] and tuple(map(float, chosen.parameters["k1"].bounds)) == (300, 500)
+    both = guided(unit, parameters=("k1",), bounds={"d1": (1, 3)}).parameters
+    assert list(both) == ["k1", "d1"] and both["d1"].bounds == (1, 3)
+    own = {"d1": Parameter(2.0, fixed=True), "k1": Parameter(380.0, fixed=True)}
+    both = guided(unit, parameters=own, bounds={"d1": (1, 3), "k2": (900, 1100)}).parameters
+    assert list(both) == ["d1", "k1", "k2"] and [bool(p.fixed) for p in both.values()] == [False, True, False]
     own = guided(unit, parameters={"d2": Parameter(2.0, fixed=True)})
     assert list(own.parameters) == ["d2"] and float(own.parameters["d2"].value) == 2.0
     given = recording(2, samples=100)
@@ -241,6 +246,24 @@ def test_a_parameter_at_which_the_unit_crashes_or_hangs_is_a_failed_trial(tmp_pa
         assert np.all(np.isnan(y[2:]))
     for y in runs(unit, given, k1=500.0):  # a new process
         assert np.all(np.isfinite(y))
+
+
+FINITE_SAMPLES = """
+import pickle, sys
+import numpy as np
+simulator, recordings = pickle.load(sys.stdin.buffer)
+print([int(np.sum(np.isfinite(simulator.simulate(r)[:, 0]))) for r in recordings])
+"""
+
+
+def test_a_unit_that_refuses_a_second_instance_does_not_end_the_process_of_its_user(tmp_path):
+    given = recording(6, samples=40)
+    pushed = given.with_(u=given.u + 1e5)
+    job = cloudpickle.dumps((guided(c_rig(tmp_path / "a.fmu", "SINGLE")), (given, pushed, given)))
+    done = subprocess.run([sys.executable, "-c", FINITE_SAMPLES], input=job, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr.decode()
+    whole, part, again = map(int, done.stdout.decode().strip("[]\n").split(","))
+    assert whole == again == len(given) and 0 < part < len(given)
 
 
 def test_a_unit_that_crashes_at_some_parameters_can_be_fitted(tmp_path):
