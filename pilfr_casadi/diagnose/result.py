@@ -14,9 +14,9 @@ import numpy as np
 from .._base import InputError, later, to_json, write_atomically
 from ..data import SAME_STEP, Recording, as_recordings, nrmse
 from ..engine import make_engine
-from ..identify import RUN_AWAY, match_channels, run_free
+from ..identify import RUN_AWAY, run_free
 from ..models import ParameterSet
-from ..simulators import ACTUATOR, Simulator, discretise, name_at, split_port
+from ..simulators import ACTUATOR, Simulator, discretise, match_channels, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
 from .effect import Effect
@@ -251,8 +251,9 @@ class Diagnosis:
         Returns
         -------
         array, shape (M, n_y)
-            Outputs in the simulator's order, at the samples of the recording as the diagnosis has corrected it (a shift
-            cuts samples off); not finite where the simulation diverges.
+            Outputs in the simulator's order and units, at the samples of the recording as the diagnosis has corrected
+            it (a shift cuts samples off); not finite where the simulation diverges. `matched(recording)` has the
+            measured outputs in the same units at the same samples; `plot` draws both.
 
         Raises
         ------
@@ -338,9 +339,7 @@ class Diagnosis:
             First scored sample; an initial state is estimated from the samples before it.
         """
         simulator = simulator or self.corrected
-        r, dt = match_channels(simulator, recording), self.train[0].dt
-        if not any(recording is known for known in self.train):  # training recordings are corrected already
-            (r,) = edited([r], self.gates)
+        r, dt = self.matched(recording), self.train[0].dt
         if abs(r.dt / dt - 1) > SAME_STEP:
             raise InputError(f"The recording's step is {r.dt:g} s, the training's {dt:g} s; resample it.")
         fitted = self.evidence.get("after" if simulator is self.corrected else "without")
@@ -354,6 +353,14 @@ class Diagnosis:
         y, skip = run_free(model, make_engine(model), r, one.starts, known=one.known)
         return r, y, skip
 
+    def matched(self, recording: Recording) -> Recording:
+        """Return a recording with the simulator's channels, order and units, corrected as the training was (`gates`).
+
+        Training recordings of the diagnosis are corrected already.
+        """
+        matched = match_channels(self.corrected, recording)
+        return matched if any(recording is known for known in self.train) else edited([matched], self.gates)[0]
+
     def export(self, **options: Any) -> Any:
         """Export the corrected simulator as a step over one sample, with the hold and sub-steps of the fit.
 
@@ -364,6 +371,8 @@ class Diagnosis:
         from ..export import exported
 
         free = replace(self.corrected, observer=None)
+        if isinstance(options.get("start"), Recording):
+            options["start"] = self.matched(options["start"])
         return exported(free, dt=self.train[0].dt, hold=self.hold, substeps=self.substeps, **options)
 
     def to_casadi(self, name: str = "model", smooth: float = 0.0) -> Any:

@@ -54,8 +54,8 @@ def fit_report(fit: Fit, train: Records, tests: Records, folder: str | os.PathLi
 
 def fit_page(fit: Fit, train: Records, tests: Records, *, model_file: str = "model.json") -> Page:
     """Fill the page of a fit; see `fit_report`."""
-    used = as_recordings(train)
-    unseen = as_recordings(tests) if isinstance(tests, Recording) or len(tests) else ()
+    used = [fit.matched(r) for r in as_recordings(train)]
+    unseen = [fit.matched(r) for r in (as_recordings(tests) if isinstance(tests, Recording) or len(tests) else ())]
     named = [
         (r.with_(name=label_recording(r, role, i, len(recordings))), role)
         for role, recordings in (("training", used), ("test", unseen))

@@ -76,7 +76,12 @@ if TYPE_CHECKING:
         port_name as port_name,
         split_port as split_port,
     )
-    from .simulator import Simulator as Simulator, unit_factor as unit_factor, unit_notes as unit_notes
+    from .simulator import (
+        Simulator as Simulator,
+        match_channels as match_channels,
+        unit_factor as unit_factor,
+        unit_notes as unit_notes,
+    )
     from .user_file import user_variable as user_variable
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
