@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -527,17 +527,20 @@ class Diagnosis:
             if errors:
                 shown = (_error_text(errors[k]) for k in ERROR_NAMES)
                 lines.append(f"  {kind.replace('_', ' '):<10}" + "".join(f"{text:>11}" for text in shown))
-        noise = f"{self._noise_text(self.floor)} ({self.floor['source']})"
+        noise = f"{self.noise_text(self.floor)} ({self.floor['source']})"
         if self.floor.get("test"):
-            noise += f", on the test recordings {self._noise_text(self.noise_on_tests)}"
+            noise += f", on the test recordings {self.noise_text(self.noise_on_tests)}"
         return [*lines, f"  noise floor {noise}"]
 
-    def _noise_text(self, noise: Mapping[str, float]) -> str:
-        """Write a noise floor as far as it is known."""
+    def noise_text(self, noise: Mapping[str, float], write: Callable[[float], str] | None = None) -> str:
+        """Write a noise floor as far as it is known; `write` formats an error, by default as printed."""
+        write = write or _error_text
         most, white = noise["nrmse"], _white(noise)
         if self.verdict == "unexplained" and self.floor["source"] == "estimated":
-            return f"at least {_error_text(most)}"
-        return f"{_error_text(white)} to {_error_text(most)}" if most > NEAR_RATIO * white else _error_text(most)
+            return f"at least {write(most)}"
+        if most > NEAR_RATIO * white:
+            return f"{write(white)} (its white part) to {write(most)} (with the slow part)"
+        return write(most)
 
     @property
     def corrected_faults(self) -> list[str]:

@@ -120,7 +120,8 @@ def headline(diagnosis: Diagnosis) -> str:
     text += f", {percent(errors.get('before'))} refitted"
     if what := correction_words(diagnosis):
         text += f", {percent(errors.get('after'))} {what}"
-    return f"{text}; the noise floor is {percent(diagnosis.noise_on_tests['nrmse'])}."
+    floor = diagnosis.noise_text(diagnosis.noise_on_tests, percent)
+    return f"{text}; the noise floor is {floor}."
 
 
 def facts(diagnosis: Diagnosis) -> dict[str, str]:

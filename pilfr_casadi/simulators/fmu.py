@@ -175,11 +175,12 @@ def from_fmu(
     own = parameters if parameters is not None else unit.parameters
     _check_types(path, described, (*used, *own, *bounds, *(inputs or ()), *(outputs or ())))
     all_outputs = described.of("output")
+    accepted = described.of("parameter") if isinstance(unit, _Unit) else unit.parameters  # fixed ones where named
     for names, there, kind in (
         (used, unit.inputs, "inputs"),
         (inputs or (), unit.inputs, "inputs"),
         (outputs or (), all_outputs, "outputs"),
-        ((*own, *bounds), unit.parameters, "parameters"),
+        ((*own, *bounds), accepted, "parameters"),
     ):
         check_known(names, there, kind, path)
     drives = tuple(inputs) if inputs is not None else tuple(n for n in unit.inputs if n not in used)
