@@ -21,7 +21,7 @@ from pilfr_casadi.data import nrmse, read_csv
 from pilfr_casadi.diagnose import Diagnosis, diagnose
 from pilfr_casadi.engine import compiler
 from pilfr_casadi.identify import load
-from pilfr_casadi.laws import Backlash, Drift, PreslidingFriction, Relaxation, StopHysteresis
+from pilfr_casadi.laws import Backlash, Delay, Drift, PreslidingFriction, Relaxation, StopHysteresis
 from pilfr_casadi.models import PILFR
 from pilfr_casadi.simulators import load_simulator
 
@@ -592,3 +592,9 @@ def test_a_step_takes_what_fits():
         assert np.array_equal(np.asarray(other[0]).ravel(), following.ravel()) and float(other[1]) == y.item()
     assert step(np.tile(x[:, None], 3), np.full((1, 3), 0.3))[0].shape == (7, 3)
     assert step(ca.MX.sym("x", 7), ca.MX.sym("u"))[1].shape == (1, 1)
+
+
+def test_a_long_memory_is_one_entry_of_the_print():
+    delayed = mass_on_spring().with_element("sensor:y", Delay().at({"T": 0.5}))
+    text = str(exported(delayed, dt=0.05))
+    assert re.search(r"sensor:y\.memory1\.\.\d+ \(\d+ states\)", text) and "memory2" not in text
