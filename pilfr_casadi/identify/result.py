@@ -403,7 +403,9 @@ class Fit:
         if self.candidates:
             reached = sorted(c.error for c in self.candidates)
             several = f"the starts reached NRMSE {_format_error(reached[0])} ... {_format_error(reached[-1])}"
-            lines.append(several if count > 1 else f"the start reached NRMSE {_format_error(reached[0])}")
+            text = several if count > 1 else f"the start reached NRMSE {_format_error(reached[0])}"
+            prior = DENSITY_PRIOR in self.note and reached[0] < float(np.mean(self.train_nrmse))
+            lines.append(f"{text}, before the weak prior that makes the weights smooth" if prior else text)
             if not any(c.drawn for c in self.candidates):
                 lines.append("no start is drawn at random, so the seed has no effect")
         if self.linear_nrmse:
