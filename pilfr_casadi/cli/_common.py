@@ -442,6 +442,16 @@ def new_file(folder: str, name: str, overwrite: bool) -> Path:
     return target
 
 
+def check_folder(path: str) -> Path:
+    """Check that the folder of the results can be made and written, and leave nothing new behind."""
+    folder = Path(path)
+    missing = [part for part in (folder, *folder.parents) if not part.exists()]
+    make_folder(path)
+    for part in missing:
+        part.rmdir()
+    return folder
+
+
 def make_folder(path: str) -> Path:
     """Make the folder of the results, and check that it is writable, before any long work."""
     folder = Path(path)

@@ -24,6 +24,7 @@ from ._common import (
     NO_RESULT,
     SimulatorFile,
     SimulatorOptions,
+    check_folder,
     flag,
     make_folder,
     new_file,
@@ -114,7 +115,7 @@ def diagnose_command(options: DiagnoseOptions) -> int:
     train = options.read_all(options.train, inputs, outputs)
     tests = options.read_all(options.test, inputs, outputs)
     _check_recordings(train, tests)
-    folder = make_folder(options.out)
+    folder = check_folder(options.out)
     error, poor = 0.0, ""
     if given is not None:
         simulator = as_simulator(given, list(train.values()))
@@ -152,7 +153,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: SimulatorFile | 
 
     corrected.py loads and corrects the simulator file `source`, if there is one.
     """
-    target = folder / "diagnosis.json"
+    target = make_folder(str(folder)) / "diagnosis.json"
     try:
         with deferred_interrupt():
             diagnosis.save(target)
@@ -302,7 +303,7 @@ def check_command(options: CheckOptions) -> int:
     given = options.simulator_file().load()
     simulator = as_simulator(given)
     recordings = options.read_all(options.train, simulator.inputs, simulator.output_names)
-    folder = make_folder(options.out) if options.out is not None else None
+    folder = check_folder(options.out) if options.out is not None else None
     print_note(simulator)
     print_recordings("training", recordings)
     with deferred_interrupt():
@@ -311,7 +312,7 @@ def check_command(options: CheckOptions) -> int:
     found = check(as_simulator(given, train), train, hold=options.hold)
     print(name_options(str(found)))
     if folder is not None:
-        target = folder / "check.json"
+        target = make_folder(str(folder)) / "check.json"
         write_atomically(target, json_text(found.to_dict()))
         print(f"check: {target}")
     return DONE

@@ -51,9 +51,11 @@ from ._common import (
     NO_RESULT,
     DataOptions,
     bounds_of,
+    check_folder,
     check_given_once,
     check_names,
     flag,
+    initial_state,
     make_folder,
     new_file,
     numbers_of,
@@ -124,7 +126,7 @@ def fit_command(options: FitOptions) -> int:
         check_names(saved, inputs, outputs)
     train_by_path = options.read_all(options.train, inputs, outputs)
     tests_by_path = options.read_all(options.test, inputs, outputs)
-    make_folder(options.out)
+    check_folder(options.out)
     print_recordings("training", train_by_path)
     print_recordings("test", tests_by_path)
     train, tests = list(train_by_path.values()), list(tests_by_path.values())
@@ -224,6 +226,7 @@ def _write(
     result: Fit, task: Fit | PILFR | Lagged, train: list[Recording], tests: list[Recording], target: Path
 ) -> None:
     """Write the model and the report, and print the errors."""
+    make_folder(str(target.parent))
     with deferred_interrupt():
         result.save(target)
         from ..report import fit_report
@@ -243,6 +246,7 @@ def _write(
 def describe_test_error(result: Fit, recording: Recording) -> str:
     """Describe the error on a test recording, or explain why there is none."""
     try:
+        recording = result.matched(recording)
         error, first = result.nrmse(recording), result.scored_from(recording)
     except InputError as reason:
         return f"no NRMSE on {recording.name}: {reason}"
@@ -288,6 +292,7 @@ def simulate_command(options: SimulateOptions) -> int:
         check_names(fitted, inputs, outputs)
     recording, columns, measured = _read_to_simulate(options, inputs, outputs)
     check_names(fitted, recording.inputs, recording.outputs if measured else fitted.model.outputs)
+    recording = fitted.matched(recording)
     y = replace(fitted, engine=announce_engine(fitted, recording, "auto", quiet=True)).simulate(recording)
     return _write_simulated(options, recording, y, fitted.model.outputs, columns, fitted.scored_from)
 
@@ -458,6 +463,7 @@ class ExportOptions:
     smooth: float = option("Width of the rounding of min and max (default: 0, exact).", "EPS", 0.0)
     dt: float | None = option("Duration of a step, needed for a simulator.", "SECONDS")
     hold: Literal["zero", "linear"] | None = option("Course of a simulator's inputs between samples.")
+    initial: Any = initial_state("State in which it begins: zero (default), or the states' values, such as 20,0.5.")
 
 
 @takes_options
@@ -475,7 +481,15 @@ def export_command(options: ExportOptions) -> int:
             raise InputError(f"--{key} was given, but a saved model has its own step; leave it out.")
     if simulated and options.dt is None:
         raise InputError("A simulator has no fixed step; give --dt SECONDS.")
-    step = exported(source, dt=options.dt, hold=options.hold, smooth=options.smooth, name=options.name)
+    if options.initial in ("estimate", "periodic"):
+        raise InputError(
+            f"--initial {options.initial} needs a recording; give zero or each state's value, as in --initial 20,0.5."
+        )
+    start = None if options.initial in (None, "zero") else np.array(options.initial)
+    more: dict[str, Any] = {"smooth": options.smooth, "name": options.name}
+    step = exported(source, dt=options.dt, hold=options.hold, start=start, **more)
+    if options.initial is None and step.states:
+        print("note: the exported model begins with every state at zero; give other values with --initial.")
     out = Path(options.out)
     if options.c:
         code, header = step.to_c(options.out)

@@ -46,6 +46,8 @@ class Rollout:
     ----------
     model : Exported
         The step; where inputs are interpolated, it also takes the inputs of the next sample.
+    recording : Recording
+        The recording with the model's channels and units.
     u, y : array, shape (M, n_u), (M, n_y)
         Inputs of the steps, and simulated outputs.
     states : array, shape (n, M + 1)
@@ -57,6 +59,7 @@ class Rollout:
     """
 
     model: Exported
+    recording: Recording
     u: Array
     y: Array
     states: Array
@@ -67,7 +70,7 @@ class Rollout:
 
 def roll_out(source: Any, recording: Recording, verb: str) -> Rollout:
     """Run a fit, a diagnosis, a simulator or an export along a recording; errors name the called `verb`."""
-    model = _export_step(source, recording, verb)
+    model, recording = _export_step(source, recording, verb)
     u = recording.u
     if len(model.inputs) > recording.n_u:
         u = np.hstack([u, np.vstack([u[1:], u[-1:]])])
@@ -79,11 +82,11 @@ def roll_out(source: Any, recording: Recording, verb: str) -> Rollout:
     memory = {model.states[name] for name in model.memory_names}
     clock = [len(model.states) - 1] if model.timed else []
     linear = [i for i in range(len(model.states)) if i not in memory and i not in clock]
-    return Rollout(model, u, y.T, np.column_stack([start, x_next]), linear, clock, first)
+    return Rollout(model, recording, u, y.T, np.column_stack([start, x_next]), linear, clock, first)
 
 
-def _export_step(source: Any, recording: Recording, verb: str) -> Exported:
-    """Export a model with the initial state of the recording."""
+def _export_step(source: Any, recording: Recording, verb: str) -> tuple[Exported, Recording]:
+    """Export a model with the initial state of the recording; return it and the recording in the model's units."""
     if not isinstance(source, ModelSource):
         raise InputError(
             f"A {type(source).__name__} was given to {verb}; give a Fit, a Diagnosis, a Simulator or an export."
@@ -98,10 +101,9 @@ def _export_step(source: Any, recording: Recording, verb: str) -> Exported:
                 f"the recording by {recording.dt:g} s from {', '.join(recording.inputs)} to "
                 f"{', '.join(recording.outputs)}; give an export with the step and the signals of the recording."
             )
-        return source
-    if isinstance(source, Simulator):
-        return exported(source, dt=recording.dt, hold=recording.hold, start=recording)
-    return exported(source, start=recording)
+        return source, recording.in_units(source.units)
+    options: dict[str, Any] = {"dt": recording.dt, "hold": recording.hold} if isinstance(source, Simulator) else {}
+    return exported(source, start=recording, **options), source.matched(recording)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +150,7 @@ class KalmanFilter:
         Parameters
         ----------
         u, y : array, shape (M, n_u), (M, n_y)
-            Inputs and measured outputs.
+            Inputs and measured outputs, in the units of the model, as `model.matched(recording)` has them.
         x0, P0 : array, optional
             Initial state and its covariance, by default `self.x0` and `self.P0`. For a known state give `P0=filter.Q`.
 
@@ -222,6 +224,7 @@ def kalman_filter(
     function, start = run.model.step, run.states[:, 0]
     if not len(start) and not disturbance:
         raise InputError("The model has neither states nor memory to observe; give disturbance=True.")
+    recording = run.recording
     residual = (recording.y - run.y)[run.first_scored :]
     spread = np.sqrt(np.mean(run.states[:, 1:] ** 2, axis=1))
     spread[run.clock] = 0.0  # the time is known

@@ -135,6 +135,7 @@ def feedforward(
         input does not reach the output within the look-ahead, or no inverse is stable.
     """
     run = roll_out(fit, recording, "feedforward")
+    recording = run.recording
     _check_ports(run, recording)
     ends = _input_limits(limits, recording)
     function = run.model.step if observer is None else observer_function(observer, run.model.step, recording)

@@ -16,6 +16,7 @@ import numpy as np
 
 from .._base import REPAIR, InputError, is_number, is_whole, later, listed, positive, real_array, usable
 from .preprocessing import butterworth, change_step, hold_at, levels_last, remove_trend
+from .units import conversion
 
 SAME_STEP = 1e-4  # relative difference up to which two steps count as the same; written times have few digits
 HOLDS = ("zero", "linear", None)
@@ -166,6 +167,37 @@ class Recording:
     def with_(self, **changes: Any) -> Self:
         """Return a copy with some fields replaced; it is checked again."""
         return replace(self, **changes)
+
+    def in_units(self, wanted: Mapping[str, str]) -> Self:
+        """Convert channels to other units; channels whose unit is unknown, here or in `wanted`, stay as they are.
+
+        Parameters
+        ----------
+        wanted : mapping of str to str
+            Units by channel, such as the `units` of a simulator.
+
+        Raises
+        ------
+        InputError
+            If a unit measures something else.
+        """
+        factors = {name: self.factor_to(wanted, name) for name in (*self.inputs, *self.outputs)}
+        changed = {name: wanted[name] for name, factor in factors.items() if factor != 1}
+        if not changed:
+            return self
+        u, y = (v * [factors[n] for n in own] for v, own in ((self.u, self.inputs), (self.y, self.outputs)))
+        return replace(self, u=u, y=y, units={**self.units, **changed})
+
+    def factor_to(self, wanted: Mapping[str, str], name: str) -> float:
+        """Return the factor from a channel's unit to the wanted one; 1 if a unit or the conversion is unknown."""
+        unit, other = self.units.get(name, ""), wanted.get(name, "")
+        factor = conversion(unit, other)
+        if factor is not None and np.isnan(factor):
+            raise InputError(
+                f"{self.label} has {name!r} in {unit}, and the simulator has it in {other}; give the values in "
+                f"{other}, or correct the unit that is wrong."
+            )
+        return 1.0 if factor is None else factor
 
     def slice(self, start: int | None = None, stop: int | None = None) -> Self:
         """Return the samples from `start` up to `stop`, counted as in a Python slice.

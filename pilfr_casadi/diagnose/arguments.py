@@ -10,7 +10,6 @@ import numpy as np
 
 from .._base import InputError, Stages, listed
 from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
-from ..identify import match_channels
 from ..laws import (
     CATALOGUE,
     SCALABLE,
@@ -23,7 +22,7 @@ from ..laws import (
     scheduled,
     seen_by,
 )
-from ..simulators import Simulator, as_simulator
+from ..simulators import Simulator, as_simulator, match_channels
 from .faults.gates import Gate, edited
 from .search.stretches import Stretches
 

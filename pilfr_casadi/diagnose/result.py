@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,9 @@ import numpy as np
 from .._base import InputError, later, to_json, write_atomically
 from ..data import SAME_STEP, Recording, as_recordings, nrmse
 from ..engine import make_engine
-from ..identify import RUN_AWAY, match_channels, run_free
+from ..identify import RUN_AWAY, run_free
 from ..models import ParameterSet
-from ..simulators import ACTUATOR, Simulator, discretise, name_at, split_port
+from ..simulators import ACTUATOR, Simulator, discretise, match_channels, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
 from .effect import Effect
@@ -251,8 +251,9 @@ class Diagnosis:
         Returns
         -------
         array, shape (M, n_y)
-            Outputs in the simulator's order, at the samples of the recording as the diagnosis has corrected it (a shift
-            cuts samples off); not finite where the simulation diverges.
+            Outputs in the simulator's order and units, at the samples of the recording as the diagnosis has corrected
+            it (a shift cuts samples off); not finite where the simulation diverges. `matched(recording)` has the
+            measured outputs in the same units at the same samples; `plot` draws both.
 
         Raises
         ------
@@ -338,9 +339,7 @@ class Diagnosis:
             First scored sample; an initial state is estimated from the samples before it.
         """
         simulator = simulator or self.corrected
-        r, dt = match_channels(simulator, recording), self.train[0].dt
-        if not any(recording is known for known in self.train):  # training recordings are corrected already
-            (r,) = edited([r], self.gates)
+        r, dt = self.matched(recording), self.train[0].dt
         if abs(r.dt / dt - 1) > SAME_STEP:
             raise InputError(f"The recording's step is {r.dt:g} s, the training's {dt:g} s; resample it.")
         fitted = self.evidence.get("after" if simulator is self.corrected else "without")
@@ -354,6 +353,14 @@ class Diagnosis:
         y, skip = run_free(model, make_engine(model), r, one.starts, known=one.known)
         return r, y, skip
 
+    def matched(self, recording: Recording) -> Recording:
+        """Return a recording with the simulator's channels, order and units, corrected as the training was (`gates`).
+
+        Training recordings of the diagnosis are corrected already.
+        """
+        matched = match_channels(self.corrected, recording)
+        return matched if any(recording is known for known in self.train) else edited([matched], self.gates)[0]
+
     def export(self, **options: Any) -> Any:
         """Export the corrected simulator as a step over one sample, with the hold and sub-steps of the fit.
 
@@ -364,6 +371,8 @@ class Diagnosis:
         from ..export import exported
 
         free = replace(self.corrected, observer=None)
+        if isinstance(options.get("start"), Recording):
+            options["start"] = self.matched(options["start"])
         return exported(free, dt=self.train[0].dt, hold=self.hold, substeps=self.substeps, **options)
 
     def to_casadi(self, name: str = "model", smooth: float = 0.0) -> Any:
@@ -524,17 +533,20 @@ class Diagnosis:
             if errors:
                 shown = (_error_text(errors[k]) for k in ERROR_NAMES)
                 lines.append(f"  {kind.replace('_', ' '):<10}" + "".join(f"{text:>11}" for text in shown))
-        noise = f"{self._noise_text(self.floor)} ({self.floor['source']})"
+        noise = f"{self.noise_text(self.floor)} ({self.floor['source']})"
         if self.floor.get("test"):
-            noise += f", on the test recordings {self._noise_text(self.noise_on_tests)}"
+            noise += f", on the test recordings {self.noise_text(self.noise_on_tests)}"
         return [*lines, f"  noise floor {noise}"]
 
-    def _noise_text(self, noise: Mapping[str, float]) -> str:
-        """Write a noise floor as far as it is known."""
+    def noise_text(self, noise: Mapping[str, float], write: Callable[[float], str] | None = None) -> str:
+        """Write a noise floor as far as it is known; `write` formats an error, by default as printed."""
+        write = write or _error_text
         most, white = noise["nrmse"], _white(noise)
         if self.verdict == "unexplained" and self.floor["source"] == "estimated":
-            return f"at least {_error_text(most)}"
-        return f"{_error_text(white)} to {_error_text(most)}" if most > NEAR_RATIO * white else _error_text(most)
+            return f"at least {write(most)}"
+        if most > NEAR_RATIO * white:
+            return f"{write(white)} (its white part) to {write(most)} (with the slow part)"
+        return write(most)
 
     @property
     def corrected_faults(self) -> list[str]:

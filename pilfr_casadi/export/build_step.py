@@ -167,6 +167,7 @@ def _find_start_state(model: Any, closed: Model, step: Exported, start: Any) -> 
         if _is_fitted(model):
             state = model.initial_state(start)
         else:
+            start = model.matched(start) if isinstance(model, Simulator) else start
             _check_recording(closed, step, start)
             state = estimate_initial_state(closed, make_engine(closed), start)
         if not np.all(np.isfinite(state)):

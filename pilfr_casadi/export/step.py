@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tempfile
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -29,6 +31,7 @@ from .smoothing import enclose, smooth_kinks
 
 FORMAT, VERSION = "pilfr_casadi function", 1
 NAMES = ".names.json"  # appended to the function's file name for the file with the names
+LISTED_MEMORY = 6  # memories of a law up to which each is listed by name
 INLINE = 4  # sub-steps written out one after the other; more become a loop, which keeps generated C short
 
 
@@ -344,7 +347,11 @@ class Exported:
 
         exact = f"smoothed, eps = {self.smooth:g}" if self.smooth else "min and max exact"
         lines = [f"{self.name}: (x, u) -> (x_next, y), a step of {self.dt:g} s, {exact}"]
-        lines += [f"x: {list_names(self.states)}", f"u: {list_names(self.inputs)}", f"y: {list_names(self.outputs)}"]
+        memory = [name for name in self.states if re.fullmatch(r".*memory\d+", name)]
+        counts = Counter(name.rstrip("0123456789") for name in memory)
+        states = [name for name in self.states if counts[name.rstrip("0123456789")] <= LISTED_MEMORY]
+        states += [f"{name}1..{n} ({n} states)" for name, n in counts.items() if n > LISTED_MEMORY]
+        lines += [f"x: {list_names(states)}", f"u: {list_names(self.inputs)}", f"y: {list_names(self.outputs)}"]
         lines.append(f"rhs in continuous time: {'none, it is sampled' if self.rhs is None else 'yes'}")
         return "\n".join(lines)
 

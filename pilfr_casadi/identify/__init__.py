@@ -56,7 +56,6 @@ if TYPE_CHECKING:
         Fit as Fit,
         FitOptions as FitOptions,
         load as load,
-        match_channels as match_channels,
         save as save,
     )
     from .sparse import (

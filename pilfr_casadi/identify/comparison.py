@@ -18,8 +18,8 @@ from ..data import Recording, as_recordings, rmse_per_output
 from ..engine import Engine, make_engine
 from ..models import Model
 from ..optimise import StatePrior, estimate_initial_state, samples_to_start
-from ..simulators import Simulator, as_simulator, discretise_for
-from .result import Fit, match_channels
+from ..simulators import Simulator, as_simulator, discretise_for, match_channels
+from .result import Fit
 
 RUN_AWAY = 1e4  # error from which a simulation counts as diverging
 

@@ -237,7 +237,7 @@ def context_of_fit(
     fit: Fit, train: Recording | Sequence[Recording], *, solver: Any, engine: str = "auto", **others: Any
 ) -> FitContext:
     """Make the context of a fit that continues an earlier one; `others` replace its `FitOptions`."""
-    recordings = as_recordings(train)
+    recordings = tuple(fit.matched(r) for r in as_recordings(train))
     options = fit.options.updated(**others, train=recordings)
     return FitContext(recordings, solver, options.all_constraints(fit.structure), engine=engine, options=options)
 

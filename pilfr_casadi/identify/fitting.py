@@ -32,13 +32,13 @@ from ..optimise import (
     stability_limits,
     violated_exact,
 )
-from ..simulators import Simulator, discretise_for
+from ..simulators import Simulator, discretise_for, match_channels
 from .context import FitContext, Stage, check_recordings, mark_interrupted, rms_error, without_density_prior
 from .lagged import check_lagged_options, fit_lagged
 from .linear_start import known_entries, linear_model, transform_to_known_basis
 from .multistart import DEFAULT_SOLVER, MOST_POLISHED, START_KINDS, StartSearch, search_starts
 from .penalty import check_penalty, solve_with_penalty
-from .result import Fit, FitOptions, match_channels, with_solution
+from .result import Fit, FitOptions, with_solution
 
 DEAD_WORKER = (
     "A worker process ended before it returned a result (it may have run out of memory); use fewer workers, or "
@@ -165,6 +165,7 @@ def fit(
     if l1 is not None and not isinstance(l1, dict):
         raise InputError(f'l1 = {l1!r} was given; give weights by name, like {{"w": 1e-4}}.')
     options = model.options if isinstance(model, Fit) else FitOptions()
+    train = _match_units(model, train)
     options = options.updated(stable, constraints, noise, weights, train)
     with ExitStack() as stack:
         report = stack.enter_context(showing)
@@ -187,6 +188,16 @@ def _check_arguments(model: Any, solver: Any, starts: Any, seed: Any, workers: A
         raise InputError(f"The solver is {solver!r}; give an object such as GaussNewton() or Ipopt().")
     for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("workers", workers, 1)):
         whole(value, name, least)
+
+
+def _match_units(model: Any, train: Recording | Sequence[Recording]) -> tuple[Recording, ...]:
+    """Return recordings with the units of the model, for a simulator its channels; of a structure, with equal units."""
+    recordings = as_recordings(train)
+    simulator = model if isinstance(model, Simulator) else model.simulator if isinstance(model, Fit) else None
+    if simulator is not None:
+        return tuple(match_channels(simulator, r) for r in recordings)
+    units = model.units if isinstance(model, Fit) else recordings[0].units
+    return tuple(r.in_units(units) for r in recordings)
 
 
 @one_blas_thread
@@ -212,8 +223,6 @@ def _fit(
     simulator = model if isinstance(model, Simulator) else model.simulator if isinstance(model, Fit) else None
     structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
     recordings = as_recordings(train)
-    if simulator is not None:
-        recordings = tuple(match_channels(simulator, r) for r in recordings)
     closed = _closed_model(model, recordings, starts.kind)
     check_gain(options.constraints, closed.element)
     context = replace(context, constraints=options.all_constraints(structure))

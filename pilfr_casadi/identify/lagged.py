@@ -186,7 +186,7 @@ def one_step(fit: Any, recording: Recording) -> np.ndarray:
     InputError
         If the fit is of another model, or the recording does not fit it.
     """
-    model = read_measured_output(fit.model)
+    model, recording = read_measured_output(fit.model), fit.matched(recording)
     state = fit.initial_state(recording)
     return make_engine(model, fit.engine).simulate(model.drive(recording), model.parameters.start, state)[0]
 

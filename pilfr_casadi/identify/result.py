@@ -37,7 +37,7 @@ from ..optimise import (
     samples_for_state,
     stability_limits,
 )
-from ..simulators import Simulator, unit_factor
+from ..simulators import Simulator, match_channels
 from .uncertainty import describe_unknown_errors
 
 DENSITY_PRIOR = "weights held near a smooth density by a weak prior"  # note of a candidate and of its fit
@@ -212,7 +212,9 @@ class Fit:
         return estimate_initial_state(self.model, self._engine, recording, state_prior=True)
 
     def simulate(self, recording: Recording) -> np.ndarray:
-        """Simulate the outputs for a recording's inputs, shape (M, n_y).
+        """Simulate the outputs for a recording's inputs, shape (M, n_y), in the units of the model (`units`).
+
+        `matched(recording)` has the measured outputs in the same units.
 
         Raises
         ------
@@ -267,7 +269,7 @@ class Fit:
         return float(np.mean(errors))
 
     def matched(self, recording: Recording) -> Recording:
-        """Check that a recording fits the model; for a simulator, put its columns in the simulator's order."""
+        """Return a recording with the model's units, for a simulator in its columns' order; check that it fits."""
         if not isinstance(recording, Recording):
             raise InputError(
                 f"A {type(recording).__name__} was given to simulate; give a Recording, which holds inputs, outputs "
@@ -275,6 +277,7 @@ class Fit:
             )
         if self.simulator is not None:
             recording = match_channels(self.simulator, recording)
+        recording = recording.in_units(self.units)
         n_u, n_y = len(self.model.inputs), self.model.n_y
         unmeasured = recording.n_y == 0 and recording.begins != "estimate"
         if recording.n_u != n_u or not (recording.n_y == n_y or unmeasured):
@@ -335,7 +338,9 @@ class Fit:
         if kind not in ("bode", "poles"):
             raise InputError(f"kind={kind!r} was given to plot; give fit, bode, poles or residuals.")
         parts = self.linear_parts(given[0])
-        return pole_zero(parts, **options).figure if kind == "poles" else bode(parts, any_bla(given), **options)
+        if kind == "poles":
+            return pole_zero(parts, **options).figure
+        return bode(parts, any_bla([self.matched(r) for r in given]), **options)
 
     def report(
         self,
@@ -398,7 +403,9 @@ class Fit:
         if self.candidates:
             reached = sorted(c.error for c in self.candidates)
             several = f"the starts reached NRMSE {_format_error(reached[0])} ... {_format_error(reached[-1])}"
-            lines.append(several if count > 1 else f"the start reached NRMSE {_format_error(reached[0])}")
+            text = several if count > 1 else f"the start reached NRMSE {_format_error(reached[0])}"
+            prior = DENSITY_PRIOR in self.note and reached[0] < float(np.mean(self.train_nrmse))
+            lines.append(f"{text}, before the weak prior that makes the weights smooth" if prior else text)
             if not any(c.drawn for c in self.candidates):
                 lines.append("no start is drawn at random, so the seed has no effect")
         if self.linear_nrmse:
@@ -425,38 +432,6 @@ class Fit:
 
     def _repr_html_(self) -> str:
         return str(later("report.fit_card")(self))
-
-
-def match_channels(simulator: Simulator, recording: Recording) -> Recording:
-    """Return a recording with only a simulator's columns, in its order and units.
-
-    Raises
-    ------
-    InputError
-        If a column is missing, or its unit measures something else; a recording without outputs needs none.
-    """
-    changes: dict[str, Any] = {}
-    units = {
-        name: unit for name, unit in recording.units.items() if name in (*simulator.inputs, *simulator.output_names)
-    }
-    for kind, names, own, values in (
-        ("input", simulator.inputs, recording.inputs, recording.u),
-        ("output", simulator.output_names, recording.outputs, recording.y),
-    ):
-        if kind == "output" and not own:
-            continue
-        for name in names:
-            if name not in own:
-                raise InputError(
-                    f"{recording.label} has no {kind} {name!r}; it has {', '.join(own) or 'none'}. Map a column to "
-                    "it by name."
-                )
-        factors = [unit_factor(simulator, recording, name) for name in names]
-        if tuple(own) != tuple(names) or any(factor != 1 for factor in factors):
-            changes["u" if kind == "input" else "y"] = values[:, [own.index(n) for n in names]] * factors
-            changes[f"{kind}s"] = tuple(names)
-            units |= {n: simulator.units[n] for n, factor in zip(names, factors, strict=True) if factor != 1}
-    return recording.with_(**changes, units=units) if changes else recording
 
 
 def save(fit: Fit, path: str | os.PathLike[str]) -> None:

@@ -34,7 +34,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import casadi as ca
 import numpy as np
@@ -231,7 +231,8 @@ class Law:
     Raises
     ------
     InputError
-        If a value or limit is not a number, or names a parameter that the law does not have.
+        If a value or limit is not a number, or names a parameter that the law does not have; if a value is outside of
+        its limits.
     """
 
     id: ClassVar[str]
@@ -298,6 +299,12 @@ class Law:
                 if not _are_numbers([entry] if count == 1 else entry, count):
                     wanted = "finite numbers" if count == 1 else "a pair (lower, upper) of increasing numbers"
                     raise InputError(f"The {option} of the law {self.id!r} hold {name} = {entry!r}; give {wanted}.")
+        for name, (low, high) in self.limits.items():
+            value = np.asarray(self.values.get(name, low), dtype=float)
+            if np.any(value < low) or np.any(value > high):
+                raise InputError(
+                    f"The law {self.id!r} has {name} = {value}, outside of its limits {low} to {high}; widen them."
+                )
 
     def force(self, *args: Any, **kwargs: Any) -> Any:
         """Force w from any of z, dz, q, t, x, u, p by name."""
@@ -386,9 +393,11 @@ class Law:
         """Copy for steps of length h, s; only a delay depends on them."""
         return self
 
-    def at(self, values: Mapping[str, Any], limits: Mapping[str, tuple[Any, Any]] | None = None) -> Law:
-        """Copy that starts at `values` inside `limits`."""
-        return replace(self, values={**self.values, **values}, limits={**self.limits, **(limits or {})})
+    def at(self, values: Mapping[str, Any], limits: Mapping[str, tuple[Any, Any]] | None = None) -> Self:
+        """Copy that starts at `values`, clipped to `limits`."""
+        own, ends = {**self.values, **values}, {**self.limits, **(limits or {})}
+        clipped = {name: np.clip(value, *ends[name]) if name in ends else value for name, value in own.items()}
+        return replace(self, values=clipped, limits=ends)
 
     def parameters(self) -> dict[str, Parameter]:
         """Parameters with start values, limits and units (in w, z, s)."""

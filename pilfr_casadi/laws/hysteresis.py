@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -71,7 +70,7 @@ class StopHysteresis(_Hysteresis):
                     "given. Give one number for all, or one for each."
                 )
         vectors = {name: np.broadcast_to(np.asarray(given[name], dtype=float), (self.n,)) for name in ("w", "r")}
-        whole = replace(self, values={**given, **vectors}, limits={"r": (0.0, np.inf), **self.limits})
+        whole = self.at({**given, **vectors}, {"r": (0.0, np.inf), **self.limits})
         return super(StopHysteresis, whole).parameters()
 
     def size(self, values: Mapping[str, Any]) -> int:

@@ -72,6 +72,9 @@ class PlottedFit(FittedModel, Protocol):
     def scored_from(self, recording: Recording) -> int:
         """First sample that is scored."""
 
+    def matched(self, recording: Recording) -> Recording:
+        """The recording with the model's channels and units."""
+
 
 def time(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:
     """Draw the measured output with the residuals of the linear model and of the fit over time, as Fig. 9 (left)."""
@@ -97,6 +100,7 @@ def traces(
     ax: Axes | None = None,
 ) -> Axes:
     """Draw measured and simulated output over a few swings around the largest."""
+    recording = fit.matched(recording)
     ax, y = axes_or_new(ax), _select_signal(recording.y, output, "output")
     part = find_largest_swings(y - np.mean(y))
     unit = _unit(fit, recording, recording.outputs[output])
@@ -125,13 +129,14 @@ def output_over_input(
     fit: PlottedFit, recording: Recording, *, input: int = 0, output: int = 0, ax: Axes | None = None
 ) -> Axes:
     """Draw measured and simulated output over an input: the nested loops of a quasi-static device (scored samples)."""
+    recording = as_scored(fit, recording)
     ax, u, y = (
         axes_or_new(ax),
         _select_signal(recording.u, input, "input"),
         _select_signal(recording.y, output, "output"),
     )
     name, simulated = recording.outputs[output], fit.simulate(recording)[:, output]
-    u, y, simulated = (column[as_scored(fit, recording).skip :] for column in (u, y, simulated))
+    u, y, simulated = (column[recording.skip :] for column in (u, y, simulated))
     size, up = scale_axis(name, y, _unit(fit, recording, name))
     error, note = _error_to_draw(simulated - y, np.ptp(y), _unit(fit, recording, name))
     ax.plot(u, y / size, color=BLUE, linewidth=3.0, alpha=0.4, label="measured", rasterized=True)
@@ -158,6 +163,7 @@ def spectrum(
     input, one for each realization; by default `recording` itself, if it is periodic. Several periods give the noise
     level, several realizations the total distortion (noise and nonlinear distortion).
     """
+    recording, steady = fit.matched(recording), None if steady is None else [fit.matched(r) for r in steady]
     y = _select_signal(recording.y, output, "output")
     signals = [("measured output", y, BLUE), *_residuals(fit, recording, output)]
     periodic = steady if steady is not None else [recording] if recording.period else []
@@ -197,7 +203,8 @@ def linear_simulation(fit: PlottedFit, recording: Recording) -> np.ndarray:
 
 
 def as_scored(fit: PlottedFit, recording: Recording) -> Recording:
-    """Set `skip` of a recording to its first scored sample, after those that estimate its initial state."""
+    """Bring a recording into the fit's units, with `skip` after the samples that estimate its initial state."""
+    recording = fit.matched(recording)
     try:
         return recording.with_(skip=fit.scored_from(recording))
     except InputError:  # the recording is too short to score any sample

@@ -109,6 +109,8 @@ def plot_recording(r: Recording) -> Figure:
     return figure
 
 
+DWARFED = 4.0  # times the range of the measured output from which another line would flatten it
+MARGIN = 0.15  # of that range, around it
 Simulated = list[tuple[str, np.ndarray | None]]  # (label, outputs (M, n_y)); None if the simulation diverges
 SIMULATED_COLOURS = (ORANGE, INK, VERMILLION, PURPLE, SKY)  # repeated for further simulations
 
@@ -145,11 +147,28 @@ def compared_traces(
     part = _find_quiet_stretch(y, part.stop - part.start, r.skip) if quiet else part
     size, up = scale_axis(r.outputs[output], y[part], unit)
     line(ax, r.t, y / size, "measured", BLUE, part=part, linewidth=4.0, alpha=0.45)
-    for label, values, colour in assign_colours(simulated):
-        y_hat = mask_divergence(values[:, output], np.ptp(y))
-        line(ax, r.t, y_hat / size, label, colour, part=part, linewidth=1.4)
+    drawn = [(label, mask_divergence(v[:, output], np.ptp(y)) / size, c) for label, v, c in assign_colours(simulated)]
+    limits = _shared_range(y[part] / size, [y_hat[part] for _, y_hat, _ in drawn])
+    for label, y_hat, colour in drawn:
+        leaves = limits and np.any((y_hat[part] < limits[0]) | (y_hat[part] > limits[1]))
+        line(ax, r.t, y_hat, f"{label} (leaves the picture)" if leaves else label, colour, part=part, linewidth=1.4)
+    if limits:
+        ax.set_ylim(*limits)
     ax.margins(x=0.01)
     return finish(ax, "time [s]", up, r.name, 3)
+
+
+def _shared_range(y: np.ndarray, simulated: Sequence[np.ndarray]) -> tuple[float, float] | None:
+    """Return the range of the measured output and of the nearest simulation, if another one dwarfs it; else None."""
+    known = [y_hat[np.isfinite(y_hat)] for y_hat in simulated]
+    known = [y_hat for y_hat in known if len(y_hat) == len(y)]
+    if not known:
+        return None
+    near = np.concatenate([y, min(known, key=lambda y_hat: float(np.mean((y_hat - y) ** 2)))])
+    span = float(np.ptp(near))
+    if max(float(np.ptp(np.concatenate([near, y_hat]))) for y_hat in known) <= DWARFED * span:
+        return None
+    return float(np.min(near)) - MARGIN * span, float(np.max(near)) + MARGIN * span
 
 
 def _find_quiet_stretch(y: np.ndarray, length: int, skip: int) -> slice:

@@ -340,6 +340,8 @@ def _draw_comparison(case: _Case, c: BeforeAfter, i: int) -> list[Block]:
     """Draw one output of a recording: two stretches, errors over time, and spectra."""
     r, name = c.recording, c.recording.outputs[i]
     unit, floor = case.unit(name), float(case.noise[i])
+    noise = case.diagnosis.floor
+    white = noise.get("white", noise["nrmse"]) / max(noise["nrmse"], 1e-300)  # the slow part is no white noise
     simulated: plots.Simulated = [("as given", c.given), ("refitted", c.before)]
     if correction := tables.correction_words(case.diagnosis):
         simulated.append((correction.removesuffix(" put back").removesuffix(" added"), c.after))
@@ -369,7 +371,7 @@ def _draw_comparison(case: _Case, c: BeforeAfter, i: int) -> list[Block]:
             f"Errors of {where}.",
         ),
         Picture(
-            plots.compared_spectra(r, simulated, i, unit, floor),
+            plots.compared_spectra(r, simulated, i, unit, floor * white),
             f"{where}: output, errors and noise over frequency.",
             f"Spectra of {where}.",
         ),

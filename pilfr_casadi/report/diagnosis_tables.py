@@ -120,7 +120,8 @@ def headline(diagnosis: Diagnosis) -> str:
     text += f", {percent(errors.get('before'))} refitted"
     if what := correction_words(diagnosis):
         text += f", {percent(errors.get('after'))} {what}"
-    return f"{text}; the noise floor is {percent(diagnosis.noise_on_tests['nrmse'])}."
+    floor = diagnosis.noise_text(diagnosis.noise_on_tests, percent)
+    return f"{text}; the noise floor is {floor}."
 
 
 def facts(diagnosis: Diagnosis) -> dict[str, str]:
@@ -351,15 +352,19 @@ def _collect_correction(diagnosis: Diagnosis) -> dict[str, Any]:
         for part in imported:
             home = laws.__name__ if getattr(laws, part.__name__, None) is part else part.__module__
             modules.setdefault(home, set()).add(part.__name__)
-        limits = {k: tuple(np.asarray(end, dtype=float).tolist() for end in ends) for k, ends in e.law.limits.items()}
+        bounds = {k: simulator.parameters[f"{e.prefix}{k}"].bounds for k in e.law.limits}  # a fit may have widened them
+        limits = {k: tuple(np.asarray(end, dtype=float).tolist() for end in ends) for k, ends in bounds.items()}
         elements.append((e, expression, e.own(fitted), limits))
     own = diagnosis.refitted.parameters
+    now = {k: np.array(p.bounds, dtype=float) for k, p in simulator.parameters.items() if k in own}
+    freed = {k: tuple(ends.tolist()) for k, ends in now.items() if ends.ndim == 1 and np.any(ends != own[k].bounds)}
     values = {k: v for k, v in fitted.items() if k in own and own[k].value.size}  # a list has no shape (0, 2)
     return {
         "diagnosis": diagnosis,
         "simulator": simulator,
         "modules": modules,
         "elements": elements,
+        "freed": freed,
         "values": values,
     }
 

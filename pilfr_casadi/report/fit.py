@@ -36,6 +36,8 @@ from .page import (
 
 Records = Recording | Sequence[Recording]
 RUNAWAY = 1e3  # NRMSE from which the page calls a simulation diverging
+EXCITED_POWER = 0.999  # share of an input's power in its excited band
+FAR_OUTSIDE = 2.0  # times the highest excited frequency from which the data say nothing of an oscillation
 MOST_DRAWN = 4  # outputs of a recording that are drawn; the table has all of them
 QUASI_STATIC = 0.9  # correlation of output and input above which the output is drawn over the input
 
@@ -54,8 +56,8 @@ def fit_report(fit: Fit, train: Records, tests: Records, folder: str | os.PathLi
 
 def fit_page(fit: Fit, train: Records, tests: Records, *, model_file: str = "model.json") -> Page:
     """Fill the page of a fit; see `fit_report`."""
-    used = as_recordings(train)
-    unseen = as_recordings(tests) if isinstance(tests, Recording) or len(tests) else ()
+    used = [fit.matched(r) for r in as_recordings(train)]
+    unseen = [fit.matched(r) for r in (as_recordings(tests) if isinstance(tests, Recording) or len(tests) else ())]
     named = [
         (r.with_(name=label_recording(r, role, i, len(recordings))), role)
         for role, recordings in (("training", used), ("test", unseen))
@@ -289,7 +291,7 @@ def _hysteresis(fit: Fit, recordings: Sequence[Recording]) -> list[Block]:
 
 def _linear_part(fit: Fit, train: Sequence[Recording]) -> list[Block]:
     """Tabulate the modes, and draw the initial linear model over the best linear approximation of the data."""
-    out = mode_tables(fit)
+    out = mode_tables(fit, train)
     if out:
         caption = "Poles in the z-plane with frequency and damping ratio, and zeros from the first input to the output."
         out.append(Picture(plots.pole_zero(fit.linear_parts()), caption, "Poles and zeros."))
@@ -309,27 +311,42 @@ def _linear_part(fit: Fit, train: Sequence[Recording]) -> list[Block]:
     return out
 
 
-def mode_tables(fit: Fit) -> list[Block]:
-    """Tabulate the modes in small motions, in which no operator slips, and in large motions, in which all slip."""
+def mode_tables(fit: Fit, train: Sequence[Recording] = ()) -> list[Block]:
+    """Tabulate the modes in small motions, in which no operator slips, and in large motions, in which all slip.
+
+    Oscillations that the inputs of `train` do not excite are marked.
+    """
     a = fit.parameters.get("A")
     if a is None or not len(a) or a.shape != (fit.model.n_x,) * 2:
         return []
-    parts = fit.linear_parts()
+    parts, highest = fit.linear_parts(), _highest_excited(train)
     if len(parts) == 1:
-        return [Table(*_modes(*parts.values()), caption="Modes of the linear part")]
+        (only,) = parts.values()
+        return [Table(*_modes(only, highest), caption="Modes of the linear part")]
     note = (
         "In small motions no operator reaches its threshold; in large motions all operators slip. With growing "
         "amplitude the hysteresis moves the modes from the first table towards the second."
     )
     small, large = parts.items()
     return [
-        Table(*_modes(small[1]), caption=f"Modes in {small[0]}"),
-        Table(*_modes(large[1]), caption=f"Modes in {large[0]}", note=note),
+        Table(*_modes(small[1], highest), caption=f"Modes in {small[0]}"),
+        Table(*_modes(large[1], highest), caption=f"Modes in {large[0]}", note=note),
     ]
 
 
-def _modes(part: LinearPart) -> tuple[list[str], list[list[Any]]]:
-    """Return the columns and rows of a table of poles."""
+def _highest_excited(train: Sequence[Recording]) -> float:
+    """Find the frequency, Hz, below which the inputs of some recording have nearly all their power."""
+    highest = 0.0
+    for r in train:
+        for column in r.u.T:
+            power = np.abs(np.fft.rfft((column - np.mean(column)) * np.hanning(len(column)))) ** 2
+            at = int(np.searchsorted(np.cumsum(power), EXCITED_POWER * np.sum(power)))
+            highest = max(highest, float(np.fft.rfftfreq(len(column), r.dt)[min(at, len(power) - 1)]))
+    return highest or np.inf
+
+
+def _modes(part: LinearPart, highest: float = np.inf) -> tuple[list[str], list[list[Any]]]:
+    """Return the columns and rows of a table of poles; `highest` is the highest frequency that inputs excite, Hz."""
     rows: list[list[Any]] = []
     for value in sorted(part.poles, key=lambda v: abs(np.angle(v))):
         if value.imag < 0:
@@ -338,6 +355,10 @@ def _modes(part: LinearPart) -> tuple[list[str], list[list[Any]]]:
         oscillates = value.imag > 0 or value.real < 0
         kind = "oscillation" if oscillates else "decay" if abs(value) < 1 else "drift"
         frequency, damping = (abs(rate) / (2 * np.pi), -rate.real / abs(rate)) if oscillates else (None, None)
+        if value.imag == 0 and oscillates:  # no continuous motion gives a negative real pole
+            kind, frequency, damping = "alternates with every sample", None, None
+        elif frequency is not None and frequency > FAR_OUTSIDE * highest:
+            kind = "oscillation, outside the excited band"
         rows.append([kind, frequency, damping, -1 / rate.real if rate.real < 0 else None, abs(value)])
     return ["mode", "frequency [Hz]", "damping ratio", "time constant [s]", "|eigenvalue|"], rows
 

@@ -66,7 +66,12 @@ if TYPE_CHECKING:
         port_name as port_name,
         split_port as split_port,
     )
-    from .simulator import Simulator as Simulator, unit_factor as unit_factor, unit_notes as unit_notes
+    from .simulator import (
+        Simulator as Simulator,
+        match_channels as match_channels,
+        unit_factor as unit_factor,
+        unit_notes as unit_notes,
+    )
     from .substeps import (
         LARGEST_STEP as LARGEST_STEP,
         MOST_SUBSTEPS as MOST_SUBSTEPS,

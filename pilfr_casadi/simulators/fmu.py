@@ -195,10 +195,12 @@ def _check_names(
     unit: _Unit | SteppedUnit, inputs: Sequence[str], outputs: Sequence[str], parameters: Sequence[str]
 ) -> None:
     """Refuse names of inputs, outputs and parameters that the unit does not have as numbers."""
+    # fixed parameters are accepted where they are named
+    accepted = unit.described.of("parameter") if isinstance(unit, _Unit) else unit.parameters
     roles = (
         (inputs, unit.inputs, "inputs"),
         (outputs, unit.described.of("output"), "outputs"),
-        (parameters, unit.parameters, "parameters"),
+        (parameters, accepted, "parameters"),
     )
     for names, known, kind in roles:
         for name in names:

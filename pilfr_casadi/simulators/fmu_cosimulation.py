@@ -171,7 +171,8 @@ class SteppedUnit(Unit):
 
 def unknown_signal(port: str, key: str, name: str, known: Sequence[str]) -> InputError:
     """Make the error about a port's coordinate or rate that is no signal of the unit."""
-    return InputError(f"`{key}` of port {port!r} is {name!r}; give an output or a state of the unit: {listed(known)}.")
+    there = listed(list(dict.fromkeys(known)))
+    return InputError(f"`{key}` of port {port!r} is {name!r}; give an output or a state of the unit: {there}.")
 
 
 def check_force(port: str, factors: Mapping[str, float], linear: bool, effective: bool) -> None:

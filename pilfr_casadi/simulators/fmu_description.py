@@ -82,8 +82,9 @@ class Unit:
 
 def describe(path: Path) -> Description:
     """Read modelDescription.xml."""
+    existing_file(path)
     try:
-        with zipfile.ZipFile(existing_file(path)) as archive:
+        with zipfile.ZipFile(path) as archive:
             root = ET.fromstring(archive.read("modelDescription.xml"))
         entries = list(root.iterfind("ModelVariables/*"))
         types = _read_types(root)

@@ -79,6 +79,7 @@ class Simulator(Equations):
     def simulate(self, recording: Recording) -> np.ndarray:
         """Simulate the outputs for a recording's inputs, shape (M, n_y), at the parameters' values.
 
+        They are in the simulator's units; `matched(recording)` has the measured outputs in the same units.
         The simulation starts from the recording's `initial` if it holds numbers, else from zero. To estimate the
         initial state, `fit` the simulator and simulate the fit.
 
@@ -96,17 +97,25 @@ class Simulator(Equations):
                 "recorded ones, as in from_fmu(..., inputs=...)."
             )
         columns = [recording.inputs.index(name) for name in self.inputs]
-        factors = [unit_factor(self, recording, name) for name in self.inputs]
-        own = recording.with_(u=recording.u[:, columns] * factors, inputs=self.inputs, units={})
+        own = recording.with_(u=recording.u[:, columns], inputs=self.inputs).in_units(self.units)
         if self.observer is not None:
-            factors = [unit_factor(self, recording, name) for name in self.output_names]
-            own = own.with_(y=self._select_outputs(own) * factors, outputs=self.output_names)
+            own = own.with_(y=self._select_outputs(own), outputs=self.output_names, units={})
         model = discretise_for(self, [own])
         drive, start = model.drive(own), np.zeros(model.n_state)
         if not isinstance(own.initial, str):
             start = model.rest_at(np.asarray(own.initial, dtype=float), own.u[0], self.parameter_set.start)
         values = np.broadcast_to(self.parameter_set.start, (len(drive), self.parameter_set.size))
         return accumulate_steps(model.closed, start, drive, values)[1][:: model.substeps]
+
+    def matched(self, recording: Recording) -> Recording:
+        """Return a recording with only the simulator's columns, in its order and units.
+
+        Raises
+        ------
+        InputError
+            If a column is missing, or its unit measures something else; a recording without outputs needs none.
+        """
+        return match_channels(self, recording)
 
     def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
         """Compute the NRMSE (Krikelis et al. 2024, Eq. 27) of a simulation, averaged over outputs and recordings.
@@ -267,18 +276,36 @@ def unit_notes(simulator: Simulator, recording: Recording) -> dict[str, str]:
 
 
 def unit_factor(simulator: Simulator, recording: Recording, name: str) -> float:
-    """Return the factor from a channel's unit in a recording to the simulator's unit; 1 if one of them is unknown.
+    """Return the factor from a channel's unit in a recording to the simulator's unit; see `Recording.factor_to`."""
+    return recording.factor_to(simulator.units, name)
+
+
+def match_channels(simulator: Simulator, recording: Recording) -> Recording:
+    """Return a recording with only a simulator's columns, in its order and units.
 
     Raises
     ------
     InputError
-        If no factor converts it.
+        If a column is missing, or its unit measures something else; a recording without outputs needs none.
     """
-    unit, wanted = recording.units.get(name, ""), simulator.units.get(name, "")
-    factor = conversion(unit, wanted)
-    if factor is not None and np.isnan(factor):
-        raise InputError(
-            f"{recording.label} has {name!r} in {unit}, and the simulator has it in {wanted}; give the values in "
-            f"{wanted}, or correct the unit that is wrong."
-        )
-    return 1.0 if factor is None else factor
+    changes: dict[str, Any] = {}
+    for kind, names, own, values in (
+        ("input", simulator.inputs, recording.inputs, recording.u),
+        ("output", simulator.output_names, recording.outputs, recording.y),
+    ):
+        if kind == "output" and not own:
+            continue
+        for name in names:
+            if name not in own:
+                raise InputError(
+                    f"{recording.label} has no {kind} {name!r}; it has {', '.join(own) or 'none'}. Map a column to "
+                    "it by name."
+                )
+        if tuple(own) != tuple(names):
+            changes["u" if kind == "input" else "y"] = values[:, [own.index(n) for n in names]]
+            changes[f"{kind}s"] = tuple(names)
+    if changes:
+        known = (*simulator.inputs, *simulator.output_names)
+        units = {name: unit for name, unit in recording.units.items() if name in known}
+        recording = recording.with_(**changes, units=units)
+    return recording.in_units(simulator.units)

@@ -308,7 +308,7 @@ def test_inputs_of_a_simulation_are_the_columns_that_agree(capsys, files, truth,
     status, out, err = run(capsys, *arguments(files, simulator=None)[:4], "--out", files / "out")
     assert status == 130 and "nothing was written" in err
     assert "inputs drive, outputs here, as found in the files" in out and seen["names"] == (("drive",), ("here",))
-    assert list((files / "out").iterdir()) == []
+    assert not (files / "out").exists()
     write_csv(files / "named.csv", force, position, names=("t", "u_vir_V", "position"))
     column = ("--column", "force=u_vir_V", "--out", files / "out")
     status, out, _ = run(capsys, "diagnose", files / "rig.py", files / "named.csv", *column)
@@ -434,3 +434,31 @@ def test_each_recording_uses_its_own_column(capsys, files):
     doubled = [",".join([*row.split(",")[:2], *row.split(",")[1:]]) for row in rows]
     (files / "other.csv").write_text("\n".join([header, *doubled]) + "\n")
     refused(capsys, "check", files / "rig.py", files / "other.csv", *both, says="which --column gives for force")
+
+
+def test_refused_recordings_leave_no_folder(capsys, files, truth):
+    force, position = truth["train"]
+    write_csv(files / "constant.csv", force, np.full_like(position, 0.25))
+    write_csv(files / "short.csv", force[:5], position[:5])
+    out = files / "new" / "out"
+    for command in ("diagnose", "check"):
+        for name in ("constant", "short"):
+            status, _, err = run(capsys, command, files / "rig.py", files / f"{name}.csv", "--out", out)
+            assert status == 2 and err.count("pilfr: ") == 1
+            assert not out.parent.exists()
+
+
+def test_an_export_begins_at_the_given_state(capsys, files):
+    command = ("export", files / "rig.py", "--c", "--dt", 0.02, "--out", files / "c")
+    status, out, _ = run(capsys, *command)
+    assert status == 0 and "begins with every state at zero; give other values with --initial" in out
+    status, out, _ = run(capsys, *command, "--initial", "0.125,0.5")
+    assert status == 0 and "note" not in out
+    assert "0.125" in (files / "c" / "model.c").read_text()
+    status, _, err = run(capsys, *command, "--initial", "estimate")
+    assert status == 2 and "--initial estimate needs a recording" in err
+
+
+def test_a_missing_unit_is_a_missing_file(capsys, files):
+    status, _, err = run(capsys, "diagnose", files / "none.fmu", files / "train.csv", "--out", files / "out")
+    assert status == 2 and "there is no file" in err and "mock-up" not in err

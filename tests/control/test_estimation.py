@@ -28,9 +28,16 @@ def rig():
 
 
 def diagnosis(corrected, data, hold="zero"):
-    empty = dict.fromkeys(("sentence", "effects", "candidates", "gates", "mismatch", "parameters", "errors", "floor"))
+    empty = dict.fromkeys(("sentence", "effects", "candidates", "mismatch", "parameters", "errors", "floor"))
     return Diagnosis(
-        verdict="complete", **empty, corrected=corrected, refitted=corrected, hold=hold, train=tuple(data), substeps=4
+        verdict="complete",
+        gates=(),
+        **empty,
+        corrected=corrected,
+        refitted=corrected,
+        hold=hold,
+        train=tuple(data),
+        substeps=4,
     )
 
 

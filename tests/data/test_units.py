@@ -110,3 +110,64 @@ def test_a_unit_of_something_else_is_refused(recorded):
 )
 def test_units_are_inserted_and_equal_symbols_collected(unit, force, coordinate, written):
     assert insert_units(unit, {"w": force, "z": coordinate}) == written
+
+
+@pytest.fixture(scope="module")
+def stated(recorded):
+    """The simulator in m and N, and the same recording in its units."""
+    simulator = replace(cart(), units={"force": "N", "pos": "m"})
+    return simulator, recorded.with_(u=1e3 * recorded.u, y=recorded.y / 1e3, units=simulator.units)
+
+
+def test_a_recording_is_converted_by_channel(recorded, stated):
+    simulator, own = stated
+    found = recorded.in_units(simulator.units)
+    assert found.units == simulator.units
+    np.testing.assert_allclose(np.hstack([found.u, found.y]), np.hstack([own.u, own.y]), rtol=1e-12)
+    assert own.in_units(simulator.units) is own
+    assert own.in_units({"pos": "furlong"}) is own
+    with pytest.raises(pilfr.InputError, match="has 'pos' in mm, and"):
+        recorded.in_units({"pos": "V"})
+
+
+def test_observers_compensators_and_exports_use_the_units_of_the_model(recorded, stated):
+    simulator, own = stated
+    fitted = pilfr.fit(simulator, own)
+    for model in (simulator, fitted, simulator.matched(own) and pilfr.exported(simulator, dt=own.dt, start=own)):
+        one, other = (pilfr.control.kalman_filter(model, r) for r in (own, recorded))
+        np.testing.assert_allclose(one.R, other.R, rtol=1e-6)
+        np.testing.assert_allclose(one.spread, other.spread, rtol=1e-6)
+    one, other = (pilfr.control.feedforward(fitted, r) for r in (own, recorded))
+    assert one.limits == pytest.approx(other.limits)
+    shifted = [r.slice(100, 300) for r in (own, recorded)]
+    one, other = (pilfr.exported(simulator, dt=own.dt, start=r).x0() for r in shifted)
+    np.testing.assert_allclose(one, other, rtol=1e-6)
+
+
+def test_a_diagnosis_takes_recordings_in_any_unit(recorded, stated):
+    simulator, own = stated
+    found = pilfr.diagnose(simulator, recorded, laws=(CoulombFriction,), workers=1)
+    one, other = (pilfr.control.kalman_filter(found, r) for r in (own, recorded))
+    np.testing.assert_allclose(one.R, other.R, rtol=1e-6)
+    shifted = [r.slice(100, 300) for r in (own, recorded)]
+    np.testing.assert_allclose(*(found.export(start=r).x0() for r in shifted), rtol=1e-6)
+    np.testing.assert_allclose(found.simulate(own), found.simulate(recorded), rtol=1e-9)
+    np.testing.assert_allclose(found.matched(recorded).y, own.y, rtol=1e-12)
+
+
+def test_weights_and_figures_of_a_fit_use_the_units_of_the_model(recorded, stated):
+    simulator, own = stated
+    fitted = pilfr.fit(simulator, [recorded, own.slice(0, 300)], weights=[2.0, 1.0])
+    assert pilfr.fit(fitted, [recorded, own.slice(0, 300)]).options.weights == fitted.options.weights
+    drawn = [fitted.plot(r).axes[0].lines[0].get_ydata() for r in (own, recorded)]
+    np.testing.assert_allclose(*drawn, rtol=1e-9)
+    drawn = [fitted.plot(r, "bode").axes[0].lines[0].get_ydata() for r in (own, recorded)]
+    np.testing.assert_allclose(*drawn, rtol=1e-6)
+
+
+def test_a_fit_without_a_simulator_keeps_the_units_of_its_training(recorded, stated):
+    _, own = stated
+    fitted = pilfr.fit(pilfr.PILFR(2), own)
+    assert fitted.nrmse(recorded) == pytest.approx(fitted.nrmse(own), rel=1e-6)
+    mixed = pilfr.fit(pilfr.PILFR(2), [own, recorded.slice(0, 300)])
+    assert mixed.train_nrmse[1] < 2 * mixed.train_nrmse[0]

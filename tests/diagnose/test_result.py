@@ -327,3 +327,10 @@ def test_a_recording_in_which_the_machine_rests_is_scored_by_the_others(diagnose
     bench = Workbench.of(rig(), [test, still], "zero")
     errors = compare_errors(bench, {"": Started(bench.model(HIDDEN))}).errors[""]
     assert 0 < errors < 0.01
+
+
+def test_a_range_of_noise_says_what_its_ends_are():
+    d = replace(example(), floor={"nrmse": 0.03, "white": 0.002, "source": "estimated"})
+    words = "0.0020 (its white part) to 0.0300 (with the slow part)"
+    assert f"noise floor {words} (estimated)" in str(d)
+    assert "the noise floor is 0.2\xa0% (its white part) to 3\xa0% (with the slow part)" in d._repr_html_()

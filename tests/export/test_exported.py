@@ -21,7 +21,7 @@ from pilfr_casadi.data import nrmse, read_csv
 from pilfr_casadi.diagnose import Diagnosis, diagnose
 from pilfr_casadi.engine import compiler
 from pilfr_casadi.identify import load
-from pilfr_casadi.laws import Backlash, Drift, PreslidingFriction, Relaxation, StopHysteresis
+from pilfr_casadi.laws import Backlash, Delay, Drift, PreslidingFriction, Relaxation, StopHysteresis
 from pilfr_casadi.models import PILFR
 from pilfr_casadi.simulators import load_simulator
 
@@ -96,9 +96,16 @@ def test_where_it_starts():
 
 def test_a_diagnosis_exports_what_it_fitted():
     simulator, data = laws_in_ports(), wave(mass_on_spring(), 0.02)
-    empty = dict.fromkeys(("sentence", "effects", "candidates", "gates", "mismatch", "parameters", "errors", "floor"))
+    empty = dict.fromkeys(("sentence", "effects", "candidates", "mismatch", "parameters", "errors", "floor"))
     diagnosis = Diagnosis(
-        verdict="complete", **empty, corrected=simulator, refitted=simulator, hold="linear", train=(data,), substeps=3
+        verdict="complete",
+        gates=(),
+        **empty,
+        corrected=simulator,
+        refitted=simulator,
+        hold="linear",
+        train=(data,),
+        substeps=3,
     )
     step, wanted = diagnosis.to_casadi("rig"), exported(simulator, dt=0.02, hold="linear", substeps=3).step
     x, u = np.random.default_rng(0).normal(size=10), np.array([1.0, 2.0])
@@ -262,7 +269,7 @@ REFUSED = {
     "start": (lambda: exported(some_fit(), start=np.zeros(4)), "has 4 numbers; give 3 .* or 7"),
     "start nan": (lambda: exported(some_fit(), start=[np.nan] * 3), "finite numbers"),
     "start text": (lambda: exported(some_fit(), start="zero"), "give numbers"),
-    "recording": (lambda: exported(mass_on_spring(), dt=0.1, start=recording_for(some_fit())), "must be the same"),
+    "recording": (lambda: exported(mass_on_spring(), dt=0.1, start=recording_for(some_fit())), "has no input"),
     "step": (lambda: exported(mass_on_spring(), dt=0.1, start=wave(mass_on_spring(), 0.2)), "step is 0.2 s"),
     "bound": (lambda: exported(some_fit()).bound(np.zeros(3), [0.0]), "3 numbers were given for the state; expected 7"),
     "fast": (
@@ -585,3 +592,9 @@ def test_a_step_takes_what_fits():
         assert np.array_equal(np.asarray(other[0]).ravel(), following.ravel()) and float(other[1]) == y.item()
     assert step(np.tile(x[:, None], 3), np.full((1, 3), 0.3))[0].shape == (7, 3)
     assert step(ca.MX.sym("x", 7), ca.MX.sym("u"))[1].shape == (1, 1)
+
+
+def test_a_long_memory_is_one_entry_of_the_print():
+    delayed = mass_on_spring().with_element("sensor:y", Delay().at({"T": 0.5}))
+    text = str(exported(delayed, dt=0.05))
+    assert re.search(r"sensor:y\.memory1\.\.\d+ \(\d+ states\)", text) and "memory2" not in text

@@ -355,6 +355,7 @@ def test_steps_too_long_for_bouc_wen_do_not_run_away():
         ({"values": [1.0]}, r"The values of the law 'clearance' are \[1.0\]; give a dict by parameter name"),
         ({"limits": {"g": 1.0}}, r"limits of the law 'clearance' hold g = 1.0; give a pair \(lower, upper\)"),
         ({"limits": {"g": (2.0, 1.0)}}, "give a pair .* of increasing numbers"),
+        ({"values": {"g": 1.0}, "limits": {"g": (2.0, 3.0)}}, r"has g = 1.0, outside of its limits 2.0 to 3.0; widen"),
     ],
 )
 def test_values_that_a_law_cannot_have(given, says):

@@ -449,3 +449,14 @@ def test_a_curve_is_drawn_from_left_to_right_and_a_loop_along_the_time(kind):
     ax = plots.force_cloud(plots.Signal("x", x, "V"), plots.Signal("w", law, "N"), x, law)
     drawn = ax.lines[1].get_xdata()
     assert np.array_equal(drawn, np.sort(x)) is (kind == "curve")
+
+
+def test_a_simulation_that_dwarfs_the_others_leaves_the_picture():
+    t = np.arange(500) * 0.01
+    y = np.sin(2 * np.pi * t)[:, None]
+    r = Recording(y, y, 0.01, ("u",), ("y",))
+    ax = plots.compared_traces(r, [("as given", 40 * y + 3.0), ("corrected", 1.05 * y)], 0)
+    assert ax.get_ylim() == pytest.approx((-1.365, 1.365), rel=1e-2)
+    assert legend_of(ax) == ["measured", "as given (leaves the picture)", "corrected"]
+    ax = plots.compared_traces(r, [("as given", 2 * y), ("corrected", 1.05 * y)], 0)
+    assert ax.get_ylim()[1] > 2 and legend_of(ax) == ["measured", "as given", "corrected"]

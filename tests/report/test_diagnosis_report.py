@@ -16,7 +16,9 @@ from test_report import EVIL, Reader, own_scripts_alone
 
 from pilfr_casadi._base import InputError
 from pilfr_casadi.diagnose import Gate, Workbench
+from pilfr_casadi.laws import CoulombFriction
 from pilfr_casadi.report import corrected_file, diagnosis_report, diagnosis_report as same, usage
+from pilfr_casadi.simulators import load_simulator
 
 
 def test_the_checker_can_fail():
@@ -130,6 +132,24 @@ def test_faults_that_were_corrected_stand_right_after_the_verdict_and_in_the_cor
     assert "corrected" in lines[at - 1] and lines[at + 1] == "#   exec('1/0')" and "Interpolated" not in source
     assert "belongs to" not in corrected_file(example(), "rig.py")
     compile(source, "corrected.py", "exec")
+
+
+def test_the_corrected_file_keeps_values_for_which_the_search_widened_the_bounds(tmp_path):
+    d = example()
+    law = CoulombFriction().at({"F_c": 1.0, "v_0": 2e-3}, {"v_0": (1e-3, 0.1)})
+    simulator = d.refitted.with_element("ground", law)
+    own = simulator.parameters
+    sharper = replace(own["ground.v_0"], value=2e-4, bounds=(1e-4, 0.1))
+    freed = replace(own["k"], value=30.0, bounds=(0.0, np.inf))  # below the bounds of the diagnosed simulator
+    simulator = simulator.with_parameters({"ground.v_0": sharper, "k": freed})
+    (tmp_path / "rig.py").write_text("from diagnosis_example import rig\n\nsimulator = rig(430.0, 5.0)\n")
+    (tmp_path / "corrected.py").write_text(corrected_file(replace(d, corrected=simulator), "rig.py"))
+    loaded = load_simulator(tmp_path / "corrected.py")
+    for name, p in simulator.parameters.items():
+        assert loaded.parameters[name].value == p.value
+        assert np.array_equal(loaded.parameters[name].bounds, p.bounds)
+    wanted = replace(simulator, hold=d.hold).simulate(d.train[0])
+    assert np.array_equal(loaded.simulate(d.train[0]), wanted)
 
 
 @pytest.mark.usefixtures("blank_figures")

@@ -230,6 +230,21 @@ def test_modes_are_eigenvalues():
     assert large.rows[0] == pytest.approx(small.rows[0])
 
 
+def test_modes_that_the_data_cannot_show_are_marked():
+    fitted = example()
+    values = fitted.model.parameters.change(A={"value": np.diag([0.9, -0.8])}, B_w={"value": np.zeros((2, 1))})
+    table, _ = mode_tables(replace(fitted, model=fitted.model.with_parameters(values)))
+    assert [row[:3] for row in table.rows] == [["decay", None, None], ["alternates with every sample", None, None]]
+    u = np.sin(2 * np.pi * 0.5 * np.arange(4000) * fitted.dt)
+    rate = 2 * np.pi * 5 * complex(-0.1, np.sqrt(1 - 0.01))
+    pole = np.exp(rate * fitted.dt)
+    a = np.array([[pole.real, pole.imag], [-pole.imag, pole.real]])
+    values = fitted.model.parameters.change(A={"value": a}, B_w={"value": np.zeros((2, 1))})
+    slow = Recording(u, u, fitted.dt)
+    table, _ = mode_tables(replace(fitted, model=fitted.model.with_parameters(values)), [slow])
+    assert table.rows[0][0] == "oscillation, outside the excited band"
+
+
 @pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize(
     ("status", "tone"),

@@ -12,7 +12,7 @@ import numpy as np
 from ..._base import InputError, Interrupt, one_at_a_time
 from ...data import Recording, nrmse
 from ...engine import Engine, make_engine
-from ...identify import match_channels, solve_within_bounds
+from ...identify import solve_within_bounds
 from ...laws import Local
 from ...linear import INJECTION, with_output_injection
 from ...models import Model, ParameterSet
@@ -27,6 +27,7 @@ from ...simulators import (
     fastest_rates,
     growth_rate,
     least_substeps,
+    match_channels,
     needed_substeps,
     rate_at_start,
 )
