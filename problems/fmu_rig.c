@@ -2,9 +2,13 @@
  *
  * Value references are places in `v`: parameters, states, derivatives, inputs, outputs. It keeps neither time nor events.
  * Macros make variants: CRASHES on instantiation; FAILURE, a statement, and FAILED, a status of the
- * getters, at stiffnesses above 600 N/m; STRICT refuses parameters in continuous-time mode; SINGLE makes one instance,
+ * getters, at stiffnesses above 600 N/m or another condition WHERE; STRICT refuses parameters in continuous-time mode; SINGLE makes one instance,
  * which cannot be reset and fails at positions above 1 m.
  */
+#ifndef WHERE
+#define WHERE (v[K1] > 600)
+#endif
+
 #include <stdlib.h>
 #include <string.h>
 
@@ -22,7 +26,7 @@ typedef struct {
 
 static void evaluate(double *v) {
 #ifdef FAILURE
-  if (v[K1] > 600) FAILURE;
+  if (WHERE) FAILURE;
 #endif
   const double inner = v[K2] * (v[X1] - v[X2]) + v[D2] * (v[V1] - v[V2]);
   v[DX1] = v[V1];

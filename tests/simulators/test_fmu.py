@@ -1,5 +1,6 @@
 """Simulators from functional mock-up units: the numbers of their equations, ports, parameters, error messages."""
 
+import os
 import pickle
 import shutil
 import subprocess
@@ -261,6 +262,19 @@ def test_a_unit_that_refuses_a_second_instance_does_not_end_the_process_of_its_u
     pushed = given.with_(u=given.u + 1e5)
     job = cloudpickle.dumps((guided(c_rig(tmp_path / "a.fmu", "SINGLE")), (given, pushed, given)))
     done = subprocess.run([sys.executable, "-c", FINITE_SAMPLES], input=job, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr.decode()
+    whole, part, again = map(int, done.stdout.decode().strip("[]\n").split(","))
+    assert whole == again == len(given) and 0 < part < len(given)
+
+
+def test_an_isolated_unit_that_crashes_at_a_state_does_not_end_the_process_of_its_user(tmp_path):
+    """Without a compiler, single points are evaluated."""
+    given = recording(6, samples=40)
+    unit = guided(c_rig(tmp_path / "a.fmu", "FAILURE=abort()", "WHERE=(v[X1]>1)"))
+    job = cloudpickle.dumps((unit, (given, given.with_(u=given.u + 1e5), given)))
+    options = {**os.environ, "PILFR_ISOLATED": "1", "PILFR_COMPILER": "none"}
+    command = [sys.executable, "-c", FINITE_SAMPLES]
+    done = subprocess.run(command, input=job, capture_output=True, check=False, env=options)
     assert done.returncode == 0, done.stderr.decode()
     whole, part, again = map(int, done.stdout.decode().strip("[]\n").split(","))
     assert whole == again == len(given) and 0 < part < len(given)
