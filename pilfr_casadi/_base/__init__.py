@@ -61,6 +61,7 @@ if TYPE_CHECKING:
         Reply as Reply,
         check_executor as check_executor,
         close_workers as close_workers,
+        end_with_parent as end_with_parent,
         one_at_a_time as one_at_a_time,
         one_blas_thread as one_blas_thread,
         open_replies as open_replies,

@@ -229,6 +229,13 @@ class ChildProcess:
                 pipe.close()
 
 
+def end_with_parent(parent: int) -> None:
+    """End this process after its parent, also while the main thread hangs."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(0)
+
+
 class WorkerProcess(ChildProcess):
     """A child process of a worker, for `run_in_worker`."""
 

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import ChildProcess, abandoned, open_replies, read_message, write_message
+from .._base import ChildProcess, abandoned, end_with_parent, open_replies, read_message, write_message
 from .external import Leaf
 from .fmu_description import tidy
 from .fmu_instance import FmuEvaluation, FmuFile, FmuSignals, UnitError, evaluation
@@ -204,7 +204,7 @@ def _has_time_event(signals: FmuSignals) -> bool:
 def serve() -> None:
     """Do jobs in the child process: read them from standard input, write results to standard output."""
     replies = open_replies()
-    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=end_with_parent, args=(os.getppid(),), daemon=True).start()
     while True:
         try:
             job = read_message(sys.stdin.buffer)
@@ -229,13 +229,6 @@ _selected: list[FmuSignals] = []  # in the child process: the signals that POINT
 
 def _select(signals: FmuSignals) -> None:
     _selected[:] = [signals]
-
-
-def _end_with_parent(parent: int) -> None:
-    """End this process after its parent, also while the unit hangs."""
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    os._exit(0)
 
 
 @atexit.register
