@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -144,12 +145,32 @@ def _places(rows: np.ndarray, part: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.all(same, axis=0))
 
 
-def check_laws(laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
-    """Return the laws as a tuple, by default the catalogue; refuse anything that is not a class of laws."""
+def check_laws(laws: Sequence[type[Law] | str] | None) -> tuple[type[Law], ...]:
+    """Return the classes of laws, by default the catalogue; a name stands for a class, or for all forms of an id."""
+    if isinstance(laws, str):
+        laws = (laws,)
+    found: list[type[Law]] = []
     for law in laws or ():
-        if not (isinstance(law, type) and issubclass(law, Law)):
+        if isinstance(law, str):
+            found += _laws_named(law)
+        elif isinstance(law, type) and issubclass(law, Law):
+            found.append(law)
+        else:
             raise InputError(f"laws holds {law!r}; give classes of laws, such as pilfr.laws.CoulombFriction.")
-    return CATALOGUE if laws is None else tuple(laws)
+    return CATALOGUE if laws is None else tuple(dict.fromkeys(found))
+
+
+def _laws_named(name: str) -> list[type[Law]]:
+    """Return the laws of the catalogue with an id, or the one with a name of a class; refuse an unknown name."""
+    found = [law for law in CATALOGUE if name in (law.id, law.__name__)]
+    if not found:
+        known = {label.lower(): label for law in CATALOGUE for label in (law.id, law.form, law.__name__) if label}
+        near = difflib.get_close_matches(name.lower().replace(" ", "_"), known, 3)
+        forms = {law.form: law.__name__ for law in reversed(CATALOGUE) if law.form}  # a form is chosen by its class
+        meant = listed(list(dict.fromkeys(forms.get(known[n], known[n]) for n in near)))
+        hint = f"did you mean {meant}?" if near else "give ids or class names from the catalogue of laws."
+        raise InputError(f"The catalogue has no law {name!r}; {hint}")
+    return found
 
 
 def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[type[Law], ...]:

@@ -434,7 +434,8 @@ class Diagnosis:
         if train and train["before"] > NEAR_CONSTANT and self.verdict in ("missing-physics", "unexplained"):
             out.append(
                 f"Refitted, the simulator alone is hardly better than a constant (error {train['before']:.2g} of the "
-                "outputs' deviation). Check its values, units and bounds before you trust a name."
+                "outputs' deviation). Either its values, units or bounds are wrong: check them before you "
+                "trust a name. Or large physics is missing: then the corrected simulator follows far better."
             )
         if train and self.effects:
             out += self._remaining_error(train["after"])

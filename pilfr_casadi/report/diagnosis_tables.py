@@ -178,7 +178,7 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
         others = "; ".join(name_at(port, law) for port, law in e.indistinguishable)
         out.append(Text(f"These recordings cannot tell it apart from: {others}."))
     else:
-        out.append(Text("No other law of the catalogue is nearly as likely."))
+        out.append(Text("No law with another name is nearly as likely; other forms of the same law may be."))
         if e.confidence < CLEAR:
             why = "something is left unexplained, a value is at a limit, or several less likely laws share the rest"
             out.append(Text(f"The confidence is lower because {why}."))
