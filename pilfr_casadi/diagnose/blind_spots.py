@@ -267,7 +267,7 @@ class Check:
 
 def _why(r: LawRow) -> str:
     """Say why a law is not detectable."""
-    return {"followed": f"followed by {r.why}", "weak": "below the noise", "no data": r.why}[r.status]
+    return {"followed": f"{r.why} can imitate it", "weak": "below the noise", "no data": r.why}[r.status]
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:

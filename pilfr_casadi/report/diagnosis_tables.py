@@ -139,7 +139,11 @@ def error_table(diagnosis: Diagnosis) -> Table:
     steps = _name_errors(diagnosis)
     rows: list[list[Any]] = []
     predicted = "free_run" in diagnosis.errors
-    for kind, name in (("train", "training"), ("test", "test (held out)"), ("free_run", "the same, free run")):
+    for kind, name in (
+        ("train", "training"),
+        ("test", "test (held out)"),
+        ("free_run", f"{'test' if diagnosis.errors.get('test') else 'training'}, the same, free run"),
+    ):
         errors = diagnosis.errors.get(kind)
         if errors:
             noise = diagnosis.floor if kind == "train" else diagnosis.noise_on_tests
@@ -248,7 +252,7 @@ def candidate_tables(
                 f"{gain:+.0f}".replace("-", "−") if np.isfinite(gain) else "–",
             ]
         )
-    columns = ["law", "port", "error of the fit", "error, held-out blocks", "margin", "ΔBIC"]
+    columns = ["law", "port", "error of the fit", "error, held-out blocks", "error / least error", "ΔBIC"]
     emphasis = [] if winner is None else [winner]  # an index outside a table marks no row
     out: list[Block] = [Table(columns, cells[:OPEN_ROWS], caption=title, emphasis=emphasis)]
     if len(cells) > OPEN_ROWS:
