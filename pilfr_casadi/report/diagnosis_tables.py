@@ -139,11 +139,9 @@ def error_table(diagnosis: Diagnosis) -> Table:
     steps = _name_errors(diagnosis)
     rows: list[list[Any]] = []
     predicted = "free_run" in diagnosis.errors
-    for kind, name in (
-        ("train", "training"),
-        ("test", "test (held out)"),
-        ("free_run", f"{'test' if diagnosis.errors.get('test') else 'training'}, the same, free run"),
-    ):
+    free = "test" if diagnosis.errors.get("test") else "training"
+    names = {"train": "training", "test": "test (held out)", "free_run": f"{free}, the same, free run"}
+    for kind, name in names.items():
         errors = diagnosis.errors.get(kind)
         if errors:
             noise = diagnosis.floor if kind == "train" else diagnosis.noise_on_tests
