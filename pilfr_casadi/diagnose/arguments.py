@@ -164,10 +164,11 @@ def _laws_named(name: str) -> list[type[Law]]:
     """Return the laws of the catalogue with an id, or the one with a name of a class; refuse an unknown name."""
     found = [law for law in CATALOGUE if name in (law.id, law.__name__)]
     if not found:
-        known = {label.lower(): label for law in CATALOGUE for label in (law.id, law.form, law.__name__) if label}
-        near = difflib.get_close_matches(name.lower().replace(" ", "_"), known, 3)
-        forms = {law.form: law.__name__ for law in reversed(CATALOGUE) if law.form}  # a form is chosen by its class
-        meant = listed(list(dict.fromkeys(forms.get(known[n], known[n]) for n in near)))
+        labels = dict.fromkeys(label for law in CATALOGUE for label in (law.id, law.__name__))
+        known = {label.lower(): label for label in labels}
+        wanted = name.lower().replace(" ", "_")
+        near = [label for label in known if wanted in label][:3] or difflib.get_close_matches(wanted, known, 3)
+        meant = listed([known[label] for label in near])
         hint = f"did you mean {meant}?" if near else "give ids or class names from the catalogue of laws."
         raise InputError(f"The catalogue has no law {name!r}; {hint}")
     return found
