@@ -161,8 +161,8 @@ def check_laws(laws: Sequence[type[Law] | str] | None) -> tuple[type[Law], ...]:
 
 
 def _laws_named(name: str) -> list[type[Law]]:
-    """Return the laws of the catalogue with an id, or the one with a name of a class; refuse an unknown name."""
-    found = [law for law in CATALOGUE if name in (law.id, law.__name__)]
+    """Return the laws of the catalogue with an id, or the one with a class name; letter case is ignored."""
+    found = [law for law in CATALOGUE if name.lower() in (law.id, law.__name__.lower())]
     if not found:
         labels = dict.fromkeys(label for law in CATALOGUE for label in (law.id, law.__name__))
         known = {label.lower(): label for label in labels}

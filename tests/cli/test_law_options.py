@@ -22,7 +22,7 @@ def files(tmp_path):
 
 
 def test_an_id_stands_for_all_forms_and_a_class_name_for_one():
-    assert check_laws(["Lag", CoulombFriction]) == (Lag, CoulombFriction)
+    assert check_laws(["lag", "Lag", CoulombFriction]) == (Lag, CoulombFriction)
     assert check_laws(["coulomb_friction"]) == tuple(law for law in CATALOGUE if law.id == "coulomb_friction")
 
 
