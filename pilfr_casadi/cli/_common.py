@@ -230,7 +230,8 @@ class SimulatorOptions(DataOptions):
 
     files: list[str] = simulator_files("SIMULATOR TRAIN")
     port: list[str] = option(
-        "Port of an FMU by its variables: an input that is a force, a coordinate, its speed (repeatable).",
+        "Port of an FMU by its variables: an input that is a force, a coordinate, its speed (repeatable); with "
+        "units, as in wall=loss[W]:temperature[K], where the FMU states none.",
         "NAME=INTO:ACROSS[:RATE]",
         [],
     )
@@ -294,21 +295,16 @@ class SimulatorOptions(DataOptions):
     def _fmu_options(self, path: str) -> dict[str, Any]:
         """Return the options of `from_fmu`, with the inputs and outputs that the first recording has."""
         from ..data import column_names
-        from ..simulators import CoSimulation, fmu_signals, needs_step_size
+        from ..simulators import CoSimulation, fmu_signals, needs_step_size, parse_port
 
-        ports = {}
-        for name, text in pairs(self.port, "--port", "INTO:ACROSS").items():
-            parts = text.split(":")
-            if not 2 <= len(parts) <= 3 or not all(parts):
-                raise InputError(f"--port {name}={text} was given; write --port NAME=INTO:ACROSS or INTO:ACROSS:RATE.")
-            ports[name] = dict(zip(("into", "across", "rate"), parts, strict=False))
+        ports = pairs(self.port, "--port", "INTO:ACROSS")
         bounds = bounds_of(self.bound)
         columns, signals = self.columns(self.train[0]), fmu_signals(path)
+        forces = {parse_port(name, text, [*signals[0], *signals[1]])["into"] for name, text in ports.items()}
         wanted = [columns.get(name, name) for names in signals for name in names]
         recorded, kept = set(column_names(self.train[0], wanted)), []
         for role, names in zip(("input", "output"), signals, strict=True):
             kept.append(tuple(name for name in names if columns.get(name, name) in recorded))
-            forces = {port["into"] for port in ports.values()}
             missing = [name for name in names if name not in kept[-1] and name not in forces]
             if missing and kept[-1]:
                 print(f"note: {self.train[0]} has no column for the {role}s {listed(missing)} of {path}", flush=True)

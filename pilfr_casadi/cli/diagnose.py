@@ -7,6 +7,7 @@ and writes check.json if a folder is given.
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ from ._common import (
     check_folder,
     flag,
     make_folder,
+    name_list,
     new_file,
     numbers_of,
     option,
@@ -45,6 +47,9 @@ if TYPE_CHECKING:
     from ..diagnose import Diagnosis
 
 
+LAWS = option("Laws to try, by id (all forms of a law) or by class name (default: the whole catalogue).", "NAME[,NAME]")
+
+
 @dataclass(frozen=True, kw_only=True)
 class DiagnoseOptions(SimulatorOptions):
     """The options of `pilfr diagnose`."""
@@ -52,6 +57,8 @@ class DiagnoseOptions(SimulatorOptions):
     files: list[str] = simulator_files("[SIMULATOR] TRAIN")
     simulated: str | None = option("Recorded simulation (inputs and outputs), instead of the simulator file.", "SIM")
     test: list[str] = option("Test recording, never fitted (repeatable).", "FILE", [])
+    laws: str | None = LAWS
+    effects: int | None = whole("Largest number of effects to look for (default: as many as the data tell).", 1, 100)
     limit: list[str] = option(
         "Largest amplitude of an input in the proposed next experiment (repeatable; default: as recorded).",
         "INPUT=AMPLITUDE",
@@ -61,7 +68,9 @@ class DiagnoseOptions(SimulatorOptions):
         "Number of parallel fits (default: one per processor, at most four).", 1, LARGEST_SIZE["workers"]
     )
     time_limit: float = seconds(
-        "End the search after about this time, with the best answer so far (default: 600).", 600.0
+        "End the search after about this time, with the best answer so far; loading the simulator and writing the "
+        "report come on top (default: 600).",
+        600.0,
     )
     focus: Literal["simulation", "prediction"] | None = option(
         "Errors of a free run, or of predictions one sample ahead (default: a free run, if the simulator can)."
@@ -103,6 +112,7 @@ class DiagnoseOptions(SimulatorOptions):
 def diagnose_command(options: DiagnoseOptions) -> int:
     """Writes the answer to DIR/diagnosis.json and the report to DIR/report.html."""
     options.check_files("--simulated SIM.csv")
+    laws = _law_names(options.laws)
     new_file(options.out, "diagnosis.json", options.overwrite)
     given = source = None
     if options.source is None:
@@ -135,6 +145,8 @@ def diagnose_command(options: DiagnoseOptions) -> int:
                 list(train.values()),
                 test=list(tests.values()) or None,
                 hold=options.hold,
+                laws=laws,
+                effects=options.effects,
                 limits=numbers_of(options.limit, "--limit"),
                 workers=options.workers,
                 stand_in_error=error,
@@ -146,6 +158,17 @@ def diagnose_command(options: DiagnoseOptions) -> int:
     except KeyboardInterrupt:
         return say("Interrupted before there was a diagnosis; nothing was written.", INTERRUPTED)
     return write_diagnosis(diagnosis, folder, source)
+
+
+def _law_names(text: str | None) -> tuple[str, ...] | None:
+    """Return the names given by `--laws`, checked before any file is read; None without the option."""
+    if text is None:
+        return None
+    from ..diagnose import check_laws
+
+    names = name_list(text, "--laws")
+    check_laws(names)
+    return names
 
 
 def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: SimulatorFile | None = None) -> int:
@@ -167,8 +190,10 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: SimulatorFile | 
                     corrected, corrected_file(diagnosis, there, source.loader, source.options, source.bounds)
                 )
         with progress_bar() as progress:
-            progress("writing the report", 0, 0, np.nan)
+            progress("writing the report: simulations and pictures", 0, 0, np.nan)
+            began = time.perf_counter()
             page = diagnosis_report(diagnosis, folder)
+            took = time.perf_counter() - began
     except KeyboardInterrupt:
         return say(f"Interrupted; the diagnosis is in {target}, a report was not written.", INTERRUPTED)
     except (InputError, OSError):
@@ -176,6 +201,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: SimulatorFile | 
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
         return say(f"The diagnosis is in {target}, but a report could not be written ({reason}).", NO_RESULT)
+    print(f"writing the report took {took:.0f} s more, which the computing time and --time-limit do not count")
     print(f"diagnosis: {target}\nreport: {page}")
     if corrected is not None:
         print(f"corrected simulator: {corrected}")
@@ -290,6 +316,7 @@ def _same_samples(options: DiagnoseOptions, name: str) -> bool:
 class CheckOptions(SimulatorOptions):
     """The options of `pilfr check`."""
 
+    laws: str | None = LAWS
     out: str | None = option("Folder for check.json (default: nothing is written).", "DIR")
     overwrite: bool = flag("Replace an existing check.json in that folder.", "--overwrite")
 
@@ -298,6 +325,7 @@ class CheckOptions(SimulatorOptions):
 def check_command(options: CheckOptions) -> int:
     """Refits only the simulator itself; with --out, the answer is in DIR/check.json."""
     options.check_files()
+    laws = _law_names(options.laws)
     if options.out is not None:
         new_file(options.out, "check.json", options.overwrite)
     given = options.simulator_file().load()
@@ -309,7 +337,7 @@ def check_command(options: CheckOptions) -> int:
     with deferred_interrupt():
         from ..diagnose import check
     train = list(recordings.values())
-    found = check(as_simulator(given, train), train, hold=options.hold)
+    found = check(as_simulator(given, train), train, hold=options.hold, laws=laws)
     print(name_options(str(found)))
     if folder is not None:
         target = make_folder(str(folder)) / "check.json"

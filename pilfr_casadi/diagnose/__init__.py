@@ -74,7 +74,7 @@ def diagnose(
     *,
     test: Recording | Sequence[Recording] | None = None,
     hold: str | None = None,
-    laws: Sequence[type[Law]] | None = None,
+    laws: Sequence[type[Law] | str] | None = None,
     effects: int | None = None,
     limits: Mapping[str, float] | None = None,
     workers: int | None = None,
@@ -97,8 +97,9 @@ def diagnose(
         Recordings to report on, never used to fit or to choose.
     hold : {"zero", "linear"}, optional
         Course of the inputs between samples, if neither recordings nor simulator say; by default the data decide.
-    laws : sequence of Law classes, optional
-        By default the whole catalogue, and `laws.VaryingParameter`, with which parameters may vary. Inputs that the
+    laws : sequence of Law classes or names, optional
+        A name is an id, such as "coulomb_friction", which stands for all forms of a law, or the name of a class. By
+        default the whole catalogue, and `laws.VaryingParameter`, with which parameters may vary. Inputs that the
         simulator's equations do not read are tried as scales of some of its laws.
     effects : int, optional
         Largest number of effects to look for; by default as many as the recordings tell.

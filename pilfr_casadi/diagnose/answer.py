@@ -158,7 +158,7 @@ def _compute_errors(
         fits = {"before": without, "after": after, **{f"without {i}": f for i, f in enumerate(each.values())}}
         compared = test_errors(bench, tests, found.gates, fits, bench.on(tests).model(request.simulator))
         on_tests = compared.errors
-        notes = (*_edit_notes(compared), *_resting_notes(compared.find_resting()))
+        notes = (*_edit_notes(compared), *_resting_notes(compared.find_resting()), *_scored_note(compared))
         if not list(_edit_notes(compared)) and on_tests["after"] > FAR_RATIO * bench.nrmse(after):
             notes = (*_test_faults(bench, after, tests, found.gates), *notes)
         fewer = {e: on_tests[f"without {i}"] for i, e in enumerate(each)}
@@ -217,6 +217,18 @@ def _resting_notes(resting: Sequence[tuple[str, int]]) -> Iterator[Gate]:
             "large. Give its initial state, or a longer test recording."
         )
         yield Gate("simulation", "resting test", first, words, False)
+
+
+def _scored_note(compared: Comparison) -> Iterator[Gate]:
+    """Note which test samples are not scored: all models are compared on the same samples, also the one as given."""
+    count = max(first - r.skip for r, first in compared.scored)
+    if count > 0:
+        words = (
+            f"Up to {count} samples of a test recording are not scored, because the initial state is estimated from "
+            "them. The slowest of the compared simulators sets this number, so another correction changes the test "
+            "errors as given and refitted a little, too."
+        )
+        yield Gate("simulation", "scored samples", count, words, False)
 
 
 def _edit_notes(compared: Comparison) -> Iterator[Gate]:
@@ -313,7 +325,8 @@ def _make_effect(
         remarks.append("these recordings do not show its memory: a curve follows them as well")
     if other_forms:
         others = in_words([display_name(other.id, other.form) for other in other_forms])
-        remarks.append(f"{others} {'are' if other_forms[1:] else 'is'} about as likely")
+        forms = "other forms of this law, are" if other_forms[1:] else "another form of this law, is"
+        remarks.append(f"{others}, {forms} about as likely")
     return Effect(
         port=element.port,
         law=law.id,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -144,12 +145,33 @@ def _places(rows: np.ndarray, part: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.all(same, axis=0))
 
 
-def check_laws(laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
-    """Return the laws as a tuple, by default the catalogue; refuse anything that is not a class of laws."""
+def check_laws(laws: Sequence[type[Law] | str] | None) -> tuple[type[Law], ...]:
+    """Return the classes of laws, by default the catalogue; a name stands for a class, or for all forms of an id."""
+    if isinstance(laws, str):
+        laws = (laws,)
+    found: list[type[Law]] = []
     for law in laws or ():
-        if not (isinstance(law, type) and issubclass(law, Law)):
+        if isinstance(law, str):
+            found += _laws_named(law)
+        elif isinstance(law, type) and issubclass(law, Law):
+            found.append(law)
+        else:
             raise InputError(f"laws holds {law!r}; give classes of laws, such as pilfr.laws.CoulombFriction.")
-    return CATALOGUE if laws is None else tuple(laws)
+    return CATALOGUE if laws is None else tuple(dict.fromkeys(found))
+
+
+def _laws_named(name: str) -> list[type[Law]]:
+    """Return the laws of the catalogue with an id, or the one with a class name; letter case is ignored."""
+    found = [law for law in CATALOGUE if name.lower() in (law.id, law.__name__.lower())]
+    if not found:
+        labels = dict.fromkeys(label for law in CATALOGUE for label in (law.id, law.__name__))
+        known = {label.lower(): label for label in labels}
+        wanted = name.lower().replace(" ", "_")
+        near = [label for label in known if wanted in label][:3] or difflib.get_close_matches(wanted, known, 3)
+        meant = listed([known[label] for label in near])
+        hint = f"did you mean {meant}?" if near else "give ids or class names from the catalogue of laws."
+        raise InputError(f"The catalogue has no law {name!r}; {hint}")
+    return found
 
 
 def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[type[Law], ...]:

@@ -18,7 +18,7 @@ import numpy as np
 from .._base import in_words, one_blas_thread, to_json
 from ..data import Recording
 from ..laws import LINEAR, Law, display_name
-from ..simulators import ACTUATOR, SENSOR, in_series, kind_of, port_name, split_port
+from ..simulators import ACTUATOR, SENSOR, UNKNOWN, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings, stated_hold
 from .detectability import LawRow, assess_laws, group_alike
 from .excitation import Excitation, excitations
@@ -92,8 +92,12 @@ class Check:
         Stated course of the inputs between samples ("" if not stated), and the start of each recording.
     hold_taken : str
         The course with which the simulator was refitted: the stated one, or the one that fits better.
+    switches : tuple of str
+        Inputs that are only ever on or off: zero or one other value.
     idle_inputs : tuple of str
         Inputs that the simulator's equations do not read.
+    unknown_domains : tuple of str
+        Declared ports whose units do not tell the physical domain, so that laws of all domains are tried there.
     next_record : str
         The recording that would help most.
     seconds : float
@@ -111,6 +115,8 @@ class Check:
     starts: tuple[str, ...]
     hold_taken: str = "zero"
     idle_inputs: tuple[str, ...] = ()
+    unknown_domains: tuple[str, ...] = ()
+    switches: tuple[str, ...] = ()
     next_record: str = ""
     seconds: float = 0.0
 
@@ -118,6 +124,11 @@ class Check:
     def detectable(self) -> tuple[LawRow, ...]:
         """Laws that are detectable."""
         return tuple(r for r in self.laws if r.status == "detectable")
+
+    @property
+    def rough(self) -> bool:
+        """Whether the simulated motion is not the machine's, so that nothing that follows from it is exact."""
+        return self.error**2 > USELESS_FIT
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of check.json; numbers that are not finite are None."""
@@ -136,7 +147,7 @@ class Check:
         lines += ["Blind spots of these recordings:"] if self.blind_spots else ["No blind spot was found."]
         lines += [f"- {b.sentence}" for b in self.blind_spots]
         lines += ["", *self._parameter_lines(), "", *self._law_lines()]
-        if groups := list(self._group_lines()):
+        if groups := [] if self.rough else list(self._group_lines()):
             lines += ["", "Laws that look the same, one group a line:", *groups]
         lines += ["", *self._excitation_lines(), "", *self._circumstances(), f"next record: {self.next_record}"]
         return "\n".join([*lines, f"computed in {self.seconds:.1f} s"])
@@ -167,6 +178,9 @@ class Check:
         return " = ".join(next((names for names in groups if port in names), (port,)))
 
     def _law_lines(self) -> Iterator[str]:
+        if self.rough:
+            yield "Which laws are detectable is not listed: the simulated motion is not the machine's."
+            return
         rows = []
         shown: dict[str, str] = {}
         for r in self.laws:
@@ -204,6 +218,12 @@ class Check:
         unsaid = f"not stated, here taken as {taken}; say hold='zero' or hold='linear' if you know"
         yield f"inputs between samples: {taken if self.hold else unsaid}"
         yield f"start of each recording: {', '.join(self.starts)}"
+        if self.unknown_domains:
+            where = in_words(self.unknown_domains)
+            yield (
+                f"physical domain unknown at {where}, so laws of all domains are tried: state the units, as in "
+                "Port(unit='W', across_unit='K'); of an FMU, as in --port wall=loss[W]:temperature[K]"
+            )
         if self.idle_inputs:
             idle = in_words(self.idle_inputs)
             yield f"inputs that the equations do not read: {idle}; a diagnosis tries their effects"
@@ -211,7 +231,7 @@ class Check:
 
 def _why(r: LawRow) -> str:
     """Say why a law is not detectable."""
-    return {"followed": f"followed by {r.why}", "weak": "below the noise", "no data": r.why}[r.status]
+    return {"followed": f"{r.why} can imitate it", "weak": "below the noise", "no data": r.why}[r.status]
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
@@ -226,7 +246,7 @@ def check(
     simulator: Any,
     train: Recording | Sequence[Recording],
     hold: str | None = None,
-    laws: Sequence[type[Law]] | None = None,
+    laws: Sequence[type[Law] | str] | None = None,
     engine: str = "auto",
 ) -> Check:
     """Find what recordings can reveal about a simulator and its missing physics, without fitting a law.
@@ -240,8 +260,8 @@ def check(
     hold : {"zero", "linear"}, optional
         Course of the inputs between samples, if neither recordings nor simulator say; by default the one with which
         the refitted simulator follows better.
-    laws : sequence of Law classes, optional
-        By default the plainest form of each law of the catalogue.
+    laws : sequence of Law classes or names, optional
+        Names are as in `diagnose`. By default the plainest form of each law of the catalogue.
     engine : {"auto", "c", "vm"}
         Generated C or CasADi's virtual machine; by default C where there is a compiler.
 
@@ -255,10 +275,10 @@ def check(
         If simulator and recordings do not fit each other, or the simulation diverges or runs away from them.
     """
     simulator, recordings = match_recordings(simulator, train, hold, excited=False)
-    check_laws(laws)
+    wanted = None if laws is None else check_laws(laws)
     stated = stated_hold(simulator, recordings, hold)
     now = _refit(Workbench.of(simulator, recordings, stated or "zero", engine), hold_said=stated is not None)
-    found = assess_recordings(now.bench, now.fitted, now.floor, stated or "", laws)
+    found = assess_recordings(now.bench, now.fitted, now.floor, stated or "", wanted)
     slow = find_held_outputs(recordings)
     return _with_faults(found, now.gates, slow, recordings) if now.gates or slow else found
 
@@ -322,7 +342,9 @@ def assess_recordings(
         hold=stated,
         hold_taken=bench.hold,
         idle_inputs=bench.simulator.idle_inputs,
+        unknown_domains=tuple(p.name for p in bench.simulator.ports if not p.series and p.domain == UNKNOWN),
         starts=tuple(START_WORDS[r.begins] for r in bench.recordings),
+        switches=tuple(name for i, name in enumerate(inputs) if _is_switch([r.u[:, i] for r in bench.recordings])),
     )
     swings = np.ptp(np.concatenate([r.u for r in bench.recordings]), axis=0)
     still = [name for name, swing in zip(inputs, swings, strict=True) if not swing > 0]
@@ -331,6 +353,12 @@ def assess_recordings(
     )
     sensors = helpful_sensors(response, runs) if ties else ()
     return replace(found, next_record=_next_record(found, inputs, sensors), seconds=time.perf_counter() - began)
+
+
+def _is_switch(runs: Sequence[np.ndarray]) -> bool:
+    """Tell whether an input is switched on and off; a single step, or two values besides zero, may be of any size."""
+    values = np.unique(np.concatenate(runs))
+    return len(values) == 2 and 0.0 in values and any(np.count_nonzero(np.diff(u)) > 1 for u in runs)
 
 
 def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[ParameterRow]) -> tuple[str, ...]:
@@ -357,8 +385,7 @@ def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) 
         if names:
             yield BlindSpot(kind, tuple(names), sentence.format(in_words(names)))
 
-    rough = found.error**2 > USELESS_FIT  # then the simulated motion is not the machine's
-    if rough:
+    if found.rough:
         left = f"{100 * found.error:.3g} % of the outputs' deviation"
         yield BlindSpot("rough", (), f"The refitted simulator leaves {left}, so all of this is rough.")
     yield from spot("constant-input", still, "Constant in all recordings: {}.")
@@ -372,19 +399,21 @@ def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) 
         yield from spot(status, names, sentence + more)
     for tie in found.ties:
         yield BlindSpot("tied", tie.names, tie.sentence)
-    known = [e for e in found.excitation if not rough or kind_of(e.port) == ACTUATOR]
+    known = [e for e in found.excitation if not found.rough or kind_of(e.port) == ACTUATOR]
     moving = [e for e in known if split_port(e.port)[1] not in still]
     yield from spot("no-motion", [e.port for e in moving if e.travel == 0], "Nothing moves at {}.")
     text = "No reversal at {}: hysteresis and friction look like stiffness and damping there."
     yield from spot("no-reversal", [e.port for e in moving if e.travel > 0 and e.reversals == 0], text)
     text = "A single amplitude at {}: hysteresis looks like damping and stiffness there."
-    yield from spot("one-amplitude", [e.port for e in moving if e.reversals and e.amplitudes == 1], text)
+    switched = {port_name(ACTUATOR, name) for name in found.switches}
+    single = [e.port for e in moving if e.reversals and e.amplitudes == 1 and e.port not in switched]
+    yield from spot("one-amplitude", single, text)
     ports, seen = (dict.fromkeys(r.port for r in rows) for rows in (found.laws, found.detectable))
     dark = [port for port in ports if port not in seen]
     yield from spot("hidden-port", dark, "No law of the catalogue is detectable at {}.")
     for port in ports:
         yield from _followed_laws(found, port)
-    for group in () if rough else _alike_ports(found):
+    for group in () if found.rough else _alike_ports(found):
         yield from spot("alike-ports", group, "A law looks the same at {}.")
 
 
@@ -417,15 +446,19 @@ def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) ->
     """Say what to record next, from the gravest blind spot that a recording can remove."""
     names = {b.kind: b.names for b in reversed(found.blind_spots)}
     if "rough" in names:
-        return "First let the simulator follow these better: check its values and units, the start and the hold."
+        return (
+            "None yet: either values, units, the start or the hold are wrong, so check its values and units, or large "
+            "physics is missing, which `pilfr diagnose` finds out from these recordings."
+        )
     if "constant-input" in names:
         return f"One in which {in_words(names['constant-input'])} varies."
-    drive = inputs[0] if inputs else "the input"
+    graded = [name for name in inputs if name not in found.switches]  # a switch has no other amplitude
+    drive = next(iter([*graded, *inputs]), "the input")
     signals = [port for kind in MOTION for port in names.get(kind, ()) if kind_of(port) == ACTUATOR]
     own = split_port(signals[0])[1] if signals else drive
     for inside, signal in ((True, drive), (False, own)):  # forces inside first, then the signals
         for kind, sentence in MOTION.items():
-            if any(in_series(port) != inside for port in names.get(kind, ())):
+            if graded and any(in_series(port) != inside for port in names.get(kind, ())):
                 return sentence.format(signal)
     if sensors:
         tied = in_words([n for t in found.ties for n in t.names])

@@ -50,8 +50,12 @@ class Effect:
         return f"; confidence {self.at_port:.2f} that a law acts there" if surer else ""
 
     def limit(self, name: str) -> str:
-        """Say that a parameter is at a limit of what is tried here, and may want to be beyond; empty if it is not."""
-        return ", at its limit" if self.parameters.get(name, {}).get("at_limit") else ""
+        """Say that a parameter is at the limit of what is tried here, or not distinct from zero; else empty."""
+        p = self.parameters.get(name, {})
+        if p.get("at_limit"):
+            return ", at the limit of the values tried"
+        superfluous = p.get("std") is not None and abs(p["value"]) < p["std"]
+        return ", zero within its standard error: this term may be superfluous" if superfluous else ""
 
     @property
     def defined(self) -> dict[str, dict[str, Any]]:
@@ -97,7 +101,12 @@ class Effect:
         else:
             local = "v the speed" if re.search(r"\bv\b", self.equation) else "z the local coordinate"
             what = f"subtracted from the derivative of {of}" if kind == EQUATION else "the force or flow"
-            symbols = f"where w is {what} and {local} at the port"
+            if kind == EQUATION:
+                local += (
+                    f" at the port; times what the equation of {of} divides by (such as a mass, an area or a heat "
+                    "capacity) it is a force that opposes, or a flow that leaves"
+                )
+            symbols = f"where w is {what} and {local}" + " at the port" * (kind != EQUATION)
         lines = [
             f"{self.name}, confidence {self.confidence:.2f}{self.place}",
             f"  {self.sentence}: {self.equation}",

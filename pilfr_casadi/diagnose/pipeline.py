@@ -95,7 +95,7 @@ def diagnose_in_steps(
     *,
     test: Recording | Sequence[Recording] | None,
     hold: str | None,
-    laws: Sequence[type[Law]] | None,
+    laws: Sequence[type[Law] | str] | None,
     effects: int | None,
     limits: Mapping[str, float] | None,
     workers: int | None,

@@ -443,7 +443,8 @@ class Diagnosis:
         if train and train["before"] > NEAR_CONSTANT and self.verdict in ("missing-physics", "unexplained"):
             out.append(
                 f"Refitted, the simulator alone is hardly better than a constant (error {train['before']:.2g} of the "
-                "outputs' deviation). Check its values, units and bounds before you trust a name."
+                "outputs' deviation). Either its values, units or bounds are wrong: check them before you "
+                "trust a name. Or large physics is missing: then the corrected simulator follows far better."
             )
         if train and self.verdict != "unexplained":
             out += self._remaining_error(train["after"])
@@ -528,11 +529,15 @@ class Diagnosis:
     def _error_lines(self) -> list[str]:
         """Format the errors as a table, with the noise floor below it."""
         lines = [f"{'NRMSE':<12}" + "".join(f"{name:>11}" for name in ERROR_NAMES.values())]
+        role = "test" if self.errors.get("test") else "train"
         for kind in ("train", "test", "free_run"):
             errors = self.errors.get(kind)
             if errors:
                 shown = (_error_text(errors[k]) for k in ERROR_NAMES)
-                lines.append(f"  {kind.replace('_', ' '):<10}" + "".join(f"{text:>11}" for text in shown))
+                label = f"{role} free" if kind == "free_run" else kind  # a free run of the recordings in the row above
+                lines.append(f"  {label:<10}" + "".join(f"{text:>11}" for text in shown))
+        if self.errors.get("free_run"):
+            lines.append(f"  {role} free: a free run of the {role} recordings; the rows above are predictions")
         noise = f"{self.noise_text(self.floor)} ({self.floor['source']})"
         if self.floor.get("test"):
             noise += f", on the test recordings {self.noise_text(self.noise_on_tests)}"

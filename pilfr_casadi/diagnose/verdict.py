@@ -458,6 +458,14 @@ def _which_laws(search: Hypotheses) -> str:
     return f"none of the laws that were fitted before the time limit ({cases})"
 
 
+def _explains_all(search: Hypotheses, laws: int) -> str:
+    """Say what failed to explain all of the mismatch; after the time limit, further effects may not have been tried."""
+    if search.out_of_time and search.tried >= search.selected:
+        effects = "one effect, which does" if laws == 1 else f"{laws} effects, which do"
+        return f"the time limit ended the search after {effects} not explain all of it"
+    return f"{_which_laws(search)} explains all of it"
+
+
 def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, float], mode: float | None) -> str:
     root, share = search.root, max(shares.values(), default=0.0)
     where = max(shares, key=lambda k: shares[k], default="")
@@ -492,6 +500,6 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
     if rest > LEAST_EXPLAINED:
         explained = f": a force at a port explains {rest:.0%} of it"
     return (
-        f"Physics is missing, most likely at {port}, and {_which_laws(search)} explains all of it. The closest "
+        f"Physics is missing, most likely at {port}, and {_explains_all(search, len(laws))}. The closest "
         f"{named} {removed} of the mismatch on the training recordings. The rest is not noise{explained}."
     )

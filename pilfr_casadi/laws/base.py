@@ -443,6 +443,8 @@ def display_name(law: str, form: str = "") -> str:
 
     A form that says no more than the id is left out.
     """
+    if law == "extra_mode" and form:  # its forms say what it is: a lag, a resonance, an elastic joint
+        law, _, form = form.partition(", ")
     form = "" if form in law.split("_") else form
     text = PROPER_NAMES.get(law, law.replace("_", " "))
     text = text.capitalize() if text.split(" ")[0] in PEOPLE else text

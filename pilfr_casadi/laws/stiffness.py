@@ -45,6 +45,11 @@ class CubicStiffness(Law):
     equation = "w = k_3 z^3"
     source = "Kovacic & Brennan (2011), The Duffing Equation, ch. 1"
     sentence = "a stiffness that grows (or falls) with the square of the deflection, the same in both directions"
+    sentences: ClassVar[Mapping[str, str]] = {
+        "thermal": "a cubic loss: a heat flow that grows with the third power of the temperature",
+        "fluid": "a cubic loss: a flow that grows with the third power of the level or pressure",
+        "electrical": "a cubic characteristic: a term that grows with the third power of the current or voltage",
+    }
     units = {"k_3": "w/z^3"}
 
     def force(self, z: Any, p: Any) -> Any:
@@ -57,6 +62,9 @@ class PowerStiffness(CubicStiffness):
     form = "power"
     equation = "w = k_n sign(z) |z|^n"
     sentence = "a force that grows with a power of the deflection, the same in both directions"
+    sentences: ClassVar[Mapping[str, str]] = {
+        "fluid": "a flow that grows with a power of the level or pressure, the same in both directions"
+    }
     units = {"k_n": "w/z^n", "n": ""}
     domains = ("mechanical", "fluid")
     starts = {"n": ("", 2.0, 2.5, 4.0)}
@@ -102,6 +110,9 @@ class AsymmetricCubicStiffness(CubicStiffness):
     equation = "w = k_3 (z^3 + b z^2)"
     source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 4.2; Klippel (2006), J. Audio Eng. Soc. 54(10)"
     sentence = "a stiffness that grows (or falls) with the square of the deflection, not the same in both directions"
+    sentences: ClassVar[Mapping[str, str]] = {
+        "fluid": "a flow that grows with the third power of the level or pressure, not the same in both directions"
+    }
     units = {"k_3": "w/z^3", "b": "z"}
     domains = ("mechanical", "fluid")
     two_sided = True
@@ -119,6 +130,11 @@ class QuadraticStiffness(Law):
     equation = "w = k_2 z^2"
     source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 4.2"
     sentence = "a stiffness that changes in proportion to the deflection, so that it is stiffer in one direction"
+    sentences: ClassVar[Mapping[str, str]] = {
+        "thermal": "a quadratic loss: a heat flow that grows with the square of the temperature",
+        "fluid": "a quadratic loss: a flow that grows with the square of the level or pressure",
+        "electrical": "a quadratic characteristic: a term that grows with the square of the current or voltage",
+    }
     units = {"k_2": "w/z^2"}
 
     def force(self, z: Any, p: Any) -> Any:

@@ -140,7 +140,9 @@ def error_table(diagnosis: Diagnosis) -> Table:
     steps = _name_errors(diagnosis)
     rows: list[list[Any]] = []
     predicted = "free_run" in diagnosis.errors
-    for kind, name in (("train", "training"), ("test", "test (held out)"), ("free_run", "the same, free run")):
+    free = "test" if diagnosis.errors.get("test") else "training"
+    names = {"train": "training", "test": "test (held out)", "free_run": f"{free}, the same, free run"}
+    for kind, name in names.items():
         errors = diagnosis.errors.get(kind)
         if errors:
             noise = diagnosis.floor if kind == "train" else diagnosis.noise_on_tests
@@ -179,7 +181,7 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
         others = "; ".join(name_at(port, law) for port, law in e.indistinguishable)
         out.append(Text(f"These recordings cannot tell it apart from: {others}."))
     else:
-        out.append(Text("No other law of the catalogue is nearly as likely."))
+        out.append(Text("No law with another name is nearly as likely; other forms of the same law may be."))
         if e.confidence < CLEAR:
             why = "something is left unexplained, a value is at a limit, or several less likely laws share the rest"
             out.append(Text(f"The confidence is lower because {why}."))
@@ -249,7 +251,7 @@ def candidate_tables(
                 f"{gain:+.0f}".replace("-", "−") if np.isfinite(gain) else "–",
             ]
         )
-    columns = ["law", "port", "error of the fit", "error, held-out blocks", "margin", "ΔBIC"]
+    columns = ["law", "port", "error of the fit", "error, held-out blocks", "error / least error", "ΔBIC"]
     emphasis = [] if winner is None else [winner]  # an index outside a table marks no row
     out: list[Block] = [Table(columns, cells[:OPEN_ROWS], caption=title, emphasis=emphasis)]
     if len(cells) > OPEN_ROWS:

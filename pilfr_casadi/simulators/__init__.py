@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         binary_path as binary_path,
         fmu_signals as fmu_signals,
         needs_step_size as needs_step_size,
+        parse_port as parse_port,
     )
     from .fmu_instance import FmuSignals as FmuSignals, evaluation as evaluation
     from .fmu_process import run_in_unit as run_in_unit

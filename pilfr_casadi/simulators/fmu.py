@@ -28,7 +28,7 @@ from .._base import InputError, check_known
 from ..models import Named, Parameter, parameter_within, within_a_factor
 from .external import NOMINAL, ROUNDING, call_external, equal_state, external, leaves, units
 from .fmu_cosimulation import CoSimulation, SteppedEquations, SteppedUnit, check_force, unknown_signal
-from .fmu_description import Description, Unit, Variable, check_file
+from .fmu_description import Description, Unit, Variable, check_file, parse_port
 from .fmu_instance import FmuFile, FmuSignals, unpack
 from .fmu_process import FmuFunction, has_time_event
 from .ports import Port
@@ -102,7 +102,7 @@ class _Unit(Unit):
 def from_fmu(
     path: str | os.PathLike[str],
     *,
-    ports: Mapping[str, Mapping[str, Any]] | None = None,
+    ports: Mapping[str, Mapping[str, Any] | str] | None = None,
     parameters: Sequence[str] | Mapping[str, Parameter] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     inputs: Sequence[str] | None = None,
@@ -120,8 +120,9 @@ def from_fmu(
         By name of a port `dict(into=..., across=..., rate=...)` with names of the unit's variables: `into` an input to
         which a law's force is added with the opposite sign (friction opposes motion), or `{input: factor}`; `across` an
         output or a state, the local coordinate; `rate`, which may be left out, its speed; `unit` and `across_unit`
-        the units of force and coordinate, by default those of the file. By default each state's equation is a port.
-        Actuators and sensors are always ports.
+        the units of force and coordinate, by default those of the file. The text "loss[W]:temperature[K]" says the
+        same, and with the speed "force[N]:position[m]:velocity". By default each state's equation is a port. Actuators
+        and sensors are always ports.
     parameters : names, or mapping from names to Parameter, optional
         Parameters that a fit may change; by default all tunable ones. Fixed ones may be named too; each change of
         their values restarts the unit. Those with `bounds` are free too; the others keep the unit's values.
@@ -146,8 +147,12 @@ def from_fmu(
         If the file is no unit for this platform, a name is not one of its variables, or a unit for co-simulation has
         no states that can be set.
     """
-    path, given, bounds = Path(path), dict(ports or {}), bounds or {}
+    path, bounds = Path(path), bounds or {}
     described = check_file(path, cosimulation is not None)
+    given = {
+        name: parse_port(name, port, described.variables) if isinstance(port, str) else port
+        for name, port in (ports or {}).items()
+    }
     unit: _Unit | SteppedUnit
     if described.identifier:
         unit = _load_unit(path, described, (*(parameters or ()), *bounds), outputs)

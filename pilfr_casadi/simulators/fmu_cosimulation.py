@@ -71,7 +71,7 @@ class SteppedUnit(Unit):
         if np.isnan(dt):
             raise InputError(
                 f"{path} is for co-simulation and states no step size; give the recordings' step, as in "
-                "from_fmu(..., cosimulation=CoSimulation(dt=0.001))."
+                "from_fmu(..., cosimulation=pilfr_casadi.simulators.CoSimulation(dt=0.001))."
             )
         slave = Slave(path, described.version, described.token, described.slave)
         unit = cls(path, described, slave, positive(dt, "dt"), {})

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import sys
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -196,6 +197,23 @@ def fmu_signals(path: str | os.PathLike[str]) -> tuple[tuple[str, ...], tuple[st
     """List the inputs and the outputs of a functional mock-up unit, without running it."""
     described = describe(Path(path))
     return described.of("input"), described.of("output")
+
+
+def parse_port(name: str, text: str, variables: Collection[str]) -> dict[str, str]:
+    """Parse a port INTO[UNIT]:ACROSS[UNIT][:RATE]; the units are optional, and brackets may belong to a variable."""
+    parts = [part.strip() for part in text.split(":")]
+    if not 2 <= len(parts) <= 3 or not all(parts):
+        raise InputError(
+            f"The port {name}={text} was given; write NAME=INTO:ACROSS or NAME=INTO:ACROSS:RATE, with units as in "
+            "loss[W]:temperature[K]."
+        )
+    out = {}
+    for key, unit_key, part in zip(("into", "across", "rate"), ("unit", "across_unit", ""), parts, strict=False):
+        found = None if part in variables else re.fullmatch(r"(.*\S)\s*\[([^\[\]]*)\]", part)
+        out[key] = found[1] if found else part
+        if found and unit_key:  # the unit of a rate follows from that of the coordinate
+            out[unit_key] = found[2].strip()
+    return out
 
 
 def tidy(error: Exception) -> str:

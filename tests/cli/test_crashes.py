@@ -47,7 +47,7 @@ def test_the_status_of_a_command_that_ends_is_its_own(unit):
 
 def test_ctrl_c_reaches_the_command(unit):
     body = "try:\n    print('begun', flush=True)\n    time.sleep(60)\nexcept KeyboardInterrupt:\n    return 130"
-    process = started(body, unit)
-    assert process.stdout.readline() == "begun\n"
-    process.send_signal(signal.SIGINT)
-    assert process.wait(30) == 130
+    with started(body, unit) as process:
+        assert process.stdout.readline() == "begun\n"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130

@@ -253,6 +253,18 @@ def test_a_simulator_that_does_not_follow_is_said_to_be_rough():
     given = record(MASS, noise_like(1))
     found = check(MASS, given.with_(y=given.y[::-1]))
     assert found.blind_spots[0].kind == "rough" and "check its values and units" in found.next_record
+    assert "large physics is missing, which `pilfr diagnose` finds out" in found.next_record
+    assert "detectable from" not in str(found) and "look the same" not in str(found)
+
+
+def test_a_switch_is_not_to_be_given_another_amplitude():
+    on_off = noise_like(1)
+    on_off = np.where(on_off > np.median(on_off), 1.0, 0.0)
+    found = check(MASS, record(MASS, on_off))
+    assert found.switches == ("force",) and "amplitude of force" not in found.next_record
+    assert not [b for b in found.blind_spots if b.kind == "one-amplitude" and "actuator:force" in b.names]
+    both = check(MASS, record(MASS, 2 * on_off - 1))  # a test signal of two levels may have another size
+    assert not both.switches
 
 
 def test_an_error_above_the_noise_is_told_first():

@@ -203,7 +203,8 @@ def test_tests_may_begin_in_the_training_data_where_they_are_not_scored(plain):
         ({"effects": -1}, "effects is -1"),
         ({"progress": "yes"}, "progress = 'yes' was given; give True"),
         ({"hold": "cubic"}, "hold='cubic' was given"),
-        ({"laws": ["friction"]}, "laws holds 'friction'; give classes of laws"),
+        ({"laws": ["friction"]}, "no law 'friction'; did you mean .*coulomb_friction"),
+        ({"laws": [7]}, "laws holds 7; give classes of laws"),
     ],
 )
 def test_bad_options_are_refused_at_once(plain, option, words):

@@ -192,7 +192,7 @@ def test_a_value_at_a_limit_of_its_law_is_told():
     y = cart().with_element("actuator:force", Backlash().at({"r": 4.0})).simulate(blank)
     for law, limited in ((Narrow, True), (Backlash, False)):
         (effect,) = pilfr.diagnose(cart(), blank.with_(y=y), laws=[law], effects=1, workers=1).effects
-        assert effect.parameters["r"]["at_limit"] == limited == (", at its limit" in str(effect))
+        assert effect.parameters["r"]["at_limit"] == limited == (", at the limit of the values tried" in str(effect))
 
 
 def test_a_correction_that_no_test_recording_tried_says_so():

@@ -16,6 +16,7 @@ from pilfr_casadi.diagnose.correction import Correction
 from pilfr_casadi.diagnose.faults.offsets import Offset, fix_idle_offsets, list_offsets, update_offsets
 from pilfr_casadi.diagnose.fits.evidence import deviations
 from pilfr_casadi.diagnose.fits.flexible_forces import flexible_shares, innovation_share
+from pilfr_casadi.diagnose.verdict import judge, posterior
 from pilfr_casadi.laws import CoulombFriction, CubicDamping, Power as StaticPower, Relaxation
 
 
@@ -218,3 +219,16 @@ def test_an_offset_whose_error_is_unknown_stays_told():
     (gate,) = list_offsets(fitted.simulator.elements, fitted.values)
     for error, told in ((np.nan, 1), (0.3, 0), (1e-3, 1)):
         assert len(update_offsets([gate], fitted, {gate.parameter: np.array(error)}, True, True)) == told
+
+
+def test_a_search_that_the_time_limit_ended_does_not_blame_the_catalogue():
+    u = 10 * multisine(200, f_max=3.0, fs=20.0, rng=np.random.default_rng(1))
+    blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
+    y = cart().with_element("ground", CoulombFriction().at({"F_c": 3.0, "v_0": 0.01})).simulate(blank)
+    found = pilfr.diagnose(cart(), blank.with_(y=y), laws=(CubicDamping,), effects=1, workers=1)
+    search = found.evidence["search"]
+    answer = replace(posterior(search), effects=())
+    assert "no law of the catalogue explains all of it" in judge(search, answer, ()).sentence
+    search.out_of_time = True
+    said = judge(search, answer, ()).sentence
+    assert "the time limit ended the search after one effect, which does not explain all of it" in said

@@ -416,3 +416,10 @@ def test_a_rectifying_sensor_sees_no_signs():
     (force,) = unit_forces(law, both, [{"n": 1.5, "b": 0.1}])[:, 0].T
     np.testing.assert_allclose(z + force, np.abs(z) ** 1.5 + 0.1, atol=1e-9)
     assert law.why_not(one) and not law.why_not(both)
+
+
+@pytest.mark.parametrize("domain", ["thermal", "fluid", "electrical"])
+def test_a_curve_of_the_coordinate_is_no_stiffness_where_nothing_deflects(domain):
+    for law in (CubicStiffness, laws.QuadraticStiffness, laws.PowerStiffness, laws.AsymmetricCubicStiffness):
+        if not law.domains or domain in law.domains:
+            assert not {"stiffness", "deflection"} & set(law.sentences[domain].split())

@@ -211,3 +211,22 @@ def test_in_a_browser(width, tmp_path):
     seen = in_a_browser(tmp_path, width)
     assert seen["title"] == "Diagnosis of a simulator: force → pos, vel"
     assert seen["pictures"] > 15
+
+
+def test_a_free_run_says_of_which_recordings_it_is():
+    d = example()
+    free = dict.fromkeys(("nominal", "before", "after"), 2.0)
+    tested = replace(d, errors={**d.errors, "free_run": free})
+    assert "\n  test free " in str(tested) and "free run of the test recordings" in str(tested)
+    alone = replace(d, errors={**d.errors, "test": None, "free_run": free})
+    assert "\n  train free " in str(alone)
+
+
+def test_an_effect_is_told_in_plain_terms():
+    effect = example().effects[0]
+    value = {"value": 0.7, "std": 0.98, "unit": "N", "at_limit": False}
+    told = str(replace(effect, parameters={"F_0": value}))
+    assert "F_0 = 0.7 ± 0.98 N, zero within its standard error: this term may be superfluous" in told
+    at_state = str(replace(effect, port="equation:h1"))
+    assert "subtracted from the derivative of h1" in at_state and "a flow that leaves" in at_state
+    assert replace(effect, port="sensor:x", law="extra_mode", form="lag").name == "lag at sensor:x"

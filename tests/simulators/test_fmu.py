@@ -19,7 +19,7 @@ from pilfr_casadi import InputError, Parameter, exported, fit, from_fmu
 from pilfr_casadi.engine import VirtualMachine, compiler, make_engine
 from pilfr_casadi.laws import CoulombFriction
 from pilfr_casadi.report import corrected_file
-from pilfr_casadi.simulators import CoSimulation, discretise, load_simulator
+from pilfr_casadi.simulators import CoSimulation, discretise, load_simulator, parse_port
 from problems.fmu_rig import FOLDER, GUIDE, PARAMETERS, c_rig, casadi_rig, description, recording, rig
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler")
@@ -90,7 +90,7 @@ ELSEWHERE = """
 import pickle, sys
 import numpy as np
 from pilfr_casadi.engine import make_engine
-from pilfr_casadi.simulators import CoSimulation, discretise
+from pilfr_casadi.simulators import parse_port, CoSimulation, discretise
 simulator, given = pickle.load(sys.stdin.buffer)
 model = discretise(simulator, given.dt, "zero", 1)
 y = make_engine(model).simulate(model.drive(given), model.parameters.start, np.zeros(model.n_state))[0]
@@ -146,7 +146,8 @@ def test_parameters_and_bounds_can_be_chosen(unit):
         ({"ports": {"guide": {"into": "guide", "across": "pos1"}}}, "has no 'guide' among its inputs"),
         ({"ports": {"guide": {"into": "guide_force", "across": "pos"}}}, "`across` of port 'guide' is 'pos'"),
         ({"ports": {"guide": {"into": "guide_force"}}}, "give dict"),
-        ({"ports": {"guide": "guide_force"}}, "give dict"),
+        ({"ports": {"guide": "guide_force"}}, "write NAME=INTO:ACROSS"),
+        ({"ports": {"guide": 1}}, "give dict"),
         ({"ports": {"guide": {"into": "force", "across": "pos1", "speed": "v1"}}}, "the unknown key 'speed'"),
     ],
 )
@@ -344,6 +345,20 @@ def test_a_port_has_units(units):
     assert guided(units["c"]).port("guide").unit == "N"
 
 
+def test_a_port_is_given_as_a_text_with_units(units):
+    port = from_fmu(units["c"], ports={"guide": "guide_force[kN]:pos1 [mm]:vel1"}).port("guide")
+    assert (port.unit, port.position_unit, port.domain) == ("kN", "mm", "mechanical")
+    plain = from_fmu(units["c"], ports={"guide": "guide_force:pos1"}).port("guide")
+    assert (plain.unit, plain.rate) == ("N", None)
+    with pytest.raises(InputError, match="write NAME=INTO:ACROSS"):
+        from_fmu(units["c"], ports={"guide": "guide_force"})
+
+
+def test_brackets_of_a_variable_are_not_taken_for_a_unit():
+    found = parse_port("axis", "f[1]:r[1][mm]:v[1]", ("f[1]", "r[1]", "v[1]"))
+    assert found == {"into": "f[1]", "across": "r[1]", "across_unit": "mm", "rate": "v[1]"}
+
+
 def test_the_message_about_inputs_names_the_cure(units):
     with pytest.raises(InputError, match=r"name the recorded ones, as in from_fmu\(\.\.\., inputs=\.\.\.\)"):
         from_fmu(units["c"]).simulate(recording(0, samples=20))
@@ -375,13 +390,16 @@ def test_the_command_checks_a_unit(tmp_path, capsys, units):
     train = write_table(tmp_path / "train.csv", recording(4, CoulombFriction({"F_c": 3.0, "v_0": 0.002}), samples=600))
     port = ("--port", "guide=guide_force:pos1:vel1", "--initial", "zero", "--hold", "zero")
     status, out, _ = run(capsys, "check", units["c"], train, *port, "--bound", "k1=300:500")
+    assert "physical domain unknown" not in out
+    unclear = ("--port", "guide=guide_force[level]:pos1[level]:vel1", *port[2:])
+    assert "physical domain unknown at guide" in run(capsys, "check", units["c"], train, *unclear)[1]
     assert status == 0 and "guide" in out and "has no column for the outputs vel1, power" in out
     bad = tmp_path / "bad.fmu"
     bad.write_text("x")
     refused(capsys, "check", bad, train, says="is not a functional mock-up unit")
     refused(capsys, "diagnose", bad, train, "--out", tmp_path / "d", says="is not a functional mock-up unit")
     assert not (tmp_path / "d").exists()
-    refused(capsys, "check", units["c"], train, "--port", "guide=x", says="write --port NAME=INTO:ACROSS")
+    refused(capsys, "check", units["c"], train, "--port", "guide=x", says="write NAME=INTO:ACROSS")
     refused(capsys, "check", units["c"], train, "--port", "guide=no:pos1", says="has no 'no' among its inputs")
     refused(capsys, "check", units["c"], train, "--bound", "k1=2:1", says="infeasible")
     model = tmp_path / "model.py"
