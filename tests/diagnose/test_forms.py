@@ -53,4 +53,4 @@ def test_forms_that_follow_alike_are_told():
     found = pilfr.diagnose(rig(430.0, 5.0), train, laws=(PiecewiseStiffness, HertzContact), effects=1, workers=1)
     (effect,) = found.effects
     other = {"above": "Hertz", "hertz": "above"}[effect.form]
-    assert f"piecewise stiffness ({other}) is about as likely" in effect.sentence
+    assert f"piecewise stiffness ({other}), another form of this law, is about as likely" in effect.sentence
