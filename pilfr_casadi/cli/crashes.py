@@ -6,6 +6,7 @@ command runs once more with every point evaluated in the FMU's own process.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
@@ -15,22 +16,26 @@ from collections.abc import Callable, Sequence
 from .._base import end_with_parent
 from ._common import NO_RESULT, say
 
-CRASHES = ("SIGABRT", "SIGSEGV", "SIGBUS", "SIGILL", "SIGFPE")
+CRASHES = {
+    int(getattr(signal, name)): name
+    for name in ("SIGABRT", "SIGSEGV", "SIGBUS", "SIGILL", "SIGFPE")
+    if hasattr(signal, name)
+}
 
 
 def run_beside_units(command: Callable[[], int], arguments: Sequence[str]) -> int:
     """Run a command; where one of its arguments is an FMU, in a child process first. Return the exit status."""
-    has_unit = any(argument.endswith(".fmu") and os.path.isfile(argument) for argument in arguments)
+    has_unit = any(argument.lower().endswith(".fmu") and os.path.isfile(argument) for argument in arguments)
     if not has_unit or not hasattr(os, "fork") or os.environ.get("PILFR_ISOLATED"):
         return command()
     ended = _run_in_child(command)
     if not os.WIFSIGNALED(ended):
         return os.waitstatus_to_exitcode(ended)
     number = os.WTERMSIG(ended)
-    if signal.Signals(number).name not in CRASHES:
-        return 128 + number
+    if number not in CRASHES:
+        return say(f"The command was ended by signal {number}.", 128 + number)
     say(
-        f"The FMU crashed ({signal.Signals(number).name}). The command starts again with every evaluation of it in a "
+        f"The FMU crashed ({CRASHES[number]}). The command starts again with every evaluation of it in a "
         "process of its own, which takes about three times as long.",
         NO_RESULT,
     )
@@ -50,8 +55,9 @@ def _run_in_child(command: Callable[[], int]) -> int:
         try:
             status = command()
         finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
+            with contextlib.suppress(OSError, ValueError):  # nobody reads the output any more
+                sys.stdout.flush()
+                sys.stderr.flush()
             os._exit(status)
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, lambda got, _: os.kill(child, got)) for number in numbers]

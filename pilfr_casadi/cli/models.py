@@ -292,6 +292,13 @@ def simulate_command(options: SimulateOptions) -> int:
         check_names(fitted, inputs, outputs)
     recording, columns, measured = _read_to_simulate(options, inputs, outputs)
     check_names(fitted, recording.inputs, recording.outputs if measured else fitted.model.outputs)
+    for name in (*recording.inputs, *recording.outputs):
+        if (factor := recording.factor_to(fitted.units, name)) != 1:
+            unit, wanted = recording.units[name], fitted.units[name]
+            print(
+                f"note: {name} is recorded in {unit}, and the model has it in {wanted}: its values were multiplied by "
+                f"{factor:g}, and {options.out} has the model's units."
+            )
     recording = fitted.matched(recording)
     y = replace(fitted, engine=announce_engine(fitted, recording, "auto", quiet=True)).simulate(recording)
     return _write_simulated(options, recording, y, fitted.model.outputs, columns, fitted.scored_from)

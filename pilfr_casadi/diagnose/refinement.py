@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, one_blas_thread, whole
+from .._base import InputError, Interrupt, one_blas_thread, whole
 from ..data import Recording
 from ..engine import make_engine
 from ..identify import regrid
@@ -178,6 +178,7 @@ def refine(diagnosis: Any, operators: int, kind: str | None, port: str | None) -
     search, after = (diagnosis.evidence.get(name) for name in ("search", "after"))
     if not isinstance(search, Search) or not isinstance(after, Fitted):
         raise InputError("This diagnosis does not hold its search; refine one that `diagnose` has just returned.")
+    search.bench = replace(search.bench, interrupt=Interrupt())  # an interrupt of an earlier one is over
     samples = sum(len(r) - r.skip for r in search.bench.recordings)
     if PER_OPERATOR * n > samples:
         raise InputError(
@@ -196,6 +197,7 @@ def refine(diagnosis: Any, operators: int, kind: str | None, port: str | None) -
         fitted = _fit_layer(search.bench, after, number, law)
         if fitted is not None:
             layers[name], held_out[name] = fitted, _predict(search, fitted)
+        search.bench.interrupt.raise_pending()
     if not layers:
         raise InputError(
             f"With a layer of {n} operators at {element.port} the simulation diverges; give fewer operators, or keep "

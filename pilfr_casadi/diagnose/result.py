@@ -356,7 +356,8 @@ class Diagnosis:
     def matched(self, recording: Recording) -> Recording:
         """Return a recording with the simulator's channels, order and units, corrected as the training was (`gates`).
 
-        Training recordings of the diagnosis are corrected already.
+        Training recordings of the diagnosis are corrected already. Give any other as it was read: a corrected one would
+        be corrected twice.
         """
         matched = match_channels(self.corrected, recording)
         return matched if any(recording is known for known in self.train) else edited([matched], self.gates)[0]

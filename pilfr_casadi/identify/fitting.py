@@ -191,13 +191,23 @@ def _check_arguments(model: Any, solver: Any, starts: Any, seed: Any, workers: A
 
 
 def _match_units(model: Any, train: Recording | Sequence[Recording]) -> tuple[Recording, ...]:
-    """Return recordings with the units of the model, for a simulator its channels; of a structure, with equal units."""
+    """Return recordings in the units of the model, with the channels of a simulator; of a structure, in equal units.
+
+    Values without a unit count as in these units.
+    """
     recordings = as_recordings(train)
     simulator = model if isinstance(model, Simulator) else model.simulator if isinstance(model, Fit) else None
+    # the first unit of each channel
+    units: Mapping[str, str] = {name: unit for r in reversed(recordings) for name, unit in r.units.items()}
     if simulator is not None:
-        return tuple(match_channels(simulator, r) for r in recordings)
-    units = model.units if isinstance(model, Fit) else recordings[0].units
-    return tuple(r.in_units(units) for r in recordings)
+        units, recordings = simulator.units, tuple(match_channels(simulator, r) for r in recordings)
+    elif isinstance(model, Fit):
+        units = model.units
+    matched = []
+    for r in (r.in_units(units) for r in recordings):
+        own = {name: unit for name, unit in units.items() if name in (*r.inputs, *r.outputs)}
+        matched.append(r.with_(units={**own, **r.units}) if own.keys() - r.units.keys() else r)
+    return tuple(matched)
 
 
 @one_blas_thread

@@ -396,7 +396,10 @@ class Law:
     def at(self, values: Mapping[str, Any], limits: Mapping[str, tuple[Any, Any]] | None = None) -> Self:
         """Copy that starts at `values`, clipped to `limits`."""
         own, ends = {**self.values, **values}, {**self.limits, **(limits or {})}
-        clipped = {name: np.clip(value, *ends[name]) if name in ends else value for name, value in own.items()}
+        try:
+            clipped = {name: np.clip(value, *ends[name]) if name in ends else value for name, value in own.items()}
+        except (TypeError, ValueError):  # they are no numbers, which the check of a law says
+            clipped = own
         return replace(self, values=clipped, limits=ends)
 
     def parameters(self) -> dict[str, Parameter]:

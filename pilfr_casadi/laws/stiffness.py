@@ -213,7 +213,6 @@ class Clearance(Law):
     units = {"k_g": "w/z", "g": "z"}
     absent = ("thermal",)  # heat flows at any difference
     two_sided = True
-    restoring = True  # a spring beyond a gap that pushed outwards would be a force that saturates
     starts = {"g": ("reach", 0.03, 0.08, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8)}
     ranges = {"g": ("reach", 0.001, 0.97), "k_g": ("max_stiffness", -1.0, 1.0)}
 

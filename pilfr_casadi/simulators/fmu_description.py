@@ -210,6 +210,8 @@ def parse_port(name: str, text: str, variables: Collection[str]) -> dict[str, st
     out = {}
     for key, unit_key, part in zip(("into", "across", "rate"), ("unit", "across_unit", ""), parts, strict=False):
         found = None if part in variables else re.fullmatch(r"(.*\S)\s*\[([^\[\]]*)\]", part)
+        if found and re.fullmatch(r"[\d, ]*", found[2]):  # an index
+            found = None
         out[key] = found[1] if found else part
         if found and unit_key:  # the unit of a rate follows from that of the coordinate
             out[unit_key] = found[2].strip()

@@ -97,8 +97,10 @@ class Simulator(Equations):
                 "recorded ones, as in from_fmu(..., inputs=...)."
             )
         columns = [recording.inputs.index(name) for name in self.inputs]
-        own = recording.with_(u=recording.u[:, columns], inputs=self.inputs).in_units(self.units)
+        own = recording.with_(u=recording.u[:, columns], inputs=self.inputs)
+        own = own.in_units({name: unit for name, unit in self.units.items() if name in self.inputs})
         if self.observer is not None:
+            own = own.in_units(self.units)
             own = own.with_(y=self._select_outputs(own), outputs=self.output_names, units={})
         model = discretise_for(self, [own])
         drive, start = model.drive(own), np.zeros(model.n_state)

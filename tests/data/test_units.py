@@ -171,3 +171,20 @@ def test_a_fit_without_a_simulator_keeps_the_units_of_its_training(recorded, sta
     assert fitted.nrmse(recorded) == pytest.approx(fitted.nrmse(own), rel=1e-6)
     mixed = pilfr.fit(pilfr.PILFR(2), [own, recorded.slice(0, 300)])
     assert mixed.train_nrmse[1] < 2 * mixed.train_nrmse[0]
+    unknown = replace(own.slice(0, 300), units={})
+    assert pilfr.fit(pilfr.PILFR(2), [unknown, own]).nrmse(recorded) == pytest.approx(
+        pilfr.fit(pilfr.PILFR(2), [unknown, own]).nrmse(own), rel=1e-6
+    )
+
+
+def test_values_without_a_unit_count_as_in_the_units_of_the_simulator(recorded, stated):
+    simulator, own = stated
+    fitted = pilfr.fit(simulator, replace(own, units={}))
+    assert fitted.units == simulator.units
+    one, other = (pilfr.control.kalman_filter(pilfr.exported(fitted), r) for r in (own, recorded))
+    np.testing.assert_allclose(one.R, other.R, rtol=1e-6)
+
+
+def test_a_simulation_does_not_need_the_units_of_the_outputs(stated):
+    simulator, own = stated
+    np.testing.assert_array_equal(simulator.simulate(replace(own, units={"pos": "V"})), simulator.simulate(own))

@@ -357,6 +357,7 @@ def test_a_port_is_given_as_a_text_with_units(units):
 def test_brackets_of_a_variable_are_not_taken_for_a_unit():
     found = parse_port("axis", "f[1]:r[1][mm]:v[1]", ("f[1]", "r[1]", "v[1]"))
     assert found == {"into": "f[1]", "across": "r[1]", "across_unit": "mm", "rate": "v[1]"}
+    assert parse_port("axis", "f:r[3]", ("f", "r[1]"))["across"] == "r[3]"  # a mistyped index is no unit
 
 
 def test_the_message_about_inputs_names_the_cure(units):
