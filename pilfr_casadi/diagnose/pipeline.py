@@ -399,7 +399,8 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
         correction, fitted = find_correction(search, answer)
         off = f"Refitted, the simulator is off by {search.bench.nrmse(refitted):.3g} of the outputs' deviation."
         said = correction.sentence if correction.elements else off
-        sentence = f"The search was interrupted before it came to an answer. {said}"
+        before = "The search was interrupted before it came to an answer." if interrupted else verdict.sentence
+        sentence = f"{before} {said}"
         return Conclusion(Verdict(verdict.kind, sentence), gates, fitted, correction)
     if verdict.kind == "unexplained":
         correction, fitted = find_correction(search, answer)
