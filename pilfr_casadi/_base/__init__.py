@@ -69,6 +69,7 @@ if TYPE_CHECKING:
         read_message as read_message,
         run_in_worker as run_in_worker,
         side_by_side as side_by_side,
+        units_are_isolated as units_are_isolated,
         worker_pool as worker_pool,
         write_message as write_message,
     )

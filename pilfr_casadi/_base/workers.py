@@ -229,6 +229,11 @@ class ChildProcess:
                 pipe.close()
 
 
+def units_are_isolated() -> bool:
+    """Tell whether programs of users, such as FMUs, are called in processes of their own alone (PILFR_ISOLATED=1)."""
+    return os.environ.get("PILFR_ISOLATED", "0") not in ("", "0")
+
+
 def end_with_parent(parent: int) -> None:
     """End this process after its parent, also while the main thread hangs."""
     while os.getppid() == parent:

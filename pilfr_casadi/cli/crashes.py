@@ -13,7 +13,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 
-from .._base import end_with_parent
+from .._base import end_with_parent, units_are_isolated
 from ._common import NO_RESULT, say
 
 CRASHES = {
@@ -26,7 +26,7 @@ CRASHES = {
 def run_beside_units(command: Callable[[], int], arguments: Sequence[str]) -> int:
     """Run a command; where one of its arguments is an FMU, in a child process first. Return the exit status."""
     has_unit = any(argument.lower().endswith(".fmu") and os.path.isfile(argument) for argument in arguments)
-    if not has_unit or not hasattr(os, "fork") or os.environ.get("PILFR_ISOLATED"):
+    if not has_unit or not hasattr(os, "fork") or units_are_isolated():
         return command()
     ended = _run_in_child(command)
     if not os.WIFSIGNALED(ended):

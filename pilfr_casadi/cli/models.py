@@ -292,13 +292,8 @@ def simulate_command(options: SimulateOptions) -> int:
         check_names(fitted, inputs, outputs)
     recording, columns, measured = _read_to_simulate(options, inputs, outputs)
     check_names(fitted, recording.inputs, recording.outputs if measured else fitted.model.outputs)
-    for name in (*recording.inputs, *recording.outputs):
-        if (factor := recording.factor_to(fitted.units, name)) != 1:
-            unit, wanted = recording.units[name], fitted.units[name]
-            print(
-                f"note: {name} is recorded in {unit}, and the model has it in {wanted}: its values were multiplied by "
-                f"{factor:g}, and {options.out} has the model's units."
-            )
+    for note in unit_notes(fitted.units, recording, "model").values():
+        print(f"note: {note}")
     recording = fitted.matched(recording)
     y = replace(fitted, engine=announce_engine(fitted, recording, "auto", quiet=True)).simulate(recording)
     return _write_simulated(options, recording, y, fitted.model.outputs, columns, fitted.scored_from)
@@ -310,7 +305,7 @@ def _simulate_equations(options: SimulateOptions) -> int:
         raise InputError("Only a saved model simulates several records in one array; give one recording.")
     inputs, outputs = options.names(simulator.inputs, simulator.output_names)
     recording, columns, _ = _read_to_simulate(options, inputs, outputs)
-    for note in unit_notes(simulator, recording).values():
+    for note in unit_notes(simulator.units, recording).values():
         print(f"note: {note}")
     seen, y, first = run_simulator(simulator, recording)
     return _write_simulated(options, seen, y, simulator.output_names, columns, lambda _: first)

@@ -17,7 +17,7 @@ from .._base import InputError, Stages, UntilInterrupted, in_words
 from ..data import Recording
 from ..engine import make_engine
 from ..optimise import GaussNewton, Status
-from ..simulators import Simulator, discretise_for, unit_factor, unit_notes
+from ..simulators import Simulator, discretise_for, unit_notes
 from .arguments import stated_hold
 from .faults.channels import accept_best, find_gross_slips, find_slips, open_bench, refit_corrected
 from .faults.gates import CURED_SHARE, EQUAL_RATIO, NEAR_NOISE_RATIO, POOR_FIT, Checked, Gate
@@ -299,9 +299,9 @@ def _with_other_hold(first: Checked, solver: GaussNewton = THOROUGH) -> Checked:
 def conversions(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Gate, ...]:
     """Note which channels are recorded in another unit than the simulator's."""
     found = {
-        sentence: Gate(name, "conversion", unit_factor(simulator, r, name), sentence)
+        sentence: Gate(name, "conversion", r.factor_to(simulator.units, name), sentence)
         for r in recordings
-        for name, sentence in unit_notes(simulator, r).items()
+        for name, sentence in unit_notes(simulator.units, r).items()
     }
     return tuple(found.values())
 

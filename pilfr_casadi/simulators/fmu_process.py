@@ -24,7 +24,15 @@ from typing import Any
 
 import numpy as np
 
-from .._base import ChildProcess, abandoned, end_with_parent, open_replies, read_message, write_message
+from .._base import (
+    ChildProcess,
+    abandoned,
+    end_with_parent,
+    open_replies,
+    read_message,
+    units_are_isolated,
+    write_message,
+)
 from .external import Leaf
 from .fmu_description import tidy
 from .fmu_instance import FmuEvaluation, FmuFile, FmuSignals, UnitError, evaluation
@@ -164,7 +172,7 @@ class FmuFunction(Leaf):
         if abandoned.pending or not math.isfinite(point.sum()):
             return none
         parameters = point[len(point) - self.signals.sizes[3] :].astype(np.float32).tobytes()
-        isolated = bool(os.environ.get("PILFR_ISOLATED")) or parameters not in self._answered
+        isolated = units_are_isolated() or parameters not in self._answered
         if not isolated and (here := _evaluation_here(self.signals)) is not None:
             with _evaluation_lock:
                 if not here.instance.failed[0]:  # a restart may end the process

@@ -263,23 +263,18 @@ class Simulator(Equations):
         return self._copy_with(parameters=ParameterSet(own), elements=tuple(others))
 
 
-def unit_notes(simulator: Simulator, recording: Recording) -> dict[str, str]:
-    """Describe, by channel, the conversions of a recording's values to the simulator's units, and unknown units."""
+def unit_notes(units: Mapping[str, str], recording: Recording, owner: str = "simulator") -> dict[str, str]:
+    """Describe, by channel, the conversions of a recording's values to a simulator's units, and unknown units."""
     out = {}
-    for name in (n for n in (*simulator.inputs, *simulator.output_names) if n in recording.units):
-        unit, wanted = recording.units[name], simulator.units.get(name, "")
-        factor = unit_factor(simulator, recording, name)
-        said = f"{name} is recorded in {unit}, and the simulator has it in {wanted}"
+    for name in (n for n in (*recording.inputs, *recording.outputs) if n in recording.units):
+        unit, wanted = recording.units[name], units.get(name, "")
+        factor = recording.factor_to(units, name)
+        said = f"{name} is recorded in {unit}, and the {owner} has it in {wanted}"
         if factor != 1:
             out[name] = f"{said}: its values were multiplied by {factor:g}."
         elif wanted and unit != wanted and conversion(unit, wanted) is None:
             out[name] = f"{said}; no conversion is known, so that its values were taken as they are."
     return out
-
-
-def unit_factor(simulator: Simulator, recording: Recording, name: str) -> float:
-    """Return the factor from a channel's unit in a recording to the simulator's unit; see `Recording.factor_to`."""
-    return recording.factor_to(simulator.units, name)
 
 
 def match_channels(simulator: Simulator, recording: Recording) -> Recording:

@@ -2,23 +2,9 @@
 
 import json
 import re
-import shutil
-from pathlib import Path
 
 import numpy as np
-import pytest
 from command_line import refused, run
-
-import pilfr_casadi
-
-DEMO = Path(pilfr_casadi.__file__).parent / "cli" / "demo_data"
-
-
-@pytest.fixture
-def files(tmp_path):
-    for name in ("rig.py", "rig_train.csv"):
-        shutil.copy(DEMO / name, tmp_path)
-    return tmp_path
 
 
 def test_findings_are_printed_and_written(capsys, files):

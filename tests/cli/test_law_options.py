@@ -1,24 +1,11 @@
 """`--laws` and `--effects` choose what is tried; names are ids or classes, and an unknown one is refused."""
 
 import json
-import shutil
-from pathlib import Path
 
-import pytest
 from command_line import refused, run
 
-import pilfr_casadi
 from pilfr_casadi.diagnose import check_laws
 from pilfr_casadi.laws import CATALOGUE, CoulombFriction, Lag
-
-DEMO = Path(pilfr_casadi.__file__).parent / "cli" / "demo_data"
-
-
-@pytest.fixture
-def files(tmp_path):
-    for name in ("rig.py", "rig_train.csv"):
-        shutil.copy(DEMO / name, tmp_path)
-    return tmp_path
 
 
 def test_an_id_stands_for_all_forms_and_a_class_name_for_one():
@@ -42,7 +29,16 @@ def test_an_unknown_law_is_refused_with_the_nearest_names(capsys, files):
 
 def test_a_diagnosis_looks_for_as_many_effects_as_are_asked_for(capsys, files):
     given = ("diagnose", files / "rig.py", files / "rig_train.csv", "--initial", "zero", "--hold", "zero")
-    options = ("--laws", "CubicStiffness,CoulombFriction", "--effects", "1", "--workers", "1", "--out", files / "out")
+    options = (
+        "--laws",
+        "CubicStiffness,CoulombFriction",
+        "--effects",
+        "1",
+        "--workers",
+        "1",
+        "--out",
+        files / "out",
+    )
     status, out, _ = run(capsys, *given, *options)
     found = json.loads((files / "out" / "diagnosis.json").read_text(encoding="utf-8"))
     assert status == 0 and "writing the report took" in out

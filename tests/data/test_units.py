@@ -81,7 +81,7 @@ def test_the_conversion_of_a_recording_is_reported(recorded):
 def test_an_unknown_unit_is_reported(recorded):
     """Nothing converts it, so that the values may be far off."""
     stated = replace(cart(), units={"force": "N", "pos": "furlong"})
-    notes = unit_notes(stated, recorded)
+    notes = unit_notes(stated.units, recorded)
     assert notes["pos"] == (
         "pos is recorded in mm, and the simulator has it in furlong; no conversion is known, so that its values were "
         "taken as they are."

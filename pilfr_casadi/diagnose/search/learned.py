@@ -212,7 +212,7 @@ def learn_forces(bench: Workbench, base: Fitted, port_names: Sequence[str], work
     Fits that diverge are left out.
     """
     starts = [s for s in linear_starts(bench, base, port_names) if s.share > 0]
-    found = side_by_side(lambda start: _fit_element(bench, base, start), starts[:FEW], workers)
+    found = side_by_side(lambda start: _fit_element(bench, base, start), starts[:FEW], workers, bench.interrupt)
     return sorted((f for f in found if f is not None), key=lambda f: f.cost)
 
 

@@ -385,7 +385,9 @@ class Search(Hypotheses):
             values = [{**base.values, **named} for _, named in placed]
             return self.fits.fit(placed[0][0], values, len(trial.laws), states=base.begin)
 
-        found = side_by_side(fit, [kind for kind in kinds if usable(kind(), entry.local)], self.workers)
+        found = side_by_side(
+            fit, [kind for kind in kinds if usable(kind(), entry.local)], self.workers, self.bench.interrupt
+        )
         self._keep_all([t for t in found if t is not None])
 
     def learned(self, base: Trial) -> list[Fitted]:
@@ -506,7 +508,10 @@ class Search(Hypotheses):
             rest = Remainder.of(self.bench, *linearise_runs(self.bench, self.root.fitted), self.laws)
             fits, before = self.fits, self.best
             found = side_by_side(
-                lambda pair: fit_pair(fits, self.root.fitted, rest, pair), choose_pairs(rest), self.workers
+                lambda pair: fit_pair(fits, self.root.fitted, rest, pair),
+                choose_pairs(rest),
+                self.workers,
+                self.bench.interrupt,
             )
             self._keep_all([t for t in found if t is not None])
         if self.best is not before:

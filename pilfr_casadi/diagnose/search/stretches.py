@@ -300,7 +300,7 @@ class Everything:
         limit = _seconds_left(search) / 2  # the rest is for the simulators that the conclusion adds
         fits = list[Fitted]()
         with search.until_interrupted():
-            fits = side_by_side(lambda t: fit_to_all(whole, t.fitted, limit), trials, search.workers)
+            fits = side_by_side(lambda t: fit_to_all(whole, t.fitted, limit), trials, search.workers, whole.interrupt)
         fits = fits or [fit_to_all(whole, t.fitted, 0.0) for t in trials]
         if not fits[0].cost < DIVERGED:
             return None
