@@ -11,11 +11,11 @@ count in the posterior (`hypotheses`).
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -45,6 +45,8 @@ from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
 from .relatives import choose_pairs, complements, fit_pair, in_place_of_variation, relatives
 from .trials import Key, Trial, place_law, select_pairs
+
+T, R = TypeVar("T"), TypeVar("R")
 
 # Effort
 MOST_CONVERGED = 5  # trials of a step that are fitted to convergence at most
@@ -95,7 +97,7 @@ class Search(Hypotheses):
         with self.until_interrupted(), suppress(InputError):
             there = self.run_laws(other.laws, other)
             if there.mean_square < DIVERGED:
-                self.keep(self.fits.polish(there))
+                self.keep(self.fits.polish(there, self.solver))
 
     @property
     def passes(self) -> list[Step]:
@@ -197,7 +199,7 @@ class Search(Hypotheses):
         if self.interrupted or not self.in_time():
             return False
         held = self.bench.with_other_hold()
-        found = refit(held, [best.values], best.simulator, states=best.initial, solver=THOROUGH)
+        found = refit(held, [best.values], best.simulator, states=best.initial, solver=self.solver)
         return found is not None and not self.interrupted and found.cost * BETTER_RATIO**2 < best.cost
 
     def _finds_shift(self) -> bool:
@@ -314,13 +316,17 @@ class Search(Hypotheses):
         ranked = sorted(kept, key=self.optimistic_evidence, reverse=True)
         most = min(NEAR_RATIO * ranked[0].error if ranked else np.inf, FAR_RATIO * self.best.error)
         near = [t for t in ranked[:MOST_CONVERGED] if not t.thorough and t.error < most]
-        converged = side_by_side(self.fits.converge, near, self.workers, self.bench.interrupt)
+        solver = self.solver
+        converged = self._side_by_side(lambda trial: self.fits.converge(trial, solver), near)
         for trial in converged:
             self.keep(trial)
         # finer steps are slow, and bring no hypothesis that is far behind to the front
         least = min([t.error for t in (*converged, self.best)])
         near = [t for t in converged if t.error < NEAR_RATIO * least]
-        for trial in side_by_side(self.fits.sharpen, near, self.workers, self.bench.interrupt):
+        sharpened = side_by_side(
+            lambda trial: self.fits.sharpen(trial, solver), near, self.workers, self.bench.interrupt
+        )
+        for trial in sharpened:
             self.keep(trial)
 
     def _finer(self, parent: Trial) -> None:
@@ -385,10 +391,12 @@ class Search(Hypotheses):
             values = [{**base.values, **named} for _, named in placed]
             return self.fits.fit(placed[0][0], values, len(trial.laws), states=base.begin)
 
-        found = side_by_side(
-            fit, [kind for kind in kinds if usable(kind(), entry.local)], self.workers, self.bench.interrupt
-        )
+        found = self._side_by_side(fit, [kind for kind in kinds if usable(kind(), entry.local)])
         self._keep_all([t for t in found if t is not None])
+
+    def _side_by_side(self, fit: Callable[[T], R], tasks: Iterable[T]) -> list[R]:
+        """Carry out fits on the workers, in order; an interrupt of one ends all."""
+        return side_by_side(fit, tasks, self.workers, self.bench.interrupt)
 
     def learned(self, base: Trial) -> list[Fitted]:
         """Fit learned forces beside a hypothesis, at the most promising ports, to a part of the recordings."""
@@ -507,12 +515,7 @@ class Search(Hypotheses):
         with self.stage(TWO):
             rest = Remainder.of(self.bench, *linearise_runs(self.bench, self.root.fitted), self.laws)
             fits, before = self.fits, self.best
-            found = side_by_side(
-                lambda pair: fit_pair(fits, self.root.fitted, rest, pair),
-                choose_pairs(rest),
-                self.workers,
-                self.bench.interrupt,
-            )
+            found = self._side_by_side(lambda pair: fit_pair(fits, self.root.fitted, rest, pair), choose_pairs(rest))
             self._keep_all([t for t in found if t is not None])
         if self.best is not before:
             self.exchange()
@@ -538,7 +541,7 @@ class Search(Hypotheses):
                 named |= simulator.elements[-1].named(source.own(best.fitted.values))
             found = self.fits.fit(simulator, [named], len(joint.laws) + len(names), states=joint.fitted.begin)
             if found is not None:
-                self.keep(self.fits.polish(found))
+                self.keep(self.fits.polish(found, self.solver))
 
     def _escape_local_minimum(self) -> bool:
         """Refit the simulator alone from the best law's parameters; if far better, restart the search and return True.
