@@ -46,7 +46,8 @@ from .learned import learn_forces, nearest_to_learned
 from .relatives import choose_pairs, complements, fit_pair, in_place_of_variation, relatives
 from .trials import Key, Trial, place_law, select_pairs
 
-T, R = TypeVar("T"), TypeVar("R")
+T = TypeVar("T")
+R = TypeVar("R")
 
 # Effort
 MOST_CONVERGED = 5  # trials of a step that are fitted to convergence at most
