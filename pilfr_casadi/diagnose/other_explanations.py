@@ -96,7 +96,7 @@ def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameter
 
 def _free(search: Search, names: Sequence[str], start: Fitted, enough: float) -> Fitted | None:
     """Refit with some pinned parameters freed; None if the fit fails or there is no time."""
-    if search.past_deadline or search.interrupted:
+    if search.past_deadline:
         return None
     bench, without = search.bench, search.root.fitted
     own = bench.simulator.parameters

@@ -356,7 +356,7 @@ def _concluded(search: Search, gates: Sequence[Gate]) -> Conclusion:
     """Draw the conclusion; after an interrupt, draw it without further fits."""
     with search.until_interrupted(), search.stage("conclusion"):
         found = conclude(search, gates)
-        search.out_of_time = search.out_of_time or search.past_deadline
+        search.out_of_time = search.out_of_time or time.perf_counter() > search.bench.deadline
         return found
     return conclude(search, gates)
 
@@ -372,7 +372,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     finished, elsewhere = not search.cut_short, tuple[Gate, ...]()
     given, gates = gates, with_tones(search, answer, gates)
     verdict = judge(search, answer, gates)
-    if verdict.kind in ("missing-physics", "unexplained") and not (interrupted or search.past_deadline):
+    if verdict.kind in ("missing-physics", "unexplained") and not search.past_deadline:
         found = _without_a_law(search, answer, verdict, gates)
         if found is not None:
             return found
@@ -395,7 +395,6 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
         gates = (*gates, *elsewhere, *find_untried_laws(search), *find_varying_values(search))
     refitted = search.root.fitted
     if search.interrupted and verdict.kind != "recording-fault":
-        search.bench = replace(search.bench, deadline=-np.inf)  # so that nothing more is fitted
         correction, fitted = find_correction(search, answer)
         off = f"Refitted, the simulator is off by {search.bench.nrmse(refitted):.3g} of the outputs' deviation."
         said = correction.sentence if correction.elements else off
