@@ -265,7 +265,7 @@ class Workbench:
         for start in starts:
             if best is not None and time.perf_counter() > self.deadline:
                 break
-            one = self._fit_from(simulator, model, engine, start, states, tuple(anneal), solver)
+            one = self._fit_from(model, engine, start, states, tuple(anneal), solver)
             if one is not None and (best is None or one[0] < best[0]):
                 best = one
         if best is None:
@@ -328,7 +328,6 @@ class Workbench:
 
     def _fit_from(
         self,
-        simulator: Simulator,
         model: Model,
         engine: Engine,
         start: Mapping[str, Any],
@@ -360,8 +359,7 @@ class Workbench:
             problem, theta, status = self._solve(problem, theta, solver)
             if np.all(np.isfinite(theta)):
                 vector, states = problem.parameters(theta), theta[n_free:]
-        if problem is None:
-            return None
+        assert problem is not None
         theta = np.concatenate([vector[problem.free], states if states is not None else problem.start[n_free:]])
         balance = self._balance(problem, theta)
         if not near_balance(balance, (problem.scale / self.scale) ** 2):
@@ -371,6 +369,10 @@ class Workbench:
 
     def _solve(self, problem: Problem, theta: np.ndarray, solver: GaussNewton) -> tuple[Problem, np.ndarray, Status]:
         """Solve a problem, and again while its outputs are out of balance (iteratively reweighted least squares)."""
+
+        def end_if_pressed(*_: object) -> None:
+            self.interrupt.raise_pending()
+
         status, until = Status.SOLVER_FAILED, min(time.perf_counter() + solver.time_limit, self.deadline)
         for done in range(MOST_BALANCES):
             balance = self._balance(problem, theta)
@@ -382,7 +384,7 @@ class Workbench:
             try:
                 timed = replace(solver, time_limit=until - time.perf_counter())
                 with np.errstate(all="ignore"):
-                    solution = solve_within_bounds(problem, theta, timed, progress=self.interrupt.raise_pending)
+                    solution = solve_within_bounds(problem, theta, timed, progress=end_if_pressed)
             except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
                 break
             theta, status = solution.theta, solution.status
