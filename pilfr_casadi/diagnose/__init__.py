@@ -9,9 +9,9 @@ about. Folders and files by stage:
 - `search`: the hypotheses, and the moves from one to others.
 - Preparation: `arguments` checks the arguments. `prediction` stabilises an unstable simulator with an observer.
   `preparation` checks the recordings for faults, in order.
-- Answer: `verdict` turns the evidences into a posterior and a verdict. `correction` chooses the corrected simulator,
-  with a learned force where named laws do not suffice. `other_explanations` weighs a pinned value, an undeclared port,
-  and a machine that changed.
+- Answer: `posterior` turns the evidences into probabilities, and `verdict` these into a verdict. `correction` chooses
+  the corrected simulator, with a learned force where named laws do not suffice. `other_explanations` weighs a pinned
+  value, an undeclared port, and a machine that changed.
 - Proof: `proof` (errors before and after, placebo, next experiment), `mismatch_map`.
 - Result: `answer` puts it together, `result` is what users hold, `result_text` what it says, an `effect` is a law that
   was found, and `refinement` puts a Prandtl-Ishlinskii layer in place of the hysteresis that was found.

@@ -28,12 +28,13 @@ from .fits.floor import Floor
 from .fits.force_recovery import is_curve_along
 from .fits.workbench import Fitted, Workbench
 from .mismatch_map import mismatch
+from .posterior import NamedEffect, hypotheses_named, names
 from .preparation import Prepared
 from .proof import Comparison, free_run_errors, next_experiment, parameter_table, placebo, test_errors
 from .result import Diagnosis
 from .search.moves import Search
 from .search.trials import Trial
-from .verdict import NamedEffect, Verdict, hypotheses_named, names
+from .verdict import Verdict
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,9 +35,9 @@ from .faults.gates import (
 from .fits.evidence import AT_NOISE_RATIO, BETTER_RATIO, CONTENDING_NATS, FAR_RATIO, NEAR_RATIO, SURE, deviations
 from .fits.linearise import simulate_states
 from .fits.workbench import FEW, THOROUGH, Fitted, Workbench, refit
+from .posterior import Posterior, posterior, strained
 from .search.moves import Search
 from .search.trials import Trial
-from .verdict import Posterior, posterior, strained
 
 # factors on a parameter's start value that are tried if the refit says nothing
 DECADES = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3)

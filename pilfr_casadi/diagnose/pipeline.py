@@ -76,13 +76,14 @@ from .other_explanations import (
     find_varying_values,
     may_act_elsewhere,
 )
+from .posterior import Posterior, names, posterior
 from .prediction import can_be_led, drift_note, drifts, prediction_note, predictor
 from .preparation import CHECKS, Prepared, conversions, hold_note, prepare, slow_note
 from .proof import errors_of
 from .result import Diagnosis
 from .search.moves import Search
 from .search.stretches import SEARCHED_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
-from .verdict import Posterior, Verdict, judge, names, posterior
+from .verdict import Verdict, judge
 
 # shares of the remaining time for the preparation, and for preparation and search; the rest is for the correction
 PREPARATION_SHARE, SEARCH_SHARE = 0.35, 0.7
