@@ -8,7 +8,8 @@ about. Folders and files by stage:
 - `faults`: what may be wrong with recordings, and the rule by which a fault is accepted and corrected.
 - `search`: the hypotheses, and the moves from one to others.
 - Preparation: `arguments` checks the arguments. `prediction` stabilises an unstable simulator with an observer.
-  `preparation` checks the recordings for faults, in order.
+  `preparation` checks the recordings for faults, in order. `repetitions` prepares and searches again where something
+  that was taken for granted proves wrong.
 - Answer: `posterior` turns the evidences into probabilities, and `verdict` these into a verdict. `correction` chooses
   the corrected simulator, with a learned force where named laws do not suffice. `other_explanations` weighs a pinned
   value, an undeclared port, and a machine that changed.
