@@ -31,7 +31,7 @@ from ...simulators import (
     needed_substeps,
     rate_at_start,
 )
-from .floor import pool
+from .floor import DIVERGED as DIVERGED, pool
 
 # Solvers: of the fits that results are based on; of other fits; of the first fit of a law, to rank the laws
 THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
@@ -48,7 +48,7 @@ MOST_BALANCES = 4  # fits with other weights at most
 NEAR_BALANCE = 1.2  # ratio of two weights that counts as equal
 
 # Diverging runs
-HUGE, DIVERGED = 1e6, 1e20  # bounds: output over the largest measured value, and mean square error
+OUT_OF_BOUNDS = 1e6  # output over the largest measured value, from which a message says where a run diverges
 RUNAWAY = 10.0  # over the outputs' deviation; a bounded oscillation about another point is off by less
 # growth within a recording, in e-folds, above which no estimated initial state can keep the run bounded
 MOST_GROWTH = 20.0
@@ -285,7 +285,7 @@ class Workbench:
         for r in self.recordings:
             with np.errstate(all="ignore"):
                 y = engine.simulate(model.drive(r), vector, np.zeros(model.n_state))[0]
-                off = ~(np.abs(y) < HUGE * np.max(np.abs(r.y), axis=0))
+                off = ~(np.abs(y) < OUT_OF_BOUNDS * np.max(np.abs(r.y), axis=0))
             if np.any(off):
                 k = int(np.argmax(np.any(off, axis=1)))
                 name = self.simulator.output_names[int(np.argmax(off[k]))]
