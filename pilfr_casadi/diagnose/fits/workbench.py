@@ -303,8 +303,8 @@ class Workbench:
 
     def _describe_instability(self, simulator: Simulator) -> str:
         """Say what to do about a simulator too unstable to follow a controlled machine; empty if it is not."""
-        rate = growth_rate(simulator, self.recordings[0]) if simulator.observer is None else 0.0
-        if rate * max(len(r) for r in self.recordings) * self.dt < MOST_GROWTH:
+        rate = growth(simulator, self.recordings) if simulator.observer is None else 0.0
+        if not rate:
             return ""
         return (
             f"it is unstable (it grows e-fold in {1 / rate:.2g} s) and cannot be run by its own inputs alone: put the "
@@ -483,6 +483,12 @@ class Workbench:
             cost, balance = pool(squares, self.noise2)
         cost = cost if np.isfinite(cost) else np.inf
         return Fitted(simulator, model, engine, values, initial, residual, cost, squares, balance)
+
+
+def growth(simulator: Simulator, recordings: Sequence[Recording]) -> float:
+    """Compute the rate, 1/s, at which a simulator grows by itself; 0 if the recordings are too short to show it."""
+    rate = growth_rate(simulator, recordings[0])
+    return rate if rate * max(len(r) * r.dt for r in recordings) > MOST_GROWTH else 0.0
 
 
 def near_balance(one: np.ndarray, other: np.ndarray) -> bool:
