@@ -65,7 +65,6 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
     other, again = found
     only_refitted, before2, after2 = again.interrupted and len(again.memo) < 2, *_comparable(search, again)
     if after2 > before2 or only_refitted:
-        search.cut_short_with(again)
         return ready, search.resume(request.most_effects)
     # the laws that were found since may have been what the hold had made up for
     if _prefers_other_hold(again):
@@ -108,12 +107,8 @@ def run_search(request: Request) -> tuple[Prepared, Search]:
     found = _again(search, partial(_search_once, request, shift_early=False))
     if found is None:
         return ready, search
-    other, again = found
-    before2, after2 = _comparable(search, again)
-    if after2 < AS_GIVEN_RATIO * before2:
-        return other, again
-    search.cut_short_with(again)
-    return ready, search
+    before2, after2 = _comparable(search, found[1])
+    return found if after2 < AS_GIVEN_RATIO * before2 else (ready, search)
 
 
 def _search_realigned(request: Request, ready: Prepared, search: Search, shift: Gate) -> tuple[Prepared, Search]:
@@ -131,10 +126,7 @@ def _search_realigned(request: Request, ready: Prepared, search: Search, shift: 
     if again.can_improve(again.best) and not again.cut_short:
         search.run(request.most_effects)
     before2, after2 = _comparable(search, again)
-    if before2 < AS_GIVEN_RATIO * after2:
-        search.cut_short_with(again)
-        return ready, search
-    return other, again
+    return (ready, search) if before2 < AS_GIVEN_RATIO * after2 else (other, again)
 
 
 def _search_from_unknown_start(
@@ -156,14 +148,18 @@ def _search_from_unknown_start(
     explained = not again.can_improve(again.best)
     if explained and gain(*_comparable(search, again), residuals, unknown) > LEAST_GAIN:
         return opened, other, again
-    search.cut_short_with(again)
     return request, ready, search
 
 
 def _again(search: Search, prepare_and_search: Callable[[], tuple[Prepared, Search]]) -> tuple[Prepared, Search] | None:
-    """Prepare and search once more; None if an interrupt came before that search began, or the simulator diverges."""
+    """Prepare and search once more; None if an interrupt came before that search began, or the simulator diverges.
+
+    If that search is cut short, so is the present one.
+    """
     with search.until_interrupted(), suppress(InputError):
-        return prepare_and_search()
+        ready, again = prepare_and_search()
+        search.cut_short_with(again)
+        return ready, again
     return None
 
 
