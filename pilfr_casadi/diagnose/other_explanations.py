@@ -31,6 +31,7 @@ from .faults.gates import (
     describe_fall,
     gain,
     open_start,
+    with_unit,
 )
 from .fits.evidence import AT_NOISE_RATIO, BETTER_RATIO, CONTENDING_NATS, FAR_RATIO, NEAR_RATIO, SURE, deviations
 from .fits.linearise import simulate_states
@@ -127,9 +128,9 @@ def _describe_pinned(search: Search, names: Sequence[str], found: Fitted, named:
     parts = []
     for name in names:
         p, value = search.bench.simulator.parameters[name], float(found.values[name])
-        unit = f" {p.unit}" if p.unit else ""
         kept = "held at" if np.all(p.fixed) else "kept by its bounds at"
-        parts.append(f"{name} = {value:.5g}{unit}, which is {kept} {float(without.values[name]):.4g}{unit}")
+        was = with_unit(float(without.values[name]), p.unit, 4)
+        parts.append(f"{name} = {with_unit(value, p.unit, 5)}, which is {kept} {was}")
     words = " and ".join(f"the {name_at(placed.port, placed.law.id)}" for placed in named)
     like = f", no further off than with {words}" if named else ""
     what, it, its, given = (

@@ -16,7 +16,7 @@ from ..laws import Law
 from ..models import Model
 from ..optimise import StatePrior
 from ..simulators import Simulator, discretise
-from .faults.gates import Gate, edited
+from .faults.gates import Gate, edited, with_unit
 from .fits.evidence import BETTER_RATIO
 from .fits.floor import effective_size
 from .fits.linearise import linearise_runs, simulate_states
@@ -244,11 +244,11 @@ def _describe_experiment(bench: Workbench, best: Mapping[str, Any], recorded: fl
     unit = {**bench.simulator.units, **bench.recordings[0].units}.get(best["input"], "")
     so_far = f"by {recorded:.2g} times" if recorded > VISIBLE_DIFFERENCE else "not at all"
     about = abs(best["level"]) > VISIBLE_LEVEL * best["amplitude"]
-    level = f" about {best['level']:.3g}{' ' + unit if unit else ''}" if about else ""
+    swing, level = with_unit(best["amplitude"], unit), f" about {with_unit(best['level'], unit)}" if about else ""
     return (
-        f"A {best['waveform']} of {best['frequency']:.3g} Hz with amplitude {best['amplitude']:.3g}"
-        f"{' ' + unit if unit else ''}{level} at {best['input']} separates {rivals} best: their outputs then differ by "
-        f"{best['separation']:.3g} times the noise (in these recordings {so_far})."
+        f"A {best['waveform']} of {best['frequency']:.3g} Hz with amplitude {swing}{level} at "
+        f"{best['input']} separates {rivals} best: their outputs then differ by {best['separation']:.3g} times the "
+        f"noise (in these recordings {so_far})."
     )
 
 
