@@ -98,18 +98,14 @@ class Started:
 
     @classmethod
     def of(cls, model: Model, fitted: Fitted, bench: Workbench | None = None) -> Started:
-        """Take the initial states of a fit, and the prior if its bench is given."""
-        return cls(model, starts_of(fitted), None if bench is None else prior_of(bench, fitted))
+        """Take the first initial state of a fit, and the prior if its bench is given.
 
-
-def starts_of(fitted: Fitted) -> list[np.ndarray]:
-    """Return further initial states to try: the state of the first training recording.
-
-    From rest alone a search may end in a wrong minimum, for example beside a contact. A learned element is uncertain at
-    rest, outside its range; with one, the states of all recordings are returned.
-    """
-    learned = any(e.law.id == "learned" for e in fitted.simulator.elements)
-    return fitted.initial if learned else fitted.initial[:1]
+        From rest alone a search may end in a wrong minimum, for example beside a contact. A learned element is
+        uncertain at rest, outside its range; with one, the initial states of all recordings are taken.
+        """
+        learned = any(e.law.id == "learned" for e in fitted.simulator.elements)
+        starts = fitted.initial if learned else fitted.initial[:1]
+        return cls(model, starts, None if bench is None else prior_of(bench, fitted))
 
 
 @lru_cache(maxsize=4)
@@ -258,8 +254,7 @@ def placebo(bench: Workbench, fitted: Fitted, port: str, law: Law) -> tuple[floa
     The unrelated signal is the law's own force, shifted by half a recording: it has the same statistics but no relation
     to the residual.
     """
-    probe, runs = linearise_runs(bench, fitted)
-    rest = Remainder.of(bench, probe, runs, [type(law)], at=port)
+    rest = Remainder.of(bench, *linearise_runs(bench, fitted), [type(law)], at=port)
     if not rest.tasks:
         return 0.0, 0.0
     own, unrelated = (rest.columns(rest.tasks[0], shifted)[0] for shifted in (False, True))
