@@ -18,10 +18,7 @@ from functools import partial
 import numpy as np
 
 from .._base import InputError
-from .arguments import (
-    Request,
-    stated_hold,
-)
+from .arguments import Request, stated_hold
 from .faults.gates import LEAST_GAIN, USELESS_FIT, Checked, Gate, gain
 from .faults.offsets import Offset, WrongStart
 from .faults.timing import TimeShift
