@@ -332,9 +332,9 @@ class ResultText:
             bound = "" if low < value < high else ", at its bound"
             lines.append(f"  {name} = {value:.5g}{std} {p['unit']}".rstrip() + f", given as {nominal:.5g}{bound}")
         more = [f"  and {len(moved) - MOST_PRINTED} more"] if len(moved) > MOST_PRINTED else []
-        for e in (e for e in self.corrected.elements if e.law.id == "offset"):
+        for e in (e for e in self.corrected.elements if isinstance(e.law, Offset)):
             value, unit = float(own[f"{e.prefix}w_0"].value), self.corrected.port(e.port).unit
-            more.append(f"  offset of {e.port.rpartition(':')[2]} = {with_unit(value, unit, 4)}")
+            more.append(f"  offset of {split_port(e.port)[1]} = {with_unit(value, unit, 4)}")
         return ["the simulator's own values, refitted:", *lines, *more] if lines or more else []
 
 
