@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.diagnose.verdict import share_named
+from pilfr_casadi.diagnose.posterior import share_named
 from pilfr_casadi.plots import new_figure
 from pilfr_casadi.plots.canvas import BLUE, FONT, GREY, INK, PALE_BLUE, PALE_GREY, SKY, VERMILLION, finish
 

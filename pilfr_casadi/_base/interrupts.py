@@ -70,17 +70,23 @@ class Interrupt:
         """Mark that Ctrl-C was pressed, and that the work has ended because of it."""
         self.pressed = self.handled = True
 
+    def mark(self, error: BaseException) -> bool:
+        """Tell whether an exception is an interrupt, and mark it then, so that fits in other threads end."""
+        caught = is_interrupt(error)
+        self.pressed = self.pressed or caught
+        return caught
+
     @contextlib.contextmanager
     def marked(self) -> Iterator[None]:
-        """Mark an interrupt as soon as it leaves the context, so that fits in other threads end (`raise_pending`)."""
+        """Mark an interrupt as soon as it leaves the context."""
         try:
             yield
         except BaseException as error:
-            self.pressed = self.pressed or is_interrupt(error)
+            self.mark(error)
             raise
 
-    def raise_pending(self, *_: object) -> None:
-        """Raise KeyboardInterrupt if Ctrl-C was pressed and the work still goes on; also as a fit's progress."""
+    def raise_pending(self) -> None:
+        """Raise KeyboardInterrupt if Ctrl-C was pressed and the work still goes on."""
         if self.pressed and not self.handled:
             raise KeyboardInterrupt
 

@@ -8,13 +8,14 @@ about. Folders and files by stage:
 - `faults`: what may be wrong with recordings, and the rule by which a fault is accepted and corrected.
 - `search`: the hypotheses, and the moves from one to others.
 - Preparation: `arguments` checks the arguments. `prediction` stabilises an unstable simulator with an observer.
-  `preparation` checks the recordings for faults, in order.
-- Answer: `verdict` turns the evidences into a posterior and a verdict. `correction` chooses the corrected simulator,
-  with a learned force where named laws do not suffice. `other_explanations` weighs a pinned value, an undeclared port,
-  and a machine that changed.
+  `preparation` checks the recordings for faults, in order. `repetitions` prepares and searches again where something
+  that was taken for granted proves wrong.
+- Answer: `posterior` turns the evidences into probabilities, and `verdict` these into a verdict. `correction` chooses
+  the corrected simulator, with a learned force where named laws do not suffice. `other_explanations` weighs a pinned
+  value, an undeclared port, and a machine that changed.
 - Proof: `proof` (errors before and after, placebo, next experiment), `mismatch_map`.
-- Result: `answer` puts it together, `result` is what users hold, an `effect` is a law that was found, and `refinement`
-  puts a Prandtl-Ishlinskii layer in place of the hysteresis that was found.
+- Result: `answer` puts it together, `result` is what users hold, `result_text` what it says, an `effect` is a law that
+  was found, and `refinement` puts a Prandtl-Ishlinskii layer in place of the hysteresis that was found.
 - After a diagnosis: `replication` fits laws that were found to the recordings of further machines.
 - Before a diagnosis: `blind_spots` (`check`: what the recordings cannot reveal), based on `identifiability` (of
   parameters), `detectability` (of laws) and `excitation` (of motions).
@@ -57,11 +58,8 @@ if TYPE_CHECKING:
         refit_error as refit_error,
         replicate as replicate,
     )
-    from .result import (
-        ERROR_NAMES as ERROR_NAMES,
-        BeforeAfter as BeforeAfter,
-        Diagnosis as Diagnosis,
-    )
+    from .result import BeforeAfter as BeforeAfter, Diagnosis as Diagnosis
+    from .result_text import ERROR_NAMES as ERROR_NAMES
     from .search.learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -28,12 +28,13 @@ from .fits.floor import Floor
 from .fits.force_recovery import is_curve_along
 from .fits.workbench import Fitted, Workbench
 from .mismatch_map import mismatch
+from .posterior import NamedEffect, hypotheses_named, names
 from .preparation import Prepared
 from .proof import Comparison, free_run_errors, next_experiment, parameter_table, placebo, test_errors
 from .result import Diagnosis
 from .search.moves import Search
 from .search.trials import Trial
-from .verdict import NamedEffect, Verdict, hypotheses_named, names
+from .verdict import Verdict
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,23 +190,23 @@ def _test_faults(bench: Workbench, after: Fitted, tests: Sequence[Recording], ga
         yield Gate(slips[0].channel, TEST_FAULT, slips[0].value, f"{place}{words}. {advice}", False)
 
 
-def _surrogate_note(error: float) -> tuple[Gate, ...]:
+def _surrogate_note(error: float) -> Iterator[Gate]:
     """Note that a surrogate replaces the simulation, with an NRMSE of `error`; no note if the error is zero."""
-    if not error:
-        return ()
-    words = f"A linear model stands for the simulation, which it follows to NRMSE {error:.4f}; that counts as noise."
-    return (Gate("simulation", "surrogate", error, f"{words} {surrogate_warning(error)}".rstrip(), False),)
+    if error:
+        words = (
+            f"A linear model stands for the simulation, which it follows to NRMSE {error:.4f}; that counts as noise."
+        )
+        yield Gate("simulation", "surrogate", error, f"{words} {surrogate_warning(error)}".rstrip(), False)
 
 
-def _convergence_note(after: Fitted) -> tuple[Gate, ...]:
+def _convergence_note(after: Fitted) -> Iterator[Gate]:
     """Note that the fit whose values are stated has not converged; no note if it has."""
-    if after.status.converged:
-        return ()
-    words = (
-        f"The fit of the corrected simulator ended early. {after.status.value} Its parameters may still change by more "
-        "than their standard errors; bound known ones, or add a recording that distinguishes them."
-    )
-    return (Gate("simulation", "convergence", after.status.name.lower(), words, False),)
+    if not after.status.converged:
+        words = (
+            f"The fit of the corrected simulator ended early. {after.status.value} Its parameters may still change by "
+            "more than their standard errors; bound known ones, or add a recording that distinguishes them."
+        )
+        yield Gate("simulation", "convergence", after.status.name.lower(), words, False)
 
 
 def _resting_notes(resting: Sequence[tuple[str, int]]) -> Iterator[Gate]:
@@ -243,9 +244,7 @@ def _edit_notes(compared: Comparison) -> Iterator[Gate]:
         yield Gate("recordings", "test correction", None, words, False)
 
 
-def _combination_note(
-    after: Fitted, std: Mapping[str, np.ndarray], blind_spots: Sequence[BlindSpot]
-) -> tuple[Gate, ...]:
+def _combination_note(after: Fitted, std: Mapping[str, np.ndarray], blind_spots: Sequence[BlindSpot]) -> Iterator[Gate]:
     """Note the numbers that the recordings determine only in combination, so that they have no standard error.
 
     Numbers without any effect on the outputs are blind spots and not in this note.
@@ -262,7 +261,7 @@ def _combination_note(
         and not after.at_bound(name)
     ]
     if len(tied) < 2:
-        return ()
+        return
     of_laws = {
         e.prefix + own: f"{own} of the {name_at(e.port, e.law.id, e.law.form, brief=True)}"
         for e in after.simulator.elements
@@ -270,7 +269,7 @@ def _combination_note(
     }
     together = in_words([of_laws.get(name, name) for name in tied])
     words = f"These recordings determine {together} only in combination, so they have no standard errors."
-    return (Gate("simulation", "combination", ", ".join(tied), words, False),)
+    yield Gate("simulation", "combination", ", ".join(tied), words, False)
 
 
 def _blind_spots(request: Request, ready: Prepared, search: Search) -> tuple[BlindSpot, ...]:

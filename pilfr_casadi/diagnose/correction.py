@@ -24,11 +24,11 @@ from ..simulators import name_at
 from .fits.evidence import FORMULA_ERROR, NEAR_RATIO, SURE, HeldOut, runs_away
 from .fits.floor import Floor
 from .fits.workbench import FEW, Fitted
+from .posterior import Posterior, explainable_remainder, hypotheses_named, share_left
 from .search.hypotheses import likeliest
 from .search.learned import Learned, LearnedForce, describe_learned, refit_learned
 from .search.moves import Search
 from .search.trials import Trial
-from .verdict import Posterior, explainable_remainder, hypotheses_named, share_left
 
 
 @dataclass(frozen=True, eq=False)

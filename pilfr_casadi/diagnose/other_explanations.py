@@ -31,13 +31,14 @@ from .faults.gates import (
     describe_fall,
     gain,
     open_start,
+    with_unit,
 )
 from .fits.evidence import AT_NOISE_RATIO, BETTER_RATIO, CONTENDING_NATS, FAR_RATIO, NEAR_RATIO, SURE, deviations
 from .fits.linearise import simulate_states
 from .fits.workbench import FEW, THOROUGH, Fitted, Workbench, refit
+from .posterior import Posterior, posterior, strained
 from .search.moves import Search
 from .search.trials import Trial
-from .verdict import Posterior, posterior, strained
 
 # factors on a parameter's start value that are tried if the refit says nothing
 DECADES = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3)
@@ -96,7 +97,7 @@ def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameter
 
 def _free(search: Search, names: Sequence[str], start: Fitted, enough: float) -> Fitted | None:
     """Refit with some pinned parameters freed; None if the fit fails or there is no time."""
-    if search.past_deadline or search.interrupted:
+    if search.past_deadline:
         return None
     bench, without = search.bench, search.root.fitted
     own = bench.simulator.parameters
@@ -127,9 +128,9 @@ def _describe_pinned(search: Search, names: Sequence[str], found: Fitted, named:
     parts = []
     for name in names:
         p, value = search.bench.simulator.parameters[name], float(found.values[name])
-        unit = f" {p.unit}" if p.unit else ""
         kept = "held at" if np.all(p.fixed) else "kept by its bounds at"
-        parts.append(f"{name} = {value:.5g}{unit}, which is {kept} {float(without.values[name]):.4g}{unit}")
+        was = with_unit(float(without.values[name]), p.unit, 4)
+        parts.append(f"{name} = {with_unit(value, p.unit, 5)}, which is {kept} {was}")
     words = " and ".join(f"the {name_at(placed.port, placed.law.id)}" for placed in named)
     like = f", no further off than with {words}" if named else ""
     what, it, its, given = (

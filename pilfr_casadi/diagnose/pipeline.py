@@ -25,20 +25,15 @@ How an answer comes about:
 **Long recordings.** Steps 1 to 6 see only their most informative stretches (`stretches`). The leading hypotheses are
 then fitted to everything before step 3, and the answer's simulator before step 7.
 
-**Repetitions.** Steps 1 and 2 are repeated in five cases: with an observer if the simulator is unstable and runs away
-from the recordings (`prediction`); with the other hold if nobody stated it and the best hypothesis follows better with
-it; without a shift if a channel seemed to be early, because missing physics can look like a lead; with a shift that
-shows only beside the first law; and from unknown initial states if a wrong zero was preferred to a wrong start. Each
-search fits different data. Its evidence is therefore not comparable; the smaller error decides. If nothing has a name
-after step 6 and the simulator drifts, the search is repeated in predictions, and the laws that are found there are
-refitted in free run (`_name_in_predictions`).
+**Repetitions.** Steps 1 and 2 are repeated where something that they took for granted proves wrong (`repetitions`). If
+nothing has a name after step 6 and the simulator drifts, the search is repeated in predictions, and the laws that are
+found there are refitted in free run (`_name_in_predictions`).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -61,14 +56,12 @@ from .arguments import (
     stated_hold,
 )
 from .correction import find_correction, named_correction
-from .faults.gates import EQUAL_RATIO, LEAST_GAIN, USELESS_FIT, Checked, Gate, gain
-from .faults.offsets import Offset, WrongStart, fix_idle_offsets, list_offsets
+from .faults.gates import EQUAL_RATIO, Gate
+from .faults.offsets import fix_idle_offsets, list_offsets
 from .faults.samples import find_clipped_input, open_unsettled, remove_glitches
-from .faults.timing import TimeShift
 from .faults.tones import find_tones
-from .fits.evidence import AS_GIVEN_RATIO, SURE
-from .fits.floor import Floor, measured_floor
-from .fits.workbench import RunsAway, converge
+from .fits.evidence import SURE
+from .fits.workbench import converge
 from .other_explanations import (
     find_pinned_parameters,
     find_undeclared_port,
@@ -76,16 +69,15 @@ from .other_explanations import (
     find_varying_values,
     may_act_elsewhere,
 )
-from .prediction import can_be_led, drift_note, drifts, prediction_note, predictor
-from .preparation import CHECKS, Prepared, conversions, hold_note, prepare, slow_note
+from .posterior import Posterior, names, posterior
+from .prediction import drift_note, drifts, predictor
+from .preparation import Prepared, conversions, slow_note
 from .proof import errors_of
+from .repetitions import run_search, search_with_focus
 from .result import Diagnosis
 from .search.moves import Search
 from .search.stretches import SEARCHED_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
-from .verdict import Posterior, Verdict, judge, names, posterior
-
-# shares of the remaining time for the preparation, and for preparation and search; the rest is for the correction
-PREPARATION_SHARE, SEARCH_SHARE = 0.35, 0.7
+from .verdict import Verdict, judge
 
 
 @one_blas_thread
@@ -136,7 +128,7 @@ def diagnose_in_steps(
         calls=calls,
     )
     most = SEARCHED_SAMPLES if search_samples is None else whole(search_samples, "search_samples", FEWEST_SAMPLES)
-    request, ready, search = _search_with_focus(_on_stretches(request, most))
+    request, ready, search = search_with_focus(_on_stretches(request, most))
     request, everything = _fit_to_everything(request, ready, search)
     found = _concluded(search, (*request.notes, *ready.gates))
     if found.verdict.kind == "unexplained" and request.focus is None and not search.cut_short:
@@ -174,189 +166,11 @@ def _fit_to_everything(request: Request, ready: Prepared, search: Search) -> tup
     return replace(request, notes=(note, *request.notes)), everything
 
 
-def _search_with_focus(request: Request) -> tuple[Request, Prepared, Search]:
-    """Search; if nobody stated the focus and the simulator runs away, let the recordings lead it."""
-    if request.focus != "prediction":
-        try:
-            return request, *_search_both_holds(request)
-        except RunsAway:  # by `Workbench`, in the first refit or as the check of it in `_search_once`
-            if request.focus == "simulation" or not can_be_led(request.simulator, request.recordings):
-                raise
-    # the gain depends little on the hold, which the search may still change
-    hold = stated_hold(request.simulator, request.recordings, request.hold) or "zero"
-    led, memory = predictor(request.simulator, request.recordings, hold, request.engine)
-    note = prediction_note(request.simulator, request.recordings, memory)
-    request = replace(request, simulator=led, notes=(*request.notes, note))
-    return request, *_search_both_holds(request)
-
-
-def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
-    """Search; if nobody stated the hold of the inputs and it matters, use the hold with the smaller error."""
-    ready, search = _search(request)
-    if search.hold_said or not _prefers_other_hold(search):
-        return ready, search
-    hold = search.bench.with_other_hold().hold
-    held = replace(request, hold=hold, say=request.say.under("other hold: "))
-    found = _again(search, partial(_search, held))
-    if found is None:
-        return ready, search.resume(request.most_effects)
-    other, again = found
-    only_refitted, before2, after2 = again.interrupted and len(again.memo) < 2, *_comparable(search, again)
-    if after2 > before2 or only_refitted:
-        search.cut_short_with(again)
-        return ready, search.resume(request.most_effects)
-    # the laws that were found since may have been what the hold had made up for
-    if _prefers_other_hold(again):
-        search.adopt(again.best)
-        resumed = search.resume(request.most_effects)
-        before2, after2 = _comparable(resumed, again)
-        if before2 < after2:
-            return ready, resumed
-    ratio = float(np.sqrt(before2 / max(after2, 1e-300)))
-    return replace(other, gates=(*other.gates, hold_note(request.simulator, hold, ratio))), again
-
-
-def _prefers_other_hold(search: Search) -> bool:
-    """Tell whether a search that nobody has interrupted would be better with the other hold."""
-    with search.until_interrupted():
-        return search.prefers_other_hold()
-    return False
-
-
-def _comparable(one: Search, other: Search) -> tuple[float, float]:
-    """Compute the mean square errors of the best hypotheses of two searches, with the noise of the first."""
-    return one.best.mean_square, one.bench.pool(other.best.fitted.squares)
-
-
-def _search(request: Request) -> tuple[Prepared, Search]:
-    """Prepare and search; if a lead was corrected, repeat without, and keep that if it is clearly better.
-
-    If a channel proves shifted beside a law, repeat with it at its right times. If a wrong zero was preferred to a
-    wrong start, repeat with the start unknown.
-    """
-    ready, search = _search_once(request, shift_early=True)
-    if search.shift is not None:
-        return _search_realigned(request, ready, search, search.shift)
-    start = next((g.otherwise for g in ready.gates if isinstance(g, WrongStart) and g.otherwise), None)
-    if start is not None and not search.cut_short:
-        request, ready, search = _search_from_unknown_start(request, ready, search, start)
-    leads = any(isinstance(g, TimeShift) and g.leads for g in ready.gates)
-    if not leads or search.cut_short or not search.can_improve(search.best):
-        return ready, search
-    found = _again(search, partial(_search_once, request, shift_early=False))
-    if found is None:
-        return ready, search
-    other, again = found
-    before2, after2 = _comparable(search, again)
-    if after2 < AS_GIVEN_RATIO * before2:
-        return other, again
-    search.cut_short_with(again)
-    return ready, search
-
-
-def _search_realigned(request: Request, ready: Prepared, search: Search, shift: Gate) -> tuple[Prepared, Search]:
-    """Search with a shifted channel at its right times, which ended a search; go on with that if it is clearly better.
-
-    Missing physics can look like a lead.
-    """
-    edits = [g for g in ready.gates if g.corrected and g.change is not None]  # the shift is one of corrected channels
-    moved = replace(request.corrected((*edits, shift), ready.nominal, "shifted: "), aligned=True)
-    search.shift, search.aligned = None, True
-    found = _again(search, partial(_search_once, moved, shift_early=True))
-    if found is None:
-        return ready, search if search.interrupted else search.run(request.most_effects)
-    other, again = found
-    if again.can_improve(again.best) and not again.cut_short:
-        search.run(request.most_effects)
-    before2, after2 = _comparable(search, again)
-    if before2 < AS_GIVEN_RATIO * after2:
-        search.cut_short_with(again)
-        return ready, search
-    return other, again
-
-
-def _search_from_unknown_start(
-    request: Request, ready: Prepared, search: Search, start: WrongStart
-) -> tuple[Request, Prepared, Search]:
-    """Search with the initial states estimated; keep that if it follows to the noise, and clearly better.
-
-    Before the missing physics is known, it may be what makes a wrong zero more likely than a wrong start. While it is
-    unknown, free initial states and an offset together make up for a part of it.
-    """
-    opened = request.corrected((start,), ready.nominal, "unknown start: ")
-    found = _again(search, partial(_search_once, opened, shift_early=True))
-    if found is None:
-        return request, ready, search
-    other, again = found
-    changed = sum(a is not b for a, b in zip(opened.recordings, request.recordings, strict=True))
-    unknown = changed * len(opened.simulator.states)
-    residuals = again.bench.scored(again.best.fitted.residual)
-    explained = not again.can_improve(again.best)
-    if explained and gain(*_comparable(search, again), residuals, unknown) > LEAST_GAIN:
-        return opened, other, again
-    search.cut_short_with(again)
-    return request, ready, search
-
-
-def _again(search: Search, prepare_and_search: Callable[[], tuple[Prepared, Search]]) -> tuple[Prepared, Search] | None:
-    """Prepare and search once more; None if an interrupt came before that search began, or the simulator diverges."""
-    with search.until_interrupted(), suppress(InputError):
-        return prepare_and_search()
-    return None
-
-
-def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]:
-    """Check and correct the recordings, refit the simulator, measure the noise, and search from there."""
-    began = time.perf_counter()
-    left = request.deadline - began
-    ready = prepare(
-        request.simulator,
-        request.recordings,
-        request.hold,
-        request.engine,
-        request.workers,
-        early=shift_early,
-        say=request.say,
-        until=began + PREPARATION_SHARE * left,
-    )
-    if request.focus is None:  # an unstable simulator may stay within bounds and still not follow
-        ready.bench.check_followed(ready.without, USELESS_FIT)
-    nominal = ready.nominal if np.isnan(request.nominal) else request.nominal
-    ready = replace(ready, gates=(*request.edits, *ready.gates), nominal=nominal)
-    ready = replace(ready, bench=replace(ready.bench, deadline=request.deadline), floor=_noise(request, ready))
-    now = Checked(ready.bench, ready.without).weighted(ready.floor)
-    ready = replace(ready, bench=now.bench, without=now.fitted)
-    search = Search(
-        ready.bench,
-        ready.without,
-        ready.floor,
-        (*request.laws, Offset),
-        request.workers,
-        request.say,
-        hold_said=request.hold_said,
-        aligned=request.aligned,
-        stand_in_error=request.stand_in_error,
-        until=began + SEARCH_SHARE * left,
-        times={CHECKS: time.perf_counter() - began},
-    )
-    return ready, search.run(request.most_effects)
-
-
-def _noise(request: Request, ready: Prepared) -> Floor:
-    """Return the noise floor of the prepared recordings; the error of a surrogate counts as noise."""
-    floor = ready.floor
-    if request.stretches is not None and floor.source == "estimated":  # what repeats may be outside the stretches
-        floor = measured_floor(request.stretches.everything(ready.bench, ready.gates).recordings) or floor
-    if not request.stand_in_error:
-        return floor
-    return floor.beside(request.stand_in_error * ready.bench.scale)
-
-
 def _concluded(search: Search, gates: Sequence[Gate]) -> Conclusion:
     """Draw the conclusion; after an interrupt, draw it without further fits."""
     with search.until_interrupted(), search.stage("conclusion"):
         found = conclude(search, gates)
-        search.out_of_time = search.out_of_time or search.past_deadline
+        search.out_of_time = search.out_of_time or time.perf_counter() > search.bench.deadline
         return found
     return conclude(search, gates)
 
@@ -372,7 +186,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     finished, elsewhere = not search.cut_short, tuple[Gate, ...]()
     given, gates = gates, with_tones(search, answer, gates)
     verdict = judge(search, answer, gates)
-    if verdict.kind in ("missing-physics", "unexplained") and not (interrupted or search.past_deadline):
+    if verdict.kind in ("missing-physics", "unexplained") and not search.past_deadline:
         found = _without_a_law(search, answer, verdict, gates)
         if found is not None:
             return found
@@ -395,7 +209,6 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
         gates = (*gates, *elsewhere, *find_untried_laws(search), *find_varying_values(search))
     refitted = search.root.fitted
     if search.interrupted and verdict.kind != "recording-fault":
-        search.bench = replace(search.bench, deadline=-np.inf)  # so that nothing more is fitted
         correction, fitted = find_correction(search, answer)
         off = f"Refitted, the simulator is off by {search.bench.nrmse(refitted):.3g} of the outputs' deviation."
         said = correction.sentence if correction.elements else off
@@ -449,7 +262,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
     say, hold = request.say.under("predictions: "), search.bench.hold
     try:
         led, memory = predictor(request.simulator, request.recordings, hold, request.engine)
-        leading = _search(replace(request, simulator=led, hold=hold, focus="prediction", say=say))[1]
+        leading = run_search(replace(request, simulator=led, hold=hold, focus="prediction", say=say))[1]
     except InputError:
         return found
     search.cut_short_with(leading)

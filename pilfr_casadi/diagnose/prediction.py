@@ -30,18 +30,12 @@ from ..linear import steady_state_gain
 from ..simulators import Simulator, discretise, growth_rate
 from .faults.gates import USELESS_FIT, Gate
 from .fits.linearise import linearise_runs
-from .fits.workbench import MOST_GROWTH, Fitted, Workbench, refit
+from .fits.workbench import Fitted, Workbench, growth, refit
 
 ROUNDING = 1e-9  # share of the largest entry that counts as zero
 # memories that are tried in turn, in half decades: times the time of e-fold growth (a longer one leaves the unstable
 # eigenvalue of the observer as it is); for a stable simulator times the longest recording's duration
 OF_GROWTH, OF_DURATION = (3.0, 1.0, 0.3, 0.1), (0.1, 0.03, 0.01, 0.003)
-
-
-def _growth(simulator: Simulator, recordings: Sequence[Recording]) -> float:
-    """Compute the rate, 1/s, at which a simulator grows; 0 if the recordings are too short to show it."""
-    rate, duration = growth_rate(simulator, recordings[0]), max(len(r) * r.dt for r in recordings)
-    return rate if rate * duration > MOST_GROWTH else 0.0
 
 
 def can_be_led(simulator: Simulator, recordings: Sequence[Recording]) -> bool:
@@ -75,7 +69,7 @@ def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, 
     InputError
         If it diverges with every observer.
     """
-    rate, duration = _growth(simulator, recordings), max(len(r) * r.dt for r in recordings)
+    rate, duration = growth(simulator, recordings), max(len(r) * r.dt for r in recordings)
     memories = [times / rate for times in OF_GROWTH] if rate else [times * duration for times in OF_DURATION]
     memories = [max(memory, recordings[0].dt) for memory in memories]  # corrections come once a sample
     best: tuple[float, Simulator, float] | None = None
@@ -99,7 +93,7 @@ def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, 
 
 def prediction_note(simulator: Simulator, recordings: Sequence[Recording], memory: float) -> Gate:
     """Note that the errors are errors of predictions, and if so that the simulator is unstable."""
-    rate = _growth(simulator, recordings)
+    rate = growth(simulator, recordings)
     why = f"The simulator is unstable by itself (it grows e-fold in {1 / rate:.2g} s). " if rate else ""
     sentence = (
         f"{why}The recordings lead the simulator: an observer lets it forget its past within {memory:.3g} s, and the "

@@ -16,7 +16,7 @@ from ..laws import Law
 from ..models import Model
 from ..optimise import StatePrior
 from ..simulators import Simulator, discretise
-from .faults.gates import Gate, edited
+from .faults.gates import Gate, edited, with_unit
 from .fits.evidence import BETTER_RATIO
 from .fits.floor import effective_size
 from .fits.linearise import linearise_runs, simulate_states
@@ -98,18 +98,14 @@ class Started:
 
     @classmethod
     def of(cls, model: Model, fitted: Fitted, bench: Workbench | None = None) -> Started:
-        """Take the initial states of a fit, and the prior if its bench is given."""
-        return cls(model, starts_of(fitted), None if bench is None else prior_of(bench, fitted))
+        """Take the first initial state of a fit, and the prior if its bench is given.
 
-
-def starts_of(fitted: Fitted) -> list[np.ndarray]:
-    """Return further initial states to try: the state of the first training recording.
-
-    From rest alone a search may end in a wrong minimum, for example beside a contact. A learned element is uncertain at
-    rest, outside its range; with one, the states of all recordings are returned.
-    """
-    learned = any(e.law.id == "learned" for e in fitted.simulator.elements)
-    return fitted.initial if learned else fitted.initial[:1]
+        From rest alone a search may end in a wrong minimum, for example beside a contact. A learned element is
+        uncertain at rest, outside its range; with one, the initial states of all recordings are taken.
+        """
+        learned = any(e.law.id == "learned" for e in fitted.simulator.elements)
+        starts = fitted.initial if learned else fitted.initial[:1]
+        return cls(model, starts, None if bench is None else prior_of(bench, fitted))
 
 
 @lru_cache(maxsize=4)
@@ -244,11 +240,11 @@ def _describe_experiment(bench: Workbench, best: Mapping[str, Any], recorded: fl
     unit = {**bench.simulator.units, **bench.recordings[0].units}.get(best["input"], "")
     so_far = f"by {recorded:.2g} times" if recorded > VISIBLE_DIFFERENCE else "not at all"
     about = abs(best["level"]) > VISIBLE_LEVEL * best["amplitude"]
-    level = f" about {best['level']:.3g}{' ' + unit if unit else ''}" if about else ""
+    swing, level = with_unit(best["amplitude"], unit), f" about {with_unit(best['level'], unit)}" if about else ""
     return (
-        f"A {best['waveform']} of {best['frequency']:.3g} Hz with amplitude {best['amplitude']:.3g}"
-        f"{' ' + unit if unit else ''}{level} at {best['input']} separates {rivals} best: their outputs then differ by "
-        f"{best['separation']:.3g} times the noise (in these recordings {so_far})."
+        f"A {best['waveform']} of {best['frequency']:.3g} Hz with amplitude {swing}{level} at "
+        f"{best['input']} separates {rivals} best: their outputs then differ by {best['separation']:.3g} times the "
+        f"noise (in these recordings {so_far})."
     )
 
 
@@ -258,8 +254,7 @@ def placebo(bench: Workbench, fitted: Fitted, port: str, law: Law) -> tuple[floa
     The unrelated signal is the law's own force, shifted by half a recording: it has the same statistics but no relation
     to the residual.
     """
-    probe, runs = linearise_runs(bench, fitted)
-    rest = Remainder.of(bench, probe, runs, [type(law)], at=port)
+    rest = Remainder.of(bench, *linearise_runs(bench, fitted), [type(law)], at=port)
     if not rest.tasks:
         return 0.0, 0.0
     own, unrelated = (rest.columns(rest.tasks[0], shifted)[0] for shifted in (False, True))

@@ -128,8 +128,8 @@ def replicate(
         On Ctrl-C.
     """
     bench = _bench(simulator, recordings, hold, engine)
-    refit = Checked(bench, bench.fit(bench.simulator, [{}, *starts], solver=THOROUGH)).weighted()
-    bench, plain = replace(refit.bench, typical=sample_run(refit.bench, refit.fitted)), refit.fitted
+    now = Checked(bench, bench.fit(bench.simulator, [{}, *starts], solver=THOROUGH)).weighted()
+    bench, plain = replace(now.bench, typical=sample_run(now.bench, now.fitted)), now.fitted
     after = _fit_with_laws(bench, plain, laws, starts) if laws else plain
     after = _refine_steps(bench, after)
     alone, values = _fit_each_recording(bench, after)

@@ -1,11 +1,11 @@
-"""The result of a diagnosis: immutable, printable, and written as diagnosis.json."""
+"""The result of a diagnosis: it simulates, plots, exports and refines, and is written as diagnosis.json."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,32 +14,15 @@ import numpy as np
 from .._base import InputError, later, to_json, write_atomically
 from ..data import SAME_STEP, Recording, as_recordings, nrmse
 from ..engine import make_engine
-from ..identify import RUN_AWAY, run_free
-from ..models import ParameterSet
-from ..simulators import ACTUATOR, Simulator, discretise, match_channels, name_at, split_port
-from .blind_spots import BlindSpot
-from .correction import Correction
-from .effect import Effect
-from .faults.gates import TEST_FAULT, Gate, edited
-from .faults.offsets import Offset
-from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, SURE
-from .fits.floor import ABOVE_NOISE
+from ..identify import run_free
+from ..simulators import Simulator, discretise, match_channels
+from .faults.gates import edited
 from .fits.workbench import Fitted, output_deviation
 from .proof import Started
 from .refinement import Refinement, refine
-from .search.learned import Learned
+from .result_text import ResultText
 
 VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
-
-ERROR_NAMES = {"nominal": "as given", "before": "refitted", "after": "corrected"}  # the errors that are printed
-MOST_PRINTED = 8  # parameters and blind spots that are printed at most
-GRAVEST_SPOTS = 2  # blind spots that are printed right after the verdict
-NEAR_CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
-INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
-OUT_OF_TIME = (
-    "The time limit ended the search: the answer rests on the fits made until then. A longer one (time_limit, "
-    "--time-limit) may find more."
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +44,7 @@ class BeforeAfter:
     after: np.ndarray | None
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
+class Diagnosis(ResultText):
     """Result of a diagnosis: the verdict, the missing physics, its confidence, the corrected simulator, and the proof.
 
     Attributes
@@ -104,114 +86,6 @@ class Diagnosis:
     calls : dict
         How often the diagnosis called functions that have no equations, by name; see `Numeric`.
     """
-
-    verdict: str
-    sentence: str
-    effects: tuple[Effect, ...]
-    candidates: tuple[dict[str, Any], ...]
-    gates: tuple[Gate, ...]
-    mismatch: dict[str, Any]
-    parameters: dict[str, dict[str, Any]]
-    errors: dict[str, dict[str, float] | None]
-    floor: dict[str, Any]
-    corrected: Simulator
-    refitted: Simulator
-    hold: str
-    train: tuple[Recording, ...] = ()
-    test: tuple[Recording, ...] = ()
-    next_experiment: dict[str, Any] | None = None
-    seconds: float = 0.0
-    times: Mapping[str, float] = field(default_factory=dict)
-    interrupted: bool = False
-    out_of_time: bool = False
-    evidence: Mapping[str, Any] = field(default_factory=dict)
-    substeps: int = 1
-    freed: str = ""
-    correction: Correction | None = None
-    blind_spots: tuple[BlindSpot, ...] = ()
-    calls: Mapping[str, int] = field(default_factory=dict)
-
-    @property
-    def sure(self) -> bool:
-        """Whether every named effect has a confidence above one half; False without effects."""
-        return bool(self.effects) and min(e.confidence for e in self.effects) > SURE
-
-    @property
-    def outcome(self) -> str:
-        """Effect of the correction on the test error: "better", "same", "worse"; "" if unknown.
-
-        It is unknown without test recordings, if a channel of these is wrong, and if the corrected simulator is the
-        refitted one.
-        """
-        errors = self.errors.get("test")
-        if not errors or not self._changed or self.test_fault:
-            return ""
-        before, after = errors["before"], errors["after"]
-        if not after <= BETTER_RATIO * before:
-            return "worse"
-        return "better" if after < before else "same"
-
-    @property
-    def summary(self) -> str:
-        """The verdict's sentence, with a warning if the search was cut short or the correction fails the test.
-
-        It also says if no test recording shows what the correction is worth.
-        """
-        errors, said = self.errors.get("test"), self.sentence
-        if self.effects and (self.interrupted or self.out_of_time):
-            said += " The search was cut short, so that a further effect may not have been tried."
-        if not errors:
-            untested = " This correction is not tested yet: give a recording of another experiment as test."
-            return said + untested if self._changed else said
-        if self.test_fault:
-            return f"{said} {self.test_fault} Until then the test error says nothing of this answer."
-        given, before, after = (_percent(errors[k]) for k in ("nominal", "before", "after"))
-        if self.outcome == "same":
-            said += f" On the test recordings it makes no difference: {before} before, {after} after."
-        elif self.outcome == "worse":
-            said += (
-                f" But this correction makes the test recordings worse: their error is {before} refitted "
-                f"and {after} with it. Do not use it as a correction.{self._better_without()}"
-            )
-        else:
-            said += self._idle_on_tests()
-        if BETTER_RATIO * errors["nominal"] < min(errors["before"], errors["after"]):
-            said += f" As given, the simulator follows the test recordings better than with any fit here: {given}."
-        return said
-
-    @property
-    def test_fault(self) -> str:
-        """The sentence on a wrong channel of the test recordings; empty if none is known."""
-        return next((g.sentence for g in self.gates if g.finding == TEST_FAULT), "")
-
-    def worth(self, effect: Effect) -> str:
-        """State the test error with and without one of several effects; empty if it is unknown."""
-        errors = self.errors.get("test")
-        if not errors or self.test_fault or np.isnan(effect.test_without):
-            return ""
-        with_it, without = _percent(errors["after"]), _percent(effect.test_without)
-        return f"error on the test recordings: {with_it} with it, {without} without it (the rest refitted)"
-
-    def _idle_on_tests(self) -> str:
-        """Name the effects without which, one at a time, the test recordings are followed as well."""
-        after = (self.errors.get("test") or {}).get("after", np.nan)
-        idle = [e.name for e in self.effects if e.test_without <= after]
-        if not idle:
-            return ""
-        rest = "their names rest" if idle[1:] else "its name rests"
-        return (
-            f" The test recordings are followed as well without {', or without '.join(idle)}; {rest} on the training "
-            "recordings alone."
-        )
-
-    def _better_without(self) -> str:
-        """Name the effect of a harmful correction without which the test error is lowest, if that helps."""
-        errors = self.errors.get("test") or {}
-        known = [e for e in self.effects if not np.isnan(e.test_without)]
-        least = min(known, key=lambda e: e.test_without, default=None)
-        if least is None or not least.test_without < errors["before"]:
-            return ""
-        return f" Without {least.name} it is {_percent(least.test_without)}."
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of diagnosis.json; numbers that are not finite are None."""
@@ -305,26 +179,6 @@ class Diagnosis:
         return BeforeAfter(r, *finite)
 
     compare = before_and_after  # the earlier name
-
-    @property
-    def _changed(self) -> bool:
-        """Whether the corrected simulator differs from the refitted one."""
-        return bool(self.effects or self.nameless or self.freed)
-
-    @property
-    def shares(self) -> dict[str, float]:
-        """Shares of the refit's error above the noise: `named` by laws, `learned` by an element, and `left`."""
-        return dict(self.correction.shares) if self.correction else {}
-
-    @property
-    def learned(self) -> tuple[Learned, ...]:
-        """The learned elements of `corrected`."""
-        return self.correction.learned if self.correction else ()
-
-    @property
-    def nameless(self) -> Correction | None:
-        """The correction, if it has elements and no effect is named."""
-        return self.correction if self.correction and self.correction.elements and not self.effects else None
 
     def run(self, recording: Recording, simulator: Simulator | None = None) -> tuple[Recording, np.ndarray, int]:
         """Simulate the corrected simulator, or another one, along a recording.
@@ -429,199 +283,5 @@ class Diagnosis:
         corrected = replace(fitted.corrected(), substeps=fitted.model.substeps)
         return replace(self, corrected=corrected, evidence=evidence, substeps=fitted.model.substeps)
 
-    def warnings(self) -> list[str]:
-        """List the reasons for doubt: an interrupt, parameters at their bounds, errors that stay large."""
-        out = [INTERRUPTED] * self.interrupted + [OUT_OF_TIME] * self.out_of_time
-        at_bounds = self._at_bounds()
-        if at_bounds:
-            one = len(at_bounds) == 1
-            out.append(
-                f"{', '.join(at_bounds)} came out at {'its bound' if one else 'their bounds'}: more is missing, or "
-                f"{'it has' if one else 'they have'} too little room. The ± of the other values do not include that."
-            )
-        out += self._doubtful_offsets()
-        train, test = self.errors["train"], None if self.test_fault else self.errors["test"]
-        if train and train["before"] > NEAR_CONSTANT and self.verdict in ("missing-physics", "unexplained"):
-            out.append(
-                f"Refitted, the simulator alone is hardly better than a constant (error {train['before']:.2g} of the "
-                "outputs' deviation). Either its values, units or bounds are wrong: check them before you "
-                "trust a name. Or large physics is missing: then the corrected simulator follows far better."
-            )
-        if train and self.verdict != "unexplained":
-            out += self._remaining_error(train["after"])
-        far = test and train and test["after"] > FAR_RATIO * max(train["after"], self.noise_on_tests["nrmse"])
-        if far and self.outcome != "worse":
-            out.append(
-                "The test error is far above the training error: the model is only near the truth, or the test "
-                "recording visits states that the training recordings do not."
-            )
-        return out
-
-    def _remaining_error(self, after: float) -> Iterator[str]:
-        """Generate a note if the corrected simulator does not follow to the noise, or only to an uncertain one."""
-        noise, white = (max(value, 1e-300) for value in (self.floor["nrmse"], _white(self.floor)))
-        tried = () if self.effects or after < ABOVE_NOISE * white else self.candidates
-        at_noise = [c for c in tried if c["nrmse_train"] < NEAR_RATIO * white]
-        best = min(at_noise, key=lambda c: c["nrmse_train"], default=None)
-        law = best and f"{name_at(best['port'], best['law'], best['form'])} follows to {best['nrmse_train']:.3g}"
-        if after > ABOVE_NOISE * noise:
-            rest = f"more may be missing ({law})" if law else "more is missing, or a law is only near"
-            yield f"The remaining error is {after / noise:.2g} times the noise: {rest}."
-        elif law or after > FAR_RATIO * white:
-            rest = f"missing physics: {law}" if law else "physics that no law here explains"
-            yield (
-                f"The remaining error is {after / white:.2g} times the white noise. Its slow part may be noise too, or "
-                f"{rest}."
-            )
-
-    @property
-    def noise_on_tests(self) -> Mapping[str, float]:
-        """The noise relative to the test recordings, `nrmse` and `white`; without these, to the training recordings."""
-        return self.floor.get("test") or self.floor
-
-    def _doubtful_offsets(self) -> Iterator[str]:
-        """Generate a note on each offset that is larger than its signal ever was."""
-        own = self.corrected.parameters
-        for e in (e for e in self.corrected.elements if isinstance(e.law, Offset) and self.train):
-            kind, name = split_port(e.port)
-            values = [r.u if kind == ACTUATOR else r.y for r in self.train]
-            at = (self.train[0].inputs if kind == ACTUATOR else self.train[0].outputs).index(name)
-            reach, value = max(float(np.max(np.abs(v[:, at]))) for v in values), float(own[f"{e.prefix}w_0"].value)
-            if abs(value) > reach:
-                yield (
-                    f"The offset of {name} ({value:.3g}) is larger than {name} ever was ({reach:.3g}): it may make up "
-                    "for something else, such as a wrong level or gain, or missing physics."
-                )
-
-    def _at_bounds(self) -> list[str]:
-        """List the free entries of parameters at a bound, each with its value.
-
-        Zeros are left out if effects are named: there an effect has replaced the parameter (friction a damper).
-        """
-        own, out = self.corrected.parameters, []
-        for name in self.parameters:
-            p = own[name]
-            low, high = (np.broadcast_to(b, p.value.shape) for b in p.bounds)
-            labels = ParameterSet({name: p}).labels
-            columns = [np.ravel(a, order="F") for a in (p.value, low, high, np.broadcast_to(p.fixed, p.value.shape))]
-            for label, v, below, above, fixed in zip(labels, *columns, strict=True):
-                if not fixed and (v <= below or v >= above) and (v or not self.effects):
-                    out.append(f"{label} ({v:.4g})")
-        return out
-
-    def __str__(self) -> str:
-        lines = [self.summary, *self.corrections_made(), *self.gravest_blind_spots()]
-        for e in self.effects:
-            lines += [str(e), f"  {self.worth(e)}"] if self.worth(e) else [str(e)]
-        lines += [*self._nameless_lines(), *self._value_lines(), *self._error_lines(), *self._blind_lines()]
-        further = [g.sentence for g in self.gates if g.sentence not in self.corrected_faults]
-        lines += [f"note: {text}" for text in (*further, *self.warnings())]
-        if self.next_experiment:
-            lines.append(f"next experiment: {self.next_experiment['sentence']}")
-        calls = "".join(f", {count} calls of {name}" for name, count in self.calls.items() if count)
-        lines.append(f"computed in {self.seconds:.{1 if self.seconds < 10 else 0}f} s{calls}")
-        return "\n".join(lines)
-
-    __repr__ = __str__
-
     def _repr_html_(self) -> str:
         return str(later("report.diagnosis_card")(self))
-
-    def _error_lines(self) -> list[str]:
-        """Format the errors as a table, with the noise floor below it."""
-        lines = [f"{'NRMSE':<12}" + "".join(f"{name:>11}" for name in ERROR_NAMES.values())]
-        role = "test" if self.errors.get("test") else "train"
-        for kind in ("train", "test", "free_run"):
-            errors = self.errors.get(kind)
-            if errors:
-                shown = (_error_text(errors[k]) for k in ERROR_NAMES)
-                label = f"{role} free" if kind == "free_run" else kind  # a free run of the recordings in the row above
-                lines.append(f"  {label:<10}" + "".join(f"{text:>11}" for text in shown))
-        if self.errors.get("free_run"):
-            lines.append(f"  {role} free: a free run of the {role} recordings; the rows above are predictions")
-        noise = f"{self.noise_text(self.floor)} ({self.floor['source']})"
-        if self.floor.get("test"):
-            noise += f", on the test recordings {self.noise_text(self.noise_on_tests)}"
-        return [*lines, f"  noise floor {noise}"]
-
-    def noise_text(self, noise: Mapping[str, float], write: Callable[[float], str] | None = None) -> str:
-        """Write a noise floor as far as it is known; `write` formats an error, by default as printed."""
-        write = write or _error_text
-        most, white = noise["nrmse"], _white(noise)
-        if self.verdict == "unexplained" and self.floor["source"] == "estimated":
-            return f"at least {write(most)}"
-        if most > NEAR_RATIO * white:
-            return f"{write(white)} (its white part) to {write(most)} (with the slow part)"
-        return write(most)
-
-    @property
-    def corrected_faults(self) -> list[str]:
-        """Faults that were corrected in the recordings; the corrected simulator belongs to corrected recordings."""
-        return [g.sentence for g in self.gates if g.fault and g.corrected and not g.parameter]
-
-    def corrections_made(self) -> list[str]:
-        """Tell which faults were corrected in the recordings, besides one that is the verdict."""
-        return [f"The recordings were corrected: {text}" for text in self.corrected_faults if text != self.sentence]
-
-    def gravest_blind_spots(self) -> list[str]:
-        """Describe the gravest facts that the recordings cannot reveal, one a line."""
-        return [f"Blind spot of these recordings: {b.sentence}" for b in self.blind_spots[:GRAVEST_SPOTS]]
-
-    def _blind_lines(self) -> list[str]:
-        """List the blind spots that are not printed after the verdict."""
-        further = [f"  {b.sentence}" for b in self.blind_spots[GRAVEST_SPOTS:MOST_PRINTED]]
-        left = len(self.blind_spots) - MOST_PRINTED
-        more = [f"  and {left} more, see pilfr check"] if left > 0 else []
-        return ["further blind spots of these recordings:", *further, *more] if further else []
-
-    def _nameless_lines(self) -> list[str]:
-        """List the laws of a correction without a sure name, with their values."""
-        if self.nameless is None:
-            return []
-        lines, parameters = list[str](), self.corrected.readable_parameters()
-        for e in self.corrected.elements[len(self.refitted.elements) :]:
-            own = {name: parameters[f"{e.prefix}{name}"] for name in e.law.parameters()}
-            numbers = {name: p for name, p in own.items() if p.value.ndim == 0 and not np.all(p.fixed)}
-            if numbers:
-                lines.append(f"in the correction, without a sure name: {name_at(e.port, e.law.id, e.law.form)}")
-                lines += [f"  {name} = {float(p.value):.5g} {p.unit}".rstrip() for name, p in numbers.items()]
-        return lines
-
-    def _value_lines(self) -> list[str]:
-        """List the simulator's own estimated values, largest changes first."""
-        own = self.corrected.parameters
-        free = {k: p for k, p in self.parameters.items() if not own[k].fixed.all() and own[k].value.ndim == 0}
-        moved = sorted(free, key=lambda k: -abs(_relative_change(free[k])))
-        lines = []
-        for name in moved[:MOST_PRINTED]:
-            p = free[name]
-            std = "" if p["std"] is None else f" ± {float(p['std']):.2g}"
-            value, nominal, (low, high) = float(p["refit_with"]), float(p["nominal"]), own[name].bounds
-            bound = "" if low < value < high else ", at its bound"
-            lines.append(f"  {name} = {value:.5g}{std} {p['unit']}".rstrip() + f", given as {nominal:.5g}{bound}")
-        more = [f"  and {len(moved) - MOST_PRINTED} more"] if len(moved) > MOST_PRINTED else []
-        for e in (e for e in self.corrected.elements if e.law.id == "offset"):
-            value, unit = float(own[f"{e.prefix}w_0"].value), self.corrected.port(e.port).unit
-            more.append(f"  offset of {e.port.rpartition(':')[2]} = {value:.4g} {unit}".rstrip())
-        return ["the simulator's own values, refitted:", *lines, *more] if lines or more else []
-
-
-def _error_text(nrmse: float) -> str:
-    """Write an error with four decimals, or two digits if it is below them."""
-    if not nrmse < RUN_AWAY:
-        return "runs away"
-    return f"{nrmse:.4f}" if nrmse >= 1e-3 or nrmse == 0 else f"{nrmse:.2g}"
-
-
-def _white(noise: Mapping[str, float]) -> float:
-    """Return the white part of a noise floor, or all of it where it is not known apart."""
-    return noise.get("white", noise["nrmse"])
-
-
-def _percent(value: float) -> str:
-    return f"{100 * value:.3g} %" if np.isfinite(value) else "infinite (the simulation diverges)"
-
-
-def _relative_change(row: Mapping[str, Any]) -> float:
-    nominal = float(row["nominal"])
-    return (float(row["refit_with"]) - nominal) / (abs(nominal) or 1e-300)

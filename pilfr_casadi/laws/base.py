@@ -218,6 +218,8 @@ class Law:
         Input that multiplies the force, or signal with which the strengths vary, if any; see `scaled`, `scheduled`.
     profile : str
         How they vary.
+    of_input : bool
+        It is the effect of an input alone, whose name `scaled` and `scheduled` put into its texts in place of "{by}".
     signal : str
         State or input that is the local coordinate of a law at a parameter, if any.
 
@@ -274,6 +276,7 @@ class Law:
     scaled_by: ClassVar[str] = ""
     scheduled_by: ClassVar[str] = ""
     profile: ClassVar[str] = ""
+    of_input: ClassVar[bool] = False
     signal: ClassVar[str] = ""
 
     values: Mapping[str, Any] = field(default_factory=dict)

@@ -124,6 +124,7 @@ class UnreadInput(Law):
     form = "{by}"
     equation = "w = a {by}"
     sentence = "{by} acts here; it is recorded, and the equations do not read it"
+    of_input = True
     units = {"a": "w"}
     places: ClassVar[tuple[str, ...]] = ("parallel", "series")
 
@@ -269,7 +270,7 @@ def behind_gap(law: type[Law]) -> type[Law]:
 def _check_force(law: Any) -> Any:
     if not (isinstance(law, type) and issubclass(law, Law)):
         raise InputError(f"A composed law is made of a class of laws, such as CoulombFriction; got {law!r}.")
-    if "parallel" not in law.places and not issubclass(law, UnreadInput):
+    if "parallel" not in law.places and not law.of_input:
         raise InputError(f"The law {law.id!r} stands in series with a signal; only a force can be composed.")
     return law
 
@@ -328,7 +329,7 @@ def _seen_by(base: Any, output: str) -> Any:
 def _scaled(base: Any, by: str) -> Any:
     strengths = {name: f"{unit}/[{by}]" if name in base.strength else unit for name, unit in base.units.items()}
 
-    if "{by}" in base.equation:
+    if base.of_input:
         words = [text.format(by=by) for text in (base.form, base.equation, base.sentence)]
     else:
         form, equation = f"{base.form}, scaled by {by}".removeprefix(", "), base.equation.replace("w =", "f =", 1)
@@ -340,7 +341,7 @@ def _scaled(base: Any, by: str) -> Any:
         units, strength = strengths, base.strength
         places = base.places
         dissipative = restoring = False  # the signal may have either sign
-        scaled_by = by
+        scaled_by, of_input = by, False
 
         def why_not(self, local: Local) -> str:
             return super().why_not(local) or _missing_signal(by, local)
@@ -368,7 +369,7 @@ def _levels(found: Law, own: str, by: str, limits: Mapping[str, float]) -> np.nd
 def _in_words(base: Any, varies: Profile, by: str, words: str) -> tuple[str, str, str]:
     """Return form, equation and sentence of a law whose strength varies."""
     course = varies.course.format(by=by)
-    if "{by}" in base.equation:
+    if base.of_input:
         return f"{by}{varies.how}, with an offset", f"w = a  with a {course}", base.sentence.format(by=words)
     form = f"{base.form}, scheduled{varies.how} by {by}".removeprefix(", ")
     if "parameter" in base.places:
@@ -401,7 +402,7 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
         units = {**base.units, **further, **shape, "low": unit, "high": unit}
         strength = (*base.strength, *further)
         places = base.places
-        scheduled_by, profile = by, name
+        scheduled_by, profile, of_input = by, name, False
 
         @classmethod
         def reads(cls) -> set[str]:

@@ -20,8 +20,8 @@ from pilfr_casadi.diagnose.other_explanations import (
     find_untried_laws,
     find_varying_values,
 )
+from pilfr_casadi.diagnose.posterior import NamedEffect, Posterior
 from pilfr_casadi.diagnose.search.moves import Search
-from pilfr_casadi.diagnose.verdict import NamedEffect, Posterior
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.report.diagnosis_tables import headline
 from pilfr_casadi.simulators import Placed, discretise

@@ -15,8 +15,8 @@ from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose.arguments import Request
 from pilfr_casadi.diagnose.faults.gates import Gate
 from pilfr_casadi.diagnose.faults.offsets import WrongStart
-from pilfr_casadi.diagnose.pipeline import _search_once
 from pilfr_casadi.diagnose.preparation import prepare
+from pilfr_casadi.diagnose.repetitions import _search_once
 
 
 def diagnosed(simulator, r, tried=(), press="", after="", **options):

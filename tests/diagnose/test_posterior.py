@@ -7,7 +7,8 @@ import pytest
 
 from pilfr_casadi.diagnose.faults.offsets import Offset
 from pilfr_casadi.diagnose.fits.evidence import STRAINED_ODDS, significance
-from pilfr_casadi.diagnose.verdict import closest_law, explainable_remainder, judge, posterior, share_named
+from pilfr_casadi.diagnose.posterior import explainable_remainder, posterior, share_named
+from pilfr_casadi.diagnose.verdict import closest_law, judge
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Delay, DirectionalFriction, QuadraticDrag
 
 SURE = share_named(0.0)  # of a law that leaves nothing: 0.98

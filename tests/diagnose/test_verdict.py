@@ -16,7 +16,8 @@ from pilfr_casadi.diagnose.correction import Correction
 from pilfr_casadi.diagnose.faults.offsets import Offset, fix_idle_offsets, list_offsets, update_offsets
 from pilfr_casadi.diagnose.fits.evidence import deviations
 from pilfr_casadi.diagnose.fits.flexible_forces import flexible_shares, innovation_share
-from pilfr_casadi.diagnose.verdict import judge, posterior
+from pilfr_casadi.diagnose.posterior import posterior
+from pilfr_casadi.diagnose.verdict import judge
 from pilfr_casadi.laws import CoulombFriction, CubicDamping, Power as StaticPower, Relaxation
 
 

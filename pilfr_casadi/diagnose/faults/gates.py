@@ -193,6 +193,11 @@ def gain(before: float, after: float, residuals: Sequence[np.ndarray], parameter
     return float(0.5 * n * np.log(before / max(after, 1e-300)) - 0.5 * parameters * np.log(n))
 
 
+def with_unit(value: float, unit: str, digits: int = 3) -> str:
+    """Write a value with its unit, if that is known."""
+    return f"{value:.{digits}g} {unit}".rstrip()
+
+
 def describe_fall(before: float, after: float) -> str:
     """Describe by how much an edit reduces the NRMSE."""
     if not np.isfinite(before):

@@ -33,6 +33,7 @@ from .gates import (
     correct,
     gain,
     settle,
+    with_unit,
 )
 
 KEPT_OFFSET = 0.1  # share of its first value that an offset must keep beside effects to be reported
@@ -154,7 +155,7 @@ def describe_constant(port: str, value: float = 0.0, parameter: str = "", unit: 
     kind, name = split_port(port)
     alike = ", or a constant load acts like one, as do dry friction and a dead zone while the input keeps its sign"
     where, load = ("input", alike) if kind == ACTUATOR else ("output", "")
-    words = f"The {where} {name} has a constant offset of about {f'{value:.3g} {unit}'.rstrip()}{load}"
+    words = f"The {where} {name} has a constant offset of about {with_unit(value, unit)}{load}"
     return Constant(name, "offset", value, words, parameter=parameter, port=port)
 
 

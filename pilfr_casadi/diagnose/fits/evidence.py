@@ -43,8 +43,9 @@ from ...simulators import MECHANICAL, PARAMETER, SENSOR, UNKNOWN, Placed, kind_o
 from .floor import effective_size
 from .workbench import DIVERGED, RUNAWAY, Fitted, Workbench
 
-# The priors and thresholds on which every answer of a search rests. Elsewhere are those of the noise (`floor`), of
-# faults (in `faults`: `gates`, `channels`, `offsets`, `timing`, `lost_samples`, `samples`, `tones`), the memories of an
+# The priors and thresholds on which every answer of a search rests. Elsewhere are those of the noise (`floor`,
+# `coloured_noise`), of faults (`preparation`, and in `faults`: `gates`, `channels`, `offsets`, `timing`,
+# `lost_samples`, `samples`, `tones`), of memory that a motion does not show (`force_recovery`), the memories of an
 # observer (`prediction`), the bases of flexible forces (`flexible_forces`, `learned`) and the accuracy of integration
 # (`workbench`, `step_refinement`). All other numbers limit the effort or keep numbers finite.
 

@@ -31,7 +31,7 @@ DRIVEN = 0.5  # share of the differences between repeats that the input explains
 RESPONSE, SPANS, COMPARED = 150, 30, 6000  # lags of the input that are tried one by one, longer spans, and samples
 NARROW_BAND, LEAST_RANK = 1e-3, 4  # least share of a direction of the input, and the directions of a sine or a ramp
 SENSOR_RESOLUTION = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
-HUGE2 = 1e20  # mean square error, over an output's variance, of a run that diverges
+DIVERGED = 1e20  # mean square error, over an output's variance, of a run that diverges
 MODEL_ERRORS = 200  # sizes of the model error that are tried where outputs with unequal noise are pooled
 SAME_LEVEL = 1e-9  # distance of two values, over the range, below which they are one level
 
@@ -86,7 +86,7 @@ def pool(squares: np.ndarray, noise2: np.ndarray | None) -> tuple[float, np.ndar
     variances of this form. For one output, equal noise, or unknown noise, it is the mean.
     """
     mean = float(np.mean(squares))
-    if noise2 is None or np.ptp(noise2) <= 0 or not 0 < mean < HUGE2:
+    if noise2 is None or np.ptp(noise2) <= 0 or not 0 < mean < DIVERGED:
         return mean, np.ones(len(squares))
     return _pool_unequal(tuple(squares.tolist()), tuple(noise2.tolist()))
 

@@ -31,7 +31,7 @@ from ...simulators import (
     needed_substeps,
     rate_at_start,
 )
-from .floor import pool
+from .floor import DIVERGED as DIVERGED, pool
 
 # Solvers: of the fits that results are based on; of other fits; of the first fit of a law, to rank the laws
 THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
@@ -48,7 +48,7 @@ MOST_BALANCES = 4  # fits with other weights at most
 NEAR_BALANCE = 1.2  # ratio of two weights that counts as equal
 
 # Diverging runs
-HUGE, DIVERGED = 1e6, 1e20  # bounds: output over the largest measured value, and mean square error
+OUT_OF_BOUNDS = 1e6  # output over the largest measured value, from which a message says where a run diverges
 RUNAWAY = 10.0  # over the outputs' deviation; a bounded oscillation about another point is off by less
 # growth within a recording, in e-folds, above which no estimated initial state can keep the run bounded
 MOST_GROWTH = 20.0
@@ -265,7 +265,7 @@ class Workbench:
         for start in starts:
             if best is not None and time.perf_counter() > self.deadline:
                 break
-            one = self._fit_from(simulator, model, engine, start, states, tuple(anneal), solver)
+            one = self._fit_from(model, engine, start, states, tuple(anneal), solver)
             if one is not None and (best is None or one[0] < best[0]):
                 best = one
         if best is None:
@@ -285,7 +285,7 @@ class Workbench:
         for r in self.recordings:
             with np.errstate(all="ignore"):
                 y = engine.simulate(model.drive(r), vector, np.zeros(model.n_state))[0]
-                off = ~(np.abs(y) < HUGE * np.max(np.abs(r.y), axis=0))
+                off = ~(np.abs(y) < OUT_OF_BOUNDS * np.max(np.abs(r.y), axis=0))
             if np.any(off):
                 k = int(np.argmax(np.any(off, axis=1)))
                 name = self.simulator.output_names[int(np.argmax(off[k]))]
@@ -303,8 +303,8 @@ class Workbench:
 
     def _describe_instability(self, simulator: Simulator) -> str:
         """Say what to do about a simulator too unstable to follow a controlled machine; empty if it is not."""
-        rate = growth_rate(simulator, self.recordings[0]) if simulator.observer is None else 0.0
-        if rate * max(len(r) for r in self.recordings) * self.dt < MOST_GROWTH:
+        rate = growth(simulator, self.recordings) if simulator.observer is None else 0.0
+        if not rate:
             return ""
         return (
             f"it is unstable (it grows e-fold in {1 / rate:.2g} s) and cannot be run by its own inputs alone: put the "
@@ -328,7 +328,6 @@ class Workbench:
 
     def _fit_from(
         self,
-        simulator: Simulator,
         model: Model,
         engine: Engine,
         start: Mapping[str, Any],
@@ -360,8 +359,7 @@ class Workbench:
             problem, theta, status = self._solve(problem, theta, solver)
             if np.all(np.isfinite(theta)):
                 vector, states = problem.parameters(theta), theta[n_free:]
-        if problem is None:
-            return None
+        assert problem is not None
         theta = np.concatenate([vector[problem.free], states if states is not None else problem.start[n_free:]])
         balance = self._balance(problem, theta)
         if not near_balance(balance, (problem.scale / self.scale) ** 2):
@@ -371,6 +369,10 @@ class Workbench:
 
     def _solve(self, problem: Problem, theta: np.ndarray, solver: GaussNewton) -> tuple[Problem, np.ndarray, Status]:
         """Solve a problem, and again while its outputs are out of balance (iteratively reweighted least squares)."""
+
+        def end_if_pressed(*_: object) -> None:
+            self.interrupt.raise_pending()
+
         status, until = Status.SOLVER_FAILED, min(time.perf_counter() + solver.time_limit, self.deadline)
         for done in range(MOST_BALANCES):
             balance = self._balance(problem, theta)
@@ -382,7 +384,7 @@ class Workbench:
             try:
                 timed = replace(solver, time_limit=until - time.perf_counter())
                 with np.errstate(all="ignore"):
-                    solution = solve_within_bounds(problem, theta, timed, progress=self.interrupt.raise_pending)
+                    solution = solve_within_bounds(problem, theta, timed, progress=end_if_pressed)
             except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
                 break
             theta, status = solution.theta, solution.status
@@ -481,6 +483,12 @@ class Workbench:
             cost, balance = pool(squares, self.noise2)
         cost = cost if np.isfinite(cost) else np.inf
         return Fitted(simulator, model, engine, values, initial, residual, cost, squares, balance)
+
+
+def growth(simulator: Simulator, recordings: Sequence[Recording]) -> float:
+    """Compute the rate, 1/s, at which a simulator grows by itself; 0 if the recordings are too short to show it."""
+    rate = growth_rate(simulator, recordings[0])
+    return rate if rate * max(len(r) * r.dt for r in recordings) > MOST_GROWTH else 0.0
 
 
 def near_balance(one: np.ndarray, other: np.ndarray) -> bool:

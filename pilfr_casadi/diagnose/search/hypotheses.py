@@ -359,8 +359,8 @@ class Hypotheses:
 
     @property
     def past_deadline(self) -> bool:
-        """Whether the time for the whole diagnosis is over."""
-        return time.perf_counter() > self.bench.deadline
+        """Whether nothing more is fitted: Ctrl-C was pressed, or the time for the whole diagnosis is over."""
+        return self.interrupted or time.perf_counter() > self.bench.deadline
 
     def in_time(self) -> bool:
         """Tell whether there is time for more; if not, note that in the result."""

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._base import InputError, is_interrupt
+from ..._base import InputError
 from ...data import Recording
 from ...laws import Law
 from ...optimise import GaussNewton
@@ -243,9 +243,8 @@ class Trials:
             found += [p.trial for p in prepared[most:]]
             report(done if self.over else total, total, least(found))
         except (KeyboardInterrupt, SystemError, RuntimeError) as error:
-            if not is_interrupt(error):
+            if not self.bench.interrupt.mark(error):
                 raise
-            self.bench.interrupt.pressed = True  # so that running fits end; what was found stays
             found += [p.trial for p in prepared]
         finally:
             pool.shutdown(cancel_futures=True)

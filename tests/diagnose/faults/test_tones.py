@@ -13,9 +13,10 @@ from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.faults.tones import find_ringing_mode, find_tone, find_tones
 from pilfr_casadi.diagnose.fits.floor import Floor
 from pilfr_casadi.diagnose.pipeline import with_tones
+from pilfr_casadi.diagnose.posterior import Posterior
 from pilfr_casadi.diagnose.search.moves import Search
 from pilfr_casadi.diagnose.search.trials import Trial
-from pilfr_casadi.diagnose.verdict import Posterior, judge
+from pilfr_casadi.diagnose.verdict import judge
 
 # steady tones
 

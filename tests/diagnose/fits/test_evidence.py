@@ -19,7 +19,7 @@ from pilfr_casadi.diagnose.fits.evidence import (
     runs_away,
     spread,
 )
-from pilfr_casadi.diagnose.verdict import share_named
+from pilfr_casadi.diagnose.posterior import share_named
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.optimise import Problem
 

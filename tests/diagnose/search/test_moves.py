@@ -16,10 +16,10 @@ from pilfr_casadi.diagnose.faults.gates import Checked
 from pilfr_casadi.diagnose.fits import flexible_forces
 from pilfr_casadi.diagnose.fits.flexible_forces import flexible_shares
 from pilfr_casadi.diagnose.fits.floor import Floor
+from pilfr_casadi.diagnose.posterior import posterior
 from pilfr_casadi.diagnose.search import hypotheses
 from pilfr_casadi.diagnose.search.moves import Search
 from pilfr_casadi.diagnose.search.trials import Trial, Trials
-from pilfr_casadi.diagnose.verdict import posterior
 from pilfr_casadi.optimise import GaussNewton
 
 FRICTION = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
