@@ -178,7 +178,7 @@ def _input_limits(limits: tuple[float, float] | None, recording: Recording) -> t
     return low, high
 
 
-def inverse_step(function: ca.Function, ahead: int, limits: tuple[float, float], delay: int = 0) -> ca.Function:
+def inverse_step(function: ca.Function, ahead: int, limits: tuple[float, float], delay: int) -> ca.Function:
     """Invert any scalar `F(x, u)` by a step `(x, u_before, wanted) -> (x_next, u)`; see `feedforward`."""
     n, output_ahead = function.size1_in(0), _output_ahead(function, ahead, delay)
     # iterate on the bracket (u, low, high); x, u_before, wanted and the sign of the gain stay constant
