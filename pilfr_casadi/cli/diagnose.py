@@ -176,19 +176,17 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: SimulatorFile | 
 
     corrected.py loads and corrects the simulator file `source`, if there is one.
     """
-    target = make_folder(str(folder)) / "diagnosis.json"
+    target, corrected = make_folder(str(folder)) / "diagnosis.json", folder / "corrected.py"
     try:
         with deferred_interrupt():
             diagnosis.save(target)
             print(diagnosis, flush=True)
             from ..report import corrected_file, diagnosis_report
 
-            corrected = folder / "corrected.py" if source is not None else None
-            if corrected is not None and source is not None:
+            if source is not None:
                 there = Path(os.path.relpath(os.path.realpath(source.path), os.path.realpath(folder))).as_posix()
-                write_atomically(
-                    corrected, corrected_file(diagnosis, there, source.loader, source.options, source.bounds)
-                )
+                text = corrected_file(diagnosis, there, source.loader, source.options, source.bounds)
+                write_atomically(corrected, text)
         with progress_bar() as progress:
             progress("writing the report: simulations and pictures", 0, 0, np.nan)
             began = time.perf_counter()
@@ -203,7 +201,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: SimulatorFile | 
         return say(f"The diagnosis is in {target}, but a report could not be written ({reason}).", NO_RESULT)
     print(f"writing the report took {took:.0f} s more, which the computing time and --time-limit do not count")
     print(f"diagnosis: {target}\nreport: {page}")
-    if corrected is not None:
+    if source is not None:
         print(f"corrected simulator: {corrected}")
     return INTERRUPTED if diagnosis.interrupted else DONE
 

@@ -82,14 +82,7 @@ class ControlTask:
 
 
 def check_task(
-    function: Any,
-    horizon: Any,
-    inputs: Any,
-    outputs: Any = None,
-    rate: Any = None,
-    move: Any = 1e-3,
-    y_scale: Any = None,
-    u_scale: Any = None,
+    function: Any, horizon: Any, inputs: Any, outputs: Any, rate: Any, move: Any, y_scale: Any, u_scale: Any
 ) -> ControlTask:
     """Check the options of a predictive controller and spread them over the horizon."""
     function = as_step_function(function)

@@ -139,9 +139,13 @@ def feedforward(
     _check_ports(run, recording)
     ends = _input_limits(limits, recording)
     function = run.model.step if observer is None else observer_function(observer, run.model.step, recording)
+    if ahead is not None and not is_whole(ahead, 0, LONGEST_LOOK_AHEAD):
+        raise InputError(
+            f"A look-ahead of {ahead!r} samples was given; give a whole number from 0 to {LONGEST_LOOK_AHEAD}."
+        )
     response = analyse_response(fit, run, recording)
     chosen, why = _choose_look_ahead(run, recording, response, ahead)
-    delay = response.delay or 0
+    delay = response.delay
     if chosen == delay and _gain_changes_sign(run, recording, response, ends):
         why = (
             "within the limits the output rises with the input in places and falls in others, so that several inputs "
@@ -178,7 +182,7 @@ def _input_limits(limits: tuple[float, float] | None, recording: Recording) -> t
     return low, high
 
 
-def inverse_step(function: ca.Function, ahead: int, limits: tuple[float, float], delay: int = 0) -> ca.Function:
+def inverse_step(function: ca.Function, ahead: int, limits: tuple[float, float], delay: int) -> ca.Function:
     """Invert any scalar `F(x, u)` by a step `(x, u_before, wanted) -> (x_next, u)`; see `feedforward`."""
     n, output_ahead = function.size1_in(0), _output_ahead(function, ahead, delay)
     # iterate on the bracket (u, low, high); x, u_before, wanted and the sign of the gain stay constant
@@ -212,17 +216,8 @@ def _output_ahead(function: ca.Function, ahead: int, delay: int) -> ca.Function:
 
 
 def _choose_look_ahead(run: Rollout, recording: Recording, response: Response, ahead: int | None) -> tuple[int, str]:
-    """Check the look-ahead, or find the shortest stable one; also say why its inverse is approximate."""
-    if ahead is not None and not is_whole(ahead, 0, LONGEST_LOOK_AHEAD):
-        raise InputError(
-            f"A look-ahead of {ahead!r} samples was given; give a whole number from 0 to {LONGEST_LOOK_AHEAD}."
-        )
+    """Choose the look-ahead given, or the shortest stable one; also say why its inverse is approximate."""
     n = response.delay
-    if n is None:
-        raise InputError(
-            "The input reaches the output nowhere along the recording (no direct feedthrough, no path through the "
-            "states), so there is nothing to invert; give a model and a recording with a response to the input."
-        )
     if ahead is not None and ahead < n:
         raise InputError(
             f"The look-ahead is {ahead} samples, but the input reaches the output only after {n} (a delay; the "
@@ -253,7 +248,7 @@ def _choose_look_ahead(run: Rollout, recording: Recording, response: Response, a
 def _gain_and_radius(run: Rollout, recording: Recording, response: Response, d: int) -> tuple[float, float, float]:
     """Compute the median gain of a look-ahead, the gain of a constant input, and the largest spectral radius."""
     n = len(response.linear[0][0])
-    output_ahead, gains, radii, constant = _output_ahead(run.model.step, d, response.delay or 0), [], [], []
+    output_ahead, gains, radii, constant = _output_ahead(run.model.step, d, response.delay), [], [], []
     for k, (a, b, _, _) in zip(response.at, response.linear, strict=True):
         slopes = output_ahead(run.states[:, k], recording.u[max(k - 1, 0)], recording.u[k])
         _, g_x, g_before, g_u = (np.asarray(v) for v in slopes)
@@ -272,7 +267,7 @@ def _gain_and_radius(run: Rollout, recording: Recording, response: Response, d: 
 
 def _gain_changes_sign(run: Rollout, recording: Recording, response: Response, ends: tuple[float, float]) -> bool:
     """Tell whether the output rises with the input in places and falls in others."""
-    n = response.delay or 0
+    n = response.delay
     output_ahead, u = _output_ahead(run.model.step, n, n), np.linspace(*ends, GAIN_INPUTS)[None, :]
     slopes = [output_ahead(run.states[:, k], recording.u[max(k - 1, 0)], u)[3] for k in response.at]
     gains = np.ravel([np.asarray(slope) for slope in slopes])
@@ -320,13 +315,11 @@ class Response:
     linear: tuple[tuple[Array, ...], ...]  # (A, B, C, D) of the linear states at each point, with constant memory
     markov: Array  # (RESPONSE_SAMPLES,)
     errors: Array  # standard errors of the Markov parameters, nan where unknown
-    delay: int | None  # samples after which the input reaches the output; None if it never does
+    delay: int  # samples after which the input reaches the output
     early: float  # largest Markov parameter before the delay at any of the points, over the largest median
 
     def zeros(self) -> Array:
         """Return the zeros at the point of the median gain, including the n zeros of the delay."""
-        if self.delay is None:
-            return np.zeros(0)
         gains = [_markov_parameters(point, self.delay + 1)[-1] for point in self.linear]
         k = int(np.argmin(np.abs(np.abs(gains) - np.median(np.abs(gains)))))
         (a, b, c, d), n = self.linear[k], self.delay
@@ -337,7 +330,7 @@ class Response:
 
 
 def analyse_response(given: Any, run: Rollout, recording: Recording) -> Response:
-    """Linearise a model of one input and one output along its run of a recording."""
+    """Linearise a model of one input and one output along its run; refuse one that does not respond to the input."""
     function, states = run.model.step, run.states
     at = np.unique(np.linspace(min(1, len(recording) - 1), len(recording) - 1, LINEARISED_STATES).astype(int))
     slopes = build_jacobians(function)
@@ -351,9 +344,13 @@ def analyse_response(given: Any, run: Rollout, recording: Recording) -> Response
     counts = markov > np.where(
         np.isnan(errors), SMALL_MARKOV_NO_ERRORS * largest, np.maximum(COUNTED_ERRORS * errors, SMALL_MARKOV * largest)
     )
-    reached = largest > 1e-12 * np.ptp(recording.y) / max(float(np.ptp(recording.u)), 1e-300) and np.any(counts)
-    delay = int(np.argmax(counts)) if reached else None
-    early = float(np.max(np.abs(each[:, :delay]), initial=0.0) / largest) if reached else 0.0
+    if not (largest > 1e-12 * np.ptp(recording.y) / max(float(np.ptp(recording.u)), 1e-300) and np.any(counts)):
+        raise InputError(
+            "The input reaches the output nowhere along the recording (no direct feedthrough, no path through the "
+            "states), so there is nothing to invert; give a model and a recording with a response to the input."
+        )
+    delay = int(np.argmax(counts))
+    early = float(np.max(np.abs(each[:, :delay]), initial=0.0) / largest)
     return Response(at, linear, markov, errors, delay, early)
 
 

@@ -32,6 +32,11 @@ def by_name_without_unit(names: Sequence[str]) -> dict[str, str]:
     return {name: full for name, full in short.items() if counts[name] == 1} | {name: name for name in names}
 
 
+def with_unit(name: str, unit: str) -> str:
+    """Return `name [unit]`, or the name alone if the unit is unknown."""
+    return f"{name} [{unit}]" if unit else name
+
+
 def unit_in_brackets(column: str) -> str:
     """Return the unit in brackets behind the name of a column; empty if there is none."""
     parts = WITH_UNIT.fullmatch(column)

@@ -111,15 +111,15 @@ def correlation(a: np.ndarray, b: np.ndarray, lags: int) -> np.ndarray:
 
     InputError is raised if the lags are not a whole number below the number of samples, or a signal is constant.
     """
+    from scipy.signal import correlate
+
     if whole(lags, "lags", 1) >= len(a):
         raise InputError(f"lags={lags} was given for {len(a)} samples; give fewer lags than samples.")
     a, b = a - np.mean(a), b - np.mean(b)
     size = float(np.sqrt((a @ a) * (b @ b)))
     if not size > 0:
         raise InputError("a signal that never changes has no correlation; leave it out.")
-    length = 2 ** int(np.ceil(np.log2(len(a) + lags + 1)))
-    product = np.fft.irfft(np.fft.rfft(a, length) * np.conj(np.fft.rfft(b, length)), length)
-    return np.concatenate([product[-lags:], product[: lags + 1]]) / size
+    return correlate(a, b, method="fft")[len(b) - 1 - lags : len(b) + lags] / size
 
 
 def chance(a: np.ndarray, b: np.ndarray, lags: int) -> float:

@@ -154,9 +154,9 @@ def _standardise(u: Array) -> Array | None:
 
 def _correlate(u: Array, v: Array) -> Array:
     """Return Σ u(t + p) v(t) over t and channels, for the lags p from 0 to M - 1, (M,)."""
-    n = len(u) + len(v)
-    spectrum = np.fft.rfft(u, n, axis=0) * np.conj(np.fft.rfft(v, n, axis=0))
-    return np.asarray(np.fft.irfft(np.sum(spectrum, axis=1), n))[: len(u)]
+    from scipy.signal import fftconvolve
+
+    return np.sum(fftconvolve(u, v[::-1], axes=0), axis=1)[len(v) - 1 :]
 
 
 def _by_period(recording: Recording, x: Array) -> Array:

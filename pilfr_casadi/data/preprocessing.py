@@ -115,7 +115,7 @@ def common_times(spans: Sequence[tuple[float, float]], step: float) -> Array:
     return times
 
 
-def check_times(t: Array, step: float, label: str, held: bool = False) -> None:
+def check_times(t: Array, step: float, label: str, held: bool) -> None:
     """Refuse times (M,), s, that do not increase, or have gaps longer than `LONGEST_GAP` median gaps and steps.
 
     `label` begins the message. A signal that is `held` may have gaps of any length.

@@ -275,7 +275,8 @@ class _Request:
         hold = self.options.get("hold")
         if self.new_step is not None:
             assert time is not None
-            dt, (parts, hold) = float(self.new_step), self._resample(table, wanted, time)
+            dt = float(self.new_step)
+            parts, hold = self._resample(table, wanted, time, dt)
         elif time is None:
             assert self.dt is not None
             dt, parts = float(self.dt), table.columns(wanted)
@@ -296,14 +297,13 @@ class _Request:
             raise InputError(f"{table.path}: {error}") from None
 
     def _resample(
-        self, table: CsvTable | ArrayTable, wanted: list[str], time: str
+        self, table: CsvTable | ArrayTable, wanted: list[str], time: str, step: float
     ) -> tuple[list[np.ndarray], str | None]:
-        """Bring each channel from its own samples to the common step; return them and the inputs' hold.
+        """Bring each channel from its own samples to a common step, s; return them and the inputs' hold.
 
         Inputs stay held if they are, and each of their levels lasts at least a step.
         """
-        assert self.new_step is not None
-        step, hold, n_u = float(self.new_step), self.options.get("hold"), len(self.inputs)
+        hold, n_u = self.options.get("hold"), len(self.inputs)
         series = table.series(wanted, time)
         inputs = [(t, column) for t, values in series[:n_u] for column in values.T]
         held = hold == "zero" and all(levels_last(t, column, step) for t, column in inputs)

@@ -158,7 +158,7 @@ def _seconds(values: Array) -> Array:
     return (values - values[0]) / np.timedelta64(1, "s") if values.dtype.kind in "mM" and len(values) else values
 
 
-def open_table(path: Path, wanted: Sequence[str] = (), suffix: str = "") -> CsvTable | ArrayTable:
+def open_table(path: Path, wanted: Sequence[str], suffix: str = "") -> CsvTable | ArrayTable:
     """Open a file by its suffix, or by another `suffix`; the `wanted` columns help to find a CSV file's delimiter."""
     suffix = suffix or path.suffix.lower()
     if suffix in OPENERS:

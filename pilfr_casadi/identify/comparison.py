@@ -18,7 +18,7 @@ from ..data import Recording, as_recordings, rmse_per_output
 from ..engine import Engine, make_engine
 from ..models import Model
 from ..optimise import StatePrior, estimate_initial_state, samples_to_start
-from ..simulators import Simulator, as_simulator, discretise_for, match_channels
+from ..simulators import Simulator, as_simulator, discretise_for
 from .result import Fit
 
 RUN_AWAY = 1e4  # error from which a simulation counts as diverging
@@ -165,7 +165,7 @@ def compare(recording: Recording, models: Mapping[str, Any] | Any) -> Comparison
 
 def simulator_nrmse(simulator: Simulator, recordings: Recording | Sequence[Recording]) -> float:
     """Compute `Simulator.nrmse`: the mean over recordings of the error in `compare`, over the simulator's outputs."""
-    given = [match_channels(simulator, r) for r in as_recordings(recordings)]
+    given = [simulator.matched(r) for r in as_recordings(recordings)]
     return float(np.mean([compare(r, simulator).nrmse["simulated"] for r in given]))
 
 
@@ -201,7 +201,7 @@ def run_simulator(simulator: Simulator, recording: Recording) -> tuple[Recording
 
     Returns the recording with the simulator's channels, the outputs (M, n_y), and the first scored sample.
     """
-    matched = match_channels(simulator, recording)
+    matched = simulator.matched(recording)
     model = discretise_for(simulator, [matched])
     return matched, *run_free(model, make_engine(model), matched)
 

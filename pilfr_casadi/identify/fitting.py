@@ -32,7 +32,7 @@ from ..optimise import (
     stability_limits,
     violated_exact,
 )
-from ..simulators import Simulator, discretise_for, match_channels
+from ..simulators import Simulator, discretise_for
 from .context import FitContext, Stage, check_recordings, mark_interrupted, rms_error, without_density_prior
 from .lagged import check_lagged_options, fit_lagged
 from .linear_start import known_entries, linear_model, transform_to_known_basis
@@ -200,7 +200,7 @@ def _match_units(model: Any, train: Recording | Sequence[Recording]) -> tuple[Re
     # the first unit of each channel
     units: Mapping[str, str] = {name: unit for r in reversed(recordings) for name, unit in r.units.items()}
     if simulator is not None:
-        units, recordings = simulator.units, tuple(match_channels(simulator, r) for r in recordings)
+        units, recordings = simulator.units, tuple(map(simulator.matched, recordings))
     elif isinstance(model, Fit):
         units = model.units
     matched = []

@@ -139,9 +139,7 @@ def state_space_matrices(given: Any, nx: int, recording: Recording) -> tuple[Arr
 
 def _offset(recordings: Sequence[Recording], a: Array, b: Array, c: Array, d: Array) -> Array:
     """Compute the mean output error (n_y,) of a linear model from rest."""
-    errors = []
-    for r in recordings:
-        errors.append((r.y - states_from_rest(a, b, r.u) @ c.T - r.u @ d.T)[r.skip :])
+    errors = [(r.y - states_from_rest(a, b, r.u) @ c.T - r.u @ d.T)[r.skip :] for r in recordings]
     return np.asarray(np.mean(np.concatenate(errors), axis=0))
 
 

@@ -37,7 +37,7 @@ from ..optimise import (
     samples_for_state,
     stability_limits,
 )
-from ..simulators import Simulator, match_channels
+from ..simulators import Simulator
 from .uncertainty import describe_unknown_errors
 
 DENSITY_PRIOR = "weights held near a smooth density by a weak prior"  # note of a candidate and of its fit
@@ -276,7 +276,7 @@ class Fit:
                 "and the time step."
             )
         if self.simulator is not None:
-            recording = match_channels(self.simulator, recording)
+            recording = self.simulator.matched(recording)
         recording = recording.in_units(self.units)
         n_u, n_y = len(self.model.inputs), self.model.n_y
         unmeasured = recording.n_y == 0 and recording.begins != "estimate"

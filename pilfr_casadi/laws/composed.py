@@ -431,14 +431,15 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
 
         def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
             """Bounds of the law, and of the ratio of its strengths."""
-            return {**super().bounds(local), **{name: (1 / MOST_RATIO, MOST_RATIO) for name in shape}}
+            return super().bounds(local) | dict.fromkeys(shape, (1 / MOST_RATIO, MOST_RATIO))
 
         def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
             """Shapes of the law, with the range of the signal."""
             signal = self.schedule(local)
+            limits = {"low": float(signal.min()), "high": float(signal.max())}
             for own in super().shapes(local):
-                for more in ({name: value for name in shape} for value in (RATIOS if shape else (1.0,))):
-                    yield {**own, **more, "low": float(signal.min()), "high": float(signal.max())}
+                for ratio in RATIOS if shape else (1.0,):
+                    yield own | dict.fromkeys(shape, ratio) | limits
 
         def doubtful(self, values: Mapping[str, Any]) -> bool:
             """Tell whether the law hardly acts, or its strength hardly varies."""

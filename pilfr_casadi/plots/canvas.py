@@ -15,6 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.textpath import TextPath
 
+from ..data import with_unit
+
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 SKY, ORANGE, INK, GREY = "#56B4E9", "#E69F00", "#222222", "#7A7A7A"
 GRID = "#DDDDDD"
@@ -99,11 +101,6 @@ def _choose_columns(ax: Axes, labels: list[str], most: int) -> int:
 def plain(text: str) -> str:
     """Escape dollar signs, which would begin a formula."""
     return str(text).replace("$", r"\$")
-
-
-def with_unit(name: str, unit: str = "") -> str:
-    """Return `name [unit]`, or the name alone if the unit is unknown."""
-    return f"{name} [{unit}]" if unit else name
 
 
 def choose_scale(values: np.ndarray, unit: str = "") -> tuple[float, str]:

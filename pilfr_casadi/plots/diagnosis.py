@@ -12,6 +12,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from ..data import with_unit
 from .canvas import (
     BLUE,
     FONT,
@@ -30,7 +31,6 @@ from .canvas import (
     noise_line,
     plain,
     scale_axis,
-    with_unit,
 )
 from .fits import draw_density
 

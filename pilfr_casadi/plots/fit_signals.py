@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from .._base import InputError
-from ..data import Recording, nrmse
+from ..data import Recording, nrmse, with_unit
 from ..export import FittedModel
 from ..linear import output_spectra
 from ..models import Model
@@ -31,7 +31,6 @@ from .canvas import (
     mask_divergence,
     plain,
     scale_axis,
-    with_unit,
 )
 from .signals import draw_densities, find_largest_swings, finish_over_time
 

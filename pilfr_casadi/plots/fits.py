@@ -13,10 +13,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from .._base import InputError
-from ..data import Recording, as_recordings
+from ..data import Recording, as_recordings, with_unit
 from ..models import weight_density
 from ..optimise import Iteration
-from .canvas import BLUE, GREY, PALE_BLUE, SKY, VERMILLION, axes_or_new, finish, new_figure, with_unit
+from .canvas import BLUE, GREY, PALE_BLUE, SKY, VERMILLION, axes_or_new, finish, new_figure
 from .fit_signals import PlottedFit, as_scored, spectrum, time
 
 Records = Recording | Sequence[Recording]

@@ -10,7 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from .canvas import BLUE, FONT, GREEN, INK, PALE_BLUE, VERMILLION, choose_scale, finish, new_figure, plain, with_unit
+from ..data import with_unit
+from .canvas import BLUE, FONT, GREEN, INK, PALE_BLUE, VERMILLION, choose_scale, finish, new_figure, plain
 
 ERRORS = 2.0  # standard errors that are drawn, about 95 %
 MOST_NAMED = 12  # machines whose names are written into a map

@@ -87,7 +87,7 @@ def simulator_card(simulator: Simulator) -> str:
         "states": ", ".join(s.states) or "none",
         "inputs": ", ".join(s.inputs) or "none",
         "outputs": ", ".join(s.output_names),
-        "ports": ", ".join(p.name for p in s.ports or ()) or "one for each state equation",
+        "ports": ", ".join(p.name for p in s.ports) or "one for each state equation",
     }
     if s.elements:
         properties["laws in ports"] = ", ".join(name_at(e.port, e.law.id, e.law.form) for e in s.elements)

@@ -345,7 +345,7 @@ def _highest_excited(train: Sequence[Recording]) -> float:
     return highest or np.inf
 
 
-def _modes(part: LinearPart, highest: float = np.inf) -> tuple[list[str], list[list[Any]]]:
+def _modes(part: LinearPart, highest: float) -> tuple[list[str], list[list[Any]]]:
     """Return the columns and rows of a table of poles; `highest` is the highest frequency that inputs excite, Hz."""
     rows: list[list[Any]] = []
     for value in sorted(part.poles, key=lambda v: abs(np.angle(v))):

@@ -36,7 +36,7 @@ def fleet_page(content: Mapping[str, Any], residuals: Mapping[str, Mapping[str, 
         Section("What is left", _rest(content, residuals)),
         Section("Drift", _drift(content, machines)),
         Section("Values of regular machines", [_values(content)] if content["values"] else []),
-        Section("All machines", [_table(content, machines, folded=len(machines) > MOST_ROWS)]),
+        Section("All machines", [_table(content)]),
     ]
     facts = {
         "machines": str(len(machines)),
@@ -170,8 +170,8 @@ def _values(content: Mapping[str, Any]) -> Table:
     return Table(columns, rows, note=note, digits=3)
 
 
-def _table(content: Mapping[str, Any], machines: Sequence[Mapping[str, Any]], folded: bool) -> Table:
-    labels = [v["name"] for v in content["values"]]
+def _table(content: Mapping[str, Any]) -> Table:
+    machines, labels = content["machines"], [v["name"] for v in content["values"]]
     rows = []
     for m in machines:
         values = [uncertain_text(with_nan(m["values"].get(k)), with_nan(m["errors"].get(k))) for k in labels]
@@ -181,6 +181,7 @@ def _table(content: Mapping[str, Any], machines: Sequence[Mapping[str, Any]], fo
     emphasis = [i for i, m in enumerate(machines) if m["name"] in content["differing"]]
     note = "The errors are NRMSE. The log evidence compares the common physics with the simulator as given."
     caption = f"{len(machines)} machines, sorted by the probability that they differ"
+    folded = len(machines) > MOST_ROWS
     return Table(columns, rows, caption=caption, note=note, emphasis=emphasis, folded=folded, digits=3)
 
 
@@ -208,7 +209,7 @@ def machine_page(content: Mapping[str, Any], name: str, residual: Mapping[str, A
         Section("Values beside the fleet", [_own_values(content, m)] if m["values"] else []),
         Section("Error beside the fleet", [] if m["failed"] else _own_error(content, m, residual)),
         Section("Drift", _drift(content, [m])),
-        Section("How it was judged", _judgement(content, m)),
+        Section("How it was judged", _judgement(m)),
     ]
     common = content["common"]["words"] or "nothing"
     return Page(
@@ -271,7 +272,7 @@ def _own_error(content: Mapping[str, Any], m: Mapping[str, Any], residual: Mappi
     return [table, Picture(plots.small_multiples([residual], [m["name"]]), RESIDUAL, "residual of the machine")]
 
 
-def _judgement(content: Mapping[str, Any], m: Mapping[str, Any]) -> list[Block]:
+def _judgement(m: Mapping[str, Any]) -> list[Block]:
     """Explain the judgement, and link the page of the fleet and the diagnosis of the machine alone."""
     text = (
         "The simulator with the physics that all machines lack was fitted to this machine, and its values, its trends "

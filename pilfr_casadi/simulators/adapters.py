@@ -48,7 +48,7 @@ def as_simulator(thing: Any, recordings: Sequence[Recording] = ()) -> Simulator:
     if isinstance(thing, Simulator):
         return thing
     if isinstance(thing, Model):
-        return _from_model(thing, recordings)
+        return _from_model(thing, recordings, {})
     if isinstance(getattr(thing, "model", None), Model):  # a Fit
         _check_step(float(thing.dt), recordings)
         return _from_model(thing.model, recordings, getattr(thing, "units", {}))
@@ -64,9 +64,7 @@ def _check_step(dt: float, recordings: Sequence[Recording]) -> None:
             raise InputError(f"The model's step is {dt:g} s, that of {r.label} {r.dt:g} s; resample the recording.")
 
 
-def _from_model(
-    model: Model, recordings: Sequence[Recording] = (), units: Mapping[str, str] | None = None
-) -> Simulator:
+def _from_model(model: Model, recordings: Sequence[Recording], units: Mapping[str, str]) -> Simulator:
     if model.n_w and model.element is None:
         raise InputError("The model has an open port; close it with close_loop first.")
     if model.reads != ("u",) or model.substeps != 1:
@@ -92,8 +90,7 @@ def _from_model(
         y = step(x, u, p)[1]
         return {n: p[f"gain_{n}"] * y[i] + p[f"offset_{n}"] for i, n in enumerate(model.outputs)}
 
-    units = dict(units or {})
-    return Simulator(dynamics, outputs, states, model.inputs, parameters, discrete=True, hold="zero", units=units)
+    return Simulator(dynamics, outputs, states, model.inputs, parameters, discrete=True, hold="zero", units=dict(units))
 
 
 def _from_system(system: Any, recordings: Sequence[Recording]) -> Simulator:
@@ -123,7 +120,7 @@ def _linear_simulator(
     states: tuple[str, ...],
     inputs: tuple[str, ...],
     outputs: tuple[str, ...],
-    discrete: bool = False,
+    discrete: bool,
 ) -> Simulator:
     """Make `ẋ = A x + B u, y = C x + D u` (or `x⁺`) with a parameter for every entry that is not 0, 1 or -1."""
     parameters: dict[str, Parameter] = {}

@@ -41,11 +41,17 @@ class Score:
 def choose_job(scores: Sequence[Score], jobs: Sequence[str]) -> str:
     """Return the job with the smallest validation error (training error if there are no validation recordings)."""
     judge = "validation" if any(s.role == "validation" for s in scores) else "train"
+    errors = {job: error for job, error in mean_errors(scores, judge).items() if job in jobs}
+    return min(errors, key=lambda job: errors[job])
+
+
+def mean_errors(scores: Sequence[Score], role: str) -> dict[str, float]:
+    """Map each job with scores of a role to its mean NRMSE, infinite if one cannot be computed."""
     errors: dict[str, list[float]] = {}
     for s in scores:
-        if s.role == judge and s.job in jobs:
+        if s.role == role:
             errors.setdefault(s.job, []).append(s.nrmse if np.isfinite(s.nrmse) else np.inf)
-    return min(errors, key=lambda job: (float(np.mean(errors[job])), list(errors).index(job)))
+    return {job: float(np.mean(of_job)) for job, of_job in errors.items()}
 
 
 def results_table(scores: Sequence[Score], jobs: Sequence[RunJob], entries: Mapping[str, Any], best: str) -> str:
@@ -106,8 +112,8 @@ def errors_by_cell(
     for (role, name), folds in pairs:
         for job in (j for j in jobs if (j.fold is not None) == folds):
             error = known.get((job.id, role, name), np.inf)
-            cells = out.setdefault((role, name), {})
-            cells.setdefault(job.cell, {})[job.id] = error if np.isfinite(error) else np.inf
+            of_cell = out.setdefault((role, name), {}).setdefault(job.cell, {})
+            of_cell[job.id] = error if np.isfinite(error) else np.inf
     return out
 
 
@@ -192,10 +198,7 @@ def select(
     Only the numbers of inputs and outputs of `recording` are used, so any recording of the run serves.
     """
     counts, errors = [], []
-    judged: dict[str, list[float]] = {}
-    for s in scores:
-        if s.role == ("held" if run.folds else "validation"):
-            judged.setdefault(s.job, []).append(s.nrmse if np.isfinite(s.nrmse) else np.inf)
+    judged = mean_errors(scores, "held" if run.folds else "validation")
     for number, cell in enumerate(run.cells):
         own = cell.model
         model = own if isinstance(own, Model) else own.model(recording.n_u, recording.n_y)
@@ -204,7 +207,7 @@ def select(
         for job in (j for j in jobs if j.cell == number and j.id in judged):
             parts[job.fold].append(job)
         best = [min(p, key=lambda j: entries[j.id]["train"]) if p else None for p in parts.values()]
-        errors.append(float(np.mean([np.inf if j is None else np.mean(judged[j.id]) for j in best])))
+        errors.append(float(np.mean([np.inf if j is None else judged[j.id] for j in best])))
     if not np.isfinite(min(errors)):
         raise InputError(f"{run.file}: no structure can be judged; {jobs[0].id}: {entries[jobs[0].id]['sentence']}")
     enough = [k for k, e in enumerate(errors) if e <= (1 + SELECTION_MARGIN) * min(errors)]
