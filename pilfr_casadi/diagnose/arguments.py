@@ -23,7 +23,7 @@ from ..laws import (
     scheduled,
     seen_by,
 )
-from ..simulators import Simulator, as_simulator, match_channels
+from ..simulators import Simulator, as_simulator
 from .faults.gates import Gate, edited
 from .search.stretches import Stretches
 
@@ -85,7 +85,7 @@ def match_recordings(
         raise InputError(f"hold={hold!r} was given; use 'zero', 'linear' or None.")
     given = as_recordings(train)
     simulator = as_simulator(simulator, given)
-    recordings = [match_channels(simulator, r) for r in given]
+    recordings = [simulator.matched(r) for r in given]
     return simulator, check_for_identification(recordings, FEWEST_SAMPLES, excited)
 
 
@@ -93,7 +93,7 @@ def match_tests(
     simulator: Simulator, test: Recording | Sequence[Recording] | None, train: Sequence[Recording]
 ) -> tuple[Recording, ...]:
     """Return the test recordings with the simulator's channels; refuse training data and other steps."""
-    tests = tuple(match_channels(simulator, r) for r in as_recordings(test)) if test is not None else ()
+    tests = tuple(simulator.matched(r) for r in as_recordings(test)) if test is not None else ()
     for t in tests:
         for r in train:
             if (shared := _shared_samples(r, t)) == len(t):

@@ -15,7 +15,7 @@ from .._base import InputError, later, to_json, write_atomically
 from ..data import SAME_STEP, Recording, as_recordings, nrmse
 from ..engine import make_engine
 from ..identify import run_free
-from ..simulators import Simulator, discretise, match_channels
+from ..simulators import Simulator, discretise
 from .faults.gates import edited
 from .fits.workbench import Fitted, output_deviation
 from .proof import Started
@@ -213,7 +213,7 @@ class Diagnosis(ResultText):
         Training recordings of the diagnosis are corrected already. Give any other as it was read: a corrected one would
         be corrected twice.
         """
-        matched = match_channels(self.corrected, recording)
+        matched = self.corrected.matched(recording)
         return matched if any(recording is known for known in self.train) else edited([matched], self.gates)[0]
 
     def export(self, **options: Any) -> Any:

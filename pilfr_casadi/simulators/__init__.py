@@ -69,7 +69,6 @@ if TYPE_CHECKING:
     )
     from .simulator import (
         Simulator as Simulator,
-        match_channels as match_channels,
         unit_notes as unit_notes,
     )
     from .substeps import (

@@ -295,6 +295,3 @@ def unit_notes(units: Mapping[str, str], recording: Recording, owner: str = "sim
         elif wanted and unit != wanted and conversion(unit, wanted) is None:
             out[name] = f"{said}; no conversion is known, so that its values were taken as they are."
     return out
-
-
-match_channels = Simulator.matched  # the function of a simulator and a recording

@@ -27,7 +27,6 @@ from ...simulators import (
     fastest_rates,
     growth_rate,
     least_substeps,
-    match_channels,
     needed_substeps,
     rate_at_start,
 )
@@ -144,7 +143,7 @@ class Workbench:
     @classmethod
     def of(cls, simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str = "auto") -> Workbench:
         """Put the recordings' channels into the simulator's order, and choose the sub-steps."""
-        ordered = tuple(match_channels(simulator, r) for r in recordings)
+        ordered = tuple(simulator.matched(r) for r in recordings)
         chosen = choose_substeps(simulator, ordered)
         return cls(simulator, ordered, hold, chosen, output_deviation(ordered), engine, chosen=chosen)
 
@@ -159,7 +158,7 @@ class Workbench:
 
     def on(self, recordings: Sequence[Recording]) -> Workbench:
         """Return the bench with other recordings; errors stay in units of the training outputs' deviation."""
-        return replace(self, recordings=tuple(match_channels(self.simulator, r) for r in recordings))
+        return replace(self, recordings=tuple(self.simulator.matched(r) for r in recordings))
 
     def renewed(self, recordings: Sequence[Recording]) -> Workbench:
         """Return a bench for other recordings, with sub-steps and the unit of errors chosen for them."""
