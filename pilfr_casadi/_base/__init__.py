@@ -1,4 +1,4 @@
-"""Foundation of all other folders: errors for the user, files, worker processes, interrupts and progress."""
+"""Foundation of all other folders: errors for the user, files, the C compiler, processes, interrupts and progress."""
 
 from typing import TYPE_CHECKING
 
@@ -7,6 +7,13 @@ from .lazy import lazy_face
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from .c_compiler import (
+        LOOPS as LOOPS,
+        build as build,
+        cache_directory as cache_directory,
+        compiler as compiler,
+        run_compiler as run_compiler,
+    )
     from .errors import (
         LARGEST as LARGEST,
         REPAIR as REPAIR,

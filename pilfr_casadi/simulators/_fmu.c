@@ -14,6 +14,7 @@ typedef struct {
   int restarts;
   void **instance;
   int *failed;
+  long long *calls; /* begun and ended: odd while the unit has not returned */
   int (*restart)(void);
   int (*set_time)(void *, double);
   int (*set_states)(void *, const double *, size_t);
@@ -99,8 +100,11 @@ static int evaluate(fmu_t *f) {
 
 void fmu_evaluate(void *unit) {
   fmu_t *f = unit;
-  int status = evaluate(f);
+  int status;
   size_t i;
+  ++*f->calls;
+  status = evaluate(f);
+  ++*f->calls;
   if (status != DISCARD) *f->failed = status > DISCARD;
   if (status <= OK) return;
   for (i = 0; i < f->n_x; i++) f->derivatives[i] = NAN;
