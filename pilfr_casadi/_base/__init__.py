@@ -68,7 +68,6 @@ if TYPE_CHECKING:
         Reply as Reply,
         check_executor as check_executor,
         close_workers as close_workers,
-        end_with_parent as end_with_parent,
         one_at_a_time as one_at_a_time,
         one_blas_thread as one_blas_thread,
         open_replies as open_replies,
@@ -76,7 +75,6 @@ if TYPE_CHECKING:
         read_message as read_message,
         run_in_worker as run_in_worker,
         side_by_side as side_by_side,
-        units_are_isolated as units_are_isolated,
         worker_pool as worker_pool,
         write_message as write_message,
     )
