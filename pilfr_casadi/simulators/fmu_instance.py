@@ -71,6 +71,7 @@ class _Fmu(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("set_time", "set_states", "get_derivatives")),
         *((name, ctypes.c_void_p) for name in ("set_values", "get_values")),
         *((name, ctypes.c_void_p) for name in ("enter_events", "update_states", "leave_events")),
+        *((name, ctypes.c_void_p) for name in ("reset", "set_up", "enter_initialisation", "leave_initialisation")),
         *((name, ctypes.c_size_t) for name in ("n_x", "n_u", "n_p", "n_y")),
         *((name, ctypes.c_void_p) for name in ("u_ref", "p_ref", "y_ref")),
         *((name, ctypes.c_void_p) for name in ("t", "x", "u", "p", "derivatives", "y", "last_p")),
@@ -137,6 +138,12 @@ class FmuInstance:
         found = getattr(self.library, f"fmi{self.file.version}{name}")
         found.restype = ctypes.c_int
         return found
+
+    def address(self, name: str) -> int | None:
+        """Return the address of a function of the unit; none of one that its version does not have."""
+        if self.file.version == 3 and name == "SetupExperiment":
+            return None
+        return ctypes.cast(self.function(name), ctypes.c_void_p).value
 
     def call(self, name: str, *arguments: Any) -> int:
         """Call a function of the unit; return its status."""
@@ -240,7 +247,8 @@ class FmuEvaluation:
         self._restart = _RESTART(lambda: instance.restart(self.arguments[3]))
         named = ("SetTime", "SetContinuousStates", "GetDerivatives", "SetReal", "GetReal")
         events = ("EnterEventMode", "NewDiscreteStates", "EnterContinuousTimeMode")
-        addresses = [ctypes.cast(instance.function(name), ctypes.c_void_p).value for name in (*named, *events)]
+        starts = ("Reset", "SetupExperiment", "EnterInitializationMode", "ExitInitializationMode")
+        addresses = [instance.address(name) for name in (*named, *events, *starts)]
         memory = [a.ctypes.data for a in (self._references[0], instance.references, self._references[1])]
         memory += [a.ctypes.data for a in self.arguments]
         memory += [self.result.ctypes.data, self.result.ctypes.data + 8 * signals.states, instance.last.ctypes.data]

@@ -171,9 +171,9 @@ def _watch(parent: int) -> None:
             if seconds > CALL_SECONDS + loading + PACE * slowest:
                 os._exit(HANGS)
         elif now != seen:
-            if seen == 1:
+            if seen < 2 <= now:
                 loading = seconds  # a restart may take as long
-            elif seen % 2:
+            elif now > 2:
                 slowest = max(slowest, seconds)
             seen, seconds = now, 0.0
     if folder := os.environ.get(FOLDER):
