@@ -20,7 +20,7 @@ import numpy as np
 
 from .._base import InputError, abandoned, build
 from ..models import accumulate_steps as accumulate_here, map_points as map_here
-from .external import Leaf, units
+from .external import Leaf, leaves, units
 from .external_buffers import EXTERNAL_CALLS, bind
 from .fmu_instance import FmuSignals
 from .fmu_process import evaluate_in_unit, run_in_unit
@@ -77,8 +77,9 @@ class FmuFunction:
         try:
             found = self.evaluate(ctypes.string_at(z, 8 * sum(self.signals.sizes)))
         except KeyboardInterrupt:  # C cannot raise it; it is raised after the run
-            abandoned.pending = True
-        ctypes.memmove(result, found.ctypes.data, found.nbytes)
+            abandoned.mark()
+        finally:
+            ctypes.memmove(result, found.ctypes.data, found.nbytes)
 
     def evaluate(self, z: bytes) -> np.ndarray:
         """Evaluate one point in a process of the unit.
@@ -95,8 +96,9 @@ class FmuFunction:
         found, failure = evaluate_in_unit(self.signals, z)
         if found is not None:
             return found
-        self._losses[parameters] = self._losses.get(parameters, 0) + 1
-        self.failure = self.failure or failure
+        if not abandoned.pending:  # else an interrupt has ended the process
+            self._losses[parameters] = self._losses.get(parameters, 0) + 1
+            self.failure = self.failure or failure
         return none
 
 
@@ -156,8 +158,9 @@ def _run_elsewhere(
 
 @functools.lru_cache(maxsize=KEPT_FUNCTIONS)
 def _called_unit(function: ca.Function) -> str:
-    """Return the name of a unit's external function that a function calls, or ""."""
-    return next((f.name() for f in function.find_functions() if f.name() in _libraries), "")
+    """Return the name of the unit that a function calls, or "" if it calls none, or programs that cannot be sent."""
+    names = [f.name() for f in function.find_functions()]
+    return next((n for n in names if n in _libraries), "") if leaves.keys().isdisjoint(names) else ""
 
 
 @functools.lru_cache(maxsize=KEPT_FUNCTIONS)

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import ChildProcess, open_replies, read_message, write_message
+from .._base import ChildProcess, abandoned, open_replies, read_message, write_message
 from .fmu_description import tidy
 from .fmu_instance import FmuFile, FmuSignals, UnitError, calls, evaluation, owns_folder
 
@@ -44,8 +44,12 @@ class _UnitProcess(ChildProcess):
 
     def ask(self, kind: bytes, body: bytes) -> bytes:
         """Send a job; return the reply."""
-        write_message(self.inbox, kind + body)
-        return read_message(self.outbox)
+        abandoned.end = self.process.kill
+        try:
+            write_message(self.inbox, kind + body)
+            return read_message(self.outbox)
+        finally:
+            abandoned.end = None
 
     def describe_end(self) -> str:
         """Describe in words how the process ended."""
