@@ -12,7 +12,6 @@ enum { OK = 1, DISCARD = 2, MOST_ITERATIONS = 100 }; /* the first two are status
 
 typedef struct {
   int version; /* 2 or 3 */
-  int restarts;
   void **instance;
   int *failed;
   long long *calls; /* begun and ended: odd while the unit has not returned */
@@ -28,7 +27,7 @@ typedef struct {
   int (*set_up)(void *, int, double, double, int, double); /* FMI 2 */
   void *enter_initialisation;
   int (*leave_initialisation)(void *);
-  size_t n_x, n_u, n_p, n_y;
+  size_t n_x, n_u, n_p, n_y, n_t; /* the first n_t parameters are tunable */
   const unsigned *u_ref, *p_ref, *y_ref;
   double *t, *x, *u, *p, *derivatives, *y, *last_p;
 } fmu_t;
@@ -91,11 +90,13 @@ static int reset(fmu_t *f) {
 }
 
 static int change_parameters(fmu_t *f) {
+  const int restarts = *f->failed || (f->n_p > f->n_t && memcmp(f->p + f->n_t, f->last_p + f->n_t,
+                                                                (f->n_p - f->n_t) * sizeof(double)));
   int status;
   if (f->n_p) f->last_p[0] = NAN;
-  if (f->restarts || *f->failed) return reset(f) > OK ? f->restart() : 0;
+  if (restarts) return reset(f) > OK ? f->restart() : 0;
   if ((status = f->enter_events(*f->instance)) > OK) return status;
-  if ((status = set_values(f, f->p_ref, f->n_p, f->p)) > OK) return status;
+  if ((status = set_values(f, f->p_ref, f->n_t, f->p)) > OK) return status;
   if ((status = update_states(f)) > OK) return status;
   return f->leave_events(*f->instance);
 }

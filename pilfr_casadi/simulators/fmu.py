@@ -45,7 +45,7 @@ TIMES = (0.0, 0.7, 13.0, 400.0)  # s, at which a dependence on time is looked fo
 class _Unit(Unit):
     """A unit with some of its outputs: `(t, x, u, p) -> (derivatives, outputs)`.
 
-    `parameters` are the tunable ones, and fixed ones that the user names.
+    `parameters` are the tunable ones, then fixed ones that the user names.
     """
 
     parameters: tuple[str, ...]
@@ -67,9 +67,9 @@ class _Unit(Unit):
                 tuple(self.variables[n].reference for n in names)
                 for names in (self.parameters, self.inputs, self.outputs)
             )
-            restarts = any(self.variables[n].variability != "tunable" for n in self.parameters)
+            tunable = sum(self.variables[n].variability == "tunable" for n in self.parameters)
             described = self.described
-            file = FmuFile(folder, int(described.version), described.token, described.binary, parameters, restarts)
+            file = FmuFile(folder, int(described.version), described.token, described.binary, parameters, tunable)
             _functions[name] = FmuFunction(name, FmuSignals(file, len(self.states), inputs, outputs))
         return _functions[name]
 
@@ -163,7 +163,7 @@ def from_fmu(
     for name, port in given.items():
         _check_port(name, port)
     used = [name for port in given.values() for name in _factors(port.get("into"))]
-    own = parameters if parameters is not None else unit.parameters
+    own = parameters if parameters is not None else [n for n in described.of("parameter") if n in unit.parameters]
     _check_names(unit, (*used, *(inputs or ())), outputs or (), (*own, *bounds))
     all_outputs = described.of("output")
     drives = tuple(inputs) if inputs is not None else tuple(n for n in unit.inputs if n not in used)
@@ -195,7 +195,8 @@ def _load_unit(path: Path, described: Description, named: Sequence[str], outputs
     parameters = tuple(
         n for n in described.of("parameter") if n in named or described.variables[n].variability == "tunable"
     )
-    return _Unit(path, described, parameters, tuple(outputs or ()))
+    tunable_first = tuple(sorted(parameters, key=lambda n: described.variables[n].variability != "tunable"))
+    return _Unit(path, described, tunable_first, tuple(outputs or ()))
 
 
 def _check_names(

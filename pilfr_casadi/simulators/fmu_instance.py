@@ -63,7 +63,6 @@ class _Fmu(ctypes.Structure):
 
     _fields_ = [
         ("version", ctypes.c_int),
-        ("restarts", ctypes.c_int),
         ("instance", ctypes.c_void_p),
         ("failed", ctypes.c_void_p),
         ("calls", ctypes.c_void_p),
@@ -72,7 +71,7 @@ class _Fmu(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("set_values", "get_values")),
         *((name, ctypes.c_void_p) for name in ("enter_events", "update_states", "leave_events")),
         *((name, ctypes.c_void_p) for name in ("reset", "set_up", "enter_initialisation", "leave_initialisation")),
-        *((name, ctypes.c_size_t) for name in ("n_x", "n_u", "n_p", "n_y")),
+        *((name, ctypes.c_size_t) for name in ("n_x", "n_u", "n_p", "n_y", "n_t")),
         *((name, ctypes.c_void_p) for name in ("u_ref", "p_ref", "y_ref")),
         *((name, ctypes.c_void_p) for name in ("t", "x", "u", "p", "derivatives", "y", "last_p")),
     ]
@@ -86,8 +85,8 @@ class FmuFile:
     version: int
     token: str
     binary: str
-    parameters: tuple[int, ...]  # value references
-    restarts: bool  # one of the parameters is fixed, so that a change takes a restart
+    parameters: tuple[int, ...]  # value references, those of tunable ones first
+    tunable: int  # number of tunable parameters; a change of the others takes a restart
 
 
 @dataclass(frozen=True)
@@ -211,11 +210,12 @@ class FmuInstance:
 
     def set_parameters(self, parameters: np.ndarray) -> int:
         """Change the parameters; return the status."""
-        if self.file.restarts or self.failed[0]:
+        n = self.file.tunable
+        if self.failed[0] or parameters[n:].tobytes() != self.last[n:].tobytes():
             return self.restart(parameters)
         steps = (
             lambda: self.call("EnterEventMode"),
-            lambda: self._set(parameters),
+            lambda: self._set(parameters[:n]),
             self._update_states,
             lambda: self.call("EnterContinuousTimeMode"),
         )
@@ -254,7 +254,6 @@ class FmuEvaluation:
         memory += [self.result.ctypes.data, self.result.ctypes.data + 8 * signals.states, instance.last.ctypes.data]
         self.structure = _Fmu(
             instance.file.version,
-            int(instance.file.restarts),
             ctypes.addressof(instance.handle),
             instance.failed.ctypes.data,
             calls.ctypes.data,
@@ -262,6 +261,7 @@ class FmuEvaluation:
             *addresses,
             *signals.sizes[1:],
             len(signals.outputs),
+            instance.file.tunable,
             *memory,
         )
 

@@ -25,7 +25,7 @@ from .fmu_description import tidy
 from .fmu_instance import FmuFile, FmuSignals, UnitError, calls, evaluation, owns_folder
 
 LOADING_SECONDS = 60.0  # seconds that the start of a unit may take
-CALL_SECONDS = 5.0  # seconds that another call may take
+CALL_SECONDS = 2.0  # seconds that another call may take
 PACE = 20.0  # further seconds, over those of the slowest call
 WATCH_SECONDS = 0.1  # interval at which calls are looked at
 HANGS = 124  # exit status of a process whose unit does not return, as of the program `timeout`
@@ -39,7 +39,7 @@ class _UnitProcess(ChildProcess):
 
     def __init__(self, file: FmuFile) -> None:
         super().__init__(serve, {FOLDER: str(file.folder) if owns_folder(file.folder) else ""})
-        self.file, self.owner = file, os.getpid()
+        self.file, self.owner, self.used = file, os.getpid(), False
         self.signals: FmuSignals | None = None  # evaluated by POINT
 
     def ask(self, kind: bytes, body: bytes) -> bytes:
@@ -83,8 +83,19 @@ def _give_back(process: _UnitProcess) -> None:
 
 
 def _ask(signals: FmuSignals, kind: bytes, body: bytes) -> tuple[bytes, str]:
-    """Send a job to a process of the unit; return the reply, or how the process failed."""
+    """Send a job to a process of the unit; return the reply, or how the process failed.
+
+    If a process crashes that has done jobs before, a new one tries again, because some units crash after many calls.
+    """
     process = _take(signals.file)
+    retry = process.used
+    reply, failure = _ask_process(process, signals, kind, body)
+    if failure and retry and not abandoned.pending and process.exit_status() != HANGS:
+        reply, failure = _ask_process(_UnitProcess(signals.file), signals, kind, body)
+    return reply, failure
+
+
+def _ask_process(process: _UnitProcess, signals: FmuSignals, kind: bytes, body: bytes) -> tuple[bytes, str]:
     try:
         if kind == POINT and process.signals != signals:
             process.ask(CALL, pickle.dumps((_select, (signals,))))
@@ -97,6 +108,7 @@ def _ask(signals: FmuSignals, kind: bytes, body: bytes) -> tuple[bytes, str]:
     except BaseException:
         process.close()  # its reply is still to come
         raise
+    process.used = True
     _give_back(process)
     return reply, ""
 

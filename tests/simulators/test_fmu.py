@@ -315,6 +315,13 @@ def test_a_point_at_which_a_unit_crashes_is_a_failed_trial(tmp_path):
     assert np.flatnonzero(~np.isfinite(rates)).tolist() == [19]
 
 
+def test_a_unit_that_crashes_after_many_calls_is_called_in_a_new_process(tmp_path):
+    counted = "{ static long calls; if (++calls > 2000) abort(); }"
+    own, given = guided(c_rig(tmp_path / "a.fmu", f"FAILURE={counted}", "WHERE=1")), recording(6, samples=40)
+    for _ in range(10):
+        assert np.all(np.isfinite(own.simulate(given)))
+
+
 def test_a_change_of_a_fixed_parameter_costs_little_more_than_one_of_a_tunable_one(units):
     given, seconds = recording(8, samples=1000), {}
     for name in ("k1", "m1"):
