@@ -1,8 +1,8 @@
 """Generated C that calls other programs (`simulators.leaves`), for which CasADi cannot write code.
 
-CasADi leaves a gap where a function is a program of its own. `fill_gaps` fills it with a call of a buffer, and `bind`
-passes the buffers of a thread to a library. A functional mock-up unit is called only in a process of its own, which
-runs the whole library.
+CasADi leaves a gap where a function is a callback, and calls an external function by its name. `fill_gaps` lets both
+call a buffer, and `simulators.bind` passes the buffers of a thread to a library. A functional mock-up unit is called
+only in a process of its own, which runs the whole library.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ GAP_WARNING = "cannot be code generated"
 
 
 def fill_gaps(code: str) -> str:
-    """Let the gaps in generated code call the programs of `leaves`."""
+    """Let the gaps and the external functions in generated code call the programs of `leaves` and `units`."""
     numbers: dict[str, int] = {}
     return GAP.sub(
         lambda gap: f"{gap[1]}  return call_external({numbers.setdefault(gap['name'], len(numbers))}, arg, res);", code

@@ -14,7 +14,6 @@ import pickle
 import shutil
 import sys
 import threading
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -145,13 +144,15 @@ def _has_time_event(signals: FmuSignals) -> bool:
 def serve() -> None:
     """Do jobs in the child process: read them from standard input, write results to standard output."""
     replies = open_replies()
-    watch = threading.Thread(target=_watch, args=(os.getppid(),), daemon=True)
+    ended = threading.Event()
+    watch = threading.Thread(target=_watch, args=(os.getppid(), ended), daemon=True)
     watch.start()
     while True:
         try:
             job = read_message(sys.stdin.buffer)
         except EOFError:
-            watch.join()  # the parent has ended
+            ended.set()
+            watch.join()
         kind, body = job[:1], job[1:]
         try:
             if kind == POINT:
@@ -173,14 +174,13 @@ def _select(signals: FmuSignals) -> None:
     _selected[:] = [signals]
 
 
-def _watch(parent: int) -> None:
+def _watch(parent: int, ended: threading.Event) -> None:
     """End this process after its parent, or if the unit does not return from a call.
 
     Seconds are counted in looks, because a process that is stopped (Ctrl-Z) or starved does nothing.
     """
     seen, seconds, loading, slowest = 0, 0.0, LOADING_SECONDS, 0.0
-    while os.getppid() == parent:
-        time.sleep(WATCH_SECONDS)
+    while os.getppid() == parent and not ended.wait(WATCH_SECONDS):
         now = int(calls[0])
         if now == seen and now % 2:
             seconds += WATCH_SECONDS
