@@ -411,6 +411,15 @@ def test_parameters_change_in_event_mode_and_fixed_ones_by_a_restart(tmp_path):
         assert np.abs(y - rig().simulate(given)).max() <= 1e-12 * np.ptp(given.y)
 
 
+def test_fixed_parameters_of_fmi_3_change_by_a_restart(tmp_path, units):
+    copy, given = tmp_path / "a.fmu", recording(2, samples=60)
+    copy.write_bytes(units["casadi"].read_bytes())
+    fixed = guided(changed(copy, ('variability="tunable"', 'variability="fixed"')), parameters=("k1", "d2"))
+    for y in runs(fixed, given, k1=450.0):
+        changed_rig = rig().with_parameters(rig().parameter_set.change(k1={"value": 450.0}))
+        assert np.abs(y - changed_rig.simulate(given)).max() <= 1e-12 * np.ptp(given.y)
+
+
 def test_a_declared_type_gives_unit_and_bounds(tmp_path):
     declared = '<TypeDefinitions><SimpleType name="K"><Real unit="N/m" min="100" max="2000"/></SimpleType>'
     unit = changed(
