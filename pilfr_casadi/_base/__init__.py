@@ -1,4 +1,4 @@
-"""Foundation of all other folders: errors for the user, files, worker processes, interrupts and progress."""
+"""Foundation of all other folders: errors for the user, files, the C compiler, processes, interrupts and progress."""
 
 from typing import TYPE_CHECKING
 
@@ -7,6 +7,13 @@ from .lazy import lazy_face
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from .c_compiler import (
+        LOOPS as LOOPS,
+        build as build,
+        cache_directory as cache_directory,
+        compiler as compiler,
+        run_compiler as run_compiler,
+    )
     from .errors import (
         LARGEST as LARGEST,
         REPAIR as REPAIR,
@@ -61,7 +68,6 @@ if TYPE_CHECKING:
         Reply as Reply,
         check_executor as check_executor,
         close_workers as close_workers,
-        end_with_parent as end_with_parent,
         one_at_a_time as one_at_a_time,
         one_blas_thread as one_blas_thread,
         open_replies as open_replies,
@@ -69,7 +75,6 @@ if TYPE_CHECKING:
         read_message as read_message,
         run_in_worker as run_in_worker,
         side_by_side as side_by_side,
-        units_are_isolated as units_are_isolated,
         worker_pool as worker_pool,
         write_message as write_message,
     )

@@ -129,9 +129,17 @@ class Abandoned(threading.local):
     """A mark for a thread that a run of compiled code was interrupted, which cannot end by itself.
 
     The Python functions that the run calls then return at once, and KeyboardInterrupt is raised where the run returns.
+    `end`, if any, ends a run in another process.
     """
 
     pending = False
+    end: Callable[[], None] | None = None
+
+    def mark(self) -> None:
+        """Mark that the run was interrupted."""
+        self.pending = True
+        if self.end is not None:
+            self.end()
 
     def raise_pending(self) -> None:
         """Raise KeyboardInterrupt if the run that has just returned was abandoned."""

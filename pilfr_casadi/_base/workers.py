@@ -229,18 +229,6 @@ class ChildProcess:
                 pipe.close()
 
 
-def units_are_isolated() -> bool:
-    """Tell whether programs of users, such as FMUs, are called in processes of their own alone (PILFR_ISOLATED=1)."""
-    return os.environ.get("PILFR_ISOLATED", "0") not in ("", "0")
-
-
-def end_with_parent(parent: int) -> None:
-    """End this process after its parent, also while the main thread hangs."""
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    os._exit(0)
-
-
 class WorkerProcess(ChildProcess):
     """A child process of a worker, for `run_in_worker`."""
 

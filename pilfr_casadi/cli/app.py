@@ -12,14 +12,12 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import typer
 
 from .._base import InputError, __version__, deferred_interrupt, terminable, unwrapped_interrupt
 from ._common import BAD_INPUT, DONE, INTERRUPTED, NO_RESULT, UsageError, say
-from .crashes import run_beside_units
 
 COMMANDS = {  # name: (file, help)
     "fit": ("models", "Identify a PI-LFR model from recordings."),
@@ -76,14 +74,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         The exit status.
     """
-    given = sys.argv[1:] if arguments is None else list(arguments)
-    return run_beside_units(partial(_answered, given), given if arguments is None else ())
-
-
-def _answered(arguments: list[str]) -> int:
-    """Run a command; turn every failure into a sentence and an exit status."""
     try:
-        return _run(arguments)
+        return _run(sys.argv[1:] if arguments is None else list(arguments))
     except typer.Exit as end:  # of --help and --version
         return end.exit_code
     except UsageError as error:

@@ -18,8 +18,7 @@ import numpy as np
 from .._base import one_at_a_time
 from ..data import Recording
 from ..laws import CATALOGUE, Law, readable_unit
-from ..models import map_points
-from ..simulators import ACTUATOR, EQUATION, Port, Simulator, port_name, split_port, stack
+from ..simulators import ACTUATOR, EQUATION, Port, Simulator, map_points, port_name, split_port, stack
 from .fits.linearise import Probe, Run, sample_run
 from .fits.screen import Remainder, Task, lengths, orthonormal, own_changes, project_off
 from .fits.workbench import Fitted, Workbench, pack_known

@@ -1,6 +1,6 @@
 """Engines that run a model: sensitivities by a matrix recursion, as generated C or in CasADi's virtual machine.
 
-`sensitivities` holds the recursion and the virtual machine, `compiled` the generated C, its compiler and its cache.
+`sensitivities` holds the recursion and the virtual machine, `compiled` the generated C.
 `external` lets generated C call programs that CasADi cannot look into. Both engines sum in the same order, so
 simulations, derivatives and fits agree bit for bit on x86-64.
 """
@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .compiled import (
-        Compiled as Compiled,
+    from .._base import (
         cache_directory as cache_directory,
         compiler as compiler,
-        make_engine as make_engine,
         run_compiler as run_compiler,
+    )
+    from .compiled import (
+        Compiled as Compiled,
+        make_engine as make_engine,
         source_code as source_code,
     )
     from .sensitivities import Engine as Engine, VirtualMachine as VirtualMachine, linearize as linearize

@@ -19,7 +19,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, listed
+from .._base import InputError, abandoned, listed
 from ..data import Recording, default_names
 from .elements import Element
 from .parameters import Parameter, ParameterSet
@@ -398,6 +398,7 @@ def _call(function: ca.Function, arrays: Sequence[np.ndarray], results: Sequence
     buffer, evaluate = function.buffer()
     _connect(buffer, arrays, results)
     evaluate()
+    abandoned.raise_pending()
 
 
 def _connect(buffer: Any, arrays: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
@@ -425,6 +426,7 @@ class Buffered:
         for own, a in zip(self._arguments, arguments, strict=False):
             own[...] = np.asarray(a).T
         self._evaluate()
+        abandoned.raise_pending()
         return [out[0].copy() if len(out) == 1 else out.T.copy() for out in self._results]
 
     @property

@@ -330,7 +330,8 @@ class _Run:
         self.history.append(Iteration(self.tried, self.cost, seconds, length, self.damping.value))
 
     def _interrupt(self) -> None:
-        self.interrupted = abandoned.pending = True
+        self.interrupted = True
+        abandoned.mark()
 
     def _iterate(self) -> Status:
         problem, options = self.problem, self.options

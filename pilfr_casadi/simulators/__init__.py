@@ -4,10 +4,11 @@
 closes them with laws and discretises them to a `Model` with enough `substeps`. `simulator` holds the class `Simulator`.
 `domains` infers a port's physical domain, and `user_arguments` checks what a user gives. `adapters` convert a Python
 file (`user_file`), a state space or a fitted model to a simulator. `fmu` wraps a functional mock-up unit as a simulator
-(`fmu_description`, `fmu_instance`, `fmu_process`, for co-simulation `fmu_cosimulation`), and `mujoco` writes the
-equations of a MuJoCo model (`mujoco_model`). `numpy_function` makes a simulator from a NumPy function, whose arguments
-`signature` reads: `tracing` calls the function with `symbols` to obtain its equations. A function that cannot be traced
-is called with numbers (`black_box`). `external` lets equations call such a program.
+(`fmu_description`, `fmu_instance`, `fmu_process`, `fmu_function`, for co-simulation `fmu_cosimulation`), and `mujoco`
+writes the equations of a MuJoCo model (`mujoco_model`). `numpy_function` makes a simulator from a NumPy function, whose
+arguments `signature` reads: `tracing` calls the function with `symbols` to obtain its equations. A function that cannot
+be traced is called with numbers (`black_box`). `external` lets equations call such a program, and `external_buffers`
+lets compiled C do so.
 """
 
 from typing import TYPE_CHECKING
@@ -30,9 +31,9 @@ if TYPE_CHECKING:
     from .external import (
         PythonFunction as PythonFunction,
         calls_external as calls_external,
-        leaves as leaves,
         units as units,
     )
+    from .external_buffers import EXTERNAL_CALLS as EXTERNAL_CALLS, bind as bind
     from .fmu import from_fmu as from_fmu
     from .fmu_cosimulation import CoSimulation as CoSimulation
     from .fmu_description import (
@@ -41,7 +42,8 @@ if TYPE_CHECKING:
         needs_step_size as needs_step_size,
         parse_port as parse_port,
     )
-    from .fmu_instance import FmuSignals as FmuSignals, evaluation as evaluation
+    from .fmu_function import map_points as map_points
+    from .fmu_instance import FmuSignals as FmuSignals
     from .fmu_process import run_in_unit as run_in_unit
     from .integration import (
         ClosedEquations as ClosedEquations,

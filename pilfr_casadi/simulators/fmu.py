@@ -26,11 +26,12 @@ import numpy as np
 
 from .._base import InputError, check_known
 from ..models import Named, Parameter, parameter_within, within_a_factor
-from .external import NOMINAL, ROUNDING, call_external, equal_state, external, leaves, units
+from .external import NOMINAL, ROUNDING, call_external, equal_state, external
 from .fmu_cosimulation import CoSimulation, SteppedEquations, SteppedUnit, check_force, unknown_signal
 from .fmu_description import Description, Unit, Variable, check_file, parse_port
+from .fmu_function import FmuFunction
 from .fmu_instance import FmuFile, FmuSignals, unpack
-from .fmu_process import FmuFunction, has_time_event
+from .fmu_process import has_time_event
 from .ports import Port
 from .simulator import Simulator
 from .user_arguments import choose_parameters
@@ -44,7 +45,7 @@ TIMES = (0.0, 0.7, 13.0, 400.0)  # s, at which a dependence on time is looked fo
 class _Unit(Unit):
     """A unit with some of its outputs: `(t, x, u, p) -> (derivatives, outputs)`.
 
-    `parameters` are the tunable ones, and fixed ones that the user names.
+    `parameters` are the tunable ones, then fixed ones that the user names.
     """
 
     parameters: tuple[str, ...]
@@ -61,19 +62,16 @@ class _Unit(Unit):
         folder, key = unpack(self.path)
         key = hashlib.sha256(f"{key} {self.parameters} {self.outputs}".encode()).hexdigest()[:16]
         name = f"fmu_{key}"
-        if name not in leaves:
+        if name not in _functions:
             parameters, inputs, outputs = (
                 tuple(self.variables[n].reference for n in names)
                 for names in (self.parameters, self.inputs, self.outputs)
             )
-            restarts = any(self.variables[n].variability != "tunable" for n in self.parameters)
+            tunable = sum(self.variables[n].variability == "tunable" for n in self.parameters)
             described = self.described
-            file = FmuFile(folder, int(described.version), described.token, described.binary, parameters, restarts)
-            units[name] = FmuSignals(file, len(self.states), inputs, outputs)
-            FmuFunction(name, units[name])
-        found = leaves[name]
-        assert isinstance(found, FmuFunction)
-        return found
+            file = FmuFile(folder, int(described.version), described.token, described.binary, parameters, tunable)
+            _functions[name] = FmuFunction(name, FmuSignals(file, len(self.states), inputs, outputs))
+        return _functions[name]
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Unpack the file again in another process."""
@@ -88,15 +86,19 @@ class _Unit(Unit):
         """`z -> (derivatives, outputs)` in one vector, for expressions; z holds t, x, u and p."""
 
         def evaluate(z: Any) -> Any:
-            return call_external(self.leaf, *(z[a:b] for a, b in pairwise(np.cumsum([0, *self.leaf.sizes]).tolist())))
+            ends = np.cumsum([0, *self.leaf.signals.sizes]).tolist()
+            return call_external(self.leaf.function, *(z[a:b] for a, b in pairwise(ends)))
 
         nominal = [1.0, *(self.variables[n].nominal for n in (*self.states, *self.inputs, *self.parameters))]
         sizes = NOMINAL * np.nan_to_num(np.array(nominal), nan=1.0)
-        return external(evaluate, sizes, self.leaf.size)
+        return external(evaluate, sizes, self.leaf.signals.results)
 
     def values(self, t: float, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
         """Evaluate derivatives and outputs by numbers."""
         return self.leaf.evaluate(np.concatenate([[t], x, u, p]).tobytes())
+
+
+_functions: dict[str, FmuFunction] = {}  # by name
 
 
 def from_fmu(
@@ -161,7 +163,7 @@ def from_fmu(
     for name, port in given.items():
         _check_port(name, port)
     used = [name for port in given.values() for name in _factors(port.get("into"))]
-    own = parameters if parameters is not None else unit.parameters
+    own = parameters if parameters is not None else [n for n in described.of("parameter") if n in unit.parameters]
     _check_names(unit, (*used, *(inputs or ())), outputs or (), (*own, *bounds))
     all_outputs = described.of("output")
     drives = tuple(inputs) if inputs is not None else tuple(n for n in unit.inputs if n not in used)
@@ -193,7 +195,8 @@ def _load_unit(path: Path, described: Description, named: Sequence[str], outputs
     parameters = tuple(
         n for n in described.of("parameter") if n in named or described.variables[n].variability == "tunable"
     )
-    return _Unit(path, described, parameters, tuple(outputs or ()))
+    tunable_first = tuple(sorted(parameters, key=lambda n: described.variables[n].variability != "tunable"))
+    return _Unit(path, described, tunable_first, tuple(outputs or ()))
 
 
 def _check_names(

@@ -8,6 +8,7 @@ NaN.
 from __future__ import annotations
 
 import atexit
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -16,7 +17,7 @@ import os
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ MOST_ITERATIONS = 100  # updates of discrete states in one event
 _LOGGER = ctypes.CFUNCTYPE(None)  # called with any arguments, which it ignores
 _log = _LOGGER(lambda: None)
 _RESTART = ctypes.CFUNCTYPE(ctypes.c_int)
+calls = np.zeros(1, dtype=np.int64)  # begun and ended calls of units in this process: odd while one has not returned
 
 
 class UnitError(Exception):
@@ -61,14 +63,15 @@ class _Fmu(ctypes.Structure):
 
     _fields_ = [
         ("version", ctypes.c_int),
-        ("restarts", ctypes.c_int),
         ("instance", ctypes.c_void_p),
         ("failed", ctypes.c_void_p),
+        ("calls", ctypes.c_void_p),
         ("restart", _RESTART),
         *((name, ctypes.c_void_p) for name in ("set_time", "set_states", "get_derivatives")),
         *((name, ctypes.c_void_p) for name in ("set_values", "get_values")),
         *((name, ctypes.c_void_p) for name in ("enter_events", "update_states", "leave_events")),
-        *((name, ctypes.c_size_t) for name in ("n_x", "n_u", "n_p", "n_y")),
+        *((name, ctypes.c_void_p) for name in ("reset", "set_up", "enter_initialisation", "leave_initialisation")),
+        *((name, ctypes.c_size_t) for name in ("n_x", "n_u", "n_p", "n_y", "n_t")),
         *((name, ctypes.c_void_p) for name in ("u_ref", "p_ref", "y_ref")),
         *((name, ctypes.c_void_p) for name in ("t", "x", "u", "p", "derivatives", "y", "last_p")),
     ]
@@ -82,8 +85,8 @@ class FmuFile:
     version: int
     token: str
     binary: str
-    parameters: tuple[int, ...]  # value references
-    restarts: bool  # one of the parameters is fixed, so that a change takes a restart
+    parameters: tuple[int, ...]  # value references, those of tunable ones first
+    tunable: int  # number of tunable parameters; a change of the others takes a restart
 
 
 @dataclass(frozen=True)
@@ -111,15 +114,16 @@ class FmuInstance:
 
     def __init__(self, file: FmuFile) -> None:
         self.file = file
-        self.library = ctypes.CDLL(str(file.folder / file.binary))
         self.handle = ctypes.c_void_p()
         self.failed = np.zeros(1, dtype=np.intc)
         self.last = np.full(len(file.parameters), np.nan)  # parameters that the instance has
         self.references = np.array([*file.parameters, 0], dtype=np.uint32)
         self.has_time_event = False
-        self._instantiate()
-        if not self._initialise(None):
-            raise UnitError("it cannot be initialised")
+        with _counted():
+            self.library = ctypes.CDLL(str(file.folder / file.binary))
+            self._instantiate()
+            if not self._initialise(None):
+                raise UnitError("it cannot be initialised")
 
     def function(self, name: str) -> Any:
         """Return a function of the unit by its name without the version."""
@@ -133,6 +137,12 @@ class FmuInstance:
         found = getattr(self.library, f"fmi{self.file.version}{name}")
         found.restype = ctypes.c_int
         return found
+
+    def address(self, name: str) -> int | None:
+        """Return the address of a function of the unit; none of one that its version does not have."""
+        if self.file.version == 3 and name == "SetupExperiment":
+            return None
+        return ctypes.cast(self.function(name), ctypes.c_void_p).value
 
     def call(self, name: str, *arguments: Any) -> int:
         """Call a function of the unit; return its status."""
@@ -200,11 +210,12 @@ class FmuInstance:
 
     def set_parameters(self, parameters: np.ndarray) -> int:
         """Change the parameters; return the status."""
-        if self.file.restarts or self.failed[0]:
+        n = self.file.tunable
+        if self.failed[0] or parameters[n:].tobytes() != self.last[n:].tobytes():
             return self.restart(parameters)
         steps = (
             lambda: self.call("EnterEventMode"),
-            lambda: self._set(parameters),
+            lambda: self._set(parameters[:n]),
             self._update_states,
             lambda: self.call("EnterContinuousTimeMode"),
         )
@@ -236,19 +247,21 @@ class FmuEvaluation:
         self._restart = _RESTART(lambda: instance.restart(self.arguments[3]))
         named = ("SetTime", "SetContinuousStates", "GetDerivatives", "SetReal", "GetReal")
         events = ("EnterEventMode", "NewDiscreteStates", "EnterContinuousTimeMode")
-        addresses = [ctypes.cast(instance.function(name), ctypes.c_void_p).value for name in (*named, *events)]
+        starts = ("Reset", "SetupExperiment", "EnterInitializationMode", "ExitInitializationMode")
+        addresses = [instance.address(name) for name in (*named, *events, *starts)]
         memory = [a.ctypes.data for a in (self._references[0], instance.references, self._references[1])]
         memory += [a.ctypes.data for a in self.arguments]
         memory += [self.result.ctypes.data, self.result.ctypes.data + 8 * signals.states, instance.last.ctypes.data]
         self.structure = _Fmu(
             instance.file.version,
-            int(instance.file.restarts),
             ctypes.addressof(instance.handle),
             instance.failed.ctypes.data,
+            calls.ctypes.data,
             self._restart,
             *addresses,
             *signals.sizes[1:],
             len(signals.outputs),
+            instance.file.tunable,
             *memory,
         )
 
@@ -273,17 +286,32 @@ class FmuEvaluation:
 
     def evaluate(self, z: np.ndarray) -> np.ndarray:
         """Evaluate one point, as `_fmu.c` does."""
-        instance, status = self.instance, 0
+        instance = self.instance
         self.z[:] = z
-        parameters = self.arguments[3]
-        if instance.failed[0] or parameters.tobytes() != instance.last.tobytes():
-            status = 0 if instance.set_parameters(parameters) <= OK else DISCARD + 1  # the mode is unknown
-            instance.last[:] = parameters
-        status = status or next((s for step in self._steps if (s := step()) > OK), 0)
+        with _counted():
+            status = self._evaluate()
         instance.failed[0] = status > DISCARD
         if status > OK:
             self.result[:] = np.nan
         return self.result[: self.signals.results]
+
+    def _evaluate(self) -> int:
+        instance, parameters = self.instance, self.arguments[3]
+        if instance.failed[0] or parameters.tobytes() != instance.last.tobytes():
+            status = instance.set_parameters(parameters)
+            instance.last[:] = parameters
+            if status > OK:
+                return DISCARD + 1  # the mode is unknown
+        return next((status for step in self._steps if (status := step()) > OK), 0)
+
+
+@contextlib.contextmanager
+def _counted() -> Iterator[None]:
+    calls[0] += 1
+    try:
+        yield
+    finally:
+        calls[0] += 1
 
 
 def _address(array: np.ndarray) -> ctypes.c_void_p:
@@ -306,7 +334,7 @@ def unpack(path: Path) -> tuple[Path, str]:
     content = path.read_bytes()
     key = hashlib.sha256(content).hexdigest()
     if key not in _folders:
-        folder = Path(tempfile.mkdtemp(prefix="pilfr-fmu-"))
+        folder = Path(tempfile.mkdtemp(prefix=_folder_prefix()))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             archive.extractall(folder)
@@ -315,3 +343,12 @@ def unpack(path: Path) -> tuple[Path, str]:
 
 
 _folders: dict[str, Path] = {}  # by digest
+
+
+def _folder_prefix() -> str:
+    return f"pilfr-fmu-{os.getpid()}-"
+
+
+def owns_folder(folder: Path) -> bool:
+    """Tell whether this process has unpacked a file into a folder, and not the process that forked it."""
+    return folder.name.startswith(_folder_prefix())

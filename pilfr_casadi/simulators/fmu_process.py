@@ -1,47 +1,35 @@
 """Evaluations of functional mock-up units for model exchange, in processes of their own.
 
-Units crash and hang, mostly at some values of their parameters. An evaluation that ends or blocks the process gives
-NaN, and the next one starts a new process. One message asks for one point, or for a whole run of a compiled model that
-calls the unit (`run_in_unit`). A message and its reply take some 15 µs: nothing beside a run, and ten times as long as
-a small unit itself needs for one point. So single points are evaluated in the user's process once the unit's own
-process has answered with the same parameters. A unit that crashes at some states then ends the user's process as well,
-unless the environment variable PILFR_ISOLATED is set.
+Units crash and hang, mostly at some values of their parameters. If an evaluation ends the process or does not return,
+the next one starts a new process. One message asks for one point, or for a whole run (`run_in_unit`): of a compiled
+model that calls the unit, or of a function at many points. A message and its reply take some 20 µs.
+
+Nobody knows how long a run may take, so a process limits each call of its unit instead, by the slowest call until then.
 """
 
 from __future__ import annotations
 
-import atexit
-import contextlib
-import functools
-import math
 import os
 import pickle
+import shutil
 import sys
 import threading
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from .._base import (
-    ChildProcess,
-    abandoned,
-    end_with_parent,
-    open_replies,
-    read_message,
-    units_are_isolated,
-    write_message,
-)
-from .external import Leaf
+from .._base import ChildProcess, abandoned, open_replies, read_message, write_message
 from .fmu_description import tidy
-from .fmu_instance import FmuEvaluation, FmuFile, FmuSignals, UnitError, evaluation
+from .fmu_instance import FmuFile, FmuSignals, UnitError, calls, evaluation, owns_folder
 
-LOADING_SECONDS = 60.0  # further seconds that the first job of a unit may take
-CALL_SECONDS = 5.0  # seconds that another job may take
-PACE = 20.0  # further seconds, over those of the slowest job of its kind and length
+LOADING_SECONDS = 60.0  # seconds that the start of a unit may take
+CALL_SECONDS = 2.0  # seconds that another call may take
+PACE = 20.0  # further seconds, over those of the slowest call
+WATCH_SECONDS = 0.1  # interval at which calls are looked at
+HANGS = 124  # exit status of a process whose unit does not return, as of the program `timeout`
 MOST_IDLE = 4  # processes that wait for their next job
-MOST_LOSSES = 3  # processes that a point's parameters may end before they count as failed
+FOLDER = "PILFR_UNIT_FOLDER"  # environment variable: what to remove if the parent ends without doing so
 POINT, CALL = b"p", b"c"  # kinds of jobs, the first byte of a message
 
 
@@ -49,35 +37,30 @@ class _UnitProcess(ChildProcess):
     """A process that holds one instance of one unit."""
 
     def __init__(self, file: FmuFile) -> None:
-        super().__init__(serve)
-        self.file, self.owner, self.jobs = file, os.getpid(), 0
+        super().__init__(serve, {FOLDER: str(file.folder) if owns_folder(file.folder) else ""})
+        self.file, self.owner, self.used = file, os.getpid(), False
         self.signals: FmuSignals | None = None  # evaluated by POINT
 
-    def ask(self, kind: bytes, body: bytes, limit: float) -> bytes:
+    def ask(self, kind: bytes, body: bytes) -> bytes:
         """Send a job; return the reply."""
-        begin = time.monotonic()
-        self.deadline = begin + limit + (0.0 if self.jobs else _loading.get(self.file, LOADING_SECONDS))
-        write_message(self.inbox, kind + body)
-        reply = read_message(self.outbox)
-        self.deadline = math.inf
-        if not self.jobs:
-            _loading.setdefault(self.file, CALL_SECONDS + time.monotonic() - begin)
-        self.jobs += 1
-        return reply
+        abandoned.end = self.process.kill
+        try:
+            write_message(self.inbox, kind + body)
+            return read_message(self.outbox)
+        finally:
+            abandoned.end = None
 
     def describe_end(self) -> str:
         """Describe in words how the process ended."""
         code = self.exit_status()
-        if self.expired:
+        if code == HANGS:
             return "takes too long"
         how = f"signal {-code}" if code is not None and code < 0 else f"status {code}"
         return f"ends the process that runs it ({how})"
 
 
-_loading: dict[FmuFile, float] = {}  # further seconds for the first job of another process of a unit
 _idle: list[_UnitProcess] = []
 _idle_lock = threading.Lock()
-_evaluation_lock = threading.Lock()  # the unit has one instance in this process
 
 
 def _take(file: FmuFile) -> _UnitProcess:
@@ -98,14 +81,25 @@ def _give_back(process: _UnitProcess) -> None:
         excess.close()
 
 
-def _ask(signals: FmuSignals, kind: bytes, body: bytes, limit: float) -> tuple[bytes, str]:
-    """Send a job to a process of the unit; return the reply, or how the process failed."""
+def _ask(signals: FmuSignals, kind: bytes, body: bytes) -> tuple[bytes, str]:
+    """Send a job to a process of the unit; return the reply, or how the process failed.
+
+    If a process crashes that has done jobs before, a new one tries again, because some units crash after many calls.
+    """
     process = _take(signals.file)
+    retry = process.used
+    reply, failure = _ask_process(process, signals, kind, body)
+    if failure and retry and not abandoned.pending and process.exit_status() != HANGS:
+        reply, failure = _ask_process(_UnitProcess(signals.file), signals, kind, body)
+    return reply, failure
+
+
+def _ask_process(process: _UnitProcess, signals: FmuSignals, kind: bytes, body: bytes) -> tuple[bytes, str]:
     try:
         if kind == POINT and process.signals != signals:
-            process.ask(CALL, pickle.dumps((_select, (signals,))), limit)
+            process.ask(CALL, pickle.dumps((_select, (signals,))))
             process.signals = signals
-        reply = process.ask(kind, body, limit)
+        reply = process.ask(kind, body)
     except (OSError, EOFError, ValueError):
         failure = process.describe_end()
         process.close()
@@ -113,95 +107,33 @@ def _ask(signals: FmuSignals, kind: bytes, body: bytes, limit: float) -> tuple[b
     except BaseException:
         process.close()  # its reply is still to come
         raise
+    process.used = True
     _give_back(process)
     return reply, ""
 
 
-def run_in_unit(
-    signals: FmuSignals, function: Callable[..., Any], arguments: tuple[Any, ...], size: int
-) -> tuple[Any, str]:
-    """Call a function of a module in a process of the unit; return its result, or None and the failure.
-
-    `size` is the length of the job, such as its number of samples, by which earlier jobs of the same function limit its
-    time.
-    """
-    key = signals, function
-    limit = LOADING_SECONDS if key not in _pace else CALL_SECONDS + PACE * size * _pace[key]
-    begin = time.monotonic()
-    reply, failure = _ask(signals, CALL, pickle.dumps((function, arguments)), limit)
+def run_in_unit(signals: FmuSignals, function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, str]:
+    """Call a function of a module in a process of the unit; return its result, or None and the failure."""
+    reply, failure = _ask(signals, CALL, pickle.dumps((function, arguments)))
     if failure:
         return None, failure
-    _pace[key] = max(_pace.get(key, 0.0), (time.monotonic() - begin) / max(size, 1))
     result, failure = pickle.loads(reply)
     if isinstance(failure, Exception):
         raise failure
     return result, failure
 
 
-_pace: dict[Any, float] = {}  # most seconds by length, by unit and function
-
-
-class FmuFunction(Leaf):
-    """A unit as a `casadi.Function` `(t, x, u, p) -> (derivatives, outputs)`; if it fails, its results are NaN.
-
-    Attributes
-    ----------
-    failure : str
-        How its process failed first.
-    """
-
-    def __init__(self, name: str, signals: FmuSignals) -> None:
-        self.signals, self.failure = signals, ""
-        self._losses: dict[bytes, int] = {}  # lost processes by parameter values
-        self._answered: set[bytes] = set()  # parameter values at which a process has answered
-        super().__init__(name, signals.sizes, signals.results)
-
-    def eval_buffer(self, arguments: list[memoryview], results: list[memoryview]) -> int:
-        """Evaluate one point, for CasADi."""
-        z = b"".join(bytes(a) for a in arguments)
-        np.frombuffer(results[0])[:] = self.evaluate(z)
-        return 0
-
-    def evaluate(self, z: bytes) -> np.ndarray:
-        """Evaluate one point, in a process of the unit until it has answered with these parameters, or always.
-
-        The unit is not called in an abandoned run or by a diverged simulation, nor again with parameters at which it
-        has ended `MOST_LOSSES` processes.
-        """
-        point, none = np.frombuffer(z), np.full(self.signals.results, np.nan)
-        if abandoned.pending or not math.isfinite(point.sum()):
-            return none
-        parameters = point[len(point) - self.signals.sizes[3] :].astype(np.float32).tobytes()
-        isolated = units_are_isolated() or parameters not in self._answered
-        if not isolated and (here := _evaluation_here(self.signals)) is not None:
-            with _evaluation_lock:
-                if not here.instance.failed[0]:  # a restart may end the process
-                    return np.array(here.evaluate(point))
-        if self._losses.get(parameters, 0) >= MOST_LOSSES:
-            return none
-        reply, failure = _ask(self.signals, POINT, z, CALL_SECONDS)
-        if not failure and len(reply) == 8 * self.signals.results:
-            self._answered.add(parameters)
-            return np.frombuffer(reply)
-        if failure:
-            self._losses[parameters] = self._losses.get(parameters, 0) + 1
-        self.failure = self.failure or failure or f"fails ({reply.decode()})"
-        return none
-
-
-@functools.cache
-def _evaluation_here(signals: FmuSignals) -> FmuEvaluation | None:
-    """Return the evaluations of a unit in this process; None if it cannot be loaded here, or is often restarted."""
-    if signals.file.restarts:
-        return None
-    with contextlib.suppress(UnitError, OSError, AttributeError):
-        return evaluation(signals)
-    return None
+def evaluate_in_unit(signals: FmuSignals, z: bytes) -> tuple[np.ndarray | None, str]:
+    """Evaluate one point in a process of the unit; return its results, or None and the failure."""
+    reply, failure = _ask(signals, POINT, z)
+    if failure or len(reply) != 8 * signals.results:
+        return None, failure or f"fails ({reply.decode()})"
+    return np.frombuffer(reply), ""
 
 
 def has_time_event(signals: FmuSignals) -> bool:
     """Tell whether a unit has announced an event in time."""
-    found, _ = run_in_unit(signals, _has_time_event, (signals,), 1)
+    found, _ = run_in_unit(signals, _has_time_event, (signals,))
     return bool(found)
 
 
@@ -212,12 +144,15 @@ def _has_time_event(signals: FmuSignals) -> bool:
 def serve() -> None:
     """Do jobs in the child process: read them from standard input, write results to standard output."""
     replies = open_replies()
-    threading.Thread(target=end_with_parent, args=(os.getppid(),), daemon=True).start()
+    ended = threading.Event()
+    watch = threading.Thread(target=_watch, args=(os.getppid(), ended), daemon=True)
+    watch.start()
     while True:
         try:
             job = read_message(sys.stdin.buffer)
         except EOFError:
-            os._exit(0)
+            ended.set()
+            watch.join()
         kind, body = job[:1], job[1:]
         try:
             if kind == POINT:
@@ -239,8 +174,24 @@ def _select(signals: FmuSignals) -> None:
     _selected[:] = [signals]
 
 
-@atexit.register
-def _close_idle() -> None:
-    for process in _idle:
-        if process.owner == os.getpid():
-            process.close()
+def _watch(parent: int, ended: threading.Event) -> None:
+    """End this process after its parent, or if the unit does not return from a call.
+
+    Seconds are counted in looks, because a process that is stopped (Ctrl-Z) or starved does nothing.
+    """
+    seen, seconds, loading, slowest = 0, 0.0, LOADING_SECONDS, 0.0
+    while os.getppid() == parent and not ended.wait(WATCH_SECONDS):
+        now = int(calls[0])
+        if now == seen and now % 2:
+            seconds += WATCH_SECONDS
+            if seconds > CALL_SECONDS + loading + PACE * slowest:
+                os._exit(HANGS)
+        elif now != seen:
+            if seen < 2 <= now:
+                loading = seconds  # a restart may take as long
+            elif now > 2:
+                slowest = max(slowest, seconds)
+            seen, seconds = now, 0.0
+    if folder := os.environ.get(FOLDER):
+        shutil.rmtree(folder, ignore_errors=True)
+    os._exit(0)

@@ -14,8 +14,9 @@ import numpy as np
 
 from .._base import InputError
 from ..data import Recording
-from ..models import Model, accumulate_steps, map_points
+from ..models import Model
 from .equations import Equations
+from .fmu_function import accumulate_steps, map_points
 from .integration import ClosedEquations, Instant, discretise
 
 LARGEST_STEP = 0.25  # largest |λ| h: a phase error of (λh)⁴/120 = 3e-5 of the angle of a cycle

@@ -7,12 +7,11 @@ import time
 import numpy as np
 import pytest
 
-from pilfr_casadi._base import InputError
+from pilfr_casadi._base import InputError, c_compiler
 from pilfr_casadi.engine import (
     Compiled,
     VirtualMachine,
     cache_directory,
-    compiled,
     compiler,
     linearize,
     make_engine,
@@ -107,11 +106,11 @@ def fresh(tmp_path, monkeypatch):
     """Use an empty cache, and clear all facts about compilers before and after."""
 
     def forget():
-        for function in (compiled.compiler, compiled._describe_machine, compiled.cache_directory):
+        for function in (c_compiler.compiler, c_compiler._describe_machine, c_compiler.cache_directory):
             function.cache_clear()
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(compiled, "_failures", {})
+    monkeypatch.setattr(c_compiler, "_failures", {})
     forget()
     yield tmp_path
     monkeypatch.undo()
@@ -162,7 +161,7 @@ def test_compiler_that_does_not_know_the_processor(model, fresh, monkeypatch):
     real = compiler()
     refuse = 'for a in "$@"; do [ "$a" = -march=native ] && { echo unknown >&2; exit 1; }; done\n'
     monkeypatch.setenv("CC", script(fresh / "old", f'{refuse}exec {real} "$@"'))
-    compiled.compiler.cache_clear()
+    c_compiler.compiler.cache_clear()
     engine = make_engine(model, "c")
     assert compiler() == str(fresh / "old")
     np.testing.assert_array_equal(output(engine, model), output(VirtualMachine(model), model))
@@ -171,24 +170,24 @@ def test_compiler_that_does_not_know_the_processor(model, fresh, monkeypatch):
 @needs_compiler
 @pytest.mark.parametrize("harm", [lambda b: b[:3000], lambda b: b[:5000] + b"x" + b[5001:], lambda b: b""])
 def test_damaged_library_is_built_anew(model, fresh, harm):
-    source = compiled.source_code(compiled.linearize(model))
-    library = compiled.build(source)
+    source = source_code(linearize(model))
+    library = c_compiler.build(source)
     good = library.read_bytes()
     library.write_bytes(harm(good))
-    again = compiled.build(source)
+    again = c_compiler.build(source)
     assert again.read_bytes() == good
     assert [p.name for p in cache_directory().glob("*/*")] == [again.name]
 
 
 @needs_compiler
 def test_the_cache_does_not_grow_without_end(fresh, monkeypatch):
-    monkeypatch.setattr(compiled, "KEPT_LIBRARIES", 2)
-    monkeypatch.setattr(compiled, "_cache_folder", lambda key: cache_directory() / "00")
+    monkeypatch.setattr(c_compiler, "KEPT_LIBRARIES", 2)
+    monkeypatch.setattr(c_compiler, "_cache_folder", lambda key: cache_directory() / "00")
     sources = [f"int number(void) {{ return {k}; }}" for k in range(4)]
-    first = compiled.build(sources[0])
+    first = c_compiler.build(sources[0])
     for k, source in enumerate(sources[1:], 1):
-        os.utime(compiled.build(source), (k, k))
-        assert compiled.build(sources[0]) == first, "what is in use stays"
+        os.utime(c_compiler.build(source), (k, k))
+        assert c_compiler.build(sources[0]) == first, "what is in use stays"
     assert len(list((cache_directory() / "00").glob("*.so"))) == 2
 
 
@@ -254,7 +253,7 @@ def test_threads_share_an_engine(model, kind):
 @pytest.mark.slow
 def test_many_lags_compile_in_proportion_to_their_code(tmp_path, monkeypatch):
     """Jumps of thousands of outputs, threaded, would take twenty times as long for three times the code."""
-    monkeypatch.setattr(compiled, "cache_directory", lambda: tmp_path)
+    monkeypatch.setattr(c_compiler, "cache_directory", lambda: tmp_path)
     sources = []
     for lags in (10, 20):
         model = read_measured_output(NARX(lags, 10).structure(1, 1).model(1, 1), 1.0)
@@ -265,7 +264,7 @@ def test_many_lags_compile_in_proportion_to_their_code(tmp_path, monkeypatch):
         taken = []
         for source in sources:
             began = time.perf_counter()
-            compiled.build(f"{source}\n/* {began} */")
+            c_compiler.build(f"{source}\n/* {began} */")
             taken.append(time.perf_counter() - began)
         return taken[1] / taken[0] / more
 

@@ -327,7 +327,11 @@ def test_no_code_is_run_from_a_model_file(tmp_path, monkeypatch, text):
 
 
 RUNS_PROGRAMS = ("user_file.py",)  # simulators/user_file runs the user's simulator file
-TALKS_TO_ITS_CHILD = ("workers.py", "fmu_process.py")
+TALKS_TO_ITS_CHILD = (
+    "workers.py",
+    "fmu_process.py",
+    "fmu_function.py",
+)  # the last loads a library that it has compiled
 
 
 def test_the_package_runs_no_text_but_the_users_own_program():

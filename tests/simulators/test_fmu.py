@@ -3,8 +3,10 @@
 import os
 import pickle
 import shutil
+import signal
 import subprocess
 import sys
+import time
 import zipfile
 from dataclasses import replace
 
@@ -19,7 +21,15 @@ from pilfr_casadi import InputError, Parameter, exported, fit, from_fmu
 from pilfr_casadi.engine import VirtualMachine, compiler, make_engine
 from pilfr_casadi.laws import CoulombFriction
 from pilfr_casadi.report import corrected_file
-from pilfr_casadi.simulators import CoSimulation, discretise, load_simulator, parse_port
+from pilfr_casadi.simulators import (
+    CoSimulation,
+    discretise,
+    fastest_rates,
+    load_simulator,
+    parse_port,
+    states_along,
+)
+from pilfr_casadi.simulators.fmu_function import FmuFunction
 from problems.fmu_rig import FOLDER, GUIDE, PARAMETERS, c_rig, casadi_rig, description, recording, rig
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler")
@@ -268,17 +278,110 @@ def test_a_unit_that_refuses_a_second_instance_does_not_end_the_process_of_its_u
     assert whole == again == len(given) and 0 < part < len(given)
 
 
-def test_an_isolated_unit_that_crashes_at_a_state_does_not_end_the_process_of_its_user(tmp_path):
+@pytest.mark.parametrize("compiler_name", ["", "none"])
+def test_a_unit_that_crashes_at_a_state_does_not_end_the_process_of_its_user(tmp_path, compiler_name):
     """Without a compiler, single points are evaluated."""
     given = recording(6, samples=40)
     unit = guided(c_rig(tmp_path / "a.fmu", "FAILURE=abort()", "WHERE=(v[X1]>1)"))
     job = cloudpickle.dumps((unit, (given, given.with_(u=given.u + 1e5), given)))
-    options = {**os.environ, "PILFR_ISOLATED": "1", "PILFR_COMPILER": "none"}
+    options = {**os.environ, "PILFR_COMPILER": compiler_name}
     command = [sys.executable, "-c", FINITE_SAMPLES]
     done = subprocess.run(command, input=job, capture_output=True, check=False, env=options)
     assert done.returncode == 0, done.stderr.decode()
     whole, part, again = map(int, done.stdout.decode().strip("[]\n").split(","))
-    assert whole == again == len(given) and 0 < part < len(given)
+    assert whole == again == len(given) and part < len(given)
+    assert part > 0 or not compiler_name
+
+
+def states_of(simulator, given):
+    """States along a run, and the rates at some of them: points and steps of functions that call the unit."""
+    model = discretise(simulator, given.dt, "zero", 1)
+    x = states_along(model, model.drive(given), model.parameters.start, np.zeros(model.n_state))
+    return x, fastest_rates(simulator, x, given.u, model.parameters.start)
+
+
+def test_many_points_are_one_job_for_the_process_of_a_unit(units, monkeypatch):
+    own, given = guided(units["c"]), recording(8, samples=300)
+    monkeypatch.setattr(FmuFunction, "evaluate", lambda *_: pytest.fail("a single point was evaluated"))
+    for found, expected in zip(states_of(own, given), states_of(rig(), given), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-12)
+
+
+def test_a_point_at_which_a_unit_crashes_is_a_failed_trial(tmp_path):
+    own, given = guided(c_rig(tmp_path / "a.fmu", "FAILURE=abort()", "WHERE=(v[X1]>1)")), recording(8, samples=20)
+    x = np.zeros((20, 4))
+    x[19, 0] = 2.0
+    rates = fastest_rates(own, x, given.u, own.parameter_set.start)
+    assert np.flatnonzero(~np.isfinite(rates)).tolist() == [19]
+
+
+def test_a_unit_that_crashes_after_many_calls_is_called_in_a_new_process(tmp_path):
+    counted = "{ static long calls; if (++calls > 2000) abort(); }"
+    own, given = guided(c_rig(tmp_path / "a.fmu", f"FAILURE={counted}", "WHERE=1")), recording(6, samples=40)
+    for _ in range(10):
+        assert np.all(np.isfinite(own.simulate(given)))
+
+
+def test_a_change_of_a_fixed_parameter_costs_little_more_than_one_of_a_tunable_one(units):
+    given, seconds = recording(8, samples=1000), {}
+    for name in ("k1", "m1"):
+        model = discretise(guided(units["c"], parameters=(name,)), given.dt, "zero", 1)
+        engine, seed = make_engine(model), np.zeros((4, 1))
+        job = model.drive(given), model.parameters.start, np.zeros(4), seed, np.zeros(1, dtype=int)
+        for _ in range(3):
+            began = time.perf_counter()
+            engine.sensitivity(*job)
+            seconds[name] = min(time.perf_counter() - began, seconds.get(name, np.inf))
+    assert seconds["m1"] < 5 * seconds["k1"] + 0.02
+
+
+BEGUN = """
+import pickle, sys
+simulator, given = pickle.load(sys.stdin.buffer)
+simulator.simulate(given)
+print("begun", flush=True)
+{body}
+"""
+
+
+def begun(unit, given, folder, body, **variables):
+    """A process that has simulated a recording, in a temporary folder of its own, and goes on with some lines."""
+    options = {**os.environ, "TMPDIR": str(folder), **variables}
+    command = [sys.executable, "-c", BEGUN.format(body=body)]
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=options
+    )
+    process.stdin.write(cloudpickle.dumps((unit, given)))
+    process.stdin.close()
+    assert process.stdout.readline() == b"begun\n", process.stderr.read().decode()
+    return process
+
+
+@pytest.mark.parametrize("compiler_name", ["", "none"])
+def test_ctrl_c_ends_a_run_in_which_the_unit_hangs(tmp_path, compiler_name):
+    given, unit = recording(6, samples=40), guided(c_rig(tmp_path / "a.fmu", "FAILURE=for(;;)", "WHERE=(v[X1]>1)"))
+    body = "simulator.simulate(given.with_(u=given.u + 1e5))"
+    with begun(unit, given, tmp_path, body, PILFR_COMPILER=compiler_name) as process:
+        time.sleep(1.0)
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        began = time.perf_counter()
+        process.wait(30)
+        assert b"KeyboardInterrupt" in process.stderr.read()
+        assert time.perf_counter() - began < 4.0
+
+
+@pytest.mark.parametrize("end", ["", "import os; os.kill(os.getpid(), 9)"])
+def test_nothing_is_left_in_the_temporary_folder(tmp_path, units, end):
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    with begun(guided(units["c"]), recording(6, samples=40), folder, end) as process:
+        process.wait(30)
+    for _ in range(50):
+        if not list(folder.glob("pilfr-fmu-*")):
+            return
+        time.sleep(0.1)
+    pytest.fail(f"{list(folder.iterdir())} is left")
 
 
 def test_a_unit_that_crashes_at_some_parameters_can_be_fitted(tmp_path):
@@ -306,6 +409,15 @@ def test_parameters_change_in_event_mode_and_fixed_ones_by_a_restart(tmp_path):
         assert np.abs(y - given.y).max() > 0.01 * np.ptp(given.y)
     for y in runs(light, given, m1=1.2):
         assert np.abs(y - rig().simulate(given)).max() <= 1e-12 * np.ptp(given.y)
+
+
+def test_fixed_parameters_of_fmi_3_change_by_a_restart(tmp_path, units):
+    copy, given = tmp_path / "a.fmu", recording(2, samples=60)
+    copy.write_bytes(units["casadi"].read_bytes())
+    fixed = guided(changed(copy, ('variability="tunable"', 'variability="fixed"')), parameters=("k1", "d2"))
+    for y in runs(fixed, given, k1=450.0):
+        changed_rig = rig().with_parameters(rig().parameter_set.change(k1={"value": 450.0}))
+        assert np.abs(y - changed_rig.simulate(given)).max() <= 1e-12 * np.ptp(given.y)
 
 
 def test_a_declared_type_gives_unit_and_bounds(tmp_path):

@@ -22,7 +22,7 @@ import numpy as np
 from ..._base import one_at_a_time
 from ...data import Recording
 from ...linear import measurement_update
-from ...models import Model, ParameterSet, map_points
+from ...models import Model, ParameterSet
 from ...simulators import (
     ACTUATOR,
     PARAMETER,
@@ -33,6 +33,7 @@ from ...simulators import (
     Simulator,
     discretise,
     kind_of,
+    map_points,
     on_grid,
     signals,
     split_port,

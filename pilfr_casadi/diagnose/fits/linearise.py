@@ -22,8 +22,18 @@ from ..._base import one_at_a_time
 from ...data import Recording
 from ...laws import Law, Local
 from ...linear import steady_state_gain, with_output_injection
-from ...models import Model, map_points
-from ...simulators import PARAMETER, Port, Simulator, discretise, signals, split_port, states_along, term_function
+from ...models import Model
+from ...simulators import (
+    PARAMETER,
+    Port,
+    Simulator,
+    discretise,
+    map_points,
+    signals,
+    split_port,
+    states_along,
+    term_function,
+)
 from .workbench import FINER_STEPS, Fitted, Workbench, pack_known
 
 WALL = 1.0  # largest |λ| h of a contact on the finest steps

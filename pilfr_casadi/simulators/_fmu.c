@@ -1,6 +1,7 @@
 /* Evaluate a functional mock-up unit for model exchange by direct calls: z = (t, x, u, p) -> derivatives, outputs.
  *
- * Tunable parameters change in event mode. A restart, by Python, changes fixed ones and follows an error.
+ * Tunable parameters change in event mode. A restart changes fixed ones and follows an error; an instance that cannot be
+ * reset is replaced by Python.
  */
 #include <math.h>
 #include <stdbool.h>
@@ -11,10 +12,10 @@ enum { OK = 1, DISCARD = 2, MOST_ITERATIONS = 100 }; /* the first two are status
 
 typedef struct {
   int version; /* 2 or 3 */
-  int restarts;
   void **instance;
   int *failed;
-  int (*restart)(void);
+  long long *calls; /* begun and ended: odd while the unit has not returned */
+  int (*restart)(void);  /* with a new instance if this one cannot be reset */
   int (*set_time)(void *, double);
   int (*set_states)(void *, const double *, size_t);
   int (*get_derivatives)(void *, double *, size_t);
@@ -22,7 +23,11 @@ typedef struct {
   int (*enter_events)(void *);
   void *update_states;
   int (*leave_events)(void *);
-  size_t n_x, n_u, n_p, n_y;
+  int (*reset)(void *);
+  int (*set_up)(void *, int, double, double, int, double); /* FMI 2 */
+  void *enter_initialisation;
+  int (*leave_initialisation)(void *);
+  size_t n_x, n_u, n_p, n_y, n_t; /* the first n_t parameters are tunable */
   const unsigned *u_ref, *p_ref, *y_ref;
   double *t, *x, *u, *p, *derivatives, *y, *last_p;
 } fmu_t;
@@ -36,6 +41,8 @@ typedef int (*set2_t)(void *, const unsigned *, size_t, const double *);
 typedef int (*get2_t)(void *, const unsigned *, size_t, double *);
 typedef int (*set3_t)(void *, const unsigned *, size_t, const double *, size_t);
 typedef int (*get3_t)(void *, const unsigned *, size_t, double *, size_t);
+typedef int (*enter2_t)(void *);
+typedef int (*enter3_t)(void *, bool, double, double, bool, double);
 typedef int (*update2_t)(void *, event_t *);
 typedef int (*update3_t)(void *, bool *, bool *, bool *, bool *, bool *, double *);
 
@@ -65,12 +72,31 @@ static int update_states(fmu_t *f) {
   return status;
 }
 
+static int enter_initialisation(fmu_t *f) {
+  int status;
+  if (f->version == 3) return ((enter3_t)f->enter_initialisation)(*f->instance, false, 0, 0, false, 0);
+  status = f->set_up(*f->instance, 0, 0, 0, 0, 0);
+  return status > OK ? status : ((enter2_t)f->enter_initialisation)(*f->instance);
+}
+
+static int reset(fmu_t *f) {
+  int status;
+  if ((status = f->reset(*f->instance)) > OK) return status;
+  if ((status = enter_initialisation(f)) > OK) return status;
+  if ((status = set_values(f, f->p_ref, f->n_p, f->p)) > OK) return status;
+  if ((status = f->leave_initialisation(*f->instance)) > OK) return status;
+  if ((status = update_states(f)) > OK) return status;
+  return f->leave_events(*f->instance);
+}
+
 static int change_parameters(fmu_t *f) {
+  const int restarts = *f->failed || (f->n_p > f->n_t && memcmp(f->p + f->n_t, f->last_p + f->n_t,
+                                                                (f->n_p - f->n_t) * sizeof(double)));
   int status;
   if (f->n_p) f->last_p[0] = NAN;
-  if (f->restarts || *f->failed) return f->restart();
+  if (restarts) return reset(f) > OK ? f->restart() : 0;
   if ((status = f->enter_events(*f->instance)) > OK) return status;
-  if ((status = set_values(f, f->p_ref, f->n_p, f->p)) > OK) return status;
+  if ((status = set_values(f, f->p_ref, f->n_t, f->p)) > OK) return status;
   if ((status = update_states(f)) > OK) return status;
   return f->leave_events(*f->instance);
 }
@@ -99,8 +125,11 @@ static int evaluate(fmu_t *f) {
 
 void fmu_evaluate(void *unit) {
   fmu_t *f = unit;
-  int status = evaluate(f);
+  int status;
   size_t i;
+  ++*f->calls;
+  status = evaluate(f);
+  ++*f->calls;
   if (status != DISCARD) *f->failed = status > DISCARD;
   if (status <= OK) return;
   for (i = 0; i < f->n_x; i++) f->derivatives[i] = NAN;
