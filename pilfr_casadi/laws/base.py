@@ -372,6 +372,10 @@ class Law:
         """Number of free numbers of the law at fitted values."""
         return sum(int(np.sum(~p.fixed)) for p in self.parameters().values())
 
+    def first_unknowns(self, values: Mapping[str, Any], dt: float) -> int:
+        """Number of unknowns with which the law begins in a recording of unknown beginning, sampled every dt s."""
+        return self.order + int(self.memory)
+
     @classmethod
     def reads(cls) -> set[str]:
         """Names of the signals that the force (and the flow) use."""

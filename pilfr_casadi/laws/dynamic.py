@@ -56,6 +56,10 @@ class Delay(Law):
         """Default limits: from zero to twice the start value."""
         return 0.0, 2 * float(np.asarray(self.values.get("T", np.inf)))
 
+    def first_unknowns(self, values: Mapping[str, Any], dt: float) -> int:
+        """Samples before the recording that arrive in it."""
+        return int(np.ceil(float(np.asarray(values["T"])) / dt))
+
     def parameters(self) -> dict[str, Parameter]:
         """The delay, within the length of its memory."""
         out = super().parameters()

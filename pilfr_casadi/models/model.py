@@ -63,6 +63,9 @@ class Model:
     resting : casadi.Function, optional
         `(x, u, p) -> state`: the whole state from the states in `states` alone, as if their signals had stood still
         before; without it, the rest is zero.
+    alike : tuple of int
+        For each entry of the state, the number of the unknown that it is if the initial state is unknown; entries with
+        the same number begin alike. By default each entry has its own.
     """
 
     step: ca.Function
@@ -77,6 +80,17 @@ class Model:
     substeps: int = 1
     stages: ca.Function | None = None
     resting: ca.Function | None = None
+    alike: tuple[int, ...] = ()
+
+    @cached_property
+    def initial_basis(self) -> np.ndarray:
+        """Matrix B (n_state, n) of an unknown initial state B v with the unknowns v (n,); see `alike`."""
+        numbers = np.array(self.alike or range(self.n_state), dtype=int)
+        return np.eye(int(np.max(numbers, initial=-1)) + 1)[numbers]
+
+    def initial_unknowns(self, state: np.ndarray) -> np.ndarray:
+        """Return the unknowns (n,) of an initial state (n_state,): of entries that begin alike, the first."""
+        return np.asarray(state)[np.argmax(self.initial_basis, axis=0)] if self.n_state else np.zeros(0)
 
     def drive(self, recording: Recording) -> np.ndarray:
         """Collect the signals that the step reads along a recording, (M * substeps, n_u), in the order of `reads`.

@@ -7,7 +7,7 @@ the same prior (`state_precision` in `penalties`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -135,30 +135,33 @@ def estimate_initial_state(
     `state_prior` it has a prior around rest on the scale of the states in a run over all inputs (`state_precision`),
     and is fitted from rest alone. With `known` it has that prior instead, and is fitted from its mean as well.
     """
-    n, values, state = model.n_state, model.parameters.start, model.first_state(recording)
+    values, state = model.parameters.start, model.first_state(recording)
     if recording.begins == "periodic":
         period = model.drive(recording)[: (recording.period or 1) * model.substeps]
         return steady_state(engine, period, values, state)
-    if recording.begins != "estimate" or not n:
+    if recording.begins != "estimate" or not model.n_state:
         return state
+    basis, starts = model.initial_basis, list(map(model.initial_unknowns, starts))
     head = recording.slice(0, max(min(len(recording), samples or samples_for_state(model)), 2)).with_(skip=0)
     problem = _state_problem(model, engine, head, known.noise if known else None)
     solver = GaussNewton(max_iterations=50)
     if known is not None:
-        return _fit_with_prior(problem, solver, (problem.start, *starts, known.mean), known)
+        mean, square = model.initial_unknowns(known.mean), basis.T @ known.precision @ basis
+        known = replace(known, mean=mean, precision=square)
+        return basis @ _fit_with_prior(problem, solver, (problem.start, *starts, mean), known)
     square = state_precision(engine, model.drive(recording), values, model.n_x, model.n_s) if state_prior else None
     if square is None:
         found = [solver.solve(problem, start) for start in (problem.start, *starts)]
-        return min(found, key=lambda solution: solution.cost).theta
-    state, wider = problem.start, 1.0
+        return basis @ min(found, key=lambda solution: solution.cost).theta
+    square, state, wider = basis.T @ square @ basis, problem.start, 1.0
     for _ in range(STATE_ROUNDS):  # free decay from a large state exceeds the states of forced motion
-        _set_prior(problem, square / wider, np.zeros(n))
+        _set_prior(problem, square / wider, np.zeros(len(square)))
         state = solver.solve(problem, state).theta
-        size = float(state @ square @ state) / STATE_NOISE**2 / n
+        size = float(state @ square @ state) / STATE_NOISE**2 / len(square)
         if size <= LARGEST_STATE * wider:
             break
         wider = size
-    return state
+    return basis @ state
 
 
 def _fit_with_prior(

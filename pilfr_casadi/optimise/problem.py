@@ -4,9 +4,9 @@
     subject to  lower <= θ <= upper,  lower_g <= g(θ) <= upper_g.
 
 θ stacks the model's free parameters and, for each recording whose initial state is estimated, that state with the
-element's memory. The mean runs over all R scored samples and outputs; `v` is the noise variance that the priors are
-weighed against. Derivatives come from the sensitivity recursion; `normal` accumulates `JᵀJ` and `Jᵀe` over stretches
-of the record, so memory does not grow with its length.
+element's memory, entries that begin alike once (`Model.alike`). The mean runs over all R scored samples and outputs;
+`v` is the noise variance that the priors are weighed against. Derivatives come from the sensitivity recursion; `normal`
+accumulates `JᵀJ` and `Jᵀe` over stretches of the record, so memory does not grow with its length.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def place_recordings(
             raise InputError("A recording in periodic steady state needs its period in samples; give `period=`.")
         period = (r.period or len(r)) * model.substeps
         yield PlacedRecording(r, at if estimated else None, model.first_state(r), model.drive(r), scale, steady, period)
-        at += estimated * model.n_state
+        at += estimated * model.initial_basis.shape[1]
 
 
 def check_weights(given: Sequence[float] | Array | None, count: int) -> Array:
@@ -157,11 +157,15 @@ class Problem:
         if scored is not None:
             self._placed = [replace(p, scored=keep) for p, keep in zip(self._placed, scored, strict=True)]
         self.residuals = sum(p.count for p in self._placed) * model.n_y  # number of scored residuals R
-        states = [p.state for p in self._placed if p.first is not None]
+        self._basis = model.initial_basis
+        states = [model.initial_unknowns(p.state) for p in self._placed if p.first is not None]
         self.labels = tuple(np.array(parameters.labels, dtype=object)[self.free]) + tuple(
-            f"initial[{i}].{k}" for i, p in enumerate(self._placed) if p.first is not None for k in range(model.n_state)
+            f"initial[{i}].{k}"
+            for i, p in enumerate(self._placed)
+            if p.first is not None
+            for k in range(self._basis.shape[1])
         )
-        unbounded = np.full(model.n_state * len(states), np.inf)
+        unbounded = np.full(self._basis.shape[1] * len(states), np.inf)
         self.lower = np.concatenate([parameters.lower[self.free], -unbounded])
         self.upper = np.concatenate([parameters.upper[self.free], unbounded])
         self.start = np.concatenate([parameters.start[self.free], *states])
@@ -223,8 +227,8 @@ class Problem:
 
         For a recording in steady state it is the state from which periods are run until they repeat.
         """
-        n = self.model.n_state
-        return [p.state if p.first is None else theta[p.first : p.first + n] for p in self._placed]
+        n = self._basis.shape[1]
+        return [p.state if p.first is None else self._basis @ theta[p.first : p.first + n] for p in self._placed]
 
     def first_states(self, theta: Array) -> list[Array]:
         """Return the state with memory at each recording's first sample."""
@@ -262,8 +266,9 @@ class Problem:
 
     def _first_slope(self, part: PlacedRecording) -> Array:
         """Return the slope of a recording's first state by the free parameters and, if it is unknown, by itself."""
-        n_state, unknown = self.model.n_state, part.first is not None or part.steady
-        return np.hstack([np.zeros((n_state, self.n_free)), np.eye(n_state)[:, : n_state * unknown]])
+        n_state = self.model.n_state
+        own = np.eye(n_state) if part.steady else self._basis if part.first is not None else np.zeros((n_state, 0))
+        return np.hstack([np.zeros((n_state, self.n_free)), own])
 
     def _run(
         self, part: PlacedRecording, theta: Array, state: Array, slope: Array
@@ -287,7 +292,7 @@ class Problem:
     def _variables(self, part: PlacedRecording) -> Array:
         """Return the variables that the columns of a recording's Jacobian belong to."""
         shared = np.arange(self.n_free)
-        return shared if part.first is None else np.append(shared, part.first + np.arange(self.model.n_state))
+        return shared if part.first is None else np.append(shared, part.first + np.arange(self._basis.shape[1]))
 
     def stretches(self, theta: Array) -> Iterator[tuple[Array, Array, Array]]:
         """Yield residuals (R_b,), their Jacobian (R_b, n_c) and its columns in θ for each stretch of each recording."""
@@ -399,7 +404,8 @@ class Problem:
         simulated, residual, initial = [], [], []
         for part in self._placed:
             first, r = part.first, part.recording
-            state = ca.MX(ca.DM(part.state)) if first is None else theta[first : first + model.n_state]
+            unknown = slice(first, (first or 0) + self._basis.shape[1])
+            state = ca.MX(ca.DM(part.state)) if first is None else ca.DM(self._basis) @ theta[unknown]
             warm_up = np.tile(part.drive[: part.period], (self._periods_before(part), 1))
             u = np.concatenate([warm_up, part.drive])
             _, y = model.closed.mapaccum("run", len(u))(state, u.T, ca.repmat(p, 1, len(u)))

@@ -211,6 +211,7 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
         substeps=substeps,
         stages=ca.Function("stages", [x, u, updated, p, stages[0]], stages[1:]) if stages else None,
         resting=step.resting(),
+        alike=step.alike_at_first(substeps),
     )
     return model if simulator.observer is None else inject_outputs(model, simulator.observer)
 
@@ -272,6 +273,15 @@ class _SubStep:
         )
         by_stages = (s2 + 2 * s3 + s4 - x) / 3 + h / 6 * self._evaluate_stage(s4, end, 1.0)
         return x_next, y, (c, ca.vertcat(c2, c3, c4), by_c, by_stages)
+
+    def alike_at_first(self, substeps: int) -> tuple[int, ...]:
+        """Number the unknowns of `Model.alike`: entries of a shift register within one sample before are alike."""
+        numbers = list(range(self.x.numel()))
+        for element, n in zip(self.simulator.elements, self.equations.n_s, strict=True):
+            first = max(numbers, default=-1) + 1
+            every = substeps if getattr(element.law, "shifts", False) else 1
+            numbers += [first + i // every for i in range(n)]
+        return tuple(numbers)
 
     def resting(self) -> ca.Function | None:
         """Make `(x, u, p) -> [x; laws' states; memory]` with all laws at rest, as if their signals had been constant.

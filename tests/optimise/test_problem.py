@@ -337,3 +337,24 @@ def test_a_size_that_no_fit_could_handle_is_refused_at_once(make):
         InputError, match=r"has at least .* parameters, and .* takes .* GB of memory; give at most 20000"
     ):
         make()
+
+
+def test_a_delay_has_one_unknown_for_each_sample_before_the_recording():
+    """However many sub-steps a sample has; the derivatives are those of this problem."""
+    law = pilfr.laws.Delay(values={"T": 0.35}).at({"T": 0.35}, {"T": (0.0, 0.4)})
+    machine = pilfr.Simulator(
+        lambda x, u, p: {"v": p.b * u.u - p.a * x.v},
+        lambda x: {"v": x.v},
+        states=("v",),
+        inputs=("u",),
+        parameters={"a": pilfr.Parameter(2.0), "b": pilfr.Parameter(1.0)},
+    ).with_element("actuator:u", law)
+    model = pilfr.simulators.discretise(machine, 0.1, "zero", substeps=8)
+    rng = np.random.default_rng(0)
+    r = Recording(u=rng.standard_normal((30, 1)), y=rng.standard_normal((30, 1)), dt=0.1, initial="estimate")
+    p = Problem(model, r)
+    assert model.n_state == 1 + 4 * 8 and p.size == 3 + 1 + 4
+    theta = p.start + 0.1 * rng.standard_normal(p.size)
+    assert p.initial_states(theta)[0][1:].reshape(4, 8) == pytest.approx(np.tile(theta[4:, None], (1, 8)))
+    assert p.jacobian(theta) == pytest.approx(central(p.residual, theta), abs=1e-6)
+    assert model.initial_unknowns(p.initial_states(theta)[0]) == pytest.approx(theta[3:])

@@ -298,10 +298,10 @@ class FirstOrder:
     @cached_property
     def base(self) -> np.ndarray:
         """Orthonormal directions of the stacked outputs that parameters and initial states can follow, (R, n)."""
-        f, n = self.fitted, self.fitted.model.n_state
+        f, basis = self.fitted, self.fitted.model.initial_basis
         free = f.model.parameters.free
         n_free = int(free.sum())
-        seed = np.hstack([np.zeros((n, n_free)), np.eye(n)])
+        seed = np.hstack([np.zeros((len(basis), n_free)), basis])
         columns, blocks = np.where(free, np.cumsum(free) - 1, -1), list[np.ndarray]()
         for r, state in zip(self.bench.recordings, f.initial, strict=True):
             with np.errstate(over="ignore", invalid="ignore"):

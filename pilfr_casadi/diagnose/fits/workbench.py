@@ -229,7 +229,8 @@ class Workbench:
     def problem_at(self, fitted: Fitted, scored: Sequence[np.ndarray] | None = None) -> tuple[Problem, np.ndarray]:
         """Make the simulation-error problem of a fitted simulator; return it and its variables at the fitted values."""
         problem = self.problem(fitted.fitted_model, fitted.engine, scored, fitted.balance)
-        states = [s for r, s in zip(self.recordings, fitted.initial, strict=True) if r.begins == "estimate"]
+        begun = zip(self.recordings, fitted.initial, strict=True)
+        states = [fitted.model.initial_unknowns(s) for r, s in begun if r.begins == "estimate"]
         return problem, np.concatenate([problem.start[: problem.n_free], *states])
 
     def fit(
@@ -339,7 +340,8 @@ class Workbench:
         states = None
         if len(guess):
             unknown = zip(self.recordings, self.initial_states(model, vector, guess), strict=True)
-            states = np.concatenate([np.zeros(0), *(state for r, state in unknown if r.begins == "estimate")])
+            known = (model.initial_unknowns(state) for r, state in unknown if r.begins == "estimate")
+            states = np.concatenate([np.zeros(0), *known])
         problem: Problem | None = None
         status = Status.SOLVER_FAILED
         for gamma in (*path, 0.0):

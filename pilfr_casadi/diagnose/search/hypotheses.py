@@ -141,7 +141,20 @@ class Hypotheses:
 
     def _tolerant(self, trial: Trial) -> float:
         """Compute the mean square error of a hypothesis and what its formulas may leave."""
-        return self.bench.pool(trial.fitted.squares + self.tolerance) if np.isfinite(trial.mean_square) else np.inf
+        if not np.isfinite(trial.mean_square):
+            return np.inf
+        return self.bench.pool(self._less_freedom(trial) * trial.fitted.squares + self.tolerance)
+
+    def _less_freedom(self, trial: Trial) -> float:
+        """Compute the ratio of all samples to those that are left to judge the laws by.
+
+        The states in which laws begin in a recording follow as many samples, whatever the physics. In a short recording
+        the register of a long delay holds most of it.
+        """
+        dt, count = self.bench.dt, sum(r.begins == "estimate" for r in self.bench.recordings)
+        unknown = count * sum(e.law.first_unknowns(e.own(trial.fitted.values), dt) for e in trial.laws)
+        total = sum(e.size for e in self.bench.scored(trial.fitted.residual))
+        return total / max(total - unknown, 1)
 
     def may_leave(self, floor: Floor | None = None) -> float:
         """Compute the mean square of a noise, by default the floor, and what the right formulas may leave."""
@@ -177,7 +190,8 @@ class Hypotheses:
         """Compute the log evidence, with a quantile of the known ratios for a hypothesis that was not predicted."""
         known, v = self.findings[trial.key].held_out, np.inf
         if known or np.isfinite(trial.mean_square):
-            squares = known.squares if known else trial.fitted.squares * self._held_out_ratio(quantile)
+            ratio = self._held_out_ratio(quantile) * self._less_freedom(trial)
+            squares = known.squares if known else ratio * trial.fitted.squares
             v = self.bench.pool(squares + self.tolerance) + (known.spread if known and self._all_wrong else 0.0)
         return self._log_evidence(trial, v, self.samples)
 

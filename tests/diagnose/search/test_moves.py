@@ -248,3 +248,20 @@ def stuck_refit(monkeypatch):
 def test_a_shift_that_only_led_out_of_a_dead_end_is_no_fault(stuck_refit):
     found = pilfr.diagnose(rig((1.4, 0.8, 0.8, 1.2)), stuck_refit)
     assert (found.verdict, found.gates) == ("complete", ()), str(found)
+
+
+def test_samples_that_a_delay_follows_by_its_unknown_beginning_do_not_count_for_it():
+    """Known beginnings follow nothing."""
+    given = recordings(None, count=1)[0].slice(0, 60)
+    late = {"T": 20 * given.dt}
+    evidences = []
+    for initial in ("estimate", "zero"):
+        found = searching([given.with_(initial=initial)])
+        placed = found.bench.simulator.with_element(
+            "actuator:force", laws.Delay().at(late, {"T": (0.0, 2 * late["T"])})
+        )
+        delayed = Trial.of(found.bench.run(placed, found.without.values, found.without.begin), 1)
+        alike = replace(delayed, fitted=replace(delayed.fitted, squares=found.without.squares))
+        found.keep(Trial.of(found.without, 0, thorough=True))
+        evidences.append(found.optimistic_evidence(alike) - found.optimistic_evidence(found.root))
+    assert evidences[0] < evidences[1] - 1
