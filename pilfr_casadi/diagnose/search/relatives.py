@@ -311,14 +311,20 @@ def pair_shares(parts: Sequence[np.ndarray], left: np.ndarray) -> np.ndarray:
 
 
 def choose_pairs(rest: Remainder) -> list[tuple[_Block, _Block]]:
-    """Choose the pairs worth a fit, best first: a few of each of the best pairs of ports."""
+    """Choose the pairs worth a fit, best first: a few of each of the best pairs of ports.
+
+    Both laws may act at one port if they are different physics there.
+    """
     blocks = list(_blocks(rest))
     if len(blocks) < 2:
         return []
     left = 1 - pair_shares([orthonormal(b.dose.phi) for b in blocks], rest.left)
     ports = np.array([b.scored.port for b in blocks])
+    laws = list({type(b.scored.law): b.scored.law for b in blocks}.values())
+    number = np.array([next(k for k, law in enumerate(laws) if type(law) is type(b.scored.law)) for b in blocks])
+    together = np.array([[complements(one, other) for other in laws] for one in laws])
     worth = np.maximum(left, 0.0)
-    worth[ports[:, None] == ports] = np.inf
+    worth[(ports[:, None] == ports) & ~together[np.ix_(number, number)]] = np.inf
     seen: dict[tuple[Any, ...], tuple[float, tuple[_Block, _Block]]] = {}
     for flat in np.argsort(worth, axis=None):
         i, j = np.unravel_index(flat, worth.shape)
