@@ -137,6 +137,10 @@ class TwoStageRelaxation(_TwoStages, Relaxation):
     def force(self, z: Any, q: Any, p: Any) -> Any:
         return p.k_1 * (z - q[0]) + p.k_2 * (z - q[1])
 
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """Tell also whether its parts pull against each other: nearly equal ones make a rate of z, not creep."""
+        return super().doubtful(values) or float(np.asarray(values["k_1"])) * float(np.asarray(values["k_2"])) < 0
+
 
 class Creep(Relaxation):
     """Creep of an actuator or a sensor: a slow part follows the signal (Kelvin-Voigt element)."""

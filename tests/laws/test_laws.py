@@ -219,6 +219,11 @@ def test_creep_at_its_longest_time_constant_is_doubtful(T, doubtful):
     assert law.doubtful({"k_v": 3.0, "T": T}) is doubtful
 
 
+@pytest.mark.parametrize(("slow", "doubtful"), [({"k_2": 2.0, "T_2": 5.0}, False), ({"k_2": -2.99, "T_2": 1.01}, True)])
+def test_creep_whose_two_parts_pull_against_each_other_is_doubtful(slow, doubtful):
+    assert laws.TwoStageRelaxation().doubtful({"k_1": 3.0, "T_1": 1.0, **slow}) is doubtful
+
+
 @pytest.mark.parametrize(
     ("values", "doubtful"),
     [
