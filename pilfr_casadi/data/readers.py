@@ -57,8 +57,8 @@ def read_csv(
         One file, or a list of files with the same columns.
     inputs, outputs : str or sequence of str
         Names of the inputs and outputs, and of their columns unless `columns` maps them. A unit behind a column's name,
-        as in ``force [N]`` or ``force (N)``, becomes the unit of the channel. Without outputs (`()`) the recording can
-        be simulated but not fitted.
+        as in ``force [N]`` or ``force (N)``, becomes the unit of the channel. Without inputs (`()`) the recording is a
+        free motion, such as a decay. Without outputs it can be simulated but not fitted.
     columns : mapping, optional
         Column by name, e.g. ``{"force": "u_vir_V"}``; the key ``"t"`` chooses the time column.
     dt : float, optional
@@ -188,11 +188,8 @@ class _Request:
     ) -> None:
         self.inputs, self.outputs = _check_names(inputs, "inputs"), _check_names(outputs, "outputs")
         self.dt, self.time_tolerance, self.new_step, self.options = dt, time_tolerance, resample, options
-        if not self.inputs:
-            raise InputError(
-                "a recording needs at least one input; name its column. To merge a file of sensors only, read these as "
-                "inputs with outputs=(), and give merge the inputs and outputs of the result."
-            )
+        if not (self.inputs or self.outputs):
+            raise InputError("a recording needs at least one input or output; name its column.")
         known = [f.name for f in fields(Recording) if f.name not in ("u", "y", "dt", "inputs", "outputs")]
         for name in options:
             if name not in known:
@@ -285,7 +282,8 @@ class _Request:
             label = f"{table.path}: column {time!r}"
             dt = step_of(t[:, 0], label, table.place, dt=self.dt, tolerance=self.time_tolerance)
         n_u = len(self.inputs)
-        u, y = np.hstack(parts[:n_u]), np.hstack([np.empty((len(parts[0]), 0)), *parts[n_u:]])
+        none = np.empty((len(parts[0]), 0))
+        u, y = np.hstack([none, *parts[:n_u]]), np.hstack([none, *parts[n_u:]])
         names = _channel_names(self.inputs, parts[:n_u]), _channel_names(self.outputs, parts[n_u:])
         found = zip((*self.inputs, *self.outputs), map(table.unit, wanted), strict=True)
         units = {name: unit for name, unit in found if unit and name in names[0] + names[1]}

@@ -15,6 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from .._base import REPAIR, InputError, is_number, is_whole, later, listed, positive, real_array, usable
+from .columns import with_unit
 from .preprocessing import butterworth, change_step, hold_at, levels_last, remove_trend
 from .units import conversion
 
@@ -30,7 +31,8 @@ class Recording:
     Parameters
     ----------
     u : array, (M, n_u) or (M,)
-        Inputs at the samples. Copied; stored as a read-only (M, n_u) array.
+        Inputs at the samples. Copied; stored as a read-only (M, n_u) array. (M, 0) is a recording without inputs, such
+        as a free decay; it suits a simulator without inputs.
     y : array, (M, n_y) or (M,)
         Outputs at the same samples. Copied; stored as a read-only (M, n_y) array. With (M, 0), no measured output, a
         recording can be simulated but not fitted.
@@ -77,7 +79,7 @@ class Recording:
 
     def __post_init__(self) -> None:
         u, inputs = _channels(self.u, self.inputs, "u", "input", self.label)
-        y, outputs = _channels(self.y, self.outputs, "y", "output", self.label, none=True)
+        y, outputs = _channels(self.y, self.outputs, "y", "output", self.label)
         if len(u) != len(y):
             raise InputError(
                 f"{self.label} has {len(u)} samples of u but {len(y)} of y; give arrays of shape (samples, channels) "
@@ -142,11 +144,11 @@ class Recording:
 
     def __repr__(self) -> str:
         def channels(names: tuple[str, ...]) -> str:
-            return ", ".join(f"{n} [{self.units[n]}]" if n in self.units else n for n in names)
+            return ", ".join(with_unit(n, self.units.get(n, "")) for n in names) or "none"
 
         head = f"Recording {self.name!r}" if self.name else "Recording"
         text = f"{head}: {len(self)} samples, dt {self.dt:.6g} s ({len(self) * self.dt:.4g} s), "
-        text += f"inputs {channels(self.inputs)}, outputs {channels(self.outputs) or 'none'}"
+        text += f"inputs {channels(self.inputs)}, outputs {channels(self.outputs)}"
         extras = {"period": self.period, "hold": self.hold, "skip": self.skip or None}
         initial = self.begins
         shown = [f"initial {initial}", *(f"{key} {value}" for key, value in extras.items() if value is not None)]
@@ -439,10 +441,10 @@ def check_for_identification(
             "record longer or choose a smaller model."
         )
     if excited and not any(_varies(r.u[:, i]) for r in recordings for i in range(r.n_u)):
-        inputs = (
-            f"inputs {listed(first.inputs)} never change" if first.n_u > 1 else f"input {first.inputs[0]} never changes"
+        raise InputError(
+            f"{_name_inputs(first.inputs)} in {listed(labels)}; a model from input to output needs an input that "
+            "changes. For a decay or a coast-down, give a Simulator, which the motion from its start excites."
         )
-        raise InputError(f"the {inputs} in {listed(labels)}; nothing can be identified without excitation.")
     for i, name in enumerate(first.outputs):
         if not any(_varies(r.y[r.skip :, i]) for r in recordings):
             raise InputError(
@@ -460,20 +462,23 @@ def _distinct_labels(recordings: Sequence[Recording]) -> list[str]:
     ]
 
 
+def _name_inputs(inputs: Sequence[str]) -> str:
+    """Say that the inputs never change, or that there are none."""
+    if not inputs:
+        return "there is no input"
+    return f"the inputs {listed(inputs)} never change" if len(inputs) > 1 else f"the input {inputs[0]} never changes"
+
+
 def _varies(x: np.ndarray) -> bool:
     return bool(np.ptp(x) > 1e-12 * np.max(np.abs(x)))
 
 
 def _channels(
-    values: Any, names: Any, letter: str, role: str, label: str, none: bool = False
+    values: Any, names: Any, letter: str, role: str, label: str
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return a signal as a read-only (M, n) copy, and its names; `none` allows a signal without channels, (M, 0)."""
+    """Return a signal as a read-only (M, n) copy, and its names; n may be zero."""
     array = _signal(values, letter, label)
     n = array.shape[1]
-    if n == 0 and not none:
-        raise InputError(
-            f"{letter} of {label} has the shape {array.shape}; give an array of shape (samples, channels)."
-        )
     names = as_tuple(names)
     if not names and n:
         names = default_names(letter, n)

@@ -274,7 +274,7 @@ def check(
     InputError
         If simulator and recordings do not fit each other, or the simulation diverges or runs away from them.
     """
-    simulator, recordings = match_recordings(simulator, train, hold, excited=False)
+    simulator, recordings = match_recordings(simulator, train, hold)
     wanted = None if laws is None else check_laws(laws)
     stated = stated_hold(simulator, recordings, hold)
     now = _refit(Workbench.of(simulator, recordings, stated or "zero", engine), hold_said=stated is not None)
