@@ -314,20 +314,21 @@ class Recording:
             If the step is not a positive number, or too long.
         """
         positive(dt, "dt", "the new step in seconds")
-        u, y = (change_step(values, self.dt, dt) if values.shape[1] else values for values in (self.u, self.y))
-        if u is self.u:
+        values = np.hstack([self.u, self.y])
+        changed = change_step(values, self.dt, dt)
+        if changed is values:
             return self
+        u, y = changed[:, : self.n_u], changed[:, self.n_u :]
         hold = self.hold
-        if hold == "zero" and all(levels_last(self.t, column, dt) for column in self.u.T):
+        if self.n_u and hold == "zero" and all(levels_last(self.t, column, dt) for column in self.u.T):
             u = np.column_stack([hold_at(self.t, column, np.arange(len(u)) * dt, dt) for column in self.u.T])
-        elif hold:
+        elif self.n_u and hold:
             hold = "linear"
         skip = min(int(np.ceil(self.skip * self.dt / dt * (1 - SAME_STEP))), len(u) - 2)
         period = round((self.period or 0) * self.dt / dt)
         whole = bool(self.period) and abs(period * dt / ((self.period or 1) * self.dt) - 1) < SAME_STEP / period
         kept = period if whole and 2 <= period <= len(u) - skip else None
         initial = "estimate" if self.begins == "periodic" and kept is None else self.initial
-        y = y if self.n_y else np.empty((len(u), 0))
         return replace(self, u=u, y=y, dt=dt, skip=skip, period=kept, initial=initial, hold=hold)
 
     def to_frame(self) -> Any:
@@ -440,7 +441,7 @@ def check_for_identification(
             f"there are {scored} scored samples in {len(recordings)} recording(s), but at least {n_min} are needed; "
             "record longer or choose a smaller model."
         )
-    if excited and not any(_varies(r.u[:, i]) for r in recordings for i in range(r.n_u)):
+    if excited and moves_freely(recordings):
         raise InputError(
             f"{_name_inputs(first.inputs)} in {listed(labels)}; a model from input to output needs an input that "
             "changes. For a decay or a coast-down, give a Simulator, which the motion from its start excites."
@@ -451,6 +452,11 @@ def check_for_identification(
                 f"the output {name!r} never changes in {listed(labels)}; check the sensor or leave this output out."
             )
     return recordings
+
+
+def moves_freely(recordings: Sequence[Recording]) -> bool:
+    """Tell whether no input ever changes, so that motion comes from the starts alone, as in a decay."""
+    return not any(_varies(column) for r in recordings for column in r.u.T)
 
 
 def _distinct_labels(recordings: Sequence[Recording]) -> list[str]:
@@ -473,9 +479,7 @@ def _varies(x: np.ndarray) -> bool:
     return bool(np.ptp(x) > 1e-12 * np.max(np.abs(x)))
 
 
-def _channels(
-    values: Any, names: Any, letter: str, role: str, label: str
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def _channels(values: Any, names: Any, letter: str, role: str, label: str) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return a signal as a read-only (M, n) copy, and its names; n may be zero."""
     array = _signal(values, letter, label)
     n = array.shape[1]

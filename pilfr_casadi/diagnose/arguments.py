@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, Stages, listed
-from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
+from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification, moves_freely
 from ..laws import (
     CATALOGUE,
     SCALABLE,
@@ -65,8 +65,12 @@ class Request:
 
 
 def stated_hold(simulator: Any, recordings: Sequence[Recording], said: str | None) -> str | None:
-    """Return the hold that the user, the simulator or a recording states; None if none of them does."""
-    return next((h for h in (said, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
+    """Return the hold that the user, the simulator or a recording states; None if none of them does.
+
+    Without an input that changes, there is nothing to state: any hold is the same.
+    """
+    stated = next((h for h in (said, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
+    return stated or ("zero" if moves_freely(recordings) else None)
 
 
 def match_recordings(
@@ -209,8 +213,7 @@ def check_limits(simulator: Simulator, limits: Mapping[str, float] | None) -> No
     """Refuse a limit on a name that is not an input, and a limit that is not positive."""
     for name, most in (limits or {}).items():
         if name not in simulator.inputs:
-            raise InputError(
-                f"A limit was given for {name!r}, which is no input; there are {listed(simulator.inputs)}."
-            )
+            own = listed(simulator.inputs) or "none"
+            raise InputError(f"A limit was given for {name!r}, which is no input; the simulator has {own}.")
         if not most > 0:
             raise InputError(f"The limit of {name} is {most!r}; give the largest amplitude allowed, a positive number.")
