@@ -91,7 +91,8 @@ class Check:
     hold, starts : str, tuple of str
         Stated course of the inputs between samples ("" if not stated), and the start of each recording.
     hold_taken : str
-        The course with which the simulator was refitted: the stated one, or the one that fits better; "" without inputs.
+        The course with which the simulator was refitted: the stated one, or the one that fits better. "" without
+        inputs.
     switches : tuple of str
         Inputs that are only ever on or off: zero or one other value.
     idle_inputs : tuple of str
@@ -418,14 +419,12 @@ def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) 
 
 
 def _free_motions(recordings: Sequence[Recording]) -> Iterator[BlindSpot]:
-    """Find out whether nothing but the start excites the recordings, and all of them have the same travel."""
+    """Find out whether the start alone moves the recordings, and all of them have the same travel."""
     if not moves_freely(recordings):
         return
     travels = np.array([np.ptp(r.y[r.skip :], axis=0) for r in recordings])
     if np.all(np.ptp(travels, axis=0) <= SMALL_SHARE * np.max(travels, axis=0)):
-        text = (
-            "No input changes, and each amplitude occurs at one time only: an effect of it may look like one of time."
-        )
+        text = "This is free motion from one start: an effect of its amplitude may look like an effect of time."
         yield BlindSpot("one-path", (), text)
 
 
@@ -465,7 +464,7 @@ def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) ->
     if "one-path" in names:
         constant = in_words(names.get("constant-input", ()))
         varied = f"One in which {constant} varies, or a" if constant else "A"
-        return f"{varied} free motion from another start, such as half of it: it has each amplitude at another time."
+        return f"{varied} free motion from another start, such as half of it: each amplitude then has another time."
     if "constant-input" in names:
         return f"One in which {in_words(names['constant-input'])} varies."
     graded = [name for name in inputs if name not in found.switches]  # a switch has no other amplitude
@@ -488,9 +487,7 @@ def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) ->
     if "flat" in names or "followed" in names:
         return f"A longer one, {f'with other amplitudes and rates of {drive}' if inputs else 'from another start'}."
     if "start" in names:
-        return (
-            "One that begins at rest, with initial='zero'." if inputs else "One from a start that you know and state."
-        )
+        return "One that begins at rest, with initial='zero'." if inputs else "One whose start you know and state."
     if found.ties:
         return f"No further record of these signals helps: measure {found.ties[0].names[0]} separately and fix it."
     return "These recordings tell most things. For the test, take amplitudes that the training recordings do not have."
