@@ -188,8 +188,6 @@ class _Request:
     ) -> None:
         self.inputs, self.outputs = _check_names(inputs, "inputs"), _check_names(outputs, "outputs")
         self.dt, self.time_tolerance, self.new_step, self.options = dt, time_tolerance, resample, options
-        if not (self.inputs or self.outputs):
-            raise InputError("a recording needs at least one input or output; name its column.")
         known = [f.name for f in fields(Recording) if f.name not in ("u", "y", "dt", "inputs", "outputs")]
         for name in options:
             if name not in known:
@@ -258,6 +256,8 @@ class _Request:
         for name in [*wanted, time] if time else wanted:
             if list(names).count(name) > 1:
                 raise InputError(f"{source} has {list(names).count(name)} columns named {name!r}; rename all but one.")
+        if not wanted and (time is None or self.new_step is not None):
+            raise InputError(f"{source} is read without inputs and outputs, for its times alone; name a time column.")
         if time is None and self.dt is None:
             refuse_other_unit(names, source)
             raise InputError(
@@ -282,7 +282,7 @@ class _Request:
             label = f"{table.path}: column {time!r}"
             dt = step_of(t[:, 0], label, table.place, dt=self.dt, tolerance=self.time_tolerance)
         n_u = len(self.inputs)
-        none = np.empty((len(parts[0]), 0))
+        none = np.empty((len(parts[0] if parts else t), 0))  # times alone, or no input, or no output
         u, y = np.hstack([none, *parts[:n_u]]), np.hstack([none, *parts[n_u:]])
         names = _channel_names(self.inputs, parts[:n_u]), _channel_names(self.outputs, parts[n_u:])
         found = zip((*self.inputs, *self.outputs), map(table.unit, wanted), strict=True)

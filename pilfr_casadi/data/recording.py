@@ -444,7 +444,7 @@ def check_for_identification(
     if excited and moves_freely(recordings):
         raise InputError(
             f"{_name_inputs(first.inputs)} in {listed(labels)}; a model from input to output needs an input that "
-            "changes. For a decay or a coast-down, give a Simulator, which the motion from its start excites."
+            "changes. For a decay or a coast-down, use a simulator, with `pilfr diagnose` or `fit` in Python."
         )
     for i, name in enumerate(first.outputs):
         if not any(_varies(r.y[r.skip :, i]) for r in recordings):

@@ -461,12 +461,13 @@ def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) ->
             "None yet: either values, units, the start or the hold are wrong, so check its values and units, or large "
             "physics is missing, which `pilfr diagnose` finds out from these recordings."
         )
+    still = names.get("constant-input", ())
+    varied = f"One in which {in_words(still)} {'varies' if len(still) == 1 else 'vary'}"
     if "one-path" in names:
-        constant = in_words(names.get("constant-input", ()))
-        varied = f"One in which {constant} varies, or a" if constant else "A"
-        return f"{varied} free motion from another start, such as half of it: each amplitude then has another time."
-    if "constant-input" in names:
-        return f"One in which {in_words(names['constant-input'])} varies."
+        begin = f"{varied}, or a" if still else "A"
+        return f"{begin} free motion from another start, such as half of it: each amplitude then has another time."
+    if still:
+        return f"{varied}."
     graded = [name for name in inputs if name not in found.switches]  # a switch has no other amplitude
     drive = next(iter([*graded, *inputs]), "the input")
     signals = [port for kind in MOTION for port in names.get(kind, ()) if kind_of(port) == ACTUATOR]
