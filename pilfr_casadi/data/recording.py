@@ -314,11 +314,9 @@ class Recording:
             If the step is not a positive number, or too long.
         """
         positive(dt, "dt", "the new step in seconds")
-        values = np.hstack([self.u, self.y])
-        changed = change_step(values, self.dt, dt)
-        if changed is values:
+        u, y = (change_step(values, self.dt, dt) for values in (self.u, self.y))
+        if u is self.u:
             return self
-        u, y = changed[:, : self.n_u], changed[:, self.n_u :]
         hold = self.hold
         if self.n_u and hold == "zero" and all(levels_last(self.t, column, dt) for column in self.u.T):
             u = np.column_stack([hold_at(self.t, column, np.arange(len(u)) * dt, dt) for column in self.u.T])

@@ -424,7 +424,7 @@ def _free_motions(recordings: Sequence[Recording]) -> Iterator[BlindSpot]:
         return
     travels = np.array([np.ptp(r.y[r.skip :], axis=0) for r in recordings])
     if np.all(np.ptp(travels, axis=0) <= SMALL_SHARE * np.max(travels, axis=0)):
-        text = "This is free motion from one start: an effect of its amplitude may look like an effect of time."
+        text = "No input changes and there is one start: an effect of the amplitude may look like an effect of time."
         yield BlindSpot("one-path", (), text)
 
 
@@ -464,8 +464,8 @@ def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) ->
     still = names.get("constant-input", ())
     varied = f"One in which {in_words(still)} {'varies' if len(still) == 1 else 'vary'}"
     if "one-path" in names:
-        begin = f"{varied}, or a" if still else "A"
-        return f"{begin} free motion from another start, such as half of it: each amplitude then has another time."
+        begin = f"{varied}, or one" if still else "One"
+        return f"{begin} from another start, such as half of it: each amplitude then has another time."
     if still:
         return f"{varied}."
     graded = [name for name in inputs if name not in found.switches]  # a switch has no other amplitude

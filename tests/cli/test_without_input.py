@@ -26,7 +26,7 @@ def test_the_missing_friction_is_named(capsys, rig):
     status, said, err = run(capsys, *given, "--out", out)
     assert status == 0 and "warning" not in err
     assert "inputs none, outputs angle" in said and "leaves out Coulomb friction at bearing." in said
-    assert "free motion from one start" in said
+    assert "No input changes and there is one start" in said
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "Diagnosis of a simulator: angle" in page and "no input" in page and "from the start alone" in page
     status, said, _ = run(capsys, "simulate", out / "corrected.py", folder / "test.csv", "--out", folder / "sim.csv")
@@ -45,11 +45,11 @@ def test_a_free_motion_is_simulated_and_exported_from_a_given_start(capsys, rig)
 def test_check_tells_what_one_decay_hides_and_names_forms(capsys, rig):
     status, said, _ = run(capsys, "check", rig, rig.parent / "train.csv", "--laws", "coulomb_friction")
     assert status == 0 and "between samples" not in said
-    assert "- This is free motion from one start" in said and "next record: A free motion from another start" in said
+    assert "- No input changes and there is one start" in said and "next record: One from another start" in said
     for form in ("(smooth)", "(presliding)", "(asymmetric)"):
         assert f"bearing  Coulomb friction {form}" in said
     both = run(capsys, "check", rig, rig.parent / "train.csv", rig.parent / "test.csv", "--laws", "coulomb_friction")
-    assert "free motion from one start" not in both[1]
+    assert "there is one start" not in both[1]
 
 
 def test_a_black_box_model_still_needs_an_input(capsys, rig):

@@ -215,6 +215,7 @@ def test_a_recording_may_lack_inputs():
     y = np.exp(-0.1 * np.arange(30.0))
     r = Recording(np.empty((30, 0)), y, 0.1, outputs=("T",), units={"T": "K"}, name="cooling", hold="zero")
     assert (r.n_u, r.inputs, r.slice(2).u.shape) == (0, (), (28, 0)) and "inputs none, outputs T [K]" in repr(r)
+    assert r.with_(y=r.u, outputs=(), units={}).resample(0.2).u.shape == (15, 0)
     coarse = r.resample(0.2)
     assert coarse.u.shape == (15, 0) and coarse.dt == 0.2 and coarse.hold == "zero"
     assert pickle.loads(pickle.dumps(r)).n_u == 0 and mean_period(r.with_(period=10)).u.shape == (10, 0)
