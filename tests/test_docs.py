@@ -45,6 +45,7 @@ SAID = {
     "docs/start/tank.md": "leaves out dead zone at actuator:pump.",
     "docs/howto/closed_loop.md": "leaves out Coulomb friction at guide.",
     "docs/howto/mujoco.md": "leaves out Coulomb friction at shoulder.",
+    "docs/howto/no_input.md": "leaves out Coulomb friction at bearing.",
     "docs/howto/delay.md": "leaves out delay at sensor:x2 and Coulomb friction at ground-m2.",
     "docs/diagnose.md": "leaves out Coulomb friction at ground-m2.",
     "docs/howto/ports.md": "['equation:vel', 'actuator:force', 'sensor:position']",

@@ -408,7 +408,7 @@ def print_note(simulator: Any) -> None:
 def print_recordings(kind: str, recordings: Mapping[str, Recording]) -> None:
     """Print a line about each recording, given by the path of its file."""
     for path, r in recordings.items():
-        names = f"inputs {', '.join(r.inputs)}, outputs {', '.join(r.outputs)}"
+        names = f"inputs {', '.join(r.inputs) or 'none'}, outputs {', '.join(r.outputs)}"
         print_line(f"{kind} data: {path}, {len(r)} samples, step {r.dt:.6g} s, {names}")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
@@ -34,6 +34,7 @@ from ..data import (
     explains_nothing,
     nrmse,
     read_stack,
+    with_unit,
     written_times,
 )
 from ..engine import VirtualMachine, compiler, make_engine
@@ -296,7 +297,7 @@ def simulate_command(options: SimulateOptions) -> int:
         print(f"note: {note}")
     recording = fitted.matched(recording)
     y = replace(fitted, engine=announce_engine(fitted, recording, "auto", quiet=True)).simulate(recording)
-    return _write_simulated(options, recording, y, fitted.model.outputs, columns, fitted.scored_from)
+    return _write_simulated(options, recording, y, fitted.model.outputs, fitted.units, columns, fitted.scored_from)
 
 
 def _simulate_equations(options: SimulateOptions) -> int:
@@ -308,7 +309,7 @@ def _simulate_equations(options: SimulateOptions) -> int:
     for note in unit_notes(simulator.units, recording).values():
         print(f"note: {note}")
     seen, y, first = run_simulator(simulator, recording)
-    return _write_simulated(options, seen, y, simulator.output_names, columns, lambda _: first)
+    return _write_simulated(options, seen, y, simulator.output_names, simulator.units, columns, lambda _: first)
 
 
 def _read_to_simulate(
@@ -329,13 +330,17 @@ def _write_simulated(
     recording: Recording,
     y: np.ndarray,
     outputs: Sequence[str],
+    units: Mapping[str, str],
     columns: dict[str, str],
     scored_from: Callable[[Recording], int],
 ) -> int:
-    """Write the simulated outputs; print their error, or the initial state if none were measured."""
+    """Write the simulated outputs; print their error, or the initial state if none were measured.
+
+    `units` are those of the model.
+    """
     if not np.all(np.isfinite(y)):
         return say(f"The simulation of {options.model} diverges on {options.data}; nothing was written.", NO_RESULT)
-    write_atomically(Path(options.out), _recording_table(options, recording, y, outputs, columns))
+    write_atomically(Path(options.out), _recording_table(options, recording, y, outputs, units, columns))
     if recording.n_y:
         _print_error(recording, y, scored_from)
     else:
@@ -377,7 +382,12 @@ def _check_initial(options: SimulateOptions, lack: str) -> None:
 
 
 def _recording_table(
-    options: SimulateOptions, recording: Recording, y: np.ndarray, outputs: Sequence[str], columns: dict[str, str]
+    options: SimulateOptions,
+    recording: Recording,
+    y: np.ndarray,
+    outputs: Sequence[str],
+    units: Mapping[str, str],
+    columns: dict[str, str],
 ) -> str:
     """Write the times as in the file, the inputs, and the simulated outputs as CSV."""
     wanted = [columns.get(name, name) for name in (*recording.inputs, *recording.outputs)]
@@ -385,7 +395,9 @@ def _recording_table(
     times = written or map(_time_text, recording.t)
     rows = np.column_stack([recording.u, y]).tolist()
     lines = [[t.strip(), *row] for t, row in zip(times, rows, strict=True)]
-    return csv_text([["t", *recording.inputs, *outputs], *lines])
+    known = {**recording.units, **units}  # of a channel in both, the recording is in the model's unit
+    names = [with_unit(name, known.get(name, "")) for name in (*recording.inputs, *outputs)]
+    return csv_text([["t", *names], *lines])
 
 
 def _time_text(t: float) -> str:
@@ -432,7 +444,8 @@ def _stack_content(out: Path, u: np.ndarray, y: np.ndarray, dt: float, fitted: F
         else:
             np.save(buffer, y)
         return buffer.getvalue()
-    lines: list[list[Any]] = [["record", "t", *fitted.model.inputs, *fitted.model.outputs]]
+    names = [with_unit(name, fitted.units.get(name, "")) for name in (*fitted.model.inputs, *fitted.model.outputs)]
+    lines: list[list[Any]] = [["record", "t", *names]]
     for record, index in enumerate(np.ndindex(*u.shape[2:])):
         at = (slice(None), slice(None), *index)
         for k, row in enumerate(np.hstack([u[at], y[at]]).tolist()):

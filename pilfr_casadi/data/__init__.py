@@ -53,6 +53,7 @@ if TYPE_CHECKING:
         check_for_identification as check_for_identification,
         default_names as default_names,
         fingerprint as fingerprint,
+        moves_freely as moves_freely,
     )
     from .tables import STACK_SUFFIXES as STACK_SUFFIXES, TABLE_SUFFIXES as TABLE_SUFFIXES, read_stack as read_stack
     from .time_grid import step_of as step_of

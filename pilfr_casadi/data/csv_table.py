@@ -54,7 +54,7 @@ class CsvTable:
     def _columns(self, names: Sequence[str], time: str | None) -> list[Array]:
         """Return each named column as numbers, (M, 1), nan where one is missing; last the times, none missing."""
         if time is not None and self._has_dates(time):
-            return [*self._columns(names, None), self._count_seconds(time)]
+            return [*(self._columns(names, None) if names else ()), self._count_seconds(time)]
         names = [*names, time] if time is not None else names
         where = [self.names.index(name) for name in names]
         may_miss = np.array([name != time for name in names])

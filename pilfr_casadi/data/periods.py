@@ -169,4 +169,4 @@ def _by_period(recording: Recording, x: Array) -> Array:
             f"{recording.label} has {steady} steady samples, which are not whole periods of {recording.period}; "
             "cut it, or correct `period` or `skip`."
         )
-    return x[recording.skip :].reshape(-1, recording.period, x.shape[1])
+    return x[recording.skip :].reshape(steady // recording.period, recording.period, x.shape[1])

@@ -57,8 +57,8 @@ def read_csv(
         One file, or a list of files with the same columns.
     inputs, outputs : str or sequence of str
         Names of the inputs and outputs, and of their columns unless `columns` maps them. A unit behind a column's name,
-        as in ``force [N]`` or ``force (N)``, becomes the unit of the channel. Without outputs (`()`) the recording can
-        be simulated but not fitted.
+        as in ``force [N]`` or ``force (N)``, becomes the unit of the channel. Without inputs (`()`) the recording is a
+        free motion, such as a decay. Without outputs it can be simulated but not fitted.
     columns : mapping, optional
         Column by name, e.g. ``{"force": "u_vir_V"}``; the key ``"t"`` chooses the time column.
     dt : float, optional
@@ -188,11 +188,6 @@ class _Request:
     ) -> None:
         self.inputs, self.outputs = _check_names(inputs, "inputs"), _check_names(outputs, "outputs")
         self.dt, self.time_tolerance, self.new_step, self.options = dt, time_tolerance, resample, options
-        if not self.inputs:
-            raise InputError(
-                "a recording needs at least one input; name its column. To merge a file of sensors only, read these as "
-                "inputs with outputs=(), and give merge the inputs and outputs of the result."
-            )
         known = [f.name for f in fields(Recording) if f.name not in ("u", "y", "dt", "inputs", "outputs")]
         for name in options:
             if name not in known:
@@ -261,6 +256,8 @@ class _Request:
         for name in [*wanted, time] if time else wanted:
             if list(names).count(name) > 1:
                 raise InputError(f"{source} has {list(names).count(name)} columns named {name!r}; rename all but one.")
+        if not wanted and (time is None or self.new_step is not None):
+            raise InputError(f"{source} is read without inputs and outputs, for its times alone; name a time column.")
         if time is None and self.dt is None:
             refuse_other_unit(names, source)
             raise InputError(
@@ -285,7 +282,8 @@ class _Request:
             label = f"{table.path}: column {time!r}"
             dt = step_of(t[:, 0], label, table.place, dt=self.dt, tolerance=self.time_tolerance)
         n_u = len(self.inputs)
-        u, y = np.hstack(parts[:n_u]), np.hstack([np.empty((len(parts[0]), 0)), *parts[n_u:]])
+        none = np.empty((len(parts[0] if parts else t), 0))  # times alone, or no input, or no output
+        u, y = np.hstack([none, *parts[:n_u]]), np.hstack([none, *parts[n_u:]])
         names = _channel_names(self.inputs, parts[:n_u]), _channel_names(self.outputs, parts[n_u:])
         found = zip((*self.inputs, *self.outputs), map(table.unit, wanted), strict=True)
         units = {name: unit for name, unit in found if unit and name in names[0] + names[1]}

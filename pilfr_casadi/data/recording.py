@@ -15,6 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from .._base import REPAIR, InputError, is_number, is_whole, later, listed, positive, real_array, usable
+from .columns import with_unit
 from .preprocessing import butterworth, change_step, hold_at, levels_last, remove_trend
 from .units import conversion
 
@@ -30,7 +31,8 @@ class Recording:
     Parameters
     ----------
     u : array, (M, n_u) or (M,)
-        Inputs at the samples. Copied; stored as a read-only (M, n_u) array.
+        Inputs at the samples. Copied; stored as a read-only (M, n_u) array. (M, 0) is a recording without inputs, such
+        as a free decay; it suits a simulator without inputs.
     y : array, (M, n_y) or (M,)
         Outputs at the same samples. Copied; stored as a read-only (M, n_y) array. With (M, 0), no measured output, a
         recording can be simulated but not fitted.
@@ -77,7 +79,7 @@ class Recording:
 
     def __post_init__(self) -> None:
         u, inputs = _channels(self.u, self.inputs, "u", "input", self.label)
-        y, outputs = _channels(self.y, self.outputs, "y", "output", self.label, none=True)
+        y, outputs = _channels(self.y, self.outputs, "y", "output", self.label)
         if len(u) != len(y):
             raise InputError(
                 f"{self.label} has {len(u)} samples of u but {len(y)} of y; give arrays of shape (samples, channels) "
@@ -142,11 +144,11 @@ class Recording:
 
     def __repr__(self) -> str:
         def channels(names: tuple[str, ...]) -> str:
-            return ", ".join(f"{n} [{self.units[n]}]" if n in self.units else n for n in names)
+            return ", ".join(with_unit(n, self.units.get(n, "")) for n in names) or "none"
 
         head = f"Recording {self.name!r}" if self.name else "Recording"
         text = f"{head}: {len(self)} samples, dt {self.dt:.6g} s ({len(self) * self.dt:.4g} s), "
-        text += f"inputs {channels(self.inputs)}, outputs {channels(self.outputs) or 'none'}"
+        text += f"inputs {channels(self.inputs)}, outputs {channels(self.outputs)}"
         extras = {"period": self.period, "hold": self.hold, "skip": self.skip or None}
         initial = self.begins
         shown = [f"initial {initial}", *(f"{key} {value}" for key, value in extras.items() if value is not None)]
@@ -312,20 +314,19 @@ class Recording:
             If the step is not a positive number, or too long.
         """
         positive(dt, "dt", "the new step in seconds")
-        u, y = (change_step(values, self.dt, dt) if values.shape[1] else values for values in (self.u, self.y))
+        u, y = (change_step(values, self.dt, dt) for values in (self.u, self.y))
         if u is self.u:
             return self
         hold = self.hold
-        if hold == "zero" and all(levels_last(self.t, column, dt) for column in self.u.T):
+        if self.n_u and hold == "zero" and all(levels_last(self.t, column, dt) for column in self.u.T):
             u = np.column_stack([hold_at(self.t, column, np.arange(len(u)) * dt, dt) for column in self.u.T])
-        elif hold:
+        elif self.n_u and hold:
             hold = "linear"
         skip = min(int(np.ceil(self.skip * self.dt / dt * (1 - SAME_STEP))), len(u) - 2)
         period = round((self.period or 0) * self.dt / dt)
         whole = bool(self.period) and abs(period * dt / ((self.period or 1) * self.dt) - 1) < SAME_STEP / period
         kept = period if whole and 2 <= period <= len(u) - skip else None
         initial = "estimate" if self.begins == "periodic" and kept is None else self.initial
-        y = y if self.n_y else np.empty((len(u), 0))
         return replace(self, u=u, y=y, dt=dt, skip=skip, period=kept, initial=initial, hold=hold)
 
     def to_frame(self) -> Any:
@@ -438,17 +439,22 @@ def check_for_identification(
             f"there are {scored} scored samples in {len(recordings)} recording(s), but at least {n_min} are needed; "
             "record longer or choose a smaller model."
         )
-    if excited and not any(_varies(r.u[:, i]) for r in recordings for i in range(r.n_u)):
-        inputs = (
-            f"inputs {listed(first.inputs)} never change" if first.n_u > 1 else f"input {first.inputs[0]} never changes"
+    if excited and moves_freely(recordings):
+        raise InputError(
+            f"{_name_inputs(first.inputs)} in {listed(labels)}; a model from input to output needs an input that "
+            "changes. For a decay or a coast-down, use a simulator, with `pilfr diagnose` or `fit` in Python."
         )
-        raise InputError(f"the {inputs} in {listed(labels)}; nothing can be identified without excitation.")
     for i, name in enumerate(first.outputs):
         if not any(_varies(r.y[r.skip :, i]) for r in recordings):
             raise InputError(
                 f"the output {name!r} never changes in {listed(labels)}; check the sensor or leave this output out."
             )
     return recordings
+
+
+def moves_freely(recordings: Sequence[Recording]) -> bool:
+    """Tell whether no input ever changes, so that motion comes from the starts alone, as in a decay."""
+    return not any(_varies(column) for r in recordings for column in r.u.T)
 
 
 def _distinct_labels(recordings: Sequence[Recording]) -> list[str]:
@@ -460,20 +466,21 @@ def _distinct_labels(recordings: Sequence[Recording]) -> list[str]:
     ]
 
 
+def _name_inputs(inputs: Sequence[str]) -> str:
+    """Say that the inputs never change, or that there are none."""
+    if not inputs:
+        return "there is no input"
+    return f"the inputs {listed(inputs)} never change" if len(inputs) > 1 else f"the input {inputs[0]} never changes"
+
+
 def _varies(x: np.ndarray) -> bool:
     return bool(np.ptp(x) > 1e-12 * np.max(np.abs(x)))
 
 
-def _channels(
-    values: Any, names: Any, letter: str, role: str, label: str, none: bool = False
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return a signal as a read-only (M, n) copy, and its names; `none` allows a signal without channels, (M, 0)."""
+def _channels(values: Any, names: Any, letter: str, role: str, label: str) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return a signal as a read-only (M, n) copy, and its names; n may be zero."""
     array = _signal(values, letter, label)
     n = array.shape[1]
-    if n == 0 and not none:
-        raise InputError(
-            f"{letter} of {label} has the shape {array.shape}; give an array of shape (samples, channels)."
-        )
     names = as_tuple(names)
     if not names and n:
         names = default_names(letter, n)

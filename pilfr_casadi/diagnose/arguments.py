@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, Stages, listed
-from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
+from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification, moves_freely
 from ..laws import (
     CATALOGUE,
     SCALABLE,
@@ -65,16 +65,20 @@ class Request:
 
 
 def stated_hold(simulator: Any, recordings: Sequence[Recording], said: str | None) -> str | None:
-    """Return the hold that the user, the simulator or a recording states; None if none of them does."""
-    return next((h for h in (said, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
+    """Return the hold that the user, the simulator or a recording states; None if none of them does.
+
+    Without an input that changes, there is nothing to state: any hold is the same.
+    """
+    stated = next((h for h in (said, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
+    return stated or ("zero" if moves_freely(recordings) else None)
 
 
 def match_recordings(
-    simulator: Any, train: Recording | Sequence[Recording], hold: str | None, excited: bool = True
+    simulator: Any, train: Recording | Sequence[Recording], hold: str | None
 ) -> tuple[Simulator, tuple[Recording, ...]]:
     """Return the simulator, and the recordings with its channels in its order.
 
-    With `excited`, recordings in which no input ever changes are refused.
+    Inputs may be constant or absent: the motion from a start, such as a decay, excites as well.
 
     Raises
     ------
@@ -86,7 +90,7 @@ def match_recordings(
     given = as_recordings(train)
     simulator = as_simulator(simulator, given)
     recordings = [simulator.matched(r) for r in given]
-    return simulator, check_for_identification(recordings, FEWEST_SAMPLES, excited)
+    return simulator, check_for_identification(recordings, FEWEST_SAMPLES, excited=False)
 
 
 def match_tests(
@@ -209,8 +213,7 @@ def check_limits(simulator: Simulator, limits: Mapping[str, float] | None) -> No
     """Refuse a limit on a name that is not an input, and a limit that is not positive."""
     for name, most in (limits or {}).items():
         if name not in simulator.inputs:
-            raise InputError(
-                f"A limit was given for {name!r}, which is no input; there are {listed(simulator.inputs)}."
-            )
+            own = listed(simulator.inputs) or "none"
+            raise InputError(f"A limit was given for {name!r}, which is no input; the simulator has {own}.")
         if not most > 0:
             raise InputError(f"The limit of {name} is {most!r}; give the largest amplitude allowed, a positive number.")

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from .._base import in_words, one_blas_thread, to_json
-from ..data import Recording
+from ..data import Recording, moves_freely
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, UNKNOWN, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings, stated_hold
-from .detectability import LawRow, assess_laws, group_alike
+from .detectability import SMALL_SHARE, LawRow, assess_laws, group_alike
 from .excitation import Excitation, excitations
 from .faults.channels import correct_gross_slips, refit_corrected
 from .faults.gates import USELESS_FIT, Checked, Gate
@@ -38,7 +38,7 @@ IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the bl
     "flat": ("no: flat within its bounds", "These recordings say less about {} than the bounds do."),
     "start": (
         "no: traded off with the unknown start",
-        "{} cannot be distinguished from the unknown initial state; say initial='zero' if it was zero.",
+        "{} cannot be distinguished from the unknown initial state; state it if you know it, such as initial='zero'.",
     ),
     "tied": ("no: traded off, see above", ""),
     "port": ("only with a law at its port", ""),
@@ -91,7 +91,8 @@ class Check:
     hold, starts : str, tuple of str
         Stated course of the inputs between samples ("" if not stated), and the start of each recording.
     hold_taken : str
-        The course with which the simulator was refitted: the stated one, or the one that fits better.
+        The course with which the simulator was refitted: the stated one, or the one that fits better. "" without
+        inputs.
     switches : tuple of str
         Inputs that are only ever on or off: zero or one other value.
     idle_inputs : tuple of str
@@ -189,9 +190,9 @@ class Check:
             for r in sorted((r for r in self.detectable if r.port == port), key=lambda r: r.share or 0.0):
                 share = "" if r.share is None else f"{100 * r.share:.2g} %"
                 strength = "{} = {:.2g} {}".format(*r.strength).rstrip() if r.strength else ""
-                rows.append((label, display_name(r.law), f"{r.force:.2g} {r.unit}".rstrip(), share, strength))
+                rows.append((label, display_name(r.law, r.form), f"{r.force:.2g} {r.unit}".rstrip(), share, strength))
             hidden = [r for r in self.laws if r.port == port and r.status != "detectable"]
-            rows += [(label, display_name(r.law), f"no: {_why(r)}", "", "") for r in sorted(hidden, key=_why)]
+            rows += [(label, display_name(r.law, r.form), f"no: {_why(r)}", "", "") for r in sorted(hidden, key=_why)]
         columns = ("port", "law", "detectable from (rms)", "share", "strength")
         yield from _table(columns, rows) if rows else ["No law is detectable at any port."]
 
@@ -214,9 +215,10 @@ class Check:
         each = ((f"{name} {value:.2g}", port_name(SENSOR, name)) for name, value in self.noise["deviation"].items())
         noise = ", ".join(f"{text} {units.get(port, '')}".rstrip() for text, port in each)
         yield f"noise ({self.noise['source']}): {noise}"
-        taken = HOLD_WORDS[self.hold_taken]
-        unsaid = f"not stated, here taken as {taken}; say hold='zero' or hold='linear' if you know"
-        yield f"inputs between samples: {taken if self.hold else unsaid}"
+        if self.hold_taken:
+            taken = HOLD_WORDS[self.hold_taken]
+            unsaid = f"not stated, here taken as {taken}; say hold='zero' or hold='linear' if you know"
+            yield f"inputs between samples: {taken if self.hold else unsaid}"
         yield f"start of each recording: {', '.join(self.starts)}"
         if self.unknown_domains:
             where = in_words(self.unknown_domains)
@@ -274,7 +276,7 @@ def check(
     InputError
         If simulator and recordings do not fit each other, or the simulation diverges or runs away from them.
     """
-    simulator, recordings = match_recordings(simulator, train, hold, excited=False)
+    simulator, recordings = match_recordings(simulator, train, hold)
     wanted = None if laws is None else check_laws(laws)
     stated = stated_hold(simulator, recordings, hold)
     now = _refit(Workbench.of(simulator, recordings, stated or "zero", engine), hold_said=stated is not None)
@@ -339,8 +341,8 @@ def assess_recordings(
             "share": dict(zip(outputs, (noise / bench.scale).tolist(), strict=True)),
         },
         error=bench.nrmse(fitted),
-        hold=stated,
-        hold_taken=bench.hold,
+        hold=stated if inputs else "",
+        hold_taken=bench.hold if inputs else "",
         idle_inputs=bench.simulator.idle_inputs,
         unknown_domains=tuple(p.name for p in bench.simulator.ports if not p.series and p.domain == UNKNOWN),
         starts=tuple(START_WORDS[r.begins] for r in bench.recordings),
@@ -348,9 +350,8 @@ def assess_recordings(
     )
     swings = np.ptp(np.concatenate([r.u for r in bench.recordings]), axis=0)
     still = [name for name, swing in zip(inputs, swings, strict=True) if not swing > 0]
-    found = replace(
-        found, blind_spots=tuple(_find_blind_spots(found, still, _alive_as_given(quiet, fitted, parameters)))
-    )
+    spots = _find_blind_spots(found, still, _alive_as_given(quiet, fitted, parameters))
+    found = replace(found, blind_spots=(*spots, *_free_motions(bench.recordings)))
     sensors = helpful_sensors(response, runs) if ties else ()
     return replace(found, next_record=_next_record(found, inputs, sensors), seconds=time.perf_counter() - began)
 
@@ -417,15 +418,25 @@ def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) 
         yield from spot("alike-ports", group, "A law looks the same at {}.")
 
 
+def _free_motions(recordings: Sequence[Recording]) -> Iterator[BlindSpot]:
+    """Find out whether the start alone moves the recordings, and all of them have the same travel."""
+    if not moves_freely(recordings):
+        return
+    travels = np.array([np.ptp(r.y[r.skip :], axis=0) for r in recordings])
+    if np.all(np.ptp(travels, axis=0) <= SMALL_SHARE * np.max(travels, axis=0)):
+        text = "No input changes and there is one start: an effect of the amplitude may look like an effect of time."
+        yield BlindSpot("one-path", (), text)
+
+
 def _followed_laws(found: Check, port: str) -> Iterator[BlindSpot]:
     """Find the laws of a port that the simulator's own parameters imitate, grouped by parameter."""
     followed = [r for r in found.laws if r.port == port and r.status == "followed" and r.law not in LINEAR]
     for why in dict.fromkeys(r.why for r in followed):
-        own = tuple(r.law for r in followed if r.why == why)
+        rows = [r for r in followed if r.why == why]
         what = _describe_change(why) if any(why == p.name for p in found.parameters) else why
-        names = in_words([display_name(name) for name in own])
+        names = in_words([display_name(r.law, r.form) for r in rows])
         text = f"{names[0].upper()}{names[1:]} at {port} cannot be distinguished from {what}."
-        yield BlindSpot("followed", (port, *own), text)
+        yield BlindSpot("followed", (port, *dict.fromkeys(r.law for r in rows)), text)
 
 
 def _alike_ports(found: Check) -> list[list[str]]:
@@ -450,8 +461,13 @@ def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) ->
             "None yet: either values, units, the start or the hold are wrong, so check its values and units, or large "
             "physics is missing, which `pilfr diagnose` finds out from these recordings."
         )
-    if "constant-input" in names:
-        return f"One in which {in_words(names['constant-input'])} varies."
+    still = names.get("constant-input", ())
+    varied = f"One in which {in_words(still)} {'varies' if len(still) == 1 else 'vary'}"
+    if "one-path" in names:
+        begin = f"{varied}, or one" if still else "One"
+        return f"{begin} from another start, such as half of it: each amplitude then has another time."
+    if still:
+        return f"{varied}."
     graded = [name for name in inputs if name not in found.switches]  # a switch has no other amplitude
     drive = next(iter([*graded, *inputs]), "the input")
     signals = [port for kind in MOTION for port in names.get(kind, ()) if kind_of(port) == ACTUATOR]
@@ -470,9 +486,9 @@ def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) ->
         sensor = f"One with another sensor between {in_words(group)}."
         return f"One that also measures the force at {forces[0]}." if forces else sensor
     if "flat" in names or "followed" in names:
-        return f"A longer one, with other amplitudes and rates of {drive}."
+        return f"A longer one, {f'with other amplitudes and rates of {drive}' if inputs else 'from another start'}."
     if "start" in names:
-        return "One that begins at rest, with initial='zero'."
+        return "One that begins at rest, with initial='zero'." if inputs else "One whose start you know and state."
     if found.ties:
         return f"No further record of these signals helps: measure {found.ties[0].names[0]} separately and fix it."
     return "These recordings tell most things. For the test, take amplitudes that the training recordings do not have."

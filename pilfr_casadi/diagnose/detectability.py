@@ -45,6 +45,7 @@ class LawRow:
     # name, value and unit of the law's strength at that force, for laws with one strength
     strength: tuple[str, float, str] | None = None
     why: str = ""  # the parameter that imitates it, or the reason why there is no data
+    form: str = ""  # of laws that were asked for, which may be several forms of one law
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,15 +83,15 @@ def assess_laws(
         if not wanted:
             continue
         task = replace(task, pairs=[(law, shapes) for law, shapes in task.pairs if type(law) in wanted])
-        for row, response in _assess_port(rest, task, base, own, levels[task.index], names):
-            rows.append(row)
+        for form, row, response in _assess_port(rest, task, base, own, levels[task.index], names):
+            rows.append(row if laws is None else replace(row, form=form))
             responses += [response] if response else []
         seen = {type(law) for law, _ in task.pairs}
         for law in (law for law in wanted if law not in seen):
             jumps = np.ptp(task.local.z) > 0 and not np.any(task.local.dz)
             still = "its coordinate jumps and has no rate, like a held input" if jumps else "its signals do not change"
             why = law().why_not(task.local) or still
-            rows.append(LawRow(task.port.name, law.id, "no data", why=why))
+            rows.append(LawRow(task.port.name, law.id, "no data", why=why, form=law.form if laws else ""))
     return tuple(rows), _group_responses(responses)
 
 
@@ -103,8 +104,8 @@ def _select_laws(port: Port, laws: Sequence[type[Law]] | None) -> tuple[type[Law
 
 def _assess_port(
     rest: Remainder, task: Task, base: np.ndarray, own: np.ndarray, level: float | None, names: Sequence[str]
-) -> Iterator[tuple[LawRow, _Response | None]]:
-    """Assess the laws of one port; yield the row of each law, and its response if it is detectable."""
+) -> Iterator[tuple[str, LawRow, _Response | None]]:
+    """Assess the laws of one port; yield the form and the row of each, and its response if it is detectable."""
     w_unit, z_unit = port_units(task.port, rest.bench.recordings[0])
     most = level or np.inf
     for law, doses in rest.doses(task):
@@ -119,13 +120,13 @@ def _assess_port(
         share = force / level if force and level else None
         row = LawRow(task.port.name, law.id, "detectable", force, w_unit, share)
         if force is None or force > most:
-            yield _undetectable(row, dose.phi, most, own, names), None
+            yield law.form, _undetectable(row, dose.phi, most, own, names), None
             continue
         if len(law.strength) == 1 and dose.phi.shape[1] == 1:
             unit = readable_unit(law.units[law.strength[0]], w_unit, z_unit)
             row = replace(row, strength=(law.strength[0], force / float(dose.size[0]), unit))
         spans = [orthonormal(phi) for phi in left if np.any(phi)]
-        yield row, _Response((task.port.name, law.id), left[middle].sum(axis=1), spans, most * size)
+        yield law.form, row, _Response((task.port.name, law.id), left[middle].sum(axis=1), spans, most * size)
 
 
 def _undetectable(row: LawRow, phi: np.ndarray, most: float, own: np.ndarray, names: Sequence[str]) -> LawRow:

@@ -130,7 +130,8 @@ def _envelope(v: np.ndarray) -> np.ndarray:
     """Compute the amplitude (M,): modulus of the analytic signal about the mean, over all columns."""
     from scipy.signal import hilbert
 
-    return np.asarray(np.sqrt(np.mean(np.abs(hilbert(v - np.mean(v, axis=0), axis=0)) ** 2, axis=1)))
+    power = np.sum(np.abs(hilbert(v - np.mean(v, axis=0), axis=0)) ** 2, axis=1)
+    return np.asarray(np.sqrt(power / max(v.shape[1], 1)))  # without a column, zero
 
 
 def _bin_indices(x: np.ndarray, edges: np.ndarray) -> np.ndarray:

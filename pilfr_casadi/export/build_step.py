@@ -152,10 +152,8 @@ def _discretise_over_sample(model: Simulator, dt: float, hold: str | None, subst
 
 def _choose_substeps_at_rest(simulator: Simulator, dt: float) -> int:
     """Choose sub-steps per sample from the fastest eigenvalue at rest."""
-    # a recording needs an input, so a simulator without inputs gets one that its equations do not read
-    driven = simulator if simulator.inputs else replace(simulator, inputs=("none",))
-    u, y = (np.zeros((REST_SAMPLES, len(names))) for names in (driven.inputs, driven.output_names))
-    return choose_substeps(driven, [Recording(u, y, dt)])
+    u, y = (np.zeros((REST_SAMPLES, len(names))) for names in (simulator.inputs, simulator.output_names))
+    return choose_substeps(simulator, [Recording(u, y, dt)])
 
 
 def _find_start_state(model: Any, closed: Model, step: Exported, start: Any) -> np.ndarray | None:

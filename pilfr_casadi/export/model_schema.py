@@ -84,7 +84,7 @@ class Signals(Table):
     @model_validator(mode="after")
     def _check(self) -> Self:
         inputs, outputs = self.names
-        if not (inputs and outputs and all(inputs + outputs)) or len({*inputs, *outputs}) < len(inputs + outputs):
+        if not (outputs and all(inputs + outputs)) or len({*inputs, *outputs}) < len(inputs + outputs):
             raise ValueError("the names of inputs and outputs are missing or not distinct")
         if self.dt <= 0:
             raise ValueError(f"the step dt is {self.dt:g} s")

@@ -253,7 +253,9 @@ def check_recordings(
         unknowns = max(int(model.model(first.n_u, first.n_y).parameters.free.sum()), 10 * model.nx)
     else:
         unknowns = int((model.model if isinstance(model, Fit) else model).parameters.free.sum())
-    return check_for_identification(train, unknowns + 2)
+    structure = model.structure if isinstance(model, Fit) else model
+    black_box = isinstance(structure, PILFR | Lagged)  # a Model may be a simulator, which moves from its start
+    return check_for_identification(train, unknowns + 2, excited=black_box)
 
 
 def mark_interrupted(model: Model, problem: Problem, solution: Solution, note: str) -> Stage:

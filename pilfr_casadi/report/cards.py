@@ -18,7 +18,7 @@ from ..laws import display_name
 from ..models import ParameterSet
 from ..simulators import PARAMETER, Simulator, kind_of, name_at
 from .diagnosis_tables import facts, headline, tone
-from .page import Table, number_text, render, status_tone, uncertain_text
+from .page import Table, number_text, render, signal_path, status_tone, uncertain_text
 
 MOST_ROWS = 12  # rows of a table; the printed object has them all
 LINE_BINS = 90  # stretches of a line, each drawn from its smallest to its largest value
@@ -120,7 +120,7 @@ def fit_card(fit: Fit) -> str:
     limits = f"at a bound: {', '.join(fit.active[:MOST_ROWS])}" if fit.active else ""
     tables = _parameter_tables(fit.simulator.readable_parameters(), fit.errors) if fit.simulator else []
     return Card(
-        f"Fit: {', '.join(m.inputs)} → {', '.join(m.outputs)}",
+        f"Fit: {signal_path(m.inputs, m.outputs)}",
         "; ".join(filter(None, (size, limits))),
         f"{fit.status.value} {fit.status.advice}".strip(),
         status_tone(fit.status),

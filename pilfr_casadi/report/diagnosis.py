@@ -29,7 +29,7 @@ from ..plots import Signal
 from ..simulators import ACTUATOR, MECHANICAL, PARAMETER, SENSOR, Port, kind_of, name_at, split_port
 from . import diagnosis_tables as tables
 from .diagnosis_tables import Action, element_of, measure_action
-from .page import Block, Code, Page, Picture, Section, Table, Text, label_recording
+from .page import Block, Code, Page, Picture, Section, Table, Text, label_recording, signal_path
 
 MOST_DRAWN = 3  # outputs and recordings that are drawn; the tables have all of them
 
@@ -106,7 +106,7 @@ def diagnosis_page(diagnosis: Diagnosis) -> Page:
         Section("The next experiment", _next_experiment(d)),
         Section(_usage_title(d), _usage(d)),
     ]
-    names = f"{', '.join(d.refitted.inputs)} → {', '.join(d.refitted.output_names)}"
+    names = signal_path(d.refitted.inputs, d.refitted.output_names)
     return Page(
         f"Diagnosis of a simulator: {names}",
         [s for s in sections if s.blocks],
@@ -123,7 +123,7 @@ def _subtitle(case: _Case) -> str:
     parts = [f"{len(d.train)} training recording{'s' * (len(d.train) != 1)}, {sum(map(len, d.train))} samples"]
     parts += [f"{len(d.test)} held out, {sum(map(len, d.test))} samples"] if d.test else ["none held out"]
     between = {"zero": "held", "linear": "interpolated"}.get(d.hold, d.hold)
-    parts += [f"step {r.dt:.4g} s", f"inputs {between} between samples"]
+    parts += [f"step {r.dt:.4g} s", f"inputs {between} between samples" if r.n_u else "no input"]
     parts += [f"computed in {d.seconds:.1f} s"] if d.seconds else []
     return "; ".join(parts)
 
@@ -322,8 +322,9 @@ def _proof(case: _Case) -> list[Block]:
     if d.test:
         out.append(
             Text(
-                "Simulated from the inputs alone. These recordings were used neither to fit nor to choose; only an "
-                "unknown initial state was estimated from the first samples and the training runs."
+                f"Simulated from the {'inputs' if d.refitted.inputs else 'start'} alone. These recordings were used "
+                "neither to fit nor to choose; only an unknown initial state was estimated from the first samples and "
+                "the training runs."
             )
         )
     role, recordings = ("test", d.test) if d.test else ("training", d.train)

@@ -30,6 +30,7 @@ from .page import (
     Text,
     label_recording,
     render,
+    signal_path,
     status_tone,
     uncertain_text,
 )
@@ -78,7 +79,7 @@ def fit_page(fit: Fit, train: Records, tests: Records, *, model_file: str = "mod
     ]
     status = fit.status
     return Page(
-        f"Identified model: {', '.join(fit.model.inputs)} → {', '.join(fit.model.outputs)}",
+        f"Identified model: {signal_path(fit.model.inputs, fit.model.outputs)}",
         [s for s in sections if s.blocks],
         subtitle=_subtitle(fit),
         answer=_answer(judged),
@@ -239,8 +240,8 @@ def _draw_output(fit: Fit, r: Recording, i: int) -> list[Block]:
     """Draw one output: over its input for a quasi-static device, over time for any other."""
     name = f"{r.outputs[i]} in {r.name}"
     correlation = [abs(np.corrcoef(u, r.y[:, i])[0, 1]) if np.ptp(u) > 0 else 0.0 for u in r.u.T]
-    j = int(np.argmax(correlation))
-    if correlation[j] > QUASI_STATIC:
+    j = int(np.argmax(correlation)) if correlation else 0
+    if correlation and correlation[j] > QUASI_STATIC:
         across = r.inputs[j]
         drawn = plots.output_over_input(fit, r, input=j, output=i)
         whole = Picture(drawn, f"{name}, over {across}.", f"Measured and simulated {name} over {across}.")

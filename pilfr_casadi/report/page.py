@@ -68,6 +68,11 @@ def uncertain_text(value: float, error: float) -> str:
     return "\u00a0±\u00a0".join(texts)
 
 
+def signal_path(inputs: Sequence[str], outputs: Sequence[str]) -> str:
+    """Write the signals of a model as "force → position"; the outputs alone if there is no input."""
+    return " → ".join(", ".join(names) for names in (inputs, outputs) if names)
+
+
 def label_recording(recording: Recording, role: str, i: int, count: int) -> str:
     """Return a recording's name; without a name its role and number: "test 2", or "test" for the only one."""
     return recording.name or (role if count == 1 else f"{role} {i + 1}")

@@ -35,7 +35,7 @@ class Simulator(Equations):
         From the same to `{output: expression}`. It may also read `dx`, the states' derivatives, for sensors of
         acceleration or force: `lambda x, dx: {"acceleration": dx.vel}`. Outputs must be linear in `dx`.
     states, inputs : tuple of str
-        Names; `states=()` is a static device.
+        Names; `states=()` is a static device, and `inputs=()` a machine that its start alone moves, such as a decay.
     parameters : mapping
         `Parameter` by name.
     ports : Port or tuple of Port

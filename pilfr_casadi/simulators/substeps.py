@@ -149,6 +149,8 @@ def _find_rate_along_run(simulator: Equations, recording: Recording, rate: float
     """Compute a high quantile of the rates along a run; return the given rate if the run diverges."""
     short, states = _run_trial(simulator, recording)
     x, u = states[::TRIAL_SUBSTEPS][SETTLING_SAMPLES::SPACING], short.u[SETTLING_SAMPLES::SPACING]
+    if not len(x):
+        return rate
     found = fastest_rates(simulator, x, u, simulator.parameter_set.start)
     found = found[np.isfinite(found)]
     return min(rate, float(np.quantile(found, RATE_QUANTILE))) if len(found) > FEWEST_RATES else rate

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -362,6 +363,15 @@ def test_a_fit_that_ends_at_the_iteration_limit_says_how_to_go_on(capsys, tmp_pa
     status, said, _ = run(capsys, "fit", train, *names, "--out", tmp_path / "out")
     assert status == 0 and ("Not converged" in said) == (iterations == 1)
     assert (f"To go on from here: --from {tmp_path / 'out' / 'model.json'}" in said) == (iterations == 1)
+
+
+def test_simulated_outputs_are_written_with_the_units_of_the_model(capsys, tmp_path, train, model):
+    known, first, again = tmp_path / "known.json", tmp_path / "first.csv", tmp_path / "again.csv"
+    replace(pilfr.load(model), units={"u": "V", "y": "mm"}).save(known)
+    assert run(capsys, "simulate", known, train, "--initial", "zero", "--out", first)[0] == 0
+    assert first.read_text().startswith("t,u [V],y [mm]\n")
+    status, said, _ = run(capsys, "simulate", known, first, "--initial", "zero", "--out", again)
+    assert status == 0 and "NRMSE on first: 0\n" in said and again.read_text() == first.read_text()
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".npz", ".mat"])

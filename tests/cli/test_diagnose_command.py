@@ -221,7 +221,6 @@ BAD_RECORDINGS = {
     "NaN in the middle": (lambda f, y: (f, np.r_[y[:400], np.nan, y[401:]]), ("nan", "402")),
     "infinite": (lambda f, y: (np.r_[f[:9], np.inf, f[10:]], y), ("inf", "11")),
     "text": (lambda f, y: ([*map(str, f[:5]), "off", *map(str, f[6:])], y), ("off", "7")),
-    "input never moves": (lambda f, y: (0 * f + 1.0, y), ("force", "never changes")),
     "output never moves": (lambda f, y: (f, 0 * y), ("position", "never changes")),
     "too short": (lambda f, y: (f[:10], y[:10]), ("samples",)),
 }

@@ -286,6 +286,17 @@ def test_a_stated_step_finds_times_in_another_unit(write, factor):
     assert f"a ratio of {factor:.4g}" in sentence(caught)
 
 
+def test_a_file_may_have_no_input_and_no_output(write):
+    decay = read_csv(write("t,angle [rad]\n0,1\n0.1,0.5\n0.2,0.2\n"), inputs=(), outputs="angle")
+    assert (decay.inputs, decay.n_u, decay.units["angle"]) == ((), 0, "rad")
+    times = ("t\n0\n0.5\n1\n", "t\n2024-05-01T10:00:00\n2024-05-01T10:00:00.5\n2024-05-01T10:00:01\n")
+    for text in times:
+        r = read_csv(write(text), inputs=(), outputs=())
+        assert (len(r), r.dt, r.n_u, r.n_y) == (3, 0.5, 0, 0)
+    with pytest.raises(InputError, match="for its times alone; name a time column"):
+        read_csv(write("a,b\n1,2\n2,3\n"), inputs=(), outputs=(), dt=0.1)
+
+
 def test_bad_columns_and_options_are_refused(write):
     path = write(GOOD)
     for options, words in [
@@ -295,7 +306,7 @@ def test_bad_columns_and_options_are_refused(write):
         (dict(columns={"force": "u"}), "no column 'u'; .*as in columns={'force': 'COLUMN'}"),
         (dict(dt=0.0), "above zero"),
         (dict(dt=float("nan")), "above zero"),
-        (dict(inputs=()), "at least one input.* sensors only, read these as inputs with outputs=()"),
+        (dict(inputs=(), outputs=(), resample=0.2), "for its times alone; name a time column"),
         (dict(inputs=[1]), "give the names of the columns"),
         (dict(columns=["force"]), "give columns={'NAME': 'COLUMN'}"),
         (dict(outputs="t"), "column 't' holds the time"),

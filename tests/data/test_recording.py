@@ -9,7 +9,7 @@ from hypothesis import given, strategies as st
 from scipy.sparse import csc_array
 
 from pilfr_casadi._base import InputError
-from pilfr_casadi.data import Recording, as_recordings, check_for_identification
+from pilfr_casadi.data import Recording, as_recordings, check_for_identification, mean_period
 from pilfr_casadi.laws import Drift
 
 
@@ -79,7 +79,7 @@ NAN = np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 6.0]])
         (dict(y=None), "lacks y; give Recording"),
         (dict(u=np.zeros((20, 2, 3))), r"shape \(20, 2, 3\).*a recording for each experiment"),
         (dict(u=np.zeros((20, 1, 1))), r"shape \(20, 1, 1\)"),
-        (dict(u=np.zeros((20, 0))), r"shape \(20, 0\)"),
+        (dict(u=np.zeros((20, 0)), inputs=("f",)), "0 input column.* 1 name"),
         (dict(u=["a"] * 20), "real numbers"),
         (dict(u=np.full(20, 1j)), "real numbers"),
         (dict(u=[[1.0], [1.0, 2.0]]), "real numbers"),
@@ -209,6 +209,23 @@ def test_a_recording_may_lack_outputs_but_cannot_be_fitted():
         check_for_identification(r)
     with pytest.raises(InputError, match="1 name"):
         r.with_(outputs=("y",))
+
+
+def test_a_recording_may_lack_inputs():
+    y = np.exp(-0.1 * np.arange(30.0))
+    r = Recording(np.empty((30, 0)), y, 0.1, outputs=("T",), units={"T": "K"}, name="cooling", hold="zero")
+    assert (r.n_u, r.inputs, r.slice(2).u.shape) == (0, (), (28, 0)) and "inputs none, outputs T [K]" in repr(r)
+    assert r.with_(y=r.u, outputs=(), units={}).resample(0.2).u.shape == (15, 0)
+    coarse = r.resample(0.2)
+    assert coarse.u.shape == (15, 0) and coarse.dt == 0.2 and coarse.hold == "zero"
+    assert pickle.loads(pickle.dumps(r)).n_u == 0 and mean_period(r.with_(period=10)).u.shape == (10, 0)
+    assert check_for_identification(r, excited=False) == (r,)
+    with pytest.raises(InputError, match="there is no input in recording 'cooling'; a model from input to output"):
+        check_for_identification(r)
+
+
+def test_a_channel_without_a_unit_is_shown_by_its_name():
+    assert "inputs u, outputs y [m]" in repr(recording().with_(units={"u": "", "y": "m"}))
 
 
 def test_nothing_to_identify():

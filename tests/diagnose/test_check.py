@@ -386,6 +386,16 @@ def test_a_stated_start_that_the_first_sample_contradicts_is_told():
     assert found.next_record.startswith("State how the recordings begin")
 
 
+def test_a_step_of_a_constant_input_has_one_amplitude_at_a_time():
+    """The input is there from the first sample on; another size of it, or another start, tells amplitude from time."""
+    given = record(MASS, np.full(SAMPLES, 2.0), initial="estimate")
+    found = check(MASS, given)
+    assert {"constant-input", "one-path"} <= {spot.kind for spot in found.blind_spots}
+    assert found.next_record.startswith("One in which force varies, or one from another start")
+    other = check(MASS, [given, record(MASS, np.full(SAMPLES, 1.0), initial="estimate")])
+    assert not {"constant-input", "one-path"} & {spot.kind for spot in other.blind_spots}
+
+
 def test_a_wrong_start_is_told_beside_a_fault_of_a_channel():
     u = 20 * multisine(600, f_max=1.5, fs=50.0, rng=np.random.default_rng(0))
     given = Recording(u, 0 * u, 0.02, ("force",), ("pos",), initial=[0.5, 0.0], hold="zero")

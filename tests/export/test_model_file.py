@@ -189,7 +189,7 @@ DAMAGE = {
     "channels": (("structure", "element", "channels"), 0, "expected"),
     "negative": (("structure", "nx"), -1, "'nx' is negative"),
     "step": (("model", "dt"), 0.0, "the step dt is 0 s"),
-    "names": (("model", "inputs"), [], "names of inputs and outputs"),
+    "names": (("model", "outputs"), [], "names of inputs and outputs"),
     "status": (("training", "status"), "FINE", "status 'FINE' is unknown"),
     "no training": (("training",), ..., "'training' is missing"),
     "fixed": (("structure", "fixed", "D_yu"), 0.5, "'D_yu' differs from the value that the structure fixes"),

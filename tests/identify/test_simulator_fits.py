@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from free_pendulum import decay, simulator as pendulum
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Simulator
@@ -96,3 +97,19 @@ def test_an_exact_fit_has_no_warning(record):
     start = record.with_(initial="zero", hold="zero")
     fit = pilfr.fit(exact, start.with_(y=exact.simulate(start)), engine="vm")
     assert fit.errors["k"] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("constant", [None, 0.0, 3.0])
+def test_a_decay_needs_no_input_that_changes(tmp_path, constant):
+    true = pendulum.with_parameters({"w": 5.3, "d": 0.05})
+    r = decay([0.8, 0.0], true)
+    if constant is not None:  # a simulator takes its own columns
+        r = r.with_(u=np.full((len(r), 1), constant), inputs=("room",))
+    found = pilfr.fit(pendulum, r, engine="vm")
+    assert found.parameters["w"] == pytest.approx(5.3, rel=1e-3)
+    assert found.initial_state(r) == pytest.approx([0.8, 0.0], abs=5e-3)
+    with pytest.raises(InputError, match="needs an input that changes"):
+        pilfr.fit(pilfr.PILFR(1, None), r)
+    with pytest.warns(UserWarning, match="not the simulator's equations"):
+        assert found.report(tmp_path, r).exists()
+    assert pilfr.load(tmp_path / "model.json", model=found.model).parameters["w"] == found.parameters["w"]

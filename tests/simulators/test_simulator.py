@@ -6,6 +6,7 @@ from itertools import pairwise
 import casadi as ca
 import numpy as np
 import pytest
+from free_pendulum import simulator as pendulum
 from scipy.integrate import solve_ivp
 
 from pilfr_casadi import InputError, Parameter, Port, PrandtlIshlinskii, Recording, Simulator, Stop, multisine, play
@@ -539,3 +540,9 @@ def test_other_bounds_free_a_parameter():
         simulator.with_bounds({"k": (3, 1)})
     with pytest.raises(InputError, match="There is no parameter 'm'; the simulator has k, d"):
         simulator.with_bounds({"m": (0, 1)})
+
+
+def test_a_free_motion_of_three_samples_is_simulated():
+    """A recording that is too short to show how fast the equations are along it."""
+    short = Recording(np.empty((3, 0)), np.empty((3, 0)), 1.0, initial=[1.0, 0.0])
+    assert np.all(np.abs(pendulum.simulate(short)) < 1.1)

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ...data import Recording
+from ...data import Recording, moves_freely
 from ...laws import Law
 from ...simulators import ACTUATOR, SENSOR, Simulator, kind_of, port_name, split_port
 from ..fits.evidence import FORMULA_ERROR
@@ -182,6 +182,8 @@ def find_offsets(now: Checked) -> Checked:
         port, after = min(settled, key=lambda pair: pair[1].cost)
         name = f"{after.bench.simulator.elements[-1].prefix}w_0"
         value, unit = float(after.fitted.values[name]), now.bench.simulator.port(port).unit
+        if _stands_for_load(now.bench, port, value):
+            break
         before, now = now, accept(now, after, describe_constant(port, value, name, unit))
         if now.bench is before.bench:
             break
@@ -195,6 +197,18 @@ def find_offsets(now: Checked) -> Checked:
     each = find_varying_offset(begin)
     more = len(begin.bench.recordings) - len(shared.gates) + len(begin.gates)
     return each if gain(shared.cost, each.cost, each.residuals, more) > LEAST_GAIN else shared
+
+
+def _stands_for_load(bench: Workbench, port: str, value: float) -> bool:
+    """Tell whether an offset of an output is larger than the output ever was, in recordings without a changing input.
+
+    Such an offset acts like a constant load, as dry friction in a coast-down is until the machine stands.
+    """
+    kind, name = split_port(port)
+    if kind != SENSOR or not moves_freely(bench.recordings):
+        return False
+    at = bench.simulator.output_names.index(name)
+    return abs(value) > max(float(np.max(np.abs(r.y[:, at]))) for r in bench.recordings)
 
 
 @dataclass(frozen=True)

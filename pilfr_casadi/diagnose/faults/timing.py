@@ -14,7 +14,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from ...data import Recording
+from ...data import Recording, moves_freely
 from ...laws import Lag
 from ..fits.floor import ABOVE_NOISE
 from ..fits.workbench import RUNAWAY, Fitted, Workbench, refit
@@ -228,11 +228,16 @@ def _screen_shifts(bench: Workbench, plain: Fitted, also_given: bool = True) -> 
     unless it runs away.
     """
     outputs, inputs = bench.simulator.output_names, bench.simulator.inputs
-    channels: list[tuple[str, tuple[int, ...], str]] = [("y", (i,), name) for i, name in enumerate(outputs)]
-    if len(outputs) > 1:
+    driven = not moves_freely(bench.recordings)  # else the times of outputs count only against each other
+    channels: list[tuple[str, tuple[int, ...], str]] = []
+    if driven or len(outputs) > 1:
+        channels += [("y", (i,), name) for i, name in enumerate(outputs)]
+    if driven and len(outputs) > 1:
         channels.append(("y", tuple(range(len(outputs))), ", ".join(outputs)))
-    if len(inputs) > 1:
+    if driven and len(inputs) > 1:
         channels += [("u", (i,), name) for i, name in enumerate(inputs)]
+    if not channels:
+        return []
     found = list[tuple[float, TimeShift]]()
     given = [bench.run_given(plain)] if also_given else []
     for reference in (plain, *(one for one in given if one.cost < RUNAWAY**2)):

@@ -148,6 +148,8 @@ def _is_driven(differences: np.ndarray, u: np.ndarray, before: np.ndarray) -> bo
     has to explain most of the second half. Noise has no such response; but an input like a sine cannot be told from
     noise of that frequency, and shows nothing.
     """
+    if not u.shape[1]:
+        return False
     every = max(len(u) // COMPARED, 1)
     columns = _responses(np.vstack([before, u]))[len(before) :: every]
     columns = columns - np.mean(columns, axis=0)

@@ -25,6 +25,12 @@ def test_periods_show_the_noise_of_each_output():
     assert found.beside(np.array([0.02, 0.0])).deviation == pytest.approx((2**0.5 * 0.02, 0.5), rel=0.05)
 
 
+def test_free_motions_show_it_only_from_the_same_start():
+    free = [r.with_(u=np.empty((4 * N, 0)), inputs=()) for r in (noisy(4, seed, initial="zero") for seed in range(4))]
+    assert measured_floor(free).deviation == pytest.approx(DEVIATION, rel=0.1)
+    assert measured_floor([r.with_(initial="estimate") for r in free]) is None
+
+
 @pytest.mark.parametrize("initial", ["zero", "estimate"])
 def test_recordings_of_the_same_input_show_it_too(initial):
     found = measured_floor([noisy(4, seed, initial=initial) for seed in range(4)])
