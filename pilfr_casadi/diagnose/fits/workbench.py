@@ -531,10 +531,10 @@ def refit(
         return None
 
 
-def converge(bench: Workbench, fitted: Fitted, seconds: float, solver: GaussNewton = LAST) -> Fitted:
+def converge(bench: Workbench, fitted: Fitted, seconds: float) -> Fitted:
     """Continue a fit until its values no longer change, for at most so many seconds."""
     if seconds <= 0:
         return fitted
-    timed = replace(solver, time_limit=seconds)
-    found = refit(bench, [fitted.values], fitted.simulator, states=fitted.initial, solver=timed, like=fitted)
+    solver = replace(LAST, time_limit=seconds)
+    found = refit(bench, [fitted.values], fitted.simulator, states=fitted.initial, solver=solver, like=fitted)
     return found if found is not None and found.cost < fitted.cost else fitted

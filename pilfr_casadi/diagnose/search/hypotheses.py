@@ -42,7 +42,7 @@ from ..fits.flexible_forces import flexible_shares, innovation_share
 from ..fits.floor import FEWEST, Floor, effective_size, white_part
 from ..fits.force_recovery import is_curve_along
 from ..fits.screen import Scored, screen
-from ..fits.workbench import DIVERGED, QUICK, THOROUGH, Fitted, Workbench, converge
+from ..fits.workbench import DIVERGED, QUICK, THOROUGH, Fitted, Workbench
 from .trials import Key, Trial, Trials
 
 MOST_PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
@@ -62,7 +62,6 @@ class Findings:
     held_out: HeldOut | None = None  # its errors on held-out data
     # whether the force of a law with memory is a curve along the runs, by the prefix of its parameters
     curves: dict[str, bool] = field(default_factory=dict)
-    settled: bool = False  # whether its fit was continued until its values stood still
     varied: bool = False  # whether variations of parameters were tried beside it
     replaced: bool = False  # whether laws with constant parameters were tried in place of its last law, which varies
 
@@ -269,15 +268,6 @@ class Hypotheses:
     def _all_wrong(self) -> bool:
         """Whether even the best model's error is mostly model error."""
         return self.samples < WRONG_MODEL_SAMPLES / LARGE_MODEL_ERROR
-
-    def settle_likeliest(self) -> None:
-        """Continue the fits of the likeliest hypotheses until their values stand still: a law may degenerate there."""
-        with self.stage("convergence"):
-            while self.in_time() and (open_ := [t for t in self._likeliest() if not self.findings[t.key].settled]):
-                seconds, trial = self.until - time.perf_counter(), open_[0]
-                fitted = converge(self.bench, trial.fitted, seconds, THOROUGH)
-                self.keep(Trial.of(fitted, len(trial.laws), thorough=True))
-                self.findings[trial.key].settled = True
 
     def judge_on_held_out_data(self) -> None:
         """Compute the held-out errors of the likeliest hypotheses.

@@ -83,7 +83,6 @@ class Search(Hypotheses):
                     self._grow_to_noise()
                 self._every_sensor()
                 self._leave_out_each()
-                self.settle_likeliest()
                 self.judge_on_held_out_data()
         if self.interrupted:
             self.forget_held_out()
