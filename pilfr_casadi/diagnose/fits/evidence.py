@@ -71,7 +71,6 @@ DISTURBANCE = 1e-5  # of the inputs, over their deviation, by which a motion is 
 # Comparison of hypotheses
 SURE = 0.5  # probability above which an answer is stated: it is more likely than not
 INDISTINGUISHABLE_NATS = 3.0  # nats within which two hypotheses are indistinguishable: odds of 20 (Kass & Raftery 1995)
-NEGLIGIBLE_NATS = 0.01  # nats that change no answer: a fit ends if its last iterations gain less
 CONTENDING_NATS = 8.0  # nats below the best within which a hypothesis may still win after more fits
 BETTER_RATIO = 1.05  # ratio of rms errors from which one is better than another
 NEAR_RATIO = 1.5  # ratio of rms errors within which one comes near another: more fits may reverse their order

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from ..._base import InputError
-from ...optimise import GaussNewton
 from ...simulators import MOST_SUBSTEPS
 from .floor import white_part
 from .workbench import FINER_STEPS, THOROUGH, Fitted, Workbench, refit
@@ -55,7 +54,7 @@ def knee_starts(fitted: Fitted, knee: str) -> list[dict[str, Any]]:
     return [values, *({**values, knee: times * values[knee]} for times in (1 / FINER_STEPS, FINER_STEPS))]
 
 
-def refit_on_finer_steps(bench: Workbench, fitted: Fitted, knee: str, solver: GaussNewton) -> Fitted:
+def refit_on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
     """Refit on finer steps if the simulation depends on them, or if the present steps limit the knee.
 
     The knee may be sharper there, as far as these steps can follow it at rest.
@@ -72,5 +71,5 @@ def refit_on_finer_steps(bench: Workbench, fitted: Fitted, knee: str, solver: Ga
     if not held and abs(there.cost / fitted.cost - 1) < COST_CHANGE:
         return fitted
     starts = [fitted.values, *([{**fitted.values, knee: low / 2}] if held else [])]
-    found = refit(finer, starts, placed, states=fitted.begin, solver=solver, like=there)
+    found = refit(finer, starts, placed, states=fitted.begin, solver=THOROUGH, like=there)
     return found if found is not None and found.cost < max(fitted.cost, there.cost) else fitted

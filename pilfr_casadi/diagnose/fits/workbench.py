@@ -532,8 +532,8 @@ def refit(
 
 
 def converge(bench: Workbench, fitted: Fitted, seconds: float) -> Fitted:
-    """Continue a fit until its values no longer change, for at most so many seconds."""
-    if seconds <= 0:
+    """Continue a fit that was stopped by its limit of iterations, for at most so many seconds."""
+    if fitted.status is not Status.MAX_ITERATIONS or seconds <= 0:
         return fitted
     solver = replace(LAST, time_limit=seconds)
     found = refit(bench, [fitted.values], fitted.simulator, states=fitted.initial, solver=solver, like=fitted)

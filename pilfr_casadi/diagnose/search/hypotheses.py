@@ -14,7 +14,6 @@ import numpy as np
 
 from ..._base import Stages, UntilInterrupted
 from ...laws import Law
-from ...optimise import GaussNewton
 from ...simulators import Placed, Simulator
 from ..faults.gates import EQUAL_RATIO
 from ..fits.coloured_noise import log_likelihood
@@ -26,7 +25,6 @@ from ..fits.evidence import (
     INDISTINGUISHABLE_NATS,
     LARGE_MODEL_ERROR,
     LOUDEST_NOISE,
-    NEGLIGIBLE_NATS,
     WRONG_MODEL_SAMPLES,
     HeldOut,
     Sample,
@@ -42,7 +40,7 @@ from ..fits.flexible_forces import flexible_shares, innovation_share
 from ..fits.floor import FEWEST, Floor, effective_size, white_part
 from ..fits.force_recovery import is_curve_along
 from ..fits.screen import Scored, screen
-from ..fits.workbench import DIVERGED, QUICK, THOROUGH, Fitted, Workbench
+from ..fits.workbench import DIVERGED, Fitted, Workbench
 from .trials import Key, Trial, Trials
 
 MOST_PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
@@ -113,11 +111,6 @@ class Hypotheses:
     def samples(self) -> float:
         """Effective samples, shared by all hypotheses."""
         return self.sample.effective(self._least_tolerant())
-
-    @property
-    def solver(self) -> GaussNewton:
-        """Solver of the fits on which evidence is based: it ends where more iterations would hardly change that."""
-        return replace(THOROUGH, tolerance=min(2 * NEGLIGIBLE_NATS / self.samples, QUICK.tolerance))
 
     def _least_tolerant(self) -> float:
         """Compute the smallest `_tolerant` of all hypotheses; kept while these stay, because each evidence needs it."""
@@ -401,7 +394,7 @@ class Hypotheses:
     def thorough(self, trial: Trial) -> Trial:
         """Return the same hypothesis fitted to convergence and to all samples, or as it is after the deadline."""
         if not self.memo[trial.key].thorough and not self.past_deadline:
-            self.keep(self.fits.polish(trial, self.solver))
+            self.keep(self.fits.polish(trial))
         return self.memo[trial.key]
 
     def estimate_noise(self) -> None:
@@ -454,9 +447,8 @@ class Hypotheses:
         as_fine = known is not None and known.fitted.model.substeps >= rest.fitted.model.substeps
         converged = known is not None and known.thorough and as_fine and known.mean_square <= rest.mean_square
         if not converged and not self.past_deadline:
-            solver = self.solver
-            found = self.fits.converge(rest, solver)
-            self.keep(self.fits.sharpen(found, solver) if found.error < FAR_RATIO * joint.error else found)
+            found = self.fits.converge(rest)
+            self.keep(self.fits.sharpen(found) if found.error < FAR_RATIO * joint.error else found)
         kept = self.memo.get(rest.key)
         return kept if kept is not None and np.isfinite(kept.mean_square) else None
 

@@ -98,7 +98,7 @@ class Search(Hypotheses):
         with self.until_interrupted(), suppress(InputError):
             there = self.run_laws(other.laws, other)
             if there.mean_square < DIVERGED:
-                self.keep(self.fits.polish(there, self.solver))
+                self.keep(self.fits.polish(there))
 
     @property
     def passes(self) -> list[Step]:
@@ -200,7 +200,7 @@ class Search(Hypotheses):
         if self.interrupted or not self.in_time():
             return False
         held = self.bench.with_other_hold()
-        found = refit(held, [best.values], best.simulator, states=best.initial, solver=self.solver)
+        found = refit(held, [best.values], best.simulator, states=best.initial, solver=THOROUGH)
         return found is not None and not self.interrupted and found.cost * BETTER_RATIO**2 < best.cost
 
     def _finds_shift(self) -> bool:
@@ -317,17 +317,13 @@ class Search(Hypotheses):
         ranked = sorted(kept, key=self.optimistic_evidence, reverse=True)
         most = min(NEAR_RATIO * ranked[0].error if ranked else np.inf, FAR_RATIO * self.best.error)
         near = [t for t in ranked[:MOST_CONVERGED] if not t.thorough and t.error < most]
-        solver = self.solver
-        converged = self._side_by_side(lambda trial: self.fits.converge(trial, solver), near)
+        converged = self._side_by_side(self.fits.converge, near)
         for trial in converged:
             self.keep(trial)
         # finer steps are slow, and bring no hypothesis that is far behind to the front
         least = min([t.error for t in (*converged, self.best)])
         near = [t for t in converged if t.error < NEAR_RATIO * least]
-        sharpened = side_by_side(
-            lambda trial: self.fits.sharpen(trial, solver), near, self.workers, self.bench.interrupt
-        )
-        for trial in sharpened:
+        for trial in self._side_by_side(self.fits.sharpen, near):
             self.keep(trial)
 
     def _finer(self, parent: Trial) -> None:
@@ -542,7 +538,7 @@ class Search(Hypotheses):
                 named |= simulator.elements[-1].named(source.own(best.fitted.values))
             found = self.fits.fit(simulator, [named], len(joint.laws) + len(names), states=joint.fitted.begin)
             if found is not None:
-                self.keep(self.fits.polish(found, self.solver))
+                self.keep(self.fits.polish(found))
 
     def _escape_local_minimum(self) -> bool:
         """Refit the simulator alone from the best law's parameters; if far better, restart the search and return True.

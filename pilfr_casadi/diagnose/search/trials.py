@@ -19,7 +19,6 @@ import numpy as np
 from ..._base import InputError
 from ...data import Recording
 from ...laws import Law
-from ...optimise import GaussNewton
 from ...simulators import Placed, Simulator
 from ..faults.gates import EQUAL_RATIO, open_start
 from ..faults.offsets import Offset
@@ -169,11 +168,11 @@ class Trials:
             whole = replace(self.bench.rerun(found), status=found.status)
         return Trial(found.last_elements(count), whole, found.cost, whole.cost if np.isfinite(whole.cost) else np.inf)
 
-    def polish(self, trial: Trial, solver: GaussNewton = THOROUGH) -> Trial:
+    def polish(self, trial: Trial) -> Trial:
         """Fit a trial to convergence and to all samples, on steps that are fine enough for its knee."""
-        return self.sharpen(self.converge(trial, solver), solver)
+        return self.sharpen(self.converge(trial))
 
-    def converge(self, trial: Trial, solver: GaussNewton = THOROUGH) -> Trial:
+    def converge(self, trial: Trial) -> Trial:
         """Fit a trial to convergence and to all samples, on steps for its present values."""
         bench = replace(self.bench, at_least=max(self.bench.at_least, trial.fitted.model.substeps))
         placed = trial.fitted.corrected()  # choose sub-steps for the fitted laws
@@ -183,16 +182,16 @@ class Trials:
             if len(starts) > 1:
                 quick = bench.fit(placed, starts, states=states, solver=QUICK, model=model, engine=engine)
                 starts, states = [quick.values], quick.initial
-            fitted = bench.fit(placed, starts, states=states, solver=solver, model=model, engine=engine)
+            fitted = bench.fit(placed, starts, states=states, solver=THOROUGH, model=model, engine=engine)
         except InputError:
             return replace(trial, mean_square=np.inf, thorough=True)
         return Trial.of(fitted, len(trial.laws), thorough=True)
 
-    def sharpen(self, trial: Trial, solver: GaussNewton = THOROUGH) -> Trial:
+    def sharpen(self, trial: Trial) -> Trial:
         """Refit a converged trial on steps that are fine enough for its knee, if it has one."""
         if not trial.knee or not trial.mean_square < DIVERGED or time.perf_counter() > self.bench.deadline:
             return trial
-        fitted = refit_on_finer_steps(self.bench, trial.fitted, trial.knee, solver)
+        fitted = refit_on_finer_steps(self.bench, trial.fitted, trial.knee)
         return Trial.of(fitted, len(trial.laws), thorough=True)
 
     def fit_pairs(

@@ -25,9 +25,9 @@ def fits(monkeypatch):
         begun[parent.key, (entries[0].port, type(entries[0].law))] += 1
         return found["begun"](self, parent, entries, gain)
 
-    def converge(self, trial, solver):
+    def converge(self, trial):
         polished[trial.key] += 1
-        return found["polished"](self, trial, solver)
+        return found["polished"](self, trial)
 
     monkeypatch.setattr(Trials, "_fit_briefly", begin)
     monkeypatch.setattr(Trials, "converge", converge)

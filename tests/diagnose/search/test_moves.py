@@ -84,7 +84,7 @@ def test_an_estimated_noise_is_no_larger_than_what_a_fit_leaves(source):
 
 
 def test_an_interrupt_leaves_what_there_is(monkeypatch):
-    def interrupted(self, trial, solver):
+    def interrupted(self, trial):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Trials, "converge", interrupted)
@@ -159,9 +159,7 @@ def test_after_the_deadline_and_ctrl_c_the_correction_fits_nothing_more(monkeypa
         fitted.append(found)
         raise pilfr.InputError("It diverges.")
 
-    monkeypatch.setattr(
-        Trials, "converge", lambda self, trial, solver: fitted.append(trial) or converge(self, trial, solver)
-    )
+    monkeypatch.setattr(Trials, "converge", lambda self, trial: fitted.append(trial) or converge(self, trial))
     monkeypatch.setattr(correction, "refit_learned", refit)
     found.bench, answer = replace(found.bench, deadline=0.0), posterior(found)
     correction.find_correction(found, answer)
