@@ -193,6 +193,11 @@ def gain(before: float, after: float, residuals: Sequence[np.ndarray], parameter
     return float(0.5 * n * np.log(before / max(after, 1e-300)) - 0.5 * parameters * np.log(n))
 
 
+def follows_better(one: float, other: float, residuals: Sequence[np.ndarray]) -> bool:
+    """Tell whether an edit that leaves the mean square `one` is clearly better than another of as many parameters."""
+    return one < CLEARLY_BETTER * other and gain(other, one, residuals, 0) > LEAST_GAIN
+
+
 def with_unit(value: float, unit: str, digits: int = 3) -> str:
     """Write a value with its unit, if that is known."""
     return f"{value:.{digits}g} {unit}".rstrip()
@@ -257,17 +262,17 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
     noises = (after.cost / max(now.noise2, 1e-300)) ** 0.5
     if noises > NEAR_NOISE_RATIO:
         sentence += f", still {noises:.2g} times the noise: more is wrong"
-    told = replace(fault, sentence=f"{sentence}.", fault=True, left=after.cost / _cost_where_kept(now, after, fault))
+    told = replace(fault, sentence=f"{sentence}.", fault=True, left=after.cost / cost_where_kept(now, after, fault))
     return now.then(after.bench, after.fitted, told)
 
 
 def _satisfies_rule(now: Checked, after: Checked, fault: Gate) -> bool:
-    before = _cost_where_kept(now, after, fault)
+    before = cost_where_kept(now, after, fault)
     gained = gain(before, after.cost, after.residuals, fault.parameters)
     return gained > LEAST_GAIN and after.cost < min(fault.most_left * before, USELESS_FIT)
 
 
-def _cost_where_kept(now: Checked, after: Checked, fault: Gate) -> float:
+def cost_where_kept(now: Checked, after: Checked, fault: Gate) -> float:
     """Compute the mean square error before a correction on the samples that it keeps."""
     kept = list(map(fault.kept, now.bench.recordings))
     if all(where == slice(r.skip, None) for where, r in zip(kept, now.bench.recordings, strict=True)):

@@ -1,7 +1,8 @@
 """Constant errors of recordings: offsets of channels, and wrong initial states.
 
 An offset that all recordings share becomes a parameter of the simulator, because a constant load has the same effect.
-Offsets that differ between the recordings are subtracted.
+Offsets that differ between the recordings are subtracted. A constant of an output may equal a constant load; if it is
+larger than the output's deviation, the load is likelier.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ...data import Recording
-from ...laws import Law
-from ...simulators import ACTUATOR, SENSOR, Simulator, kind_of, port_name, split_port
+from ...laws import Gain, Law
+from ...simulators import ACTUATOR, SENSOR, Simulator, in_series, kind_of, port_name, split_port
 from ..fits.evidence import FORMULA_ERROR
 from ..fits.floor import ABOVE_NOISE, noise_floor
 from ..fits.screen import block_diagonal, lengths
@@ -31,6 +32,8 @@ from .gates import (
     Gate,
     accept,
     correct,
+    cost_where_kept,
+    follows_better,
     gain,
     settle,
     with_unit,
@@ -129,7 +132,7 @@ class Offset(Law):
     sentence = "a constant offset of the signal"
     units: ClassVar[Mapping[str, str]] = {"w_0": "w"}
     strength: ClassVar[tuple[str, ...]] = ("w_0",)
-    places: ClassVar[tuple[str, ...]] = ("series",)
+    places: ClassVar[tuple[str, ...]] = ("series", "parallel")  # a constant load, in parallel
 
     def force(self, p: Any) -> Any:
         """Return the constant."""
@@ -138,9 +141,13 @@ class Offset(Law):
 
 @dataclass(frozen=True)
 class Constant(Gate):
-    """A constant at an input or an output, a parameter of the simulator; other physics may remain beside it."""
+    """A constant at a port, a parameter of the simulator; other physics may remain beside it.
+
+    `alike` says in the sentence what else the recordings may show.
+    """
 
     port: str = ""
+    alike: str = ""
     parameters: ClassVar[int] = 1
     most_left: ClassVar[float] = 1.0
     remedy: ClassVar[str] = "with it as a parameter"
@@ -150,51 +157,107 @@ class Constant(Gate):
         return replace(bench, simulator=bench.simulator.with_element(self.port, Offset()))
 
 
-def describe_constant(port: str, value: float = 0.0, parameter: str = "", unit: str = "") -> Constant:
-    """Return the fault that a channel has a constant offset."""
+def describe_constant(port: str, value: float = 0.0, parameter: str = "", unit: str = "", alike: str = "") -> Constant:
+    """Return the fault that a channel has a constant offset; `alike` says what else it may be."""
     kind, name = split_port(port)
-    alike = ", or a constant load acts like one, as do dry friction and a dead zone while the input keeps its sign"
-    where, load = ("input", alike) if kind == ACTUATOR else ("output", "")
-    words = f"The {where} {name} has a constant offset of about {with_unit(value, unit)}{load}"
-    return Constant(name, "offset", value, words, parameter=parameter, port=port)
+    own = ", or a constant load acts like one, as do dry friction and a dead zone while the input keeps its sign"
+    where, load = ("input", own) if kind == ACTUATOR else ("output", "")
+    words = f"The {where} {name} has a constant offset of about {with_unit(value, unit)}{load}{alike}"
+    return Constant(name, "offset", value, words, parameter=parameter, port=port, alike=alike)
 
 
-def find_offsets(now: Checked) -> Checked:
+def find_offsets(now: Checked, otherwise: Mapping[str, str] | None = None) -> Checked:
     """Find constants at inputs and outputs, the most useful first, and keep them as parameters of the simulator.
 
     They count as a fault if they explain most of the mismatch. Offsets of each recording's own take their place where
-    more than noise is left and they gain enough.
+    more than noise is left and they gain enough. `otherwise` says by port which other fault follows as well.
     """
     begin, ports = now, _channels(now.bench.simulator)
+    inner = [port.name for port in now.bench.simulator.all_ports() if not port.series]
     while ports:
-        share = share_of_constants(now.bench, now.fitted, ports)
-        largest = max(share.values())
+        share = share_of_constants(now.bench, now.fitted, [*ports, *inner])
+        largest = max(share[name] for name in ports)
         if largest < EXCEPTION_SHARE:
             break
-        alike = [name for name in ports if np.isclose(share[name], largest)]  # as at an input and an output behind it
-        tried = [
-            (name, correct(now, describe_constant(name), [now.fitted.values], now.fitted.initial, THOROUGH))
-            for name in alike
-        ]
-        settled = [(name, found) for name, found in tried if found is not None]
-        if not settled:
-            break
-        port, after = min(settled, key=lambda pair: pair[1].cost)
-        name = f"{after.bench.simulator.elements[-1].prefix}w_0"
-        value, unit = float(after.fitted.values[name]), now.bench.simulator.port(port).unit
-        before, now = now, accept(now, after, describe_constant(port, value, name, unit))
+        alike = [name for name in share if np.isclose(share[name], largest)]  # as at an input and an output behind it
+        settled = {name: found for name in alike if (found := _with_constant(now, name)) is not None}
+        port = _choose_constant(settled)
+        if not port:
+            ports = [name for name in ports if name not in alike]
+            continue
+        after, words = settled[port], _describe_alike(settled, port, (otherwise or {}).get(port, ""))
+        name, unit = _name_of_constant(after), now.bench.simulator.port(port).unit
+        constant = describe_constant(port, float(after.fitted.values[name]), name, unit, words)
+        before, now = now, accept(now, after, constant)
         if now.bench is before.bench:
             break
         ports.remove(port)
     fault = now.cost < CURED_SHARE * begin.cost
     # a constant load acts alike, so that the share that is left does not prove a fault
-    found = (replace(g, fault=fault, left=1.0) for g in now.gates[len(begin.gates) :])
-    shared = begin.then(now.bench, now.fitted, *found)
+    added = (replace(g, fault=fault, left=1.0) for g in now.gates[len(begin.gates) :])
+    shared = begin.then(now.bench, now.fitted, *added)
     if shared.cost < NEAR_NOISE_RATIO**2 * shared.noise2:
         return shared
     each = find_varying_offset(begin)
     more = len(begin.bench.recordings) - len(shared.gates) + len(begin.gates)
     return each if gain(shared.cost, each.cost, each.residuals, more) > LEAST_GAIN else shared
+
+
+def _with_constant(now: Checked, port: str) -> Checked | None:
+    """Fit a constant at a port."""
+    return correct(now, describe_constant(port), [now.fitted.values], now.fitted.initial, THOROUGH)
+
+
+def _name_of_constant(after: Checked) -> str:
+    """Return the parameter of the constant that was fitted last."""
+    return f"{after.bench.simulator.elements[-1].prefix}w_0"
+
+
+def _choose_constant(settled: Mapping[str, Checked]) -> str:
+    """Choose the channel whose constant follows best; "" if there is none that is likely.
+
+    A constant of an output above its deviation is hardly the sensor's if one at an input or an inner port acts alike.
+    """
+    channels = [port for port in settled if in_series(port)]
+    best = min(channels, key=lambda port: settled[port].cost, default="")
+    if not best or kind_of(best) != SENSOR:
+        return best
+    after = settled[best]
+    i = after.bench.simulator.output_names.index(split_port(best)[1])
+    others = [port for port in _alike(settled, best) if kind_of(port) != SENSOR]
+    if not others or abs(after.fitted.values[_name_of_constant(after)]) <= after.bench.scale[i]:
+        return best
+    return min(filter(in_series, others), key=lambda port: settled[port].cost, default="")
+
+
+def _alike(settled: Mapping[str, Checked], port: str) -> list[str]:
+    """List the other ports whose constant follows about as well."""
+    one = settled[port]
+    others = ((name, found.cost) for name, found in settled.items() if name != port)
+    return [name for name, cost in others if not follows_better(one.cost, cost, one.residuals)]
+
+
+def _describe_alike(settled: Mapping[str, Checked], port: str, other: str) -> str:
+    """Say that a constant load acts like the constant of an output, and that it may be the fault `other`."""
+    loads = [name for name in _alike(settled, port) if kind_of(port) == SENSOR and not in_series(name)]
+    words = f", or a constant load at {' or '.join(loads)} acts like one" if loads else ""
+    return f"{words}; or else {other}: these recordings do not tell which" if other else words
+
+
+def find_rivals(now: Checked, after: Checked, fault: Gate, cost: float) -> list[tuple[str, type[Law]]]:
+    """List the constants at ports, and gains of channels, that follow about as well as a fault.
+
+    `cost` is the mean square that the fault leaves; what they leave is taken on the samples that the fault keeps.
+    """
+    simulator, found = now.bench.simulator, list[tuple[str, type[Law]]]()
+    for port in simulator.all_ports():
+        for law in (Offset, Gain) if port.series else (Offset,):
+            placed = simulator.with_element(port.name, law())
+            fitted = refit(now.bench, [now.fitted.values, after.fitted.values], placed, states=now.fitted.initial)
+            left = np.inf if fitted is None else cost_where_kept(now.then(now.bench, fitted), after, fault)
+            if not follows_better(cost, left, after.residuals):
+                found.append((port.name, law))
+    return found
 
 
 @dataclass(frozen=True)
@@ -297,11 +360,20 @@ def share_of_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -
     return dict(zip(ports, (along**2 / max(first.error @ first.error, 1e-300)).tolist(), strict=True))
 
 
-def list_offsets(elements: Sequence[Any], values: Mapping[str, Any], simulator: Simulator | None = None) -> list[Gate]:
-    """List the offsets among fitted laws as findings, with the units that the simulator knows."""
+def list_offsets(
+    elements: Sequence[Any],
+    values: Mapping[str, Any],
+    simulator: Simulator | None = None,
+    alike: Mapping[str, str] | None = None,
+) -> list[Gate]:
+    """List the offsets among fitted laws as findings, with the units that the simulator knows.
+
+    `alike` says by parameter what else a constant may be.
+    """
     placed = [(e.port, f"{e.prefix}w_0") for e in elements if isinstance(e.law, Offset)]
     units = {port: simulator.port(port).unit if simulator else "" for port, _ in placed}
-    found = [describe_constant(port, float(values[name]), name, units[port]) for port, name in placed]
+    words = alike or {}
+    found = [describe_constant(p, float(values[name]), name, units[p], words.get(name, "")) for p, name in placed]
     return [replace(c, sentence=f"{c.sentence}; it is a parameter of the corrected simulator.") for c in found]
 
 
@@ -333,7 +405,8 @@ def update_offsets(
     gates: Sequence[Gate], after: Fitted, std: Mapping[str, np.ndarray], effects: bool, sure: bool
 ) -> tuple[Gate, ...]:
     """Return the findings with the offsets at their fitted values; drop offsets that the effects have replaced."""
-    fitted = {g.parameter: g for g in list_offsets(after.simulator.elements, after.values, after.simulator)}
+    alike = {g.parameter: g.alike for g in gates if isinstance(g, Constant)}
+    fitted = {g.parameter: g for g in list_offsets(after.simulator.elements, after.values, after.simulator, alike)}
     out = []
     for gate in gates:
         if not gate.parameter:
