@@ -132,11 +132,21 @@ class Offset(Law):
     sentence = "a constant offset of the signal"
     units: ClassVar[Mapping[str, str]] = {"w_0": "w"}
     strength: ClassVar[tuple[str, ...]] = ("w_0",)
-    places: ClassVar[tuple[str, ...]] = ("series", "parallel")  # a constant load, in parallel
+    places: ClassVar[tuple[str, ...]] = ("series",)
 
     def force(self, p: Any) -> Any:
         """Return the constant."""
         return p.w_0
+
+
+class Load(Offset):
+    """A constant force or flow at an inner port, which may act like an offset; only to compare both."""
+
+    places: ClassVar[tuple[str, ...]] = ("parallel",)
+
+
+def _law_of_constant(port: str) -> Offset:
+    return Offset() if in_series(port) else Load()
 
 
 @dataclass(frozen=True)
@@ -154,7 +164,7 @@ class Constant(Gate):
 
     def apply(self, bench: Workbench) -> Workbench:
         """Return the bench with the constant in its simulator."""
-        return replace(bench, simulator=bench.simulator.with_element(self.port, Offset()))
+        return replace(bench, simulator=bench.simulator.with_element(self.port, _law_of_constant(self.port)))
 
 
 def describe_constant(port: str, value: float = 0.0, parameter: str = "", unit: str = "", alike: str = "") -> Constant:
@@ -244,15 +254,15 @@ def _describe_alike(settled: Mapping[str, Checked], port: str, other: str) -> st
     return f"{words}; or else {other}: these recordings do not tell which" if other else words
 
 
-def find_rivals(now: Checked, after: Checked, fault: Gate, cost: float) -> list[tuple[str, type[Law]]]:
+def find_rivals(now: Checked, after: Checked, fault: Gate, cost: float) -> list[tuple[str, Law]]:
     """List the constants at ports, and gains of channels, that follow about as well as a fault.
 
     `cost` is the mean square that the fault leaves; what they leave is taken on the samples that the fault keeps.
     """
-    simulator, found = now.bench.simulator, list[tuple[str, type[Law]]]()
+    simulator, found = now.bench.simulator, list[tuple[str, Law]]()
     for port in simulator.all_ports():
-        for law in (Offset, Gain) if port.series else (Offset,):
-            placed = simulator.with_element(port.name, law())
+        for law in (_law_of_constant(port.name), Gain()) if port.series else (Load(),):
+            placed = simulator.with_element(port.name, law)
             fitted = refit(now.bench, [now.fitted.values, after.fitted.values], placed, states=now.fitted.initial)
             left = np.inf if fitted is None else cost_where_kept(now.then(now.bench, fitted), after, fault)
             if not follows_better(cost, left, after.residuals):

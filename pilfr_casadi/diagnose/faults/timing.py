@@ -232,7 +232,7 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: 
     kept = 0.0 if fault.kind == "u" or fault.is_whole(bench.dt) else AVERAGED_NOISE * noise2
     rivals = find_rivals(now, after, fault, after.cost + kept)
     words = fault.sentence[0].lower() + fault.sentence[1:] if fault.finding == "clock" else fault.sentence
-    offsets = {port: words for port, law in rivals if law is Offset and in_series(port)}
+    offsets = {port: words for port, law in rivals if law.id == Offset.id and in_series(port)}
     return find_offsets(now, offsets) if offsets else now if rivals else found
 
 
