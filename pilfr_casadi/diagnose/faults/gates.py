@@ -252,27 +252,29 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
     If the recordings as given are followed as well from the corrected refit's values, the correction only led the refit
     out of a local minimum: that refit is returned, without a finding.
     """
-    if after is None or not _satisfies_rule(now, after, fault):
+    if after is None or not satisfies_rule(_cost_where_kept(now, after, fault), after, fault):
         return now
     back = refit(now.bench, [after.fitted.values], states=now.fitted.initial, like=now.fitted)
-    if back is not None and not _satisfies_rule(now.then(now.bench, back), after, fault):
-        return now.then(now.bench, back)
+    if back is not None:
+        led = now.then(now.bench, back)
+        if not satisfies_rule(_cost_where_kept(led, after, fault), after, fault):
+            return led
     errors = now.bench.nrmse(now.fitted), after.bench.nrmse(after.fitted)
     sentence = f"{fault.sentence}; {fault.remedy} {describe_fall(*errors)}"
     noises = (after.cost / max(now.noise2, 1e-300)) ** 0.5
     if noises > NEAR_NOISE_RATIO:
         sentence += f", still {noises:.2g} times the noise: more is wrong"
-    told = replace(fault, sentence=f"{sentence}.", fault=True, left=after.cost / cost_where_kept(now, after, fault))
+    told = replace(fault, sentence=f"{sentence}.", fault=True, left=after.cost / _cost_where_kept(now, after, fault))
     return now.then(after.bench, after.fitted, told)
 
 
-def _satisfies_rule(now: Checked, after: Checked, fault: Gate) -> bool:
-    before = cost_where_kept(now, after, fault)
+def satisfies_rule(before: float, after: Checked, fault: Gate) -> bool:
+    """Tell whether the rule accepts a fault whose correction reduces the mean square error `before`."""
     gained = gain(before, after.cost, after.residuals, fault.parameters)
     return gained > LEAST_GAIN and after.cost < min(fault.most_left * before, USELESS_FIT)
 
 
-def cost_where_kept(now: Checked, after: Checked, fault: Gate) -> float:
+def _cost_where_kept(now: Checked, after: Checked, fault: Gate) -> float:
     """Compute the mean square error before a correction on the samples that it keeps."""
     kept = list(map(fault.kept, now.bench.recordings))
     if all(where == slice(r.skip, None) for where, r in zip(kept, now.bench.recordings, strict=True)):

@@ -322,7 +322,7 @@ def find_output_gaps(now: Checked) -> Checked:
     without = correct(now, pause, [after.fitted.values], after.fitted.begin)
     if without is not None and CLEARLY_BETTER * without.cost < after.cost:  # nothing has to be moved
         return now
-    if find_rivals(now, after, gap, after.cost):
+    if find_rivals(now, after, after.cost):
         return now
     r = now.bench.recordings[i]
     verb = "are" if len(gap.columns) > 1 else "is"

@@ -32,7 +32,6 @@ from .gates import (
     Gate,
     accept,
     correct,
-    cost_where_kept,
     follows_better,
     gain,
     settle,
@@ -254,18 +253,17 @@ def _describe_alike(settled: Mapping[str, Checked], port: str, other: str) -> st
     return f"{words}; or else {other}: these recordings do not tell which" if other else words
 
 
-def find_rivals(now: Checked, after: Checked, fault: Gate, cost: float) -> list[tuple[str, Law]]:
-    """List the constants at ports, and gains of channels, that follow about as well as a fault.
+def find_rivals(now: Checked, after: Checked, cost: float) -> list[tuple[str, Law]]:
+    """List the constants at ports, and the gains of channels, that follow about as well as a fault.
 
-    `cost` is the mean square that the fault leaves; what they leave is taken on the samples that the fault keeps.
+    `after` is the refit with the fault corrected, to as many samples, and `cost` the mean square that it leaves.
     """
     simulator, found = now.bench.simulator, list[tuple[str, Law]]()
     for port in simulator.all_ports():
         for law in (_law_of_constant(port.name), Gain()) if port.series else (Load(),):
             placed = simulator.with_element(port.name, law)
             fitted = refit(now.bench, [now.fitted.values, after.fitted.values], placed, states=now.fitted.initial)
-            left = np.inf if fitted is None else cost_where_kept(now.then(now.bench, fitted), after, fault)
-            if not follows_better(cost, left, after.residuals):
+            if fitted is not None and not follows_better(cost, fitted.cost, after.residuals):
                 found.append((port.name, law))
     return found
 

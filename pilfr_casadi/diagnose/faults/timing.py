@@ -22,7 +22,7 @@ from ...data import Recording
 from ...laws import Lag
 from ...simulators import in_series
 from ..fits.floor import ABOVE_NOISE
-from ..fits.workbench import RUNAWAY, Fitted, Workbench, refit
+from ..fits.workbench import RUNAWAY, THOROUGH, Fitted, Workbench, refit
 from .gates import (
     CLEARLY_BETTER,
     EQUAL_RATIO,
@@ -33,6 +33,7 @@ from .gates import (
     accept,
     correct,
     follows_better,
+    satisfies_rule,
     settle,
 )
 from .offsets import Offset, find_offsets, find_rivals
@@ -113,6 +114,11 @@ class TimeShift(Gate):
         moved = self.read(r)
         return slice(moved.skip, len(moved) if len(moved) < len(r) else None)
 
+    def keep(self, r: Recording) -> Recording:
+        """Return the recording as it is, with the samples that the correction scores."""
+        moved = self.read(r)
+        return moved.with_(u=r.u[: len(moved)], y=r.y[: len(moved)])
+
     def remainder(self, first: FirstOrder, fitted: Fitted) -> Callable[[float], float]:
         """Return the mean square that parameters and initial states leave, as a function of the value.
 
@@ -141,14 +147,11 @@ class TimeShift(Gate):
     def relocate(self, now: Checked, after: Checked) -> Self:
         """Return the fault at the value with the smallest remainder nearby, hardly beyond the range tried."""
         width = now.bench.dt if self.finding == "alignment" else abs(self.value)
-        most, left = BEYOND * self.largest(now.bench.dt), self.remainder_beside(now, after)
-        value = _minimise(left, max(self.value - width, -most), min(self.value + width, most))[0]
-        return self if abs(value - self.value) < 2e-3 * width else self.at(value, now.bench.dt)
-
-    def remainder_beside(self, now: Checked, after: Checked) -> Callable[[float], float]:
-        """Return the remainder along the run that was refitted with the fault corrected."""
+        most = BEYOND * self.largest(now.bench.dt)
         first = FirstOrder.of(replace(now.bench, scale=after.bench.scale), after.fitted)
-        return self.remainder(first, after.fitted)
+        low, high = max(self.value - width, -most), min(self.value + width, most)
+        value = _minimise(self.remainder(first, after.fitted), low, high)[0]
+        return self if abs(value - self.value) < 2e-3 * width else self.at(value, now.bench.dt)
 
     def largest(self, dt: float) -> float:
         """Return the largest value that is tried."""
@@ -218,7 +221,12 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: 
     settled = [pair for s in _screen_shifts(bench, now.fitted, given) if (pair := _settle_shift(now, s)) is not None]
     if not settled:
         return now
-    fault, after = _smallest_alike(now, *min(settled, key=lambda pair: pair[1].cost))
+    fault, after = min(settled, key=lambda pair: pair[1].cost)
+    kept = _on_kept_samples(now, fault, after)
+    smaller = _find_smaller(kept, fault, after)
+    if smaller is not None and (again := _settle_shift(now, smaller)) is not None:
+        fault, after = again
+        kept = _on_kept_samples(now, fault, after)
     if abs(fault.value) > fault.largest(bench.dt):
         return now
     found = accept(now, after, fault)
@@ -226,14 +234,22 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: 
         return found
     more_is_wrong = after.cost > NEAR_NOISE_RATIO**2 * noise2  # then a delay or a slow clock may be physics
     may_be_physics = fault.is_like_delay(bench.dt, part) or (more_is_wrong and not (fault.leads and early))
-    if may_be_physics or _is_lag(now, after, fault):
+    if may_be_physics or not satisfies_rule(kept.cost, after, fault) or _is_lag(now, after, fault):
         return now
     # interpolation has removed a part of the noise
-    kept = 0.0 if fault.kind == "u" or fault.is_whole(bench.dt) else AVERAGED_NOISE * noise2
-    rivals = find_rivals(now, after, fault, after.cost + kept)
+    averaged = 0.0 if fault.kind == "u" or fault.is_whole(bench.dt) else AVERAGED_NOISE * noise2
+    rivals = find_rivals(kept, after, after.cost + averaged)
     words = fault.sentence[0].lower() + fault.sentence[1:] if fault.finding == "clock" else fault.sentence
     offsets = {port: words for port, law in rivals if law.id == Offset.id and in_series(port)}
     return find_offsets(now, offsets) if offsets else now if rivals else found
+
+
+def _on_kept_samples(now: Checked, fault: TimeShift, after: Checked) -> Checked:
+    """Refit to the samples that a fault keeps, as they were recorded: fewer are followed more easily."""
+    recordings = tuple(map(fault.keep, now.bench.recordings))
+    bench, values = replace(now.bench, recordings=recordings, scale=after.bench.scale), now.fitted.values
+    fitted = refit(bench, [values, after.fitted.values], states=now.fitted.begin, solver=THOROUGH)
+    return now.then(bench, fitted or bench.rerun(now.fitted))
 
 
 def _settle_shift(now: Checked, screened: TimeShift) -> tuple[TimeShift, Checked] | None:
@@ -248,24 +264,24 @@ def _settle_shift(now: Checked, screened: TimeShift) -> tuple[TimeShift, Checked
     return (whole, near) if near is not None and as_good else settled
 
 
-def _smallest_alike(now: Checked, fault: TimeShift, after: Checked) -> tuple[TimeShift, Checked]:
-    """Return the smallest shift that follows about as well, such as by a period less; or the fault itself."""
-    dt = now.bench.dt
-    count = int(abs(fault.value / dt))
+def _find_smaller(kept: Checked, fault: TimeShift, after: Checked) -> TimeShift | None:
+    """Find a smaller shift that follows the samples of this one as well, such as by a period less; None without one."""
+    dt = kept.bench.dt
+    count = int(abs(fault.value) / dt)
     if fault.finding != "alignment" or count < 2:
-        return fault, after
-    left = fault.remainder_beside(now, after)
-    here, values = left(fault.value), dt * np.arange(-count, count + 1.0)
+        return None
+    left = fault.remainder(FirstOrder.of(kept.bench, kept.fitted), kept.fitted)
+    values = dt * np.arange(1.0 - count, count)
     shares = np.array([left(float(v)) for v in values])
-    lowest = np.flatnonzero((shares[1:-1] <= shares[:-2]) & (shares[1:-1] <= shares[2:])) + 1  # one for each minimum
-    for k in sorted(lowest, key=lambda k: abs(values[k])):
-        value, share = _minimise(left, values[k - 1], values[k + 1])
-        if abs(value) > abs(fault.value) - dt or follows_better(here, share, after.residuals):
+    inner = shares[1:-1]
+    lowest = 1 + np.flatnonzero((inner <= shares[:-2]) & (inner <= shares[2:]) & (inner < CLEARLY_BETTER))
+    for k in sorted(lowest, key=lambda k: shares[k])[:MOST_SHIFTS]:
+        settled = _settle_shift(kept, fault.at(float(values[k]), dt))
+        if settled is None or not abs(settled[0].value) < abs(fault.value) - dt:
             continue
-        settled = _settle_shift(now, fault.at(value, dt))
-        if settled is not None and not follows_better(after.cost, settled[1].cost, after.residuals):
-            return settled
-    return fault, after
+        if not follows_better(after.cost, settled[1].cost, after.residuals):
+            return settled[0]
+    return None
 
 
 def _is_lag(now: Checked, after: Checked, fault: TimeShift) -> bool:
