@@ -125,7 +125,8 @@ class ResultText:
         """
         errors, said = self.errors.get("test"), self.sentence
         if self.effects and (self.interrupted or self.out_of_time):
-            said += " The search was cut short, so that a further effect may not have been tried."
+            by = "Ctrl-C" if self.interrupted else "the time limit"
+            said += f" The search was cut short by {by}, so that a further effect may not have been tried."
         if not errors:
             untested = " This correction is not tested yet: give a recording of another experiment as test."
             return said + untested if self._changed else said

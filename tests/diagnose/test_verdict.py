@@ -18,7 +18,7 @@ from pilfr_casadi.diagnose.fits.evidence import deviations
 from pilfr_casadi.diagnose.fits.flexible_forces import flexible_shares, innovation_share
 from pilfr_casadi.diagnose.posterior import posterior
 from pilfr_casadi.diagnose.verdict import judge
-from pilfr_casadi.laws import CoulombFriction, CubicDamping, Power as StaticPower, Relaxation
+from pilfr_casadi.laws import CATALOGUE, CoulombFriction, CubicDamping, Power as StaticPower, Relaxation
 
 
 def test_a_value_of_the_simulator_that_a_law_replaces_is_told_to_come_out_as_zero():
@@ -229,6 +229,8 @@ def test_a_search_that_the_time_limit_ended_does_not_blame_the_catalogue():
     found = pilfr.diagnose(cart(), blank.with_(y=y), laws=(CubicDamping,), effects=1, workers=1)
     search = found.evidence["search"]
     answer = replace(posterior(search), effects=())
+    assert "none of the laws tried (cubic damping) explains all of it" in judge(search, answer, ()).sentence
+    search.laws = CATALOGUE
     assert "no law of the catalogue explains all of it" in judge(search, answer, ()).sentence
     search.out_of_time = True
     said = judge(search, answer, ()).sentence
