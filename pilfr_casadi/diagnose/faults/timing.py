@@ -275,7 +275,7 @@ def _find_smaller(kept: Checked, fault: TimeShift, after: Checked) -> TimeShift 
     shares = np.array([left(float(v)) for v in values])
     inner = shares[1:-1]
     lowest = 1 + np.flatnonzero((inner <= shares[:-2]) & (inner <= shares[2:]) & (inner < CLEARLY_BETTER))
-    for k in sorted(lowest, key=lambda k: shares[k])[:MOST_SHIFTS]:
+    for k in sorted(lowest, key=lambda k: abs(values[k]))[:MOST_SCREENED]:
         settled = _settle_shift(kept, fault.at(float(values[k]), dt))
         if settled is None or not abs(settled[0].value) < abs(fault.value) - dt:
             continue
