@@ -203,13 +203,6 @@ def _explains_all(search: Hypotheses, laws: int) -> str:
     return f"{_which_laws(search)} explains all of it"
 
 
-def _explains_any(search: Hypotheses) -> str:
-    """Say what failed to explain any of the mismatch; after the time limit, further effects may not have been tried."""
-    if search.out_of_time and search.tried >= search.selected:
-        return f"{_which_laws(search)} alone explains it; the time limit ended the search before more were combined"
-    return f"{_which_laws(search)} explains it"
-
-
 def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, float], mode: float | None) -> str:
     root, share = search.root, max(shares.values(), default=0.0)
     where = max(shares, key=lambda k: shares[k], default="")
@@ -229,7 +222,7 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
         noise = search.least_floor.nrmse(search.bench.scale)
         least = "at least" if search.floor.source == "estimated" else "about"
         return (
-            f"Physics is missing, and {_explains_any(search)}. The refitted simulator is off by "
+            f"Physics is missing, and {_which_laws(search)} explains it. The refitted simulator is off by "
             f"{100 * search.bench.nrmse(root.fitted):.3g} % of the outputs' deviation; the noise is {least} "
             f"{100 * noise:.3g} %.{at}{rings}"
         )

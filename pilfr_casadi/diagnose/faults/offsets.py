@@ -196,7 +196,7 @@ def find_offsets(now: Checked, otherwise: Mapping[str, str] | None = None) -> Ch
             continue
         after, words = settled[port], _describe_alike(settled, port, (otherwise or {}).get(port, ""))
         name, unit = _name_of_constant(after), now.bench.simulator.port(port).unit
-        constant = describe_constant(port, float(after.fitted.values[name]), name, unit, words)
+        constant = describe_constant(port, _constant(after), name, unit, words)
         before, now = now, accept(now, after, constant)
         if now.bench is before.bench:
             break
@@ -222,19 +222,28 @@ def _name_of_constant(after: Checked) -> str:
     return f"{after.bench.simulator.elements[-1].prefix}w_0"
 
 
+def _constant(after: Checked) -> float:
+    """Return the value of the constant that was fitted last."""
+    return float(after.fitted.values[_name_of_constant(after)])
+
+
+def _is_large(port: str, after: Checked) -> bool:
+    """Tell whether a constant is at an output and above its deviation, which a sensor's zero hardly ever is."""
+    if kind_of(port) != SENSOR:
+        return False
+    i = after.bench.simulator.output_names.index(split_port(port)[1])
+    return abs(_constant(after)) > after.bench.scale[i]
+
+
 def _choose_constant(settled: Mapping[str, Checked]) -> str:
     """Choose the channel whose constant follows best; "" if there is none that is likely.
 
-    A constant of an output above its deviation is hardly the sensor's if one at an input or an inner port acts alike.
+    A large constant of an output is not likely if one at an input or an inner port acts alike.
     """
     channels = [port for port in settled if in_series(port)]
     best = min(channels, key=lambda port: settled[port].cost, default="")
-    if not best or kind_of(best) != SENSOR:
-        return best
-    after = settled[best]
-    i = after.bench.simulator.output_names.index(split_port(best)[1])
-    others = [port for port in _alike(settled, best) if kind_of(port) != SENSOR]
-    if not others or abs(after.fitted.values[_name_of_constant(after)]) <= after.bench.scale[i]:
+    others = [port for port in _alike(settled, best) if kind_of(port) != SENSOR] if best else []
+    if not others or not _is_large(best, settled[best]):
         return best
     return min(filter(in_series, others), key=lambda port: settled[port].cost, default="")
 
@@ -247,9 +256,15 @@ def _alike(settled: Mapping[str, Checked], port: str) -> list[str]:
 
 
 def _describe_alike(settled: Mapping[str, Checked], port: str, other: str) -> str:
-    """Say that a constant load acts like the constant of an output, and that it may be the fault `other`."""
-    loads = [name for name in _alike(settled, port) if kind_of(port) == SENSOR and not in_series(name)]
-    words = f", or a constant load at {' or '.join(loads)} acts like one" if loads else ""
+    """Describe what acts like a constant: one of another channel, a constant load, or the fault `other`."""
+    alike, own, words = _alike(settled, port), settled[port].bench.simulator, ""
+    loads = [name for name in alike if not in_series(name)]
+    if loads and kind_of(port) == SENSOR:
+        words += f", or a constant load at {' or '.join(loads)} acts like one"
+    for name in (n for n in alike if in_series(n) and not _is_large(n, settled[n])):
+        where = "input" if kind_of(name) == ACTUATOR else "output"
+        size = with_unit(_constant(settled[name]), own.port(name).unit)
+        words += f", or the {where} {split_port(name)[1]} has one of about {size}"
     return f"{words}; or else {other}: these recordings do not tell which" if other else words
 
 
