@@ -1,8 +1,8 @@
 """Constant errors of recordings: offsets of channels, and wrong initial states.
 
 An offset that all recordings share becomes a parameter of the simulator, because a constant load has the same effect.
-Offsets that differ between the recordings are subtracted. A constant of an output may equal a constant load; if it is
-larger than the output's deviation, the load is likelier.
+Offsets that differ between the recordings are subtracted. A constant of an output may equal one of an
+input, which is told instead if the output's is larger than its deviation, or a constant load, which is told beside it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from ...data import Recording
 from ...laws import Gain, Law
-from ...simulators import ACTUATOR, SENSOR, Simulator, in_series, kind_of, port_name, split_port
+from ...simulators import ACTUATOR, EQUATION, SENSOR, Simulator, in_series, kind_of, port_name, split_port
 from ..fits.evidence import FORMULA_ERROR
 from ..fits.floor import ABOVE_NOISE, noise_floor
 from ..fits.screen import block_diagonal, lengths
@@ -192,8 +192,7 @@ def find_offsets(now: Checked, otherwise: Mapping[str, str] | None = None) -> Ch
         settled = {name: found for name in alike if (found := _with_constant(now, name)) is not None}
         port = _choose_constant(settled)
         if not port:
-            ports = [name for name in ports if name not in alike]
-            continue
+            break
         after, words = settled[port], _describe_alike(settled, port, (otherwise or {}).get(port, ""))
         name, unit = _name_of_constant(after), now.bench.simulator.port(port).unit
         constant = describe_constant(port, _constant(after), name, unit, words)
@@ -236,16 +235,16 @@ def _is_large(port: str, after: Checked) -> bool:
 
 
 def _choose_constant(settled: Mapping[str, Checked]) -> str:
-    """Choose the channel whose constant follows best; "" if there is none that is likely.
+    """Choose the channel whose constant follows best; "" if there is none.
 
-    A large constant of an output is not likely if one at an input or an inner port acts alike.
+    An input's constant that acts alike takes the place of a large one of an output.
     """
     channels = [port for port in settled if in_series(port)]
     best = min(channels, key=lambda port: settled[port].cost, default="")
-    others = [port for port in _alike(settled, best) if kind_of(port) != SENSOR] if best else []
-    if not others or not _is_large(best, settled[best]):
+    if not best or not _is_large(best, settled[best]):
         return best
-    return min(filter(in_series, others), key=lambda port: settled[port].cost, default="")
+    inputs = [port for port in _alike(settled, best) if kind_of(port) == ACTUATOR]
+    return min(inputs, key=lambda port: settled[port].cost, default=best)
 
 
 def _alike(settled: Mapping[str, Checked], port: str) -> list[str]:
@@ -260,7 +259,8 @@ def _describe_alike(settled: Mapping[str, Checked], port: str, other: str) -> st
     alike, own, words = _alike(settled, port), settled[port].bench.simulator, ""
     loads = [name for name in alike if not in_series(name)]
     if loads and kind_of(port) == SENSOR:
-        words += f", or a constant load at {' or '.join(loads)} acts like one"
+        places = [f"in the {p.replace(':', ' of ')}" if kind_of(p) == EQUATION else f"at {p}" for p in loads]
+        words += f", or a constant load {' or '.join(places)} acts like one"
     for name in (n for n in alike if in_series(n) and not _is_large(n, settled[n])):
         where = "input" if kind_of(name) == ACTUATOR else "output"
         size = with_unit(_constant(settled[name]), own.port(name).unit)
