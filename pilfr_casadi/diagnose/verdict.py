@@ -221,8 +221,14 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
         )
         noise = search.least_floor.nrmse(search.bench.scale)
         least = "at least" if search.floor.source == "estimated" else "about"
+        large = (
+            search.floor.source == "estimated"
+            and share < LEAST_EXPLAINED
+            and times_of_noise(search) < WHITE_NOISE_RATIO
+        )
+        or_noise = ", or the noise is large and slow" if large and not mode else ""
         return (
-            f"Physics is missing, and {_which_laws(search)} explains it. The refitted simulator is off by "
+            f"Physics is missing{or_noise}, and {_which_laws(search)} explains it. The refitted simulator is off by "
             f"{100 * search.bench.nrmse(root.fitted):.3g} % of the outputs' deviation; the noise is {least} "
             f"{100 * noise:.3g} %.{at}{rings}"
         )
