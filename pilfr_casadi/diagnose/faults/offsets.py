@@ -1,8 +1,8 @@
 """Constant errors of recordings: offsets of channels, and wrong initial states.
 
 An offset that all recordings share becomes a parameter of the simulator, because a constant load has the same effect.
-Offsets that differ between the recordings are subtracted. A constant of an output may equal one of an
-input, which is told instead if the output's is larger than its deviation, or a constant load, which is told beside it.
+Offsets that differ between the recordings are subtracted. A constant of an output may equal one of an input, which is
+told instead if the output's is larger than its deviation, or a constant load, which is told beside it.
 """
 
 from __future__ import annotations
