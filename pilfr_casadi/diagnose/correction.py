@@ -43,7 +43,7 @@ class Correction:
     # rms error of the refit on held-out blocks, in units of the outputs' deviation; nan if nothing was compared
     before: float = np.nan
     after: float = np.nan  # the same of the corrected simulator
-    closest: Trial | None = None  # the hypothesis with its named laws, if something was compared
+    closest: Trial | None = None  # the hypothesis with its named laws, if it was chosen among others
     late: bool = False  # whether there was no time left to compare it with others
 
     @property
@@ -130,7 +130,8 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     if search.past_deadline and (len(predicted) < 2 or (named and _may_be_best(candidates[0], predicted))):
         # without a comparison the named laws stay, or what is far better
         stays = tried[0] if named else _far_better(search, candidates)
-        return replace(named_correction(search, stays.fitted), late=not named), stays.fitted
+        said = named_correction(search, stays.fitted, search.floor if named else search.least_floor)
+        return replace(said, late=not named, closest=stays), stays.fitted
     chosen = _choose(predicted)[0].base
     beside = best_laws if named and not chosen.laws else chosen
     learned = _learned_candidates(search, search.memo[beside.key]) if beside.laws else []
@@ -225,9 +226,9 @@ def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()
     return [_Candidate.of(search, fitted, base)]
 
 
-def named_correction(search: Search, fitted: Fitted) -> Correction:
+def named_correction(search: Search, fitted: Fitted, floor: Floor | None = None) -> Correction:
     """Describe a simulator without a learned element, which was not compared with others."""
-    return Correction(_describe_elements(search, fitted), _shares(search, fitted, fitted, search.floor))
+    return Correction(_describe_elements(search, fitted), _shares(search, fitted, fitted, floor or search.floor))
 
 
 def _may_recur(search: Search, trial: Trial) -> bool:

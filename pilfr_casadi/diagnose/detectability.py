@@ -73,7 +73,7 @@ def assess_laws(
     tried = {port.name: _select_laws(port, laws) for port in live_ports(bench.simulator)}
     rest = Remainder.of(bench, probe, runs, tuple(dict.fromkeys(law for own in tried.values() for law in own)))
     own, start = own_changes(bench, rest.runs, known=[r.from_zero for r in rest.runs])
-    base = orthonormal(np.hstack([own, start]))
+    base, needed = orthonormal(np.hstack([own, start])), _needed_directions(own, start)
     rest = replace(rest, base=base[:, :0])
     levels = _local_levels(bench, fitted, runs)
     rows: list[LawRow] = []
@@ -83,7 +83,7 @@ def assess_laws(
         if not wanted:
             continue
         task = replace(task, pairs=[(law, shapes) for law, shapes in task.pairs if type(law) in wanted])
-        for form, row, response in _assess_port(rest, task, base, own, levels[task.index], names):
+        for form, row, response in _assess_port(rest, task, base, (own, needed), levels[task.index], names):
             rows.append(row if laws is None else replace(row, form=form))
             responses += [response] if response else []
         seen = {type(law) for law, _ in task.pairs}
@@ -103,9 +103,17 @@ def _select_laws(port: Port, laws: Sequence[type[Law]] | None) -> tuple[type[Law
 
 
 def _assess_port(
-    rest: Remainder, task: Task, base: np.ndarray, own: np.ndarray, level: float | None, names: Sequence[str]
+    rest: Remainder,
+    task: Task,
+    base: np.ndarray,
+    own: tuple[np.ndarray, np.ndarray],
+    level: float | None,
+    names: Sequence[str],
 ) -> Iterator[tuple[str, LawRow, _Response | None]]:
-    """Assess the laws of one port; yield the form and the row of each, and its response if it is detectable."""
+    """Assess the laws of one port; yield the form and the row of each, and its response if it is detectable.
+
+    `own` are the changes by each parameter, and their directions by `_needed_directions`.
+    """
     w_unit, z_unit = port_units(task.port, rest.bench.recordings[0])
     most = level or np.inf
     for law, doses in rest.doses(task):
@@ -129,15 +137,32 @@ def _assess_port(
         yield law.form, row, _Response((task.port.name, law.id), left[middle].sum(axis=1), spans, most * size)
 
 
-def _undetectable(row: LawRow, phi: np.ndarray, most: float, own: np.ndarray, names: Sequence[str]) -> LawRow:
-    """Say why a law is not detectable: it is weak at the largest local force, or own parameters imitate it."""
+def _needed_directions(own: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return the direction of each parameter's change (R, n) that neither others nor initial states can follow.
+
+    Along it lies all that would be left of an imitated response without that parameter.
+    """
+    columns = np.hstack([own, start])
+    dual = np.linalg.pinv(columns / np.maximum(lengths(columns), 1e-300), rcond=1e-6).T[:, : own.shape[1]]
+    return np.asarray(dual / np.maximum(lengths(dual), 1e-300))
+
+
+def _undetectable(
+    row: LawRow, phi: np.ndarray, most: float, own: tuple[np.ndarray, np.ndarray], names: Sequence[str]
+) -> LawRow:
+    """Say why a law is not detectable: it is weak at the largest local force, or own parameters imitate it.
+
+    Of several parameters, the one is named without which the most would be left.
+    """
     response = phi[:, np.argmax(lengths(phi))]
     size = float(np.linalg.norm(response))
     if size == 0 or size * most < DETECTION_ERRORS:
         return replace(row, status="weak")
-    cosines = np.abs(response @ own) / np.maximum(lengths(own), 1e-300)
-    alike = np.max(cosines, initial=0.0) > SMALL_SHARE
-    return replace(row, status="followed", why=names[int(np.argmax(cosines))] if alike else "the unknown start")
+    changes, needed = own
+    cosines = np.abs(response @ changes) / np.maximum(lengths(changes), 1e-300)
+    if not np.max(cosines, initial=0.0) > SMALL_SHARE:
+        return replace(row, status="followed", why="the unknown start")
+    return replace(row, status="followed", why=names[int(np.argmax(np.abs(response @ needed)))])
 
 
 def _group_responses(responses: list[_Response]) -> tuple[tuple[tuple[str, str], ...], ...]:

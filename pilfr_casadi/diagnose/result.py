@@ -103,6 +103,7 @@ class Diagnosis(ResultText):
             "description": self.correction.to_dict() if self.correction else None,
             "notes": self.warnings(),
             "interrupted": self.interrupted,
+            "out_of_time": self.out_of_time,
         }
         if self.correction:
             raw |= {"shares": self.shares, "learned": [e.to_dict() for e in self.learned]}

@@ -124,8 +124,10 @@ class ResultText:
         It also says if no test recording shows what the correction is worth.
         """
         errors, said = self.errors.get("test"), self.sentence
-        if self.effects and (self.interrupted or self.out_of_time):
-            said += " The search was cut short, so that a further effect may not have been tried."
+        untold = self.out_of_time and "time limit" not in said
+        if untold or (self.effects and (self.interrupted or self.out_of_time)):
+            by = "Ctrl-C" if self.interrupted else "the time limit"
+            said += f" The search was cut short by {by}, so that a further effect may not have been tried."
         if not errors:
             untested = " This correction is not tested yet: give a recording of another experiment as test."
             return said + untested if self._changed else said

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._base import in_words
+from ..laws import CATALOGUE, display_name
 from ..simulators import name_at
 from .faults.gates import Gate
 from .faults.tones import find_ringing_mode
@@ -77,7 +78,7 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
     if fault and (noise or cured):
         return Verdict("recording-fault", fault.sentence)
     if noise:
-        beside = f" but a steady tone in {' and '.join(g.channel for g in steady)}" if steady else ""
+        beside = _describe_beside(steady, gates) + _among_laws(search)
         rest = "no force at any port explains any of the rest"
         if measured:
             rest = "the rest is as large as the noise"
@@ -91,6 +92,14 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
     if closest is None or not closest.laws:
         closest = closest_law(search, found.best)
     return Verdict("unexplained", _describe_unexplained(search, closest, shares, mode))
+
+
+def _describe_beside(tones: Sequence[Gate], gates: Sequence[Gate]) -> str:
+    """Describe the steady tones and the fitted offsets, beside which nothing is missing."""
+    found = [f"a steady tone in {in_words([g.channel for g in tones])}"] if tones else []
+    offsets = [g.channel for g in gates if g.parameter and g.finding == "offset"]
+    found += [f"an offset of {in_words(offsets)}"] if offsets else []
+    return f" but {in_words(found)}" if found else ""
 
 
 def closest_law(search: Hypotheses, likeliest: Trial) -> Trial:
@@ -113,7 +122,8 @@ def _is_noise(search: Hypotheses, quiet: float, explained: bool, mode: float | N
     if search.floor.source != "estimated":
         like = times < ABOVE_NOISE and not explained
     else:
-        like = times < WHITE_NOISE_RATIO or (not explained and may_be_coloured_noise(search, quiet))
+        near = quiet**2 * search.root.mean_square < ABOVE_NOISE**2 * search.floor2
+        like = (near and times < WHITE_NOISE_RATIO) or (not explained and may_be_coloured_noise(search, quiet))
     return like and mode is None and not _swells(search)
 
 
@@ -165,9 +175,24 @@ def _describe_vanished(search: Hypotheses, found: Posterior) -> str:
 def _which_laws(search: Hypotheses) -> str:
     """Describe the laws of which none explains the mismatch: after the time limit, only those that were fitted."""
     if not search.out_of_time or search.tried >= search.selected:
-        return "no law of the catalogue"
+        restricted = _restricted_laws(search)
+        return f"none of the laws tried ({restricted})" if restricted else "no law of the catalogue"
     cases = f"{search.tried} of {search.selected} cases of a law at a port"
     return f"none of the laws that were fitted before the time limit ({cases})"
+
+
+def _restricted_laws(search: Hypotheses) -> str:
+    """List the laws that were allowed; "" if all of the catalogue were."""
+    names = {law.__name__ for law in search.laws}
+    if names >= {law.__name__ for law in CATALOGUE}:
+        return ""
+    return in_words(list(dict.fromkeys(display_name(law.id) for law in search.laws if law.id != "offset")))
+
+
+def _among_laws(search: Hypotheses) -> str:
+    """Say which laws were tried, unless it were all of the catalogue."""
+    restricted = _restricted_laws(search)
+    return f", as far as the laws tried can show ({restricted})" if restricted else ""
 
 
 def _explains_all(search: Hypotheses, laws: int) -> str:
@@ -196,8 +221,14 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
         )
         noise = search.least_floor.nrmse(search.bench.scale)
         least = "at least" if search.floor.source == "estimated" else "about"
+        large = (
+            search.floor.source == "estimated"
+            and share < LEAST_EXPLAINED
+            and times_of_noise(search) < WHITE_NOISE_RATIO
+        )
+        or_noise = ", or the noise is large and slow" if large and not mode else ""
         return (
-            f"Physics is missing, and {_which_laws(search)} explains it. The refitted simulator is off by "
+            f"Physics is missing{or_noise}, and {_which_laws(search)} explains it. The refitted simulator is off by "
             f"{100 * search.bench.nrmse(root.fitted):.3g} % of the outputs' deviation; the noise is {least} "
             f"{100 * noise:.3g} %.{at}{rings}"
         )

@@ -207,9 +207,11 @@ def test_a_correction_that_no_test_recording_tried_says_so():
 
 def test_a_search_that_was_cut_short_says_so_first():
     d = with_test_errors(0.5, 0.1, 0.9)
-    for how in ("interrupted", "out_of_time"):
-        first = str(replace(d, **{how: True})).splitlines()[0]
-        assert "was cut short, so that a further effect may not have been tried" in first
+    for how, by in (("interrupted", "Ctrl-C"), ("out_of_time", "the time limit")):
+        cut_short = replace(d, **{how: True})
+        first = str(cut_short).splitlines()[0]
+        assert f"was cut short by {by}, so that a further effect may not have been tried" in first
+        assert cut_short.to_dict()[how] is True
     assert "cut short" not in str(d).splitlines()[0]
 
 

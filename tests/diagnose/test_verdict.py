@@ -12,13 +12,13 @@ from tank import tank
 import pilfr_casadi as pilfr
 from pilfr_casadi import Recording, multisine
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.correction import Correction
+from pilfr_casadi.diagnose.correction import Correction, find_correction
 from pilfr_casadi.diagnose.faults.offsets import Offset, fix_idle_offsets, list_offsets, update_offsets
 from pilfr_casadi.diagnose.fits.evidence import deviations
 from pilfr_casadi.diagnose.fits.flexible_forces import flexible_shares, innovation_share
 from pilfr_casadi.diagnose.posterior import posterior
 from pilfr_casadi.diagnose.verdict import judge
-from pilfr_casadi.laws import CoulombFriction, CubicDamping, Power as StaticPower, Relaxation
+from pilfr_casadi.laws import CATALOGUE, CoulombFriction, CubicDamping, Power as StaticPower, Relaxation
 
 
 def test_a_value_of_the_simulator_that_a_law_replaces_is_told_to_come_out_as_zero():
@@ -229,7 +229,44 @@ def test_a_search_that_the_time_limit_ended_does_not_blame_the_catalogue():
     found = pilfr.diagnose(cart(), blank.with_(y=y), laws=(CubicDamping,), effects=1, workers=1)
     search = found.evidence["search"]
     answer = replace(posterior(search), effects=())
+    assert "none of the laws tried (cubic damping) explains all of it" in judge(search, answer, ()).sentence
+    search.laws = CATALOGUE
     assert "no law of the catalogue explains all of it" in judge(search, answer, ()).sentence
     search.out_of_time = True
     said = judge(search, answer, ()).sentence
     assert "the time limit ended the search after one effect, which does not explain all of it" in said
+
+
+def test_one_hypothesis_is_told_where_the_time_ended_before_a_comparison():
+    """The closest law, the corrected simulator and the shares are all of that one."""
+    u = 10 * multisine(200, f_max=3.0, fs=20.0, rng=np.random.default_rng(1))
+    blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
+    y = cart().with_element("ground", CoulombFriction().at({"F_c": 3.0, "v_0": 0.01})).simulate(blank)
+    found = pilfr.diagnose(cart(), blank.with_(y=y), laws=(CubicDamping,), effects=1, workers=1)
+    search = found.evidence["search"]
+    search.bench = replace(search.bench, deadline=0.0)
+    answer = replace(posterior(search), effects=())
+    correction, fitted = find_correction(search, answer)
+    assert correction.late and correction.closest.fitted is fitted
+    said = judge(search, answer, (), correction.closest).sentence
+    assert f"removes {correction.shares['named']:.0%} of the mismatch" in said
+
+
+def test_a_large_error_of_a_few_times_the_noise_is_not_said_to_be_complete():
+    """It may be slow noise as well, and the sentence says so."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-10, 10, 40), 10)[:, None]
+    blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
+    y, slow = cart().simulate(blank), lfilter([1], [1, -0.9], rng.standard_normal((600, 1)), axis=0)[200:]
+    r = blank.with_(y=y + 0.2 * np.std(y) * slow / np.std(slow))
+    found = pilfr.diagnose(cart(), r, laws=(CoulombFriction,), effects=1, workers=1)
+    assert found.verdict == "unexplained"
+    assert found.sentence.startswith(
+        "Physics is missing, or the noise is large and slow, and none of the laws tried (C"
+    )
+
+
+def test_an_offset_is_told_beside_which_nothing_is_missing():
+    true = cart().with_element("sensor:pos", Offset().at({"w_0": 5e-4}))
+    found = pilfr.diagnose(cart(), of_cart(1, true), laws=(CoulombFriction,), effects=1, workers=1)
+    assert found.sentence.startswith("Nothing is missing but an offset of pos, as far as the laws tried can show")

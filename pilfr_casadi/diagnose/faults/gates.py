@@ -193,6 +193,11 @@ def gain(before: float, after: float, residuals: Sequence[np.ndarray], parameter
     return float(0.5 * n * np.log(before / max(after, 1e-300)) - 0.5 * parameters * np.log(n))
 
 
+def follows_better(one: float, other: float, residuals: Sequence[np.ndarray]) -> bool:
+    """Tell whether an edit that leaves the mean square `one` is clearly better than another of as many parameters."""
+    return one < CLEARLY_BETTER * other and gain(other, one, residuals, 0) > LEAST_GAIN
+
+
 def with_unit(value: float, unit: str, digits: int = 3) -> str:
     """Write a value with its unit, if that is known."""
     return f"{value:.{digits}g} {unit}".rstrip()
@@ -247,11 +252,13 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
     If the recordings as given are followed as well from the corrected refit's values, the correction only led the refit
     out of a local minimum: that refit is returned, without a finding.
     """
-    if after is None or not _satisfies_rule(now, after, fault):
+    if after is None or not satisfies_rule(_cost_where_kept(now, after, fault), after, fault):
         return now
     back = refit(now.bench, [after.fitted.values], states=now.fitted.initial, like=now.fitted)
-    if back is not None and not _satisfies_rule(now.then(now.bench, back), after, fault):
-        return now.then(now.bench, back)
+    if back is not None:
+        led = now.then(now.bench, back)
+        if not satisfies_rule(_cost_where_kept(led, after, fault), after, fault):
+            return led
     errors = now.bench.nrmse(now.fitted), after.bench.nrmse(after.fitted)
     sentence = f"{fault.sentence}; {fault.remedy} {describe_fall(*errors)}"
     noises = (after.cost / max(now.noise2, 1e-300)) ** 0.5
@@ -261,8 +268,8 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
     return now.then(after.bench, after.fitted, told)
 
 
-def _satisfies_rule(now: Checked, after: Checked, fault: Gate) -> bool:
-    before = _cost_where_kept(now, after, fault)
+def satisfies_rule(before: float, after: Checked, fault: Gate) -> bool:
+    """Tell whether the rule accepts a fault whose correction reduces the mean square error `before`."""
     gained = gain(before, after.cost, after.residuals, fault.parameters)
     return gained > LEAST_GAIN and after.cost < min(fault.most_left * before, USELESS_FIT)
 

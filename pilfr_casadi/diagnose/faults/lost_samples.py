@@ -13,7 +13,8 @@ one of these explains about as much, or if no state is such an integral. A refit
 If only some outputs have lost samples, as in one of two loggers, their later samples are early relative to the others.
 Every sample is tried with every number of lost samples: before it the outputs count as recorded, after it moved.
 Cumulative sums of the error that parameters and initial states leave make this fast. It is no gap if to leave out as
-many samples, with nothing moved, explains as much: a shock may have fallen into them.
+many samples, with nothing moved, explains as much: a shock may have fallen into them. It is none either if a constant
+or a gain of the whole recording does (`find_rivals`), as where the outputs only rise or fall.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ from .gates import (
     robust_deviation,
     settle,
 )
+from .offsets import find_rivals
 from .timing import LARGEST_SHIFT
 
 MOST_GAPS = 3  # gaps that are sought at most
@@ -319,6 +321,8 @@ def find_output_gaps(now: Checked) -> Checked:
     pause = _Pause(gap.channel, "pause", (i, k, k + abs(lost)))
     without = correct(now, pause, [after.fitted.values], after.fitted.begin)
     if without is not None and CLEARLY_BETTER * without.cost < after.cost:  # nothing has to be moved
+        return now
+    if find_rivals(now, after, after.cost):
         return now
     r = now.bench.recordings[i]
     verb = "are" if len(gap.columns) > 1 else "is"

@@ -1,7 +1,8 @@
 """Constant errors of recordings: offsets of channels, and wrong initial states.
 
 An offset that all recordings share becomes a parameter of the simulator, because a constant load has the same effect.
-Offsets that differ between the recordings are subtracted.
+Offsets that differ between the recordings are subtracted. A constant of an output may equal one of an input, which is
+told instead if the output's is larger than its deviation, or a constant load, which is told beside it.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ...data import Recording, moves_freely
-from ...laws import Law
-from ...simulators import ACTUATOR, SENSOR, Simulator, kind_of, port_name, split_port
+from ...laws import Gain, Law
+from ...simulators import ACTUATOR, EQUATION, SENSOR, Simulator, in_series, kind_of, port_name, split_port
 from ..fits.evidence import FORMULA_ERROR
 from ..fits.floor import ABOVE_NOISE, noise_floor
 from ..fits.screen import block_diagonal, lengths
@@ -31,6 +32,7 @@ from .gates import (
     Gate,
     accept,
     correct,
+    follows_better,
     gain,
     settle,
     with_unit,
@@ -136,62 +138,74 @@ class Offset(Law):
         return p.w_0
 
 
+class Load(Offset):
+    """A constant force or flow at an inner port, which may act like an offset; only to compare both."""
+
+    places: ClassVar[tuple[str, ...]] = ("parallel",)
+
+
+def _law_of_constant(port: str) -> Offset:
+    return Offset() if in_series(port) else Load()
+
+
 @dataclass(frozen=True)
 class Constant(Gate):
-    """A constant at an input or an output, a parameter of the simulator; other physics may remain beside it."""
+    """A constant at a port, a parameter of the simulator; other physics may remain beside it.
+
+    `alike` says in the sentence what else the recordings may show.
+    """
 
     port: str = ""
+    alike: str = ""
     parameters: ClassVar[int] = 1
     most_left: ClassVar[float] = 1.0
     remedy: ClassVar[str] = "with it as a parameter"
 
     def apply(self, bench: Workbench) -> Workbench:
         """Return the bench with the constant in its simulator."""
-        return replace(bench, simulator=bench.simulator.with_element(self.port, Offset()))
+        return replace(bench, simulator=bench.simulator.with_element(self.port, _law_of_constant(self.port)))
 
 
-def describe_constant(port: str, value: float = 0.0, parameter: str = "", unit: str = "") -> Constant:
-    """Return the fault that a channel has a constant offset."""
+def describe_constant(port: str, value: float = 0.0, parameter: str = "", unit: str = "", alike: str = "") -> Constant:
+    """Return the fault that a channel has a constant offset; `alike` says what else it may be."""
     kind, name = split_port(port)
-    alike = ", or a constant load acts like one, as do dry friction and a dead zone while the input keeps its sign"
-    where, load = ("input", alike) if kind == ACTUATOR else ("output", "")
-    words = f"The {where} {name} has a constant offset of about {with_unit(value, unit)}{load}"
-    return Constant(name, "offset", value, words, parameter=parameter, port=port)
+    own = ", or a constant load acts like one, as do dry friction and a dead zone while the input keeps its sign"
+    where, load = ("input", own) if kind == ACTUATOR else ("output", "")
+    words = f"The {where} {name} has a constant offset of about {with_unit(value, unit)}{load}{alike}"
+    return Constant(name, "offset", value, words, parameter=parameter, port=port, alike=alike)
 
 
-def find_offsets(now: Checked) -> Checked:
+def find_offsets(now: Checked, otherwise: Mapping[str, str] | None = None) -> Checked:
     """Find constants at inputs and outputs, the most useful first, and keep them as parameters of the simulator.
 
     They count as a fault if they explain most of the mismatch. Offsets of each recording's own take their place where
-    more than noise is left and they gain enough.
+    more than noise is left and they gain enough. `otherwise` says by port which other fault follows as well.
     """
     begin, ports = now, _channels(now.bench.simulator)
+    inner = [port.name for port in now.bench.simulator.all_ports() if not port.series]
     while ports:
-        share = share_of_constants(now.bench, now.fitted, ports)
-        largest = max(share.values())
+        share = share_of_constants(now.bench, now.fitted, [*ports, *inner])
+        largest = max(share[name] for name in ports)
         if largest < EXCEPTION_SHARE:
             break
-        alike = [name for name in ports if np.isclose(share[name], largest)]  # as at an input and an output behind it
-        tried = [
-            (name, correct(now, describe_constant(name), [now.fitted.values], now.fitted.initial, THOROUGH))
-            for name in alike
-        ]
-        settled = [(name, found) for name, found in tried if found is not None]
-        if not settled:
+        alike = [name for name in share if np.isclose(share[name], largest)]  # as at an input and an output behind it
+        settled = {name: found for name in alike if (found := _with_constant(now, name)) is not None}
+        port = _choose_constant(settled)
+        if not port:
             break
-        port, after = min(settled, key=lambda pair: pair[1].cost)
-        name = f"{after.bench.simulator.elements[-1].prefix}w_0"
-        value, unit = float(after.fitted.values[name]), now.bench.simulator.port(port).unit
-        if _stands_for_load(now.bench, port, value):
+        after, words = settled[port], _describe_alike(settled, port, (otherwise or {}).get(port, ""))
+        name, unit = _name_of_constant(after), now.bench.simulator.port(port).unit
+        if _stands_for_load(now.bench, port, _constant(after)):
             break
-        before, now = now, accept(now, after, describe_constant(port, value, name, unit))
+        constant = describe_constant(port, _constant(after), name, unit, words)
+        before, now = now, accept(now, after, constant)
         if now.bench is before.bench:
             break
         ports.remove(port)
     fault = now.cost < CURED_SHARE * begin.cost
     # a constant load acts alike, so that the share that is left does not prove a fault
-    found = (replace(g, fault=fault, left=1.0) for g in now.gates[len(begin.gates) :])
-    shared = begin.then(now.bench, now.fitted, *found)
+    added = (replace(g, fault=fault, left=1.0) for g in now.gates[len(begin.gates) :])
+    shared = begin.then(now.bench, now.fitted, *added)
     if shared.cost < NEAR_NOISE_RATIO**2 * shared.noise2:
         return shared
     each = find_varying_offset(begin)
@@ -209,6 +223,78 @@ def _stands_for_load(bench: Workbench, port: str, value: float) -> bool:
         return False
     at = bench.simulator.output_names.index(name)
     return abs(value) > max(float(np.max(np.abs(r.y[:, at]))) for r in bench.recordings)
+
+
+def _with_constant(now: Checked, port: str) -> Checked | None:
+    """Fit a constant at a port."""
+    return correct(now, describe_constant(port), [now.fitted.values], now.fitted.initial, THOROUGH)
+
+
+def _name_of_constant(after: Checked) -> str:
+    """Return the parameter of the constant that was fitted last."""
+    return f"{after.bench.simulator.elements[-1].prefix}w_0"
+
+
+def _constant(after: Checked) -> float:
+    """Return the value of the constant that was fitted last."""
+    return float(after.fitted.values[_name_of_constant(after)])
+
+
+def _is_large(port: str, after: Checked) -> bool:
+    """Tell whether a constant is at an output and above its deviation, which a sensor's zero hardly ever is."""
+    if kind_of(port) != SENSOR:
+        return False
+    i = after.bench.simulator.output_names.index(split_port(port)[1])
+    return abs(_constant(after)) > after.bench.scale[i]
+
+
+def _choose_constant(settled: Mapping[str, Checked]) -> str:
+    """Choose the channel whose constant follows best; "" if there is none.
+
+    An input's constant that acts alike takes the place of a large one of an output.
+    """
+    channels = [port for port in settled if in_series(port)]
+    best = min(channels, key=lambda port: settled[port].cost, default="")
+    if not best or not _is_large(best, settled[best]):
+        return best
+    inputs = [port for port in _alike(settled, best) if kind_of(port) == ACTUATOR]
+    return min(inputs, key=lambda port: settled[port].cost, default=best)
+
+
+def _alike(settled: Mapping[str, Checked], port: str) -> list[str]:
+    """List the other ports whose constant follows about as well."""
+    one = settled[port]
+    others = ((name, found.cost) for name, found in settled.items() if name != port)
+    return [name for name, cost in others if not follows_better(one.cost, cost, one.residuals)]
+
+
+def _describe_alike(settled: Mapping[str, Checked], port: str, other: str) -> str:
+    """Describe what acts like a constant: one of another channel, a constant load, or the fault `other`."""
+    alike, own, words = _alike(settled, port), settled[port].bench.simulator, ""
+    loads = [name for name in alike if not in_series(name)]
+    if loads and kind_of(port) == SENSOR:
+        places = [f"in the {p.replace(':', ' of ')}" if kind_of(p) == EQUATION else f"at {p}" for p in loads]
+        words += f", or a constant load {' or '.join(places)} acts like one"
+    for name in (n for n in alike if in_series(n) and not _is_large(n, settled[n])):
+        where = "input" if kind_of(name) == ACTUATOR else "output"
+        size = with_unit(_constant(settled[name]), own.port(name).unit)
+        words += f", or the {where} {split_port(name)[1]} has one of about {size}"
+    return f"{words}; or else {other}: these recordings do not tell which" if other else words
+
+
+def find_rivals(now: Checked, after: Checked, cost: float) -> list[tuple[str, Law]]:
+    """List the constants at ports, and the gains of channels, that follow about as well as a fault.
+
+    `after` is the refit with the fault corrected, to as many samples, and `cost` the mean square that it leaves.
+    """
+    simulator, found = now.bench.simulator, list[tuple[str, Law]]()
+    for port in simulator.all_ports():
+        for law in (_law_of_constant(port.name), Gain()) if port.series else (Load(),):
+            placed = simulator.with_element(port.name, law)
+            fitted = refit(now.bench, [now.fitted.values, after.fitted.values], placed, states=now.fitted.initial)
+            if fitted is not None and not follows_better(cost, fitted.cost, after.residuals):
+                found.append((port.name, law))
+    return found
 
 
 @dataclass(frozen=True)
@@ -311,11 +397,20 @@ def share_of_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -
     return dict(zip(ports, (along**2 / max(first.error @ first.error, 1e-300)).tolist(), strict=True))
 
 
-def list_offsets(elements: Sequence[Any], values: Mapping[str, Any], simulator: Simulator | None = None) -> list[Gate]:
-    """List the offsets among fitted laws as findings, with the units that the simulator knows."""
+def list_offsets(
+    elements: Sequence[Any],
+    values: Mapping[str, Any],
+    simulator: Simulator | None = None,
+    alike: Mapping[str, str] | None = None,
+) -> list[Gate]:
+    """List the offsets among fitted laws as findings, with the units that the simulator knows.
+
+    `alike` says by parameter what else a constant may be.
+    """
     placed = [(e.port, f"{e.prefix}w_0") for e in elements if isinstance(e.law, Offset)]
     units = {port: simulator.port(port).unit if simulator else "" for port, _ in placed}
-    found = [describe_constant(port, float(values[name]), name, units[port]) for port, name in placed]
+    words = alike or {}
+    found = [describe_constant(p, float(values[name]), name, units[p], words.get(name, "")) for p, name in placed]
     return [replace(c, sentence=f"{c.sentence}; it is a parameter of the corrected simulator.") for c in found]
 
 
@@ -347,7 +442,8 @@ def update_offsets(
     gates: Sequence[Gate], after: Fitted, std: Mapping[str, np.ndarray], effects: bool, sure: bool
 ) -> tuple[Gate, ...]:
     """Return the findings with the offsets at their fitted values; drop offsets that the effects have replaced."""
-    fitted = {g.parameter: g for g in list_offsets(after.simulator.elements, after.values, after.simulator)}
+    alike = {g.parameter: g.alike for g in gates if isinstance(g, Constant)}
+    fitted = {g.parameter: g for g in list_offsets(after.simulator.elements, after.values, after.simulator, alike)}
     out = []
     for gate in gates:
         if not gate.parameter:

@@ -4,6 +4,10 @@ One channel is read at shifted times, and the error of the refitted simulator is
 parameters and initial states can follow. A refit confirms the shift (or clock rate) with the smallest remainder. A late
 output or an early input may be physics (a delay). A shift of many whole samples is typical of a recorder, and only a
 recorder puts an output before its cause.
+
+On a ramp, a decay or a sine other causes act like a shift or a clock rate. So it has to follow clearly better than a
+smaller shift, such as one by a period less, and than a constant or a gain (`find_rivals`), which are more common.
+Its value has to lie within the range that is screened.
 """
 
 from __future__ import annotations
@@ -16,9 +20,23 @@ import numpy as np
 
 from ...data import Recording, moves_freely
 from ...laws import Lag
+from ...simulators import in_series
 from ..fits.floor import ABOVE_NOISE
-from ..fits.workbench import RUNAWAY, Fitted, Workbench, refit
-from .gates import CLEARLY_BETTER, EQUAL_RATIO, NEAR_NOISE_RATIO, Checked, FirstOrder, Gate, accept, correct, settle
+from ..fits.workbench import RUNAWAY, THOROUGH, Fitted, Workbench, refit
+from .gates import (
+    CLEARLY_BETTER,
+    EQUAL_RATIO,
+    NEAR_NOISE_RATIO,
+    Checked,
+    FirstOrder,
+    Gate,
+    accept,
+    correct,
+    follows_better,
+    satisfies_rule,
+    settle,
+)
+from .offsets import Offset, find_offsets, find_rivals
 
 LARGEST_SHIFT = 64  # largest shift that is tried, and largest number of lost samples of an output
 SHIFTS = np.union1d(np.arange(-LARGEST_SHIFT, LARGEST_SHIFT + 1.0), np.linspace(-2.0, 2.0, 17))  # samples
@@ -27,6 +45,7 @@ RATES = np.concatenate([-np.geomspace(1e-4, 0.05, 28)[::-1], np.geomspace(1e-4, 
 WHOLE_SHIFT = 0.12  # distance in samples within which a shift counts as whole
 LONG_SHIFT = 4.5  # shift in samples above which a whole shift is a fault of the recording
 MOST_SCREENED, MOST_SHIFTS = 4, 2  # faults that refits confirm, and shifts of one channel among them
+BEYOND = 1.05  # how far a value may move beyond the range tried, which shows that the best one is not in it
 LEAST_RECORDED = 0.5  # least share of the samples that a shift may read inside the recordings
 AVERAGED_NOISE = 0.5  # share of a noise that the mean of two samples removes, the most that interpolation can
 
@@ -95,6 +114,11 @@ class TimeShift(Gate):
         moved = self.read(r)
         return slice(moved.skip, len(moved) if len(moved) < len(r) else None)
 
+    def keep(self, r: Recording) -> Recording:
+        """Return the recording as it is, with the samples that the correction scores."""
+        moved = self.read(r)
+        return moved.with_(u=r.u[: len(moved)], y=r.y[: len(moved)])
+
     def remainder(self, first: FirstOrder, fitted: Fitted) -> Callable[[float], float]:
         """Return the mean square that parameters and initial states leave, as a function of the value.
 
@@ -121,11 +145,17 @@ class TimeShift(Gate):
         return left
 
     def relocate(self, now: Checked, after: Checked) -> Self:
-        """Return the fault at the value with the smallest remainder nearby."""
+        """Return the fault at the value with the smallest remainder nearby, hardly beyond the range tried."""
         width = now.bench.dt if self.finding == "alignment" else abs(self.value)
+        most = BEYOND * self.largest(now.bench.dt)
         first = FirstOrder.of(replace(now.bench, scale=after.bench.scale), after.fitted)
-        value = _minimise(self.remainder(first, after.fitted), self.value - width, self.value + width)[0]
+        low, high = max(self.value - width, -most), min(self.value + width, most)
+        value = _minimise(self.remainder(first, after.fitted), low, high)[0]
         return self if abs(value - self.value) < 2e-3 * width else self.at(value, now.bench.dt)
+
+    def largest(self, dt: float) -> float:
+        """Return the largest value that is tried."""
+        return float(RATES[-1] if self.finding == "clock" else LARGEST_SHIFT * dt)
 
     @property
     def delay(self) -> float:
@@ -136,6 +166,10 @@ class TimeShift(Gate):
     def leads(self) -> bool:
         """Whether outputs come before their causes: an early output or a late input, which no physics explains."""
         return self.delay < 0
+
+    def is_whole(self, dt: float) -> bool:
+        """Tell whether it is a shift by whole samples, which needs no interpolation."""
+        return self.finding == "alignment" and in_steps(self.value, dt)
 
     def is_like_delay(self, dt: float, part: float) -> bool:
         """Tell whether it may be a delay: by a fraction of `part` samples, or by few samples."""
@@ -184,28 +218,70 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: 
     bench, noise2 = now.bench, now.noise2
     if now.cost < ABOVE_NOISE**2 * noise2:
         return now
-    best: tuple[TimeShift, Checked] | None = None
-    for screened in _screen_shifts(bench, now.fitted, given):
-        settled = settle(now, screened)
-        if settled is None:
-            continue
-        fault, after = settled
-        if fault.finding == "alignment":
-            whole = fault.at(round(fault.value / bench.dt) * bench.dt, bench.dt)
-            near = correct(now, whole, [after.fitted.values, {}], after.fitted.begin)
-            if near is not None and near.cost < EQUAL_RATIO * after.cost + AVERAGED_NOISE * noise2:
-                fault, after = whole, near
-        if best is None or after.cost < best[1].cost:
-            best = fault, after
-    if best is None:
+    settled = [pair for s in _screen_shifts(bench, now.fitted, given) if (pair := _settle_shift(now, s)) is not None]
+    if not settled:
         return now
-    fault, after = best
+    fault, after = min(settled, key=lambda pair: pair[1].cost)
+    kept = _on_kept_samples(now, fault, after)
+    smaller = _find_smaller(kept, fault, after)
+    if smaller is not None and (again := _settle_shift(now, smaller)) is not None:
+        fault, after = again
+        kept = _on_kept_samples(now, fault, after)
+    if abs(fault.value) > fault.largest(bench.dt):
+        return now
     found = accept(now, after, fault)
     if not found.adds_to(now):
         return found
     more_is_wrong = after.cost > NEAR_NOISE_RATIO**2 * noise2  # then a delay or a slow clock may be physics
     may_be_physics = fault.is_like_delay(bench.dt, part) or (more_is_wrong and not (fault.leads and early))
-    return now if may_be_physics or _is_lag(now, after, fault) else found
+    if may_be_physics or not satisfies_rule(kept.cost, after, fault) or _is_lag(now, after, fault):
+        return now
+    # interpolation has removed a part of the noise
+    averaged = 0.0 if fault.kind == "u" or fault.is_whole(bench.dt) else AVERAGED_NOISE * noise2
+    rivals = find_rivals(kept, after, after.cost + averaged)
+    words = fault.sentence[0].lower() + fault.sentence[1:] if fault.finding == "clock" else fault.sentence
+    offsets = {port: words for port, law in rivals if law.id == Offset.id and in_series(port)}
+    return find_offsets(now, offsets) if offsets else now if rivals else found
+
+
+def _on_kept_samples(now: Checked, fault: TimeShift, after: Checked) -> Checked:
+    """Refit to the samples that a fault keeps, as they were recorded: fewer are followed more easily."""
+    recordings = tuple(map(fault.keep, now.bench.recordings))
+    bench, values = replace(now.bench, recordings=recordings, scale=after.bench.scale), now.fitted.values
+    fitted = refit(bench, [values, after.fitted.values], states=now.fitted.begin, solver=THOROUGH)
+    return now.then(bench, fitted or bench.rerun(now.fitted))
+
+
+def _settle_shift(now: Checked, screened: TimeShift) -> tuple[TimeShift, Checked] | None:
+    """Settle a shift or a clock rate; a shift of whole samples is preferred."""
+    settled, dt = settle(now, screened), now.bench.dt
+    if settled is None or settled[0].finding != "alignment":
+        return settled
+    fault, after = settled
+    whole = fault.at(round(fault.value / dt) * dt, dt)
+    near = correct(now, whole, [after.fitted.values, {}], after.fitted.begin)
+    as_good = near is not None and near.cost < EQUAL_RATIO * after.cost + AVERAGED_NOISE * now.noise2
+    return (whole, near) if near is not None and as_good else settled
+
+
+def _find_smaller(kept: Checked, fault: TimeShift, after: Checked) -> TimeShift | None:
+    """Find a smaller shift that follows the samples of this one as well, such as by a period less; None without one."""
+    dt = kept.bench.dt
+    count = int(abs(fault.value) / dt)
+    if fault.finding != "alignment" or count < 2:
+        return None
+    left = fault.remainder(FirstOrder.of(kept.bench, kept.fitted), kept.fitted)
+    values = dt * np.arange(1.0 - count, count)
+    shares = np.array([left(float(v)) for v in values])
+    inner = shares[1:-1]
+    lowest = 1 + np.flatnonzero((inner <= shares[:-2]) & (inner <= shares[2:]) & (inner < CLEARLY_BETTER))
+    for k in sorted(lowest, key=lambda k: abs(values[k]))[:MOST_SCREENED]:
+        settled = _settle_shift(kept, fault.at(float(values[k]), dt))
+        if settled is None or not abs(settled[0].value) < abs(fault.value) - dt:
+            continue
+        if not follows_better(after.cost, settled[1].cost, after.residuals):
+            return settled[0]
+    return None
 
 
 def _is_lag(now: Checked, after: Checked, fault: TimeShift) -> bool:
