@@ -32,9 +32,9 @@ from ..data import (
     Recording,
     column_names,
     explains_nothing,
+    name_with_unit,
     nrmse,
     read_stack,
-    with_unit,
     written_times,
 )
 from ..engine import VirtualMachine, compiler, make_engine
@@ -396,7 +396,7 @@ def _recording_table(
     rows = np.column_stack([recording.u, y]).tolist()
     lines = [[t.strip(), *row] for t, row in zip(times, rows, strict=True)]
     known = {**recording.units, **units}  # of a channel in both, the recording is in the model's unit
-    names = [with_unit(name, known.get(name, "")) for name in (*recording.inputs, *outputs)]
+    names = [name_with_unit(name, known.get(name, "")) for name in (*recording.inputs, *outputs)]
     return csv_text([["t", *names], *lines])
 
 
@@ -444,7 +444,7 @@ def _stack_content(out: Path, u: np.ndarray, y: np.ndarray, dt: float, fitted: F
         else:
             np.save(buffer, y)
         return buffer.getvalue()
-    names = [with_unit(name, fitted.units.get(name, "")) for name in (*fitted.model.inputs, *fitted.model.outputs)]
+    names = [name_with_unit(name, fitted.units.get(name, "")) for name in (*fitted.model.inputs, *fitted.model.outputs)]
     lines: list[list[Any]] = [["record", "t", *names]]
     for record, index in enumerate(np.ndindex(*u.shape[2:])):
         at = (slice(None), slice(None), *index)

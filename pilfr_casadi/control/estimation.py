@@ -169,7 +169,7 @@ class KalmanFilter:
         """
         n = len(self.x0)
         u, y = (numbers(v, name) for v, name in ((u, "u"), (y, "y")))
-        if not u.size or not y.size or not u.ndim or not y.ndim:
+        if not u.ndim or not y.size or not y.ndim or not len(u):
             raise InputError("There are no samples to filter; give at least one.")
         u, y = u.reshape(len(u), -1), y.reshape(len(y), -1)
         P = self.P0 if P0 is None else numbers(P0, "P0")

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .columns import TIME_NAMES as TIME_NAMES, is_time as is_time, with_unit as with_unit
+    from .columns import TIME_NAMES as TIME_NAMES, is_time as is_time, name_with_unit as name_with_unit
     from .common_clock import merge as merge
     from .excitation import (
         excited_bins as excited_bins,

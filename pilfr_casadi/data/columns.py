@@ -32,7 +32,7 @@ def by_name_without_unit(names: Sequence[str]) -> dict[str, str]:
     return {name: full for name, full in short.items() if counts[name] == 1} | {name: name for name in names}
 
 
-def with_unit(name: str, unit: str) -> str:
+def name_with_unit(name: str, unit: str) -> str:
     """Return `name [unit]`, or the name alone if the unit is unknown."""
     return f"{name} [{unit}]" if unit else name
 

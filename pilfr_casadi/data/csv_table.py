@@ -15,7 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from .._base import REPAIR, InputError, usable
-from .columns import by_name_without_unit, is_time, present_samples, refuse_slow_channels, unit_in_brackets, with_unit
+from .columns import (
+    by_name_without_unit,
+    is_time,
+    name_with_unit,
+    present_samples,
+    refuse_slow_channels,
+    unit_in_brackets,
+)
 from .units import dimension
 
 Array = np.ndarray
@@ -159,7 +166,7 @@ def parse_csv(path: Path, text: str, wanted: Sequence[str]) -> CsvTable:
         )
     rows = [i for i in written if i > top]
     if rows and (units := _read_units(_cells(lines[rows[0]], delimiter, f"{path}: line {rows[0] + 1}"), names)):
-        names = tuple(map(with_unit, names, units))
+        names = tuple(map(name_with_unit, names, units))
         top = rows.pop(0)
     if not rows:
         raise InputError(f"{path} has a header but no data below it; give one row for each sample.")

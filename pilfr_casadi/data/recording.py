@@ -15,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from .._base import REPAIR, InputError, is_number, is_whole, later, listed, positive, real_array, usable
-from .columns import with_unit
+from .columns import name_with_unit
 from .preprocessing import butterworth, change_step, hold_at, levels_last, remove_trend
 from .units import conversion
 
@@ -144,7 +144,7 @@ class Recording:
 
     def __repr__(self) -> str:
         def channels(names: tuple[str, ...]) -> str:
-            return ", ".join(with_unit(n, self.units.get(n, "")) for n in names) or "none"
+            return ", ".join(name_with_unit(n, self.units.get(n, "")) for n in names) or "none"
 
         head = f"Recording {self.name!r}" if self.name else "Recording"
         text = f"{head}: {len(self)} samples, dt {self.dt:.6g} s ({len(self) * self.dt:.4g} s), "

@@ -31,7 +31,7 @@ from .faults.gates import (
     describe_fall,
     gain,
     open_start,
-    with_unit,
+    value_with_unit,
 )
 from .fits.evidence import AT_NOISE_RATIO, BETTER_RATIO, CONTENDING_NATS, FAR_RATIO, NEAR_RATIO, SURE, deviations
 from .fits.linearise import simulate_states
@@ -129,8 +129,8 @@ def _describe_pinned(search: Search, names: Sequence[str], found: Fitted, named:
     for name in names:
         p, value = search.bench.simulator.parameters[name], float(found.values[name])
         kept = "held at" if np.all(p.fixed) else "kept by its bounds at"
-        was = with_unit(float(without.values[name]), p.unit, 4)
-        parts.append(f"{name} = {with_unit(value, p.unit, 5)}, which is {kept} {was}")
+        was = value_with_unit(float(without.values[name]), p.unit, 4)
+        parts.append(f"{name} = {value_with_unit(value, p.unit, 5)}, which is {kept} {was}")
     words = " and ".join(f"the {name_at(placed.port, placed.law.id)}" for placed in named)
     like = f", no further off than with {words}" if named else ""
     what, it, its, given = (
@@ -269,7 +269,7 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
     squares = np.average([f.squares for f in fits], weights=sizes, axis=0)
     cost = bench.pool(squares)
     more_starts = sum(len(part.recordings) for part in benches) - len(bench.recordings)
-    more = whole.model.parameters.free.sum() * (len(fits) - 1) + len(whole.initial[0]) * more_starts
+    more = whole.model.parameters.free.sum() * (len(fits) - 1) + whole.model.initial_basis.shape[1] * more_starts
     residual = [e for part, f in zip(benches, fits, strict=True) for e in part.scored(f.residual)]
     if cost > CURED_SHARE * whole.cost or gain(whole.cost, max(cost, search.floor2), residual, more) < LEAST_GAIN:
         return None

@@ -16,7 +16,7 @@ from ..laws import Law
 from ..models import Model
 from ..optimise import StatePrior
 from ..simulators import Simulator, discretise
-from .faults.gates import Gate, edited, with_unit
+from .faults.gates import Gate, edited, value_with_unit
 from .fits.evidence import BETTER_RATIO
 from .fits.floor import effective_size
 from .fits.linearise import linearise_runs, simulate_states
@@ -240,7 +240,10 @@ def _describe_experiment(bench: Workbench, best: Mapping[str, Any], recorded: fl
     unit = {**bench.simulator.units, **bench.recordings[0].units}.get(best["input"], "")
     so_far = f"by {recorded:.2g} times" if recorded > VISIBLE_DIFFERENCE else "not at all"
     about = abs(best["level"]) > VISIBLE_LEVEL * best["amplitude"]
-    swing, level = with_unit(best["amplitude"], unit), f" about {with_unit(best['level'], unit)}" if about else ""
+    swing, level = (
+        value_with_unit(best["amplitude"], unit),
+        f" about {value_with_unit(best['level'], unit)}" if about else "",
+    )
     return (
         f"A {best['waveform']} of {best['frequency']:.3g} Hz with amplitude {swing}{level} at "
         f"{best['input']} separates {rivals} best: their outputs then differ by {best['separation']:.3g} times the "

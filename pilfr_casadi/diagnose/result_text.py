@@ -15,7 +15,7 @@ from ..simulators import ACTUATOR, Simulator, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
 from .effect import Effect
-from .faults.gates import TEST_FAULT, Gate, with_unit
+from .faults.gates import TEST_FAULT, Gate, value_with_unit
 from .faults.offsets import Offset
 from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, SURE
 from .fits.floor import ABOVE_NOISE
@@ -318,7 +318,7 @@ class ResultText:
             numbers = {name: p for name, p in own.items() if p.value.ndim == 0 and not np.all(p.fixed)}
             if numbers:
                 lines.append(f"in the correction, without a sure name: {name_at(e.port, e.law.id, e.law.form)}")
-                lines += [f"  {name} = {with_unit(float(p.value), p.unit, 5)}" for name, p in numbers.items()]
+                lines += [f"  {name} = {value_with_unit(float(p.value), p.unit, 5)}" for name, p in numbers.items()]
         return lines
 
     def _value_lines(self) -> list[str]:
@@ -336,7 +336,7 @@ class ResultText:
         more = [f"  and {len(moved) - MOST_PRINTED} more"] if len(moved) > MOST_PRINTED else []
         for e in (e for e in self.corrected.elements if isinstance(e.law, Offset)):
             value, unit = float(own[f"{e.prefix}w_0"].value), self.corrected.port(e.port).unit
-            more.append(f"  offset of {split_port(e.port)[1]} = {with_unit(value, unit, 4)}")
+            more.append(f"  offset of {split_port(e.port)[1]} = {value_with_unit(value, unit, 4)}")
         return ["the simulator's own values, refitted:", *lines, *more] if lines or more else []
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import casadi as ca
 
 from .._base import InputError, make_folder, write_atomically
-from ..data import with_unit
+from ..data import name_with_unit
 
 LONGEST_NAME = 50  # letters: C distinguishes names by their first 63, and the longest ending is "_casadi_release"
 C_KEYWORDS = frozenset(  # of C and C++
@@ -116,7 +116,7 @@ def make_unique(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def _describe_entry(names: Mapping[str, Any], name: str) -> str:
-    text = with_unit(name, names["units"].get(name, ""))
+    text = name_with_unit(name, names["units"].get(name, ""))
     return f"{text}, r = {names['thresholds'][name]:.6g}" if name in names["thresholds"] else text
 
 

@@ -434,9 +434,9 @@ def _restore_values(tables: schema.ModelTables, model: Model, structure: PILFR |
     if unknown:
         raise _Unusable(f"has the parameter {unknown[0]!r}, which its model lacks; give the model it was saved from")
     states, memory = len(tables.model.states), tables.model.memory
-    if (states, memory) != (model.n_x, model.n_s):
+    if (states, memory) != (len(model.states), model.n_s):
         raise _Unusable(
-            f"is of a model with {states} states and {memory} of memory and this one has {model.n_x} and "
+            f"is of a model with {states} states and {memory} of memory and this one has {len(model.states)} and "
             f"{model.n_s}; give the model it was saved from"
         )
     for name, p in model.parameters.items():

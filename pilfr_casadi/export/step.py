@@ -23,7 +23,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, numbers, path_text, write_atomically
-from ..data import with_unit
+from ..data import name_with_unit
 from ..models import ParameterSet
 from ..simulators import calls_external
 from .c_code import make_unique, write_c
@@ -344,7 +344,7 @@ class Exported:
 
     def __str__(self) -> str:
         def list_names(names: Iterable[str]) -> str:
-            return ", ".join(with_unit(n, self.units.get(n, "")) for n in names) or "none"
+            return ", ".join(name_with_unit(n, self.units.get(n, "")) for n in names) or "none"
 
         exact = f"smoothed, eps = {self.smooth:g}" if self.smooth else "min and max exact"
         lines = [f"{self.name}: (x, u) -> (x_next, y), a step of {self.dt:g} s, {exact}"]

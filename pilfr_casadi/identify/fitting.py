@@ -319,8 +319,7 @@ def fit_from_values(model: Model, structure: PILFR | None, context: FitContext, 
         raise InputError("The simulation diverges at the start values; start from a stable model.")
     start = problem.start
     if earlier is not None:
-        estimated = [r for r in context.recordings if r.begins == "estimate"]
-        begin = np.concatenate([start[: problem.n_free], *(earlier.initial_state(r) for r in estimated)])
+        begin = problem.variables(start[: problem.n_free], [earlier.initial_state(r) for r in context.recordings])
         start = begin if problem.cost(begin) < problem.cost(start) else start
     return _solve_and_refine(model, structure, problem, start, context)
 

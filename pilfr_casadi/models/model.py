@@ -63,7 +63,7 @@ class Model:
     resting : casadi.Function, optional
         `(x, u, p) -> state`: the whole state from the states in `states` alone, as if their signals had stood still
         before; without it, the rest is zero.
-    alike : tuple of int
+    begin_alike : tuple of int
         For each entry of the state, the number of the unknown that it is if the initial state is unknown; entries with
         the same number begin alike. By default each entry has its own.
     """
@@ -80,12 +80,12 @@ class Model:
     substeps: int = 1
     stages: ca.Function | None = None
     resting: ca.Function | None = None
-    alike: tuple[int, ...] = ()
+    begin_alike: tuple[int, ...] = ()
 
     @cached_property
     def initial_basis(self) -> np.ndarray:
-        """Matrix B (n_state, n) of an unknown initial state B v with the unknowns v (n,); see `alike`."""
-        numbers = np.array(self.alike or range(self.n_state), dtype=int)
+        """Matrix B (n_state, n) of an unknown initial state B v with the unknowns v (n,); see `begin_alike`."""
+        numbers = np.array(self.begin_alike or range(self.n_state), dtype=int)
         return np.eye(int(np.max(numbers, initial=-1)) + 1)[numbers]
 
     def initial_unknowns(self, state: np.ndarray) -> np.ndarray:

@@ -72,7 +72,7 @@ class StatePrior:
 
 def samples_for_state(model: Model) -> int:
     """Return the least number of samples that an unknown initial state is fitted to: ten per state, at least 50."""
-    return max(SAMPLES_PER_STATE * model.n_state, 50)
+    return max(SAMPLES_PER_STATE * model.initial_basis.shape[1], 50)
 
 
 def samples_to_start(model: Model, engine: Engine, recording: Recording) -> int:
@@ -146,7 +146,8 @@ def estimate_initial_state(
     problem = _state_problem(model, engine, head, known.noise if known else None)
     solver = GaussNewton(max_iterations=50)
     if known is not None:
-        mean, square = model.initial_unknowns(known.mean), basis.T @ known.precision @ basis
+        square = basis.T @ known.precision @ basis
+        mean = np.linalg.pinv(square, hermitian=True) @ basis.T @ known.precision @ known.mean
         known = replace(known, mean=mean, precision=square)
         return basis @ _fit_with_prior(problem, solver, (problem.start, *starts, mean), known)
     square = state_precision(engine, model.drive(recording), values, model.n_x, model.n_s) if state_prior else None

@@ -4,9 +4,9 @@
     subject to  lower <= θ <= upper,  lower_g <= g(θ) <= upper_g.
 
 θ stacks the model's free parameters and, for each recording whose initial state is estimated, that state with the
-element's memory, entries that begin alike once (`Model.alike`). The mean runs over all R scored samples and outputs;
-`v` is the noise variance that the priors are weighed against. Derivatives come from the sensitivity recursion; `normal`
-accumulates `JᵀJ` and `Jᵀe` over stretches of the record, so memory does not grow with its length.
+element's memory, entries that begin alike once (`Model.begin_alike`). The mean runs over all R scored samples and
+outputs; `v` is the noise variance that the priors are weighed against. Derivatives come from the sensitivity recursion;
+`normal` accumulates `JᵀJ` and `Jᵀe` over stretches of the record, so memory does not grow with its length.
 """
 
 from __future__ import annotations
@@ -211,6 +211,12 @@ class Problem:
     def size(self) -> int:
         """Number of variables."""
         return len(self.start)
+
+    def variables(self, free: Array, states: Sequence[Array]) -> Array:
+        """Return θ from the free parameters and each recording's initial state; known states are ignored."""
+        own = zip(self._placed, states, strict=True)
+        unknown = (self.model.initial_unknowns(state) for part, state in own if part.first is not None)
+        return np.concatenate([free, *unknown])
 
     def parameters(self, theta: Array) -> Array:
         """Return the model's full parameter vector (n_p,) at θ."""

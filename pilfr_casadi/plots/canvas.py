@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.textpath import TextPath
 
-from ..data import with_unit
+from ..data import name_with_unit
 
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 SKY, ORANGE, INK, GREY = "#56B4E9", "#E69F00", "#222222", "#7A7A7A"
@@ -116,7 +116,7 @@ def choose_scale(values: np.ndarray, unit: str = "") -> tuple[float, str]:
 def scale_axis(name: str, values: np.ndarray, unit: str = "") -> tuple[float, str]:
     """Choose the power of a thousand by which to divide the values of an axis; return it and the axis label."""
     size, unit = choose_scale(values, unit)
-    return size, with_unit(name, unit)
+    return size, name_with_unit(name, unit)
 
 
 def thin(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.ndarray, np.ndarray]:

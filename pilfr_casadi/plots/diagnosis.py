@@ -12,7 +12,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from ..data import with_unit
+from ..data import name_with_unit
 from .canvas import (
     BLUE,
     FONT,
@@ -72,7 +72,7 @@ def _scale_outputs(found: Mapping[str, Any], unit: str, kind: str = "amplitude")
         return 1.0, f"{kind} of the outputs [deviations{per}]"
     ((name, scale),) = found["scale"].items()
     factor, label = choose_scale(scale * np.asarray(found[kind]["edges"]), (unit + per) if unit else "")
-    return scale / factor, with_unit(f"{kind} of {name}", label)
+    return scale / factor, name_with_unit(f"{kind} of {name}", label)
 
 
 def mismatch_bands(found: Mapping[str, Any]) -> Axes:

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from .._base import InputError
-from ..data import Recording, nrmse, with_unit
+from ..data import Recording, name_with_unit, nrmse
 from ..export import FittedModel
 from ..linear import output_spectra
 from ..models import Model
@@ -121,7 +121,7 @@ def remains(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes 
     rms = float(np.sqrt(np.mean((residual[recording.skip :] / size) ** 2)))
     label = f"residual, this model (rms {rms:.3g} {unit}".rstrip() + ")"
     line(ax, recording.t, residual / size, label, INK, linewidth=0.8)
-    return finish_over_time(ax, recording, with_unit(f"simulated − measured {recording.outputs[output]}", unit))
+    return finish_over_time(ax, recording, name_with_unit(f"simulated − measured {recording.outputs[output]}", unit))
 
 
 def output_over_input(
@@ -141,7 +141,7 @@ def output_over_input(
     ax.plot(u, y / size, color=BLUE, linewidth=3.0, alpha=0.4, label="measured", rasterized=True)
     ax.plot(u, (y + error) / size, color=INK, linewidth=0.5, label=plain(f"this model{note}"), rasterized=True)
     across = recording.inputs[input]
-    return finish(ax, with_unit(across, _unit(fit, recording, across)), up, recording.name)
+    return finish(ax, name_with_unit(across, _unit(fit, recording, across)), up, recording.name)
 
 
 def spectrum(

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from .._base import InputError
-from ..data import Recording, as_recordings, with_unit
+from ..data import Recording, as_recordings, name_with_unit
 from ..models import weight_density
 from ..optimise import Iteration
 from .canvas import BLUE, GREY, PALE_BLUE, SKY, VERMILLION, axes_or_new, finish, new_figure
@@ -130,7 +130,7 @@ def _label(fit: PlottedFit, signal: str, channel: int, name: str = "") -> str:
         i = int(np.argmax(last))
         passed_through = np.count_nonzero(last) == 1 and last[i] == 1.0 and not any(np.any(row) for row in others)
         if fixed and passed_through and (signal == "z" or i == channel):
-            return with_unit(name, fit.units.get(names[i], ""))
+            return name_with_unit(name, fit.units.get(names[i], ""))
     return f"{name} (model scale)"
 
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from ..data import with_unit
+from ..data import name_with_unit
 from .canvas import BLUE, FONT, GREEN, INK, PALE_BLUE, VERMILLION, choose_scale, finish, new_figure, plain
 
 ERRORS = 2.0  # standard errors that are drawn, about 95 %
@@ -107,7 +107,7 @@ def machine_trends(trends: Sequence[Mapping[str, Any]]) -> Figure:
         centre = [float(np.sum(weight * a[known]) / np.sum(weight)) for a in (t, v)]
         ax.plot(t, centre[1] + r["slope"] * (t - centre[0]), color=VERMILLION, linewidth=1.2)
         time = "recording" if r["per"] == "recording" else "time"
-        finish(ax, time if k // columns == rows - 1 else "", with_unit(r["name"], r["unit"]), r["title"])
+        finish(ax, time if k // columns == rows - 1 else "", name_with_unit(r["name"], r["unit"]), r["title"])
     return figure
 
 
@@ -127,4 +127,4 @@ def _scale_column(column: Column) -> tuple[np.ndarray, np.ndarray, str]:
     """Divide values by a power of a thousand of their size; return them, their errors and the label."""
     name, unit, values, errors = column
     size, unit = choose_scale(values[np.isfinite(values)], unit)
-    return values / size, errors / size, with_unit(name, unit)
+    return values / size, errors / size, name_with_unit(name, unit)

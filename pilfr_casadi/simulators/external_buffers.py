@@ -79,7 +79,8 @@ def _make_python_buffer(function: PythonFunction) -> tuple[_External, list[objec
         try:
             result[:] = function.evaluate(arguments)
         except KeyboardInterrupt:  # C cannot raise it; the engine does after the run
-            result[:], abandoned.pending = np.nan, True
+            result[:] = np.nan
+            abandoned.mark()
 
     callback = ctypes.CFUNCTYPE(None, ctypes.c_void_p)(evaluate)
     address = ctypes.cast(callback, ctypes.c_void_p).value

@@ -2,8 +2,8 @@
 
 Units for co-simulation alone are stepped (`fmu_cosimulation`).
 
-A unit is a program and runs with the rights of the user, mostly in a process of its own (`fmu_process`). Differences
-along directions give the Jacobians (`external`). If a derivative or an output equals a state at every trial point, the
+A unit is a program and runs with the rights of the user, in processes of its own (`fmu_process`). Differences along
+directions give the Jacobians (`external`). If a derivative or an output equals a state at every trial point, the
 equations use the state instead of calling the unit.
 
 A force in a port is added to an input of the unit. States are deviations from their start values. Events are not

@@ -59,7 +59,7 @@ class _EventInfo(ctypes.Structure):
 
 
 class _Fmu(ctypes.Structure):
-    """`fmu_t` of the engine's `_fmu.c`."""
+    """`fmu_t` of `_fmu.c`."""
 
     _fields_ = [
         ("version", ctypes.c_int),
@@ -334,6 +334,7 @@ def unpack(path: Path) -> tuple[Path, str]:
     content = path.read_bytes()
     key = hashlib.sha256(content).hexdigest()
     if key not in _folders:
+        _remove_folders_of_killed_processes()
         folder = Path(tempfile.mkdtemp(prefix=_folder_prefix()))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -347,6 +348,18 @@ _folders: dict[str, Path] = {}  # by digest
 
 def _folder_prefix() -> str:
     return f"pilfr-fmu-{os.getpid()}-"
+
+
+def _remove_folders_of_killed_processes() -> None:
+    """Remove folders of units whose process was killed, so that it could not remove them itself."""
+    for folder in Path(tempfile.gettempdir()).glob("pilfr-fmu-*-*") if os.name == "posix" else ():
+        number = folder.name.split("-")[2]
+        try:
+            os.kill(int(number), 0)
+        except (ValueError, PermissionError):  # not of this package, or a process of somebody else
+            continue
+        except ProcessLookupError:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def owns_folder(folder: Path) -> bool:

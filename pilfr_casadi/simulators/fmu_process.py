@@ -163,7 +163,7 @@ def serve() -> None:
         except (UnitError, OSError, AttributeError) as error:
             found = tidy(error).encode() if kind == POINT else pickle.dumps((None, tidy(error)))
         except Exception as error:
-            found = pickle.dumps((None, error))
+            found = tidy(error).encode() if kind == POINT else pickle.dumps((None, error))
         write_message(replies, found)
 
 

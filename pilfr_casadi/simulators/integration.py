@@ -211,7 +211,7 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
         substeps=substeps,
         stages=ca.Function("stages", [x, u, updated, p, stages[0]], stages[1:]) if stages else None,
         resting=step.resting(),
-        alike=step.alike_at_first(substeps),
+        begin_alike=step.alike_at_first(substeps),
     )
     return model if simulator.observer is None else inject_outputs(model, simulator.observer)
 
@@ -275,7 +275,10 @@ class _SubStep:
         return x_next, y, (c, ca.vertcat(c2, c3, c4), by_c, by_stages)
 
     def alike_at_first(self, substeps: int) -> tuple[int, ...]:
-        """Number the unknowns of `Model.alike`: entries of a shift register within one sample before are alike."""
+        """Number the unknowns of `Model.begin_alike`: entries of a shift register within one sample begin alike.
+
+        So does a held input; an interpolated one does about.
+        """
         numbers = list(range(self.x.numel()))
         for element, n in zip(self.simulator.elements, self.equations.n_s, strict=True):
             first = max(numbers, default=-1) + 1

@@ -243,7 +243,7 @@ def test_messages_name_options_of_the_command_line(capsys, tmp_path, train, monk
     assert run(capsys, *fit_arguments(path, tmp_path, "--operators", 0, "--time-tolerance", 0.1))[0] == 0
     periodic = [a if a != "zero" else "periodic" for a in fit_arguments(train, tmp_path, "--overwrite")]
     refused(capsys, *periodic, says="--period SAMPLES")
-    monkeypatch.setattr("pilfr_casadi.engine.compiled.compiler", lambda: None)
+    monkeypatch.setattr("pilfr_casadi._base.c_compiler.compiler", lambda: None)
     refused(capsys, *fit_arguments(train, tmp_path, "--overwrite", "--engine", "c"), says="--engine vm")
 
 
@@ -326,7 +326,7 @@ def test_a_model_is_overwritten_only_with_overwrite(capsys, tmp_path, train):
 def test_fit_prints_its_data_order_and_engine(capsys, tmp_path, train, monkeypatch):
     arguments = list(fit_arguments(train, tmp_path, "--operators", 0))
     del arguments[arguments.index("--nx") : arguments.index("--nx") + 2]
-    monkeypatch.setattr("pilfr_casadi.engine.compiled.compiler", lambda: None)
+    monkeypatch.setattr("pilfr_casadi._base.c_compiler.compiler", lambda: None)
     monkeypatch.setattr("pilfr_casadi.cli.models.compiler", lambda: None)
     status, out, err = run(capsys, *arguments)
     assert status == 0 and "warning" not in err
@@ -336,7 +336,7 @@ def test_fit_prints_its_data_order_and_engine(capsys, tmp_path, train, monkeypat
 
 @pytest.mark.usefixtures("blank_figures")
 def test_a_compiler_that_fails_is_named(capsys, tmp_path, train, monkeypatch):
-    monkeypatch.setattr("pilfr_casadi.engine.compiled.compiler", lambda: "/bin/false")
+    monkeypatch.setattr("pilfr_casadi._base.c_compiler.compiler", lambda: "/bin/false")
     status, out, err = run(capsys, *fit_arguments(train, tmp_path, "--operators", 0))
     assert status == 0 and "warning" not in err
     assert out.count("virtual machine") == 1 and "/bin/false could not build the model" in out

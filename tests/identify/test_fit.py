@@ -293,3 +293,34 @@ def test_start_values_are_not_broadcast():
         pilfr_casadi.InputError, match=r"The start of 'A' has the shape \(1, 2\); give a number or an array"
     ):
         pilfr_casadi.fit(structure, recording, start={"A": [[0.9, 0.1]]})
+
+
+def delayed_recording():
+    """A lag behind a delay of its sensor, recorded from the middle of its motion; and the simulator with the delay."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.standard_normal((90, 1)), 10, axis=0)
+    machine = pilfr_casadi.Simulator(
+        lambda x, u, p: {"v": -x.v / p.tau + u.f},
+        lambda x: {"v": x.v},
+        states=("v",),
+        inputs=("f",),
+        parameters={"tau": pilfr_casadi.Parameter(0.5, bounds=(0.05, 5))},
+    ).with_element("sensor:v", pilfr_casadi.laws.Delay().at({"T": 0.2}, {"T": (0.01, 0.4)}))
+    true = machine.with_parameters({"tau": 0.3})
+    whole = pilfr_casadi.Recording(u, np.zeros((len(u), 0)), 0.02, inputs=("f",), initial="zero", hold="zero")
+    y = true.simulate(whole) + 1e-3 * rng.standard_normal((len(u), 1))
+    cut = [slice(100, 500), slice(500, 900)]
+    return machine, *(pilfr_casadi.Recording(u[k], y[k], 0.02, inputs=("f",), outputs=("v",), hold="zero") for k in cut)
+
+
+def test_a_simulator_with_a_long_delay_is_fitted_again_tested_and_loaded(tmp_path):
+    """Its unknown start counts by the samples before the recording, not by the steps of its integration."""
+    machine, train, test = delayed_recording()
+    fitted = pilfr_casadi.fit(machine, train)
+    again = pilfr_casadi.fit(fitted, train)
+    assert again.train_nrmse == pytest.approx(fitted.train_nrmse, rel=1e-2)
+    assert fitted.nrmse(test) < 0.02
+    with pytest.warns(UserWarning, match="not the simulator.s equations"):
+        fitted.save(tmp_path / "model.json")
+    loaded = pilfr_casadi.load(tmp_path / "model.json", model=fitted.model)
+    assert loaded.nrmse(test) == pytest.approx(fitted.nrmse(test), rel=1e-6)

@@ -198,7 +198,7 @@ def follows_better(one: float, other: float, residuals: Sequence[np.ndarray]) ->
     return one < CLEARLY_BETTER * other and gain(other, one, residuals, 0) > LEAST_GAIN
 
 
-def with_unit(value: float, unit: str, digits: int = 3) -> str:
+def value_with_unit(value: float, unit: str, digits: int = 3) -> str:
     """Write a value with its unit, if that is known."""
     return f"{value:.{digits}g} {unit}".rstrip()
 

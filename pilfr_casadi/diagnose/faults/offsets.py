@@ -35,7 +35,7 @@ from .gates import (
     follows_better,
     gain,
     settle,
-    with_unit,
+    value_with_unit,
 )
 
 KEPT_OFFSET = 0.1  # share of its first value that an offset must keep beside effects to be reported
@@ -171,7 +171,7 @@ def describe_constant(port: str, value: float = 0.0, parameter: str = "", unit: 
     kind, name = split_port(port)
     own = ", or a constant load acts like one, as do dry friction and a dead zone while the input keeps its sign"
     where, load = ("input", own) if kind == ACTUATOR else ("output", "")
-    words = f"The {where} {name} has a constant offset of about {with_unit(value, unit)}{load}{alike}"
+    words = f"The {where} {name} has a constant offset of about {value_with_unit(value, unit)}{load}{alike}"
     return Constant(name, "offset", value, words, parameter=parameter, port=port, alike=alike)
 
 
@@ -277,7 +277,7 @@ def _describe_alike(settled: Mapping[str, Checked], port: str, other: str) -> st
         words += f", or a constant load {' or '.join(places)} acts like one"
     for name in (n for n in alike if in_series(n) and not _is_large(n, settled[n])):
         where = "input" if kind_of(name) == ACTUATOR else "output"
-        size = with_unit(_constant(settled[name]), own.port(name).unit)
+        size = value_with_unit(_constant(settled[name]), own.port(name).unit)
         words += f", or the {where} {split_port(name)[1]} has one of about {size}"
     return f"{words}; or else {other}: these recordings do not tell which" if other else words
 

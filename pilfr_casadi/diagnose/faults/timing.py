@@ -241,7 +241,9 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: 
     rivals = find_rivals(kept, after, after.cost + averaged)
     words = fault.sentence[0].lower() + fault.sentence[1:] if fault.finding == "clock" else fault.sentence
     offsets = {port: words for port, law in rivals if law.id == Offset.id and in_series(port)}
-    return find_offsets(now, offsets) if offsets else now if rivals else found
+    if offsets:
+        return find_offsets(now, offsets)
+    return now if rivals else found
 
 
 def _on_kept_samples(now: Checked, fault: TimeShift, after: Checked) -> Checked:

@@ -15,7 +15,7 @@ import numpy as np
 from ...data import Recording
 from ..fits.linearise import linearise_runs
 from ..fits.workbench import Fitted, Workbench
-from .gates import EXCEPTION_SHARE, LEAST_GAIN, Gate, with_unit
+from .gates import EXCEPTION_SHARE, LEAST_GAIN, Gate, value_with_unit
 
 LEVEL_WIDTHS = 6  # widths on either side of a spectral line that tell the level of the spectrum there
 TONE_LINES = 5  # spectral lines on either side that may belong to a tone
@@ -38,8 +38,8 @@ def find_tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
         f, amplitude = (float(v) for v in np.mean(steady, axis=0))
         unit = bench.recordings[0].units.get(name, "")
         sentence = (
-            f"{name} holds a steady tone of {f:.4g} Hz, amplitude {with_unit(amplitude, unit)}, that is in no input, "
-            "as from mains hum or a fan: shield or filter it, or record what causes it."
+            f"{name} holds a steady tone of {f:.4g} Hz, amplitude {value_with_unit(amplitude, unit)}, that is in no "
+            "input, as from mains hum or a fan: shield or filter it, or record what causes it."
         )
         scale = bench.balanced(fitted).scale
         share = amplitude**2 / 2 / scale[i] ** 2 / len(scale) / fitted.cost

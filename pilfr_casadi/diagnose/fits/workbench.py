@@ -229,9 +229,7 @@ class Workbench:
     def problem_at(self, fitted: Fitted, scored: Sequence[np.ndarray] | None = None) -> tuple[Problem, np.ndarray]:
         """Make the simulation-error problem of a fitted simulator; return it and its variables at the fitted values."""
         problem = self.problem(fitted.fitted_model, fitted.engine, scored, fitted.balance)
-        begun = zip(self.recordings, fitted.initial, strict=True)
-        states = [fitted.model.initial_unknowns(s) for r, s in begun if r.begins == "estimate"]
-        return problem, np.concatenate([problem.start[: problem.n_free], *states])
+        return problem, problem.variables(problem.start[: problem.n_free], fitted.initial)
 
     def fit(
         self,
