@@ -252,3 +252,17 @@ def test_a_model_that_diverges_is_neither_observed_nor_inverted(small):
     wild = fit.model.with_parameters(fit.model.parameters.change(A={"value": 3 * np.eye(2)}))
     for verb in (kalman_filter, feedforward):
         refused(lambda verb=verb: verb(replace(fit, model=wild), record), "diverges along the recording")
+
+
+def test_a_machine_without_an_input_is_filtered():
+    """Of a cooling curve, the predictions are off by the noise."""
+    cooling = pilfr.Simulator(
+        lambda x, p: {"T": -x.T / p.tau},
+        lambda x: {"T": x.T},
+        states=("T",),
+        parameters={"tau": pilfr.Parameter(1.0, bounds=(0.1, 10))},
+    )
+    y = np.exp(-0.02 * np.arange(200) / 1.5)[:, None] + 1e-3 * np.random.default_rng(0).standard_normal((200, 1))
+    given = pilfr.Recording(np.empty((200, 0)), y, 0.02, outputs=("T",))
+    observer = kalman_filter(pilfr.fit(cooling, given), given)
+    assert np.std((observer.run(given.u, given.y)[1] - given.y)[20:]) < 2e-3

@@ -384,6 +384,18 @@ def test_nothing_is_left_in_the_temporary_folder(tmp_path, units, end):
     pytest.fail(f"{list(folder.iterdir())} is left")
 
 
+def test_folders_of_killed_processes_are_removed(tmp_path, units):
+    """Of running ones, never."""
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    dead, alive = (tmp_path / f"pilfr-fmu-{number}-x" for number in (gone.pid, os.getppid()))
+    for folder in (dead, alive):
+        folder.mkdir()
+    with begun(guided(units["c"]), recording(6, samples=40), tmp_path, "") as process:
+        process.wait(30)
+    assert alive.exists() and not dead.exists()
+
+
 def test_a_unit_that_crashes_at_some_parameters_can_be_fitted(tmp_path):
     given, unit = recording(7, samples=200), guided(c_rig(tmp_path / "a.fmu", "FAILURE=abort()"))
     start = unit.with_parameters(unit.parameter_set.change(k1={"value": 590.0}))
