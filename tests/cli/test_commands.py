@@ -326,7 +326,7 @@ def test_a_model_is_overwritten_only_with_overwrite(capsys, tmp_path, train):
 def test_fit_prints_its_data_order_and_engine(capsys, tmp_path, train, monkeypatch):
     arguments = list(fit_arguments(train, tmp_path, "--operators", 0))
     del arguments[arguments.index("--nx") : arguments.index("--nx") + 2]
-    monkeypatch.setattr("pilfr_casadi._base.c_compiler.compiler", lambda: None)
+    monkeypatch.setattr("pilfr_casadi.engine.compiled.compiler", lambda: None)
     monkeypatch.setattr("pilfr_casadi.cli.models.compiler", lambda: None)
     status, out, err = run(capsys, *arguments)
     assert status == 0 and "warning" not in err
