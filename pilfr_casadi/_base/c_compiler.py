@@ -110,7 +110,7 @@ def _compile(cc: str, source: str, key: str, level: tuple[str, ...]) -> Path:
         library = _cache_folder(key) / f"{key}-{_digest(partial)}.so"
         library.parent.mkdir(mode=0o700, exist_ok=True)
         os.replace(partial, library)
-    with contextlib.suppress(OSError):  # keep the folder's most recently used; loaded ones need no file
+    with contextlib.suppress(OSError):  # keep the most recently used; a unit's new process needs the file again
         for old in sorted(library.parent.glob("*.so"), key=lambda p: p.stat().st_mtime)[:-KEPT_LIBRARIES]:
             old.unlink()
     return library

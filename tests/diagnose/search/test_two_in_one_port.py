@@ -6,7 +6,10 @@ from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
-from pilfr_casadi.diagnose.search.relatives import complements
+from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose.fits.linearise import linearise_runs
+from pilfr_casadi.diagnose.fits.screen import Remainder
+from pilfr_casadi.diagnose.search.relatives import choose_pairs, complements
 
 FRICTION = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
 RIPPLE = laws.PeriodicForce(values={"a": 5.0, "b": 3.0, "L": 0.02})
@@ -44,6 +47,21 @@ def test_a_drive_may_have_a_dead_zone_and_a_limit():
     first = "after the dead zone" not in limit.sentence  # then it limits the signal before the dead zone
     assert values == pytest.approx({"g": 1.5, "L": 13.5 if first else 12.0}, rel=0.03)
     assert found.errors["test"]["after"] < 1.3 * found.floor["nrmse"]
+
+
+def test_two_laws_of_one_drive_are_a_pair_to_try_at_once():
+    """Of those at one port, only laws that are different physics there."""
+    true = example_rig().with_element("actuator:force", laws.DeadZone().at({"g": 1.5}))
+    true = true.with_element("actuator:force", laws.Saturation().at({"L": 12.0}))
+    bench = Workbench.of(example_rig(430.0, 5.0), [recorded(true, 0, samples=500)], "zero")
+    tried = (laws.DeadZone, laws.Saturation, laws.SoftSaturation)
+    rest = Remainder.of(bench, *linearise_runs(bench, bench.fit(bench.simulator)), tried)
+    at_drive = [
+        {type(block.scored.law) for block in pair}
+        for pair in choose_pairs(rest)
+        if {block.scored.port for block in pair} == {"actuator:force"}
+    ]
+    assert at_drive and all(laws.DeadZone in kinds and len(kinds) == 2 for kinds in at_drive)
 
 
 def test_a_drive_may_have_a_dead_zone_and_a_delay():
