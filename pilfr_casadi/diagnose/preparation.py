@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -88,14 +89,10 @@ def prepare(
     bench, times = open_bench(simulator, recordings, said or "zero", engine)
     checks, noted = _Checks(workers, early, say, until), (*spikes, *transients, *slow, *times)
     held: Sequence[Gate] = ()
-    try:
+    if said:
         first = checks.begin(bench, noted)
-    except InputError:
-        if said:
-            raise
-        first = checks.begin(bench.with_other_hold(), noted)
-    if not said:
-        first, held = choose_hold(first.with_deadline(checks.deadline))
+    else:
+        first, held = choose_hold(checks.begin_with_either_hold(bench, noted).with_deadline(checks.deadline))
     nominal = errors_of(replace(bench, hold=first.bench.hold), first.fitted.model)
     say(CHECKS, 1, CHECKED)
     now = checks.run(first, 1.0 if said else 0.5)
@@ -137,6 +134,19 @@ class _Checks:
             slips = find_gross_slips(replace(bench, deadline=self.deadline), self.workers)
             found = self._try_gross_slips(replace(bench, deadline=self.deadline), slips, gates) if slips else None
         return found or first_refit(replace(bench, deadline=self.deadline), gates)
+
+    def begin_with_either_hold(self, bench: Workbench, gates: tuple[Gate, ...]) -> Checked:
+        """Begin; with the other hold too if a channel is at fault, of which the wrong hold may choose the wrong one."""
+        other = bench.with_other_hold()
+        try:
+            first = self.begin(bench, gates)
+        except InputError:
+            return self.begin(other, gates)
+        if len(first.gates) == len(gates) or bench.interrupt.pressed:
+            return first
+        with suppress(InputError):
+            first = min(first, self.begin(other, gates), key=lambda checked: checked.cost)
+        return first
 
     def _try_gross_slips(self, bench: Workbench, slips: Sequence[Gate], gates: tuple[Gate, ...]) -> Checked | None:
         """Correct the likeliest fault if the rule accepts it; None if there is no fault and every run diverges.
