@@ -143,7 +143,7 @@ def _factors(unit: str) -> list[tuple[str, float]] | None:
     if re.search(r"\([^)]*/", plain):  # a quotient in brackets
         return None
     found, sign = list[tuple[str, float]](), 1.0
-    for token in re.findall(r"\[[^\]]*\]|[^\s*/·^()]+(?:\^\(?[\w.-]+\)?)?|/", plain):
+    for token in re.findall(r"(?:\[[^\]]*\]|[^\s*/·^()]+)(?:\^\(?[\w.-]+\)?)?|/", plain):
         symbol, _, power = token.partition("^")
         number = re.fullmatch(r"-?[\d.]+", power.strip("()"))
         if token == "/":

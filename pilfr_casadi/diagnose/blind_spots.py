@@ -21,7 +21,7 @@ from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, UNKNOWN, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings, stated_hold
 from .detectability import SMALL_SHARE, LawRow, assess_laws, group_alike
-from .excitation import Excitation, excitations
+from .excitation import Excitation, excitations, single_frequency
 from .faults.channels import correct_gross_slips, refit_corrected
 from .faults.gates import USELESS_FIT, Checked, Gate
 from .faults.offsets import WrongStart, find_wrong_start
@@ -350,7 +350,8 @@ def assess_recordings(
     )
     swings = np.ptp(np.concatenate([r.u for r in bench.recordings]), axis=0)
     still = [name for name, swing in zip(inputs, swings, strict=True) if not swing > 0]
-    spots = _find_blind_spots(found, still, _alive_as_given(quiet, fitted, parameters))
+    spots = [*_single_frequencies(inputs, bench.recordings)]
+    spots += _find_blind_spots(found, still, _alive_as_given(quiet, fitted, parameters))
     found = replace(found, blind_spots=(*spots, *_free_motions(bench.recordings)))
     sensors = helpful_sensors(response, runs) if ties else ()
     return replace(found, next_record=_next_record(found, inputs, sensors), seconds=time.perf_counter() - began)
@@ -418,6 +419,14 @@ def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) 
         yield from spot("alike-ports", group, "A law looks the same at {}.")
 
 
+def _single_frequencies(inputs: Sequence[str], recordings: Sequence[Recording]) -> Iterator[BlindSpot]:
+    """Find inputs that are one sine in all recordings."""
+    for i, name in enumerate(inputs):
+        if f := single_frequency([r.u[:, i] for r in recordings], recordings[0].dt):
+            text = f"{name} has a single frequency, {f:.3g} Hz: a delay, a lag and a resonance look alike there."
+            yield BlindSpot("one-frequency", (name,), text)
+
+
 def _free_motions(recordings: Sequence[Recording]) -> Iterator[BlindSpot]:
     """Find out whether the start alone moves the recordings, and all of them have the same travel."""
     if not moves_freely(recordings):
@@ -468,6 +477,8 @@ def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) ->
         return f"{begin} from another start, such as half of it: each amplitude then has another time."
     if still:
         return f"{varied}."
+    if single := names.get("one-frequency"):
+        return f"One with several frequencies and amplitudes of {in_words(single)}, such as a multisine."
     graded = [name for name in inputs if name not in found.switches]  # a switch has no other amplitude
     drive = next(iter([*graded, *inputs]), "the input")
     signals = [port for kind in MOTION for port in names.get(kind, ()) if kind_of(port) == ACTUATOR]

@@ -25,7 +25,8 @@ class Excitation:
     reversals : int
         Turning points with swings of at least a twentieth of the travel on both sides.
     amplitudes : int
-        Distinct amplitudes of nine tenths of the swings; amplitudes closer than a tenth of the largest count once.
+        Distinct amplitudes of nine tenths of the swings between reversals, or of all without such a swing; amplitudes
+        closer than a tenth of the largest count once.
     rests : int
         Stretches longer than two typical swings in which the coordinate stays within a twentieth of the travel.
     """
@@ -48,11 +49,39 @@ def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator
         for z in signals if travel > 0 else ():
             turns = _turning_points(z, least)
             reversals += max(len(turns) - 2, 0)
-            swings += np.abs(np.diff(z[turns])).tolist()
+            whole = turns[1:-1] if len(turns) > 3 else turns  # a recording cuts its first and last swing short
+            swings += np.abs(np.diff(z[whole])).tolist()
             longest = 2 * float(np.median(np.diff(turns))) if len(turns) > 2 else SMALL_SHARE * len(z)
             rests += _count_rests(z, least, longest)
         unit = port.across_unit or port_units(port, bench.recordings[0])[1]
         yield Excitation(port.name, travel, unit, reversals, _count_distinct(np.array(swings)), rests)
+
+
+def single_frequency(runs: Sequence[np.ndarray], dt: float) -> float:
+    """Find the only frequency, Hz, of a signal in all recordings (M,); 0 if it has several or none.
+
+    A sine, with a level, has to leave at most a tenth of the signal's deviation in each recording.
+    """
+    found = [_sine(u, dt) for u in runs if np.ptp(u) > 0]
+    alike = bool(found) and max(f for f, _ in found) - min(f for f, _ in found) <= SMALL_SHARE * found[0][0]
+    return found[0][0] if alike and max(left for _, left in found) <= SMALL_SHARE else 0.0
+
+
+def _sine(u: np.ndarray, dt: float) -> tuple[float, float]:
+    """Fit a sine of a period at least, and a level; return its frequency, Hz, and the share of the deviation left."""
+    from scipy.optimize import minimize_scalar
+    from scipy.signal import periodogram
+
+    t, deviation = dt * np.arange(len(u)), np.std(u)
+
+    def left(f: float) -> float:
+        basis = np.column_stack([np.ones(len(t)), np.cos(2 * np.pi * f * t), np.sin(2 * np.pi * f * t)])
+        return float(np.std(u - basis @ np.linalg.lstsq(basis, u)[0]) / deviation)
+
+    frequencies, power = periodogram(u, 1 / dt)
+    peak, width = float(frequencies[np.argmax(power)]), 1 / (dt * len(u))
+    best = minimize_scalar(left, bounds=(max(peak - width, width), peak + width), method="bounded")
+    return float(best.x), float(best.fun)
 
 
 def _turning_points(z: np.ndarray, least: float) -> list[int]:

@@ -104,6 +104,7 @@ def test_a_unit_of_something_else_is_refused(recorded):
         ("w/z", "N", "N", ""),
         ("1/z", "N", "m/s", "s/m"),
         ("w/z^n", "N", "rad/s", "N/(rad/s)^n"),
+        ("[speed]^2", "N", "m", "[speed]^2"),
         ("w/z^2", "[w]", "m/(s rad)", "[w] s^2 rad^2/m^2"),
         ("w/z", "N", "m/(s/rad)", "N/(m/(s/rad))"),
     ],

@@ -85,7 +85,7 @@ def test_a_diagnosis_tells_the_same_blind_spots(some):
 
 def test_a_further_record_is_named_by_the_gravest_blind_spot(some):
     says = {
-        "one amplitude": "A second amplitude of force",
+        "one amplitude": "several frequencies and amplitudes of force",
         "one push": "A slow triangle of force",
         "one temperature": "temperature varies",
         "sensor upstream": "slow triangle",
@@ -336,6 +336,19 @@ def test_a_second_amplitude_and_reversals_are_counted():
     rows = {e.port: e for e in check(MASS, both, laws=()).excitation}
     assert rows["mount"].reversals > 50 and rows["mount"].amplitudes > 1
     assert rows["mount"].unit == "m"
+
+
+def test_one_sine_is_one_amplitude_of_one_frequency():
+    t, sine = DT * np.arange(SAMPLES), lambda f, t: 30 * np.sin(2 * np.pi * f * t)
+    cut = record(MASS, 5 + sine(0.7, t + 0.3))  # the ends cut two swings short
+    found = check(MASS, cut, laws=())
+    assert next(e for e in found.excitation if e.port == "actuator:force").amplitudes == 1
+    (spot,) = (b for b in found.blind_spots if b.kind == "one-frequency")
+    assert spot.names == ("force",) and "force has a single frequency, 0.7 Hz" in spot.sentence
+    assert found.next_record == "One with several frequencies and amplitudes of force, such as a multisine."
+    for others in ([sine(0.7, t) + sine(1.9, t) / 3], [sine(0.7, t), sine(1.9, t)]):
+        several = check(MASS, [record(MASS, u) for u in others], laws=())
+        assert "one-frequency" not in {b.kind for b in several.blind_spots}
 
 
 def test_reversals_and_amplitudes_of_steps_are_counted():
