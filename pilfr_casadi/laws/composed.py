@@ -172,7 +172,7 @@ class VaryingParameter(Law):
     flexible = True
     equation = "w = c"
     source = "Toth (2010), Modeling and Identification of Linear Parameter-Varying Systems, sec. 2.1"
-    sentence = "a parameter that varies with {by}: a change is added to its value"
+    sentence = "a parameter that varies with {by}: a change is added to its value, within its bounds"
     units = {"c": "w"}
     places = ("parameter",)
 
