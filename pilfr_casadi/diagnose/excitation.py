@@ -1,4 +1,4 @@
-"""Count reversals, distinct amplitudes and rests of the motion at each port."""
+"""Describe what moves a machine in recordings: reversals, amplitudes and rests at ports, ranges and frequencies."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from .fits.linearise import Probe, Run
 from .fits.workbench import Workbench
 
 SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
+
+LONGEST_SEGMENT = 512  # samples from which a spectral density is computed
+NEW_DENSITY = SMALL_SHARE**2  # of a normalised trained spectral density over another, below which frequencies are new
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,36 @@ def single_frequency(runs: Sequence[np.ndarray], dt: float) -> float:
     found = [_sine(u, dt) for u in runs if np.ptp(u) > 0]
     alike = bool(found) and max(f for f, _ in found) - min(f for f, _ in found) <= SMALL_SHARE * found[0][0]
     return found[0][0] if alike and max(left for _, left in found) <= SMALL_SHARE else 0.0
+
+
+def ranges_left(trained: np.ndarray, tested: np.ndarray) -> list[tuple[int, float, float]]:
+    """Find channels that leave their trained range by more than a tenth: number, farthest value, limit of the range.
+
+    Both signals have one column for each channel.
+    """
+    found = []
+    for i, (known, signal) in enumerate(zip(trained.T, tested.T, strict=True)):
+        low, high, least, most = (float(f(x)) for x in (known, signal) for f in (np.min, np.max))
+        value, limit = (most, high) if most - high > low - least else (least, low)
+        if abs(value - limit) > SMALL_SHARE * (high - low):
+            found.append((i, value, limit))
+    return found
+
+
+def share_at_new_frequencies(trained: Sequence[np.ndarray], tested: Sequence[np.ndarray], dt: float) -> float:
+    """Compute the share of a signal's variance at frequencies that have 100 times less of the trained one's variance.
+
+    Each signal has one array (M,) for each recording.
+    """
+    from scipy.signal import welch
+
+    length = min(LONGEST_SEGMENT, *map(len, trained), *map(len, tested))
+    known, now = (
+        np.average([welch(u, 1 / dt, nperseg=length)[1] for u in signals], axis=0, weights=[len(u) for u in signals])
+        for signals in (trained, tested)
+    )
+    known, now = (density / max(np.sum(density), 1e-300) for density in (known, now))
+    return float(np.sum(now[known < NEW_DENSITY * now]))
 
 
 def _sine(u: np.ndarray, dt: float) -> tuple[float, float]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from diagnosis_rig import OFF, recordings, rig
+from diagnosis_rig import DT, OFF, SAMPLES, recordings, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
@@ -169,6 +169,7 @@ def test_a_wrong_channel_of_the_test_recordings_is_told_and_judges_nothing(facto
         (fault,) = (g for g in found.gates if g.finding == "test fault")
         assert (found.verdict, found.outcome, fault.channel) == ("missing-physics", "", "x2")
         assert words in fault.sentence and fault.sentence in found.summary and "worse" not in found.summary
+        assert "test range" not in {g.finding for g in found.gates}
         assert not any("test error" in text for text in found.warnings())
     assert "In the test recording wrong," in fault.sentence
 
@@ -182,6 +183,21 @@ def test_correct_tests_are_not_blamed_for_faults_of_the_training_data_nor_for_ph
     loud = rig(OFF).with_element("ground-m1", hard).simulate(test.with_(u=60 * test.u))
     found = pilfr.diagnose(rig(OFF), train, test=test.with_(u=60 * test.u, y=loud), laws=FEW)
     assert found.errors["test"]["after"] > 1 and not found.test_fault
+    (note,) = (g.sentence for g in found.gates if g.finding == "test range")
+    assert note.startswith("The test recordings go beyond the training recordings: force reaches ")
+    assert "x2 reaches" in note and "frequencies" not in note
+
+
+def test_frequencies_of_the_test_recordings_that_training_does_not_have_are_told():
+    t, (train, test) = DT * np.arange(SAMPLES), recordings(count=2)
+    machine = rig().with_element("actuator:force", Delay(values={"T": 0.01}))
+    train, test = (
+        r.with_(u=u[:, None], y=machine.simulate(r.with_(u=u[:, None], y=np.zeros((len(u), 1)))))
+        for r, u in ((train, 5 * np.sin(2 * np.pi * 1 * t)), (test, 5 * np.sin(2 * np.pi * 8 * t)))
+    )
+    found = pilfr.diagnose(rig(OFF), train, test=test, laws=())
+    (note,) = (g.sentence for g in found.gates if g.finding == "test range")
+    assert "100% of force is at frequencies that it hardly has in training" in note and "force reaches" not in note
 
 
 def test_tests_may_begin_in_the_training_data_where_they_are_not_scored(plain):
