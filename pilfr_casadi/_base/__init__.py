@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         is_whole as is_whole,
         listed as listed,
         numbers as numbers,
+        percent as percent,
         positive as positive,
         read_bytes as read_bytes,
         real_array as real_array,

@@ -35,6 +35,11 @@ def in_words(names: Sequence[str]) -> str:
     return " and ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else "".join(names)
 
 
+def percent(share: float) -> str:
+    """Write a share, "12.3 %"."""
+    return f"{100 * share:.3g} %"
+
+
 def usable(values: np.ndarray) -> np.ndarray:
     """Tell which values are finite and small enough that their squares can be summed; a boolean array."""
     return np.abs(values) <= LARGEST  # False for nan

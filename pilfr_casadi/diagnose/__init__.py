@@ -61,6 +61,7 @@ if TYPE_CHECKING:
     from .result import BeforeAfter as BeforeAfter, Diagnosis as Diagnosis
     from .result_text import ERROR_NAMES as ERROR_NAMES
     from .search.learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
+    from .verdict import closest_hypothesis as closest_hypothesis
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
     __all__.append("diagnose")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, in_words
+from .._base import InputError, in_words, percent
 from ..data import Recording
 from ..identify import surrogate_warning
 from ..laws import Law, display_name, readable_unit, short_name
@@ -204,7 +204,7 @@ def _range_note(bench: Workbench, tests: Sequence[Recording]) -> Iterator[Gate]:
     for i, name in enumerate(simulator.inputs):
         share = share_at_new_frequencies([r.u[:, i] for r in trained], [r.u[:, i] for r in tests], bench.dt)
         if share > SURE:
-            words.append(f"{share:.0%} of {name} is at frequencies that it hardly has in training")
+            words.append(f"{percent(share)} of {name} is at frequencies that it hardly has in training")
     if words:
         advice = "There the corrected simulator extrapolates; train it on recordings like these, too."
         sentence = f"The test recordings go beyond the training recordings: {in_words(words)}. {advice}"

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import in_words, one_blas_thread, to_json
+from .._base import in_words, one_blas_thread, percent, to_json
 from ..data import Recording, moves_freely
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, UNKNOWN, in_series, kind_of, port_name, split_port
@@ -157,7 +157,7 @@ class Check:
         """State the error of the refitted simulator, and what follows if it is above the noise."""
         floor = float(np.mean(list(self.noise["share"].values())))
         times = self.error / max(floor, 1e-300)
-        yield f"refitted: error {100 * self.error:.3g} % of the outputs' deviation, {times:.2g} times the noise"
+        yield f"refitted: error {percent(self.error)} of the outputs' deviation, {times:.2g} times the noise"
         if times > ABOVE_NOISE:
             yield "  Something is missing, or the noise is slow. Refitted values may stand in for missing physics;"
             yield "  standard errors and detectable strengths count the noise alone."
@@ -388,7 +388,7 @@ def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) 
             yield BlindSpot(kind, tuple(names), sentence.format(in_words(names)))
 
     if found.rough:
-        left = f"{100 * found.error:.3g} % of the outputs' deviation"
+        left = f"{percent(found.error)} of the outputs' deviation"
         yield BlindSpot("rough", (), f"The refitted simulator leaves {left}, so all of this is rough.")
     yield from spot("constant-input", still, "Constant in all recordings: {}.")
     if not found.parameters:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, percent
 from ..laws import CATALOGUE
 from ..simulators import name_at
 from .fits.evidence import FORMULA_ERROR, NEAR_RATIO, SURE, HeldOut, runs_away
@@ -58,7 +58,7 @@ class Correction:
     @property
     def sentence(self) -> str:
         """State the elements, the shares that they explain, and how much better the simulator predicts."""
-        named, learned, left = (f"{100 * self.shares[k]:.3g} %" for k in ("named", "learned", "left"))
+        named, learned, left = (percent(self.shares[k]) for k in ("named", "learned", "left"))
         shares = (
             f"Of the mismatch above the noise, named laws explain {named}, a learned force {learned}; {left} is left."
         )
@@ -75,8 +75,8 @@ class Correction:
             return shares
         return (
             f"The corrected simulator has {self.words}. On parts of the training recordings that it was not fitted to, "
-            f"its error is {100 * self.after:.3g} % of the outputs' deviation; that of the refit is "
-            f"{100 * self.before:.3g} %. {shares}"
+            f"its error is {percent(self.after)} of the outputs' deviation; that of the refit is "
+            f"{percent(self.before)}. {shares}"
         )
 
     def to_dict(self) -> dict[str, Any] | None:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .._base import InputError, listed
+from .._base import InputError, listed, percent
 from ..data import Recording
 from ..laws import display_name
 from ..simulators import UNKNOWN, Placed, in_series, name_at
@@ -202,7 +202,8 @@ def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[tu
     sentence = (
         f"No declared port {'may ' * bool(named)}reach{'' if named else 'es'} it: in the equation of {state}, "
         f"{display_name(law)} explains it{' as well' * bool(named)} (refitted with it, the error is "
-        f"{other.bench.nrmse(found.best.fitted):.3g} of the outputs' deviation). Declare the port that it acts through."
+        f"{percent(other.bench.nrmse(found.best.fitted))} of the outputs' deviation). "
+        "Declare the port that it acts through."
     )
     gate = Gate(state, "undeclared", law.replace("_", " "), sentence, corrected=False)
     ahead = other.log_prior(found.best) - search.log_prior(found.best)  # as many samples count in both
@@ -280,8 +281,8 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
     names = " / ".join(name for name, *_ in groups)
     errors = np.sqrt(np.mean(whole.squares)), np.sqrt(np.mean(squares))
     sentence = (
-        f"With values of their own, {where} ({names}) are followed to {errors[1]:.3g} of the outputs' deviation "
-        f"instead of {errors[0]:.3g} ({listed}): something differs between them, such as a setting, a "
+        f"With values of their own, {where} ({names}) are followed to {percent(errors[1])} of the outputs' deviation "
+        f"instead of {percent(errors[0])} ({listed}): something differs between them, such as a setting, a "
         "temperature or a level that the simulator does not know."
     )
     return Gate(", ".join(name for name, _ in values), "varying", [v for _, v in values], sentence, corrected=False)

@@ -40,7 +40,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, Stages, deferred_interrupt, one_blas_thread, processors, whole
+from .._base import InputError, Progress, Stages, deferred_interrupt, one_blas_thread, percent, processors, whole
 from ..data import Recording, as_recordings
 from ..laws import Law, VaryingParameter, display_name
 from .answer import Conclusion, FinalFits, build_diagnosis
@@ -210,7 +210,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     refitted = search.root.fitted
     if search.interrupted and verdict.kind != "recording-fault":
         correction, fitted = find_correction(search, answer)
-        off = f"Refitted, the simulator is off by {search.bench.nrmse(refitted):.3g} of the outputs' deviation."
+        off = f"Refitted, the simulator is off by {percent(search.bench.nrmse(refitted))} of the outputs' deviation."
         said = correction.sentence if correction.elements else off
         before = "The search was interrupted before it came to an answer." if interrupted else verdict.sentence
         sentence = f"{before} {said}"

@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Interrupt, one_blas_thread, whole
+from .._base import InputError, Interrupt, one_blas_thread, percent, whole
 from ..data import Recording
 from ..engine import make_engine
 from ..identify import regrid
@@ -108,7 +108,7 @@ class Refinement:
     def sentence(self) -> str:
         """Say whether the layer replaces the diagnosed law, and why."""
         what = f"A layer of {len(self.weights)} {self.kind.replace('_', ' ')}s at {self.port}"
-        before, after = (f"{100 * self.held_out[k].expected:.3g} %" for k in (DIAGNOSED, self.kind))
+        before, after = (percent(self.held_out[k].expected) for k in (DIAGNOSED, self.kind))
         errors = f"the expected error is {after} of the outputs' deviation with the layer and {before} with the law"
         if self.improves:
             return f"{what} takes the place of {self._law}: by held-out training data {errors}."

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base import percent
 from ..data import Recording
 from ..identify import RUN_AWAY
 from ..models import ParameterSet
@@ -190,8 +191,8 @@ class ResultText:
         train, test = self.errors["train"], None if self.test_fault else self.errors["test"]
         if train and train["before"] > NEAR_CONSTANT and self.verdict in ("missing-physics", "unexplained"):
             out.append(
-                f"Refitted, the simulator alone is hardly better than a constant (error {train['before']:.2g} of the "
-                "outputs' deviation). Either its values, units or bounds are wrong: check them before you "
+                f"Refitted, the simulator alone is hardly better than a constant (error {percent(train['before'])} of "
+                "the outputs' deviation). Either its values, units or bounds are wrong: check them before you "
                 "trust a name. Or large physics is missing: then the corrected simulator follows far better."
             )
         if train and self.verdict != "unexplained":

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._base import in_words
+from .._base import in_words, percent
 from ..laws import CATALOGUE, display_name
 from ..simulators import name_at
 from .faults.gates import Gate
@@ -25,6 +25,7 @@ from .fits.evidence import (
     LEAST_EXPLAINED,
     NEAR_RATIO,
     NEGLIGIBLE_ERROR,
+    OTHER_PORT_SHARE,
     SURE,
     WHITE_NOISE_RATIO,
 )
@@ -52,7 +53,7 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
         return Verdict(
             "complete",
             "Nothing is seen that the simulation lacks: refitted, what stands for it follows the recordings to "
-            f"{off:.3g} of the outputs' deviation, and the simulation itself to {search.stand_in_error:.3g}.",
+            f"{percent(off)} of the outputs' deviation, and the simulation itself to {percent(search.stand_in_error)}.",
         )
     fault = min((g for g in gates if g.fault), key=lambda g: g.left, default=None)
     cured = fault is not None and fault.left < FORMULA_ERROR
@@ -86,11 +87,10 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
             rest = "the rest is slow noise: hardly any force explains its changes from sample to sample"
         return Verdict(
             "complete",
-            f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {off:.3g} of the "
+            f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {percent(off)} of the "
             f"outputs' deviation, and {rest}.",
         )
-    if closest is None or not closest.laws:
-        closest = closest_law(search, found.best)
+    closest = closest_hypothesis(search, closest) or found.best
     return Verdict("unexplained", _describe_unexplained(search, closest, shares, mode))
 
 
@@ -102,13 +102,15 @@ def _describe_beside(tones: Sequence[Gate], gates: Sequence[Gate]) -> str:
     return f" but {in_words(found)}" if found else ""
 
 
-def closest_law(search: Hypotheses, likeliest: Trial) -> Trial:
-    """Return the most promising hypothesis with a law.
+def closest_hypothesis(search: Hypotheses, chosen: Trial | None = None) -> Trial | None:
+    """Return the hypothesis with effects that an unexplained mismatch is compared with, None if there is none.
 
-    The likeliest one may explain nothing: where all are wrong, few samples count, and the
-    smallest claim is refuted least.
+    It is the one chosen as the correction, or else the most promising: the likeliest one may explain nothing, because
+    few samples count where all hypotheses are wrong, and the smallest claim is then refuted least.
     """
-    return max((t for t in search.memo.values() if t.laws), key=search.optimistic_evidence, default=likeliest)
+    if chosen is not None and chosen.effects:
+        return chosen
+    return max((t for t in search.memo.values() if t.effects), key=search.optimistic_evidence, default=None)
 
 
 def _is_noise(search: Hypotheses, quiet: float, explained: bool, mode: float | None) -> bool:
@@ -175,24 +177,27 @@ def _describe_vanished(search: Hypotheses, found: Posterior) -> str:
 def _which_laws(search: Hypotheses) -> str:
     """Describe the laws of which none explains the mismatch: after the time limit, only those that were fitted."""
     if not search.out_of_time or search.tried >= search.selected:
-        restricted = _restricted_laws(search)
-        return f"none of the laws tried ({restricted})" if restricted else "no law of the catalogue"
-    cases = f"{search.tried} of {search.selected} cases of a law at a port"
-    return f"none of the laws that were fitted before the time limit ({cases})"
+        allowed = _allowed_laws(search)
+        if allowed is None:
+            return "no law of the catalogue"
+        return f"none of the laws tried ({allowed})" if allowed else "no law (none was allowed)"
+    pairs = f"{search.tried} of {search.selected} pairs of port and law"
+    return f"none of the laws that were fitted before the time limit ({pairs})"
 
 
-def _restricted_laws(search: Hypotheses) -> str:
-    """List the laws that were allowed; "" if all of the catalogue were."""
-    names = {law.__name__ for law in search.laws}
-    if names >= {law.__name__ for law in CATALOGUE}:
-        return ""
+def _allowed_laws(search: Hypotheses) -> str | None:
+    """List the laws that were allowed; None if all of the catalogue were."""
+    if {law.__name__ for law in search.laws} >= {law.__name__ for law in CATALOGUE}:
+        return None
     return in_words(list(dict.fromkeys(display_name(law.id) for law in search.laws if law.id != "offset")))
 
 
 def _among_laws(search: Hypotheses) -> str:
     """Say which laws were tried, unless it were all of the catalogue."""
-    restricted = _restricted_laws(search)
-    return f", as far as the laws tried can show ({restricted})" if restricted else ""
+    allowed = _allowed_laws(search)
+    if allowed is None:
+        return ""
+    return f", as far as the laws tried can show ({allowed})" if allowed else ", though no law was allowed"
 
 
 def _explains_all(search: Hypotheses, laws: int) -> str:
@@ -215,7 +220,8 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
             else ""
         )
         at = (
-            f" A force at {where} could explain {share:.0%} of the rest; it may also be one that was not recorded."
+            f" A force at {where} could explain {100 * share:.0f} % of the rest; it may also be one that was not "
+            "recorded."
             if share > LEAST_EXPLAINED
             else ""
         )
@@ -229,19 +235,19 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
         or_noise = ", or the noise is large and slow" if large and not mode else ""
         return (
             f"Physics is missing{or_noise}, and {_which_laws(search)} explains it. The refitted simulator is off by "
-            f"{100 * search.bench.nrmse(root.fitted):.3g} % of the outputs' deviation; the noise is {least} "
-            f"{100 * noise:.3g} %.{at}{rings}"
+            f"{percent(search.bench.nrmse(root.fitted))} of the outputs' deviation; the noise is {least} "
+            f"{percent(noise)}.{at}{rings}"
         )
-    port = where if shares.get(laws[0].port, 0.0) < 0.5 * share else laws[0].port
+    port = where if shares.get(laws[0].port, 0.0) < OTHER_PORT_SHARE * share else laws[0].port
     # after the time limit, this may not be worth another minute
     looked = search.findings[closest.key].flexible is not None or not search.out_of_time
     rest = max(search.flexible(closest).values(), default=0.0) if looked else 0.0
     words = " and ".join(name_at(e.port, e.law.id, e.law.form) for e in laws)
     named = f"laws, {words}, remove" if laws[1:] else f"law, {words}, removes"
-    removed = f"{1 - left:.0%}" if round(left, 2) else f"all but {100 * left:.1g} %"
+    removed = f"{100 * (1 - left):.0f} %" if round(left, 2) else f"all but {100 * left:.1g} %"
     explained = ": nothing tried explains it" if looked else ""
     if rest > LEAST_EXPLAINED:
-        explained = f": a force at a port explains {rest:.0%} of it"
+        explained = f": a force at a port explains {100 * rest:.0f} % of it"
     return (
         f"Physics is missing, most likely at {port}, and {_explains_all(search, len(laws))}. The closest "
         f"{named} {removed} of the mismatch on the training recordings. The rest is not noise{explained}."

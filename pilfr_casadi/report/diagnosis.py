@@ -21,12 +21,13 @@ from ..diagnose import (
     HiddenForce,
     Learned,
     Workbench,
+    closest_hypothesis,
     hidden_force,
     port_signals,
 )
 from ..laws import display_name, readable_unit, strengths_over
 from ..plots import Signal
-from ..simulators import ACTUATOR, MECHANICAL, PARAMETER, SENSOR, Port, kind_of, name_at, split_port
+from ..simulators import ACTUATOR, MECHANICAL, PARAMETER, SENSOR, Port, in_series, kind_of, name_at, split_port
 from . import diagnosis_tables as tables
 from .diagnosis_tables import Action, element_of, measure_action
 from .page import Block, Code, Page, Picture, Section, Table, Text, label_recording, signal_path
@@ -138,12 +139,8 @@ def _result(d: Diagnosis, actions: Sequence[Action | None]) -> list[Block]:
     out: list[Block] = [Text(line) for line in d.gravest_blind_spots()]
     for k, action in enumerate(actions):
         out += tables.effect_blocks(d, k, action.table if action else None)
-    if d.verdict == "complete" and not d.freed:
-        out.append(Text("Refitted within its bounds, the simulator follows the recordings down to the noise."))
-    elif d.verdict == "unexplained":
-        out.append(
-            Text("No law of the catalogue explains the whole mismatch. The pictures below show where and how it acts.")
-        )
+    if d.verdict == "unexplained":
+        out.append(Text("The sections below show where and how the mismatch acts."))
     elif d.verdict == "recording-fault":
         out.append(Text("Correct the recordings before you look for missing physics; see the checks above."))
     if d.correction and (d.nameless or d.learned):
@@ -184,7 +181,7 @@ def _mismatch(case: _Case) -> list[Block]:
 
 
 def _hidden_forces(case: _Case) -> list[Block]:
-    """Draw the forces of the named effects; without a name, with the nearest law and at the most likely port."""
+    """Draw the forces of the named effects; without a name, those of the closest laws and at the most likely port."""
     d, out = case.diagnosis, [block for learned in case.diagnosis.learned for block in _learned_force(case, learned)]
     for e in d.effects:
         if (number := element_of(case.after, e)) is not None:
@@ -194,19 +191,18 @@ def _hidden_forces(case: _Case) -> list[Block]:
     if d.verdict != "unexplained":
         return out
     search, passes = d.evidence.get("search"), tables.candidates_by_pass(d)
-    nearest = max(search.steps[0].trials, key=search.evidence) if search is not None and search.steps else None
-    if nearest is not None:
-        fitted, port = nearest.fitted, nearest.port
-        number, name = len(fitted.simulator.elements) - 1, f"{display_name(nearest.law.id)} (the nearest law)"
-        out += _force_blocks(case, fitted, port, number, name)
-    elif passes:
+    closest: Any = search and closest_hypothesis(search, d.correction.closest if d.correction else None)
+    for acting in closest.effects if closest else ():
+        number, law = closest.fitted.simulator.elements.index(acting), display_name(acting.law.id)
+        out += _force_blocks(case, closest.fitted, acting.port, number, f"{law} (the closest law)")
+    if not closest and passes:
         candidates, _ = passes[0]
         out += _force_blocks(case, case.before, candidates[0]["port"], None, "")
     table = tables.flexible_table(d)
     if table is not None:
         out.append(table)
         port = str(table.rows[0][0])
-        if nearest is None or port != nearest.port:
+        if not closest or port not in {acting.port for acting in closest.effects}:
             out += _force_blocks(case, case.before, port, None, "")
     return out
 
@@ -217,7 +213,7 @@ def _learned_force(case: _Case, learned: Learned) -> list[Block]:
     force = Signal("learned force w", learned.force, port.unit)
     laws = [(f"{display_name(n.law)}, off by {100 * n.error:.2g} %", n.force) for n in learned.nearest]
     text = (
-        f"The blue points are the learned force at {learned.port} along the training recordings. The lines are the "
+        f"The points are the learned force at {learned.port} along the training recordings. The lines are the "
         "named laws that come nearest to it, drawn along the stretch where it is strongest."
     )
     out: list[Block] = [Text(text)]
@@ -243,18 +239,19 @@ def _force_blocks(case: _Case, fitted: Fitted, port: str, number: int | None, na
     """Recover the force in a port along the recording with the most energy, and draw it with the law called `name`."""
     bench, records = case.bench, case.bench.recordings
     strongest = int(np.argmax([np.std(r.y[r.skip :] / bench.scale) * np.sqrt(len(r)) for r in records]))
+    what = "signal" if in_series(port) else "force"
     try:
         hidden = hidden_force(bench, fitted, port, number, case.noise, strongest)
     except (InputError, np.linalg.LinAlgError, RuntimeError):
         hidden = None
     if hidden is None:
-        return [Text(f"The outputs do not show the force at {port}, so it cannot be recovered.")]
+        return [Text(f"The outputs do not show the {what} at {port}, so it cannot be recovered.")]
     recording = hidden.recording or (f"training recording {strongest + 1}" if len(records) > 1 else "the recording")
     text = (
-        f"The blue points are the force at {port} that makes the simulator follow {recording}. A smoother computed "
-        "it with the fitted parameters, assuming only that the force changes in random steps; it uses no law."
+        f"The points are the {what} at {port} that makes the simulator follow {recording}. A smoother computed it with "
+        f"the fitted parameters, assuming only that the {what} changes in random steps; it uses no law."
     )
-    text += f" The orange line is the fitted {name} along the simulation." if name else ""
+    text += f" The line is the fitted {name} along the simulation." if name else ""
     return [Text(text), *_force_pictures(hidden, bench.simulator.port(port), name)]
 
 

@@ -53,7 +53,7 @@ def test_a_wrong_sign_beside_another_zero_is_told():
     y = recorded()[1] * [-1, 1] + [3.0, 0]
     found = prepare(tanks(1.15), [of_tanks(y)], "zero", "auto")
     assert [(g.channel, g.finding) for g in found.gates] == [("upper", "sign"), ("upper", "offset")]
-    assert re.search(r"error falls from \S+ to \S+ times the outputs' deviation", found.gates[0].sentence)
+    assert re.search(r"error falls from \S+ % to \S+ % of the outputs' deviation", found.gates[0].sentence)
     assert found.without.values["sensor:upper.w_0"] == pytest.approx(-3.0, rel=0.01)
     assert found.without.cost < 0.01**2
 

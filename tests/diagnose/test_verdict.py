@@ -17,7 +17,7 @@ from pilfr_casadi.diagnose.faults.offsets import Offset, fix_idle_offsets, list_
 from pilfr_casadi.diagnose.fits.evidence import deviations
 from pilfr_casadi.diagnose.fits.flexible_forces import flexible_shares, innovation_share
 from pilfr_casadi.diagnose.posterior import posterior
-from pilfr_casadi.diagnose.verdict import judge
+from pilfr_casadi.diagnose.verdict import closest_hypothesis, judge
 from pilfr_casadi.laws import CATALOGUE, CoulombFriction, CubicDamping, Power as StaticPower, Relaxation
 
 
@@ -237,6 +237,16 @@ def test_a_search_that_the_time_limit_ended_does_not_blame_the_catalogue():
     assert "the time limit ended the search after one effect, which does not explain all of it" in said
 
 
+def test_without_laws_no_law_is_blamed_and_an_offset_is_no_closest_law():
+    u = 10 * multisine(200, f_max=3.0, fs=20.0, rng=np.random.default_rng(1))
+    blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
+    y = 0.2 + cart().with_element("ground", CoulombFriction().at({"F_c": 3.0, "v_0": 0.01})).simulate(blank)
+    found = pilfr.diagnose(cart(), blank.with_(y=y), laws=(), workers=1)
+    assert found.sentence.startswith("Physics is missing, and no law (none was allowed) explains it.")
+    search = found.evidence["search"]
+    assert any(t.laws for t in search.memo.values()) and closest_hypothesis(search) is None
+
+
 def test_one_hypothesis_is_told_where_the_time_ended_before_a_comparison():
     """The closest law, the corrected simulator and the shares are all of that one."""
     u = 10 * multisine(200, f_max=3.0, fs=20.0, rng=np.random.default_rng(1))
@@ -249,7 +259,7 @@ def test_one_hypothesis_is_told_where_the_time_ended_before_a_comparison():
     correction, fitted = find_correction(search, answer)
     assert correction.late and correction.closest.fitted is fitted
     said = judge(search, answer, (), correction.closest).sentence
-    assert f"removes {correction.shares['named']:.0%} of the mismatch" in said
+    assert f"removes {100 * correction.shares['named']:.0f} % of the mismatch" in said
 
 
 def test_a_large_error_of_a_few_times_the_noise_is_not_said_to_be_complete():

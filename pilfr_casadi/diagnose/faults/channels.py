@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._base import InputError, side_by_side
+from ..._base import InputError, percent, side_by_side
 from ...data import Recording, dimension
 from ...optimise import GaussNewton
 from ...simulators import SENSOR, Simulator, port_name
@@ -107,7 +107,7 @@ def open_bench(simulator: Any, recordings: Sequence[Recording], hold: str, engin
                 bench = Workbench.of(simulator, [r.with_(dt=r.dt * factor) for r in recordings], hold, engine)
                 cost, fault = bench.fit(simulator).cost, scale_time(factor)
                 if cost < USELESS_FIT:
-                    words = f"as given, the simulator cannot follow; corrected, its error is {cost**0.5:.3g}"
+                    words = f"as given, the simulator cannot follow; corrected, its error is {percent(cost**0.5)}"
                     words = f"{fault.sentence}; {words} of the outputs' deviation."
                     return bench, [replace(fault, sentence=words, fault=True)]
         raise error

@@ -21,7 +21,7 @@ from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
-from ..._base import InputError
+from ..._base import InputError, percent
 from ...data import Recording
 from ...optimise import GaussNewton
 from ..fits.evidence import FORMULA_ERROR
@@ -206,8 +206,8 @@ def value_with_unit(value: float, unit: str, digits: int = 3) -> str:
 def describe_fall(before: float, after: float) -> str:
     """Describe by how much an edit reduces the NRMSE."""
     if not np.isfinite(before):
-        return f"the refitted error is {after:.3g} times the outputs' deviation, where the simulation diverged before"
-    return f"the refitted error falls from {before:.3g} to {after:.3g} times the outputs' deviation"
+        return f"the refitted error is {percent(after)} of the outputs' deviation, where the simulation diverged before"
+    return f"the refitted error falls from {percent(before)} to {percent(after)} of the outputs' deviation"
 
 
 def correct(

@@ -24,6 +24,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from ..._base import percent
 from ...data import Recording
 from ...laws import AsymmetricSaturation
 from ...simulators import ACTUATOR, SENSOR, port_name
@@ -160,7 +161,7 @@ def mend_stale_samples(now: Checked) -> Checked:
             repeated = share_of_repeats([getattr(r, side)[r.skip :, i] for r in now.bench.recordings])
             if not repeated or name in held:
                 continue
-            words = f"{repeated:.0%} of the samples of {name} repeat the one before, as from lost or stale samples"
+            words = f"{percent(repeated)} of the samples of {name} repeat the one before, as from lost or stale samples"
             fault = Stale(name, "stale", repeated, words, change=partial(_interpolate_repeats, side=side, column=i))
             found = accept(now, correct(now, fault, [{}, now.fitted.values], now.fitted.begin), fault)
             if not found.adds_to(now) and side == "y":
@@ -295,8 +296,8 @@ def find_clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gat
         explained = _explained_beyond(bench, without, fault)
         if 1 - explained < min(MOST_LEFT, remains):
             sentence = (
-                f"{fault.sentence}, and its likely course beyond the limit explains {explained:.0%} of the mismatch: "
-                "the recording does not contain the true input there. Record it with a larger range."
+                f"{fault.sentence}, and its likely course beyond the limit explains {percent(explained)} of the "
+                "mismatch: the recording does not contain the true input there. Record it with a larger range."
             )
             return replace(fault, sentence=sentence, corrected=False, fault=True)
     return None

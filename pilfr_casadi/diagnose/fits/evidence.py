@@ -87,6 +87,8 @@ EXPLAINED_NOISE = 0.01  # largest share of noise that a force may explain
 EXPLAINED_QUIET_NOISE = 0.05  # the same of noise that does not matter, and of innovations
 MOST_INNOVATIONS = 0.5  # share of a residual's innovations that a force explains from which it is no noise
 LEAST_EXPLAINED = 0.1  # least share of a residual that a flexible force has to explain to count
+# of the largest share that a force at a port explains: below it, the port of the closest law is not the likeliest place
+OTHER_PORT_SHARE = 0.5
 
 LEAST_KNOWN = 1e-12  # eigenvalue of the scaled information, over the largest, below which a combination is unknown
 UNKNOWN_SHARE = 1e-6  # squared share of a parameter in an unknown combination; rounding gives far less
