@@ -6,8 +6,8 @@ output or an early input may be physics (a delay). A shift of many whole samples
 recorder puts an output before its cause.
 
 On a ramp, a decay or a sine other causes act like a shift or a clock rate. So it has to follow clearly better than a
-smaller shift, such as one by a period less, and than a constant or a gain (`find_rivals`), which are more common.
-Its value has to lie within the range that is screened.
+smaller shift, such as one by a period less, and than a constant or a gain (`find_rivals`), which are more common; else
+a note tells both. Its value has to lie within the range that is screened.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from ...data import Recording, moves_freely
-from ...laws import Lag
+from ...laws import Gain, Lag, Law
 from ...simulators import in_series
 from ..fits.floor import ABOVE_NOISE
 from ..fits.workbench import RUNAWAY, THOROUGH, Fitted, Workbench, refit
@@ -234,7 +234,14 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: 
     offsets = {port: words for port, law in rivals if law.id == Offset.id and in_series(port)}
     if offsets:
         return find_offsets(now, offsets)
-    return now if rivals else found
+    return now.then(now.bench, now.fitted, _describe_rivals(fault, rivals)) if rivals else found
+
+
+def _describe_rivals(fault: TimeShift, rivals: Sequence[tuple[str, Law]]) -> Gate:
+    """Note a shift or a clock rate that is not corrected, because gains or constant loads follow as well."""
+    others = " or ".join(f"a {'gain' if law.id == Gain.id else 'constant load'} at {port}" for port, law in rivals)
+    words = f"{fault.sentence}, or else {others} acts like that: these recordings do not tell which"
+    return Gate(fault.channel, fault.finding, fault.value, f"{words}, and no time is changed.", corrected=False)
 
 
 def _find_likeliest(now: Checked, given: bool) -> tuple[TimeShift, Checked, Checked] | None:
