@@ -17,15 +17,15 @@ import ctypes
 import functools
 import re
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from .._base import LOOPS, InputError, abandoned, build, cache_directory, compiler, one_at_a_time
+from .._base import LOOPS, InputError, abandoned, build, compiler, one_at_a_time
 from ..models import Model
 from ..simulators import EXTERNAL_CALLS, FmuSignals, bind, calls_external, run_in_unit, units
 from .external import external_names, fill_gaps, suppress_gap_warnings
@@ -222,9 +222,8 @@ def _load(library: Path) -> ctypes.CDLL:
         raise InputError(f"The compiled model cannot be loaded ({error}); use engine='vm'.") from error
 
 
-@functools.cache
-def _build_loops(_cache: Path) -> Path:
-    """Build the time loops, once per cache directory."""
+def _build_loops() -> Path:
+    """Return the library of the time loops."""
     return build("\n".join((_read_source("_kernel.h"), _read_source("_kernel.c"))), LOOPS)
 
 
@@ -286,20 +285,26 @@ class _Runs:
 
 
 class Compiled:
-    """Generated C behind the `Engine` protocol; it has no state between calls, so threads may share it.
+    """Generated C behind the `Engine` protocol; threads may share it.
 
     A model that calls a functional mock-up unit runs in a process of the unit; if that fails, the results are NaN.
     """
 
     def __init__(self, model: Model) -> None:
         self.linear = linearize(model)
-        source = source_code(self.linear)
-        programs = external_names(source)
+        self._source = source_code(self.linear)
+        programs = external_names(self._source)
         unit = next((units[name] for name in programs if name in units), None)
-        loops, library = _build_loops(cache_directory()), build(source)
+        loops, library = _build_loops(), build(self._source)
         self.runs = _Runs(loops, library, self.linear.sizes, self.linear.substeps, programs, unit)
         if unit is None:
             assert _load(loops) and _load(library)
+
+    def _run_in_unit(self, unit: FmuSignals, run: Callable[..., Any], *arguments: np.ndarray | bool) -> Any:
+        """Run in a process of the unit; build libraries again that the cache has dropped, which a new process loads."""
+        if not (self.runs.loops.exists() and self.runs.library.exists()):
+            self.runs = replace(self.runs, loops=_build_loops(), library=build(self._source))
+        return run_in_unit(unit, run, (self.runs, *arguments))[0]
 
     def _arguments(self, u: np.ndarray, p: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, ...]:
         n = self.linear.sizes
@@ -314,7 +319,7 @@ class Compiled:
         u, p, state = self._arguments(u, p, state)
         if self.runs.unit is None:
             return self.runs.simulate(u, p, state, signals)
-        found, _ = run_in_unit(self.runs.unit, _Runs.simulate, (self.runs, u, p, state, signals))
+        found = self._run_in_unit(self.runs.unit, _Runs.simulate, u, p, state, signals)
         return found or tuple(a * np.nan for a in self.runs.simulation_results(u, state, signals))
 
     def sensitivity(
@@ -326,7 +331,7 @@ class Compiled:
         column = np.ascontiguousarray(columns, dtype=ctypes.c_long).reshape(len(p))
         if self.runs.unit is None:
             return self.runs.sensitivity(u, p, state, seed, column)
-        found, _ = run_in_unit(self.runs.unit, _Runs.sensitivity, (self.runs, u, p, state, seed, column))
+        found = self._run_in_unit(self.runs.unit, _Runs.sensitivity, u, p, state, seed, column)
         y, jac, state, slope = found or (a * np.nan for a in self.runs.sensitivity_results(u, state, seed))
         return y, jac, state, slope
 
