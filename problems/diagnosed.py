@@ -40,7 +40,7 @@ def free_run(simulator: Simulator, recording: Recording, hold: str, first: int =
 def started(fitted: Fitted, recording: Recording, hold: str, state: np.ndarray) -> np.ndarray:
     """Simulated minus measured outputs (M, n_y) of a fitted simulator from a given state with memory."""
     bench = Workbench.of(fitted.simulator, [recording], hold)
-    return bench.result(fitted.simulator, fitted.values, [state], fitted.engine, fitted.model).residual[0]
+    return bench.rerun(fitted, initial=[state]).residual[0]
 
 
 def rmse(error: np.ndarray) -> float:

@@ -105,12 +105,12 @@ def _cache_folder(key: str) -> Path:
 def _compile(cc: str, source: str, key: str, level: tuple[str, ...]) -> Path:
     """Compile to a temporary file and rename it, so that a library is never incomplete."""
     choices = [(*some, *flags) for some, flags in zip((level, level[:1]), COMPILER_FLAGS, strict=True)]
+    _cache_folder(key).mkdir(mode=0o700, parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=cache_directory()) as folder:
         partial = run_compiler(cc, source, Path(folder), *choices)
         library = _cache_folder(key) / f"{key}-{_digest(partial)}.so"
-        library.parent.mkdir(mode=0o700, exist_ok=True)
         os.replace(partial, library)
-    with contextlib.suppress(OSError):  # keep the most recently used; a unit's new process needs the file again
+    with contextlib.suppress(OSError):  # keep the most recently used
         for old in sorted(library.parent.glob("*.so"), key=lambda p: p.stat().st_mtime)[:-KEPT_LIBRARIES]:
             old.unlink()
     return library

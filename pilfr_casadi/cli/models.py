@@ -274,6 +274,18 @@ class SimulateOptions(DataOptions):
     out: str = option("CSV file; for several records also .npz or .npy.", "FILE", ...)
 
 
+@dataclass(frozen=True)
+class _Simulated:
+    """Simulated outputs y (M, n_y) along a recording, with their names and the units of the model's channels."""
+
+    recording: Recording
+    y: np.ndarray
+    outputs: Sequence[str]
+    units: Mapping[str, str]
+    columns: dict[str, str]  # of the file, by name
+    scored_from: Callable[[Recording], int]
+
+
 @takes_options
 def simulate_command(options: SimulateOptions) -> int:
     """Prints the error of the simulation if the file has the outputs too."""
@@ -297,7 +309,8 @@ def simulate_command(options: SimulateOptions) -> int:
         print(f"note: {note}")
     recording = fitted.matched(recording)
     y = replace(fitted, engine=announce_engine(fitted, recording, "auto", quiet=True)).simulate(recording)
-    return _write_simulated(options, recording, y, fitted.model.outputs, fitted.units, columns, fitted.scored_from)
+    run = _Simulated(recording, y, fitted.model.outputs, fitted.units, columns, fitted.scored_from)
+    return _write_simulated(options, run)
 
 
 def _simulate_equations(options: SimulateOptions) -> int:
@@ -309,7 +322,8 @@ def _simulate_equations(options: SimulateOptions) -> int:
     for note in unit_notes(simulator.units, recording).values():
         print(f"note: {note}")
     seen, y, first = run_simulator(simulator, recording)
-    return _write_simulated(options, seen, y, simulator.output_names, simulator.units, columns, lambda _: first)
+    run = _Simulated(seen, y, simulator.output_names, simulator.units, columns, lambda _: first)
+    return _write_simulated(options, run)
 
 
 def _read_to_simulate(
@@ -325,27 +339,17 @@ def _read_to_simulate(
     return options.read(options.data, inputs, outputs if measured else ()), columns, measured
 
 
-def _write_simulated(
-    options: SimulateOptions,
-    recording: Recording,
-    y: np.ndarray,
-    outputs: Sequence[str],
-    units: Mapping[str, str],
-    columns: dict[str, str],
-    scored_from: Callable[[Recording], int],
-) -> int:
-    """Write the simulated outputs; print their error, or the initial state if none were measured.
-
-    `units` are those of the model.
-    """
-    if not np.all(np.isfinite(y)):
+def _write_simulated(options: SimulateOptions, run: _Simulated) -> int:
+    """Write the simulated outputs; print their error, or the initial state if none were measured."""
+    recording = run.recording
+    if not np.all(np.isfinite(run.y)):
         return say(f"The simulation of {options.model} diverges on {options.data}; nothing was written.", NO_RESULT)
-    write_atomically(Path(options.out), _recording_table(options, recording, y, outputs, units, columns))
+    write_atomically(Path(options.out), _recording_table(options, run))
     if recording.n_y:
-        _print_error(recording, y, scored_from)
+        _print_error(recording, run.y, run.scored_from)
     else:
         state = {"zero": "zero", "periodic": "periodic steady state"}.get(recording.begins, "as given")
-        print(f"{options.data} has no outputs ({listed(outputs)}) to compare with; initial state: {state}")
+        print(f"{options.data} has no outputs ({listed(run.outputs)}) to compare with; initial state: {state}")
         if options.initial is None:
             print("  If the machine begins elsewhere, give each state's value with --initial.")
     print(f"simulated outputs: {options.out}")
@@ -381,22 +385,16 @@ def _check_initial(options: SimulateOptions, lack: str) -> None:
         )
 
 
-def _recording_table(
-    options: SimulateOptions,
-    recording: Recording,
-    y: np.ndarray,
-    outputs: Sequence[str],
-    units: Mapping[str, str],
-    columns: dict[str, str],
-) -> str:
+def _recording_table(options: SimulateOptions, run: _Simulated) -> str:
     """Write the times as in the file, the inputs, and the simulated outputs as CSV."""
+    recording, columns = run.recording, run.columns
     wanted = [columns.get(name, name) for name in (*recording.inputs, *recording.outputs)]
     written = None if options.resample else written_times(options.data, columns, wanted)
     times = written or map(_time_text, recording.t)
-    rows = np.column_stack([recording.u, y]).tolist()
+    rows = np.column_stack([recording.u, run.y]).tolist()
     lines = [[t.strip(), *row] for t, row in zip(times, rows, strict=True)]
-    known = {**recording.units, **units}  # of a channel in both, the recording is in the model's unit
-    names = [name_with_unit(name, known.get(name, "")) for name in (*recording.inputs, *outputs)]
+    known = {**recording.units, **run.units}  # of a channel in both, the recording is in the model's unit
+    names = [name_with_unit(name, known.get(name, "")) for name in (*recording.inputs, *run.outputs)]
     return csv_text([["t", *names], *lines])
 
 

@@ -32,7 +32,7 @@ Array = np.ndarray
 SMALLEST_SPREAD = 1e-6  # of the largest: keeps the covariance regular if a state never moves
 DISTURBANCE = 0.1  # of an output's standard deviation: least size of a disturbance, above the error of a usable model
 NOISE_SHARES = 10.0 ** np.arange(-4.5, -0.4, 0.5)  # candidates for the process noise per step over the states' spread
-COMPARED_SAMPLES = 2048  # samples on which these candidates are compared
+CANDIDATE_SAMPLES = 2048  # samples on which these candidates are compared
 PROBE_POINTS = 5  # states and inputs at which an observer's model is compared with a fit
 
 ModelSource: TypeAlias = Fit | Diagnosis | Simulator | Exported
@@ -309,7 +309,7 @@ def _build_filter(function: ca.Function, spread: Array, noise: Array, share: flo
 
 def _prediction_cost(observer: KalmanFilter, u: Array, y: Array, start: Array) -> float:
     """Compute minus twice the mean log-likelihood of one-step predictions, with the variance of their errors."""
-    u, y = u[:COMPARED_SAMPLES], y[:COMPARED_SAMPLES]
+    u, y = u[:CANDIDATE_SAMPLES], y[:CANDIDATE_SAMPLES]
     _, predicted, _ = observer.run(u, y, start, observer.Q + 1e-6 * observer.P0)
     error = (y - predicted)[len(y) // 10 :]
     size = np.mean(error**2, axis=0)

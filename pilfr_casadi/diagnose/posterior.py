@@ -259,9 +259,10 @@ def _weights(search: Hypotheses, trials: Sequence[Trial]) -> np.ndarray:
 
 
 def _shares(logs: np.ndarray) -> np.ndarray:
-    """Normalise numbers, given by their logarithms, to a sum of one."""
-    found = np.exp(logs - logs.max(initial=-np.inf)) if len(logs) else logs
-    return np.asarray(found / max(found.sum(), 1e-300))
+    """Normalise numbers, given by their logarithms, to a sum of one; equal shares if all of them are zero."""
+    largest = logs.max(initial=-np.inf)
+    found = np.exp(logs - largest) if np.isfinite(largest) else np.ones_like(logs)
+    return np.asarray(found / found.sum())
 
 
 def _indistinguishable(search: Hypotheses, best: Trial, element: Placed) -> dict[Name, Trial]:

@@ -271,7 +271,7 @@ def with_observer(now: Checked) -> Checked:
     if not gain.any():
         return now
     try:
-        led = bench.fit(bench.simulator, anneal=OBSERVER_GAINS, model=bench.model(bench.simulator, gain))
+        led = bench.fit(bench.simulator, anneal=OBSERVER_GAINS, like=bench.compile(bench.simulator, gain))
         found = bench.fit(bench.simulator, [led.values], states=led.begin, solver=THOROUGH)
     except (InputError, np.linalg.LinAlgError):
         return now

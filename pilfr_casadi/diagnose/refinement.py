@@ -38,7 +38,7 @@ from ..simulators import Simulator, discretise, in_series, on_grid
 from .fits.evidence import HeldOut, Sample, held_out_errors, spread
 from .fits.floor import effective_size
 from .fits.force_recovery import signals_along
-from .fits.workbench import THOROUGH, Fitted, Workbench
+from .fits.workbench import THOROUGH, Compiled, Fitted, Workbench
 from .search.moves import Search
 
 FINE_THRESHOLDS = 40  # thresholds of each of the two fine grids that estimate the density of weights
@@ -255,17 +255,17 @@ def _fit_layer(bench: Workbench, after: Fitted, number: int, kind: type[Law]) ->
     placed = _replace_law(after.simulator, number, kind().at(starts[0], kind().bounds(local)))
     element = placed.elements[number]
     model = discretise(placed, bench.dt, bench.hold, after.model.substeps)
-    engine = make_engine(model, bench.engine)
+    layered = Compiled(placed, model, make_engine(model, bench.engine))
     first, h = np.cumsum([0, *local.lengths])[:-1], bench.dt / after.model.substeps
     states = [_initial_state(after, s, number, element.law, z[k], h) for s, k in zip(after.initial, first, strict=True)]
     own = [{**after.values, **element.named(start)} for start in starts]
     try:
-        best = bench.fit(placed, own, states=states, model=model, engine=engine)
+        best = bench.fit(placed, own, states=states, like=layered)
         for _ in range(ROUNDS):
             values = element.own(best.values)
             moved = {**values, **_spread_thresholds(values["r"], values["w"], local.half, len(values["r"]))}
             own = [{**best.values, **element.named(moved)}, best.values]
-            found = bench.fit(placed, own, states=best.initial, solver=THOROUGH, model=model, engine=engine)
+            found = bench.fit(placed, own, states=best.initial, solver=THOROUGH, like=layered)
             gained, best = found.cost < GAIN * best.cost, min(found, best, key=lambda f: f.cost)
             if not gained:
                 break

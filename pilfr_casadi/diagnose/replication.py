@@ -198,14 +198,8 @@ def _fit_each_recording(bench: Workbench, after: Fitted) -> tuple[list[np.ndarra
     residuals, values = [], []
     for i, r in enumerate(bench.recordings):
         own = bench.on([r])
-        fitted = own.fit(
-            after.simulator,
-            [after.values],
-            states=after.initial[i : i + 1],
-            solver=THOROUGH,
-            model=after.model,
-            engine=after.engine,
-        )
+        state = after.initial[i : i + 1]
+        fitted = own.fit(after.simulator, [after.values], states=state, solver=THOROUGH, like=after)
         residuals.append(fitted.residual[0])
         values.append(_values(own, fitted))
     return residuals, tuple(values)

@@ -1,8 +1,7 @@
 """Engines that run a model: sensitivities by a matrix recursion, as generated C or in CasADi's virtual machine.
 
-`sensitivities` holds the recursion and the virtual machine, `compiled` the generated C.
-`external` lets generated C call programs that CasADi cannot look into. Both engines sum in the same order, so
-simulations, derivatives and fits agree bit for bit on x86-64.
+`sensitivities` holds the recursion and the virtual machine, `compiled` the generated C. Both engines sum in the same
+order, so simulations, derivatives and fits agree bit for bit on x86-64.
 """
 
 from typing import TYPE_CHECKING

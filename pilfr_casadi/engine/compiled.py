@@ -5,6 +5,10 @@ up. Only the others become code, and expressions of parameters alone are evaluat
 with many operators are sparse, so the loops read them from tables. The slopes of a step of several stages are hardly
 ever zero and are written out term by term.
 
+Where a step calls another program (`simulators.leaves`), CasADi leaves a gap in the code for a callback, and calls an
+external function by its name. Both are made to call a buffer, and `simulators.bind` passes the buffers of a thread to a
+library. A functional mock-up unit is called only in a process of its own, which runs the whole library.
+
 The loops are built once, a model's library once per structure; `_base.c_compiler` keeps both. Without a
 working C compiler `make_engine` falls back to the virtual machine of `sensitivities`. It gives the same numbers, bit by
 bit on x86-64, because neither engine fuses products and sums there.
@@ -15,20 +19,21 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
+import io
 import re
+import sys
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from .._base import LOOPS, InputError, abandoned, build, cache_directory, compiler, one_at_a_time
+from .._base import LOOPS, InputError, abandoned, build, compiler, one_at_a_time
 from ..models import Model
 from ..simulators import EXTERNAL_CALLS, FmuSignals, bind, calls_external, run_in_unit, units
-from .external import external_names, fill_gaps, suppress_gap_warnings
 from .sensitivities import BLOCKS, TARGETS, Engine, Linearization, VirtualMachine, linearize
 
 _SOURCES = {"x": 0, "s": 1, "z": 2, "w": 3}
@@ -38,6 +43,13 @@ _VALUES = ("constant", "p", "fixed", "u", "x", "s", "z", "w", "c", "computed")
 ENTRY = re.compile(r"CASADI_SYMBOL_EXPORT int pilfr_\w+\(const casadi_real\*\* arg")
 ABSENT_ARGUMENT = re.compile(r"arg\[(\d+)\]\? arg\[\1\]\[(\d+)\] : 0")
 ABSENT_RESULT = re.compile(r"if \(res\[\d+\]!=0\) ")
+# and the calls of other programs: the gap or the call that CasADi writes, and the call that takes its place
+HEAD = r"(/\* (?P<name>\w+):\([^\n]*\n[^\n]*\{\n)"  # comment and first line of a generated function
+GAP_LINE = r"#error Code generation not supported[^\n]*"
+EXTERNAL_LINE = r"if \((?P=name)\(arg, res, iw, w, mem\)\) return 1;"
+GAP = re.compile(HEAD + rf" *({GAP_LINE}|{EXTERNAL_LINE})\n *return 0;")
+CALL = re.compile(HEAD + r" *return call_external\(")
+GAP_WARNING = "cannot be code generated"
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +115,7 @@ def source_code(linear: Linearization) -> str:
     at, sizes = code.at, linear.sizes
     options = {"with_header": False, "main": False, "indent": 0, "casadi_int": "long long"}
     generator = ca.CodeGenerator("generated", options)
-    with suppress_gap_warnings() if calls_external(linear.step) else contextlib.nullcontext():
+    with _suppress_gap_warnings() if calls_external(linear.step) else contextlib.nullcontext():
         for function in code.functions.values():
             generator.add(function)
         generated = generator.dump()
@@ -140,7 +152,31 @@ def source_code(linear: Linearization) -> str:
     generated = _drop_uncalled(generated)
     if not calls_external(linear.step):
         return "\n".join([_drop_absence_tests(generated), *lines])
-    return "\n".join([EXTERNAL_CALLS, fill_gaps(generated), *lines])
+    return "\n".join([EXTERNAL_CALLS, _fill_gaps(generated), *lines])
+
+
+def _fill_gaps(code: str) -> str:
+    """Let the gaps and the external functions in generated code call the programs of `leaves` and `units`."""
+    numbers: dict[str, int] = {}
+    return GAP.sub(
+        lambda gap: f"{gap[1]}  return call_external({numbers.setdefault(gap['name'], len(numbers))}, arg, res);", code
+    )
+
+
+def _external_names(code: str) -> tuple[str, ...]:
+    """List the programs that filled code calls, by their number in the calls."""
+    return tuple(dict.fromkeys(found["name"] for found in CALL.finditer(code)))
+
+
+@contextlib.contextmanager
+def _suppress_gap_warnings() -> Iterator[None]:
+    """Suppress CasADi's warnings about these gaps; print all other messages afterwards."""
+    screen, messages = sys.stderr, io.StringIO()
+    with contextlib.redirect_stderr(messages):
+        yield
+    for line in messages.getvalue().splitlines():
+        if GAP_WARNING not in line:
+            print(line, file=screen)
 
 
 def _drop_uncalled(generated: str) -> str:
@@ -222,9 +258,8 @@ def _load(library: Path) -> ctypes.CDLL:
         raise InputError(f"The compiled model cannot be loaded ({error}); use engine='vm'.") from error
 
 
-@functools.cache
-def _build_loops(_cache: Path) -> Path:
-    """Build the time loops, once per cache directory."""
+def _build_loops() -> Path:
+    """Return the library of the time loops."""
     return build("\n".join((_read_source("_kernel.h"), _read_source("_kernel.c"))), LOOPS)
 
 
@@ -286,20 +321,26 @@ class _Runs:
 
 
 class Compiled:
-    """Generated C behind the `Engine` protocol; it has no state between calls, so threads may share it.
+    """Generated C behind the `Engine` protocol; threads may share it.
 
     A model that calls a functional mock-up unit runs in a process of the unit; if that fails, the results are NaN.
     """
 
     def __init__(self, model: Model) -> None:
         self.linear = linearize(model)
-        source = source_code(self.linear)
-        programs = external_names(source)
+        self._source = source_code(self.linear)
+        programs = _external_names(self._source)
         unit = next((units[name] for name in programs if name in units), None)
-        loops, library = _build_loops(cache_directory()), build(source)
+        loops, library = _build_loops(), build(self._source)
         self.runs = _Runs(loops, library, self.linear.sizes, self.linear.substeps, programs, unit)
         if unit is None:
             assert _load(loops) and _load(library)
+
+    def _run_in_unit(self, unit: FmuSignals, run: Callable[..., Any], *arguments: np.ndarray | bool) -> Any:
+        """Run in a process of the unit; build libraries again that the cache has dropped, which a new process loads."""
+        if not (self.runs.loops.exists() and self.runs.library.exists()):
+            self.runs = replace(self.runs, loops=_build_loops(), library=build(self._source))
+        return run_in_unit(unit, run, (self.runs, *arguments))[0]
 
     def _arguments(self, u: np.ndarray, p: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, ...]:
         n = self.linear.sizes
@@ -314,7 +355,7 @@ class Compiled:
         u, p, state = self._arguments(u, p, state)
         if self.runs.unit is None:
             return self.runs.simulate(u, p, state, signals)
-        found, _ = run_in_unit(self.runs.unit, _Runs.simulate, (self.runs, u, p, state, signals))
+        found = self._run_in_unit(self.runs.unit, _Runs.simulate, u, p, state, signals)
         return found or tuple(a * np.nan for a in self.runs.simulation_results(u, state, signals))
 
     def sensitivity(
@@ -326,7 +367,7 @@ class Compiled:
         column = np.ascontiguousarray(columns, dtype=ctypes.c_long).reshape(len(p))
         if self.runs.unit is None:
             return self.runs.sensitivity(u, p, state, seed, column)
-        found, _ = run_in_unit(self.runs.unit, _Runs.sensitivity, (self.runs, u, p, state, seed, column))
+        found = self._run_in_unit(self.runs.unit, _Runs.sensitivity, u, p, state, seed, column)
         y, jac, state, slope = found or (a * np.nan for a in self.runs.sensitivity_results(u, state, seed))
         return y, jac, state, slope
 

@@ -120,13 +120,14 @@ def _external_function(name: str, signals: FmuSignals, ask: Any) -> ca.Function:
     shapes = ", ".join(f"{{{n}, 1, 1}}" for n in (*signals.sizes, signals.results))
     sizes = ", ".join(map(str, signals.sizes))
     numbers = {"n_in": len(signals.sizes), "size": sum(signals.sizes), "results": signals.results}
-    library = build(EXTERNAL_CALLS + LIBRARY.format(name=name, shapes=shapes, sizes=sizes, **numbers))
+    source = EXTERNAL_CALLS + LIBRARY.format(name=name, shapes=shapes, sizes=sizes, **numbers)
+    library = build(source)
     ctypes.c_void_p.in_dll(ctypes.CDLL(str(library)), "pilfr_ask").value = ctypes.cast(ask, ctypes.c_void_p).value
-    _libraries[name] = library
+    _libraries[name] = library, source
     return ca.external(name, str(library))
 
 
-_libraries: dict[str, Path] = {}  # of external functions, by name
+_libraries: dict[str, tuple[Path, str]] = {}  # of external functions, by name, with their sources
 
 
 def map_points(function: ca.Function, *arguments: np.ndarray) -> list[np.ndarray]:
@@ -151,7 +152,10 @@ def _run_elsewhere(
     name = _called_unit(function)
     if not name:
         return None
-    job = run, _serialized(function), name, units[name], _libraries[name], arguments
+    library, source = _libraries[name]
+    if not library.exists():  # the cache has dropped it; the same source gives the same file again
+        build(source)
+    job = run, _serialized(function), name, units[name], library, arguments
     found: list[np.ndarray] | None = run_in_unit(units[name], _run_here, job)[0]
     return found
 

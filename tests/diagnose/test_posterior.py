@@ -52,6 +52,11 @@ def test_two_laws_that_tie_share_the_confidence(search, trial, behind, share):
     assert list(found.effects[0].alike) == ([CUBIC_NAME] if behind < 3 else [])
 
 
+def test_laws_that_all_diverge_leave_the_simulator_alone(search, trial):
+    found = posterior(search(trial(DRY, left=np.inf), trial(CUBIC, left=np.inf)))
+    assert found.nothing == 1.0 and not found.effects
+
+
 @pytest.mark.parametrize(("port", "at_port"), [("a", SURE), ("b", SURE / 3)])
 def test_a_port_is_sure_where_only_the_law_is_not(search, trial, port, at_port):
     """Three laws at one port, or at three."""

@@ -18,6 +18,7 @@ from diagnosis_example import example
 from exported_fits import one_sentence
 
 from pilfr_casadi import InputError, Parameter, exported, fit, from_fmu
+from pilfr_casadi._base import c_compiler
 from pilfr_casadi.engine import VirtualMachine, compiler, make_engine
 from pilfr_casadi.laws import CoulombFriction
 from pilfr_casadi.report import corrected_file
@@ -305,6 +306,23 @@ def test_many_points_are_one_job_for_the_process_of_a_unit(units, monkeypatch):
     monkeypatch.setattr(FmuFunction, "evaluate", lambda *_: pytest.fail("a single point was evaluated"))
     for found, expected in zip(states_of(own, given), states_of(rig(), given), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-12)
+
+
+def test_libraries_that_the_cache_has_dropped_are_built_again(units, tmp_path, monkeypatch):
+    """A process of the unit loads them at its first run, which may come long after."""
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    monkeypatch.setattr(c_compiler, "cache_directory", lambda: cache)
+    given, found = recording(8, samples=60), []
+    for simulator in (guided(units["c"]), rig()):
+        model = discretise(simulator, given.dt, "zero", 1)
+        engine = make_engine(model, "c")
+        shutil.rmtree(cache, ignore_errors=True)
+        y = engine.simulate(model.drive(given), model.parameters.start, np.zeros(model.n_state))[0]
+        shutil.rmtree(cache, ignore_errors=True)
+        found.append((y, *states_of(simulator, given)))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-12)
 
 
 def test_a_point_at_which_a_unit_crashes_is_a_failed_trial(tmp_path):

@@ -6,8 +6,8 @@ output or an early input may be physics (a delay). A shift of many whole samples
 recorder puts an output before its cause.
 
 On a ramp, a decay or a sine other causes act like a shift or a clock rate. So it has to follow clearly better than a
-smaller shift, such as one by a period less, and than a constant or a gain (`find_rivals`), which are more common.
-Its value has to lie within the range that is screened.
+smaller shift, such as one by a period less, and than a constant or a gain (`find_rivals`), which are more common; else
+a note tells both. Its value has to lie within the range that is screened.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from ...data import Recording, moves_freely
-from ...laws import Lag
+from ...laws import Gain, Lag, Law
 from ...simulators import in_series
 from ..fits.floor import ABOVE_NOISE
 from ..fits.workbench import RUNAWAY, THOROUGH, Fitted, Workbench, refit
@@ -215,35 +215,53 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: 
     as a fault if it is a multiple of `part` samples, nothing else is wrong, and no lag follows it as well. Without
     `early`, a shift that puts outputs before their causes also counts as a fault only if nothing else is wrong.
     """
-    bench, noise2 = now.bench, now.noise2
-    if now.cost < ABOVE_NOISE**2 * noise2:
+    dt, noise2 = now.bench.dt, now.noise2
+    likeliest = _find_likeliest(now, given)
+    if likeliest is None:
         return now
-    settled = [pair for s in _screen_shifts(bench, now.fitted, given) if (pair := _settle_shift(now, s)) is not None]
+    fault, after, kept = likeliest
+    found = accept(now, after, fault)
+    if not found.adds_to(now):
+        return found
+    more_is_wrong = after.cost > NEAR_NOISE_RATIO**2 * noise2  # then a delay or a slow clock may be physics
+    may_be_physics = fault.is_like_delay(dt, part) or (more_is_wrong and not (fault.leads and early))
+    if may_be_physics or not satisfies_rule(kept.cost, after, fault) or _is_lag(now, after, fault):
+        return now
+    # interpolation has removed a part of the noise
+    averaged = 0.0 if fault.kind == "u" or fault.is_whole(dt) else AVERAGED_NOISE * noise2
+    rivals = find_rivals(kept, after, after.cost + averaged)
+    words = fault.sentence[0].lower() + fault.sentence[1:] if fault.finding == "clock" else fault.sentence
+    offsets = {port: words for port, law in rivals if law.id == Offset.id and in_series(port)}
+    if offsets:
+        return find_offsets(now, offsets)
+    return now.then(now.bench, now.fitted, _describe_rivals(fault, rivals)) if rivals else found
+
+
+def _describe_rivals(fault: TimeShift, rivals: Sequence[tuple[str, Law]]) -> Gate:
+    """Note a shift or a clock rate that is not corrected, because gains or constant loads follow as well."""
+    others = " or ".join(f"a {'gain' if law.id == Gain.id else 'constant load'} at {port}" for port, law in rivals)
+    words = f"{fault.sentence}, or else {others} acts like that: these recordings do not tell which"
+    return Gate(fault.channel, fault.finding, fault.value, f"{words}, and no time is changed.", corrected=False)
+
+
+def _find_likeliest(now: Checked, given: bool) -> tuple[TimeShift, Checked, Checked] | None:
+    """Return the shift or clock rate that follows best, the refit with it, and one without it to the same samples.
+
+    None if only noise is left, no channel looks shifted, or the best value is beyond the range that is tried.
+    """
+    if now.cost < ABOVE_NOISE**2 * now.noise2:
+        return None
+    screened = _screen_shifts(now.bench, now.fitted, given)
+    settled = [pair for s in screened if (pair := _settle_shift(now, s)) is not None]
     if not settled:
-        return now
+        return None
     fault, after = min(settled, key=lambda pair: pair[1].cost)
     kept = _on_kept_samples(now, fault, after)
     smaller = _find_smaller(kept, fault, after)
     if smaller is not None and (again := _settle_shift(now, smaller)) is not None:
         fault, after = again
         kept = _on_kept_samples(now, fault, after)
-    if abs(fault.value) > fault.largest(bench.dt):
-        return now
-    found = accept(now, after, fault)
-    if not found.adds_to(now):
-        return found
-    more_is_wrong = after.cost > NEAR_NOISE_RATIO**2 * noise2  # then a delay or a slow clock may be physics
-    may_be_physics = fault.is_like_delay(bench.dt, part) or (more_is_wrong and not (fault.leads and early))
-    if may_be_physics or not satisfies_rule(kept.cost, after, fault) or _is_lag(now, after, fault):
-        return now
-    # interpolation has removed a part of the noise
-    averaged = 0.0 if fault.kind == "u" or fault.is_whole(bench.dt) else AVERAGED_NOISE * noise2
-    rivals = find_rivals(kept, after, after.cost + averaged)
-    words = fault.sentence[0].lower() + fault.sentence[1:] if fault.finding == "clock" else fault.sentence
-    offsets = {port: words for port, law in rivals if law.id == Offset.id and in_series(port)}
-    if offsets:
-        return find_offsets(now, offsets)
-    return now if rivals else found
+    return (fault, after, kept) if abs(fault.value) <= fault.largest(now.bench.dt) else None
 
 
 def _on_kept_samples(now: Checked, fault: TimeShift, after: Checked) -> Checked:

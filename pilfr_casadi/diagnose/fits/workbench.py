@@ -58,12 +58,18 @@ class RunsAway(InputError):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fitted:
-    """A simulator fitted to recordings."""
+class Compiled:
+    """A simulator with its discretised model and the engine that runs it."""
 
     simulator: Simulator
     model: Model
     engine: Engine
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Fitted(Compiled):
+    """A simulator fitted to recordings."""
+
     values: dict[str, np.ndarray]  # parameters by name
     initial: list[np.ndarray]  # state with memory at each recording's first sample
     # (M, n_y), simulated minus measured outputs of each recording, unscored samples included
@@ -189,10 +195,12 @@ class Workbench:
         model = discretise(simulator, self.dt, self.hold, self._substeps(simulator))
         return model if gain is None else with_output_injection(model, gain)
 
-    def compile(self, simulator: Simulator, gain: np.ndarray | None = None) -> tuple[Model, Engine]:
-        """Discretise and compile a simulator, with output injection if a gain is given."""
+    def compile(self, simulator: Simulator, gain: np.ndarray | None = None, like: Compiled | None = None) -> Compiled:
+        """Discretise and compile a simulator, with output injection if a gain is given, or reuse a compiled model."""
+        if like is not None:
+            return Compiled(simulator, like.model, like.engine)
         model = self.model(simulator, gain)
-        return model, make_engine(model, self.engine)
+        return Compiled(simulator, model, make_engine(model, self.engine))
 
     def _substeps(self, simulator: Simulator) -> int:
         """Choose more sub-steps for a fast law, up to a limit: a stiff start of a law is not worth a fine grid."""
@@ -239,50 +247,49 @@ class Workbench:
         states: Sequence[np.ndarray] = (),
         anneal: Sequence[float] = (),
         solver: GaussNewton = QUICK,
-        model: Model | None = None,
-        engine: Engine | None = None,
+        like: Compiled | None = None,
     ) -> Fitted:
         """Fit from several starts (values by name), each through the sequence of injection gains `anneal`.
 
-        `states` are initial guesses of each recording's initial state, without the states of new laws at its end.
+        `states` are initial guesses of each recording's initial state, without the states of new laws at its end. The
+        compiled model of `like` is reused.
 
         Raises
         ------
         InputError
             If the simulation diverges from every start.
         """
-        model = model or self.model(simulator)
-        engine = engine or make_engine(model, self.engine)
+        one = self.compile(simulator, like=like)
         estimated = any(r.begins == "estimate" for r in self.recordings)
-        if not np.any(model.parameters.free) and not (estimated and model.n_state):
-            found = self._run_as_given(simulator, model, engine)
-            if not np.isfinite(found.cost):
+        if not np.any(one.model.parameters.free) and not (estimated and one.model.n_state):
+            given = self._run_as_given(one)
+            if not np.isfinite(given.cost):
                 raise InputError("The simulation diverges at the given values; check the parameters' values and units.")
-            return found
+            return given
         best: tuple[float, np.ndarray, Problem, Status] | None = None
         for start in starts:
             if best is not None and time.perf_counter() > self.deadline:
                 break
-            one = self._fit_from(model, engine, start, states, tuple(anneal), solver)
-            if one is not None and (best is None or one[0] < best[0]):
-                best = one
+            found = self._fit_from(one, start, states, tuple(anneal), solver)
+            if found is not None and (best is None or found[0] < best[0]):
+                best = found
         if best is None:
             unstable = self._describe_instability(simulator)
             raise (RunsAway if unstable else InputError)(
-                f"The simulation diverges at the start values{self._describe_divergence(model, engine, starts[0])}; "
+                f"The simulation diverges at the start values{self._describe_divergence(one, starts[0])}; "
                 + (unstable or "check the parameters' values and units, and the hold.")
             )
         _, theta, problem, status = best
         values = problem.values(theta)
         values.pop(INJECTION, None)
-        return replace(self.result(simulator, values, problem.first_states(theta), engine, model), status=status)
+        return replace(self.result(one, values, problem.first_states(theta)), status=status)
 
-    def _describe_divergence(self, model: Model, engine: Engine, start: Mapping[str, Any]) -> str:
+    def _describe_divergence(self, one: Compiled, start: Mapping[str, Any]) -> str:
         """Describe where a run from rest exceeds every bound."""
-        vector = start_vector(model, start)
+        vector = start_vector(one.model, start)
         for r in self.recordings:
             with np.errstate(all="ignore"):
-                y = engine.simulate(model.drive(r), vector, np.zeros(model.n_state))[0]
+                y = one.engine.simulate(one.model.drive(r), vector, np.zeros(one.model.n_state))[0]
                 off = ~(np.abs(y) < OUT_OF_BOUNDS * np.max(np.abs(r.y), axis=0))
             if np.any(off):
                 k = int(np.argmax(np.any(off, axis=1)))
@@ -310,59 +317,53 @@ class Workbench:
             "focus 'prediction' of a diagnosis."
         )
 
-    def run_given(self, like: Fitted | None = None) -> Fitted:
+    def run_given(self, like: Compiled | None = None) -> Fitted:
         """Run the simulator at the given values, with the states in which a fit begins.
 
         The cost of a diverging run is infinite. The compiled model of `like` is reused.
         """
-        model, engine = (like.model, like.engine) if like else self.compile(self.simulator)
-        return self._run_as_given(self.simulator, model, engine)
+        return self._run_as_given(self.compile(self.simulator, like=like))
 
-    def _run_as_given(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:
-        freed = model.parameters.change(**{name: {"fixed": False} for name in model.parameters})
-        problem = self.problem(model.with_parameters(freed), engine)  # which needs variables
-        values = {k: p.value for k, p in model.parameters.items()}
-        return self.result(simulator, values, problem.first_states(problem.start), engine, model)
+    def _run_as_given(self, one: Compiled) -> Fitted:
+        parameters = one.model.parameters
+        freed = parameters.change(**{name: {"fixed": False} for name in parameters})
+        problem = self.problem(one.model.with_parameters(freed), one.engine)  # which needs variables
+        values = {k: p.value for k, p in parameters.items()}
+        return self.result(one, values, problem.first_states(problem.start))
 
     def _fit_from(
         self,
-        model: Model,
-        engine: Engine,
+        one: Compiled,
         start: Mapping[str, Any],
         guess: Sequence[np.ndarray],
         path: tuple[float, ...],
         solver: GaussNewton,
     ) -> tuple[float, np.ndarray, Problem, Status] | None:
-        parameters = model.parameters
+        model, parameters = one.model, one.model.parameters
         vector = start_vector(model, start)
-        states = None
+        states = [model.first_state(r) for r in self.recordings]
         if len(guess):
-            unknown = zip(self.recordings, self.initial_states(model, vector, guess), strict=True)
-            known = (model.initial_unknowns(state) for r, state in unknown if r.begins == "estimate")
-            states = np.concatenate([np.zeros(0), *known])
+            states = self.initial_states(model, vector, guess)
         problem: Problem | None = None
         status = Status.SOLVER_FAILED
         for gamma in (*path, 0.0):
             at = parameters.at(vector)
             if INJECTION in parameters:
                 at = at.change(**{INJECTION: {"value": gamma}})
-            problem = self.problem(model.with_parameters(at), engine)
-            n_free = int(problem.free.sum())
-            theta = problem.start.copy()
-            if states is not None:
-                theta[n_free:] = states
+            problem = self.problem(model.with_parameters(at), one.engine)
+            theta = problem.variables(problem.start[: problem.n_free], states)
             if not np.isfinite(problem.cost(theta)):
                 if gamma == 0.0 and not path:
                     return None
                 continue
             problem, theta, status = self._solve(problem, theta, solver)
             if np.all(np.isfinite(theta)):
-                vector, states = problem.parameters(theta), theta[n_free:]
+                vector, states = problem.parameters(theta), problem.initial_states(theta)
         assert problem is not None
-        theta = np.concatenate([vector[problem.free], states if states is not None else problem.start[n_free:]])
+        theta = problem.variables(vector[problem.free], states)
         balance = self._balance(problem, theta)
         if not near_balance(balance, (problem.scale / self.scale) ** 2):
-            problem = self.problem(problem.model, engine, balance=balance)
+            problem = self.problem(problem.model, one.engine, balance=balance)
         cost = problem.cost(theta)  # starts are compared with the weights of where they end
         return (cost, theta, problem, status) if cost < DIVERGED else None
 
@@ -410,20 +411,14 @@ class Workbench:
         return out
 
     def by_cost(
-        self,
-        simulator: Simulator,
-        model: Model,
-        engine: Engine,
-        starts: Sequence[Mapping[str, Any]],
-        states: Sequence[np.ndarray],
+        self, one: Compiled, starts: Sequence[Mapping[str, Any]], states: Sequence[np.ndarray]
     ) -> list[Mapping[str, Any]]:
         """Order starts by their error before a fit, from the same initial states."""
-        initial = self.initial_states(model, start_vector(model, starts[0]), states)
+        initial = self.initial_states(one.model, start_vector(one.model, starts[0]), states)
 
         def cost(start: Mapping[str, Any]) -> float:
-            values = model.parameters.unpack(start_vector(model, start))
-            found = self.result(simulator, values, initial, engine, model).cost
-            return found if np.isfinite(found) else np.inf
+            values = one.model.parameters.unpack(start_vector(one.model, start))
+            return self.result(one, values, initial).cost
 
         return sorted(starts, key=cost)
 
@@ -445,10 +440,10 @@ class Workbench:
 
     def run(self, simulator: Simulator, values: Mapping[str, Any], states: Sequence[np.ndarray]) -> Fitted:
         """Run a simulator at values by name, from the simulator's own initial states."""
-        model, engine = self.compile(simulator)
-        vector = start_vector(model, values)
-        initial = self.initial_states(model, vector, states)
-        return self.result(simulator, model.parameters.unpack(vector), initial, engine, model)
+        one = self.compile(simulator)
+        vector = start_vector(one.model, values)
+        initial = self.initial_states(one.model, vector, states)
+        return self.result(one, one.model.parameters.unpack(vector), initial)
 
     def scored(self, residual: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the residual of each recording (M, n_y) without the samples that do not count."""
@@ -463,17 +458,11 @@ class Workbench:
         """Run a fitted simulator along these recordings, at its own values and initial states or at others."""
         values = fitted.values if values is None else values
         initial = fitted.initial if initial is None else initial
-        return self.result(fitted.simulator, values, initial, fitted.engine, fitted.model)
+        return self.result(fitted, values, initial)
 
-    def result(
-        self,
-        simulator: Simulator,
-        values: dict[str, np.ndarray],
-        initial: list[np.ndarray],
-        engine: Engine,
-        model: Model,
-    ) -> Fitted:
+    def result(self, one: Compiled, values: dict[str, np.ndarray], initial: list[np.ndarray]) -> Fitted:
         """Compute the residuals at given values and initial states."""
+        model, engine = one.model, one.engine
         vector = model.parameters.pack(values)
         with np.errstate(over="ignore", invalid="ignore"):  # a diverging run has an infinite cost
             runs = zip(self.recordings, initial, strict=True)
@@ -481,7 +470,7 @@ class Workbench:
             squares = np.mean((np.concatenate(self.scored(residual)) / self.scale) ** 2, axis=0)
             cost, balance = pool(squares, self.noise2)
         cost = cost if np.isfinite(cost) else np.inf
-        return Fitted(simulator, model, engine, values, initial, residual, cost, squares, balance)
+        return Fitted(one.simulator, model, engine, values, initial, residual, cost, squares, balance)
 
 
 def growth(simulator: Simulator, recordings: Sequence[Recording]) -> float:
@@ -518,13 +507,11 @@ def refit(
     *,
     states: Sequence[np.ndarray] = (),
     solver: GaussNewton = QUICK,
-    like: Fitted | None = None,
+    like: Compiled | None = None,
 ) -> Fitted | None:
     """Fit a simulator, by default the bench's; None if it diverges. The compiled model of `like` is reused."""
-    model, engine = (like.model, like.engine) if like else (None, None)
-    simulator = simulator or bench.simulator
     try:
-        return bench.fit(simulator, starts, states=states, solver=solver, model=model, engine=engine)
+        return bench.fit(simulator or bench.simulator, starts, states=states, solver=solver, like=like)
     except InputError:
         return None
 

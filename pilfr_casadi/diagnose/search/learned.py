@@ -219,12 +219,12 @@ def learn_forces(bench: Workbench, base: Fitted, port_names: Sequence[str], work
 def _fit_element(bench: Workbench, base: Fitted, start: Start) -> Fitted | None:
     """Fit a learned element together with the simulator's own parameters; None if every start diverges."""
     placed = base.simulator.with_element(start.port, start.law)
-    model, engine = bench.compile(placed)
+    compiled = bench.compile(placed)
     name = f"{placed.elements[-1].prefix}c"
     starts = [{**base.values, name: share * np.asarray(start.law.values["c"])} for share in START_SHARES]
-    best = bench.by_cost(placed, model, engine, starts, base.initial)[0]
+    best = bench.by_cost(compiled, starts, base.initial)[0]
     try:
-        return bench.fit(placed, [best], states=base.initial, model=model, engine=engine)
+        return bench.fit(placed, [best], states=base.initial, like=compiled)
     except InputError:
         return None
 
@@ -238,7 +238,7 @@ def refit_learned(bench: Workbench, found: Fitted) -> Fitted:
         If the simulation diverges.
     """
     placed = found.simulator
-    fitted = bench.fit(placed, [found.values], states=found.initial, model=found.model, engine=found.engine)
+    fitted = bench.fit(placed, [found.values], states=found.initial, like=found)
     z, dz, _ = signals_along(bench, fitted)
     seen = {f"{placed.elements[-1].prefix}{k}": np.array(v) for k, v in _ranges(EXTENSION, z=z, v=dz).items()}
     return replace(bench.rerun(fitted, {**fitted.values, **seen}), status=fitted.status)

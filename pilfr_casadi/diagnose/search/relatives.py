@@ -33,7 +33,7 @@ SHAPES_OF_A_LAW = 5  # shapes of each law at each port: the best alone
 PLACES, LAWS = 4, 2  # pairs of ports that are tried, and pairs of laws at each pair of ports
 MOST_PAIRS = 60  # pairs of laws whose share is cross-validated
 RIDGE = 1e-4  # on the gram matrix of orthonormal columns, against nearly parallel laws
-COMPARED_SAMPLES = 4000  # approximate number of samples on which forces are compared
+MATCHED_SAMPLES = 4000  # approximate number of samples on which a law is matched to a force
 
 
 def complements(one: Law, other: Law) -> bool:
@@ -258,7 +258,7 @@ def _most_alike(
 def _match_force(law: Law, local: Local, force: np.ndarray) -> tuple[float, dict[str, Any]]:
     """Compute the share of a force that a law leaves, beside gains of the signal and its rate, and its start values."""
     shapes = list(law.shapes(local))
-    every = max(len(force) // COMPARED_SAMPLES, 1)
+    every = max(len(force) // MATCHED_SAMPLES, 1)
     base = np.column_stack([np.ones_like(local.z), local.z, local.dz])[::every]
     q = np.linalg.svd(base / np.maximum(np.linalg.norm(base, axis=0), 1e-300), full_matrices=False)[0]
     target = force[::every] - q @ (q.T @ force[::every])

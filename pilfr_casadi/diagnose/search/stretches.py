@@ -39,7 +39,7 @@ from ..faults.gates import Gate
 from ..fits.flexible_forces import Surface
 from ..fits.linearise import Probe, loudest_stretch, run
 from ..fits.screen import Dose, Remainder, orthonormal
-from ..fits.workbench import DIVERGED, FEW, Fitted, Workbench, output_deviation, refit
+from ..fits.workbench import DIVERGED, FEW, Compiled, Fitted, Workbench, output_deviation, refit
 from .hypotheses import Findings, count_samples, likeliest
 from .moves import Search
 from .trials import Trial
@@ -194,15 +194,15 @@ def force_features(
     """
     try:
         bench = Workbench.of(simulator, recordings, hold, engine)
-        model, runner = bench.compile(simulator)
+        given = bench.compile(simulator)
     except InputError:
         return None
-    pieces = [piece for i in range(len(recordings)) for piece in _loudest(bench, model, runner, i, stretches)]
+    pieces = [piece for i in range(len(recordings)) for piece in _loudest(bench, given, i, stretches)]
     if not all(np.all(np.isfinite(state)) for _, state in pieces):
         return None
-    values = {name: p.value for name, p in model.parameters.items()}
+    values = {name: p.value for name, p in given.model.parameters.items()}
     alike = np.ones(len(bench.scale))
-    fitted = Fitted(simulator, model, runner, values, [], [], np.nan, np.nan * alike, alike)
+    fitted = Fitted(simulator, given.model, given.engine, values, [], [], np.nan, np.nan * alike, alike)
     probe = Probe.of(bench, fitted)
 
     def explained(piece: tuple[Recording, np.ndarray]) -> dict[tuple[str, str], float]:
@@ -221,20 +221,21 @@ def force_features(
 
 
 def _loudest(
-    bench: Workbench, model: Model, engine: Engine, i: int, stretches: Sequence[Stretch]
+    bench: Workbench, given: Compiled, i: int, stretches: Sequence[Stretch]
 ) -> Iterator[tuple[Recording, np.ndarray]]:
     """Generate the part of each stretch of recording i with the largest residual as given, and the state before it."""
-    r, p, rows = bench.recordings[i], model.parameters.start, model.substeps
+    r, model = bench.recordings[i], given.model
+    p, rows = model.parameters.start, model.substeps
     here = [s for s in stretches if s.recording == i]
     if not here:
         return
-    drive, at, state = model.drive(r), 0, _first_state(model, engine, r)
+    drive, at, state = model.drive(r), 0, _first_state(model, given.engine, r)
 
     def simulate(begin: int, end: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if end == begin:
             return r.y[:0], state
         with np.errstate(all="ignore"):
-            y, after = engine.simulate(drive[begin * rows : end * rows], p, state)
+            y, after = given.engine.simulate(drive[begin * rows : end * rows], p, state)
         return y, after
 
     for s in here:  # in the order of their samples
@@ -334,5 +335,5 @@ def back_on_stretches(bench: Workbench, fitted: Fitted, states: Sequence[np.ndar
     """Run a fit to everything along the stretches of a bench; only their initial states are fitted, from `states`."""
     parameters = fitted.fitted_model.parameters
     held = fitted.model.with_parameters(parameters.change(**{k: {"fixed": True} for k in parameters}))
-    found = bench.fit(fitted.simulator, [fitted.values], states=states, model=held, engine=fitted.engine)
+    found = bench.fit(fitted.simulator, [fitted.values], states=states, like=replace(fitted, model=held))
     return bench.rerun(fitted, initial=found.initial)

@@ -176,13 +176,13 @@ class Trials:
         """Fit a trial to convergence and to all samples, on steps for its present values."""
         bench = replace(self.bench, at_least=max(self.bench.at_least, trial.fitted.model.substeps))
         placed = trial.fitted.corrected()  # choose sub-steps for the fitted laws
-        model, engine = bench.compile(placed)
+        compiled = bench.compile(placed)
         starts, states = knee_starts(trial.fitted, trial.knee), trial.fitted.initial
         try:
             if len(starts) > 1:
-                quick = bench.fit(placed, starts, states=states, solver=QUICK, model=model, engine=engine)
+                quick = bench.fit(placed, starts, states=states, solver=QUICK, like=compiled)
                 starts, states = [quick.values], quick.initial
-            fitted = bench.fit(placed, starts, states=states, solver=THOROUGH, model=model, engine=engine)
+            fitted = bench.fit(placed, starts, states=states, solver=THOROUGH, like=compiled)
         except InputError:
             return replace(trial, mean_square=np.inf, thorough=True)
         return Trial.of(fitted, len(trial.laws), thorough=True)
@@ -253,7 +253,7 @@ class Trials:
         """Compile a pair and fit it briefly from its best start."""
         first, base = entries[0], parent.fitted
         placed, _ = place_law(base.simulator, first, first.starts[0])
-        model, engine = self.bench.compile(placed, gain)
+        compiled = self.bench.compile(placed, gain)
         users = self.bench.simulator.parameters
         # the refit may have compensated for the law by an offset there, or by the term that the law is in line with
         offsets = [e for e in self.bench.simulator.elements if e.port == first.port and isinstance(e.law, Offset)]
@@ -279,11 +279,11 @@ class Trials:
         if first.law.free == set(first.law.strength):  # at zero strength the simulator is unchanged
             zero = {k: 0.0 * np.asarray(v) if k in first.law.free else v for k, v in first.starts[0].items()}
             starts.append({**base.values, **place_law(base.simulator, first, zero)[1]})
-        best, *rest = self.part.by_cost(placed, model, engine, starts, base.begin)
+        best, *rest = self.part.by_cost(compiled, starts, base.begin)
         last = (s for s in rest if not any(s is o for o in observed))
         ranked = [best, *(s for s in observed if s is not best), *last]
         count = len(parent.laws) + 1
-        options = {"states": base.begin, "model": model, "engine": engine}
+        options = {"states": base.begin, "like": compiled}
         brief = self.fit(placed, ranked[:1], count, solver=BRIEF, **options)
         if afresh:
             nearest = [s for s in ranked if any(s is n for n in given)][:1]

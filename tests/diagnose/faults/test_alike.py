@@ -79,6 +79,27 @@ def test_a_constant_on_a_staircase_is_no_shift_and_no_clock(dead):
     assert "too early: these recordings do not tell which; with it as a parameter" in found.sentence
 
 
+def test_a_shift_that_a_gain_imitates_is_noted_and_not_corrected():
+    """On an exponential decay both are the same."""
+    simulator = wheel().with_parameters({"gain": Parameter(1.0, fixed=True), "lag": Parameter(0.1, bounds=(0.01, 1))})
+    command, speed = (np.exp(-(np.arange(150) + early) / 40) for early in (0, 5))
+    now = refitted(simulator, turned(command, speed, 0.002))
+    found = find_time_shift(now)
+    (note,) = found.gates
+    assert (note.channel, note.finding, note.value, note.corrected, note.fault) == (
+        "speed",
+        "alignment",
+        -5.0,
+        False,
+        False,
+    )
+    assert note.sentence == (
+        "speed is recorded 5 samples (5 s) too early, or else a gain at actuator:command or a gain at sensor:speed "
+        "acts like that: these recordings do not tell which, and no time is changed."
+    )
+    assert found.bench is now.bench and found.fitted is now.fitted
+
+
 @pytest.mark.parametrize(("late", "samples", "seed"), [(6.0, 220, 1), (11.4, 109, 1), (20.0, 150, 0)])
 def test_a_delayed_sine_is_not_early_by_the_rest_of_its_period(late, samples, seed):
     command, speed = (np.sin(2 * np.pi * (np.arange(samples) - shift) / 64) for shift in (0, late))

@@ -20,7 +20,6 @@ from pilfr_casadi.diagnose.fits.evidence import (
     spread,
 )
 from pilfr_casadi.diagnose.posterior import share_named
-from pilfr_casadi.engine import make_engine
 from pilfr_casadi.optimise import Problem
 
 NONE = np.zeros(0)
@@ -193,9 +192,7 @@ def test_a_stiffness_that_is_negative_at_a_level_of_an_input_runs_away_there(sti
     refitted = bench.fit(simulator)
     shape = {"k_1": 0.0, "k_1_high": stiffness, "low": 0.0, "high": 1.0}
     varied = simulator.with_element("ground", laws.scheduled(laws.LinearStiffness, "heat")().at(shape))
-    model = bench.model(varied)
-    values = model.parameters.unpack(model.parameters.start)
-    found = bench.result(varied, values, refitted.initial, make_engine(model), model)
+    found = bench.run(varied, {}, refitted.initial)
     assert found.cost < 0.1 and runs_away(bench, found, refitted) == away
 
 
@@ -213,9 +210,7 @@ def test_a_pendulum_that_turns_over_at_a_held_torque_does_not_run_away():
     bench = Workbench.of(arm, [r], "zero")
     refitted = bench.fit(arm)
     stronger = arm.with_element("actuator:torque", laws.PowerWithGain().at({"a": 0.0, "n": 0.5, "b": 0.3}))
-    model = bench.model(stronger)
-    values = model.parameters.unpack(model.parameters.start)
-    found = bench.result(stronger, values, refitted.initial, make_engine(model), model)
+    found = bench.run(stronger, {}, refitted.initial)
     held = r.with_(u=np.full((800, 1), 0.65))
     assert np.max(np.abs(arm.simulate(held))) < 4 < 50 < np.max(np.abs(stronger.simulate(held)))
     assert not runs_away(bench, found, refitted)
