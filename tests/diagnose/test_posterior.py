@@ -8,7 +8,7 @@ import pytest
 from pilfr_casadi.diagnose.faults.offsets import Offset
 from pilfr_casadi.diagnose.fits.evidence import STRAINED_ODDS, significance
 from pilfr_casadi.diagnose.posterior import explainable_remainder, posterior, share_named
-from pilfr_casadi.diagnose.verdict import closest_law, judge
+from pilfr_casadi.diagnose.verdict import closest_hypothesis, judge
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Delay, DirectionalFriction, QuadraticDrag
 
 SURE = share_named(0.0)  # of a law that leaves nothing: 0.98
@@ -176,12 +176,13 @@ def test_of_forms_that_follow_alike_the_plainest_is_stated(search, trial, better
     assert (posterior(told).best.key == plain.key) is is_plain
 
 
-def test_the_closest_law_is_the_one_that_promises_most(search, trial):
+def test_the_closest_law_is_the_one_that_corrects_or_promises_most(search, trial):
     """A delay that explains nothing may be the likeliest where hardly any sample counts."""
     cube, delay = trial(CUBIC, left=0.5), trial(("actuator:force", Delay), left=1.0)
     found = search((cube, 4.0), delay)
     assert found.evidence(delay) > found.evidence(found.memo[cube.key])
-    assert closest_law(found, delay).key == cube.key
+    assert closest_hypothesis(found).key == cube.key
+    assert closest_hypothesis(found, delay) is delay
 
 
 def test_a_mismatch_below_the_noise_hardly_shows_what_explains_it(search, trial):
