@@ -22,7 +22,7 @@ from ...laws import Law
 from ...simulators import Placed, Simulator
 from ..faults.gates import EQUAL_RATIO, open_start
 from ..faults.offsets import Offset
-from ..fits.evidence import FAR_RATIO, FORMULA_ERROR
+from ..fits.evidence import FAR_RATIO, FORMULA_ERROR, WRONG_MODEL_SAMPLES
 from ..fits.screen import Pair, Scored
 from ..fits.step_refinement import knee_starts, refit_on_finer_steps
 from ..fits.workbench import BRIEF, COMPARED_SAMPLES, DIVERGED, FEW, QUICK, THOROUGH, Fitted, Workbench
@@ -356,7 +356,7 @@ def select_pairs(scored: Sequence[Scored], again: bool) -> list[list[Scored]]:
 
     These are the best law of each port with a single free parameter, which richer ones hide in the list, and the laws
     made for a port: special laws of its domain, and laws in line with its term. Their forces are so curved that a small
-    dose says little about them.
+    dose says little about them. The most promising come first, because a time limit may leave the others out.
     """
     chosen, best = dict[Pair, list[Scored]](), BEST_AGAIN if again else BEST
     for source in ("simulation", "observer"):
@@ -374,7 +374,13 @@ def select_pairs(scored: Sequence[Scored], again: bool) -> list[list[Scored]]:
         largest[s.source] = max(largest.get(s.source, 0.0), s.share)
         if s.pair in chosen:
             chosen[s.pair].append(s)
-    return [[s for s in found if s.share > LEAST_SHARE * largest[s.source]] or found for found in chosen.values()]
+    kept = ([s for s in found if s.share > LEAST_SHARE * largest[s.source]] or found for found in chosen.values())
+    return sorted(kept, key=lambda found: max(map(_promise, found)), reverse=True)
+
+
+def _promise(one: Scored) -> float:
+    """Estimate the log evidence of a law from its screen: the samples of a wrong model count, and a nat per number."""
+    return float(-0.5 * WRONG_MODEL_SAMPLES * np.log(max(1 - one.share, 1e-300)) - one.law.size(one.starts[0]))
 
 
 def _is_plain(one: Scored) -> bool:

@@ -14,7 +14,7 @@ from pilfr_casadi.diagnose import Workbench, port_signals
 from pilfr_casadi.diagnose.fits.force_recovery import forces_of_change
 from pilfr_casadi.diagnose.fits.screen import Scored
 from pilfr_casadi.diagnose.search.relatives import in_place_of_variation, relatives
-from pilfr_casadi.diagnose.search.trials import Trial, Trials
+from pilfr_casadi.diagnose.search.trials import Trial, Trials, select_pairs
 from pilfr_casadi.laws import (
     Backlash,
     CoulombFriction,
@@ -61,6 +61,22 @@ def entry(tiny):
     """Make the entry of a port and a law, with its start values, in the list of the screen."""
     local = port_signals(*tiny, "a")
     return lambda port, law, *starts: Scored(port, law(), 0.1, starts or ({},), local)
+
+
+def test_the_simplest_of_laws_that_explain_about_as_much_is_fitted_first(tiny):
+    """A time limit may leave the others out."""
+    local = port_signals(*tiny, "a")
+
+    def entry(law, share, **own):
+        return Scored("a", law.at(own), share, (own,), local)
+
+    cube, both = (
+        entry(CubicStiffness(), 0.90, k_3=1.0),
+        entry(StribeckFriction(), 0.91, F_c=1.0, F_e=0.5, v_s=1.0, v_0=0.1),
+    )
+    assert [found[0].law.id for found in select_pairs([both, cube], again=False)] == [cube.law.id, both.law.id]
+    far = replace(cube, share=0.5)
+    assert [found[0].law.id for found in select_pairs([both, far], again=False)] == [both.law.id, cube.law.id]
 
 
 def test_a_special_case_that_was_left_after_a_few_steps_is_fitted_again(asked_for, entry):
