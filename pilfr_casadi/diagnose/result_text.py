@@ -137,6 +137,8 @@ class ResultText:
         given, before, after = (_percent(errors[k]) for k in ("nominal", "before", "after"))
         if self.outcome == "same":
             said += f" On the test recordings it makes no difference: {before} before, {after} after."
+            said += " A constant would follow them as well." if errors["after"] > 1 else ""
+            said += self._better_without()
         elif self.outcome == "worse":
             said += (
                 f" But this correction makes the test recordings worse: their error is {before} refitted "
@@ -169,11 +171,11 @@ class ResultText:
         )
 
     def _better_without(self) -> str:
-        """Name the effect of a harmful correction without which the test error is lowest, if that helps."""
+        """Name the effect of a useless correction without which the test error is lowest, if that helps."""
         errors = self.errors.get("test") or {}
         known = [e for e in self.effects if not np.isnan(e.test_without)]
         least = min(known, key=lambda e: e.test_without, default=None)
-        if least is None or not least.test_without < errors["before"]:
+        if least is None or not BETTER_RATIO * least.test_without < errors["before"]:
             return ""
         return f" Without {least.name} it is {_percent(least.test_without)}."
 

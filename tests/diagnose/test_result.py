@@ -228,6 +228,16 @@ def test_the_effect_that_harms_the_test_recording_is_told(without, advised, tmp_
     assert json.loads((tmp_path / "diagnosis.json").read_text())["effects"][1]["test_without"] == without
 
 
+def test_a_law_that_spoils_the_test_is_told_where_all_together_make_no_difference():
+    d = example()
+    drag = replace(d.effects[0], law="quadratic_drag", form="", test_without=0.86)
+    errors = {role: {**e, "nominal": 4.0, "before": 2.12, "after": 2.16} for role, e in d.errors.items()}
+    d = replace(d, effects=(replace(d.effects[0], test_without=2.2), drag), errors=errors)
+    assert d.outcome == "same"
+    assert "makes no difference: 212 % before, 216 % after. A constant would follow them as well." in d.summary
+    assert "Without quadratic drag at ground it is 86 %." in d.summary
+
+
 @pytest.mark.usefixtures("blank_figures")
 def test_the_gravest_blind_spots_stand_right_after_the_verdict(tmp_path):
     spots = tuple(BlindSpot("flat", (name,), f"These recordings say nothing about {name}.") for name in "abc")
