@@ -120,7 +120,7 @@ class DataOptions:
         "20,0.5 (default: estimate; zero where no outputs were measured)."
     )
     period: int | None = whole("Samples per period; needs --initial.", 0, MOST_SAMPLES, metavar="SAMPLES")
-    hold: Literal["zero", "linear"] | None = option("Course of the inputs between samples.")
+    hold: Literal["zero", "linear", "band-limited"] | None = option("Course of the inputs between samples.")
     skip: int = whole("Leading samples that are simulated but not scored.", 0, MOST_SAMPLES, 0, "SAMPLES")
     dt: float | None = option("Step, if the file has no time column.", "SECONDS")
     time_tolerance: float | None = option(

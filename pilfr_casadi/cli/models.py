@@ -475,7 +475,7 @@ class ExportOptions:
     name: str = option("Name of the function (default: model).", "NAME", "model")
     smooth: float = option("Width of the rounding of min and max (default: 0, exact).", "EPS", 0.0)
     dt: float | None = option("Duration of a step, needed for a simulator.", "SECONDS")
-    hold: Literal["zero", "linear"] | None = option("Course of a simulator's inputs between samples.")
+    hold: Literal["zero", "linear", "band-limited"] | None = option("Course of a simulator's inputs between samples.")
     initial: Any = initial_state("State in which it begins: zero (default), or the states' values, such as 20,0.5.")
 
 

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         repeats_itself as repeats_itself,
         same_input as same_input,
     )
+    from .preprocessing import interpolate_band_limited as interpolate_band_limited
     from .readers import (
         column_names as column_names,
         read as read,

@@ -86,7 +86,7 @@ def merge(
         period=None,
         start=first.start + begin,
         initial=first.initial if keeps_initial else "estimate",
-        hold=first.hold if as_sampled or not first.hold else "linear",
+        hold="linear" if first.hold == "zero" and not as_sampled else first.hold,
         skip=min(max(int(np.ceil((first.skip * first.dt - begin) / step - SAME_STEP)), 0), len(times) - 1),
     )
 

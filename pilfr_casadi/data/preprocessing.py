@@ -19,6 +19,8 @@ from .._base import InputError, is_number, listed, positive, whole
 Array = np.ndarray
 
 TRENDS = ("constant", "linear")
+INTERPOLATION_REACH = 20  # samples on each side that an interpolated value depends on
+INTERPOLATION_WINDOW = ("kaiser", 8.0)  # of the sine cardinal: 80 dB of attenuation
 FILTERS = ("lowpass", "highpass", "bandpass", "bandstop")
 LARGEST_FACTOR = 1000  # largest numerator and denominator of a rational change of step
 RATIO_ERROR = 1e-9  # relative error of that ratio, far below a sample over the longest recordings
@@ -172,3 +174,22 @@ def hold_at(t: Array, values: Array, times: Array, step: float) -> Array:
     means = np.diff(np.interp(np.append(times, times[-1] + step), known, integral)) / step
     first, last = (np.searchsorted(t, times + share * step, "right") - 1 for share in (SAME_TIME, 1 - SAME_TIME))
     return np.where(first == last, values[first], means)  # without rounding where the signal keeps its value
+
+
+def interpolate_band_limited(values: np.ndarray, n: int, periodic: bool) -> np.ndarray:
+    """Interpolate band-limited signals (M, k) at n points a sample; return (n M + 1, k), the samples unchanged.
+
+    The signals have no content above half the sampling rate, as behind an anti-alias filter. They repeat if `periodic`;
+    else they are reflected in their first and last points.
+    """
+    from scipy.signal import resample_poly
+
+    if n == 1 or not values.size:
+        after = values[:1] if periodic else values[-1:]
+        return np.vstack([np.repeat(values, n, axis=0), after])
+    beyond = min(INTERPOLATION_REACH, len(values) - 1)
+    pad = ((beyond, beyond + 1), (0, 0))
+    more = np.pad(values, pad, "wrap") if periodic else np.pad(values, pad, "reflect", reflect_type="odd")
+    fine = resample_poly(more, n, 1, axis=0, window=INTERPOLATION_WINDOW)
+    fine[::n] = more
+    return np.asarray(fine[n * beyond : n * (beyond + len(values)) + 1])

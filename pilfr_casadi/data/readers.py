@@ -323,7 +323,7 @@ class _Request:
         for i, (t, values) in enumerate(series):
             bring = hold_at if held and i < n_u else partial(interpolate_at, smooth=i >= n_u)
             parts.append(np.column_stack([bring(t, column, times, step) for column in values.T]))
-        return parts, "linear" if hold and not held else hold
+        return parts, "linear" if hold == "zero" and not held else hold
 
 
 def _check_names(given: Any, role: str) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from .preprocessing import butterworth, change_step, hold_at, levels_last, remov
 from .units import conversion
 
 SAME_STEP = 1e-4  # relative difference up to which two steps count as the same; written times have few digits
-HOLDS = ("zero", "linear", None)
+HOLDS = ("zero", "linear", "band-limited", None)
 INITIALS = ("zero", "estimate", "periodic")
 
 
@@ -48,8 +48,9 @@ class Recording:
         State at the first sample: estimated, zero, periodic steady state, or given as numbers. In steady state the
         memory of an operator that never slips in a period is not unique; the memory reached from rest with zero memory
         is used, and `fit` reports this.
-    hold : {"zero", "linear"}, optional
-        Input between the samples: held or interpolated linearly. ``None`` leaves it open.
+    hold : {"zero", "linear", "band-limited"}, optional
+        Input between the samples: held, interpolated linearly, or without content above half the sampling rate, as
+        behind an anti-alias filter. ``None`` leaves it open.
     skip : int
         Leading samples that are simulated but not scored.
     name : str
@@ -298,7 +299,7 @@ class Recording:
             If a cutoff is not below the Nyquist frequency, there are too few samples, or a name is unknown.
         """
         edited = self._edit_channels(lambda values: butterworth(values, self.dt, cutoff, kind, order), channels)
-        smooth = self.hold and set(self._select(channels)) & set(self.inputs)
+        smooth = self.hold == "zero" and set(self._select(channels)) & set(self.inputs)
         return replace(edited, hold="linear" if smooth else self.hold)
 
     def resample(self, dt: float) -> Self:
@@ -320,7 +321,7 @@ class Recording:
         hold = self.hold
         if self.n_u and hold == "zero" and all(levels_last(self.t, column, dt) for column in self.u.T):
             u = np.column_stack([hold_at(self.t, column, np.arange(len(u)) * dt, dt) for column in self.u.T])
-        elif self.n_u and hold:
+        elif self.n_u and hold == "zero":
             hold = "linear"
         skip = min(int(np.ceil(self.skip * self.dt / dt * (1 - SAME_STEP))), len(u) - 2)
         period = round((self.period or 0) * self.dt / dt)
@@ -535,7 +536,7 @@ def _check_options(r: Recording, m: int) -> None:
     if not (is_number(r.start) and np.isfinite(r.start)):
         raise InputError(f"start of {r.label} is {r.start!r}; give the time of its first sample in seconds.")
     if not (r.hold is None or isinstance(r.hold, str)) or r.hold not in HOLDS:
-        raise InputError(f"hold of {r.label} is {r.hold!r}; give 'zero', 'linear' or None.")
+        raise InputError(f"hold of {r.label} is {r.hold!r}; give 'zero', 'linear', 'band-limited' or None.")
     if isinstance(r.initial, str) and r.initial not in INITIALS:
         raise InputError(f"initial of {r.label} is {r.initial!r}; give one of {listed(INITIALS)}, or the state itself.")
     if not is_whole(r.skip, 0, m - 1):

@@ -94,7 +94,7 @@ def diagnose(
         Recordings to fit to and to choose on.
     test : Recording or sequence of Recording, optional
         Recordings to report on, never used to fit or to choose.
-    hold : {"zero", "linear"}, optional
+    hold : {"zero", "linear", "band-limited"}, optional
         Course of the inputs between samples, if neither recordings nor simulator say; by default the data decide.
     laws : sequence of Law classes or names, optional
         A name is an id, such as "coulomb_friction", which stands for all forms of a law, or the name of a class. By

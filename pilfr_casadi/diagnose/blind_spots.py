@@ -48,7 +48,7 @@ MOTION = {  # by kind of blind spot: the record that removes it
     "one-amplitude": "A second amplitude of {}, such as half of it.",
 }
 # by hold: its name in the printed result
-HOLD_WORDS = {"zero": "held", "linear": "interpolated"}
+HOLD_WORDS = {"zero": "held", "linear": "interpolated", "band-limited": "band-limited"}
 # by kind of initial state: its name in the printed result
 START_WORDS = {"zero": "at zero", "estimate": "estimated", "periodic": "periodic", "given": "as given"}
 # by source of the noise floor: its name in the printed result
@@ -259,7 +259,7 @@ def check(
         The simulator, with nominal parameters, bounds and ports.
     train : Recording or sequence of Recording
         The recordings that are to be diagnosed.
-    hold : {"zero", "linear"}, optional
+    hold : {"zero", "linear", "band-limited"}, optional
         Course of the inputs between samples, if neither recordings nor simulator say; by default the one with which
         the refitted simulator follows better.
     laws : sequence of Law classes or names, optional

@@ -344,7 +344,11 @@ def slow_note(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Ga
 
 def hold_note(simulator: Simulator, hold: str, ratio: float) -> Gate:
     """Note that the hold was chosen from the data; the other's error is `ratio` times as large."""
-    words = {"zero": "held over each sample", "linear": "interpolated between samples"}[hold]
+    words = {
+        "zero": "held over each sample",
+        "linear": "interpolated between samples",
+        "band-limited": "band-limited between samples",
+    }[hold]
     how = f"fits better (error {ratio:.3g} times smaller)" if ratio > EQUAL_RATIO else "fits no worse"
     how = how if np.isfinite(ratio) else "lets the simulation follow (otherwise it diverges)"
     sentence = f"The recordings do not say what inputs do between samples; {words} {how} and is used."

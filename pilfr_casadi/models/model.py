@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, abandoned, listed
-from ..data import Recording, default_names
+from ..data import Recording, default_names, interpolate_band_limited
 from .elements import Element
 from .parameters import Parameter, ParameterSet
 
@@ -66,6 +66,8 @@ class Model:
     begin_alike : tuple of int
         For each entry of the state, the number of the unknown that it is if the initial state is unknown; entries with
         the same number begin alike. By default each entry has its own.
+    band_limited : bool
+        Whether inputs that change between samples are band-limited there, in place of linear.
     """
 
     step: ca.Function
@@ -81,6 +83,7 @@ class Model:
     stages: ca.Function | None = None
     resting: ca.Function | None = None
     begin_alike: tuple[int, ...] = ()
+    band_limited: bool = False
 
     @cached_property
     def initial_basis(self) -> np.ndarray:
@@ -95,9 +98,9 @@ class Model:
     def drive(self, recording: Recording) -> np.ndarray:
         """Collect the signals that the step reads along a recording, (M * substeps, n_u), in the order of `reads`.
 
-        `u` is the input at the start of a sub-step and `next` at its end (both interpolated between samples; `u` alone
-        is held over the sample), `t` the time in s (see `Recording.start`), `y` the measured output, and
-        `sampled` one where a sample is taken and zero in the sub-steps after it.
+        `u` is the input at the start of a sub-step and `next` at its end (both interpolated between samples, in a line
+        or as `band_limited` signals; `u` alone is held over the sample), `t` the time in s (see `Recording.start`), `y`
+        the measured output, and `sampled` one where a sample is taken and zero in the sub-steps after it.
         """
         n, m = self.substeps, len(recording)
         share = np.tile(np.arange(n) / n, m)
@@ -114,6 +117,10 @@ class Model:
                 values = recording.y if signal == "y" else recording.u
                 period = recording.period if recording.period and m % recording.period == 0 else None
                 after = values[m - period] if period else values[-1]
+                if self.band_limited and signal != "y":
+                    fine = interpolate_band_limited(values, n, periodic=period is not None)
+                    columns.append(fine[1:] if signal == "next" else fine[:-1])
+                    continue
                 a, b = np.repeat(values, n, axis=0), np.repeat(np.vstack([values[1:], after]), n, axis=0)
                 columns.append(a + (b - a) * (share + (1 / n if signal == "next" else 0.0))[:, None])
         return np.ascontiguousarray(np.hstack(columns)) if len(columns) != 1 else columns[0]

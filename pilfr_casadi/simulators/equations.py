@@ -19,6 +19,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, whole
+from ..data import HOLDS
 from ..models import Named, Parameter, ParameterSet
 from .domains import MECHANICAL, UNKNOWN, common_domain, is_motion, may_be_speed
 from .external import calls_external
@@ -63,8 +64,8 @@ class Equations:
                 raise InputError(f"The simulator's {kind} are {getattr(self, kind)!r}; give a function of x, u and p.")
         for kind in ("states", "inputs"):
             object.__setattr__(self, kind, check_names(getattr(self, kind), kind))
-        if self.hold not in (None, "zero", "linear"):
-            raise InputError(f"hold = {self.hold!r} was given; use 'zero', 'linear' or None.")
+        if self.hold not in HOLDS:
+            raise InputError(f"hold = {self.hold!r} was given; use 'zero', 'linear', 'band-limited' or None.")
         object.__setattr__(self, "substeps", whole(self.substeps, "substeps", 1))
         if not isinstance(self.units, Mapping):
             raise InputError(f"The simulator's units are {self.units!r}; give {{name: unit}}.")

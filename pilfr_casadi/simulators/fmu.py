@@ -133,7 +133,7 @@ def from_fmu(
     inputs, outputs : tuple of str, optional
         Recorded inputs and outputs; by default all outputs, and all inputs that no port uses. Other inputs keep their
         start values, so name the recorded ones if the recordings lack some.
-    hold : {"zero", "linear"}, optional
+    hold : {"zero", "linear", "band-limited"}, optional
         As of `Simulator`.
     cosimulation : CoSimulation, optional
         Step size and states of a unit for co-simulation; a unit for both kinds is then stepped.

@@ -29,6 +29,8 @@ from .equations import Equations, Named, stack
 from .ports import ACTUATOR, PARAMETER, SENSOR, Expression, Placed, Port, split_port
 from .user_arguments import call
 
+BAND_LIMITED_STEPS = 4  # per sample at least; lines between them miss a third of the sampling rate by 2 %
+
 E = TypeVar("E", bound=Equations)
 
 
@@ -172,19 +174,22 @@ def on_grid(simulator: E, h: float) -> E:
 def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: int = 1) -> Model:
     """Discretise a simulator with its laws to a closed model for samples dt apart, s.
 
-    `hold` says whether inputs are constant between samples ("zero") or interpolated ("linear"); `substeps` is the
-    number of Runge-Kutta steps per sample (`choose_substeps`).
+    `hold` says whether inputs are constant between samples ("zero"), interpolated ("linear") or band-limited;
+    `substeps` is the number of Runge-Kutta steps per sample (`choose_substeps`), at least four for band-limited inputs,
+    which are linear within a step.
     """
     own = getattr(simulator.dynamics, "dt", None)  # of a program that steps by itself
     if own is not None and abs(own / dt - 1) > SAME_STEP:
         raise InputError(f"The simulator has steps of {own:g} s, the recordings of {dt:g} s; give both the same step.")
+    band_limited = hold == "band-limited"
+    substeps = max(substeps, BAND_LIMITED_STEPS) if band_limited and not simulator.discrete else substeps
     simulator = on_grid(simulator, dt / substeps)
     step = _SubStep(simulator, dt / substeps, hold)
     x, s, u0, u1, t, updated = step.x, step.s, step.u0, step.u1, step.t, step.updated
     x_next, y, stages = step.advance()
     update, z = step.update, step.z
     reads, columns = ["u"], [u0]
-    if hold == "linear":
+    if hold != "zero":
         reads, columns = [*reads, "next"], [*columns, u1]
     if ca.depends_on(ca.vertcat(x_next, y, update), t):
         reads, columns = [*reads, "t"], [*columns, t]
@@ -212,6 +217,7 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
         stages=ca.Function("stages", [x, u, updated, p, stages[0]], stages[1:]) if stages else None,
         resting=step.resting(),
         begin_alike=step.alike_at_first(substeps),
+        band_limited=band_limited,
     )
     return model if simulator.observer is None else inject_outputs(model, simulator.observer)
 
@@ -227,7 +233,7 @@ class _SubStep:
         n_x, n_u = len(simulator.states) + sum(equations.n_q), len(simulator.inputs)
         self.x, self.s = ca.SX.sym("x", n_x), ca.SX.sym("s", sum(equations.n_s))
         self.u0, self.u1, self.t = ca.SX.sym("u", n_u), ca.SX.sym("next", n_u), ca.SX.sym("t")
-        self.end, slope = (self.u1, (self.u1 - self.u0) / h) if hold == "linear" else (self.u0, ca.SX.zeros(n_u))
+        self.end, slope = (self.u1, (self.u1 - self.u0) / h) if hold != "zero" else (self.u0, ca.SX.zeros(n_u))
         sizes = (("x", n_x), ("s", self.s.numel()), ("u", n_u), ("t", 1))
         now = {name: ca.SX.sym(name, n) for name, n in sizes}
         f, y, after, local = equations.evaluate(Instant(**now, slope=slope))
@@ -241,7 +247,7 @@ class _SubStep:
         read = (self.s[i] if shift else self.updated[i] for i, shift in enumerate(self.shifts))
         self.memory = ca.vertcat(ca.SX(0, 1), *read)
         # a register's content moves on within the step if inputs are interpolated
-        self.drift = (self.updated - self.memory) * (hold == "linear")
+        self.drift = (self.updated - self.memory) * (hold != "zero")
 
     def _evaluate(self, x: Any, s: Any, u: Any, t: Any) -> Any:
         return self.function(x, s, u, t, self.u0, self.u1, self.vector)

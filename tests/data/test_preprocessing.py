@@ -7,7 +7,7 @@ from scipy.signal import lsim, lti
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Recording
-from pilfr_casadi.data import merge, read_csv, read_frame
+from pilfr_casadi.data import interpolate_band_limited, merge, read_csv, read_frame
 
 DT = 1e-3
 T = np.arange(4000) * DT
@@ -361,3 +361,22 @@ def test_a_merged_input_is_linear_where_one_of_the_records_is():
     smooth = Recording(u[:, 1:], u[:, 1:], 0.02, ("b",), ("y",), hold="linear")
     assert pilfr.merge(held, smooth).hold == "linear"
     assert pilfr.merge(held, smooth, inputs="a", outputs="y").hold == "zero"
+
+
+@pytest.mark.parametrize("periodic", [True, False])
+def test_a_band_limited_signal_is_interpolated_through_its_samples(periodic):
+    def signal(k):
+        return np.stack([np.sin(2 * np.pi * 0.3 * k), 2 + np.cos(2 * np.pi * 0.05 * k + 1)], axis=-1)
+
+    k = np.arange(200)
+    fine = interpolate_band_limited(signal(k), 5, periodic)
+    assert fine.shape == (1001, 2) and np.array_equal(fine[:-1:5], signal(k))
+    inside = slice(0, None) if periodic else slice(150, -150)
+    assert np.max(np.abs(fine - signal(np.arange(1001) / 5))[inside]) < 2e-3
+    assert interpolate_band_limited(signal(k), 1, periodic).shape == (201, 2)
+
+
+def test_a_band_limited_input_stays_that():
+    u = np.random.default_rng(0).standard_normal((500, 1))
+    r = Recording(u, u, 0.01, hold="band-limited")
+    assert {r.resample(0.005).hold, r.resample(0.03).hold, r.detrend().hold} == {"band-limited"}

@@ -72,6 +72,7 @@ def test_names_that_are_there_already_get_an_underscore():
     dynamics, outputs = (lambda x, u, t: dict(time=u.f - x.time + t)), (lambda x: dict(y=x.time))
     simulator = Simulator(dynamics, outputs, states=("time",), inputs=("f", "f_next"))
     found = exported(simulator, dt=0.1, hold="linear")
+    assert exported(simulator, dt=0.1, hold="band-limited").step.serialize() == found.step.serialize()
     assert list(found.states) == ["time", "time_"]
     assert found.inputs == ("f", "f_next", "f_next_", "f_next_next")
 

@@ -546,3 +546,20 @@ def test_a_free_motion_of_three_samples_is_simulated():
     """A recording that is too short to show how fast the equations are along it."""
     short = Recording(np.empty((3, 0)), np.empty((3, 0)), 1.0, initial=[1.0, 0.0])
     assert np.all(np.abs(pendulum.simulate(short)) < 1.1)
+
+
+def test_a_band_limited_input_is_followed_between_its_samples():
+    """Two sines of a lag, one of them with three samples a period, in closed form."""
+    lag = Simulator(
+        lambda x, u, p: {"y": (u.u - x.y) / p.T}, lambda x: {"y": x.y}, ("y",), ("u",), {"T": Parameter(0.3)}
+    )
+    t, waves = 0.1 * np.arange(400), ((3.2, 0.0), (0.7, 1.0))
+    u = sum(np.sin(2 * np.pi * f * t + phase) for f, phase in waves)
+    y = sum(np.imag(np.exp(1j * (2 * np.pi * f * t + phase)) / (1 + 2j * np.pi * f * 0.3)) for f, phase in waves)
+    off = {}
+    for hold in ("zero", "linear", "band-limited"):
+        r = Recording(u, y, 0.1, hold=hold, initial=[y[0]])
+        off[hold] = lag.nrmse(r)
+    assert off["band-limited"] < 0.01 < 0.05 < off["linear"] < off["zero"]
+    same = replace(lag, hold="band-limited")
+    assert same.nrmse(r.with_(hold=None)) == off["band-limited"]
