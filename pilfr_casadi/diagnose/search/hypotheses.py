@@ -89,8 +89,7 @@ class Hypotheses:
     count: float = FEWEST  # samples of the best residual over its correlation time
     # mean square of the mismatch, all outputs alike, of which formulas may leave a share; by default the refit's error
     mismatch2: float | None = None
-    # the key and the value of `_least_tolerant`, and what must live as long as its identity is in the key
-    _least: tuple[tuple[float, ...], float, tuple[object, ...]] | None = None
+    _least: tuple[tuple[object, ...], float] | None = None  # what `_least_tolerant` rests on, and its value
 
     @cached_property
     def fits(self) -> Trials:
@@ -114,10 +113,9 @@ class Hypotheses:
 
     def _least_tolerant(self) -> float:
         """Compute the smallest `_tolerant` of all hypotheses; kept while these stay, because each evidence needs it."""
-        kept = (self.bench, *self.memo.values())
-        key = (self.tolerance, *map(id, kept))
-        if self._least is None or self._least[0] != key:
-            self._least = key, min(map(self._tolerant, self.memo.values())), kept
+        basis = (self.tolerance, self.bench, *self.memo.values())  # objects, each equal to itself alone
+        if self._least is None or self._least[0] != basis:
+            self._least = basis, min(map(self._tolerant, self.memo.values()))
         return self._least[1]
 
     @property
