@@ -168,11 +168,18 @@ def _fit_to_everything(request: Request, ready: Prepared, search: Search) -> tup
 
 def _concluded(search: Search, gates: Sequence[Gate]) -> Conclusion:
     """Draw the conclusion; after an interrupt, draw it without further fits."""
-    with search.until_interrupted(), search.stage("conclusion"):
+    found = None
+    with search.until_interrupted():
+        found = _conclude_as_stage(search, gates)
+    return found or conclude(search, gates)
+
+
+def _conclude_as_stage(search: Search, gates: Sequence[Gate]) -> Conclusion:
+    """Draw the conclusion, and note if the time ended meanwhile; an interrupted fit raises at the end of the stage."""
+    with search.stage("conclusion"):
         found = conclude(search, gates)
         search.out_of_time = search.out_of_time or time.perf_counter() > search.bench.deadline
         return found
-    return conclude(search, gates)
 
 
 def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:

@@ -76,9 +76,10 @@ def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
 
 def _prefers_other_hold(search: Search) -> bool:
     """Tell whether a search that nobody has interrupted would be better with the other hold."""
+    prefers = False
     with search.until_interrupted():
-        return search.prefers_other_hold()
-    return False
+        prefers = search.prefers_other_hold()
+    return prefers
 
 
 def _comparable(one: Search, other: Search) -> tuple[float, float]:
@@ -153,11 +154,11 @@ def _again(search: Search, prepare_and_search: Callable[[], tuple[Prepared, Sear
 
     If that search is cut short, so is the present one.
     """
+    found = None
     with search.until_interrupted(), suppress(InputError):
-        ready, again = prepare_and_search()
-        search.cut_short_with(again)
-        return ready, again
-    return None
+        found = prepare_and_search()
+        search.cut_short_with(found[1])
+    return found
 
 
 def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]:
