@@ -143,10 +143,14 @@ def share_left(
     above the outputs' variance counts as that, which a constant leaves: in a free run errors may accumulate without
     end, and to have removed them says little of a law.
     """
-    one, noise2 = (before or search.root).fitted, (floor or search.floor).squares(search.bench.scale)
-    noise, left, whole, most = (float(np.mean(v / fitted.balance)) for v in (noise2, fitted.squares, one.squares, 1.0))
-    excess = max(min(whole, most) - noise, 1e-300)
-    return float(np.clip((max(left, least * noise) - noise) / excess, 0.0, 1.0))
+
+    def pooled(squares: np.ndarray | float) -> float:
+        return float(np.mean(squares / fitted.balance))
+
+    noise = pooled((floor or search.floor).squares(search.bench.scale))
+    left = pooled(fitted.squares)
+    most = min(pooled((before or search.root).fitted.squares), pooled(1.0))
+    return float(np.clip((max(left, least * noise) - noise) / max(most - noise, 1e-300), 0.0, 1.0))
 
 
 def share_named(s: float, odds: float = 1.0) -> float:
