@@ -92,7 +92,7 @@ def prepare(
     if said:
         first = checks.begin(bench, noted)
     else:
-        first, held = choose_hold(checks.begin_with_either_hold(bench, noted).with_deadline(checks.deadline))
+        first, held = choose_hold(checks.begin_with_either_hold(bench, noted).with_deadline(checks.refit_deadline()))
     nominal = errors_of(replace(bench, hold=first.bench.hold), first.fitted.model)
     say(CHECKS, 1, CHECKED)
     now = checks.run(first, 1.0 if said else 0.5)
@@ -122,18 +122,18 @@ class _Checks:
     until: float
     left_out: list[Callable[[Checked], Checked]] = field(default_factory=list)
 
-    @property
-    def deadline(self) -> float:
-        """When a first refit ends: with the checks, and after a few seconds in any case."""
+    def refit_deadline(self) -> float:
+        """Return when a refit that begins now ends: with the checks, but in LEAST_REFIT seconds at the earliest."""
         return max(self.until, time.perf_counter() + LEAST_REFIT)
 
     def begin(self, bench: Workbench, gates: tuple[Gate, ...]) -> Checked:
         """Refit from the user's values; correct a fault of a channel that shows at these values."""
         found: Checked | None = None
         with UntilInterrupted(bench.interrupt, self.say.interrupted):
-            slips = find_gross_slips(replace(bench, deadline=self.deadline), self.workers)
-            found = self._try_gross_slips(replace(bench, deadline=self.deadline), slips, gates) if slips else None
-        return found or first_refit(replace(bench, deadline=self.deadline), gates)
+            slips = find_gross_slips(replace(bench, deadline=self.refit_deadline()), self.workers)
+            if slips:
+                found = self._try_gross_slips(replace(bench, deadline=self.refit_deadline()), slips, gates)
+        return found or first_refit(replace(bench, deadline=self.refit_deadline()), gates)
 
     def begin_with_either_hold(self, bench: Workbench, gates: tuple[Gate, ...]) -> Checked:
         """Begin; with the other hold too if a channel is at fault, of which the wrong hold may choose the wrong one."""
@@ -160,7 +160,7 @@ class _Checks:
         found = accept_best(now, () if bench.interrupt.pressed else slips, self.workers)
         if bench.interrupt.pressed:  # half a fit accepts wrong faults
             return now if np.isfinite(now.cost) else None
-        found = found.with_deadline(self.deadline)
+        found = found.with_deadline(self.refit_deadline())
         if found.adds_to(now):
             return refit_corrected(found)
         if not np.isfinite(found.cost):
@@ -170,7 +170,7 @@ class _Checks:
 
     def run(self, first: Checked, part: float) -> Checked:
         """Correct one fault after the other from the first refit on; `part` is the unit of shifts, see `timing`."""
-        now = with_observer(first.with_deadline(self.deadline)).weighted()
+        now = with_observer(first.with_deadline(self.refit_deadline())).weighted()
         now = self._in_turn(now, find_wrong_start, in_any_case=True)
         now = now.with_deadline(self.until)
         slips, shift = partial(self._correct_slips, part=part), partial(find_time_shift, part=part, early=self.early)
@@ -227,7 +227,7 @@ def _with_better_hold(
     If inputs are taken as held but were interpolated, a late channel is late by half a sample more or less.
     """
     try:
-        again = _with_other_hold(first.with_deadline(checks.deadline))
+        again = _with_other_hold(first.with_deadline(checks.refit_deadline()))
         both = now, checks.run(again, 0.5)
     except InputError:
         return now, held
