@@ -341,8 +341,8 @@ def _draw_comparison(case: _Case, c: BeforeAfter, i: int) -> list[Block]:
     noise = case.diagnosis.floor
     white = noise.get("white", noise["nrmse"]) / max(noise["nrmse"], 1e-300)  # the slow part is no white noise
     simulated: plots.Simulated = [("as given", c.given), ("refitted", c.before)]
-    if correction := tables.correction_words(case.diagnosis):
-        simulated.append((correction.removesuffix(" put back").removesuffix(" added"), c.after))
+    if correction := tables.correction_label(case.diagnosis):
+        simulated.append((correction, c.after))
     diverging = [label for label, y in simulated if y is None]
     note = f" The simulation diverges: {', '.join(diverging)}." if diverging else ""
     where = f"{name} in {r.name}"

@@ -39,14 +39,20 @@ def correction_words(diagnosis: Diagnosis) -> str:
 
     The text says "put back" only if the names are certain and the laws help on the test recordings.
     """
+    stated = diagnosis.sure and diagnosis.outcome in ("better", "")
+    done = f" {'put back' if stated else 'added'}" if diagnosis.effects else ""
+    return correction_label(diagnosis) + done
+
+
+def correction_label(diagnosis: Diagnosis) -> str:
+    """Name the corrected simulator in a legend; empty if it is the refitted one."""
     if diagnosis.effects:
         names = [_short_name(e) for e in diagnosis.effects]
         if any(g.finding == "unsure" for g in diagnosis.gates):
             names.append("laws of uncertain name")
         if diagnosis.learned:
             names.append("a learned force")
-        stated = diagnosis.sure and diagnosis.outcome in ("better", "")
-        return f"with {' and '.join(names)} {'put back' if stated else 'added'}"
+        return f"with {' and '.join(names)}"
     if diagnosis.nameless:
         return "corrected"
     return f"with {diagnosis.freed} let go" if diagnosis.freed else ""
