@@ -58,7 +58,7 @@ from .arguments import (
 from .correction import find_correction, named_correction
 from .faults.gates import EQUAL_RATIO, Gate
 from .faults.offsets import fix_idle_offsets, list_offsets
-from .faults.samples import find_clipped_input, open_unsettled, remove_glitches
+from .faults.samples import clean_recordings, find_clipped_input
 from .faults.tones import find_tones
 from .fits.evidence import SURE
 from .fits.workbench import converge
@@ -146,14 +146,12 @@ def _on_stretches(request: Request, most: int) -> Request:
     if sum(map(len, request.recordings)) <= most:
         return request
     request.say("choice of stretches", 0, 1)
-    recordings, spikes = remove_glitches(request.recordings)
-    recordings, transients = open_unsettled(recordings)
+    recordings, notes = clean_recordings(request.recordings)
     hold = stated_hold(request.simulator, recordings, request.hold) or "zero"
     chosen = choose_stretches(request.simulator, recordings, hold, request.engine, most, request.workers)
     stretches = Stretches(recordings, chosen)
     request.say("choice of stretches", 1, 1)
-    notes = (*request.notes, *spikes, *transients)
-    return replace(request, recordings=stretches.cut(), stretches=stretches, notes=notes)
+    return replace(request, recordings=stretches.cut(), stretches=stretches, notes=(*request.notes, *notes))
 
 
 def _fit_to_everything(request: Request, ready: Prepared, search: Search) -> tuple[Request, Everything | None]:

@@ -24,7 +24,7 @@ from .faults.channels import accept_best, find_gross_slips, find_slips, open_ben
 from .faults.gates import CURED_SHARE, EQUAL_RATIO, NEAR_NOISE_RATIO, POOR_FIT, Checked, Gate
 from .faults.lost_samples import find_gaps, find_output_gaps
 from .faults.offsets import find_offsets, find_wrong_start
-from .faults.samples import find_held_outputs, mend_stale_samples, open_unsettled, remove_glitches, unclip
+from .faults.samples import clean_recordings, find_held_outputs, mend_stale_samples, unclip
 from .faults.timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps
 from .fits.floor import Floor, pool, white_part
 from .fits.linearise import linearise_runs, observer_gain, sample_run
@@ -82,12 +82,11 @@ def prepare(
     """
     say = say or Stages(lambda *_: None)
     say(CHECKS, 0, CHECKED)
-    recordings, spikes = remove_glitches(recordings)
-    recordings, transients = open_unsettled(recordings)
+    recordings, cleaned = clean_recordings(recordings)
     slow = find_held_outputs(recordings)
     said = stated_hold(simulator, recordings, hold)
     bench, times = open_bench(simulator, recordings, said or "zero", engine)
-    checks, noted = _Checks(workers, early, say, until), (*spikes, *transients, *slow, *times)
+    checks, noted = _Checks(workers, early, say, until), (*cleaned, *slow, *times)
     held: Sequence[Gate] = ()
     if said:
         first = checks.begin(bench, noted)
