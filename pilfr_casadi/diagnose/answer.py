@@ -24,7 +24,7 @@ from .excitation import ranges_left, share_at_new_frequencies
 from .faults.channels import IN_RECORDINGS, find_gross_slips
 from .faults.gates import EQUAL_RATIO, TEST_FAULT, Gate, edited, value_with_unit
 from .faults.offsets import Offset, remove_idle_offsets, update_offsets
-from .fits.evidence import FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, SURE, deviations
+from .fits.evidence import FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, SURE, all_sure, deviations
 from .fits.floor import Floor
 from .fits.force_recovery import is_curve_along
 from .fits.workbench import Fitted, Workbench
@@ -128,8 +128,7 @@ def build_diagnosis(
 
 def _is_sure(found: Conclusion) -> bool:
     """Tell whether every named effect is sure, or there is none because nothing is missing."""
-    sure = min((e.confidence for e in found.effects), default=0.0) > SURE
-    return sure or found.verdict.kind in ("complete", "recording-fault")
+    return all_sure(e.confidence for e in found.effects) or found.verdict.kind in ("complete", "recording-fault")
 
 
 def _describe_noise(floor: Floor, white: Floor, bench: Workbench, compared: Comparison | None) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from .correction import Correction
 from .effect import Effect
 from .faults.gates import TEST_FAULT, Gate, value_with_unit
 from .faults.offsets import Offset
-from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, SURE
+from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, all_sure
 from .fits.floor import ABOVE_NOISE
 from .search.learned import Learned
 
@@ -65,8 +65,8 @@ class ResultText:
 
     @property
     def sure(self) -> bool:
-        """Whether every named effect has a confidence above one half; False without effects."""
-        return bool(self.effects) and min(e.confidence for e in self.effects) > SURE
+        """Whether every named effect has a confidence above SURE; False without effects."""
+        return all_sure(e.confidence for e in self.effects)
 
     @property
     def outcome(self) -> str:

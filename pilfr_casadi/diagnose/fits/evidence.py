@@ -69,7 +69,7 @@ INPUT_FACTOR = 0.7  # factor on the inputs' deviation for which the spread is co
 DISTURBANCE = 1e-5  # of the inputs, over their deviation, by which a motion is tried: linear, and above rounding
 
 # Comparison of hypotheses
-SURE = 0.5  # probability above which an answer is stated: it is more likely than not
+SURE = 0.5  # probability above which an answer is stated: more likely than not; `studies` (fleets) use it as well
 INDISTINGUISHABLE_NATS = 3.0  # nats within which two hypotheses are indistinguishable: odds of 20 (Kass & Raftery 1995)
 CONTENDING_NATS = 8.0  # nats below the best within which a hypothesis may still win after more fits
 BETTER_RATIO = 1.05  # ratio of rms errors from which one is better than another
@@ -111,6 +111,11 @@ class Sample:
         """Compute the effective samples n if the best hypothesis leaves the mean square error v."""
         wrong = float(np.clip(1 - self.noise2 / max(v, 1e-300), LEAST_MODEL_ERROR, 1.0))
         return WRONG_MODEL_SAMPLES * self.count / (WRONG_MODEL_SAMPLES + wrong * self.count)
+
+
+def all_sure(confidences: Iterable[float]) -> bool:
+    """Tell whether all confidences are above SURE; False if there is none."""
+    return min(confidences, default=0.0) > SURE
 
 
 def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
