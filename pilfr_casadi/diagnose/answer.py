@@ -29,7 +29,7 @@ from .fits.floor import Floor
 from .fits.force_recovery import is_curve_along
 from .fits.workbench import Fitted, Workbench
 from .mismatch_map import mismatch
-from .posterior import NamedEffect, hypotheses_named, names
+from .posterior import NamedEffect, hypotheses_named
 from .preparation import Prepared
 from .proof import Comparison, free_run_errors, next_experiment, parameter_table, placebo, test_errors
 from .result import Diagnosis
@@ -394,7 +394,7 @@ def _design_experiment(
         if effect.alike:
             name, other = next(iter(effect.alike.items()))
             stated = hypotheses_named(search, {e.name for e in effects})
-            having = stated or [t for t in search.memo.values() if effect.name in names(t)]
+            having = stated or [t for t in search.memo.values() if effect.name in t.names]
             one = max(having, key=search.evidence)
             rivals = in_words([name_at(*pair, brief=True) for pair in (effect.name, name)])
             best = next_experiment(search.bench, one.fitted, other.fitted, search.floor.deviation, limits, rivals)

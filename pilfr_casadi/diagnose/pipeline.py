@@ -69,7 +69,7 @@ from .other_explanations import (
     find_varying_values,
     may_act_elsewhere,
 )
-from .posterior import Posterior, names, posterior
+from .posterior import Posterior, posterior
 from .prediction import drift_note, drifts, predictor
 from .preparation import Prepared, conversions, slow_note
 from .proof import errors_of
@@ -275,7 +275,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
         return found
     named, answer = _concluded(leading, ()), posterior(leading)
     best = answer.best
-    if named.verdict.kind != "missing-physics" or {e.name for e in named.effects} != names(best):
+    if named.verdict.kind != "missing-physics" or {e.name for e in named.effects} != best.names:
         return found
     with search.stage("fit in free run"):
         search.keep(search.run_laws(best.laws, best))
@@ -288,7 +288,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
     if verdict.kind != "missing-physics" or not predicts:
         return found
     correction = replace(named_correction(search, trial.fitted), before=before.rms, after=after.rms, closest=trial)
-    note = drift_note(request.simulator, memory, " and ".join(display_name(law) for _, law in sorted(names(trial))))
+    note = drift_note(request.simulator, memory, " and ".join(display_name(law) for _, law in sorted(trial.names)))
     return replace(
         found,
         verdict=verdict,

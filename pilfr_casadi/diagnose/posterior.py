@@ -43,9 +43,7 @@ from .fits.evidence import (
 from .fits.floor import ABOVE_NOISE, Floor, times_white
 from .fits.workbench import Fitted
 from .search.hypotheses import Hypotheses
-from .search.trials import Trial
-
-Name = tuple[str, str]  # port and law id
+from .search.trials import Name, Trial
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,14 +109,9 @@ class Posterior:
         return replace(self, named=self.named / (1 + odds), effects=effects)
 
 
-def names(trial: Trial) -> frozenset[Name]:
-    """Return ports and law ids of the effects of a hypothesis."""
-    return frozenset((e.port, e.law.id) for e in trial.effects)
-
-
 def hypotheses_named(search: Hypotheses, said: Collection[Name]) -> list[Trial]:
     """List the hypotheses whose effects have these ports and law ids; an effect may have several forms."""
-    return [t for t in search.memo.values() if names(t) == said]
+    return [t for t in search.memo.values() if t.names == said]
 
 
 def explainable_remainder(search: Hypotheses, trial: Trial, before: Trial | None = None) -> float:
@@ -169,7 +162,7 @@ def posterior(search: Hypotheses) -> Posterior:
     weights = _weights(search, trials)
     by_names: dict[frozenset[Name], float] = {}
     for t, w in zip(trials, weights, strict=True):
-        by_names[names(t)] = by_names.get(names(t), 0.0) + float(w)
+        by_names[t.names] = by_names.get(t.names, 0.0) + float(w)
     said = max(by_names, key=lambda n: by_names[n])
     while True:
         best = _plainest(search, hypotheses_named(search, said))
@@ -212,7 +205,7 @@ def _acts(search: Hypotheses, best: Trial, element: Placed) -> float:
 
 def _without(search: Hypotheses, best: Trial, effect: NamedEffect) -> Trial | None:
     """Return the hypothesis without one of several effects, if it was fitted."""
-    others = names(best) - {effect.name}
+    others = best.names - {effect.name}
     fitted = hypotheses_named(search, others) if others else []
     return min(fitted, key=lambda t: t.mean_square, default=None)
 
@@ -249,7 +242,7 @@ def _weights(search: Hypotheses, trials: Sequence[Trial]) -> np.ndarray:
     Laws claim only to be near the physics; they are weighed by samples that count as far as their error is noise.
     """
     tempered = np.array([search.evidence(t) for t in trials])
-    alone = np.array([not names(t) for t in trials])
+    alone = np.array([not t.names for t in trials])
     if _is_slow_noise(search):
         near = alone | (tempered > max(tempered[~alone], default=0.0) - CONTENDING_NATS)
         full = np.array([search.evidence_in_noise(t) if one else -np.inf for t, one in zip(trials, near, strict=True)])
@@ -275,14 +268,14 @@ def _indistinguishable(search: Hypotheses, best: Trial, element: Placed) -> dict
     The same law in every sensor is one effect, at "sensor:a + sensor:b".
     """
     own = (element.port, element.law.id)
-    rest, out = names(best) - {own}, dict[Name, Trial]()
+    rest, out = best.names - {own}, dict[Name, Trial]()
     least = search.evidence(best) - INDISTINGUISHABLE_NATS
     every = [port_name(SENSOR, name) for name in search.bench.simulator.output_names]
     for t in sorted(search.memo.values(), key=search.evidence, reverse=True):
-        other = names(t) - rest
-        if search.evidence(t) < least or not rest <= names(t) or own in other or not other:
+        other = t.names - rest
+        if search.evidence(t) < least or not rest <= t.names or own in other or not other:
             continue
-        if len(other) == 1 and len(names(t)) == len(names(best)):
+        if len(other) == 1 and len(t.names) == len(best.names):
             out.setdefault(next(iter(other)), t)
         elif other == {(port, element.law.id) for port in every}:
             out.setdefault((" + ".join(every), element.law.id), t)

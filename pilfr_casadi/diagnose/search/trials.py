@@ -33,6 +33,7 @@ MOST_REFINED = 8  # pairs fitted from several starts; only FEW if `again`
 QUIET_SHARE = 0.1  # of the residual power in the loudest stretch, below which the head of a recording says too little
 LEAST_SHARE = 0.01  # share over the largest of the same run below which start values are not used
 Key = frozenset[Pair]
+Name = tuple[str, str]  # port and law id of an effect
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -61,6 +62,11 @@ class Trial:
     def effects(self) -> tuple[Placed, ...]:
         """The laws that are effects; an offset is a finding about the recording."""
         return tuple(e for e in self.laws if not isinstance(e.law, Offset))
+
+    @property
+    def names(self) -> frozenset[Name]:
+        """Ports and law ids of the effects, which are alike for all forms of a law."""
+        return frozenset((e.port, e.law.id) for e in self.effects)
 
     def supersedes(self, other: Trial) -> bool:
         """Tell whether this fit of a hypothesis replaces another; a thorough one has priority."""
