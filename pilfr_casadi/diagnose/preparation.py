@@ -21,7 +21,7 @@ from ..optimise import GaussNewton, Status
 from ..simulators import Simulator, discretise_for, unit_notes
 from .arguments import stated_hold
 from .faults.channels import accept_best, find_gross_slips, find_slips, open_bench, refit_corrected
-from .faults.gates import CURED_SHARE, EQUAL_RATIO, NEAR_NOISE_RATIO, POOR_FIT, Checked, Gate
+from .faults.gates import CURED_SHARE, EQUAL_RATIO, NEAR_NOISE_RATIO, POOR_FIT, Checked, Gate, error_ratio
 from .faults.lost_samples import find_gaps, find_output_gaps
 from .faults.offsets import find_offsets, find_wrong_start
 from .faults.samples import clean_recordings, find_held_outputs, mend_stale_samples, unclip
@@ -232,7 +232,7 @@ def _with_better_hold(
         return now, held
     noise2 = np.min([found.floor.squares(found.bench.scale) for found in both], axis=0)
     costs = [_comparable_cost(found, noise2) for found in both]
-    ratio = (max(costs) / max(min(costs), 1e-300)) ** 0.5
+    ratio = error_ratio(*costs)
     if ratio > EQUAL_RATIO:
         now = both[int(costs[1] < costs[0])]
         held = [hold_note(now.bench.simulator, now.bench.hold, ratio)]
@@ -292,7 +292,7 @@ def choose_hold(first: Checked, solver: GaussNewton = THOROUGH) -> tuple[Checked
     if Status.TIME_LIMIT in (first.fitted.status, other.fitted.status):
         return first, ()
     costs = first.cost, other.cost
-    ratio = float(np.sqrt(max(costs) / max(min(costs), 1e-300)))
+    ratio = error_ratio(*costs)
     if not ratio >= EQUAL_RATIO:
         return first, ()
     best = other if other.cost < first.cost else first

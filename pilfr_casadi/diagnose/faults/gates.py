@@ -193,6 +193,11 @@ def gain(before: float, after: float, residuals: Sequence[np.ndarray], parameter
     return float(0.5 * n * np.log(before / max(after, 1e-300)) - 0.5 * parameters * np.log(n))
 
 
+def error_ratio(one: float, other: float) -> float:
+    """Compute the ratio of the larger to the smaller of two rms errors from their mean squares."""
+    return float(np.sqrt(max(one, other) / max(min(one, other), 1e-300)))
+
+
 def follows_better(one: float, other: float, residuals: Sequence[np.ndarray]) -> bool:
     """Tell whether an edit that leaves the mean square `one` is clearly better than another of as many parameters."""
     return one < CLEARLY_BETTER * other and gain(other, one, residuals, 0) > LEAST_GAIN
