@@ -128,7 +128,8 @@ def diagnose_in_steps(
         calls=calls,
     )
     most = SEARCHED_SAMPLES if search_samples is None else whole(search_samples, "search_samples", FEWEST_SAMPLES)
-    request, ready, search = search_with_focus(_on_stretches(request, most))
+    request, first = search_with_focus(_on_stretches(request, most))
+    ready, search = first.ready, first.search
     request, everything = _fit_to_everything(request, ready, search)
     found = _concluded(search, (*request.notes, *ready.gates))
     if found.verdict.kind == "unexplained" and request.focus is None and not search.cut_short:
@@ -267,7 +268,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
     say, hold = request.say.under("predictions: "), search.bench.hold
     try:
         led, memory = predictor(request.simulator, request.recordings, hold, request.engine)
-        leading = run_search(replace(request, simulator=led, hold=hold, focus="prediction", say=say))[1]
+        leading = run_search(replace(request, simulator=led, hold=hold, focus="prediction", say=say)).search
     except InputError:
         return found
     search.cut_short_with(leading)

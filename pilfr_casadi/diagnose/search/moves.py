@@ -88,10 +88,11 @@ class Search(Hypotheses):
             self.forget_held_out()
         return self
 
-    def resume(self, effects: float) -> Search:
+    def resume(self, effects: float) -> None:
         """Continue with the present hold because the other is no better, unless the search was interrupted."""
         self.hold_said = True
-        return self if self.interrupted else self.run(effects)
+        if not self.interrupted:
+            self.run(effects)
 
     def adopt(self, other: Trial) -> None:
         """Fit the laws of another search's hypothesis to these recordings, from its values, and keep the fit."""
