@@ -113,17 +113,17 @@ def diagnose_in_steps(
     calls, slow = simulator.program_calls, slow_note(simulator, recordings)
     say = say.under(f"{slow[0].value:.2g} s a simulation: ") if slow else say
     request = Request(
-        simulator,
-        recordings,
-        tried,
-        hold,
-        engine,
-        workers,
-        most_effects,
-        stand_in_error,
-        deadline,
-        say,
-        focus,
+        simulator=simulator,
+        recordings=recordings,
+        laws=tried,
+        hold=hold,
+        engine=engine,
+        workers=workers,
+        most_effects=most_effects,
+        stand_in_error=stand_in_error,
+        deadline=deadline,
+        say=say,
+        focus=focus,
         notes=(*conversions(simulator, given), *slow),
         calls=calls,
     )
