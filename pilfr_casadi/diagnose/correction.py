@@ -112,39 +112,63 @@ class _Candidate:
 _Predicted = tuple[_Candidate, HeldOut]
 
 
-def find_correction(search: Search, answer: Posterior, named: bool = False) -> tuple[Correction, Fitted]:
-    """Choose the corrected simulator from the candidates that can be tried before the deadline.
+def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction, Fitted]:
+    """Choose the corrected simulator if the answer names its effects: with them, or with what predicts better.
 
-    With `named`, the answer names its effects. If a learned element at another port predicts better without them, the
-    correction omits them. A learned element at the port of a named effect would only imitate it, and is not tried.
-    After the deadline nothing more is fitted, and after an interrupt the named laws stay.
+    If a learned element at another port predicts better without them, the correction omits them. A learned element at
+    the port of a named effect would only imitate it, and is not tried. After an interrupt, and where the time ends
+    before a comparison, the named laws stay.
     """
-    best_laws = answer.best
-    if named and (search.interrupted or _is_settled(search, answer)):
-        return named_correction(search, best_laws.fitted), best_laws.fitted
-    refit = _Candidate.of(search, search.root.fitted, search.root)
-    refitted = [] if search.past_deadline else _predict(search, [refit], [])
-    tried = _named_hypotheses(search, answer) if named else _hypotheses_with_laws(search)
-    candidates = [_Candidate.of(search, t.fitted, t) for t in tried]
-    predicted = _predict(search, candidates, refitted) if refitted else []
-    if search.past_deadline and (len(predicted) < 2 or (named and _may_be_best(candidates[0], predicted))):
-        # without a comparison the named laws stay, or what is far better
-        stays = tried[0] if named else _far_better(search, candidates)
-        said = named_correction(search, stays.fitted, search.floor if named else search.least_floor)
-        return replace(said, late=not named, closest=stays), stays.fitted
+    best = answer.best
+    if search.interrupted or _is_settled(search, answer):
+        return uncompared_correction(search, best.fitted), best.fitted
+    refit = _predict_refit(search)
+    candidates = [_Candidate.of(search, t.fitted, t) for t in _named_hypotheses(search, answer)]
+    predicted = _predict(search, candidates, refit) if refit else []
+    if search.past_deadline and (len(predicted) < 2 or _may_be_best(candidates[0], predicted)):
+        stays = candidates[0].base
+        return replace(uncompared_correction(search, stays.fitted), closest=stays), stays.fitted
     chosen = _choose(predicted)[0].base
-    beside = best_laws if named and not chosen.laws else chosen
-    learned = _learned_candidates(search, search.memo[beside.key]) if beside.laws else []
-    learned += _learned_candidates(search, search.root, {e.port for e in best_laws.laws} if named else ())
-    candidate, held_out = _choose(_predict(search, learned, predicted))
+    learned = _learned_candidates(search, search.memo[(chosen if chosen.laws else best).key])
+    learned += _learned_candidates(search, search.root, taken={e.port for e in best.laws})
+    return _describe_best(search, _predict(search, learned, predicted), search.floor)
+
+
+def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
+    """Choose the corrected simulator if nothing has a name.
+
+    Where the time ends before a comparison, a hypothesis that is far better than the refit corrects. The floor may
+    contain error that no law explains, so that shares are told of the least noise.
+    """
+    refit = _predict_refit(search)
+    candidates = [_Candidate.of(search, t.fitted, t) for t in _hypotheses_with_laws(search)]
+    predicted = _predict(search, candidates, refit) if refit else []
+    if search.past_deadline and len(predicted) < 2:
+        stays = _far_better(search, candidates)
+        late = uncompared_correction(search, stays.fitted, search.least_floor)
+        return replace(late, late=True, closest=stays), stays.fitted
+    chosen = _choose(predicted)[0].base
+    learned = _learned_candidates(search, search.memo[chosen.key]) if chosen.laws else []
+    learned += _learned_candidates(search, search.root)
+    return _describe_best(search, _predict(search, learned, predicted), search.least_floor)
+
+
+def _predict_refit(search: Search) -> list[_Predicted]:
+    """Predict held-out data with the refitted simulator; empty if the time is over."""
+    refit = _Candidate.of(search, search.root.fitted, search.root)
+    return [] if search.past_deadline else _predict(search, [refit], [])
+
+
+def _describe_best(search: Search, predicted: list[_Predicted], floor: Floor) -> tuple[Correction, Fitted]:
+    """Describe the candidate with the smallest expected error, beside the refit, which was predicted first."""
+    candidate, held_out = _choose(predicted)
     fitted, base = candidate.fitted, candidate.base
-    # without a name, the floor may contain error that no law explains; only the least noise is then certain
-    shares = _shares(search, base.fitted, fitted, search.floor if named else search.least_floor)
+    shares = _shares(search, base.fitted, fitted, floor)
     elements: tuple[Learned, ...] = ()
     if fitted is not base.fitted:
         laws = dict.fromkeys((*CATALOGUE, *search.laws))
         elements = (describe_learned(search.bench, fitted, shares["learned"], laws),)
-    errors = refitted[0][1].rms, held_out.rms
+    errors = predicted[0][1].rms, held_out.rms
     return Correction(_describe_elements(search, fitted), shares, elements, *errors, base), fitted
 
 
@@ -226,7 +250,7 @@ def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()
     return [_Candidate.of(search, fitted, base)]
 
 
-def named_correction(search: Search, fitted: Fitted, floor: Floor | None = None) -> Correction:
+def uncompared_correction(search: Search, fitted: Fitted, floor: Floor | None = None) -> Correction:
     """Describe a simulator without a learned element, which was not compared with others."""
     return Correction(_describe_elements(search, fitted), _shares(search, fitted, fitted, floor or search.floor))
 

@@ -16,8 +16,8 @@ How an answer comes about:
    else unexplained.
 5. If there is time, explanations without a law are tried: a parameter pinned to a wrong value, and a clipped input.
    They count if they explain as much as the law.
-6. `find_correction` compares named laws with a learned force on held-out parts of the recordings. If the named law
-   predicts worse than the force, the name is withdrawn and the verdict is chosen again. A learned force that stays
+6. `find_named_correction` compares named laws with a learned force on held-out parts of the recordings. If the named
+   law predicts worse than the force, the name is withdrawn and the verdict is chosen again. A learned force that stays
    beside the laws lowers their confidence (`Posterior.within`).
 7. The proof (`proof`) adds errors on test recordings, placebos and standard errors. It changes no verdict. Offsets that
    no longer improve the fit beside the effects are set to zero.
@@ -55,7 +55,7 @@ from .arguments import (
     match_tests,
     stated_hold,
 )
-from .correction import find_correction, named_correction
+from .correction import find_named_correction, find_unnamed_correction, uncompared_correction
 from .faults.gates import EQUAL_RATIO, Gate
 from .faults.offsets import fix_idle_offsets, list_offsets
 from .faults.samples import clean_recordings, find_clipped_input
@@ -197,7 +197,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
         if found is not None:
             return found
     if verdict.kind == "missing-physics":
-        correction, fitted = find_correction(search, answer, named=True)
+        correction, fitted = find_named_correction(search, answer)
         answer = answer.within({(port, law) for port, law, _ in correction.elements}, correction.shares["learned"])
         gates = with_tones(search, answer, given)
         verdict = judge(search, answer, gates)
@@ -215,20 +215,20 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
         gates = (*gates, *elsewhere, *find_untried_laws(search), *find_varying_values(search))
     refitted = search.root.fitted
     if search.interrupted and verdict.kind != "recording-fault":
-        correction, fitted = find_correction(search, answer)
+        correction, fitted = find_unnamed_correction(search)
         off = f"Refitted, the simulator is off by {percent(search.bench.nrmse(refitted))} of the outputs' deviation."
         said = correction.sentence if correction.elements else off
         before = "The search was interrupted before it came to an answer." if interrupted else verdict.sentence
         sentence = f"{before} {said}"
         return Conclusion(Verdict(verdict.kind, sentence), gates, fitted, correction)
     if verdict.kind == "unexplained":
-        correction, fitted = find_correction(search, answer)
+        correction, fitted = find_unnamed_correction(search)
         verdict = judge(search, answer, gates, correction.closest)
         where = [f"{g.value} in the equation of {g.channel} explains it" for g in elsewhere]
         said = f"Physics is missing, but hardly at a declared port: {where[0]}." if where else verdict.sentence
         verdict = Verdict(verdict.kind, f"{said} {correction.sentence}")
         return Conclusion(verdict, gates, fitted, correction)
-    return Conclusion(verdict, gates, refitted, named_correction(search, refitted))
+    return Conclusion(verdict, gates, refitted, uncompared_correction(search, refitted))
 
 
 def with_tones(search: Search, answer: Posterior, gates: Sequence[Gate]) -> tuple[Gate, ...]:
@@ -241,7 +241,7 @@ def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: S
     """Conclude that a parameter has a wrong pinned value, or an input was clipped, if that explains as much as laws."""
     held = find_pinned_parameters(search, answer)
     if held is not None:
-        corrected = named_correction(search, held.fitted)
+        corrected = uncompared_correction(search, held.fitted)
         return Conclusion(
             Verdict("complete", held.sentence), tuple(gates), held.fitted, corrected, (), " and ".join(held.names)
         )
@@ -254,7 +254,7 @@ def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: S
     if clipping is None:
         return None
     fault = Verdict("recording-fault", clipping.sentence)
-    return Conclusion(fault, (*gates, clipping), refitted, named_correction(search, refitted))
+    return Conclusion(fault, (*gates, clipping), refitted, uncompared_correction(search, refitted))
 
 
 def _name_in_predictions(request: Request, search: Search, found: Conclusion) -> Conclusion:
@@ -288,7 +288,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
     predicts = known and after.error < before.error and not after.rms > EQUAL_RATIO * found.correction.after
     if verdict.kind != "missing-physics" or not predicts:
         return found
-    correction = replace(named_correction(search, trial.fitted), before=before.rms, after=after.rms, closest=trial)
+    correction = replace(uncompared_correction(search, trial.fitted), before=before.rms, after=after.rms, closest=trial)
     note = drift_note(request.simulator, memory, " and ".join(display_name(law) for _, law in sorted(trial.names)))
     return replace(
         found,

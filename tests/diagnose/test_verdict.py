@@ -12,7 +12,7 @@ from tank import tank
 import pilfr_casadi as pilfr
 from pilfr_casadi import Recording, multisine
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.correction import Correction, find_correction
+from pilfr_casadi.diagnose.correction import Correction, find_unnamed_correction
 from pilfr_casadi.diagnose.faults.offsets import Offset, fix_idle_offsets, list_offsets, update_offsets
 from pilfr_casadi.diagnose.fits.evidence import deviations
 from pilfr_casadi.diagnose.fits.flexible_forces import flexible_shares, innovation_share
@@ -256,7 +256,7 @@ def test_one_hypothesis_is_told_where_the_time_ended_before_a_comparison():
     search = found.evidence["search"]
     search.bench = replace(search.bench, deadline=0.0)
     answer = replace(posterior(search), effects=())
-    correction, fitted = find_correction(search, answer)
+    correction, fitted = find_unnamed_correction(search)
     assert correction.late and correction.closest.fitted is fitted
     said = judge(search, answer, (), correction.closest).sentence
     assert f"removes {100 * correction.shares['named']:.0f} % of the mismatch" in said

@@ -162,16 +162,16 @@ def test_after_the_deadline_and_ctrl_c_the_correction_fits_nothing_more(monkeypa
     monkeypatch.setattr(Trials, "converge", lambda self, trial: fitted.append(trial) or converge(self, trial))
     monkeypatch.setattr(correction, "refit_learned", refit)
     found.bench, answer = replace(found.bench, deadline=0.0), posterior(found)
-    correction.find_correction(found, answer)
+    correction.find_unnamed_correction(found)
     unsure = replace(answer, effects=tuple(replace(e, confidence=0.4) for e in answer.effects))
-    assert correction.find_correction(found, unsure, named=True)[0].elements  # no comparison has refuted the name
+    assert correction.find_named_correction(found, unsure)[0].elements  # no comparison has refuted the name
     assert not fitted
     found.bench = replace(found.bench, deadline=np.inf, interrupt=Interrupt(True, True))
     with monkeypatch.context() as patch:  # after Ctrl-C not even the parts that a comparison needs
         patch.setattr(type(found), "held_out_errors", lambda *_: pytest.fail("a comparison after Ctrl-C"))
-        assert correction.find_correction(found, unsure, named=True)[0].elements
+        assert correction.find_named_correction(found, unsure)[0].elements
     found.bench = replace(found.bench, interrupt=Interrupt())
-    correction.find_correction(found, posterior(found))
+    correction.find_unnamed_correction(found)
     assert fitted
 
 
