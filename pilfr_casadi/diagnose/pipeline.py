@@ -34,7 +34,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -55,13 +55,13 @@ from .arguments import (
     match_tests,
     stated_hold,
 )
-from .correction import find_named_correction, find_unnamed_correction, uncompared_correction
+from .correction import Correction, find_named_correction, find_unnamed_correction, uncompared_correction
 from .faults.gates import EQUAL_RATIO, Gate
 from .faults.offsets import fix_idle_offsets, list_offsets
 from .faults.samples import clean_recordings, find_clipped_input
 from .faults.tones import find_tones
 from .fits.evidence import SURE
-from .fits.workbench import converge
+from .fits.workbench import Fitted, converge
 from .other_explanations import (
     find_pinned_parameters,
     find_undeclared_port,
@@ -142,6 +142,9 @@ def diagnose_in_steps(
     return replace(built, interrupted=built.interrupted or bool(pressed))
 
 
+# long recordings
+
+
 def _on_stretches(request: Request, most: int) -> Request:
     """Restrict a request to the most informative stretches if the recordings have more than `most` samples."""
     if sum(map(len, request.recordings)) <= most:
@@ -156,13 +159,37 @@ def _on_stretches(request: Request, most: int) -> Request:
 
 
 def _fit_to_everything(request: Request, ready: Prepared, search: Search) -> tuple[Request, Everything | None]:
-    """Fit the leading hypotheses to all recordings if the search ran on stretches of them, and note that."""
+    """Fit the likeliest hypotheses to all recordings, and drop from the search those that these refute."""
     if request.stretches is None:
         return request, None
     with search.stage("fits to all recordings"):
         everything = Everything.of(search, request.stretches, ready.gates)
     note = request.stretches.note(everything is not None)
     return replace(request, notes=(note, *request.notes)), everything
+
+
+def _final_fits(
+    request: Request, ready: Prepared, search: Search, found: Conclusion, everything: Everything | None
+) -> FinalFits:
+    """Return the fits that the answer states: those of the search, or fits to everything if it ran on stretches."""
+    bench, without, after = search.bench, search.root.fitted, found.fitted
+    if found.effects and not np.isfinite(found.correction.after):  # a held-out comparison chose what it compared
+        with search.until_interrupted():
+            after = fix_idle_offsets(bench, after)
+    if everything is None:
+        if not search.interrupted:
+            with search.until_interrupted(), search.stage("convergence"):
+                after = converge(bench, after, request.deadline - time.perf_counter())
+        return FinalFits(bench, without, after, ready.nominal, (without, after))
+    with search.stage("fits to all recordings"):
+        whole, pair = everything.bench, (without, after)
+        to_all = [everything.fit(search, one) for one in pair]
+        drawn = [back_on_stretches(bench, f, one.initial) for f, one in zip(to_all, pair, strict=True)]
+        nominal = errors_of(whole, whole.model(request.simulator))
+    return FinalFits(whole, to_all[0], to_all[1], nominal, (drawn[0], drawn[1]), partial(everything.fit, search))
+
+
+# the conclusion
 
 
 def _concluded(search: Search, gates: Sequence[Gate]) -> Conclusion:
@@ -184,51 +211,50 @@ def _conclude_as_stage(search: Search, gates: Sequence[Gate]) -> Conclusion:
 def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     """Draw the conclusion from a search: steps 3 to 6 of the module docstring.
 
-    A name that may stand for a law where no port is declared is weighed against that. If there is no name, undeclared
-    ports and varying values are checked, unless the time is over. After Ctrl-C nothing more is fitted: a name that was
-    found stays; otherwise the refitted simulator is returned.
+    After Ctrl-C nothing more is fitted: a name that was found stays; otherwise the refitted simulator is returned.
     """
-    answer, interrupted = posterior(search), search.interrupted
-    finished, elsewhere = not search.cut_short, tuple[Gate, ...]()
-    given, gates = gates, with_tones(search, answer, gates)
-    verdict = judge(search, answer, gates)
-    if verdict.kind in ("missing-physics", "unexplained") and not search.past_deadline:
-        found = _without_a_law(search, answer, verdict, gates)
+    answer, elsewhere = posterior(search), tuple[Gate, ...]()
+    interrupted, finished = search.interrupted, not search.cut_short
+    judged = _Judged.of(search, answer, gates)
+    if judged.kind in ("missing-physics", "unexplained") and not search.past_deadline:
+        found = _conclude_without_a_law(search, judged)
         if found is not None:
             return found
-    if verdict.kind == "missing-physics":
+    if judged.kind == "missing-physics":
         correction, fitted = find_named_correction(search, answer)
-        answer = answer.within({(port, law) for port, law, _ in correction.elements}, correction.shares["learned"])
-        gates = with_tones(search, answer, given)
-        verdict = judge(search, answer, gates)
-        if verdict.kind == "missing-physics" and finished and may_act_elsewhere(search, answer.best):
-            elsewhere, odds = find_undeclared_port(search, answer.best)
-            answer = answer.against(odds)
-            verdict = judge(search, answer, gates)
-        if verdict.kind == "missing-physics":
-            said = f"{verdict.sentence} {correction.sentence}" if correction.learned else verdict.sentence
-            zeros = list_offsets(search.added_laws(fitted), fitted.values)
-            notes = (*gates, *elsewhere, *zeros)
-            return Conclusion(Verdict(verdict.kind, said), notes, fitted, correction, answer.effects)
-    if verdict.kind == "unexplained" and finished:
+        judged, elsewhere = _weigh_names(search, answer, correction, gates, finished)
+        if judged.kind == "missing-physics":
+            return _conclude_named(search, judged, elsewhere, correction, fitted)
+    if judged.kind == "unexplained" and finished:
         elsewhere = elsewhere or find_undeclared_port(search)[0]
-        gates = (*gates, *elsewhere, *find_untried_laws(search), *find_varying_values(search))
+        notes = (*judged.gates, *elsewhere, *find_untried_laws(search), *find_varying_values(search))
+        judged = replace(judged, gates=notes)
+    if search.interrupted and judged.kind != "recording-fault":
+        return _conclude_interrupted(search, judged, came_to_an_answer=not interrupted)
+    if judged.kind == "unexplained":
+        return _conclude_unexplained(search, judged, elsewhere)
     refitted = search.root.fitted
-    if search.interrupted and verdict.kind != "recording-fault":
-        correction, fitted = find_unnamed_correction(search)
-        off = f"Refitted, the simulator is off by {percent(search.bench.nrmse(refitted))} of the outputs' deviation."
-        said = correction.sentence if correction.elements else off
-        before = "The search was interrupted before it came to an answer." if interrupted else verdict.sentence
-        sentence = f"{before} {said}"
-        return Conclusion(Verdict(verdict.kind, sentence), gates, fitted, correction)
-    if verdict.kind == "unexplained":
-        correction, fitted = find_unnamed_correction(search)
-        verdict = judge(search, answer, gates, correction.closest)
-        where = [f"{g.value} in the equation of {g.channel} explains it" for g in elsewhere]
-        said = f"Physics is missing, but hardly at a declared port: {where[0]}." if where else verdict.sentence
-        verdict = Verdict(verdict.kind, f"{said} {correction.sentence}")
-        return Conclusion(verdict, gates, fitted, correction)
-    return Conclusion(verdict, gates, refitted, uncompared_correction(search, refitted))
+    return Conclusion(judged.verdict, judged.gates, refitted, uncompared_correction(search, refitted))
+
+
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    """A posterior, the notes beside it, and the verdict on both."""
+
+    answer: Posterior
+    gates: tuple[Gate, ...]
+    verdict: Verdict
+
+    @classmethod
+    def of(cls, search: Search, answer: Posterior, gates: Sequence[Gate]) -> _Judged:
+        """Judge a posterior, with the steady tones that its laws leave among the notes."""
+        noted = with_tones(search, answer, gates)
+        return cls(answer, noted, judge(search, answer, noted))
+
+    @property
+    def kind(self) -> str:
+        """Kind of the verdict."""
+        return self.verdict.kind
 
 
 def with_tones(search: Search, answer: Posterior, gates: Sequence[Gate]) -> tuple[Gate, ...]:
@@ -237,15 +263,15 @@ def with_tones(search: Search, answer: Posterior, gates: Sequence[Gate]) -> tupl
     return (*gates, *find_tones(search.bench, fitted))
 
 
-def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: Sequence[Gate]) -> Conclusion | None:
+def _conclude_without_a_law(search: Search, judged: _Judged) -> Conclusion | None:
     """Conclude that a parameter has a wrong pinned value, or an input was clipped, if that explains as much as laws."""
+    answer, gates = judged.answer, judged.gates
     held = find_pinned_parameters(search, answer)
     if held is not None:
         corrected = uncompared_correction(search, held.fitted)
-        return Conclusion(
-            Verdict("complete", held.sentence), tuple(gates), held.fitted, corrected, (), " and ".join(held.names)
-        )
-    named = verdict.kind == "missing-physics"
+        freed = " and ".join(held.names)
+        return Conclusion(Verdict("complete", held.sentence), gates, held.fitted, corrected, freed=freed)
+    named = judged.kind == "missing-physics"
     if named and answer.sure >= SURE:
         return None
     refitted = search.root.fitted
@@ -255,6 +281,53 @@ def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: S
         return None
     fault = Verdict("recording-fault", clipping.sentence)
     return Conclusion(fault, (*gates, clipping), refitted, uncompared_correction(search, refitted))
+
+
+def _weigh_names(
+    search: Search, answer: Posterior, correction: Correction, gates: Sequence[Gate], finished: bool
+) -> tuple[_Judged, tuple[Gate, ...]]:
+    """Weigh names against a learned force and, after a finished search, against laws where no port is declared.
+
+    Also returns the note about such a law.
+    """
+    answer = answer.within({(port, law) for port, law, _ in correction.elements}, correction.shares["learned"])
+    judged = _Judged.of(search, answer, gates)
+    if judged.kind != "missing-physics" or not finished or not may_act_elsewhere(search, answer.best):
+        return judged, ()
+    elsewhere, odds = find_undeclared_port(search, answer.best)
+    return _Judged.of(search, answer.against(odds), gates), elsewhere
+
+
+def _conclude_named(
+    search: Search, judged: _Judged, elsewhere: Sequence[Gate], correction: Correction, fitted: Fitted
+) -> Conclusion:
+    """State the named effects, and the offsets beside them."""
+    said = f"{judged.verdict.sentence} {correction.sentence}" if correction.learned else judged.verdict.sentence
+    notes = (*judged.gates, *elsewhere, *list_offsets(search.added_laws(fitted), fitted.values))
+    return Conclusion(Verdict(judged.kind, said), notes, fitted, correction, judged.answer.effects)
+
+
+def _conclude_interrupted(search: Search, judged: _Judged, came_to_an_answer: bool) -> Conclusion:
+    """State what an interrupted search leaves: a correction without a name, or the refitted simulator."""
+    correction, fitted = find_unnamed_correction(search)
+    error = percent(search.bench.nrmse(search.root.fitted))
+    off = f"Refitted, the simulator is off by {error} of the outputs' deviation."
+    said = correction.sentence if correction.elements else off
+    none = "The search was interrupted before it came to an answer."
+    sentence = f"{judged.verdict.sentence if came_to_an_answer else none} {said}"
+    return Conclusion(Verdict(judged.kind, sentence), judged.gates, fitted, correction)
+
+
+def _conclude_unexplained(search: Search, judged: _Judged, elsewhere: Sequence[Gate]) -> Conclusion:
+    """State the law that is closest to an unexplained mismatch, or the law that explains it at an undeclared port."""
+    correction, fitted = find_unnamed_correction(search)
+    verdict = judge(search, judged.answer, judged.gates, correction.closest)
+    where = [f"{g.value} in the equation of {g.channel} explains it" for g in elsewhere]
+    said = f"Physics is missing, but hardly at a declared port: {where[0]}." if where else verdict.sentence
+    return Conclusion(Verdict(verdict.kind, f"{said} {correction.sentence}"), judged.gates, fitted, correction)
+
+
+# naming in predictions
 
 
 def _name_in_predictions(request: Request, search: Search, found: Conclusion) -> Conclusion:
@@ -299,24 +372,3 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
         effects=answer.effects,
         decided=leading,
     )
-
-
-def _final_fits(
-    request: Request, ready: Prepared, search: Search, found: Conclusion, everything: Everything | None
-) -> FinalFits:
-    """Return the fits that the answer states: those of the search, or fits to everything if it ran on stretches."""
-    bench, without, after = search.bench, search.root.fitted, found.fitted
-    if found.effects and not np.isfinite(found.correction.after):  # a held-out comparison chose what it compared
-        with search.until_interrupted():
-            after = fix_idle_offsets(bench, after)
-    if everything is None:
-        if not search.interrupted:
-            with search.until_interrupted(), search.stage("convergence"):
-                after = converge(bench, after, request.deadline - time.perf_counter())
-        return FinalFits(bench, without, after, ready.nominal, (without, after))
-    with search.stage("fits to all recordings"):
-        whole, pair = everything.bench, (without, after)
-        to_all = [everything.fit(search, one) for one in pair]
-        drawn = [back_on_stretches(bench, f, one.initial) for f, one in zip(to_all, pair, strict=True)]
-        nominal = errors_of(whole, whole.model(request.simulator))
-    return FinalFits(whole, to_all[0], to_all[1], nominal, (drawn[0], drawn[1]), partial(everything.fit, search))
