@@ -44,7 +44,7 @@ from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted, refit
 from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
 from .relatives import choose_pairs, complements, fit_pair, in_place_of_variation, relatives
-from .trials import Key, Trial, place_law, select_pairs
+from .trials import Effort, Key, Trial, place_law, select_pairs
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -161,7 +161,7 @@ class Search(Hypotheses):
         self.mismatch2, found = float(np.mean(base.fitted.squares)), False
         try:
             if self.can_improve(base):
-                self.add(base, again=True)
+                self.add(base, few=True)
             at_noise = self.best.mean_square < ABOVE_NOISE**2 * self.least_noise2
             found = at_noise and len(self.best.effects) > len(base.effects)
         finally:
@@ -230,13 +230,13 @@ class Search(Hypotheses):
         self.aligned = True
         return self.shift is not None
 
-    def add(self, parent: Trial, again: bool = False) -> None:
-        """Fit the laws that the screen selects beside a hypothesis, fewer if `again`; polish those that may win."""
-        scored, gain = self._standing(parent)
+    def add(self, parent: Trial, few: bool = False) -> None:
+        """Fit the laws, or only a few, that the screen selects beside a hypothesis; polish those that may win."""
+        scored, observer_gain = self._standing(parent)
         if self.steps and not self.in_time():
             return
         enough = float(np.sqrt(self.floor2 + NEARLY_EXPLAINED * max(parent.mean_square - self.floor2, 0.0)))
-        trials = self._with_relatives(parent, scored, scored, gain, enough, again)
+        trials = self._with_relatives(parent, scored, scored, Effort(observer_gain, enough, few))
         with self.stage("choice"):
             self._record(parent, scored, trials)
             self.estimate_noise()
@@ -247,24 +247,18 @@ class Search(Hypotheses):
 
     def _standing(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
         """Return what was screened beside a hypothesis and may stand beside its laws, and the observer's gain."""
-        scored, gain = self.screened(parent)
-        return [s for s in scored if _may_stand_beside(parent.laws, s.port, s.law)], gain
+        scored, observer_gain = self.screened(parent)
+        return [s for s in scored if _may_stand_beside(parent.laws, s.port, s.law)], observer_gain
 
     def _with_relatives(
-        self,
-        parent: Trial,
-        selected: Sequence[Scored],
-        scored: Sequence[Scored],
-        gain: np.ndarray | None,
-        enough: float,
-        again: bool,
+        self, parent: Trial, selected: Sequence[Scored], scored: Sequence[Scored], effort: Effort
     ) -> list[Trial]:
         """Fit some of the pairs screened, then those to which the best fits of these hypotheses point."""
-        found = self._fitted(parent, selected, gain, enough, again)
+        found = self._fitted(parent, selected, effort)
         trials = sorted(map(self._best_known, found), key=lambda t: t.error)
         more = relatives(self.bench, trials, scored) if self.in_time() else []
         if more:
-            trials = sorted([*trials, *self._fitted(parent, more, gain, enough, again)], key=lambda t: t.error)
+            trials = sorted([*trials, *self._fitted(parent, more, effort)], key=lambda t: t.error)
         return trials
 
     def _best_known(self, trial: Trial) -> Trial:
@@ -291,17 +285,19 @@ class Search(Hypotheses):
         self._keep_all(trials)
         self.steps.append(Step(parent, tuple(scored), tuple(trials)))
 
-    def _try(self, base: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> None:
+    def _try(self, base: Trial, entries: Sequence[Scored], observer_gain: np.ndarray | None = None) -> None:
         """Fit some pairs beside a hypothesis, none of their relatives, and note the move."""
-        self._record(base, entries, self._fitted(base, entries, gain, float(np.sqrt(self.floor2)), True))
+        self._record(base, entries, self._fitted(base, entries, self._little_effort(observer_gain)))
 
-    def _fitted(
-        self, parent: Trial, scored: Sequence[Scored], gain: np.ndarray | None, enough: float, again: bool
-    ) -> list[Trial]:
+    def _little_effort(self, observer_gain: np.ndarray | None = None) -> Effort:
+        """Fit few pairs, and refine none far behind one whose error is at the noise."""
+        return Effort(observer_gain, float(np.sqrt(self.floor2)), few=True)
+
+    def _fitted(self, parent: Trial, scored: Sequence[Scored], effort: Effort) -> list[Trial]:
         began = time.perf_counter()
         stage = f"fits, effect {len(parent.laws) + 1}" if parent.laws else "fits"
-        pairs = select_pairs(scored, again)
-        trials, tried = self.fits.fit_pairs(parent, pairs, gain, enough, partial(self.say, stage), again)
+        pairs = select_pairs(scored, effort.few)
+        trials, tried = self.fits.fit_pairs(parent, pairs, effort, partial(self.say, stage))
         if not parent.laws:
             self.tried, self.selected = self.tried + tried, self.selected + len(pairs)
         self.times["fits"] = self.times.get("fits", 0.0) + time.perf_counter() - began
@@ -419,8 +415,8 @@ class Search(Hypotheses):
                 if alike and _may_stand_beside(base.laws, port, near.kind):
                     entries.append(replace(alike[0], law=near.kind, starts=(near.start,)))
         if entries:
-            noise = float(np.sqrt(self.floor2))
-            self._record(base, entries, self._with_relatives(base, entries, [*entries, *scored], None, noise, True))
+            effort = self._little_effort()
+            self._record(base, entries, self._with_relatives(base, entries, [*entries, *scored], effort))
 
     def vary_parameters(self, base: Trial) -> None:
         """Let parameters of the simulator vary with a signal beside a hypothesis: fit those that explain most."""
@@ -433,18 +429,18 @@ class Search(Hypotheses):
         laws = [varying(by, profile) for by in dict.fromkeys(signals) for profile in VARIATIONS[:2]]
         laws += [heated(by) for by in dict.fromkeys(signals[1:])]
         with self.stage("varying parameters"):
-            scored, gain = screen(self.bench, base.fitted, laws, self.floor.deviation, self.workers)
+            scored, observer_gain = screen(self.bench, base.fitted, laws, self.floor.deviation, self.workers)
             self.note_alternatives(scored)
         best = list(dict.fromkeys((s.port, s.law.form) for s in scored))[:FEW]
         taken = {e.port for e in base.laws}
         entries = [s for s in scored if (s.port, s.law.form) in best and s.port not in taken]
         if not entries:
             return
-        self._try(base, entries, gain)
+        self._try(base, entries, observer_gain)
         self.replace_variation(base)
         last = self.best.laws[-1] if self.best.laws else None
         if last and kind_of(last.port) == PARAMETER and last.law.scheduled_by:
-            self._curve(base, [s for s in entries if s.pair == (last.port, type(last.law))], gain)
+            self._curve(base, [s for s in entries if s.pair == (last.port, type(last.law))], observer_gain)
 
     def replace_variation(self, base: Trial) -> None:
         """Fit laws with constant parameters whose force is like that of the best hypothesis' last law, which varies."""
@@ -457,9 +453,9 @@ class Search(Hypotheses):
         known.replaced = True
         entries = in_place_of_variation(self.bench, best, self._standing(base)[0])
         if entries:
-            self._try(base, entries, None)
+            self._try(base, entries)
 
-    def _curve(self, base: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> None:
+    def _curve(self, base: Trial, entries: Sequence[Scored], observer_gain: np.ndarray | None) -> None:
         """Let the parameter that varies in the best hypothesis follow a curve of higher degree."""
         best = self.best
         # what the curve misses is in no force at a port, so that it may have passed for noise
@@ -468,7 +464,7 @@ class Search(Hypotheses):
         law = varying(best.law.scheduled_by, VARIATIONS[-1])()
         finer = [replace(s, law=law, starts=(law.starts_as(best.law, best.own),)) for s in entries]
         self.note_alternatives(finer)
-        self._try(base, finer, gain)
+        self._try(base, finer, observer_gain)
 
     def exchange(self) -> None:
         """Try all other laws, and none, in place of each of several laws, the rest in place, until none changes."""
@@ -480,11 +476,11 @@ class Search(Hypotheses):
                     continue
                 if self.in_time() and not self._expanded(rest):  # from the values of all laws, which may be right
                     self.keep(rest)
-                    self.add(rest, again=True)
+                    self.add(rest, few=True)
                 found = self.leave_out(best, [element])
                 wrong = found is not None and not self._expanded(found, FAR_RATIO)  # it had been in a wrong minimum
                 if found is not None and wrong and self.can_improve(self.best) and self.in_time():
-                    self.add(found, again=True)
+                    self.add(found, few=True)
             if self.best.key == best.key:
                 return
 
