@@ -72,21 +72,26 @@ class Search(Hypotheses):
     steps: list[Step] = field(default_factory=list)  # the moves, in their order
     aligned: bool = False  # whether the times of the channels are settled, so that no shift is looked for
     shift: Gate | None = None  # the shift of a channel that ended the search, because it shows only beside a law
+    other_hold: bool = False  # whether the search ended because the other hold of the inputs proved better
 
     def run(self, effects: float) -> Search:
         """Search for up to `effects` effects; an interrupt ends the search with the present results."""
+        self.other_hold = False
         self.keep(Trial.of(self.without, 0, thorough=True))
         with self.until_interrupted():
             self.estimate_noise()
-            if not self.interrupted and self._grow(effects) and self._name_rest(effects):
-                if len(self.best.effects) < effects:
-                    self._grow_to_noise()
-                self._every_sensor()
-                self._leave_out_each()
-                self.judge_on_held_out_data()
+            if not self.interrupted:
+                self._grow(effects)
+                self._name_rest(effects)
+                self._finish(effects)
         if self.interrupted:
             self.forget_held_out()
         return self
+
+    @property
+    def must_repeat(self) -> bool:
+        """Whether the search goes no further: it has to be repeated with the other hold or with a channel shifted."""
+        return self.other_hold or self.shift is not None
 
     def resume(self, effects: float) -> None:
         """Continue with the present hold because the other is no better, unless the search was interrupted."""
@@ -111,8 +116,8 @@ class Search(Hypotheses):
         ranked = ((parent, sorted(trials.values(), key=lambda t: t.error)) for parent, trials in found.values())
         return [Step(parent, (), tuple(trials)) for parent, trials in ranked if trials]
 
-    def _grow(self, effects: float, varied: bool = False) -> bool:
-        """Add effects while that pays; return False as soon as the other hold, or a channel's shift, proves better.
+    def _grow(self, effects: float, varied: bool = False) -> None:
+        """Add effects while that pays; end as soon as the other hold, or a channel's shift, proves better.
 
         A parameter that varies can imitate many laws. So hypotheses with one are a basis for more only if `varied`.
         The first law is fitted even if the preparation took all the time.
@@ -126,8 +131,11 @@ class Search(Hypotheses):
             self.add(parent)
             if not parent.laws and self.in_time() and self._escape_local_minimum():
                 self.add(self.root)
-            if (not self.hold_said and self.prefers_other_hold()) or (not parent.laws and self._finds_shift()):
-                return False
+            self.other_hold = not self.hold_said and self.prefers_other_hold()
+            if not parent.laws and not self.must_repeat:
+                self._find_shift()
+            if self.must_repeat:
+                return
             if not parent.laws and self.can_improve(self.best) and self.in_time():
                 self.vary_parameters(self.root)
             if len(self._parent(varied).effects) > len(parent.effects) >= 1:
@@ -137,8 +145,8 @@ class Search(Hypotheses):
         if effects > 1 and TWO not in self.times and self.can_improve(self.best) and self.in_time():
             best = self.best
             self.add_two()
-            return self.best is best or self._grow(effects, varied)
-        return True
+            if self.best is not best:
+                self._grow(effects, varied)
 
     def _parent(self, varied: bool) -> Trial:
         """Return the best hypothesis, or the best one in which no parameter varies."""
@@ -170,7 +178,7 @@ class Search(Hypotheses):
         if found:  # other laws may stand beside the new one in place of those before
             self.exchange()
 
-    def _name_rest(self, effects: float) -> bool:
+    def _name_rest(self, effects: float) -> None:
         """Name what is left beside the simulator, the best hypothesis, and that without its weakest effect.
 
         A parameter may vary with a signal; or a force that is learned there is nearly a law.
@@ -178,6 +186,8 @@ class Search(Hypotheses):
         The weakest of several effects may imitate a law that only a learned force shows, such as a gain that varies
         with the position. Go on if one of the laws leads.
         """
+        if self.must_repeat:
+            return
         best = self._parent(varied=False)
         fewer = [t for t in self.memo.values() if t.effects and t.key < best.key]
         without_weakest = sorted(fewer, key=lambda t: (-len(t.effects), t.mean_square))[:1]
@@ -185,10 +195,19 @@ class Search(Hypotheses):
             for base in {t.key: t for t in (self.root, best, *without_weakest)}.values():
                 if len(base.effects) < effects and self.can_improve(self.best) and self.in_time():
                     name_rest(base)
-        if self.best is best:
-            return True
-        self.exchange()  # laws that were found before may have made up for this one
-        return self._grow(effects, varied=True)
+        if self.best is not best:
+            self.exchange()  # laws that were found before may have made up for this one
+            self._grow(effects, varied=True)
+
+    def _finish(self, effects: float) -> None:
+        """Look for what the moves before cannot find, and compare the likeliest hypotheses."""
+        if self.must_repeat:
+            return
+        if len(self.best.effects) < effects:
+            self._grow_to_noise()
+        self._every_sensor()
+        self._leave_out_each()
+        self.judge_on_held_out_data()
 
     def _pays(self, trial: Trial) -> bool:
         """Tell whether the last of several laws was worth it; a wrong model can always use one more."""
@@ -204,13 +223,13 @@ class Search(Hypotheses):
         found = refit(held, [best.values], best.simulator, states=best.initial, solver=THOROUGH)
         return found is not None and not self.interrupted and found.cost * BETTER_RATIO**2 < best.cost
 
-    def _finds_shift(self) -> bool:
+    def _find_shift(self) -> None:
         """Look beside each of the first laws for an output that comes before its cause; their absence may hide it.
 
         Filters and laws with memory are left out: they imitate a shift. A delay is a law itself.
         """
         if self.aligned or not self.can_improve(self.best):
-            return False
+            return
         first_move = {t.key for s in self.steps if not s.parent.laws for t in s.trials}
         kept = [self.memo[key] for key in first_move]
         plain = [t for t in kept if not (t.law.order or t.law.memory)]
@@ -228,7 +247,6 @@ class Search(Hypotheses):
                     sentence = f"{shift.sentence.rstrip('.')} (beside {beside})."
                     best, self.shift = found.cost, replace(shift, sentence=sentence)
         self.aligned = True
-        return self.shift is not None
 
     def add(self, parent: Trial, few: bool = False) -> None:
         """Fit the laws, or only a few, that the screen selects beside a hypothesis; polish those that may win."""
