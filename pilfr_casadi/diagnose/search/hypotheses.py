@@ -276,7 +276,7 @@ class Hypotheses:
                 unknown = [t for t in (best, *self._likeliest()) if self.findings[t.key].held_out is None]
                 if not unknown or (done >= MOST_PREDICTED and unknown[0] is not best):
                     break
-                if not self.in_time():  # an unfinished comparison favours the hypotheses that were not judged
+                if not self.may_go_on():  # an unfinished comparison favours the hypotheses that were not judged
                     self.forget_held_out()
                     break
                 self.say("held-out blocks", done, min(done + len(unknown), max(MOST_PREDICTED, done + 1)))
@@ -367,8 +367,8 @@ class Hypotheses:
         """Whether nothing more is fitted: Ctrl-C was pressed, or the time for the whole diagnosis is over."""
         return self.interrupted or time.perf_counter() > self.bench.deadline
 
-    def in_time(self) -> bool:
-        """Tell whether there is time for more; if not, note that in the result."""
+    def may_go_on(self) -> bool:
+        """Tell whether there is time for more; if not, set `out_of_time`, with which the result tells that."""
         self.out_of_time = self.out_of_time or time.perf_counter() > self.until
         return not self.out_of_time
 

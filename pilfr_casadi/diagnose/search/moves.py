@@ -126,23 +126,23 @@ class Search(Hypotheses):
             self.can_improve(self.best)
             and len((parent := self._parent(varied)).effects) < effects
             and self._pays(parent)
-            and (self.in_time() or not self.steps)
+            and (self.may_go_on() or not self.steps)
         ):
             self.add(parent)
-            if not parent.laws and self.in_time() and self._escape_local_minimum():
+            if not parent.laws and self.may_go_on() and self._escape_local_minimum():
                 self.add(self.root)
             self.other_hold = not self.hold_said and self.prefers_other_hold()
             if not parent.laws and not self.must_repeat:
                 self._find_shift()
             if self.must_repeat:
                 return
-            if not parent.laws and self.can_improve(self.best) and self.in_time():
+            if not parent.laws and self.can_improve(self.best) and self.may_go_on():
                 self.vary_parameters(self.root)
             if len(self._parent(varied).effects) > len(parent.effects) >= 1:
                 self.exchange()
             if len(self._parent(varied).laws) <= len(parent.laws):  # no added law is worth its prior
                 break
-        if effects > 1 and TWO not in self.times and self.can_improve(self.best) and self.in_time():
+        if effects > 1 and TWO not in self.times and self.can_improve(self.best) and self.may_go_on():
             best = self.best
             self.add_two()
             if self.best is not best:
@@ -163,7 +163,7 @@ class Search(Hypotheses):
         """
         base, least = self.best, LEAST_FORMULA_ERROR * self.root.mean_square
         is_noise = base.mean_square < ABOVE_NOISE**2 * self.least_noise2 + least
-        if not base.laws or is_noise or base.mean_square > self.may_leave() or not self.in_time():
+        if not base.laws or is_noise or base.mean_square > self.may_leave() or not self.may_go_on():
             return
         noise = self.floor, self.count
         self.mismatch2, found = float(np.mean(base.fitted.squares)), False
@@ -193,7 +193,7 @@ class Search(Hypotheses):
         without_weakest = sorted(fewer, key=lambda t: (-len(t.effects), t.mean_square))[:1]
         for name_rest in (self.vary_parameters, self.name_learned):
             for base in {t.key: t for t in (self.root, best, *without_weakest)}.values():
-                if len(base.effects) < effects and self.can_improve(self.best) and self.in_time():
+                if len(base.effects) < effects and self.can_improve(self.best) and self.may_go_on():
                     name_rest(base)
         if self.best is not best:
             self.exchange()  # laws that were found before may have made up for this one
@@ -217,7 +217,7 @@ class Search(Hypotheses):
     def prefers_other_hold(self) -> bool:
         """Tell whether the best hypothesis follows the recordings better with the other hold of the inputs."""
         best = self.best.fitted
-        if self.interrupted or not self.in_time():
+        if self.interrupted or not self.may_go_on():
             return False
         held = self.bench.with_other_hold()
         found = refit(held, [best.values], best.simulator, states=best.initial, solver=THOROUGH)
@@ -238,7 +238,7 @@ class Search(Hypotheses):
             first.setdefault((trial.port, trial.law.id), trial)
         best, part = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_said else 0.5
         with self.stage("shifts beside a law"):
-            for trial in list(first.values())[:FEW] if self.in_time() else ():
+            for trial in list(first.values())[:FEW] if self.may_go_on() else ():
                 bench = replace(self.bench, simulator=trial.fitted.simulator)
                 found = find_time_shift(Checked(bench, trial.fitted), part, given=False)
                 shift = found.gates[0] if found.gates else None
@@ -251,7 +251,7 @@ class Search(Hypotheses):
     def add(self, parent: Trial, few: bool = False) -> None:
         """Fit the laws, or only a few, that the screen selects beside a hypothesis; polish those that may win."""
         scored, observer_gain = self._standing(parent)
-        if self.steps and not self.in_time():
+        if self.steps and not self.may_go_on():
             return
         enough = float(np.sqrt(self.floor2 + NEARLY_EXPLAINED * max(parent.mean_square - self.floor2, 0.0)))
         trials = self._with_relatives(parent, scored, scored, Effort(observer_gain, enough, few))
@@ -274,7 +274,7 @@ class Search(Hypotheses):
         """Fit some of the pairs screened, then those to which the best fits of these hypotheses point."""
         found = self._fitted(parent, selected, effort)
         trials = sorted(map(self._best_known, found), key=lambda t: t.error)
-        more = relatives(self.bench, trials, scored) if self.in_time() else []
+        more = relatives(self.bench, trials, scored) if self.may_go_on() else []
         if more:
             trials = sorted([*trials, *self._fitted(parent, more, effort)], key=lambda t: t.error)
         return trials
@@ -349,7 +349,7 @@ class Search(Hypotheses):
         self._vary_strength()
         best = self._best_with_one_more(parent)
         by = (best.law.scheduled_by or best.law.scaled_by) if best is not None else ""
-        if best is not None and by and "parallel" in best.law.places and self.in_time():
+        if best is not None and by and "parallel" in best.law.places and self.may_go_on():
             kind = constant(type(best.law))
             self._refine(best, [scheduled(kind, by, p) for p in likely_profiles(kind) if p != best.law.profile])
         self.replace_variation(parent)
@@ -364,7 +364,7 @@ class Search(Hypotheses):
         kept = [self.memo[t.key] for t in added]  # perhaps found before, with these laws added in another order
         step = [new if known.pair != new.pair else known for new, known in zip(added, kept, strict=True)]
         # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
-        if not step or not self.can_improve(self.best, self.least_floor) or not self.in_time():
+        if not step or not self.can_improve(self.best, self.least_floor) or not self.may_go_on():
             return
         likeliest = max(step, key=self.optimistic_evidence)
         forms = [t for t in step if t.law.id == likeliest.law.id and t is not likeliest]
@@ -466,7 +466,7 @@ class Search(Hypotheses):
         known = self.findings[best.key]
         if known.replaced or not best.laws or best.key - base.key != {best.pair} or base.key - best.key:
             return
-        if not best.law.scheduled_by or not self.in_time():
+        if not best.law.scheduled_by or not self.may_go_on():
             return
         known.replaced = True
         entries = in_place_of_variation(self.bench, best, self._standing(base)[0])
@@ -477,7 +477,7 @@ class Search(Hypotheses):
         """Let the parameter that varies in the best hypothesis follow a curve of higher degree."""
         best = self.best
         # what the curve misses is in no force at a port, so that it may have passed for noise
-        if not (self.can_improve(best, self.least_floor) and self.in_time()):
+        if not (self.can_improve(best, self.least_floor) and self.may_go_on()):
             return
         law = varying(best.law.scheduled_by, VARIATIONS[-1])()
         finer = [replace(s, law=law, starts=(law.starts_as(best.law, best.own),)) for s in entries]
@@ -492,12 +492,12 @@ class Search(Hypotheses):
                 rest = self.run_laws([e for e in best.laws if e is not element], best)
                 if not rest.mean_square < DIVERGED:
                     continue
-                if self.in_time() and not self._expanded(rest):  # from the values of all laws, which may be right
+                if self.may_go_on() and not self._expanded(rest):  # from the values of all laws, which may be right
                     self.keep(rest)
                     self.add(rest, few=True)
                 found = self.leave_out(best, [element])
                 wrong = found is not None and not self._expanded(found, FAR_RATIO)  # it had been in a wrong minimum
-                if found is not None and wrong and self.can_improve(self.best) and self.in_time():
+                if found is not None and wrong and self.can_improve(self.best) and self.may_go_on():
                     self.add(found, few=True)
             if self.best.key == best.key:
                 return
@@ -539,7 +539,7 @@ class Search(Hypotheses):
         """
         best, names = self.best, self.bench.simulator.output_names
         filters = [e for e in best.laws if kind_of(e.port) == ACTUATOR and (e.law.order or e.law.shifts)]
-        if len(names) < 2 or len(filters) != 1 or not self.in_time():
+        if len(names) < 2 or len(filters) != 1 or not self.may_go_on():
             return
         source = filters[0]
         others = [e for e in best.laws if e is not source]
