@@ -7,26 +7,31 @@ How an answer comes about:
 2. `Search.run` fits further hypotheses: the simulator with laws in its ports, with all parameters estimated together.
    Each gets a log evidence: how well it follows the recordings, less the cost of its parameters, plus its prior
    (`evidence`, which lists the numbers on which an answer rests).
-3. `posterior` turns the evidences into probabilities. An effect's confidence is the probability of all hypotheses that
-   have it, times the probability that its law is the physics (`share_named`): a rest that a flexible force could
-   explain lowers it, as do values at a bound or at which the law degenerates. Of forms of a law that follow alike, the
-   plainest is stated.
+3. `posterior` turns the evidences into probabilities. The confidence of an effect is the probability of all hypotheses
+   that have it, times the probability that its law is the physics (`share_named`), times the probability that its
+   strength is not zero. Three things lower it: a remainder that a flexible force explains, a parameter at a bound, and
+   values at which the law degenerates into another. Among forms of a law that fit equally well, the one with the fewest
+   parameters is stated.
 4. `judge` chooses the verdict. It is a recording fault if its correction removed the mismatch; missing physics if the
    law of the likeliest hypothesis is more likely than not the physics; complete if the refit's residual can be noise;
-   else unexplained.
+   else unexplained. Steps 5 to 7 judge again if they change the probabilities.
 5. If there is time, explanations without a law are tried: a parameter pinned to a wrong value, and a clipped input.
    They count if they explain as much as the law.
 6. `find_named_correction` compares named laws with a learned force on held-out parts of the recordings. If the named
-   law predicts worse than the force, the name is withdrawn and the verdict is chosen again. A learned force that stays
-   beside the laws lowers their confidence (`Posterior.within`).
-7. The proof (`proof`) adds errors on test recordings, placebos and standard errors. It changes no verdict. Offsets that
-   no longer improve the fit beside the effects are set to zero.
+   law predicts worse than the force, the name is withdrawn. A learned force that stays beside the laws lowers their
+   confidence (`Posterior.within`).
+7. If the named laws may imitate a law where no port is declared, they are weighed against that
+   (`find_undeclared_port`). If nothing has a name, such laws, those that were not tried, and parameters that vary are
+   looked for, and `find_unnamed_correction` chooses the corrected simulator.
+8. `_final_fits` sets offsets to zero that no longer improve the fit beside the effects, and fits to convergence.
+   `build_diagnosis` adds the proof (`proof`): errors on test recordings, placebos and standard errors. It changes no
+   verdict.
 
-**Long recordings.** Steps 1 to 6 see only their most informative stretches (`stretches`). The leading hypotheses are
-then fitted to everything before step 3, and the answer's simulator before step 7.
+**Long recordings.** Steps 1 to 7 see only their most informative stretches (`stretches`). The likeliest hypotheses are
+fitted to everything before step 3, and the answer's simulator in step 8.
 
 **Repetitions.** Steps 1 and 2 are repeated where something that they took for granted proves wrong (`repetitions`). If
-nothing has a name after step 6 and the simulator drifts, the search is repeated in predictions, and the laws that are
+nothing has a name after step 7 and the simulator drifts, the search is repeated in predictions, and the laws that are
 found there are refitted in free run (`_name_in_predictions`).
 """
 
@@ -173,7 +178,8 @@ def _final_fits(
 ) -> FinalFits:
     """Return the fits that the answer states: those of the search, or fits to everything if it ran on stretches."""
     bench, without, after = search.bench, search.root.fitted, found.fitted
-    if found.effects and not np.isfinite(found.correction.after):  # a held-out comparison chose what it compared
+    # after a held-out comparison, the offsets stay as they were compared
+    if found.effects and not np.isfinite(found.correction.after):
         with search.until_interrupted():
             after = fix_idle_offsets(bench, after)
     if everything is None:
@@ -209,7 +215,7 @@ def _conclude_as_stage(search: Search, gates: Sequence[Gate]) -> Conclusion:
 
 
 def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
-    """Draw the conclusion from a search: steps 3 to 6 of the module docstring.
+    """Draw the conclusion from a search: steps 3 to 7 of the module docstring.
 
     After Ctrl-C nothing more is fitted: a name that was found stays; otherwise the refitted simulator is returned.
     """
@@ -258,7 +264,7 @@ class _Judged:
 
 
 def with_tones(search: Search, answer: Posterior, gates: Sequence[Gate]) -> tuple[Gate, ...]:
-    """Add the steady tones that the named laws leave, or the refit if nothing has a name."""
+    """Add the steady tones in the residual of the named laws, or of the refit if nothing is named."""
     fitted = answer.best.fitted if answer.effects else search.root.fitted
     return (*gates, *find_tones(search.bench, fitted))
 
@@ -331,10 +337,10 @@ def _conclude_unexplained(search: Search, judged: _Judged, elsewhere: Sequence[G
 
 
 def _name_in_predictions(request: Request, search: Search, found: Conclusion) -> Conclusion:
-    """Search once more in predictions if the simulator drifts, so that errors of free runs hardly tell laws apart.
+    """Search with one-step predictions if the simulator drifts: errors of its free runs hardly distinguish laws.
 
-    The laws that are named there are refitted in free run. There they have to act as surely, and to predict held-out
-    data better than the refit, and as well as the correction that was found without a name.
+    The laws that are named there are refitted in free run. They are kept if their strengths are significant there and
+    they predict held-out data better than the refit, and as well as the correction that was found without a name.
     """
     if request.simulator.observer is not None or not drifts(search.bench, search.root.fitted):
         return found
