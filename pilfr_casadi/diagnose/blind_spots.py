@@ -380,6 +380,7 @@ def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[Param
 def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) -> Iterator[BlindSpot]:
     """Describe everything that the recordings cannot reveal, the gravest first.
 
+    To add a blind spot, yield it here at its rank; its remedy goes into `MOTION` or `_next_record`.
     `still` are inputs that never change; `alive` are dead or flat parameters that move the outputs at the given values.
     """
 

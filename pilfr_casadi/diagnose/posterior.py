@@ -11,9 +11,10 @@ law leaves and that a flexible force at some port would explain. The density of 
     2 / (π s_0 (1 + (s / s_0)²)), if the law is the physics: half-Cauchy,
 
 and the probability of a hypothesis is divided between a named and an unnamed answer in this ratio. s_0 is the share
-that the formula of the right law may leave. A wrong law often drives a parameter of the simulator to a bound. The
-confidence of an effect is the probability that it is included and that its strength is not zero. An effect beside
-others is named if that exceeds one half (Barbieri & Berger 2004).
+that the formula of the right law may leave. A wrong law often drives a parameter of the simulator to a bound; then the
+odds against the law rise by STRAINED_ODDS. The confidence of an effect is the probability that it is included, that its
+law is the physics, and that its strength is not zero. An effect beside others is included if its probability exceeds
+SURE (median probability model, Barbieri & Berger 2004).
 """
 
 from __future__ import annotations
@@ -131,10 +132,9 @@ def share_left(
 ) -> float:
     """Compute the share that a fit leaves of a hypothesis' mean square error above the noise.
 
-    The hypothesis is by default the refit, and the noise the floor, of which at least `least` counts as left. The
-    estimated floor may contain physics that nothing explains; the white noise is a lower limit of the noise. An error
-    above the outputs' variance counts as that, which a constant leaves: in a free run errors may accumulate without
-    end, and to have removed them says little of a law.
+    The hypothesis is by default the refit, and the noise the floor. The estimated floor may contain physics that
+    nothing explains; the white noise is a lower limit of the noise. `least` is the multiple of the noise below which no
+    error counts. The error before is limited to the outputs' variance, because free-run errors can grow without limit.
     """
 
     def pooled(squares: np.ndarray | float) -> float:
@@ -149,7 +149,7 @@ def share_left(
 def share_named(s: float, odds: float = 1.0) -> float:
     """Compute the probability that a law which leaves the share s is the physics.
 
-    `odds` tells how much likelier what is seen beside that is of a wrong law than of the right one (`_odds_against`).
+    `odds` is the likelihood ratio of the other observations, wrong law over right law (`_odds_against`).
     """
     law = (1 - OUTSIDE_CATALOGUE) * 2 / (np.pi * FORMULA_ERROR * (1 + (s / FORMULA_ERROR) ** 2))
     other = OUTSIDE_CATALOGUE / (max(s, FORMULA_ERROR) * (1 - np.log(FORMULA_ERROR)))
@@ -184,8 +184,8 @@ def posterior(search: Hypotheses) -> Posterior:
 def _named_beside(search: Hypotheses, best: Trial, effect: NamedEffect) -> float:
     """Compute the probability that one law of a hypothesis is the physics, from what is left of its own mismatch.
 
-    Its own mismatch is what the others leave without it. A small effect may only make up for the formula of a large
-    one, and so it has to explain its part as well as that one does.
+    A small effect may only compensate an inexact formula of a large one. Its share is therefore judged on the error
+    without it.
     """
     remainder = explainable_remainder(search, best, _without(search, best, effect))
     return share_named(remainder, _odds_against(search, best, [effect.element]))

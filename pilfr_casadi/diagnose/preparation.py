@@ -36,8 +36,8 @@ CHECKED_ABOVE = 4e-4  # mean square error up to which signs and units are not ch
 CHECKS, CHECKED = "checks and refit", 6  # the stage's name, and the number of its parts that are reported
 LEAST_REFIT = 10.0  # seconds for the first refit in any case
 UNCHECKED = (
-    "Some checks of the recordings were left out, because the time was over or somebody interrupted them: a shift, a "
-    "gap or an offset of a channel may have been missed."
+    "Some checks of the recordings were left out, because time ran out or the run was interrupted: a shift, a gap or "
+    "an offset of a channel may have been missed."
 )
 TIMED_SAMPLES = 50  # samples whose simulation is timed
 LONG_SIMULATION = 1.0  # seconds that a simulation takes without a note
@@ -77,7 +77,7 @@ def prepare(
 ) -> Prepared:
     """Correct faults of the recordings, refit from the user's values, and measure the noise.
 
-    Without `early`, an early channel counts as a fault only where nothing else is wrong. No check begins after `until`
+    Without `early`, an early channel is corrected only if no other error is left. No check begins after `until`
     (a time of `time.perf_counter`), and the fits of checks end then; a note tells if checks were left out.
     """
     say = say or Stages(lambda *_: None)

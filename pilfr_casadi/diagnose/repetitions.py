@@ -1,10 +1,15 @@
 """Prepare and search, and repeat that where something that was taken for granted proves wrong.
 
-There are five cases: with an observer if the simulator is unstable and runs away from the recordings (`prediction`);
-with the other hold if nobody stated it and the best hypothesis follows better with it; without a shift if a channel
-seemed to be early, because missing physics can look like a lead; with a shift that shows only beside the first law; and
-from unknown initial states if a wrong zero was preferred to a wrong start. Each search fits different data. Its
-evidence is therefore not comparable; the smaller error decides.
+There are five cases:
+
+- If the simulator is unstable and runs away from the recordings, search with an observer (`prediction`).
+- If nobody stated the hold of the inputs and the best hypothesis follows better with the other one, search with that.
+- If a channel seemed to be early, search without that correction, because missing physics can look like a lead.
+- If a channel proves shifted only beside the first law, search with it at its right times.
+- If a wrong zero was preferred to a wrong start, search from unknown initial states.
+
+A sixth, in predictions, is `pipeline._name_in_predictions`. Each search fits different data. Its evidence is therefore
+not comparable; the smaller error decides.
 """
 
 from __future__ import annotations
@@ -46,7 +51,7 @@ class Attempt:
 
 
 def search_with_focus(request: Request) -> tuple[Request, Attempt]:
-    """Search; if nobody stated the focus and the simulator runs away, let the recordings lead it."""
+    """Search; if nobody stated the focus and the simulator runs away, correct its states by an observer."""
     if request.focus != "prediction":
         try:
             return request, _search_both_holds(request)

@@ -89,7 +89,7 @@ class _Case:
 
 
 def diagnosis_page(diagnosis: Diagnosis) -> Page:
-    """Fill the page of a diagnosis; see `diagnosis_report`."""
+    """Build the page of a diagnosis; see `diagnosis_report`."""
     case, d = _Case.of(diagnosis), diagnosis
     actions = [measure_action(case.bench, case.after, e, element_of(case.after, e)) for e in d.effects]
     checks = tables.check_table(d)
@@ -181,7 +181,7 @@ def _mismatch(case: _Case) -> list[Block]:
 
 
 def _hidden_forces(case: _Case) -> list[Block]:
-    """Draw the forces of the named effects; without a name, those of the closest laws and at the most likely port."""
+    """Draw the forces of the named effects; without a name, those of the closest laws and of the likeliest port."""
     d, out = case.diagnosis, [block for learned in case.diagnosis.learned for block in _learned_force(case, learned)]
     for e in d.effects:
         if (number := element_of(case.after, e)) is not None:

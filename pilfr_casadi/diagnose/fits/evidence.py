@@ -53,7 +53,8 @@ from .workbench import DIVERGED, RUNAWAY, Fitted, Workbench
 EFFECT_PRIOR = np.log(0.5)  # log probability of each further effect: one more effect is as likely as not
 FLEXIBLE_PRIOR = np.log(0.2)  # the same of a law that can imitate others, relative to a law that cannot
 DOUBTFUL_PRIOR = np.log(0.01)  # the same of parameter values at which a law degenerates into another
-DOMAIN_PRIOR = np.log(4.0)  # the same of a law of the port's domain relative to a general one, or of that to a rare one
+# log odds of a law made for the port's domain against a general law, and of that against one that is rare there
+DOMAIN_PRIOR = np.log(4.0)
 OUTSIDE_CATALOGUE = 0.1  # probability that missing physics is in no law of the catalogue
 STRAINED_ODDS = 10.0  # how much likelier a wrong law drives a parameter of the simulator to a bound than the right one
 STATE_PRIOR = 1e-9  # precision of initial states relative to the information of a sample: hardly any prior
@@ -64,7 +65,8 @@ LEAST_FORMULA_ERROR = 1e-6  # share that the right explanation leaves in any cas
 WRONG_MODEL_SAMPLES = 8.0  # effective samples of a model whose whole error is model error (n_0)
 LEAST_MODEL_ERROR = 0.05  # least share of the error that counts as model error
 LARGE_MODEL_ERROR = 0.2  # share of model error in the error above which models are judged on held-out blocks
-DISTURBANCE_WEIGHT = 0.2  # of a law's remainder that no force at a port explains: a disturbance may act beside the law
+# weight of the remainder that no force at a port explains; it may come from a disturbance
+DISTURBANCE_WEIGHT = 0.2
 INPUT_FACTOR = 0.7  # factor on the inputs' deviation for which the spread is computed: well inside their range
 DISTURBANCE = 1e-5  # of the inputs, over their deviation, by which a motion is tried: linear, and above rounding
 
@@ -366,8 +368,8 @@ def log_prior(
 def log_prior_of_states(bench: Workbench, fitted: Fitted) -> float:
     """Compute the log prior density of the estimated states in which laws begin, relative to the largest.
 
-    The machine was at work before, with signals like the recorded ones or others; so the density is that of Cauchy,
-    whose tail is heavy, with the covariance of `Problem.state_priors`. States are counted from rest.
+    The machine was at work before, with signals like the recorded ones or others. The prior is therefore a multivariate
+    Cauchy density, for its heavy tails, with the covariance of `Problem.state_priors`. States are counted from rest.
     """
     own, total = len(bench.simulator.states), 0.0
     if fitted.model.n_x == own or all(r.begins != "estimate" for r in bench.recordings):
@@ -457,7 +459,7 @@ def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldO
 
 
 def _at_prior_means(fitted: Fitted) -> Fitted:
-    """Return a fit with its free parameters that have a prior at the prior's mean."""
+    """Set the free parameters that have a prior to its mean."""
     means = {k: p.prior[0] for k, p in fitted.model.parameters.items() if p.prior is not None and not np.all(p.fixed)}
     values = {k: np.where(fitted.model.parameters[k].fixed, fitted.values[k], mean) for k, mean in means.items()}
     return replace(fitted, values={**fitted.values, **values})

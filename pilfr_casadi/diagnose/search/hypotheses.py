@@ -53,7 +53,7 @@ class Findings:
     # the scores of all further laws, and the observer's gain; see `screen`
     screened: tuple[list[Scored], np.ndarray | None] | None = None
     flexible: dict[str, float] | None = None  # the share of the residual that a flexible force at each port explains
-    innovations: float | None = None  # the share of the residual's innovations that it explains
+    innovations: float | None = None  # the share of the residual's innovations that a flexible force explains
     # the log likelihood of a sample of its residual as coloured noise, and the log prior density of its first states
     likelihood: tuple[float, float] | None = None
     learned: list[Fitted] | None = None  # the learned forces beside it, best first
@@ -87,7 +87,7 @@ class Hypotheses:
     selected: int = 0
     tried: int = 0
     count: float = FEWEST  # samples of the best residual over its correlation time
-    # mean square of the mismatch, all outputs alike, of which formulas may leave a share; by default the refit's error
+    # reference mean square of the mismatch for `tolerance`, all outputs alike; None: that of the refit
     mismatch2: float | None = None
     _least: tuple[tuple[object, ...], float] | None = None  # what `_least_tolerant` rests on, and its value
 
@@ -257,7 +257,7 @@ class Hypotheses:
 
     @property
     def _all_wrong(self) -> bool:
-        """Whether even the best model's error is mostly model error."""
+        """Whether over a fifth of even the best model's error may be model error, or samples are too few to tell."""
         return self.samples < WRONG_MODEL_SAMPLES / LARGE_MODEL_ERROR
 
     def judge_on_held_out_data(self) -> None:
@@ -309,8 +309,8 @@ class Hypotheses:
     def evidence_in_noise(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis whose residual is coloured noise.
 
-        Its innovations count as far as white noise would. A law would follow slow noise by a first state that it never
-        reaches otherwise, so that counts as well.
+        Its innovations are weighted as white noise. The prior of the laws' initial states is included; otherwise a law
+        could fit slow noise by an implausible initial state.
         """
         if not np.isfinite(trial.mean_square):
             return -np.inf

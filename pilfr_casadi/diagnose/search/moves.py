@@ -156,10 +156,10 @@ class Search(Hypotheses):
         return max(fixed, key=self.optimistic_evidence)
 
     def _grow_to_noise(self) -> None:
-        """Add a law for a rest as small as the formula error of the laws before it.
+        """Try one more law on a residual below the formula error of the laws before it.
 
-        An inexact formula can look like one more effect. So it counts only if what is left can be white noise, and no
-        rest counts that even the right formulas may leave.
+        An inexact formula can look like one more effect. The law is therefore kept only if the remaining residual can
+        be white noise. Residuals below LEAST_FORMULA_ERROR are skipped.
         """
         base, least = self.best, LEAST_FORMULA_ERROR * self.root.mean_square
         is_noise = base.mean_square < ABOVE_NOISE**2 * self.least_noise2 + least
@@ -179,12 +179,11 @@ class Search(Hypotheses):
             self.exchange()
 
     def _name_rest(self, effects: float) -> None:
-        """Name what is left beside the simulator, the best hypothesis, and that without its weakest effect.
+        """Try varying parameters and laws near learned forces beside three hypotheses.
 
-        A parameter may vary with a signal; or a force that is learned there is nearly a law.
-
-        The weakest of several effects may imitate a law that only a learned force shows, such as a gain that varies
-        with the position. Go on if one of the laws leads.
+        These are the simulator, the best one, and the best one without its weakest effect, which may imitate a law that
+        only a learned force shows, such as a gain that varies with the position. Search on if one of them becomes the
+        best.
         """
         if self.must_repeat:
             return
@@ -210,7 +209,7 @@ class Search(Hypotheses):
         self.judge_on_held_out_data()
 
     def _pays(self, trial: Trial) -> bool:
-        """Tell whether the last of several laws was worth it; a wrong model can always use one more."""
+        """Tell whether the last of several laws was worth it; a wrong model gains from any further law."""
         fewer = [t for t in self.memo.values() if t.laws and len(t.effects) < len(trial.effects)]
         return len(trial.effects) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
 
@@ -224,7 +223,7 @@ class Search(Hypotheses):
         return found is not None and not self.interrupted and found.cost * BETTER_RATIO**2 < best.cost
 
     def _find_shift(self) -> None:
-        """Look beside each of the first laws for an output that comes before its cause; their absence may hide it.
+        """Look beside each of the first laws for an output that comes before its cause; missing physics may hide it.
 
         Filters and laws with memory are left out: they imitate a shift. A delay is a law itself.
         """
@@ -342,7 +341,7 @@ class Search(Hypotheses):
             self.keep(trial)
 
     def _finer(self, parent: Trial) -> None:
-        """Fit the best law of a step in its finer forms; then let the strength of the best that may vary do so."""
+        """Fit the best law of a step in its finer forms; then schedule the strength of the best law that allows it."""
         best = self._best_with_one_more(parent)
         if best is not None:
             self._refine(best, FINER.get(type(best.law), ()))
