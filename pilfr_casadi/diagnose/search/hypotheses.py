@@ -260,7 +260,7 @@ class Hypotheses:
         """Whether over a fifth of even the best model's error may be model error, or samples are too few to tell."""
         return self.samples < WRONG_MODEL_SAMPLES / LARGE_MODEL_ERROR
 
-    def judge_on_held_out_data(self) -> None:
+    def cross_validate_likeliest(self) -> None:
         """Compute the held-out errors of the likeliest hypotheses.
 
         If only one is likely and its error is noise, the fit error is enough. Otherwise held-out data decide, because a
@@ -446,7 +446,7 @@ class Hypotheses:
         converged = known is not None and known.thorough and as_fine and known.mean_square <= rest.mean_square
         if not converged and not self.past_deadline:
             found = self.fits.converge(rest)
-            self.keep(self.fits.sharpen(found) if found.error < FAR_RATIO * joint.error else found)
+            self.keep(self.fits.refine_knee(found) if found.error < FAR_RATIO * joint.error else found)
         kept = self.memo.get(rest.key)
         return kept if kept is not None and np.isfinite(kept.mean_square) else None
 

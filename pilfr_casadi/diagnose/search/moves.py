@@ -206,7 +206,7 @@ class Search(Hypotheses):
             self._grow_to_noise()
         self._every_sensor()
         self._leave_out_each()
-        self.judge_on_held_out_data()
+        self.cross_validate_likeliest()
 
     def _pays(self, trial: Trial) -> bool:
         """Tell whether the last of several laws was worth it; a wrong model gains from any further law."""
@@ -337,7 +337,7 @@ class Search(Hypotheses):
         # finer steps are slow, and bring no hypothesis that is far behind to the front
         least = min([t.error for t in (*converged, self.best)])
         near = [t for t in converged if t.error < NEAR_RATIO * least]
-        for trial in self._side_by_side(self.fits.sharpen, near):
+        for trial in self._side_by_side(self.fits.refine_knee, near):
             self.keep(trial)
 
     def _finer(self, parent: Trial) -> None:

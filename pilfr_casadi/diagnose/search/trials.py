@@ -185,7 +185,7 @@ class Trials:
 
     def polish(self, trial: Trial) -> Trial:
         """Fit a trial to convergence and to all samples, on steps that are fine enough for its knee."""
-        return self.sharpen(self.converge(trial))
+        return self.refine_knee(self.converge(trial))
 
     def converge(self, trial: Trial) -> Trial:
         """Fit a trial to convergence and to all samples, on steps for its present values."""
@@ -202,7 +202,7 @@ class Trials:
             return replace(trial, mean_square=np.inf, thorough=True)
         return Trial.of(fitted, len(trial.laws), thorough=True)
 
-    def sharpen(self, trial: Trial) -> Trial:
+    def refine_knee(self, trial: Trial) -> Trial:
         """Refit a converged trial on steps that are fine enough for its knee, if it has one."""
         if not trial.knee or not trial.mean_square < DIVERGED or time.perf_counter() > self.bench.deadline:
             return trial

@@ -110,7 +110,7 @@ def test_hypotheses_are_not_compared_by_different_errors_where_time_ran_out(monk
     found.held_out(found.best)
     found.until = 0.0
     monkeypatch.setattr(Search, "_likeliest", lambda self: [self.root, self.best])
-    found.judge_on_held_out_data()
+    found.cross_validate_likeliest()
     assert found.out_of_time and all(known.held_out is None for known in found.findings.values())
 
     def just_in_time(bench, fitted, workers):
