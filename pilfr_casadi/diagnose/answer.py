@@ -24,7 +24,7 @@ from .excitation import ranges_left, share_at_new_frequencies
 from .faults.channels import IN_RECORDINGS, find_gross_slips
 from .faults.gates import EQUAL_RATIO, TEST_FAULT, Gate, edited, value_with_unit
 from .faults.offsets import Offset, remove_idle_offsets, update_offsets
-from .fits.evidence import FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, SURE, all_sure, deviations
+from .fits.evidence import FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, SURE, all_sure, standard_errors
 from .fits.floor import Floor
 from .fits.force_recovery import is_curve_along
 from .fits.workbench import Fitted, Workbench
@@ -78,7 +78,7 @@ def build_diagnosis(
     proving = time.perf_counter()
     request.say("proof", 0, 1)
     bench, without, after = final.bench, final.without, final.after
-    std = deviations(bench, after)
+    std = standard_errors(bench, after)
     errors, fewer, compared, test_notes = _compute_errors(request, search, found, final, tests)
     decided = found.decided or search
     forms = {e: _other_forms(decided, found.effects, e) for e in found.effects}

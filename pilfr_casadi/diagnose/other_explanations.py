@@ -33,7 +33,7 @@ from .faults.gates import (
     open_start,
     value_with_unit,
 )
-from .fits.evidence import AT_NOISE_RATIO, BETTER_RATIO, CONTENDING_NATS, FAR_RATIO, NEAR_RATIO, SURE, deviations
+from .fits.evidence import AT_NOISE_RATIO, BETTER_RATIO, CONTENDING_NATS, FAR_RATIO, NEAR_RATIO, SURE, standard_errors
 from .fits.linearise import simulate_states
 from .fits.workbench import FEW, THOROUGH, Fitted, Workbench, refit
 from .posterior import Posterior, posterior, strained
@@ -292,7 +292,7 @@ def _clearest_differences(
     whole: Fitted, fits: Sequence[Fitted], benches: Sequence[Workbench]
 ) -> list[tuple[str, list[float]]]:
     """List the parameters with the most significant differences, the most significant first."""
-    spreads = [deviations(part, f) for part, f in zip(benches, fits, strict=True)]
+    spreads = [standard_errors(part, f) for part, f in zip(benches, fits, strict=True)]
     out = list[tuple[float, str, list[float]]]()
     for name, p in whole.simulator.parameters.items():
         if np.size(p.value) != 1 or np.all(p.fixed):

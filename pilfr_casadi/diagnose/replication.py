@@ -27,7 +27,7 @@ from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
 from .arguments import match_recordings, stated_hold
 from .faults.channels import correct_gross_slips
 from .faults.gates import Checked
-from .fits.evidence import FORMULA_ERROR, Sample, deviations, information, log_evidence, log_prior, prior_width
+from .fits.evidence import FORMULA_ERROR, Sample, information, log_evidence, log_prior, prior_width, standard_errors
 from .fits.floor import effective_size, measured_floor, third_differences
 from .fits.linearise import sample_run
 from .fits.workbench import FINER_STEPS, THOROUGH, Fitted, Workbench, refit
@@ -178,7 +178,7 @@ def _refine_steps(bench: Workbench, fitted: Fitted) -> Fitted:
     """
     most = min(FINER_STEPS**2 * bench.chosen, MOST_SUBSTEPS)
     while fitted.model.substeps < most and not fitted.simulator.discrete and np.any(fitted.model.parameters.free):
-        error = fitted.model.parameters.pack(deviations(bench, fitted))
+        error = fitted.model.parameters.pack(standard_errors(bench, fitted))
         steps = min(FINER_STEPS * fitted.model.substeps, most)
         finer = replace(bench, substeps=steps, at_least=steps, chosen=max(bench.chosen, -(-steps // FINER_STEPS)))
         found = refit(finer, [fitted.values], fitted.simulator, states=fitted.initial, solver=THOROUGH)
@@ -224,7 +224,7 @@ def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ..
 
 def _values(bench: Workbench, fitted: Fitted) -> Values:
     own = fitted.model.parameters
-    values, errors = fitted.vector, own.pack(deviations(bench, fitted))
+    values, errors = fitted.vector, own.pack(standard_errors(bench, fitted))
     free = [(k, label) for k, label in enumerate(own.labels) if own.free[k]]
     return Values({label: float(values[k]) for k, label in free}, {label: float(errors[k]) for k, label in free})
 

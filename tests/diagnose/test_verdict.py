@@ -14,7 +14,7 @@ from pilfr_casadi import Recording, multisine
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.correction import Correction, find_unnamed_correction
 from pilfr_casadi.diagnose.faults.offsets import Offset, fix_idle_offsets, list_offsets, update_offsets
-from pilfr_casadi.diagnose.fits.evidence import deviations
+from pilfr_casadi.diagnose.fits.evidence import standard_errors
 from pilfr_casadi.diagnose.fits.flexible_forces import flexible_shares, innovation_share
 from pilfr_casadi.diagnose.posterior import posterior
 from pilfr_casadi.diagnose.verdict import closest_hypothesis, judge
@@ -208,7 +208,7 @@ def test_samples_that_do_not_count_do_not_make_a_value_more_certain():
     errors = []
     for counted in (r.with_(skip=400), r.slice(400).with_(initial="estimate")):
         bench = Workbench.of(cart(), [counted], "zero")
-        errors.append(deviations(bench, bench.fit(bench.simulator)))
+        errors.append(standard_errors(bench, bench.fit(bench.simulator)))
     for name in ("d", "k"):
         assert errors[0][name] == pytest.approx(errors[1][name], rel=0.3)
 

@@ -68,7 +68,7 @@ LARGE_MODEL_ERROR = 0.2  # share of model error in the error above which models 
 # weight of the remainder that no force at a port explains; it may come from a disturbance
 DISTURBANCE_WEIGHT = 0.2
 INPUT_FACTOR = 0.7  # factor on the inputs' deviation for which the spread is computed: well inside their range
-DISTURBANCE = 1e-5  # of the inputs, over their deviation, by which a motion is tried: linear, and above rounding
+PERTURBATION = 1e-5  # of the inputs, over their deviation, by which a motion is tried: linear, and above rounding
 
 # Comparison of hypotheses
 SURE = 0.5  # probability above which an answer is stated: more likely than not; `studies` (fleets) use it as well
@@ -160,8 +160,8 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     spread reveals parameters that the recordings hardly determine, such as a curve of a pressure that had two levels; a
     cross-validation on the same recordings cannot.
 
-    A motion near an unstable one, such as a pendulum's near its upper rest, enlarges any small change. If the motion
-    for the other inputs enlarges more than the recorded one, that is a matter of those inputs, and the spread is
+    A motion near an unstable one, such as a pendulum's near its upper rest, amplifies any small change. If the motion
+    for the other inputs amplifies more than the recorded one, that is a matter of those inputs, and the spread is
     divided by it.
     """
     if not np.any(fitted.model.parameters.free):
@@ -188,7 +188,7 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     found = float(np.sum(covariance * other * np.outer(width, width)))
     if not np.isfinite(found):
         return np.inf
-    as_recorded, now = _enlargement(bench, fitted), _enlargement(bench.on(smaller), fitted)
+    as_recorded, now = _amplification(bench, fitted), _amplification(bench.on(smaller), fitted)
     return found / max(now / as_recorded, 1.0) if 0 < as_recorded < np.inf and now < np.inf else found
 
 
@@ -220,13 +220,13 @@ def runs_away(bench: Workbench, fitted: Fitted, refitted: Fitted) -> bool:
     return False
 
 
-def _enlargement(bench: Workbench, fitted: Fitted) -> float:
-    """Compute the mean square change of the outputs by a small disturbance, over that of the inputs."""
-    rng, size = np.random.default_rng(0), DISTURBANCE * np.std(np.concatenate([r.u for r in bench.recordings]), axis=0)
-    disturbed = bench.on([r.with_(u=r.u + size * rng.standard_normal(r.u.shape)) for r in bench.recordings])
+def _amplification(bench: Workbench, fitted: Fitted) -> float:
+    """Compute the mean square change of the outputs by a small perturbation, over that of the inputs."""
+    rng, size = np.random.default_rng(0), PERTURBATION * np.std(np.concatenate([r.u for r in bench.recordings]), axis=0)
+    perturbed = bench.on([r.with_(u=r.u + size * rng.standard_normal(r.u.shape)) for r in bench.recordings])
     try:
         with np.errstate(all="ignore"):
-            runs = [problem.simulate(theta) for problem, theta in (b.problem_at(fitted) for b in (bench, disturbed))]
+            runs = [problem.simulate(theta) for problem, theta in (b.problem_at(fitted) for b in (bench, perturbed))]
             moved = np.concatenate([(y - x) / bench.scale for x, y in zip(*runs, strict=True)])
     except (InputError, RuntimeError):  # a run diverges
         return np.inf
@@ -259,7 +259,7 @@ def _hessian(bench: Workbench, fitted: Fitted) -> tuple[Problem, np.ndarray, np.
         return problem, theta, np.full((len(theta), len(theta)), np.inf)
 
 
-def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
+def standard_errors(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
     """Compute standard errors from the residual and its correlation time; nan for fixed parameters and at bounds.
 
     Initial states are estimated together with the parameters. Parameters that can be identified only together, such as
