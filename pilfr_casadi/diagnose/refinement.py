@@ -35,7 +35,7 @@ from ..identify import regrid
 from ..laws import OPERATORS, Law, Local, display_name, hysteresis_layer, unit_forces
 from ..models import check_size, play
 from ..simulators import Simulator, discretise, in_series, on_grid
-from .fits.evidence import HeldOut, Sample, held_out_errors, spread
+from .fits.evidence import EffectiveSamples, HeldOut, held_out_errors, spread
 from .fits.floor import effective_size
 from .fits.force_recovery import signals_along
 from .fits.workbench import THOROUGH, Compiled, Fitted, Workbench
@@ -219,7 +219,7 @@ def _predict(search: Search, fitted: Fitted) -> HeldOut:
     bench = search.bench
     found = held_out_errors(bench, fitted, search.workers)
     v = found.mean_square
-    n = Sample(search.floor2, effective_size(bench.scored(fitted.residual))).effective(v)
+    n = EffectiveSamples(search.floor2, effective_size(bench.scored(fitted.residual))).at(v)
     return replace(found, spread=spread(bench, fitted, search.added_laws(fitted), v, n) if np.isfinite(v) else np.inf)
 
 

@@ -27,7 +27,15 @@ from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
 from .arguments import match_recordings, stated_hold
 from .faults.channels import correct_gross_slips
 from .faults.gates import Checked
-from .fits.evidence import FORMULA_ERROR, Sample, information, log_evidence, log_prior, prior_width, standard_errors
+from .fits.evidence import (
+    FORMULA_ERROR,
+    EffectiveSamples,
+    information,
+    log_evidence,
+    log_prior,
+    prior_width,
+    standard_errors,
+)
 from .fits.floor import effective_size, measured_floor, third_differences
 from .fits.linearise import sample_run
 from .fits.workbench import FINER_STEPS, THOROUGH, Fitted, Workbench, refit
@@ -217,7 +225,7 @@ def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ..
     """Compute the log evidence with the laws minus the log evidence of the simulator as given."""
     tolerance = FORMULA_ERROR * max(plain.cost - noise2, 0.0)
     costs = plain.cost + tolerance, after.cost + tolerance
-    n = Sample(noise2 + tolerance, max(effective_size(bench.scored(after.residual)), 1.0)).effective(min(costs))
+    n = EffectiveSamples(noise2 + tolerance, max(effective_size(bench.scored(after.residual)), 1.0)).at(min(costs))
     known = information(bench, after, laws)
     return log_evidence(costs[1], known, log_prior(laws, {}), n) - log_evidence(costs[0], np.zeros(0), 0.0, n)
 

@@ -103,13 +103,13 @@ REFIT = GaussNewton(max_iterations=8, tolerance=1e-2, patience=2)
 
 
 @dataclass(frozen=True)
-class Sample:
-    """The recordings' mean square noise in units of the outputs' variance, and their number of samples."""
+class EffectiveSamples:
+    """The number of samples that count in an evidence, which depends on how far the error is noise."""
 
-    noise2: float
-    count: float
+    noise2: float  # mean square noise of the recordings, in units of the outputs' variance
+    count: float  # samples of the recordings over the residual's correlation time
 
-    def effective(self, v: float) -> float:
+    def at(self, v: float) -> float:
         """Compute the effective samples n if the best hypothesis leaves the mean square error v."""
         wrong = float(np.clip(1 - self.noise2 / max(v, 1e-300), LEAST_MODEL_ERROR, 1.0))
         return WRONG_MODEL_SAMPLES * self.count / (WRONG_MODEL_SAMPLES + wrong * self.count)

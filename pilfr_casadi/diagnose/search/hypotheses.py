@@ -26,8 +26,8 @@ from ..fits.evidence import (
     LARGE_MODEL_ERROR,
     LOUDEST_NOISE,
     WRONG_MODEL_SAMPLES,
+    EffectiveSamples,
     HeldOut,
-    Sample,
     held_out_errors,
     information,
     log_evidence,
@@ -109,7 +109,7 @@ class Hypotheses:
     @property
     def samples(self) -> float:
         """Effective samples, shared by all hypotheses."""
-        return self.sample.effective(self._least_tolerant())
+        return self.effective_samples.at(self._least_tolerant())
 
     def _least_tolerant(self) -> float:
         """Compute the smallest `_tolerant` of all hypotheses; kept while these stay, because each evidence needs it."""
@@ -151,9 +151,9 @@ class Hypotheses:
         return self.bench.pool((floor or self.floor).squares(self.bench.scale) + self.tolerance)
 
     @property
-    def sample(self) -> Sample:
-        """Noise and number of samples of the recordings."""
-        return Sample(self.may_leave(), self.count)
+    def effective_samples(self) -> EffectiveSamples:
+        """The effective samples at any error, from the noise and the number of samples of the recordings."""
+        return EffectiveSamples(self.may_leave(), self.count)
 
     @property
     def root(self) -> Trial:
@@ -167,7 +167,7 @@ class Hypotheses:
 
     def optimistic_evidence(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis with as many effective samples as at the noise level."""
-        return self._log_evidence(trial, self._tolerant(trial), self.sample.effective(0.0))
+        return self._log_evidence(trial, self._tolerant(trial), self.effective_samples.at(0.0))
 
     def evidence(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis, from its error on held-out blocks if that is known.
@@ -238,7 +238,7 @@ class Hypotheses:
     def _alike(self, one: Trial, other: Trial) -> bool:
         """Tell whether two hypotheses follow the recordings so alike that these do not distinguish them."""
         ratio = one.mean_square / max(other.mean_square, 1e-300)
-        nats = 0.5 * self.sample.effective(0.0) * np.log(ratio)
+        nats = 0.5 * self.effective_samples.at(0.0) * np.log(ratio)
         return bool(ratio < EQUAL_RATIO and nats < INDISTINGUISHABLE_NATS)
 
     def held_out_errors(self, fitted: Fitted, spread: float) -> HeldOut:
@@ -247,9 +247,9 @@ class Hypotheses:
 
     def spread(self, fitted: Fitted) -> float:
         """Compute the mean square uncertainty of a fitted simulator's predictions for other inputs."""
-        own = Sample(self.floor2, count_samples(fitted, self.bench))
+        own = EffectiveSamples(self.floor2, count_samples(fitted, self.bench))
         v = self.bench.pool(fitted.squares + self.tolerance)
-        return spread(self.bench, fitted, self.added_laws(fitted), v, own.effective(0.0))
+        return spread(self.bench, fitted, self.added_laws(fitted), v, own.at(0.0))
 
     def added_laws(self, fitted: Fitted) -> tuple[Placed, ...]:
         """Return the laws that a fitted simulator has beside the one that is diagnosed."""
@@ -316,7 +316,7 @@ class Hypotheses:
             return -np.inf
         known, residuals = self.findings[trial.key], self.bench.scored(trial.fitted.residual)
         size = sum(e.size for e in residuals)
-        n = replace(self.sample, count=size).effective(0.0)
+        n = replace(self.effective_samples, count=size).at(0.0)
         if known.likelihood is None:
             known.likelihood = log_likelihood(residuals) / size, log_prior_of_states(self.bench, trial.fitted)
         likelihood, states = known.likelihood
@@ -359,7 +359,7 @@ class Hypotheses:
         An error no larger than what the formulas of the present laws may leave asks for no further law.
         """
         limit = self.may_leave(noise)
-        most = 0.5 * self.sample.effective(0.0) * np.log(max(self._tolerant(trial) / limit, 1.0))
+        most = 0.5 * self.effective_samples.at(0.0) * np.log(max(self._tolerant(trial) / limit, 1.0))
         return trial.mean_square > limit and bool(most > np.log(max(len(self.alternatives), 1)) - EFFECT_PRIOR)
 
     @property
