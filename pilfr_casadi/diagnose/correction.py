@@ -181,7 +181,7 @@ def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_
     """Predict held-out data with further candidates, the most promising first, as long as they can be best."""
     out = list(predicted)
     for c in sorted(candidates, key=lambda c: c.least):
-        least = min((h.mean_square for _, h in out), default=np.inf)
+        least = min((h.score for _, h in out), default=np.inf)
         if out and (c.least >= least or search.past_deadline):
             break
         bare = c.fitted is c.base.fitted
@@ -194,7 +194,7 @@ def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_
 def _may_be_best(candidate: _Candidate, predicted: Sequence[_Predicted]) -> bool:
     """Tell whether a candidate that was not predicted may have a smaller error than those that were."""
     left_out = all(c is not candidate for c, _ in predicted)
-    return left_out and candidate.least < min(h.mean_square for _, h in predicted)
+    return left_out and candidate.least < min(h.score for _, h in predicted)
 
 
 def _far_better(search: Search, candidates: Sequence[_Candidate]) -> Trial:
@@ -206,7 +206,7 @@ def _far_better(search: Search, candidates: Sequence[_Candidate]) -> Trial:
 
 def _choose(predicted: Sequence[_Predicted]) -> _Predicted:
     """Choose the candidate with the smallest expected error on other recordings."""
-    return min(predicted, key=lambda p: p[1].mean_square)
+    return min(predicted, key=lambda p: p[1].score)
 
 
 def _named_hypotheses(search: Search, answer: Posterior) -> list[Trial]:

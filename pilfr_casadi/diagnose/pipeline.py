@@ -363,9 +363,9 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
         before, after = search.held_out(search.root), search.held_out(trial)
     answer = replace(answer, effects=named.effects).acting(search, trial)
     verdict = judge(leading, answer, ())
-    known = np.isfinite(before.error) or not search.past_deadline
-    predicts = known and after.error < before.error and not after.rms > EQUAL_RATIO * found.correction.after
-    if verdict.kind != "missing-physics" or not predicts:
+    known = np.isfinite(before.weighted_rms) or not search.past_deadline
+    better = known and after.weighted_rms < before.weighted_rms
+    if verdict.kind != "missing-physics" or not better or after.rms > EQUAL_RATIO * found.correction.after:
         return found
     correction = replace(uncompared_correction(search, trial.fitted), before=before.rms, after=after.rms, closest=trial)
     note = drift_note(request.simulator, memory, " and ".join(display_name(law) for _, law in sorted(trial.names)))

@@ -206,7 +206,7 @@ def refine(diagnosis: Any, operators: int, kind: str | None, port: str | None) -
     best, *others = layers
     for name in others:  # plays and stops differ only by a line; another kind has to be better in both errors
         one, other = held_out[best], held_out[name]
-        best = name if other.error < one.error and other.mean_square < one.mean_square else best
+        best = name if other.weighted_rms < one.weighted_rms and other.score < one.score else best
     return _build_refinement(diagnosis, search.bench, best, layers[best], number, held_out)
 
 
@@ -218,7 +218,7 @@ def _predict(search: Search, fitted: Fitted) -> HeldOut:
     """
     bench = search.bench
     found = held_out_errors(bench, fitted, search.workers)
-    v = found.mean_square
+    v = found.score  # still without a spread
     n = EffectiveSamples(search.floor2, effective_size(bench.scored(fitted.residual))).at(v)
     return replace(found, spread=spread(bench, fitted, search.added_laws(fitted), v, n) if np.isfinite(v) else np.inf)
 
@@ -374,7 +374,7 @@ def _build_refinement(
     signal = in_series(port)
     z = np.linspace(0.0, float(np.ptp(loops[0][0])) / 2, CURVE_POINTS)
     order = np.argsort(values["r"])
-    improves = held_out[kind].mean_square < held_out[DIAGNOSED].mean_square
+    improves = held_out[kind].score < held_out[DIAGNOSED].score
     old = after.simulator.elements[number].law
     return Refinement(
         port=port,

@@ -50,7 +50,7 @@ def test_a_layer_of_many_operators_predicts_better(many, refined):
     test = many.test[0]
     assert refined.nrmse(test) < 0.6 * many.nrmse(test)
     assert refined.nrmse(test) == pytest.approx(refined.errors["test"]["refined"])
-    assert refined.held_out[refined.kind].mean_square < refined.held_out["diagnosed"].mean_square
+    assert refined.held_out[refined.kind].score < refined.held_out["diagnosed"].score
     assert np.max(np.abs(refined.simulate(test) - test.y)) < 0.01 * np.max(np.abs(test.y))
 
 

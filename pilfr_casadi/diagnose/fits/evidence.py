@@ -412,23 +412,23 @@ class HeldOut:
     spread: float = 0.0  # mean square uncertainty of predictions for other inputs; see `evidence.spread`
 
     @property
-    def mean_square(self) -> float:
-        """The larger of the two errors plus the spread for other inputs."""
+    def score(self) -> float:
+        """Mean square error by which models are chosen: outputs weighted by noise, plus the spread for other inputs."""
         return max(self.blocks, self.ahead) + self.spread
 
     @property
-    def error(self) -> float:
-        """Root of the larger of the two errors."""
+    def weighted_rms(self) -> float:
+        """Rms error, outputs weighted by their noise, without the spread."""
         return float(np.sqrt(max(self.blocks, self.ahead)))
 
     @property
     def rms(self) -> float:
-        """The error with all outputs alike, whatever their noise, as reports state it."""
+        """Rms error, all outputs alike, without the spread, as reports state it."""
         return float(np.sqrt(np.mean(self.squares)))
 
     @property
     def expected(self) -> float:
-        """The same with the spread for other inputs."""
+        """Rms error, all outputs alike, with the spread for other inputs."""
         return float(np.hypot(self.rms, np.sqrt(self.spread)))
 
 
