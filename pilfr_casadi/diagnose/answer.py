@@ -29,7 +29,7 @@ from .fits.floor import Floor
 from .fits.force_recovery import is_curve_along
 from .fits.workbench import Fitted, Workbench
 from .mismatch_map import mismatch
-from .posterior import NamedEffect, hypotheses_named
+from .posterior import LikelyEffect, hypotheses_named
 from .preparation import Prepared
 from .proof import Comparison, free_run_errors, next_experiment, parameter_table, placebo, test_errors
 from .result import Diagnosis
@@ -46,7 +46,7 @@ class Conclusion:
     gates: tuple[Gate, ...]
     fitted: Fitted  # the corrected simulator, or the refitted one if there is nothing to correct
     correction: Correction  # the elements that `fitted` has beside the refitted simulator
-    effects: tuple[NamedEffect, ...] = ()
+    effects: tuple[LikelyEffect, ...] = ()
     freed: str = ""  # the pinned parameters whose other values explain as much as the named laws, joined by "and"
     decided: Search | None = None  # the search that has named the effects, if it is another one
 
@@ -143,12 +143,12 @@ def _describe_noise(floor: Floor, white: Floor, bench: Workbench, compared: Comp
 
 def _compute_errors(
     request: Request, search: Search, found: Conclusion, final: FinalFits, tests: tuple[Recording, ...]
-) -> tuple[dict[str, dict[str, float] | None], dict[NamedEffect, float], Comparison | None, tuple[Gate, ...]]:
+) -> tuple[dict[str, dict[str, float] | None], dict[LikelyEffect, float], Comparison | None, tuple[Gate, ...]]:
     """Compute the table of errors (see `Diagnosis`), the test errors without each of several effects, and notes.
 
     Also returns the comparison on the test recordings, if there are any.
     """
-    bench, without, after, fewer = final.bench, final.without, final.after, dict[NamedEffect, float]()
+    bench, without, after, fewer = final.bench, final.without, final.after, dict[LikelyEffect, float]()
     notes, compared = tuple[Gate, ...](), None
     errors: dict[str, dict[str, float] | None] = {
         "train": {"nominal": final.nominal, "before": bench.nrmse(without), "after": bench.nrmse(after)},
@@ -300,11 +300,11 @@ def _blind_spots(request: Request, ready: Prepared, search: Search) -> tuple[Bli
     return ()
 
 
-def _without_each_effect(search: Search, found: Conclusion) -> dict[NamedEffect, Fitted]:
+def _without_each_effect(search: Search, found: Conclusion) -> dict[LikelyEffect, Fitted]:
     """Fit the corrected simulator without each of several named effects; empty beside a learned force."""
     if len(found.effects) < 2 or found.correction.learned or search.interrupted:
         return {}
-    joint, out = Trial.of(found.fitted, len(found.correction.elements)), dict[NamedEffect, Fitted]()
+    joint, out = Trial.of(found.fitted, len(found.correction.elements)), dict[LikelyEffect, Fitted]()
     for effect in found.effects:
         rest = search.leave_out(joint, [e for e in joint.laws if (e.port, e.law.id) == effect.name])
         if rest is not None:
@@ -314,7 +314,7 @@ def _without_each_effect(search: Search, found: Conclusion) -> dict[NamedEffect,
 
 def _make_effect(
     search: Search,
-    named: NamedEffect,
+    named: LikelyEffect,
     final: FinalFits,
     std: dict[str, np.ndarray],
     other_forms: Sequence[Law],
@@ -361,7 +361,7 @@ def _make_effect(
     )
 
 
-def _other_forms(search: Search, effects: Sequence[NamedEffect], effect: NamedEffect) -> list[Law]:
+def _other_forms(search: Search, effects: Sequence[LikelyEffect], effect: LikelyEffect) -> list[Law]:
     """List the laws of no more parameters that make another form of an effect about as likely, the likeliest first."""
     stated, law = {e.name for e in effects}, effect.element.law
     alike = hypotheses_named(search, stated)
@@ -385,7 +385,7 @@ def _order(fitted: Fitted, element: Placed) -> Iterator[str]:
 
 
 def _design_experiment(
-    search: Search, effects: Sequence[NamedEffect], limits: Mapping[str, float] | None
+    search: Search, effects: Sequence[LikelyEffect], limits: Mapping[str, float] | None
 ) -> dict[str, Any] | None:
     """Design the experiment that would separate the first tie, if there is one."""
     if search.bench.simulator.observer is not None:  # a proposed input has no outputs to be led by

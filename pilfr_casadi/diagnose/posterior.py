@@ -48,7 +48,7 @@ from .search.trials import Name, Trial
 
 
 @dataclass(frozen=True, eq=False)
-class NamedEffect:
+class LikelyEffect:
     """An effect of the likeliest hypothesis."""
 
     element: Placed
@@ -64,7 +64,7 @@ class NamedEffect:
         """Port and law id."""
         return self.element.port, self.element.law.id
 
-    def times(self, probability: float) -> NamedEffect:
+    def times(self, probability: float) -> LikelyEffect:
         """Weigh the effect by the probability of something else that it rests on."""
         return replace(self, confidence=probability * self.confidence, at_port=probability * self.at_port)
 
@@ -80,7 +80,7 @@ class Posterior:
 
     best: Trial  # the likeliest hypothesis
     named: float  # probability that the laws of the best hypothesis are the physics, given this hypothesis
-    effects: tuple[NamedEffect, ...]  # its laws, strongest first
+    effects: tuple[LikelyEffect, ...]  # its laws, strongest first
     nothing: float  # probability of the simulator alone
 
     @property
@@ -181,7 +181,7 @@ def posterior(search: Hypotheses) -> Posterior:
     return answer.acting(search, best)
 
 
-def _named_beside(search: Hypotheses, best: Trial, effect: NamedEffect) -> float:
+def _named_beside(search: Hypotheses, best: Trial, effect: LikelyEffect) -> float:
     """Compute the probability that one law of a hypothesis is the physics, from what is left of its own mismatch.
 
     A small effect may only compensate an inexact formula of a large one. Its share is therefore judged on the error
@@ -203,7 +203,7 @@ def _acts(search: Hypotheses, best: Trial, element: Placed) -> float:
     return significance(search.bench, best.fitted, names) if names else 1.0
 
 
-def _without(search: Hypotheses, best: Trial, effect: NamedEffect) -> Trial | None:
+def _without(search: Hypotheses, best: Trial, effect: LikelyEffect) -> Trial | None:
     """Return the hypothesis without one of several effects, if it was fitted."""
     others = best.names - {effect.name}
     fitted = hypotheses_named(search, others) if others else []
@@ -225,7 +225,7 @@ def _plainest(search: Hypotheses, trials: Sequence[Trial]) -> Trial:
 
 def _make_effect(
     search: Hypotheses, best: Trial, element: Placed, by_names: Mapping[frozenset[Name], float]
-) -> NamedEffect:
+) -> LikelyEffect:
     """Make an effect, with its inclusion probability given that the physics is in the catalogue."""
     twins, law = _indistinguishable(search, best, element), element.law.id
     ports = {element.port}
@@ -233,7 +233,7 @@ def _make_effect(
         ports |= set(places.split(" + ")) if other == law else set()
     included = sum(w for n, w in by_names.items() if n & {(port, law) for port in ports})
     at_port = sum(w for n, w in by_names.items() if ports & {port for port, _ in n})
-    return NamedEffect(element, included, twins, min(at_port, 1.0))
+    return LikelyEffect(element, included, twins, min(at_port, 1.0))
 
 
 def _weights(search: Hypotheses, trials: Sequence[Trial]) -> np.ndarray:
