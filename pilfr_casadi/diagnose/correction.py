@@ -109,7 +109,7 @@ class _Candidate:
         return self.fitted.cost + self.spread
 
 
-_Predicted = tuple[_Candidate, HeldOut]
+_Validated = tuple[_Candidate, HeldOut]
 
 
 def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction, Fitted]:
@@ -122,16 +122,16 @@ def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction
     best = answer.best
     if search.interrupted or _is_settled(search, answer):
         return uncompared_correction(search, best.fitted), best.fitted
-    refit = _predict_refit(search)
+    refit = _cross_validate_refit(search)
     candidates = [_Candidate.of(search, t.fitted, t) for t in _named_hypotheses(search, answer)]
-    predicted = _predict(search, candidates, refit) if refit else []
-    if search.past_deadline and (len(predicted) < 2 or _may_be_best(candidates[0], predicted)):
+    validated = _cross_validate(search, candidates, refit) if refit else []
+    if search.past_deadline and (len(validated) < 2 or _may_be_best(candidates[0], validated)):
         stays = candidates[0].base
         return replace(uncompared_correction(search, stays.fitted), closest=stays), stays.fitted
-    chosen = _choose(predicted)[0].base
+    chosen = _choose(validated)[0].base
     learned = _learned_candidates(search, search.memo[(chosen if chosen.laws else best).key])
     learned += _learned_candidates(search, search.root, taken={e.port for e in best.laws})
-    return _describe_best(search, _predict(search, learned, predicted), search.floor)
+    return _describe_best(search, _cross_validate(search, learned, validated), search.floor)
 
 
 def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
@@ -140,35 +140,35 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
     Where the time ends before a comparison, a hypothesis that is far better than the refit corrects. The floor may
     contain error that no law explains, so that shares are told of the least noise.
     """
-    refit = _predict_refit(search)
+    refit = _cross_validate_refit(search)
     candidates = [_Candidate.of(search, t.fitted, t) for t in _hypotheses_with_laws(search)]
-    predicted = _predict(search, candidates, refit) if refit else []
-    if search.past_deadline and len(predicted) < 2:
+    validated = _cross_validate(search, candidates, refit) if refit else []
+    if search.past_deadline and len(validated) < 2:
         stays = _far_better(search, candidates)
         late = uncompared_correction(search, stays.fitted, search.least_floor)
         return replace(late, late=True, closest=stays), stays.fitted
-    chosen = _choose(predicted)[0].base
+    chosen = _choose(validated)[0].base
     learned = _learned_candidates(search, search.memo[chosen.key]) if chosen.laws else []
     learned += _learned_candidates(search, search.root)
-    return _describe_best(search, _predict(search, learned, predicted), search.least_floor)
+    return _describe_best(search, _cross_validate(search, learned, validated), search.least_floor)
 
 
-def _predict_refit(search: Search) -> list[_Predicted]:
-    """Predict held-out data with the refitted simulator; empty if the time is over."""
+def _cross_validate_refit(search: Search) -> list[_Validated]:
+    """Cross-validate the refitted simulator; empty if the time is over."""
     refit = _Candidate.of(search, search.root.fitted, search.root)
-    return [] if search.past_deadline else _predict(search, [refit], [])
+    return [] if search.past_deadline else _cross_validate(search, [refit], [])
 
 
-def _describe_best(search: Search, predicted: list[_Predicted], floor: Floor) -> tuple[Correction, Fitted]:
-    """Describe the candidate with the smallest expected error, beside the refit, which was predicted first."""
-    candidate, held_out = _choose(predicted)
+def _describe_best(search: Search, validated: list[_Validated], floor: Floor) -> tuple[Correction, Fitted]:
+    """Describe the candidate with the smallest expected error, beside the refit, which comes first."""
+    candidate, held_out = _choose(validated)
     fitted, base = candidate.fitted, candidate.base
     shares = _shares(search, base.fitted, fitted, floor)
     elements: tuple[Learned, ...] = ()
     if fitted is not base.fitted:
         laws = dict.fromkeys((*CATALOGUE, *search.laws))
         elements = (describe_learned(search.bench, fitted, shares["learned"], laws),)
-    errors = predicted[0][1].rms, held_out.rms
+    errors = validated[0][1].rms, held_out.rms
     return Correction(_describe_elements(search, fitted), shares, elements, *errors, base), fitted
 
 
@@ -177,9 +177,9 @@ def _is_settled(search: Search, answer: Posterior) -> bool:
     return answer.sure > SURE and explainable_remainder(search, answer.best) < FORMULA_ERROR
 
 
-def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_Predicted]) -> list[_Predicted]:
-    """Predict held-out data with further candidates, the most promising first, as long as they can be best."""
-    out = list(predicted)
+def _cross_validate(search: Search, candidates: Sequence[_Candidate], validated: list[_Validated]) -> list[_Validated]:
+    """Cross-validate further candidates, the most promising first, as long as they can be best."""
+    out = list(validated)
     for c in sorted(candidates, key=lambda c: c.least):
         least = min((h.score for _, h in out), default=np.inf)
         if out and (c.least >= least or search.past_deadline):
@@ -191,10 +191,10 @@ def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_
     return out
 
 
-def _may_be_best(candidate: _Candidate, predicted: Sequence[_Predicted]) -> bool:
-    """Tell whether a candidate that was not predicted may have a smaller error than those that were."""
-    left_out = all(c is not candidate for c, _ in predicted)
-    return left_out and candidate.least < min(h.score for _, h in predicted)
+def _may_be_best(candidate: _Candidate, validated: Sequence[_Validated]) -> bool:
+    """Tell whether a candidate that was not cross-validated may have a smaller error than those that were."""
+    left_out = all(c is not candidate for c, _ in validated)
+    return left_out and candidate.least < min(h.score for _, h in validated)
 
 
 def _far_better(search: Search, candidates: Sequence[_Candidate]) -> Trial:
@@ -204,9 +204,9 @@ def _far_better(search: Search, candidates: Sequence[_Candidate]) -> Trial:
     return search.root if best is None or near else best.base
 
 
-def _choose(predicted: Sequence[_Predicted]) -> _Predicted:
+def _choose(validated: Sequence[_Validated]) -> _Validated:
     """Choose the candidate with the smallest expected error on other recordings."""
-    return min(predicted, key=lambda p: p[1].score)
+    return min(validated, key=lambda p: p[1].score)
 
 
 def _named_hypotheses(search: Search, answer: Posterior) -> list[Trial]:

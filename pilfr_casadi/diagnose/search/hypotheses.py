@@ -43,7 +43,7 @@ from ..fits.screen import Scored, screen
 from ..fits.workbench import DIVERGED, Fitted, Workbench
 from .trials import Key, Trial, Trials
 
-MOST_PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
+MOST_CROSS_VALIDATED = 6  # hypotheses that are cross-validated; more only until the likeliest one is
 
 
 @dataclass(eq=False, repr=False)
@@ -177,7 +177,7 @@ class Hypotheses:
         return self._judged_evidence(trial, 0.5)
 
     def _judged_evidence(self, trial: Trial, quantile: float) -> float:
-        """Compute the log evidence, with a quantile of the known ratios for a hypothesis that was not predicted."""
+        """Compute the log evidence, with a quantile of the known ratios for one that was not cross-validated."""
         known, v = self.findings[trial.key].held_out, np.inf
         if known or np.isfinite(trial.mean_square):
             ratio = self._held_out_ratio(quantile) * self._less_freedom(trial)
@@ -274,12 +274,12 @@ class Hypotheses:
             for done in itertools.count():
                 best = max(self.memo.values(), key=self.evidence)
                 unknown = [t for t in (best, *self._likeliest()) if self.findings[t.key].held_out is None]
-                if not unknown or (done >= MOST_PREDICTED and unknown[0] is not best):
+                if not unknown or (done >= MOST_CROSS_VALIDATED and unknown[0] is not best):
                     break
                 if not self.may_go_on():  # an unfinished comparison favours the hypotheses that were not judged
                     self.forget_held_out()
                     break
-                self.say("held-out blocks", done, min(done + len(unknown), max(MOST_PREDICTED, done + 1)))
+                self.say("held-out blocks", done, min(done + len(unknown), max(MOST_CROSS_VALIDATED, done + 1)))
                 self.held_out(unknown[0])
 
     def forget_held_out(self) -> None:
