@@ -21,7 +21,7 @@ from .correction import Correction
 from .detectability import port_units
 from .effect import Effect
 from .excitation import ranges_left, share_at_new_frequencies
-from .faults.channels import IN_RECORDINGS, find_gross_slips
+from .faults.channels import IN_RECORDINGS, find_gross_channel_errors
 from .faults.gates import EQUAL_RATIO, TEST_FAULT, Gate, edited, value_with_unit
 from .faults.offsets import Offset, remove_idle_offsets, update_offsets
 from .fits.evidence import FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, SURE, all_sure, standard_errors
@@ -181,15 +181,15 @@ def _test_faults(bench: Workbench, after: Fitted, tests: Sequence[Recording], ga
     for i, (r, now) in enumerate(zip(tests, edited(tests, gates), strict=True), 1):
         if not np.ptp(now.y, axis=0).all():
             continue
-        slips = find_gross_slips(replace(bench.renewed([now]), simulator=after.corrected()))
-        if not slips or slips[0].left ** 0.5 > FAR_RATIO * bench.nrmse(after):
+        faults = find_gross_channel_errors(replace(bench.renewed([now]), simulator=after.corrected()))
+        if not faults or faults[0].left ** 0.5 > FAR_RATIO * bench.nrmse(after):
             continue
         name = f"recording {r.name or i}" if len(tests) > 1 else "recording"
         place = f"In the test {name}, unlike the training recordings, "
-        equal = [g for g in slips if g.left <= EQUAL_RATIO * slips[0].left]
+        equal = [g for g in faults if g.left <= EQUAL_RATIO * faults[0].left]
         words = ", or ".join(g.sentence.removeprefix(IN_RECORDINGS) for g in equal)
         advice = "It does not tell which: check both." if len(equal) > 1 else "Correct that."
-        yield Gate(slips[0].channel, TEST_FAULT, slips[0].value, f"{place}{words}. {advice}", False)
+        yield Gate(faults[0].channel, TEST_FAULT, faults[0].value, f"{place}{words}. {advice}", False)
 
 
 def _range_note(bench: Workbench, tests: Sequence[Recording]) -> Iterator[Gate]:

@@ -22,7 +22,7 @@ from ..simulators import ACTUATOR, SENSOR, UNKNOWN, in_series, kind_of, port_nam
 from .arguments import check_laws, match_recordings, stated_hold
 from .detectability import SMALL_SHARE, LawRow, assess_laws, group_alike
 from .excitation import Excitation, excitations, single_frequency
-from .faults.channels import correct_gross_slips, refit_corrected
+from .faults.channels import correct_gross_channel_errors, refit_corrected
 from .faults.gates import USELESS_FIT, Checked, Gate
 from .faults.offsets import WrongStart, find_wrong_start
 from .faults.samples import find_held_outputs
@@ -287,7 +287,7 @@ def check(
 
 def _refit(bench: Workbench, hold_said: bool) -> Checked:
     """Refit with channels and start corrected if they are wrong, and with the better hold unless it is stated."""
-    now = correct_gross_slips(bench)
+    now = correct_gross_channel_errors(bench)
     if now is not None and now.gates:
         now = refit_corrected(now)
     elif now is None or not np.isfinite(now.cost):

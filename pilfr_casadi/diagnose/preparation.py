@@ -20,7 +20,7 @@ from ..engine import make_engine
 from ..optimise import GaussNewton, Status
 from ..simulators import Simulator, discretise_for, unit_notes
 from .arguments import stated_hold
-from .faults.channels import accept_best, find_gross_slips, find_slips, open_bench, refit_corrected
+from .faults.channels import accept_best, find_channel_errors, find_gross_channel_errors, open_bench, refit_corrected
 from .faults.gates import CURED_SHARE, EQUAL_RATIO, NEAR_NOISE_RATIO, POOR_FIT, Checked, Gate, error_ratio
 from .faults.lost_samples import find_gaps, find_output_gaps
 from .faults.offsets import find_offsets, find_wrong_start
@@ -129,9 +129,9 @@ class _Checks:
         """Refit from the user's values; correct a fault of a channel that shows at these values."""
         found: Checked | None = None
         with UntilInterrupted(bench.interrupt, self.say.interrupted):
-            slips = find_gross_slips(replace(bench, deadline=self.refit_deadline()), self.workers)
-            if slips:
-                found = self._try_gross_slips(replace(bench, deadline=self.refit_deadline()), slips, gates)
+            faults = find_gross_channel_errors(replace(bench, deadline=self.refit_deadline()), self.workers)
+            if faults:
+                found = self._try_gross_errors(replace(bench, deadline=self.refit_deadline()), faults, gates)
         return found or first_refit(replace(bench, deadline=self.refit_deadline()), gates)
 
     def begin_with_either_hold(self, bench: Workbench, gates: tuple[Gate, ...]) -> Checked:
@@ -147,7 +147,7 @@ class _Checks:
             first = min(first, self.begin(other, gates), key=lambda checked: checked.cost)
         return first
 
-    def _try_gross_slips(self, bench: Workbench, slips: Sequence[Gate], gates: tuple[Gate, ...]) -> Checked | None:
+    def _try_gross_errors(self, bench: Workbench, faults: Sequence[Gate], gates: tuple[Gate, ...]) -> Checked | None:
         """Correct the likeliest fault if the rule accepts it; None if there is no fault and every run diverges.
 
         The refit to the recordings as given gets half of the time: a slow simulator is not fitted at length to what it
@@ -156,7 +156,7 @@ class _Checks:
         brief = replace(bench, deadline=(time.perf_counter() + bench.deadline) / 2)
         plain = refit(brief, solver=THOROUGH) or brief.run_given()
         now = replace(with_observer(Checked(brief, plain, gates)), bench=bench)
-        found = accept_best(now, () if bench.interrupt.pressed else slips, self.workers)
+        found = accept_best(now, () if bench.interrupt.pressed else faults, self.workers)
         if bench.interrupt.pressed:  # half a fit accepts wrong faults
             return now if np.isfinite(now.cost) else None
         found = found.with_deadline(self.refit_deadline())
@@ -172,8 +172,9 @@ class _Checks:
         now = with_observer(first.with_deadline(self.refit_deadline())).weighted()
         now = self._in_turn(now, find_wrong_start, in_any_case=True)
         now = now.with_deadline(self.until)
-        slips, shift = partial(self._correct_slips, part=part), partial(find_time_shift, part=part, early=self.early)
-        now = self._in_turn(now, self._report(2), slips, in_any_case=True)
+        channels = partial(self._correct_channel_errors, part=part)
+        shift = partial(find_time_shift, part=part, early=self.early)
+        now = self._in_turn(now, self._report(2), channels, in_any_case=True)
         now = self._in_turn(now, self._report(3), unclip, mend_stale_samples, find_gaps)
         now = self._in_turn(now, self._report(4), _refine_steps, in_any_case=True)
         return self._in_turn(now, shift, find_output_gaps, self._report(5), find_offsets)
@@ -198,16 +199,16 @@ class _Checks:
 
         return report
 
-    def _correct_slips(self, now: Checked, part: float) -> Checked:
+    def _correct_channel_errors(self, now: Checked, part: float) -> Checked:
         """Correct wrong signs, units and exchanged channels if the refit is not at the noise, and refit."""
         if now.cost <= NEAR_NOISE_RATIO**2 * now.noise2 or np.mean(now.fitted.squares) <= CHECKED_ABOVE:
             return now
-        found = self._find_slips(now, part)
+        found = self._find_channel_errors(now, part)
         return refit_corrected(found) if found.adds_to(now) else found
 
-    def _find_slips(self, now: Checked, part: float) -> Checked:
+    def _find_channel_errors(self, now: Checked, part: float) -> Checked:
         """Find wrong signs, units and exchanged channels; or a shift, because half a period late looks like a sign."""
-        found = find_slips(now, self.workers)
+        found = find_channel_errors(now, self.workers)
         if not found.adds_to(now) or found.cost <= POOR_FIT:
             return found
         late = find_time_shift(now, part, self.early)

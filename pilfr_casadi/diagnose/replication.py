@@ -25,7 +25,7 @@ from ..data import Recording
 from ..laws import Law
 from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
 from .arguments import match_recordings, stated_hold
-from .faults.channels import correct_gross_slips
+from .faults.channels import correct_gross_channel_errors
 from .faults.gates import Checked
 from .fits.evidence import (
     FORMULA_ERROR,
@@ -97,7 +97,7 @@ def find_channel_faults(
     The simulator is refitted only if one is suspected. For arguments and errors see `replicate`.
     """
     bench = _bench(simulator, recordings, hold, engine)
-    now = correct_gross_slips(bench)
+    now = correct_gross_channel_errors(bench)
     bench.interrupt.raise_pending()
     return tuple(fault.sentence for fault in now.gates) if now else ()
 
