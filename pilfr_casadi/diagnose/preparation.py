@@ -71,13 +71,13 @@ def prepare(
     hold: str | None,
     engine: str,
     workers: int = 1,
-    early: bool = True,
+    correct_early: bool = True,
     say: Stages | None = None,
     until: float = np.inf,
 ) -> Prepared:
     """Correct faults of the recordings, refit from the user's values, and measure the noise.
 
-    Without `early`, an early channel is corrected only if no other error is left. No check begins after `until`
+    Without `correct_early`, an early channel is corrected only if no other error is left. No check begins after `until`
     (a time of `time.perf_counter`), and the fits of checks end then; a note tells if checks were left out.
     """
     say = say or Stages(lambda *_: None)
@@ -86,7 +86,7 @@ def prepare(
     slow = find_held_outputs(recordings)
     said = stated_hold(simulator, recordings, hold)
     bench, times = open_bench(simulator, recordings, said or "zero", engine)
-    checks, noted = _Checks(workers, early, say, until), (*cleaned, *slow, *times)
+    checks, noted = _Checks(workers, correct_early, say, until), (*cleaned, *slow, *times)
     held: Sequence[Gate] = ()
     if said:
         first = checks.begin(bench, noted)
@@ -116,7 +116,7 @@ class _Checks:
     """The checks of recordings in their order; `left_out` receives the first of each run that was not begun."""
 
     workers: int
-    early: bool
+    correct_early: bool
     say: Stages
     until: float
     left_out: list[Callable[[Checked], Checked]] = field(default_factory=list)
@@ -167,13 +167,13 @@ class _Checks:
         bench, values, states = found.bench, found.fitted.values, found.fitted.initial
         return replace(found, fitted=bench.fit(bench.simulator, [values], states=states, solver=THOROUGH))
 
-    def run(self, first: Checked, part: float) -> Checked:
-        """Correct one fault after the other from the first refit on; `part` is the unit of shifts, see `timing`."""
+    def run(self, first: Checked, shift_step: float) -> Checked:
+        """Correct one fault after the other from the first refit on; for `shift_step` see `timing`."""
         now = with_observer(first.with_deadline(self.refit_deadline())).weighted()
         now = self._in_turn(now, find_wrong_start, in_any_case=True)
         now = now.with_deadline(self.until)
-        channels = partial(self._correct_channel_errors, part=part)
-        shift = partial(find_time_shift, part=part, early=self.early)
+        channels = partial(self._correct_channel_errors, shift_step=shift_step)
+        shift = partial(find_time_shift, shift_step=shift_step, correct_early=self.correct_early)
         now = self._in_turn(now, self._report(2), channels, in_any_case=True)
         now = self._in_turn(now, self._report(3), unclip, mend_stale_samples, find_gaps)
         now = self._in_turn(now, self._report(4), _refine_steps, in_any_case=True)
@@ -199,19 +199,19 @@ class _Checks:
 
         return report
 
-    def _correct_channel_errors(self, now: Checked, part: float) -> Checked:
+    def _correct_channel_errors(self, now: Checked, shift_step: float) -> Checked:
         """Correct wrong signs, units and exchanged channels if the refit is not at the noise, and refit."""
         if now.cost <= NEAR_NOISE_RATIO**2 * now.noise2 or np.mean(now.fitted.squares) <= CHECKED_ABOVE:
             return now
-        found = self._find_channel_errors(now, part)
+        found = self._find_channel_errors(now, shift_step)
         return refit_corrected(found) if found.adds_to(now) else found
 
-    def _find_channel_errors(self, now: Checked, part: float) -> Checked:
+    def _find_channel_errors(self, now: Checked, shift_step: float) -> Checked:
         """Find wrong signs, units and exchanged channels; or a shift, because half a period late looks like a sign."""
         found = find_channel_errors(now, self.workers)
         if not found.adds_to(now) or found.cost <= POOR_FIT:
             return found
-        late = find_time_shift(now, part, self.early)
+        late = find_time_shift(now, shift_step, self.correct_early)
         return late if late.cost < CURED_SHARE * found.cost else found
 
 

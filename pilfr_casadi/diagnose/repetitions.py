@@ -108,7 +108,7 @@ def run_search(request: Request) -> Attempt:
     If a channel proves shifted beside a law, repeat with it at its right times. If a wrong zero was preferred to a
     wrong start, repeat with the start unknown.
     """
-    first = _search_once(request, shift_early=True)
+    first = _search_once(request, correct_early=True)
     if first.search.shift is not None:
         return _search_realigned(request, first, first.search.shift)
     start = next((g.otherwise for g in first.ready.gates if isinstance(g, WrongStart) and g.otherwise), None)
@@ -118,7 +118,7 @@ def run_search(request: Request) -> Attempt:
     leads = any(isinstance(g, TimeShift) and g.leads for g in first.ready.gates)
     if not leads or search.cut_short or not search.can_improve(search.best):
         return first
-    other = _again(first, partial(_search_once, request, shift_early=False))
+    other = _again(first, partial(_search_once, request, correct_early=False))
     if other is None:
         return first
     before2, after2 = first.compared_with(other)
@@ -135,7 +135,7 @@ def _search_realigned(request: Request, first: Attempt, shift: Gate) -> Attempt:
     moved = replace(request.corrected((*edits, shift), first.ready.nominal, "shifted: "), aligned=True)
     search = first.search
     search.shift, search.aligned = None, True
-    other = _again(first, partial(_search_once, moved, shift_early=True))
+    other = _again(first, partial(_search_once, moved, correct_early=True))
     if other is None:
         if not search.interrupted:
             search.run(request.most_effects)
@@ -154,7 +154,7 @@ def _search_from_unknown_start(request: Request, first: Attempt, start: WrongSta
     unknown, free initial states and an offset together make up for a part of it.
     """
     opened = request.corrected((start,), first.ready.nominal, "unknown start: ")
-    other = _again(first, partial(_search_once, opened, shift_early=True))
+    other = _again(first, partial(_search_once, opened, correct_early=True))
     if other is None:
         return request, first
     again = other.search
@@ -179,7 +179,7 @@ def _again(first: Attempt, prepare_and_search: Callable[[], Attempt]) -> Attempt
     return found
 
 
-def _search_once(request: Request, shift_early: bool) -> Attempt:
+def _search_once(request: Request, correct_early: bool) -> Attempt:
     """Check and correct the recordings, refit the simulator, measure the noise, and search from there."""
     began = time.perf_counter()
     left = request.deadline - began
@@ -189,7 +189,7 @@ def _search_once(request: Request, shift_early: bool) -> Attempt:
         hold=request.hold,
         engine=request.engine,
         workers=request.workers,
-        early=shift_early,
+        correct_early=correct_early,
         say=request.say,
         until=began + PREPARATION_SHARE * left,
     )

@@ -235,11 +235,11 @@ class Search(Hypotheses):
         first = dict[tuple[str, str], Trial]()  # of each law the likeliest form, the likeliest laws first
         for trial in sorted(plain, key=self.optimistic_evidence, reverse=True):
             first.setdefault((trial.port, trial.law.id), trial)
-        best, part = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_said else 0.5
+        best, shift_step = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_said else 0.5
         with self.stage("shifts beside a law"):
             for trial in list(first.values())[:FEW] if self.may_go_on() else ():
                 bench = replace(self.bench, simulator=trial.fitted.simulator)
-                found = find_time_shift(Checked(bench, trial.fitted), part, given=False)
+                found = find_time_shift(Checked(bench, trial.fitted), shift_step, given=False)
                 shift = found.gates[0] if found.gates else None
                 if isinstance(shift, TimeShift) and shift.leads and found.cost < best:
                     beside = name_at(trial.port, trial.law.id, trial.law.form)
