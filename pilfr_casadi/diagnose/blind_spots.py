@@ -279,20 +279,20 @@ def check(
     simulator, recordings = match_recordings(simulator, train, hold)
     wanted = None if laws is None else check_laws(laws)
     stated = stated_hold(simulator, recordings, hold)
-    now = _refit(Workbench.of(simulator, recordings, stated or "zero", engine), hold_said=stated is not None)
+    now = _refit(Workbench.of(simulator, recordings, stated or "zero", engine), hold_stated=stated is not None)
     found = assess_recordings(now.bench, now.fitted, now.floor, stated or "", wanted)
     slow = find_held_outputs(recordings)
     return _with_faults(found, now.gates, slow, recordings) if now.gates or slow else found
 
 
-def _refit(bench: Workbench, hold_said: bool) -> Checked:
+def _refit(bench: Workbench, hold_stated: bool) -> Checked:
     """Refit with channels and start corrected if they are wrong, and with the better hold unless it is stated."""
     now = correct_gross_channel_errors(bench)
     if now is not None and now.gates:
         now = refit_corrected(now)
     elif now is None or not np.isfinite(now.cost):
         now = Checked(bench, bench.fit(bench.simulator))
-    if not hold_said:
+    if not hold_stated:
         now = choose_hold(now, QUICK)[0]
     now = find_wrong_start(now)
     now.bench.interrupt.raise_pending()  # half a fit would tell wrong things

@@ -308,9 +308,9 @@ def _conclude_named(
     search: Search, judged: _Judged, elsewhere: Sequence[Gate], correction: Correction, fitted: Fitted
 ) -> Conclusion:
     """State the named effects, and the offsets beside them."""
-    said = f"{judged.verdict.sentence} {correction.sentence}" if correction.learned else judged.verdict.sentence
+    sentence = f"{judged.verdict.sentence} {correction.sentence}" if correction.learned else judged.verdict.sentence
     notes = (*judged.gates, *elsewhere, *list_offsets(search.added_laws(fitted), fitted.values))
-    return Conclusion(Verdict(judged.kind, said), notes, fitted, correction, judged.answer.effects)
+    return Conclusion(Verdict(judged.kind, sentence), notes, fitted, correction, judged.answer.effects)
 
 
 def _conclude_interrupted(search: Search, judged: _Judged, came_to_an_answer: bool) -> Conclusion:
@@ -318,9 +318,9 @@ def _conclude_interrupted(search: Search, judged: _Judged, came_to_an_answer: bo
     correction, fitted = find_unnamed_correction(search)
     error = percent(search.bench.nrmse(search.root.fitted))
     off = f"Refitted, the simulator is off by {error} of the outputs' deviation."
-    said = correction.sentence if correction.elements else off
     none = "The search was interrupted before it came to an answer."
-    sentence = f"{judged.verdict.sentence if came_to_an_answer else none} {said}"
+    answer = judged.verdict.sentence if came_to_an_answer else none
+    sentence = f"{answer} {correction.sentence if correction.elements else off}"
     return Conclusion(Verdict(judged.kind, sentence), judged.gates, fitted, correction)
 
 
@@ -329,8 +329,8 @@ def _conclude_unexplained(search: Search, judged: _Judged, elsewhere: Sequence[G
     correction, fitted = find_unnamed_correction(search)
     verdict = judge(search, judged.answer, judged.gates, correction.closest)
     where = [f"{g.value} in the equation of {g.channel} explains it" for g in elsewhere]
-    said = f"Physics is missing, but hardly at a declared port: {where[0]}." if where else verdict.sentence
-    return Conclusion(Verdict(verdict.kind, f"{said} {correction.sentence}"), judged.gates, fitted, correction)
+    answer = f"Physics is missing, but hardly at a declared port: {where[0]}." if where else verdict.sentence
+    return Conclusion(Verdict(verdict.kind, f"{answer} {correction.sentence}"), judged.gates, fitted, correction)
 
 
 # naming in predictions

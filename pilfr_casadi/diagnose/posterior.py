@@ -110,9 +110,9 @@ class Posterior:
         return replace(self, named=self.named / (1 + odds), effects=effects)
 
 
-def hypotheses_named(search: Hypotheses, said: Collection[Name]) -> list[Trial]:
+def hypotheses_named(search: Hypotheses, wanted: Collection[Name]) -> list[Trial]:
     """List the hypotheses whose effects have these ports and law ids; an effect may have several forms."""
-    return [t for t in search.memo.values() if t.names == said]
+    return [t for t in search.memo.values() if t.names == wanted]
 
 
 def explainable_remainder(search: Hypotheses, trial: Trial, before: Trial | None = None) -> float:
@@ -163,17 +163,17 @@ def posterior(search: Hypotheses) -> Posterior:
     by_names: dict[frozenset[Name], float] = {}
     for t, w in zip(trials, weights, strict=True):
         by_names[t.names] = by_names.get(t.names, 0.0) + float(w)
-    said = max(by_names, key=lambda n: by_names[n])
+    likeliest_names = max(by_names, key=lambda n: by_names[n])
     while True:
-        best = _plainest(search, hypotheses_named(search, said))
-        if not said:
-            return Posterior(best, 0.0, (), by_names[said])
+        best = _plainest(search, hypotheses_named(search, likeliest_names))
+        if not likeliest_names:
+            return Posterior(best, 0.0, (), by_names[likeliest_names])
         found = [_make_effect(search, best, e, by_names) for e in best.effects]
         least = min(found, key=lambda e: e.confidence)
-        fewer = said - {least.name}
+        fewer = likeliest_names - {least.name}
         if least.confidence > SURE or fewer not in by_names or not fewer:
             break
-        said = fewer
+        likeliest_names = fewer
     named = share_named(explainable_remainder(search, best), _odds_against(search, best, best.effects))
     effects = (e.times(_named_beside(search, best, e)) for e in found)
     strongest_first = sorted(effects, key=lambda e: -(_without(search, best, e) or search.root).mean_square)

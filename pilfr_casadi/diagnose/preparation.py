@@ -84,19 +84,19 @@ def prepare(
     say(CHECKS, 0, CHECKED)
     recordings, cleaned = clean_recordings(recordings)
     slow = find_held_outputs(recordings)
-    said = stated_hold(simulator, recordings, hold)
-    bench, times = open_bench(simulator, recordings, said or "zero", engine)
+    stated = stated_hold(simulator, recordings, hold)
+    bench, times = open_bench(simulator, recordings, stated or "zero", engine)
     checks, noted = _Checks(workers, correct_early, say, until), (*cleaned, *slow, *times)
     held: Sequence[Gate] = ()
-    if said:
+    if stated:
         first = checks.begin(bench, noted)
     else:
         first, held = choose_hold(checks.begin_with_either_hold(bench, noted).with_deadline(checks.refit_deadline()))
     nominal = errors_of(replace(bench, hold=first.bench.hold), first.fitted.model)
     say(CHECKS, 1, CHECKED)
-    now = checks.run(first, 1.0 if said else 0.5)
+    now = checks.run(first, 1.0 if stated else 0.5)
     faulty = any(g.fault for g in now.gates[len(first.gates) :])
-    if not said and faulty and not bench.interrupt.pressed:  # on faulty data the better hold says nothing
+    if not stated and faulty and not bench.interrupt.pressed:  # on faulty data the better hold says nothing
         now, held = _with_better_hold(checks, now, first, held)
     bench, without = now.bench, now.fitted
     cut_short = checks.left_out or bench.interrupt.pressed

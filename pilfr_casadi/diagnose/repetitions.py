@@ -70,7 +70,7 @@ def _search_both_holds(request: Request) -> Attempt:
     """Search; if nobody stated the hold of the inputs and it matters, use the hold with the smaller error."""
     first = run_search(request)
     search = first.search
-    if search.hold_said or not _prefers_other_hold(search):
+    if search.hold_stated or not _prefers_other_hold(search):
         return first
     hold = search.bench.with_other_hold().hold
     held = replace(request, hold=hold, say=request.say.under("other hold: "))
@@ -207,7 +207,7 @@ def _search_once(request: Request, correct_early: bool) -> Attempt:
         laws=(*request.laws, Offset),
         workers=request.workers,
         say=request.say,
-        hold_said=request.hold_said,
+        hold_stated=request.hold_stated,
         aligned=request.aligned,
         stand_in_error=request.stand_in_error,
         until=began + SEARCH_SHARE * left,

@@ -124,29 +124,29 @@ class ResultText:
 
         It also says if no test recording shows what the correction is worth.
         """
-        errors, said = self.errors.get("test"), self.sentence
-        untold = self.out_of_time and "time limit" not in said
+        errors, text = self.errors.get("test"), self.sentence
+        untold = self.out_of_time and "time limit" not in text
         if untold or (self.effects and (self.interrupted or self.out_of_time)):
             by = "Ctrl-C" if self.interrupted else "the time limit"
-            said += f" The search was cut short by {by}, so that a further effect may not have been tried."
+            text += f" The search was cut short by {by}, so that a further effect may not have been tried."
         if not errors:
             untested = " This correction is not tested yet: give a recording of another experiment as test."
-            return said + untested if self._changed else said
+            return text + untested if self._changed else text
         if self.test_fault:
-            return f"{said} {self.test_fault} Until then the test error says nothing of this answer."
+            return f"{text} {self.test_fault} Until then the test error says nothing of this answer."
         given, before, after = (_percent(errors[k]) for k in ("nominal", "before", "after"))
         if self.outcome == "same":
-            said += f" On the test recordings it makes no difference: {before} before, {after} after."
+            text += f" On the test recordings it makes no difference: {before} before, {after} after."
         elif self.outcome == "worse":
-            said += (
+            text += (
                 f" But this correction makes the test recordings worse: their error is {before} refitted "
                 f"and {after} with it. Do not use it as a correction.{self._better_without()}"
             )
         else:
-            said += self._idle_on_tests()
+            text += self._idle_on_tests()
         if BETTER_RATIO * errors["nominal"] < min(errors["before"], errors["after"]):
-            said += f" As given, the simulator follows the test recordings better than with any fit here: {given}."
-        return said
+            text += f" As given, the simulator follows the test recordings better than with any fit here: {given}."
+        return text
 
     def worth(self, effect: Effect) -> str:
         """State the test error with and without one of several effects; empty if it is unknown."""

@@ -152,15 +152,15 @@ def _describe_effects(search: Hypotheses, found: Posterior) -> str:
     there = in_words(list(dict.fromkeys(e.element.port for e in found.effects if not e.confidence > SURE)))
     certain = f"not certain, only that something acts at {there}" if placed else "not certain"
     if not unsure:
-        said = f"The simulator leaves out {sure}."
+        sentence = f"The simulator leaves out {sure}."
     elif not sure:
         the = "these" if " and " in unsure else "the"
-        said = f"The simulator most likely leaves out {unsure}; {the} {names_are} {certain}."
+        sentence = f"The simulator most likely leaves out {unsure}; {the} {names_are} {certain}."
     else:
         these = "these" if " and " in unsure else "this"
         more = f"More acts beside that, most likely {unsure}; {these} {names_are} {certain}."
-        said = f"The simulator leaves out {sure}. {more}"
-    return said + _describe_vanished(search, found)
+        sentence = f"The simulator leaves out {sure}. {more}"
+    return sentence + _describe_vanished(search, found)
 
 
 def _describe_vanished(search: Hypotheses, found: Posterior) -> str:

@@ -265,8 +265,8 @@ def accept_best(now: Checked, faults: Sequence[Gate], workers: int = 1) -> Check
     rest = [one for one in found if one[0] is not fault and one[0].finding == fault.finding == "unit"]
     equal = [f.sentence.removeprefix(IN_RECORDINGS) for f, a in rest if CLEARLY_BETTER * a.cost < after.cost]
     if equal:
-        said = f"{fault.sentence}; or else {'; or '.join(equal)}: these recordings do not tell which"
-        fault = replace(fault, sentence=said)
+        sentence = f"{fault.sentence}; or else {'; or '.join(equal)}: these recordings do not tell which"
+        fault = replace(fault, sentence=sentence)
     return accept(now, after, fault)
 
 

@@ -74,7 +74,7 @@ class Hypotheses:
     laws: Sequence[type[Law]]
     workers: int
     say: Stages
-    hold_said: bool = True  # whether somebody stated the hold of the inputs between samples
+    hold_stated: bool = True  # whether somebody stated the hold of the inputs between samples
     stand_in_error: float = 0.0  # NRMSE between a surrogate and its simulation; the floor contains it
     until: float = np.inf  # time (of `time.perf_counter`) at which the search ends
     memo: dict[Key, Trial] = field(default_factory=dict)  # the best trial of every fitted hypothesis, by key

@@ -95,7 +95,7 @@ class Search(Hypotheses):
 
     def resume(self, effects: float) -> None:
         """Continue with the present hold because the other is no better, unless the search was interrupted."""
-        self.hold_said = True
+        self.hold_stated = True
         if not self.interrupted:
             self.run(effects)
 
@@ -131,7 +131,7 @@ class Search(Hypotheses):
             self.add(parent)
             if not parent.laws and self.may_go_on() and self._escape_local_minimum():
                 self.add(self.root)
-            self.other_hold = not self.hold_said and self.prefers_other_hold()
+            self.other_hold = not self.hold_stated and self.prefers_other_hold()
             if not parent.laws and not self.must_repeat:
                 self._find_shift()
             if self.must_repeat:
@@ -235,7 +235,7 @@ class Search(Hypotheses):
         first = dict[tuple[str, str], Trial]()  # of each law the likeliest form, the likeliest laws first
         for trial in sorted(plain, key=self.optimistic_evidence, reverse=True):
             first.setdefault((trial.port, trial.law.id), trial)
-        best, shift_step = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_said else 0.5
+        best, shift_step = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_stated else 0.5
         with self.stage("shifts beside a law"):
             for trial in list(first.values())[:FEW] if self.may_go_on() else ():
                 bench = replace(self.bench, simulator=trial.fitted.simulator)
