@@ -95,7 +95,7 @@ def build_diagnosis(
         effects=effects,
         candidates=tuple(_candidate_row(decided, t, step.parent) for step in decided.passes for t in step.trials),
         gates=(
-            *_surrogate_note(request.stand_in_error),
+            *_surrogate_note(request.surrogate_nrmse),
             *_convergence_note(after),
             *test_notes,
             *_combination_note(after, std, blind_spots),

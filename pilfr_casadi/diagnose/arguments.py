@@ -42,7 +42,7 @@ class Request:
     engine: str
     workers: int
     most_effects: float
-    stand_in_error: float
+    surrogate_nrmse: float
     deadline: float
     say: Stages
     focus: str | None = None

@@ -177,7 +177,7 @@ def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[tu
                 search.workers,
                 search.say,
                 aligned=True,
-                stand_in_error=search.stand_in_error,
+                surrogate_nrmse=search.surrogate_nrmse,
                 until=search.until,
             )
             there.alternatives |= {port: laws for port, laws in search.alternatives.items() if in_series(port)}

@@ -125,7 +125,7 @@ def diagnose_in_steps(
         engine=engine,
         workers=workers,
         most_effects=most_effects,
-        stand_in_error=stand_in_error,
+        surrogate_nrmse=stand_in_error,
         deadline=deadline,
         say=say,
         focus=focus,

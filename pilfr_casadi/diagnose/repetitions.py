@@ -209,7 +209,7 @@ def _search_once(request: Request, correct_early: bool) -> Attempt:
         say=request.say,
         hold_stated=request.hold_stated,
         aligned=request.aligned,
-        stand_in_error=request.stand_in_error,
+        surrogate_nrmse=request.surrogate_nrmse,
         until=began + SEARCH_SHARE * left,
         times={CHECKS: time.perf_counter() - began},
     )
@@ -221,6 +221,6 @@ def _noise(request: Request, ready: Prepared) -> Floor:
     floor = ready.floor
     if request.stretches is not None and floor.source == "estimated":  # what repeats may be outside the stretches
         floor = measured_floor(request.stretches.everything(ready.bench, ready.gates).recordings) or floor
-    if not request.stand_in_error:
+    if not request.surrogate_nrmse:
         return floor
-    return floor.beside(request.stand_in_error * ready.bench.scale)
+    return floor.beside(request.surrogate_nrmse * ready.bench.scale)

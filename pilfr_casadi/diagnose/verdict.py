@@ -49,11 +49,12 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
     `closest` is the hypothesis that an unexplained mismatch is compared with, by default the most promising with a law.
     """
     off = search.bench.nrmse(search.root.fitted)
-    if search.stand_in_error and off < NEAR_RATIO * search.stand_in_error:
+    surrogate = search.surrogate_nrmse
+    if surrogate and off < NEAR_RATIO * surrogate:
         return Verdict(
             "complete",
             "Nothing is seen that the simulation lacks: refitted, what stands for it follows the recordings to "
-            f"{percent(off)} of the outputs' deviation, and the simulation itself to {percent(search.stand_in_error)}.",
+            f"{percent(off)} of the outputs' deviation, and the simulation itself to {percent(surrogate)}.",
         )
     fault = min((g for g in gates if g.fault), key=lambda g: g.left, default=None)
     cured = fault is not None and fault.left < FORMULA_ERROR

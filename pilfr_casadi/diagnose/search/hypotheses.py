@@ -75,7 +75,7 @@ class Hypotheses:
     workers: int
     say: Stages
     hold_stated: bool = True  # whether somebody stated the hold of the inputs between samples
-    stand_in_error: float = 0.0  # NRMSE between a surrogate and its simulation; the floor contains it
+    surrogate_nrmse: float = 0.0  # NRMSE between a surrogate and its simulation; the floor contains it
     until: float = np.inf  # time (of `time.perf_counter`) at which the search ends
     memo: dict[Key, Trial] = field(default_factory=dict)  # the best trial of every fitted hypothesis, by key
     alternatives: dict[str, tuple[Law, ...]] = field(default_factory=dict)
@@ -345,7 +345,7 @@ class Hypotheses:
         if self.floor.source != "estimated":
             return self.floor
         white = white_part(self.bench.scored(self.best.fitted.residual))
-        white = np.hypot(white, self.stand_in_error * self.bench.scale)
+        white = np.hypot(white, self.surrogate_nrmse * self.bench.scale)
         return Floor(white, self.floor.source)
 
     @property
@@ -411,7 +411,7 @@ class Hypotheses:
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
         share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
         rest = np.minimum(np.sqrt(share) * self.rms(best), LOUDEST_NOISE * self.bench.scale)
-        known, white = self.stand_in_error * self.bench.scale, white_part(self.bench.scored(best.fitted.residual))
+        known, white = self.surrogate_nrmse * self.bench.scale, white_part(self.bench.scored(best.fitted.residual))
         noise = np.minimum(np.hypot(np.maximum(white, rest), known), self.rms(nearest))
         self.floor = Floor(noise, "estimated")
 
