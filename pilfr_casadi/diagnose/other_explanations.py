@@ -29,7 +29,7 @@ from .faults.gates import (
     USELESS_FIT,
     Gate,
     describe_fall,
-    gain,
+    evidence_gain,
     open_start,
     value_with_unit,
 )
@@ -89,7 +89,7 @@ def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameter
         # any value equals a law that hardly explains anything
         if (
             best.cost <= enough
-            and gain(without.cost, best.cost, search.bench.scored(best.residual), len(freed)) > LEAST_GAIN
+            and evidence_gain(without.cost, best.cost, search.bench.scored(best.residual), len(freed)) > LEAST_GAIN
         ):
             return PinnedParameters(freed, best, _describe_pinned(search, freed, best, named))
     return None
@@ -272,7 +272,9 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
     more_starts = sum(len(part.recordings) for part in benches) - len(bench.recordings)
     more = whole.model.parameters.free.sum() * (len(fits) - 1) + whole.model.initial_basis.shape[1] * more_starts
     residual = [e for part, f in zip(benches, fits, strict=True) for e in part.scored(f.residual)]
-    if cost > CURED_SHARE * whole.cost or gain(whole.cost, max(cost, search.floor2), residual, more) < LEAST_GAIN:
+    if cost > CURED_SHARE * whole.cost:
+        return None
+    if evidence_gain(whole.cost, max(cost, search.floor2), residual, more) < LEAST_GAIN:
         return None
     values = _clearest_differences(whole, fits, benches)
     if not values:

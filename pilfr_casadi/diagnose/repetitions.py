@@ -24,7 +24,7 @@ import numpy as np
 
 from .._base import InputError
 from .arguments import Request, stated_hold
-from .faults.gates import LEAST_GAIN, USELESS_FIT, Checked, Gate, error_ratio, gain
+from .faults.gates import LEAST_GAIN, USELESS_FIT, Checked, Gate, error_ratio, evidence_gain
 from .faults.offsets import Offset, WrongStart
 from .faults.timing import TimeShift
 from .fits.evidence import AS_GIVEN_RATIO
@@ -162,7 +162,7 @@ def _search_from_unknown_start(request: Request, first: Attempt, start: WrongSta
     unknown = changed * len(opened.simulator.states)
     residuals = again.bench.scored(again.best.fitted.residual)
     explained = not again.can_improve(again.best)
-    if explained and gain(*first.compared_with(other), residuals, unknown) > LEAST_GAIN:
+    if explained and evidence_gain(*first.compared_with(other), residuals, unknown) > LEAST_GAIN:
         return opened, other
     return request, first
 

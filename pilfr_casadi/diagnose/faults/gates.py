@@ -184,7 +184,7 @@ class Checked:
 # the one rule
 
 
-def gain(before: float, after: float, residuals: Sequence[np.ndarray], parameters: int = 1) -> float:
+def evidence_gain(before: float, after: float, residuals: Sequence[np.ndarray], parameters: int = 1) -> float:
     """Compute the gain in log evidence, nats, of a fit with more parameters, by BIC on its effective samples.
 
     `residuals` (M, n_y) are its scored samples in each recording.
@@ -200,7 +200,7 @@ def error_ratio(one: float, other: float) -> float:
 
 def follows_better(one: float, other: float, residuals: Sequence[np.ndarray]) -> bool:
     """Tell whether an edit that leaves the mean square `one` is clearly better than another of as many parameters."""
-    return one < CLEARLY_BETTER * other and gain(other, one, residuals, 0) > LEAST_GAIN
+    return one < CLEARLY_BETTER * other and evidence_gain(other, one, residuals, 0) > LEAST_GAIN
 
 
 def value_with_unit(value: float, unit: str, digits: int = 3) -> str:
@@ -275,7 +275,7 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
 
 def satisfies_rule(before: float, after: Checked, fault: Gate) -> bool:
     """Tell whether the rule accepts a fault whose correction reduces the mean square error `before`."""
-    gained = gain(before, after.cost, after.residuals, fault.parameters)
+    gained = evidence_gain(before, after.cost, after.residuals, fault.parameters)
     return gained > LEAST_GAIN and after.cost < min(fault.most_left * before, USELESS_FIT)
 
 
