@@ -78,7 +78,7 @@ from .posterior import Posterior, posterior
 from .prediction import drift_note, drifts, predictor
 from .preparation import Prepared, conversions, slow_note
 from .proof import errors_of
-from .repetitions import run_search, search_with_focus
+from .repetitions import search_with_one_hold, search_with_repetitions
 from .result import Diagnosis
 from .search.moves import Search
 from .search.stretches import SEARCHED_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
@@ -133,7 +133,7 @@ def diagnose_in_steps(
         calls=calls,
     )
     most = SEARCHED_SAMPLES if search_samples is None else whole(search_samples, "search_samples", FEWEST_SAMPLES)
-    request, first = search_with_focus(_on_stretches(request, most))
+    request, first = search_with_repetitions(_on_stretches(request, most))
     ready, search = first.ready, first.search
     request, everything = _fit_to_everything(request, ready, search)
     found = _concluded(search, (*request.notes, *ready.gates))
@@ -347,7 +347,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
     say, hold = request.say.under("predictions: "), search.bench.hold
     try:
         led, memory = predictor(request.simulator, request.recordings, hold, request.engine)
-        leading = run_search(replace(request, simulator=led, hold=hold, focus="prediction", say=say)).search
+        leading = search_with_one_hold(replace(request, simulator=led, hold=hold, focus="prediction", say=say)).search
     except InputError:
         return found
     search.cut_short_with(leading)

@@ -8,8 +8,10 @@ There are five cases:
 - If a channel proves shifted only beside the first law, search with it at its right times.
 - If a wrong zero was preferred to a wrong start, search from unknown initial states.
 
-A sixth, in predictions, is `pipeline._name_in_predictions`. Each search fits different data. Its evidence is therefore
-not comparable; the smaller error decides.
+A sixth, in predictions, is `pipeline._name_in_predictions`. The functions are nested: `search_with_repetitions` calls
+`_search_with_either_hold`, that calls `search_with_one_hold`, and that `_search_once`.
+
+Each search fits different data. Its evidence is therefore not comparable; the smaller error decides.
 """
 
 from __future__ import annotations
@@ -50,11 +52,11 @@ class Attempt:
         return self.search.best.mean_square, self.search.bench.pool(other.search.best.fitted.squares)
 
 
-def search_with_focus(request: Request) -> tuple[Request, Attempt]:
+def search_with_repetitions(request: Request) -> tuple[Request, Attempt]:
     """Search; if nobody stated the focus and the simulator runs away, correct its states by an observer."""
     if request.focus != "prediction":
         try:
-            return request, _search_both_holds(request)
+            return request, _search_with_either_hold(request)
         except RunsAway:  # by `Workbench`, in the first refit or as the check of it in `_search_once`
             if request.focus == "simulation" or not can_be_led(request.simulator, request.recordings):
                 raise
@@ -63,18 +65,18 @@ def search_with_focus(request: Request) -> tuple[Request, Attempt]:
     led, memory = predictor(request.simulator, request.recordings, hold, request.engine)
     note = prediction_note(request.simulator, request.recordings, memory)
     request = replace(request, simulator=led, notes=(*request.notes, note))
-    return request, _search_both_holds(request)
+    return request, _search_with_either_hold(request)
 
 
-def _search_both_holds(request: Request) -> Attempt:
+def _search_with_either_hold(request: Request) -> Attempt:
     """Search; if nobody stated the hold of the inputs and it matters, use the hold with the smaller error."""
-    first = run_search(request)
+    first = search_with_one_hold(request)
     search = first.search
     if search.hold_stated or not _prefers_other_hold(search):
         return first
     hold = search.bench.with_other_hold().hold
     held = replace(request, hold=hold, say=request.say.under("other hold: "))
-    other = _again(first, partial(run_search, held))
+    other = _again(first, partial(search_with_one_hold, held))
     if other is None:
         search.resume(request.most_effects)
         return first
@@ -102,7 +104,7 @@ def _prefers_other_hold(search: Search) -> bool:
     return prefers
 
 
-def run_search(request: Request) -> Attempt:
+def search_with_one_hold(request: Request) -> Attempt:
     """Prepare and search; if a lead was corrected, repeat without, and keep that if it is clearly better.
 
     If a channel proves shifted beside a law, repeat with it at its right times. If a wrong zero was preferred to a
