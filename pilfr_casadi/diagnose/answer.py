@@ -33,6 +33,7 @@ from .posterior import LikelyEffect, hypotheses_named
 from .preparation import Prepared
 from .proof import Comparison, free_run_errors, next_experiment, parameter_table, placebo, test_errors
 from .result import Diagnosis
+from .result_text import Basis
 from .search.moves import Search
 from .search.trials import Trial
 from .verdict import Verdict
@@ -117,7 +118,7 @@ def build_diagnosis(
         times={**search.times, "proof": now - proving},
         interrupted=search.interrupted,
         out_of_time=search.out_of_time,
-        evidence={"search": search, "noise": floor.deviation, "without": final.drawn[0], "after": final.drawn[1]},
+        evidence=Basis(search, floor.deviation, without=final.drawn[0], after=final.drawn[1]),
         substeps=after.model.substeps,
         freed=found.freed,
         correction=found.correction,

@@ -175,8 +175,8 @@ def refine(diagnosis: Any, operators: int, kind: str | None, port: str | None) -
     check_size("A layer", 2 * n)
     if kind is not None and kind not in OPERATORS:
         raise InputError(f"kind = {kind!r} was given; give {', '.join(map(repr, OPERATORS))}, or None to try them.")
-    search, after = (diagnosis.evidence.get(name) for name in ("search", "after"))
-    if not isinstance(search, Search) or not isinstance(after, Fitted):
+    search, after = diagnosis.evidence.search, diagnosis.evidence.after
+    if search is None or after is None:
         raise InputError("This diagnosis does not hold its search; refine one that `diagnose` has just returned.")
     search.bench = replace(search.bench, interrupt=Interrupt())  # an interrupt of an earlier one is over
     samples = sum(len(r) - r.skip for r in search.bench.recordings)
@@ -361,7 +361,7 @@ def _initial_state(after: Fitted, state: np.ndarray, number: int, law: Law, z: f
 def _build_refinement(
     diagnosis: Any, bench: Workbench, kind: str, fitted: Fitted, number: int, held_out: Mapping[str, HeldOut]
 ) -> Refinement:
-    element, after = fitted.simulator.elements[number], diagnosis.evidence["after"]
+    element, after = fitted.simulator.elements[number], diagnosis.evidence.after
     values, port = element.own(fitted.values), element.port
     refined = diagnosis.with_fit(fitted)
     errors: dict[str, dict[str, float] | None] = {

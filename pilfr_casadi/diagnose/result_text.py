@@ -34,6 +34,16 @@ OUT_OF_TIME = (
 
 
 @dataclass(frozen=True, eq=False)
+class Basis:
+    """The search and the fits on which a diagnosis rests; None where one is unknown."""
+
+    search: Any = None  # the `Search`
+    noise: np.ndarray | None = None  # standard deviation of each output's noise, (n_y,)
+    without: Any = None  # the refitted simulator, as `Fitted` to the recordings of the search
+    after: Any = None  # the corrected one
+
+
+@dataclass(frozen=True, eq=False)
 class ResultText:
     """The data of a `Diagnosis`, which are described there, and what they say in words."""
 
@@ -56,7 +66,7 @@ class ResultText:
     times: Mapping[str, float] = field(default_factory=dict)
     interrupted: bool = False
     out_of_time: bool = False
-    evidence: Mapping[str, Any] = field(default_factory=dict)
+    evidence: Basis = Basis()
     substeps: int = 1
     freed: str = ""
     correction: Correction | None = None

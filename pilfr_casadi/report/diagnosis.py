@@ -76,11 +76,11 @@ class _Case:
 
     @classmethod
     def of(cls, d: Diagnosis) -> _Case:
-        search = d.evidence.get("search")
+        search, noise = d.evidence.search, d.evidence.noise
         recordings = d.train if search is None else search.bench.recordings  # stretches of long recordings
         bench = Workbench.of(d.refitted, recordings, d.hold)
-        noise = np.asarray(d.evidence.get("noise", float(d.floor["nrmse"]) * bench.scale))
-        return cls(d, bench, d.evidence["without"], d.evidence["after"], np.nan_to_num(noise))
+        noise = float(d.floor["nrmse"]) * bench.scale if noise is None else noise
+        return cls(d, bench, d.evidence.without, d.evidence.after, np.nan_to_num(noise))
 
     def unit(self, name: str) -> str:
         """Return the unit of an input or output; empty if it is unknown."""
@@ -190,7 +190,7 @@ def _hidden_forces(case: _Case) -> list[Block]:
             out += _strength_pictures(case, number)
     if d.verdict != "unexplained":
         return out
-    search, passes = d.evidence.get("search"), tables.candidates_by_pass(d)
+    search, passes = d.evidence.search, tables.candidates_by_pass(d)
     closest: Any = search and closest_hypothesis(search, d.correction.closest if d.correction else None)
     for acting in closest.effects if closest else ():
         number, law = closest.fitted.simulator.elements.index(acting), display_name(acting.law.id)

@@ -199,7 +199,7 @@ def candidates_by_pass(diagnosis: Diagnosis) -> list[tuple[list[dict[str, Any]],
 
     The hypothesis is None if it is unknown.
     """
-    rows, search = list(diagnosis.candidates), diagnosis.evidence.get("search")
+    rows, search = list(diagnosis.candidates), diagnosis.evidence.search
     steps = search.passes if search is not None else []
     sizes, parents = [len(step.trials) for step in steps], [step.parent for step in steps]
     if sum(sizes) != len(rows):
@@ -268,7 +268,7 @@ def candidate_tables(
 
 def flexible_table(diagnosis: Diagnosis) -> Table | None:
     """Tabulate the share of the mismatch that a flexible force at each port could explain."""
-    search = diagnosis.evidence.get("search")
+    search = diagnosis.evidence.search
     opened = search.flexible(search.root) if search is not None else {}
     if not opened:
         return None

@@ -42,7 +42,7 @@ def test_slow_noise_that_two_periods_show_is_no_missing_physics():
     slow = lfilter([1], [1, -0.98], np.random.default_rng(2).standard_normal(len(y) + 500))[500:, None]
     r = blank.with_(y=y + 0.15 * np.std(y) * slow / np.std(slow))
     found = pilfr.diagnose(cart(), r, laws=(CoulombFriction, CubicDamping), effects=1, workers=1)
-    assert max(found.evidence["search"].flexible(found.evidence["search"].root).values()) > 0.3
+    assert max(found.evidence.search.flexible(found.evidence.search.root).values()) > 0.3
     assert found.verdict == "complete"
     assert "the rest is as large as the noise" in found.sentence
 
@@ -227,7 +227,7 @@ def test_a_search_that_the_time_limit_ended_does_not_blame_the_catalogue():
     blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
     y = cart().with_element("ground", CoulombFriction().at({"F_c": 3.0, "v_0": 0.01})).simulate(blank)
     found = pilfr.diagnose(cart(), blank.with_(y=y), laws=(CubicDamping,), effects=1, workers=1)
-    search = found.evidence["search"]
+    search = found.evidence.search
     answer = replace(posterior(search), effects=())
     assert "none of the laws tried (cubic damping) explains all of it" in judge(search, answer, ()).sentence
     search.laws = CATALOGUE
@@ -243,7 +243,7 @@ def test_without_laws_no_law_is_blamed_and_an_offset_is_no_closest_law():
     y = 0.2 + cart().with_element("ground", CoulombFriction().at({"F_c": 3.0, "v_0": 0.01})).simulate(blank)
     found = pilfr.diagnose(cart(), blank.with_(y=y), laws=(), workers=1)
     assert found.sentence.startswith("Physics is missing, and no law (none was allowed) explains it.")
-    search = found.evidence["search"]
+    search = found.evidence.search
     assert any(t.laws for t in search.memo.values()) and closest_hypothesis(search) is None
 
 
@@ -253,7 +253,7 @@ def test_one_hypothesis_is_told_where_the_time_ended_before_a_comparison():
     blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
     y = cart().with_element("ground", CoulombFriction().at({"F_c": 3.0, "v_0": 0.01})).simulate(blank)
     found = pilfr.diagnose(cart(), blank.with_(y=y), laws=(CubicDamping,), effects=1, workers=1)
-    search = found.evidence["search"]
+    search = found.evidence.search
     search.bench = replace(search.bench, deadline=0.0)
     answer = replace(posterior(search), effects=())
     correction, fitted = find_unnamed_correction(search)

@@ -134,14 +134,14 @@ def test_held_out_blocks_tell_a_better_simulator():
 @pytest.mark.parametrize("seconds", [-1.0, 1e-3])
 def test_a_refit_that_is_cut_short_predicts_nothing(nameless, seconds):
     """It begins at a fit to all samples, so that it would seem to predict those left out."""
-    bench, fitted = nameless.evidence["search"].bench, nameless.evidence["after"]
+    bench, fitted = nameless.evidence.search.bench, nameless.evidence.after
     assert np.isfinite(held_out_errors(bench, fitted).rms)
     assert held_out_errors(replace(bench, deadline=time.perf_counter() + seconds), fitted).rms == np.inf
 
 
 def test_held_out_samples_have_no_say_in_what_predicts_them(nameless):
     """The weights that a refit starts from do not matter, because what is held out has shaped them."""
-    bench, fitted = nameless.evidence["search"].bench, nameless.evidence["after"]
+    bench, fitted = nameless.evidence.search.bench, nameless.evidence.after
     name = f"{fitted.simulator.elements[-1].prefix}c"
     elsewhere = replace(fitted, values={**fitted.values, name: 2 * fitted.values[name]})
     there, here = (held_out_errors(bench, f) for f in (elsewhere, fitted))

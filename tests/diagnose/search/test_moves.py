@@ -97,7 +97,7 @@ def test_at_the_time_limit_the_search_answers_from_what_it_has():
     assert found.out_of_time and len(found.steps) == 1  # the first law is fitted in any case
     (r,) = rubbing()
     diagnosis = pilfr.diagnose(rig(OFF), r.slice(0, 800), laws=TRIED, time_limit=1e-3)
-    assert diagnosis.evidence["search"].bench.deadline == np.inf  # what is fitted later, as by `refine`, has time
+    assert diagnosis.evidence.search.bench.deadline == np.inf  # what is fitted later, as by `refine`, has time
     assert "The time limit ended the search" in str(diagnosis)
     assert "none of the laws that were fitted before the time limit (1 of " in diagnosis.sentence
     with pytest.raises(pilfr.InputError, match="time_limit=0 was given"):
