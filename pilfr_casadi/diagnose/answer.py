@@ -389,7 +389,7 @@ def _design_experiment(
     search: Search, effects: Sequence[LikelyEffect], limits: Mapping[str, float] | None
 ) -> dict[str, Any] | None:
     """Design the experiment that would separate the first tie, if there is one."""
-    if search.bench.simulator.observer is not None:  # a proposed input has no outputs to be led by
+    if search.bench.simulator.observer is not None:  # a proposed input has no outputs to correct states by
         return None
     for effect in effects:
         if effect.alike:

@@ -346,14 +346,15 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
         return found
     say, hold = request.say.under("predictions: "), search.bench.hold
     try:
-        led, memory = predictor(request.simulator, request.recordings, hold, request.engine)
-        leading = search_with_one_hold(replace(request, simulator=led, hold=hold, focus="prediction", say=say)).search
+        observed, memory = predictor(request.simulator, request.recordings, hold, request.engine)
+        observed_request = replace(request, simulator=observed, hold=hold, focus="prediction", say=say)
+        predicting = search_with_one_hold(observed_request).search
     except InputError:
         return found
-    search.cut_short_with(leading)
-    if leading.interrupted:
+    search.cut_short_with(predicting)
+    if predicting.interrupted:
         return found
-    named, answer = _concluded(leading, ()), posterior(leading)
+    named, answer = _concluded(predicting, ()), posterior(predicting)
     best = answer.best
     if named.verdict.kind != "missing-physics" or {e.name for e in named.effects} != best.names:
         return found
@@ -362,7 +363,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
         trial = search.thorough(search.memo[best.key])
         before, after = search.held_out(search.root), search.held_out(trial)
     answer = replace(answer, effects=named.effects).acting(search, trial)
-    verdict = judge(leading, answer, ())
+    verdict = judge(predicting, answer, ())
     known = np.isfinite(before.weighted_rms) or not search.past_deadline
     better = known and after.weighted_rms < before.weighted_rms
     if verdict.kind != "missing-physics" or not better or after.rms > EQUAL_RATIO * found.correction.after:
@@ -376,5 +377,5 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
         fitted=trial.fitted,
         correction=correction,
         effects=answer.effects,
-        decided=leading,
+        decided=predicting,
     )

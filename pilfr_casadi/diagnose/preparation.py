@@ -102,8 +102,8 @@ def prepare(
     cut_short = checks.left_out or bench.interrupt.pressed
     corrected = bool(now.gates or held)  # values and states from faulty data may be in a wrong minimum
     if corrected and not bench.interrupt.pressed:
-        led = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
-        without = min(led, bench.fit(bench.simulator, [{}, led.values], solver=THOROUGH), key=lambda f: f.cost)
+        again = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
+        without = min(again, bench.fit(bench.simulator, [{}, again.values], solver=THOROUGH), key=lambda f: f.cost)
     bench.check_followed(without)
     bench = replace(bench, typical=sample_run(bench, without))
     say(CHECKS, CHECKED, CHECKED, without.cost**0.5)
@@ -271,8 +271,8 @@ def with_observer(now: Checked) -> Checked:
     if not gain.any():
         return now
     try:
-        led = bench.fit(bench.simulator, anneal=OBSERVER_GAINS, like=bench.compile(bench.simulator, gain))
-        found = bench.fit(bench.simulator, [led.values], states=led.begin, solver=THOROUGH)
+        observed = bench.fit(bench.simulator, anneal=OBSERVER_GAINS, like=bench.compile(bench.simulator, gain))
+        found = bench.fit(bench.simulator, [observed.values], states=observed.begin, solver=THOROUGH)
     except (InputError, np.linalg.LinAlgError):
         return now
     return replace(now, fitted=found) if found.cost < now.cost else now

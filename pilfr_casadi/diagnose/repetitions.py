@@ -32,7 +32,7 @@ from .faults.timing import TimeShift
 from .fits.evidence import AS_GIVEN_RATIO
 from .fits.floor import Floor, measured_floor
 from .fits.workbench import RunsAway
-from .prediction import can_be_led, prediction_note, predictor
+from .prediction import observer_keeps_up, prediction_note, predictor
 from .preparation import CHECKS, Prepared, hold_note, prepare
 from .search.moves import Search
 
@@ -58,13 +58,13 @@ def search_with_repetitions(request: Request) -> tuple[Request, Attempt]:
         try:
             return request, _search_with_either_hold(request)
         except RunsAway:  # by `Workbench`, in the first refit or as the check of it in `_search_once`
-            if request.focus == "simulation" or not can_be_led(request.simulator, request.recordings):
+            if request.focus == "simulation" or not observer_keeps_up(request.simulator, request.recordings):
                 raise
     # the gain depends little on the hold, which the search may still change
     hold = stated_hold(request.simulator, request.recordings, request.hold) or "zero"
-    led, memory = predictor(request.simulator, request.recordings, hold, request.engine)
+    observed, memory = predictor(request.simulator, request.recordings, hold, request.engine)
     note = prediction_note(request.simulator, request.recordings, memory)
-    request = replace(request, simulator=led, notes=(*request.notes, note))
+    request = replace(request, simulator=observed, notes=(*request.notes, note))
     return request, _search_with_either_hold(request)
 
 

@@ -254,16 +254,16 @@ def settle(now: Checked, fault: G, solver: GaussNewton = QUICK) -> tuple[G, Chec
 def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
     """Return the corrected state with its finding if the rule accepts the fault, else the state before.
 
-    If the recordings as given are followed as well from the corrected refit's values, the correction only led the refit
-    out of a local minimum: that refit is returned, without a finding.
+    If the recordings as given are followed as well from the corrected refit's values, the correction only took the
+    refit out of a local minimum: that refit is returned, without a finding.
     """
     if after is None or not satisfies_rule(_cost_where_kept(now, after, fault), after, fault):
         return now
     back = refit(now.bench, [after.fitted.values], states=now.fitted.initial, like=now.fitted)
     if back is not None:
-        led = now.then(now.bench, back)
-        if not satisfies_rule(_cost_where_kept(led, after, fault), after, fault):
-            return led
+        moved = now.then(now.bench, back)
+        if not satisfies_rule(_cost_where_kept(moved, after, fault), after, fault):
+            return moved
     errors = now.bench.nrmse(now.fitted), after.bench.nrmse(after.fitted)
     sentence = f"{fault.sentence}; {fault.remedy} {describe_fall(*errors)}"
     noises = (after.cost / max(now.noise2, 1e-300)) ** 0.5

@@ -97,7 +97,7 @@ UNKNOWN_SHARE = 1e-6  # squared share of a parameter in an unknown combination; 
 
 # Held-out data
 FOLDS, ROUNDS = 4, 2  # folds, and blocks of a recording in each fold: eight blocks, spread over the recording
-LEAD_SHARE = 0.5  # share of a block that is never held out at the start of a recording: it determines the initial state
+WARM_UP_SHARE = 0.5  # share of a block, at the start of a recording, that is never held out: it gives the initial state
 # The fit to all blocks is near each of these fits; a fit that has not converged after so many steps is used as it is.
 REFIT = GaussNewton(max_iterations=8, tolerance=1e-2, patience=2)
 
@@ -436,8 +436,8 @@ def blocks_of(bench: Workbench) -> list[np.ndarray]:
     """Return the number of each sample's block, (M,) for each recording; -1 for samples in no block."""
     out = []
     for r in bench.recordings:
-        lead = int(LEAD_SHARE * (len(r) - r.skip) / (FOLDS * ROUNDS)) if r.begins == "estimate" else 0
-        numbers, begin = np.full(len(r), -1), r.skip + lead
+        warm_up = int(WARM_UP_SHARE * (len(r) - r.skip) / (FOLDS * ROUNDS)) if r.begins == "estimate" else 0
+        numbers, begin = np.full(len(r), -1), r.skip + warm_up
         numbers[begin:] = np.arange(len(r) - begin) * FOLDS * ROUNDS // max(len(r) - begin, 1)
         out.append(numbers)
     return out
