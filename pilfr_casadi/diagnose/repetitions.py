@@ -105,7 +105,7 @@ def _prefers_other_hold(search: Search) -> bool:
 
 
 def search_with_one_hold(request: Request) -> Attempt:
-    """Prepare and search; if a lead was corrected, repeat without, and keep that if it is clearly better.
+    """Prepare and search; if an early channel was corrected, repeat without, and keep that if it is clearly better.
 
     If a channel proves shifted beside a law, repeat with it at its right times. If a wrong zero was preferred to a
     wrong start, repeat with the start unknown.
