@@ -72,7 +72,7 @@ def run(seed: int = 0, **options: Any) -> tuple[Diagnosis, dict[str, dict[str, f
     diagnosis = diagnose(simulator(), data["train"], test=tests, **options)
     out: dict[str, dict[str, float]] = {}
     for name, key in (("before", "without"), ("after", "after")):
-        f = diagnosis.evidence[key]
+        f = getattr(diagnosis.evidence, key)
         out[name] = {}
         for r in tests:
             y = f.engine.simulate(f.model.drive(r), f.vector, 0 * f.initial[0])[0]

@@ -102,7 +102,7 @@ def judge(folder: Path, diagnosis: Diagnosis) -> dict[str, dict[str, float]]:
     data = recordings(folder)
     out = {}
     for name, key in (("before", "without"), ("after", "after")):
-        fitted = diagnosis.evidence[key]
+        fitted = getattr(diagnosis.evidence, key)
         out[name] = {
             k: rmse(started(fitted, r, diagnosis.hold, np.asarray(fitted.initial[0]))) for k, r in data.items()
         }

@@ -8,6 +8,7 @@ import numpy as np
 from pilfr_casadi.data import Recording
 from pilfr_casadi.diagnose import Diagnosis, Effect, Workbench, mismatch
 from pilfr_casadi.diagnose.faults.gates import Gate
+from pilfr_casadi.diagnose.result_text import Basis
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import BoucWen, CubicStiffness, Saturation
 from pilfr_casadi.models import Parameter
@@ -111,6 +112,6 @@ def example(verdict="missing-physics", port="ground", law="ground", test=True, o
         train=tuple(train),
         test=(held_out,) if test else (),
         seconds=3.0,
-        evidence={"without": before, "after": after},
+        evidence=Basis(without=before, after=after),
     )
     return Diagnosis(**{**fields, **more})

@@ -1,4 +1,9 @@
-"""Foundation of all other folders: errors for the user, files, the C compiler, processes, interrupts and progress."""
+"""Foundation of all other folders.
+
+`errors` holds `InputError` and checks of arguments, `files` writes files and digests, `c_compiler` builds and caches
+libraries, `workers` runs work in threads and processes, `interrupts` handles Ctrl-C and time limits, `progress` reports
+stages, and `lazy` makes the face of a folder, whose names are imported when they are first used.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,8 @@
-"""The command line `pilfr`, a thin skin over the Python API."""
+"""The command line `pilfr`, a thin skin over the Python API.
+
+`app` runs a command and turns failures into exit statuses. The commands are in `diagnose` (and check), `models` (fit,
+simulate, export), `studies` (run, campaign, fleet) and `demo`; `_common` holds the options that they share.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,9 @@
-"""From a fitted model to a running controller: observer, hysteresis compensation, predictive control, bounds."""
+"""From a fitted model to a running controller: observer, hysteresis compensation, predictive control, bounds.
+
+`estimation` holds the Kalman filter, and `observability` computes what outputs show of a state. `inverse` computes the
+feedforward of a model, and `element_inverse` the inverse of its element. `control_task` is the checked problem of
+predictive control; `mpc` solves it, and `dompc` hands it to do-mpc. `bounds` bounds the response to limited inputs.
+"""
 
 from typing import TYPE_CHECKING
 

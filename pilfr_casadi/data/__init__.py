@@ -1,4 +1,10 @@
-"""Recordings: reading and preprocessing them, excitation signals, metrics, periods and units; before any model."""
+"""Recordings, before any model: reading and preprocessing them, excitation signals, metrics, periods and units.
+
+`recording` holds the class `Recording`. `readers` makes recordings of files and frames: `tables` opens files by suffix
+(add a file type in `OPENERS`), `csv_table` parses text, `columns` tells time columns and units by their names,
+`time_grid` finds the step, and `common_clock` merges files. `preprocessing` resamples and filters, `periods` finds and
+averages periods, `units` converts units, `excitation` makes signals, and `metrics` compares them.
+"""
 
 from typing import TYPE_CHECKING
 

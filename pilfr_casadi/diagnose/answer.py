@@ -21,18 +21,19 @@ from .correction import Correction
 from .detectability import port_units
 from .effect import Effect
 from .excitation import ranges_left, share_at_new_frequencies
-from .faults.channels import IN_RECORDINGS, find_gross_slips
+from .faults.channels import IN_RECORDINGS, find_gross_channel_errors
 from .faults.gates import EQUAL_RATIO, TEST_FAULT, Gate, edited, value_with_unit
 from .faults.offsets import Offset, remove_idle_offsets, update_offsets
-from .fits.evidence import FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, SURE, deviations
+from .fits.evidence import FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, SURE, all_sure, standard_errors
 from .fits.floor import Floor
 from .fits.force_recovery import is_curve_along
 from .fits.workbench import Fitted, Workbench
 from .mismatch_map import mismatch
-from .posterior import NamedEffect, hypotheses_named, names
+from .posterior import LikelyEffect, hypotheses_named
 from .preparation import Prepared
 from .proof import Comparison, free_run_errors, next_experiment, parameter_table, placebo, test_errors
 from .result import Diagnosis
+from .result_text import Basis
 from .search.moves import Search
 from .search.trials import Trial
 from .verdict import Verdict
@@ -46,7 +47,7 @@ class Conclusion:
     gates: tuple[Gate, ...]
     fitted: Fitted  # the corrected simulator, or the refitted one if there is nothing to correct
     correction: Correction  # the elements that `fitted` has beside the refitted simulator
-    effects: tuple[NamedEffect, ...] = ()
+    effects: tuple[LikelyEffect, ...] = ()
     freed: str = ""  # the pinned parameters whose other values explain as much as the named laws, joined by "and"
     decided: Search | None = None  # the search that has named the effects, if it is another one
 
@@ -78,7 +79,7 @@ def build_diagnosis(
     proving = time.perf_counter()
     request.say("proof", 0, 1)
     bench, without, after = final.bench, final.without, final.after
-    std = deviations(bench, after)
+    std = standard_errors(bench, after)
     errors, fewer, compared, test_notes = _compute_errors(request, search, found, final, tests)
     decided = found.decided or search
     forms = {e: _other_forms(decided, found.effects, e) for e in found.effects}
@@ -95,7 +96,7 @@ def build_diagnosis(
         effects=effects,
         candidates=tuple(_candidate_row(decided, t, step.parent) for step in decided.passes for t in step.trials),
         gates=(
-            *_surrogate_note(request.stand_in_error),
+            *_surrogate_note(request.surrogate_nrmse),
             *_convergence_note(after),
             *test_notes,
             *_combination_note(after, std, blind_spots),
@@ -117,7 +118,7 @@ def build_diagnosis(
         times={**search.times, "proof": now - proving},
         interrupted=search.interrupted,
         out_of_time=search.out_of_time,
-        evidence={"search": search, "noise": floor.deviation, "without": final.drawn[0], "after": final.drawn[1]},
+        evidence=Basis(search, floor.deviation, without=final.drawn[0], after=final.drawn[1]),
         substeps=after.model.substeps,
         freed=found.freed,
         correction=found.correction,
@@ -128,8 +129,7 @@ def build_diagnosis(
 
 def _is_sure(found: Conclusion) -> bool:
     """Tell whether every named effect is sure, or there is none because nothing is missing."""
-    sure = min((e.confidence for e in found.effects), default=0.0) > SURE
-    return sure or found.verdict.kind in ("complete", "recording-fault")
+    return all_sure(e.confidence for e in found.effects) or found.verdict.kind in ("complete", "recording-fault")
 
 
 def _describe_noise(floor: Floor, white: Floor, bench: Workbench, compared: Comparison | None) -> dict[str, Any]:
@@ -144,12 +144,12 @@ def _describe_noise(floor: Floor, white: Floor, bench: Workbench, compared: Comp
 
 def _compute_errors(
     request: Request, search: Search, found: Conclusion, final: FinalFits, tests: tuple[Recording, ...]
-) -> tuple[dict[str, dict[str, float] | None], dict[NamedEffect, float], Comparison | None, tuple[Gate, ...]]:
+) -> tuple[dict[str, dict[str, float] | None], dict[LikelyEffect, float], Comparison | None, tuple[Gate, ...]]:
     """Compute the table of errors (see `Diagnosis`), the test errors without each of several effects, and notes.
 
     Also returns the comparison on the test recordings, if there are any.
     """
-    bench, without, after, fewer = final.bench, final.without, final.after, dict[NamedEffect, float]()
+    bench, without, after, fewer = final.bench, final.without, final.after, dict[LikelyEffect, float]()
     notes, compared = tuple[Gate, ...](), None
     errors: dict[str, dict[str, float] | None] = {
         "train": {"nominal": final.nominal, "before": bench.nrmse(without), "after": bench.nrmse(after)},
@@ -182,15 +182,15 @@ def _test_faults(bench: Workbench, after: Fitted, tests: Sequence[Recording], ga
     for i, (r, now) in enumerate(zip(tests, edited(tests, gates), strict=True), 1):
         if not np.ptp(now.y, axis=0).all():
             continue
-        slips = find_gross_slips(replace(bench.renewed([now]), simulator=after.corrected()))
-        if not slips or slips[0].left ** 0.5 > FAR_RATIO * bench.nrmse(after):
+        faults = find_gross_channel_errors(replace(bench.renewed([now]), simulator=after.corrected()))
+        if not faults or faults[0].left ** 0.5 > FAR_RATIO * bench.nrmse(after):
             continue
         name = f"recording {r.name or i}" if len(tests) > 1 else "recording"
         place = f"In the test {name}, unlike the training recordings, "
-        equal = [g for g in slips if g.left <= EQUAL_RATIO * slips[0].left]
+        equal = [g for g in faults if g.left <= EQUAL_RATIO * faults[0].left]
         words = ", or ".join(g.sentence.removeprefix(IN_RECORDINGS) for g in equal)
         advice = "It does not tell which: check both." if len(equal) > 1 else "Correct that."
-        yield Gate(slips[0].channel, TEST_FAULT, slips[0].value, f"{place}{words}. {advice}", False)
+        yield Gate(faults[0].channel, TEST_FAULT, faults[0].value, f"{place}{words}. {advice}", False)
 
 
 def _range_note(bench: Workbench, tests: Sequence[Recording]) -> Iterator[Gate]:
@@ -295,17 +295,17 @@ def _combination_note(after: Fitted, std: Mapping[str, np.ndarray], blind_spots:
 
 def _blind_spots(request: Request, ready: Prepared, search: Search) -> tuple[BlindSpot, ...]:
     """Find the blind spots of the recordings for the refitted simulator; empty if they cannot be computed."""
-    stated = search.bench.hold if request.hold_said else ""
+    stated = search.bench.hold if request.hold_stated else ""
     with suppress(InputError, np.linalg.LinAlgError):
         return assess_recordings(search.bench, search.root.fitted, ready.floor, stated).blind_spots
     return ()
 
 
-def _without_each_effect(search: Search, found: Conclusion) -> dict[NamedEffect, Fitted]:
+def _without_each_effect(search: Search, found: Conclusion) -> dict[LikelyEffect, Fitted]:
     """Fit the corrected simulator without each of several named effects; empty beside a learned force."""
     if len(found.effects) < 2 or found.correction.learned or search.interrupted:
         return {}
-    joint, out = Trial.of(found.fitted, len(found.correction.elements)), dict[NamedEffect, Fitted]()
+    joint, out = Trial.of(found.fitted, len(found.correction.elements)), dict[LikelyEffect, Fitted]()
     for effect in found.effects:
         rest = search.leave_out(joint, [e for e in joint.laws if (e.port, e.law.id) == effect.name])
         if rest is not None:
@@ -315,7 +315,7 @@ def _without_each_effect(search: Search, found: Conclusion) -> dict[NamedEffect,
 
 def _make_effect(
     search: Search,
-    named: NamedEffect,
+    named: LikelyEffect,
     final: FinalFits,
     std: dict[str, np.ndarray],
     other_forms: Sequence[Law],
@@ -362,7 +362,7 @@ def _make_effect(
     )
 
 
-def _other_forms(search: Search, effects: Sequence[NamedEffect], effect: NamedEffect) -> list[Law]:
+def _other_forms(search: Search, effects: Sequence[LikelyEffect], effect: LikelyEffect) -> list[Law]:
     """List the laws of no more parameters that make another form of an effect about as likely, the likeliest first."""
     stated, law = {e.name for e in effects}, effect.element.law
     alike = hypotheses_named(search, stated)
@@ -386,16 +386,16 @@ def _order(fitted: Fitted, element: Placed) -> Iterator[str]:
 
 
 def _design_experiment(
-    search: Search, effects: Sequence[NamedEffect], limits: Mapping[str, float] | None
+    search: Search, effects: Sequence[LikelyEffect], limits: Mapping[str, float] | None
 ) -> dict[str, Any] | None:
     """Design the experiment that would separate the first tie, if there is one."""
-    if search.bench.simulator.observer is not None:  # a proposed input has no outputs to be led by
+    if search.bench.simulator.observer is not None:  # a proposed input has no outputs to correct states by
         return None
     for effect in effects:
         if effect.alike:
             name, other = next(iter(effect.alike.items()))
             stated = hypotheses_named(search, {e.name for e in effects})
-            having = stated or [t for t in search.memo.values() if effect.name in names(t)]
+            having = stated or [t for t in search.memo.values() if effect.name in t.names]
             one = max(having, key=search.evidence)
             rivals = in_words([name_at(*pair, brief=True) for pair in (effect.name, name)])
             best = next_experiment(search.bench, one.fitted, other.fitted, search.floor.deviation, limits, rivals)

@@ -42,7 +42,7 @@ class Request:
     engine: str
     workers: int
     most_effects: float
-    stand_in_error: float
+    surrogate_nrmse: float
     deadline: float
     say: Stages
     focus: str | None = None
@@ -59,17 +59,17 @@ class Request:
         return replace(self, recordings=recordings, edits=(*self.edits, *edits), nominal=nominal, say=say)
 
     @property
-    def hold_said(self) -> bool:
-        """Whether somebody said what inputs do between samples."""
+    def hold_stated(self) -> bool:
+        """Whether somebody stated what inputs do between samples."""
         return stated_hold(self.simulator, self.recordings, self.hold) is not None
 
 
-def stated_hold(simulator: Any, recordings: Sequence[Recording], said: str | None) -> str | None:
+def stated_hold(simulator: Any, recordings: Sequence[Recording], hold: str | None) -> str | None:
     """Return the hold that the user, the simulator or a recording states; None if none of them does.
 
     Without an input that changes, there is nothing to state: any hold is the same.
     """
-    stated = next((h for h in (said, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
+    stated = next((h for h in (hold, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
     return stated or ("zero" if moves_freely(recordings) else None)
 
 

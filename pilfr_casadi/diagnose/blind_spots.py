@@ -22,7 +22,7 @@ from ..simulators import ACTUATOR, SENSOR, UNKNOWN, in_series, kind_of, port_nam
 from .arguments import check_laws, match_recordings, stated_hold
 from .detectability import SMALL_SHARE, LawRow, assess_laws, group_alike
 from .excitation import Excitation, excitations, single_frequency
-from .faults.channels import correct_gross_slips, refit_corrected
+from .faults.channels import correct_gross_channel_errors, refit_corrected
 from .faults.gates import USELESS_FIT, Checked, Gate
 from .faults.offsets import WrongStart, find_wrong_start
 from .faults.samples import find_held_outputs
@@ -279,20 +279,20 @@ def check(
     simulator, recordings = match_recordings(simulator, train, hold)
     wanted = None if laws is None else check_laws(laws)
     stated = stated_hold(simulator, recordings, hold)
-    now = _refit(Workbench.of(simulator, recordings, stated or "zero", engine), hold_said=stated is not None)
+    now = _refit(Workbench.of(simulator, recordings, stated or "zero", engine), hold_stated=stated is not None)
     found = assess_recordings(now.bench, now.fitted, now.floor, stated or "", wanted)
     slow = find_held_outputs(recordings)
     return _with_faults(found, now.gates, slow, recordings) if now.gates or slow else found
 
 
-def _refit(bench: Workbench, hold_said: bool) -> Checked:
+def _refit(bench: Workbench, hold_stated: bool) -> Checked:
     """Refit with channels and start corrected if they are wrong, and with the better hold unless it is stated."""
-    now = correct_gross_slips(bench)
+    now = correct_gross_channel_errors(bench)
     if now is not None and now.gates:
         now = refit_corrected(now)
     elif now is None or not np.isfinite(now.cost):
         now = Checked(bench, bench.fit(bench.simulator))
-    if not hold_said:
+    if not hold_stated:
         now = choose_hold(now, QUICK)[0]
     now = find_wrong_start(now)
     now.bench.interrupt.raise_pending()  # half a fit would tell wrong things
@@ -380,6 +380,7 @@ def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[Param
 def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) -> Iterator[BlindSpot]:
     """Describe everything that the recordings cannot reveal, the gravest first.
 
+    To add a blind spot, yield it here at its rank; its remedy goes into `MOTION` or `_next_record`.
     `still` are inputs that never change; `alive` are dead or flat parameters that move the outputs at the given values.
     """
 

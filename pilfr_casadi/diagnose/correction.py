@@ -4,9 +4,9 @@ If the named answer is not sure, or leaves error above the noise, several candid
 training recordings (`evidence`): the refitted simulator; the named laws, all of them and the sure ones alone; all
 likely hypotheses if no law is named; and a learned force, alone or beside laws. The score is the held-out error plus
 the spread of predictions for other inputs (`evidence.spread`), which is large if many parameters are hardly determined.
-The smallest score wins. Candidates are predicted in the order of their fit error plus spread, until that exceeds the
-smallest score. If the time is over before, the hypothesis with the least fit error plus spread corrects where the refit
-is not near it. Test recordings are never used.
+The smallest score wins. Candidates are cross-validated in the order of their fit error plus spread, until that exceeds
+the smallest score. When time runs out first, the hypothesis with the smallest fit error plus spread is used if the
+refit is more than NEAR_RATIO worse. Test recordings are never used.
 """
 
 from __future__ import annotations
@@ -109,42 +109,66 @@ class _Candidate:
         return self.fitted.cost + self.spread
 
 
-_Predicted = tuple[_Candidate, HeldOut]
+_Validated = tuple[_Candidate, HeldOut]
 
 
-def find_correction(search: Search, answer: Posterior, named: bool = False) -> tuple[Correction, Fitted]:
-    """Choose the corrected simulator from the candidates that can be tried before the deadline.
+def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction, Fitted]:
+    """Choose the corrected simulator if the answer names its effects: with them, or with what predicts better.
 
-    With `named`, the answer names its effects. If a learned element at another port predicts better without them, the
-    correction omits them. A learned element at the port of a named effect would only imitate it, and is not tried.
-    After the deadline nothing more is fitted, and after an interrupt the named laws stay.
+    If a learned element at another port predicts better without them, the correction omits them. A learned element at
+    the port of a named effect would only imitate it, and is not tried. After an interrupt, and where the time ends
+    before a comparison, the named laws stay.
     """
-    best_laws = answer.best
-    if named and (search.interrupted or _is_settled(search, answer)):
-        return named_correction(search, best_laws.fitted), best_laws.fitted
+    best = answer.best
+    if search.interrupted or _is_settled(search, answer):
+        return uncompared_correction(search, best.fitted), best.fitted
+    refit = _cross_validate_refit(search)
+    candidates = [_Candidate.of(search, t.fitted, t) for t in _named_hypotheses(search, answer)]
+    validated = _cross_validate(search, candidates, refit) if refit else []
+    if search.past_deadline and (len(validated) < 2 or _may_be_best(candidates[0], validated)):
+        stays = candidates[0].base
+        return replace(uncompared_correction(search, stays.fitted), closest=stays), stays.fitted
+    chosen = _choose(validated)[0].base
+    learned = _learned_candidates(search, search.memo[(chosen if chosen.laws else best).key])
+    learned += _learned_candidates(search, search.root, taken={e.port for e in best.laws})
+    return _describe_best(search, _cross_validate(search, learned, validated), search.floor)
+
+
+def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
+    """Choose the corrected simulator if nothing has a name.
+
+    Where the time ends before a comparison, a hypothesis that is far better than the refit corrects. The floor may
+    contain error that no law explains, so that shares are told of the least noise.
+    """
+    refit = _cross_validate_refit(search)
+    candidates = [_Candidate.of(search, t.fitted, t) for t in _hypotheses_with_laws(search)]
+    validated = _cross_validate(search, candidates, refit) if refit else []
+    if search.past_deadline and len(validated) < 2:
+        stays = _far_better(search, candidates)
+        late = uncompared_correction(search, stays.fitted, search.least_floor)
+        return replace(late, late=True, closest=stays), stays.fitted
+    chosen = _choose(validated)[0].base
+    learned = _learned_candidates(search, search.memo[chosen.key]) if chosen.laws else []
+    learned += _learned_candidates(search, search.root)
+    return _describe_best(search, _cross_validate(search, learned, validated), search.least_floor)
+
+
+def _cross_validate_refit(search: Search) -> list[_Validated]:
+    """Cross-validate the refitted simulator; empty if the time is over."""
     refit = _Candidate.of(search, search.root.fitted, search.root)
-    refitted = [] if search.past_deadline else _predict(search, [refit], [])
-    tried = _named_hypotheses(search, answer) if named else _hypotheses_with_laws(search)
-    candidates = [_Candidate.of(search, t.fitted, t) for t in tried]
-    predicted = _predict(search, candidates, refitted) if refitted else []
-    if search.past_deadline and (len(predicted) < 2 or (named and _may_be_best(candidates[0], predicted))):
-        # without a comparison the named laws stay, or what is far better
-        stays = tried[0] if named else _far_better(search, candidates)
-        said = named_correction(search, stays.fitted, search.floor if named else search.least_floor)
-        return replace(said, late=not named, closest=stays), stays.fitted
-    chosen = _choose(predicted)[0].base
-    beside = best_laws if named and not chosen.laws else chosen
-    learned = _learned_candidates(search, search.memo[beside.key]) if beside.laws else []
-    learned += _learned_candidates(search, search.root, {e.port for e in best_laws.laws} if named else ())
-    candidate, held_out = _choose(_predict(search, learned, predicted))
+    return [] if search.past_deadline else _cross_validate(search, [refit], [])
+
+
+def _describe_best(search: Search, validated: list[_Validated], floor: Floor) -> tuple[Correction, Fitted]:
+    """Describe the candidate with the smallest expected error, beside the refit, which comes first."""
+    candidate, held_out = _choose(validated)
     fitted, base = candidate.fitted, candidate.base
-    # without a name, the floor may contain error that no law explains; only the least noise is then certain
-    shares = _shares(search, base.fitted, fitted, search.floor if named else search.least_floor)
+    shares = _shares(search, base.fitted, fitted, floor)
     elements: tuple[Learned, ...] = ()
     if fitted is not base.fitted:
         laws = dict.fromkeys((*CATALOGUE, *search.laws))
         elements = (describe_learned(search.bench, fitted, shares["learned"], laws),)
-    errors = refitted[0][1].rms, held_out.rms
+    errors = validated[0][1].rms, held_out.rms
     return Correction(_describe_elements(search, fitted), shares, elements, *errors, base), fitted
 
 
@@ -153,11 +177,11 @@ def _is_settled(search: Search, answer: Posterior) -> bool:
     return answer.sure > SURE and explainable_remainder(search, answer.best) < FORMULA_ERROR
 
 
-def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_Predicted]) -> list[_Predicted]:
-    """Predict held-out data with further candidates, the most promising first, as long as they can be best."""
-    out = list(predicted)
+def _cross_validate(search: Search, candidates: Sequence[_Candidate], validated: list[_Validated]) -> list[_Validated]:
+    """Cross-validate further candidates, the most promising first, as long as they can be best."""
+    out = list(validated)
     for c in sorted(candidates, key=lambda c: c.least):
-        least = min((h.mean_square for _, h in out), default=np.inf)
+        least = min((h.score for _, h in out), default=np.inf)
         if out and (c.least >= least or search.past_deadline):
             break
         bare = c.fitted is c.base.fitted
@@ -167,10 +191,10 @@ def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_
     return out
 
 
-def _may_be_best(candidate: _Candidate, predicted: Sequence[_Predicted]) -> bool:
-    """Tell whether a candidate that was not predicted may have a smaller error than those that were."""
-    left_out = all(c is not candidate for c, _ in predicted)
-    return left_out and candidate.least < min(h.mean_square for _, h in predicted)
+def _may_be_best(candidate: _Candidate, validated: Sequence[_Validated]) -> bool:
+    """Tell whether a candidate that was not cross-validated may have a smaller error than those that were."""
+    left_out = all(c is not candidate for c, _ in validated)
+    return left_out and candidate.least < min(h.score for _, h in validated)
 
 
 def _far_better(search: Search, candidates: Sequence[_Candidate]) -> Trial:
@@ -180,9 +204,9 @@ def _far_better(search: Search, candidates: Sequence[_Candidate]) -> Trial:
     return search.root if best is None or near else best.base
 
 
-def _choose(predicted: Sequence[_Predicted]) -> _Predicted:
+def _choose(validated: Sequence[_Validated]) -> _Validated:
     """Choose the candidate with the smallest expected error on other recordings."""
-    return min(predicted, key=lambda p: p[1].mean_square)
+    return min(validated, key=lambda p: p[1].score)
 
 
 def _named_hypotheses(search: Search, answer: Posterior) -> list[Trial]:
@@ -226,7 +250,7 @@ def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()
     return [_Candidate.of(search, fitted, base)]
 
 
-def named_correction(search: Search, fitted: Fitted, floor: Floor | None = None) -> Correction:
+def uncompared_correction(search: Search, fitted: Fitted, floor: Floor | None = None) -> Correction:
     """Describe a simulator without a learned element, which was not compared with others."""
     return Correction(_describe_elements(search, fitted), _shares(search, fitted, fitted, floor or search.floor))
 

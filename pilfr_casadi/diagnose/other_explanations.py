@@ -29,11 +29,11 @@ from .faults.gates import (
     USELESS_FIT,
     Gate,
     describe_fall,
-    gain,
+    evidence_gain,
     open_start,
     value_with_unit,
 )
-from .fits.evidence import AT_NOISE_RATIO, BETTER_RATIO, CONTENDING_NATS, FAR_RATIO, NEAR_RATIO, SURE, deviations
+from .fits.evidence import AT_NOISE_RATIO, BETTER_RATIO, CONTENDING_NATS, FAR_RATIO, NEAR_RATIO, SURE, standard_errors
 from .fits.linearise import simulate_states
 from .fits.workbench import FEW, THOROUGH, Fitted, Workbench, refit
 from .posterior import Posterior, posterior, strained
@@ -89,7 +89,7 @@ def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameter
         # any value equals a law that hardly explains anything
         if (
             best.cost <= enough
-            and gain(without.cost, best.cost, search.bench.scored(best.residual), len(freed)) > LEAST_GAIN
+            and evidence_gain(without.cost, best.cost, search.bench.scored(best.residual), len(freed)) > LEAST_GAIN
         ):
             return PinnedParameters(freed, best, _describe_pinned(search, freed, best, named))
     return None
@@ -177,7 +177,7 @@ def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[tu
                 search.workers,
                 search.say,
                 aligned=True,
-                stand_in_error=search.stand_in_error,
+                surrogate_nrmse=search.surrogate_nrmse,
                 until=search.until,
             )
             there.alternatives |= {port: laws for port, laws in search.alternatives.items() if in_series(port)}
@@ -272,7 +272,9 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
     more_starts = sum(len(part.recordings) for part in benches) - len(bench.recordings)
     more = whole.model.parameters.free.sum() * (len(fits) - 1) + whole.model.initial_basis.shape[1] * more_starts
     residual = [e for part, f in zip(benches, fits, strict=True) for e in part.scored(f.residual)]
-    if cost > CURED_SHARE * whole.cost or gain(whole.cost, max(cost, search.floor2), residual, more) < LEAST_GAIN:
+    if cost > CURED_SHARE * whole.cost:
+        return None
+    if evidence_gain(whole.cost, max(cost, search.floor2), residual, more) < LEAST_GAIN:
         return None
     values = _clearest_differences(whole, fits, benches)
     if not values:
@@ -292,7 +294,7 @@ def _clearest_differences(
     whole: Fitted, fits: Sequence[Fitted], benches: Sequence[Workbench]
 ) -> list[tuple[str, list[float]]]:
     """List the parameters with the most significant differences, the most significant first."""
-    spreads = [deviations(part, f) for part, f in zip(benches, fits, strict=True)]
+    spreads = [standard_errors(part, f) for part, f in zip(benches, fits, strict=True)]
     out = list[tuple[float, str, list[float]]]()
     for name, p in whole.simulator.parameters.items():
         if np.size(p.value) != 1 or np.all(p.fixed):

@@ -7,26 +7,31 @@ How an answer comes about:
 2. `Search.run` fits further hypotheses: the simulator with laws in its ports, with all parameters estimated together.
    Each gets a log evidence: how well it follows the recordings, less the cost of its parameters, plus its prior
    (`evidence`, which lists the numbers on which an answer rests).
-3. `posterior` turns the evidences into probabilities. An effect's confidence is the probability of all hypotheses that
-   have it, times the probability that its law is the physics (`share_named`): a rest that a flexible force could
-   explain lowers it, as do values at a bound or at which the law degenerates. Of forms of a law that follow alike, the
-   plainest is stated.
+3. `posterior` turns the evidences into probabilities. The confidence of an effect is the probability of all hypotheses
+   that have it, times the probability that its law is the physics (`share_named`), times the probability that its
+   strength is not zero. Three things lower it: a remainder that a flexible force explains, a parameter at a bound, and
+   values at which the law degenerates into another. Among forms of a law that fit equally well, the one with the fewest
+   parameters is stated.
 4. `judge` chooses the verdict. It is a recording fault if its correction removed the mismatch; missing physics if the
    law of the likeliest hypothesis is more likely than not the physics; complete if the refit's residual can be noise;
-   else unexplained.
+   else unexplained. Steps 5 to 7 judge again if they change the probabilities.
 5. If there is time, explanations without a law are tried: a parameter pinned to a wrong value, and a clipped input.
    They count if they explain as much as the law.
-6. `find_correction` compares named laws with a learned force on held-out parts of the recordings. If the named law
-   predicts worse than the force, the name is withdrawn and the verdict is chosen again. A learned force that stays
-   beside the laws lowers their confidence (`Posterior.within`).
-7. The proof (`proof`) adds errors on test recordings, placebos and standard errors. It changes no verdict. Offsets that
-   no longer improve the fit beside the effects are set to zero.
+6. `find_named_correction` compares named laws with a learned force on held-out parts of the recordings. If the named
+   law predicts worse than the force, the name is withdrawn. A learned force that stays beside the laws lowers their
+   confidence (`Posterior.within`).
+7. If the named laws may imitate a law where no port is declared, they are weighed against that
+   (`find_undeclared_port`). If nothing has a name, such laws, those that were not tried, and parameters that vary are
+   looked for, and `find_unnamed_correction` chooses the corrected simulator.
+8. `_final_fits` sets offsets to zero that no longer improve the fit beside the effects, and fits to convergence.
+   `build_diagnosis` adds the proof (`proof`): errors on test recordings, placebos and standard errors. It changes no
+   verdict.
 
-**Long recordings.** Steps 1 to 6 see only their most informative stretches (`stretches`). The leading hypotheses are
-then fitted to everything before step 3, and the answer's simulator before step 7.
+**Long recordings.** Steps 1 to 7 see only their most informative stretches (`stretches`). The likeliest hypotheses are
+fitted to everything before step 3, and the answer's simulator in step 8.
 
 **Repetitions.** Steps 1 and 2 are repeated where something that they took for granted proves wrong (`repetitions`). If
-nothing has a name after step 6 and the simulator drifts, the search is repeated in predictions, and the laws that are
+nothing has a name after step 7 and the simulator drifts, the search is repeated in predictions, and the laws that are
 found there are refitted in free run (`_name_in_predictions`).
 """
 
@@ -34,7 +39,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -55,13 +60,13 @@ from .arguments import (
     match_tests,
     stated_hold,
 )
-from .correction import find_correction, named_correction
+from .correction import Correction, find_named_correction, find_unnamed_correction, uncompared_correction
 from .faults.gates import EQUAL_RATIO, Gate
 from .faults.offsets import fix_idle_offsets, list_offsets
-from .faults.samples import find_clipped_input, open_unsettled, remove_glitches
+from .faults.samples import clean_recordings, find_clipped_input
 from .faults.tones import find_tones
 from .fits.evidence import SURE
-from .fits.workbench import converge
+from .fits.workbench import Fitted, converge
 from .other_explanations import (
     find_pinned_parameters,
     find_undeclared_port,
@@ -69,11 +74,11 @@ from .other_explanations import (
     find_varying_values,
     may_act_elsewhere,
 )
-from .posterior import Posterior, names, posterior
+from .posterior import Posterior, posterior
 from .prediction import drift_note, drifts, predictor
 from .preparation import Prepared, conversions, slow_note
 from .proof import errors_of
-from .repetitions import run_search, search_with_focus
+from .repetitions import search_with_one_hold, search_with_repetitions
 from .result import Diagnosis
 from .search.moves import Search
 from .search.stretches import SEARCHED_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
@@ -113,22 +118,23 @@ def diagnose_in_steps(
     calls, slow = simulator.program_calls, slow_note(simulator, recordings)
     say = say.under(f"{slow[0].value:.2g} s a simulation: ") if slow else say
     request = Request(
-        simulator,
-        recordings,
-        tried,
-        hold,
-        engine,
-        workers,
-        most_effects,
-        stand_in_error,
-        deadline,
-        say,
-        focus,
+        simulator=simulator,
+        recordings=recordings,
+        laws=tried,
+        hold=hold,
+        engine=engine,
+        workers=workers,
+        most_effects=most_effects,
+        surrogate_nrmse=stand_in_error,
+        deadline=deadline,
+        say=say,
+        focus=focus,
         notes=(*conversions(simulator, given), *slow),
         calls=calls,
     )
     most = SEARCHED_SAMPLES if search_samples is None else whole(search_samples, "search_samples", FEWEST_SAMPLES)
-    request, ready, search = search_with_focus(_on_stretches(request, most))
+    request, first = search_with_repetitions(_on_stretches(request, most))
+    ready, search = first.ready, first.search
     request, everything = _fit_to_everything(request, ready, search)
     found = _concluded(search, (*request.notes, *ready.gates))
     if found.verdict.kind == "unexplained" and request.focus is None and not search.cut_short:
@@ -141,23 +147,24 @@ def diagnose_in_steps(
     return replace(built, interrupted=built.interrupted or bool(pressed))
 
 
+# long recordings
+
+
 def _on_stretches(request: Request, most: int) -> Request:
     """Restrict a request to the most informative stretches if the recordings have more than `most` samples."""
     if sum(map(len, request.recordings)) <= most:
         return request
     request.say("choice of stretches", 0, 1)
-    recordings, spikes = remove_glitches(request.recordings)
-    recordings, transients = open_unsettled(recordings)
+    recordings, notes = clean_recordings(request.recordings)
     hold = stated_hold(request.simulator, recordings, request.hold) or "zero"
     chosen = choose_stretches(request.simulator, recordings, hold, request.engine, most, request.workers)
     stretches = Stretches(recordings, chosen)
     request.say("choice of stretches", 1, 1)
-    notes = (*request.notes, *spikes, *transients)
-    return replace(request, recordings=stretches.cut(), stretches=stretches, notes=notes)
+    return replace(request, recordings=stretches.cut(), stretches=stretches, notes=(*request.notes, *notes))
 
 
 def _fit_to_everything(request: Request, ready: Prepared, search: Search) -> tuple[Request, Everything | None]:
-    """Fit the leading hypotheses to all recordings if the search ran on stretches of them, and note that."""
+    """Fit the likeliest hypotheses to all recordings, and drop from the search those that these refute."""
     if request.stretches is None:
         return request, None
     with search.stage("fits to all recordings"):
@@ -166,141 +173,13 @@ def _fit_to_everything(request: Request, ready: Prepared, search: Search) -> tup
     return replace(request, notes=(note, *request.notes)), everything
 
 
-def _concluded(search: Search, gates: Sequence[Gate]) -> Conclusion:
-    """Draw the conclusion; after an interrupt, draw it without further fits."""
-    with search.until_interrupted(), search.stage("conclusion"):
-        found = conclude(search, gates)
-        search.out_of_time = search.out_of_time or time.perf_counter() > search.bench.deadline
-        return found
-    return conclude(search, gates)
-
-
-def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
-    """Draw the conclusion from a search: steps 3 to 6 of the module docstring.
-
-    A name that may stand for a law where no port is declared is weighed against that. If there is no name, undeclared
-    ports and varying values are checked, unless the time is over. After Ctrl-C nothing more is fitted: a name that was
-    found stays; otherwise the refitted simulator is returned.
-    """
-    answer, interrupted = posterior(search), search.interrupted
-    finished, elsewhere = not search.cut_short, tuple[Gate, ...]()
-    given, gates = gates, with_tones(search, answer, gates)
-    verdict = judge(search, answer, gates)
-    if verdict.kind in ("missing-physics", "unexplained") and not search.past_deadline:
-        found = _without_a_law(search, answer, verdict, gates)
-        if found is not None:
-            return found
-    if verdict.kind == "missing-physics":
-        correction, fitted = find_correction(search, answer, named=True)
-        answer = answer.within({(port, law) for port, law, _ in correction.elements}, correction.shares["learned"])
-        gates = with_tones(search, answer, given)
-        verdict = judge(search, answer, gates)
-        if verdict.kind == "missing-physics" and finished and may_act_elsewhere(search, answer.best):
-            elsewhere, odds = find_undeclared_port(search, answer.best)
-            answer = answer.against(odds)
-            verdict = judge(search, answer, gates)
-        if verdict.kind == "missing-physics":
-            said = f"{verdict.sentence} {correction.sentence}" if correction.learned else verdict.sentence
-            zeros = list_offsets(search.added_laws(fitted), fitted.values)
-            notes = (*gates, *elsewhere, *zeros)
-            return Conclusion(Verdict(verdict.kind, said), notes, fitted, correction, answer.effects)
-    if verdict.kind == "unexplained" and finished:
-        elsewhere = elsewhere or find_undeclared_port(search)[0]
-        gates = (*gates, *elsewhere, *find_untried_laws(search), *find_varying_values(search))
-    refitted = search.root.fitted
-    if search.interrupted and verdict.kind != "recording-fault":
-        correction, fitted = find_correction(search, answer)
-        off = f"Refitted, the simulator is off by {percent(search.bench.nrmse(refitted))} of the outputs' deviation."
-        said = correction.sentence if correction.elements else off
-        before = "The search was interrupted before it came to an answer." if interrupted else verdict.sentence
-        sentence = f"{before} {said}"
-        return Conclusion(Verdict(verdict.kind, sentence), gates, fitted, correction)
-    if verdict.kind == "unexplained":
-        correction, fitted = find_correction(search, answer)
-        verdict = judge(search, answer, gates, correction.closest)
-        where = [f"{g.value} in the equation of {g.channel} explains it" for g in elsewhere]
-        said = f"Physics is missing, but hardly at a declared port: {where[0]}." if where else verdict.sentence
-        verdict = Verdict(verdict.kind, f"{said} {correction.sentence}")
-        return Conclusion(verdict, gates, fitted, correction)
-    return Conclusion(verdict, gates, refitted, named_correction(search, refitted))
-
-
-def with_tones(search: Search, answer: Posterior, gates: Sequence[Gate]) -> tuple[Gate, ...]:
-    """Add the steady tones that the named laws leave, or the refit if nothing has a name."""
-    fitted = answer.best.fitted if answer.effects else search.root.fitted
-    return (*gates, *find_tones(search.bench, fitted))
-
-
-def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: Sequence[Gate]) -> Conclusion | None:
-    """Conclude that a parameter has a wrong pinned value, or an input was clipped, if that explains as much as laws."""
-    held = find_pinned_parameters(search, answer)
-    if held is not None:
-        corrected = named_correction(search, held.fitted)
-        return Conclusion(
-            Verdict("complete", held.sentence), tuple(gates), held.fitted, corrected, (), " and ".join(held.names)
-        )
-    named = verdict.kind == "missing-physics"
-    if named and answer.sure >= SURE:
-        return None
-    refitted = search.root.fitted
-    left = answer.best.mean_square / search.root.mean_square if named else 1.0
-    clipping = find_clipped_input(search.bench, refitted, left)
-    if clipping is None:
-        return None
-    fault = Verdict("recording-fault", clipping.sentence)
-    return Conclusion(fault, (*gates, clipping), refitted, named_correction(search, refitted))
-
-
-def _name_in_predictions(request: Request, search: Search, found: Conclusion) -> Conclusion:
-    """Search once more in predictions if the simulator drifts, so that errors of free runs hardly tell laws apart.
-
-    The laws that are named there are refitted in free run. There they have to act as surely, and to predict held-out
-    data better than the refit, and as well as the correction that was found without a name.
-    """
-    if request.simulator.observer is not None or not drifts(search.bench, search.root.fitted):
-        return found
-    say, hold = request.say.under("predictions: "), search.bench.hold
-    try:
-        led, memory = predictor(request.simulator, request.recordings, hold, request.engine)
-        leading = run_search(replace(request, simulator=led, hold=hold, focus="prediction", say=say))[1]
-    except InputError:
-        return found
-    search.cut_short_with(leading)
-    if leading.interrupted:
-        return found
-    named, answer = _concluded(leading, ()), posterior(leading)
-    best = answer.best
-    if named.verdict.kind != "missing-physics" or {e.name for e in named.effects} != names(best):
-        return found
-    with search.stage("fit in free run"):
-        search.keep(search.run_laws(best.laws, best))
-        trial = search.thorough(search.memo[best.key])
-        before, after = search.held_out(search.root), search.held_out(trial)
-    answer = replace(answer, effects=named.effects).acting(search, trial)
-    verdict = judge(leading, answer, ())
-    known = np.isfinite(before.error) or not search.past_deadline
-    predicts = known and after.error < before.error and not after.rms > EQUAL_RATIO * found.correction.after
-    if verdict.kind != "missing-physics" or not predicts:
-        return found
-    correction = replace(named_correction(search, trial.fitted), before=before.rms, after=after.rms, closest=trial)
-    note = drift_note(request.simulator, memory, " and ".join(display_name(law) for _, law in sorted(names(trial))))
-    return replace(
-        found,
-        verdict=verdict,
-        gates=(*found.gates, note),
-        fitted=trial.fitted,
-        correction=correction,
-        effects=answer.effects,
-        decided=leading,
-    )
-
-
 def _final_fits(
     request: Request, ready: Prepared, search: Search, found: Conclusion, everything: Everything | None
 ) -> FinalFits:
     """Return the fits that the answer states: those of the search, or fits to everything if it ran on stretches."""
     bench, without, after = search.bench, search.root.fitted, found.fitted
-    if found.effects and not np.isfinite(found.correction.after):  # a held-out comparison chose what it compared
+    # after a held-out comparison, the offsets stay as they were compared
+    if found.effects and not np.isfinite(found.correction.after):
         with search.until_interrupted():
             after = fix_idle_offsets(bench, after)
     if everything is None:
@@ -314,3 +193,189 @@ def _final_fits(
         drawn = [back_on_stretches(bench, f, one.initial) for f, one in zip(to_all, pair, strict=True)]
         nominal = errors_of(whole, whole.model(request.simulator))
     return FinalFits(whole, to_all[0], to_all[1], nominal, (drawn[0], drawn[1]), partial(everything.fit, search))
+
+
+# the conclusion
+
+
+def _concluded(search: Search, gates: Sequence[Gate]) -> Conclusion:
+    """Draw the conclusion; after an interrupt, draw it without further fits."""
+    found = None
+    with search.until_interrupted():
+        found = _conclude_as_stage(search, gates)
+    return found or conclude(search, gates)
+
+
+def _conclude_as_stage(search: Search, gates: Sequence[Gate]) -> Conclusion:
+    """Draw the conclusion, and note if the time ended meanwhile; an interrupted fit raises at the end of the stage."""
+    with search.stage("conclusion"):
+        found = conclude(search, gates)
+        search.out_of_time = search.out_of_time or time.perf_counter() > search.bench.deadline
+        return found
+
+
+def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
+    """Draw the conclusion from a search: steps 3 to 7 of the module docstring.
+
+    After Ctrl-C nothing more is fitted: a name that was found stays; otherwise the refitted simulator is returned.
+    """
+    answer, elsewhere = posterior(search), tuple[Gate, ...]()
+    interrupted, finished = search.interrupted, not search.cut_short
+    judged = _Judged.of(search, answer, gates)
+    if judged.kind in ("missing-physics", "unexplained") and not search.past_deadline:
+        found = _conclude_without_a_law(search, judged)
+        if found is not None:
+            return found
+    if judged.kind == "missing-physics":
+        correction, fitted = find_named_correction(search, answer)
+        judged, elsewhere = _weigh_names(search, answer, correction, gates, finished)
+        if judged.kind == "missing-physics":
+            return _conclude_named(search, judged, elsewhere, correction, fitted)
+    if judged.kind == "unexplained" and finished:
+        elsewhere = elsewhere or find_undeclared_port(search)[0]
+        notes = (*judged.gates, *elsewhere, *find_untried_laws(search), *find_varying_values(search))
+        judged = replace(judged, gates=notes)
+    if search.interrupted and judged.kind != "recording-fault":
+        return _conclude_interrupted(search, judged, came_to_an_answer=not interrupted)
+    if judged.kind == "unexplained":
+        return _conclude_unexplained(search, judged, elsewhere)
+    refitted = search.root.fitted
+    return Conclusion(judged.verdict, judged.gates, refitted, uncompared_correction(search, refitted))
+
+
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    """A posterior, the notes beside it, and the verdict on both."""
+
+    answer: Posterior
+    gates: tuple[Gate, ...]
+    verdict: Verdict
+
+    @classmethod
+    def of(cls, search: Search, answer: Posterior, gates: Sequence[Gate]) -> _Judged:
+        """Judge a posterior, with the steady tones that its laws leave among the notes."""
+        noted = with_tones(search, answer, gates)
+        return cls(answer, noted, judge(search, answer, noted))
+
+    @property
+    def kind(self) -> str:
+        """Kind of the verdict."""
+        return self.verdict.kind
+
+
+def with_tones(search: Search, answer: Posterior, gates: Sequence[Gate]) -> tuple[Gate, ...]:
+    """Add the steady tones in the residual of the named laws, or of the refit if nothing is named."""
+    fitted = answer.best.fitted if answer.effects else search.root.fitted
+    return (*gates, *find_tones(search.bench, fitted))
+
+
+def _conclude_without_a_law(search: Search, judged: _Judged) -> Conclusion | None:
+    """Conclude that a parameter has a wrong pinned value, or an input was clipped, if that explains as much as laws."""
+    answer, gates = judged.answer, judged.gates
+    held = find_pinned_parameters(search, answer)
+    if held is not None:
+        corrected = uncompared_correction(search, held.fitted)
+        freed = " and ".join(held.names)
+        return Conclusion(Verdict("complete", held.sentence), gates, held.fitted, corrected, freed=freed)
+    named = judged.kind == "missing-physics"
+    if named and answer.sure >= SURE:
+        return None
+    refitted = search.root.fitted
+    left = answer.best.mean_square / search.root.mean_square if named else 1.0
+    clipping = find_clipped_input(search.bench, refitted, left)
+    if clipping is None:
+        return None
+    fault = Verdict("recording-fault", clipping.sentence)
+    return Conclusion(fault, (*gates, clipping), refitted, uncompared_correction(search, refitted))
+
+
+def _weigh_names(
+    search: Search, answer: Posterior, correction: Correction, gates: Sequence[Gate], finished: bool
+) -> tuple[_Judged, tuple[Gate, ...]]:
+    """Weigh names against a learned force and, after a finished search, against laws where no port is declared.
+
+    Also returns the note about such a law.
+    """
+    answer = answer.within({(port, law) for port, law, _ in correction.elements}, correction.shares["learned"])
+    judged = _Judged.of(search, answer, gates)
+    if judged.kind != "missing-physics" or not finished or not may_act_elsewhere(search, answer.best):
+        return judged, ()
+    elsewhere, odds = find_undeclared_port(search, answer.best)
+    return _Judged.of(search, answer.against(odds), gates), elsewhere
+
+
+def _conclude_named(
+    search: Search, judged: _Judged, elsewhere: Sequence[Gate], correction: Correction, fitted: Fitted
+) -> Conclusion:
+    """State the named effects, and the offsets beside them."""
+    sentence = f"{judged.verdict.sentence} {correction.sentence}" if correction.learned else judged.verdict.sentence
+    notes = (*judged.gates, *elsewhere, *list_offsets(search.added_laws(fitted), fitted.values))
+    return Conclusion(Verdict(judged.kind, sentence), notes, fitted, correction, judged.answer.effects)
+
+
+def _conclude_interrupted(search: Search, judged: _Judged, came_to_an_answer: bool) -> Conclusion:
+    """State what an interrupted search leaves: a correction without a name, or the refitted simulator."""
+    correction, fitted = find_unnamed_correction(search)
+    error = percent(search.bench.nrmse(search.root.fitted))
+    off = f"Refitted, the simulator is off by {error} of the outputs' deviation."
+    none = "The search was interrupted before it came to an answer."
+    answer = judged.verdict.sentence if came_to_an_answer else none
+    sentence = f"{answer} {correction.sentence if correction.elements else off}"
+    return Conclusion(Verdict(judged.kind, sentence), judged.gates, fitted, correction)
+
+
+def _conclude_unexplained(search: Search, judged: _Judged, elsewhere: Sequence[Gate]) -> Conclusion:
+    """State the law that is closest to an unexplained mismatch, or the law that explains it at an undeclared port."""
+    correction, fitted = find_unnamed_correction(search)
+    verdict = judge(search, judged.answer, judged.gates, correction.closest)
+    where = [f"{g.value} in the equation of {g.channel} explains it" for g in elsewhere]
+    answer = f"Physics is missing, but hardly at a declared port: {where[0]}." if where else verdict.sentence
+    return Conclusion(Verdict(verdict.kind, f"{answer} {correction.sentence}"), judged.gates, fitted, correction)
+
+
+# naming in predictions
+
+
+def _name_in_predictions(request: Request, search: Search, found: Conclusion) -> Conclusion:
+    """Search with one-step predictions if the simulator drifts: errors of its free runs hardly distinguish laws.
+
+    The laws that are named there are refitted in free run. They are kept if their strengths are significant there and
+    they predict held-out data better than the refit, and as well as the correction that was found without a name.
+    """
+    if request.simulator.observer is not None or not drifts(search.bench, search.root.fitted):
+        return found
+    say, hold = request.say.under("predictions: "), search.bench.hold
+    try:
+        observed, memory = predictor(request.simulator, request.recordings, hold, request.engine)
+        observed_request = replace(request, simulator=observed, hold=hold, focus="prediction", say=say)
+        predicting = search_with_one_hold(observed_request).search
+    except InputError:
+        return found
+    search.cut_short_with(predicting)
+    if predicting.interrupted:
+        return found
+    named, answer = _concluded(predicting, ()), posterior(predicting)
+    best = answer.best
+    if named.verdict.kind != "missing-physics" or {e.name for e in named.effects} != best.names:
+        return found
+    with search.stage("fit in free run"):
+        search.keep(search.run_laws(best.laws, best))
+        trial = search.thorough(search.memo[best.key])
+        before, after = search.held_out(search.root), search.held_out(trial)
+    answer = replace(answer, effects=named.effects).acting(search, trial)
+    verdict = judge(predicting, answer, ())
+    known = np.isfinite(before.weighted_rms) or not search.past_deadline
+    better = known and after.weighted_rms < before.weighted_rms
+    if verdict.kind != "missing-physics" or not better or after.rms > EQUAL_RATIO * found.correction.after:
+        return found
+    correction = replace(uncompared_correction(search, trial.fitted), before=before.rms, after=after.rms, closest=trial)
+    note = drift_note(request.simulator, memory, " and ".join(display_name(law) for _, law in sorted(trial.names)))
+    return replace(
+        found,
+        verdict=verdict,
+        gates=(*found.gates, note),
+        fitted=trial.fitted,
+        correction=correction,
+        effects=answer.effects,
+        decided=predicting,
+    )

@@ -11,9 +11,10 @@ law leaves and that a flexible force at some port would explain. The density of 
     2 / (π s_0 (1 + (s / s_0)²)), if the law is the physics: half-Cauchy,
 
 and the probability of a hypothesis is divided between a named and an unnamed answer in this ratio. s_0 is the share
-that the formula of the right law may leave. A wrong law often drives a parameter of the simulator to a bound. The
-confidence of an effect is the probability that it is included and that its strength is not zero. An effect beside
-others is named if that exceeds one half (Barbieri & Berger 2004).
+that the formula of the right law may leave. A wrong law often drives a parameter of the simulator to a bound; then the
+odds against the law rise by STRAINED_ODDS. The confidence of an effect is the probability that it is included, that its
+law is the physics, and that its strength is not zero. An effect beside others is included if its probability exceeds
+SURE (median probability model, Barbieri & Berger 2004).
 """
 
 from __future__ import annotations
@@ -43,13 +44,11 @@ from .fits.evidence import (
 from .fits.floor import ABOVE_NOISE, Floor, times_white
 from .fits.workbench import Fitted
 from .search.hypotheses import Hypotheses
-from .search.trials import Trial
-
-Name = tuple[str, str]  # port and law id
+from .search.trials import Name, Trial
 
 
 @dataclass(frozen=True, eq=False)
-class NamedEffect:
+class LikelyEffect:
     """An effect of the likeliest hypothesis."""
 
     element: Placed
@@ -65,7 +64,7 @@ class NamedEffect:
         """Port and law id."""
         return self.element.port, self.element.law.id
 
-    def times(self, probability: float) -> NamedEffect:
+    def times(self, probability: float) -> LikelyEffect:
         """Weigh the effect by the probability of something else that it rests on."""
         return replace(self, confidence=probability * self.confidence, at_port=probability * self.at_port)
 
@@ -81,7 +80,7 @@ class Posterior:
 
     best: Trial  # the likeliest hypothesis
     named: float  # probability that the laws of the best hypothesis are the physics, given this hypothesis
-    effects: tuple[NamedEffect, ...]  # its laws, strongest first
+    effects: tuple[LikelyEffect, ...]  # its laws, strongest first
     nothing: float  # probability of the simulator alone
 
     @property
@@ -111,14 +110,9 @@ class Posterior:
         return replace(self, named=self.named / (1 + odds), effects=effects)
 
 
-def names(trial: Trial) -> frozenset[Name]:
-    """Return ports and law ids of the effects of a hypothesis."""
-    return frozenset((e.port, e.law.id) for e in trial.effects)
-
-
-def hypotheses_named(search: Hypotheses, said: Collection[Name]) -> list[Trial]:
+def hypotheses_named(search: Hypotheses, wanted: Collection[Name]) -> list[Trial]:
     """List the hypotheses whose effects have these ports and law ids; an effect may have several forms."""
-    return [t for t in search.memo.values() if names(t) == said]
+    return [t for t in search.memo.values() if t.names == wanted]
 
 
 def explainable_remainder(search: Hypotheses, trial: Trial, before: Trial | None = None) -> float:
@@ -138,21 +132,24 @@ def share_left(
 ) -> float:
     """Compute the share that a fit leaves of a hypothesis' mean square error above the noise.
 
-    The hypothesis is by default the refit, and the noise the floor, of which at least `least` counts as left. The
-    estimated floor may contain physics that nothing explains; the white noise is a lower limit of the noise. An error
-    above the outputs' variance counts as that, which a constant leaves: in a free run errors may accumulate without
-    end, and to have removed them says little of a law.
+    The hypothesis is by default the refit, and the noise the floor. The estimated floor may contain physics that
+    nothing explains; the white noise is a lower limit of the noise. `least` is the multiple of the noise below which no
+    error counts. The error before is limited to the outputs' variance, because free-run errors can grow without limit.
     """
-    one, noise2 = (before or search.root).fitted, (floor or search.floor).squares(search.bench.scale)
-    noise, left, whole, most = (float(np.mean(v / fitted.balance)) for v in (noise2, fitted.squares, one.squares, 1.0))
-    excess = max(min(whole, most) - noise, 1e-300)
-    return float(np.clip((max(left, least * noise) - noise) / excess, 0.0, 1.0))
+
+    def pooled(squares: np.ndarray | float) -> float:
+        return float(np.mean(squares / fitted.balance))
+
+    noise = pooled((floor or search.floor).squares(search.bench.scale))
+    left = pooled(fitted.squares)
+    most = min(pooled((before or search.root).fitted.squares), pooled(1.0))
+    return float(np.clip((max(left, least * noise) - noise) / max(most - noise, 1e-300), 0.0, 1.0))
 
 
 def share_named(s: float, odds: float = 1.0) -> float:
     """Compute the probability that a law which leaves the share s is the physics.
 
-    `odds` tells how much likelier what is seen beside that is of a wrong law than of the right one (`_odds_against`).
+    `odds` is the likelihood ratio of the other observations, wrong law over right law (`_odds_against`).
     """
     law = (1 - OUTSIDE_CATALOGUE) * 2 / (np.pi * FORMULA_ERROR * (1 + (s / FORMULA_ERROR) ** 2))
     other = OUTSIDE_CATALOGUE / (max(s, FORMULA_ERROR) * (1 - np.log(FORMULA_ERROR)))
@@ -165,18 +162,18 @@ def posterior(search: Hypotheses) -> Posterior:
     weights = _weights(search, trials)
     by_names: dict[frozenset[Name], float] = {}
     for t, w in zip(trials, weights, strict=True):
-        by_names[names(t)] = by_names.get(names(t), 0.0) + float(w)
-    said = max(by_names, key=lambda n: by_names[n])
+        by_names[t.names] = by_names.get(t.names, 0.0) + float(w)
+    likeliest_names = max(by_names, key=lambda n: by_names[n])
     while True:
-        best = _plainest(search, hypotheses_named(search, said))
-        if not said:
-            return Posterior(best, 0.0, (), by_names[said])
+        best = _plainest(search, hypotheses_named(search, likeliest_names))
+        if not likeliest_names:
+            return Posterior(best, 0.0, (), by_names[likeliest_names])
         found = [_make_effect(search, best, e, by_names) for e in best.effects]
         least = min(found, key=lambda e: e.confidence)
-        fewer = said - {least.name}
+        fewer = likeliest_names - {least.name}
         if least.confidence > SURE or fewer not in by_names or not fewer:
             break
-        said = fewer
+        likeliest_names = fewer
     named = share_named(explainable_remainder(search, best), _odds_against(search, best, best.effects))
     effects = (e.times(_named_beside(search, best, e)) for e in found)
     strongest_first = sorted(effects, key=lambda e: -(_without(search, best, e) or search.root).mean_square)
@@ -184,11 +181,11 @@ def posterior(search: Hypotheses) -> Posterior:
     return answer.acting(search, best)
 
 
-def _named_beside(search: Hypotheses, best: Trial, effect: NamedEffect) -> float:
+def _named_beside(search: Hypotheses, best: Trial, effect: LikelyEffect) -> float:
     """Compute the probability that one law of a hypothesis is the physics, from what is left of its own mismatch.
 
-    Its own mismatch is what the others leave without it. A small effect may only make up for the formula of a large
-    one, and so it has to explain its part as well as that one does.
+    A small effect may only compensate an inexact formula of a large one. Its share is therefore judged on the error
+    without it.
     """
     remainder = explainable_remainder(search, best, _without(search, best, effect))
     return share_named(remainder, _odds_against(search, best, [effect.element]))
@@ -206,9 +203,9 @@ def _acts(search: Hypotheses, best: Trial, element: Placed) -> float:
     return significance(search.bench, best.fitted, names) if names else 1.0
 
 
-def _without(search: Hypotheses, best: Trial, effect: NamedEffect) -> Trial | None:
+def _without(search: Hypotheses, best: Trial, effect: LikelyEffect) -> Trial | None:
     """Return the hypothesis without one of several effects, if it was fitted."""
-    others = names(best) - {effect.name}
+    others = best.names - {effect.name}
     fitted = hypotheses_named(search, others) if others else []
     return min(fitted, key=lambda t: t.mean_square, default=None)
 
@@ -228,7 +225,7 @@ def _plainest(search: Hypotheses, trials: Sequence[Trial]) -> Trial:
 
 def _make_effect(
     search: Hypotheses, best: Trial, element: Placed, by_names: Mapping[frozenset[Name], float]
-) -> NamedEffect:
+) -> LikelyEffect:
     """Make an effect, with its inclusion probability given that the physics is in the catalogue."""
     twins, law = _indistinguishable(search, best, element), element.law.id
     ports = {element.port}
@@ -236,7 +233,7 @@ def _make_effect(
         ports |= set(places.split(" + ")) if other == law else set()
     included = sum(w for n, w in by_names.items() if n & {(port, law) for port in ports})
     at_port = sum(w for n, w in by_names.items() if ports & {port for port, _ in n})
-    return NamedEffect(element, included, twins, min(at_port, 1.0))
+    return LikelyEffect(element, included, twins, min(at_port, 1.0))
 
 
 def _weights(search: Hypotheses, trials: Sequence[Trial]) -> np.ndarray:
@@ -245,7 +242,7 @@ def _weights(search: Hypotheses, trials: Sequence[Trial]) -> np.ndarray:
     Laws claim only to be near the physics; they are weighed by samples that count as far as their error is noise.
     """
     tempered = np.array([search.evidence(t) for t in trials])
-    alone = np.array([not names(t) for t in trials])
+    alone = np.array([not t.names for t in trials])
     if _is_slow_noise(search):
         near = alone | (tempered > max(tempered[~alone], default=0.0) - CONTENDING_NATS)
         full = np.array([search.evidence_in_noise(t) if one else -np.inf for t, one in zip(trials, near, strict=True)])
@@ -271,14 +268,14 @@ def _indistinguishable(search: Hypotheses, best: Trial, element: Placed) -> dict
     The same law in every sensor is one effect, at "sensor:a + sensor:b".
     """
     own = (element.port, element.law.id)
-    rest, out = names(best) - {own}, dict[Name, Trial]()
+    rest, out = best.names - {own}, dict[Name, Trial]()
     least = search.evidence(best) - INDISTINGUISHABLE_NATS
     every = [port_name(SENSOR, name) for name in search.bench.simulator.output_names]
     for t in sorted(search.memo.values(), key=search.evidence, reverse=True):
-        other = names(t) - rest
-        if search.evidence(t) < least or not rest <= names(t) or own in other or not other:
+        other = t.names - rest
+        if search.evidence(t) < least or not rest <= t.names or own in other or not other:
             continue
-        if len(other) == 1 and len(names(t)) == len(names(best)):
+        if len(other) == 1 and len(t.names) == len(best.names):
             out.setdefault(next(iter(other)), t)
         elif other == {(port, element.law.id) for port in every}:
             out.setdefault((" + ".join(every), element.law.id), t)

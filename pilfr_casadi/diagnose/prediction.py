@@ -1,7 +1,8 @@
-"""Prediction focus: the recordings lead the simulator, and its errors are errors of one-step predictions.
+"""Prediction focus: an observer corrects the simulator's states, and the errors are those of one-step predictions.
 
 An unstable simulator cannot be run by its inputs alone, and a simulator with a drift or an unrecorded disturbance
-leaves the recordings however good it is. An observer leads it (Ljung 1999, System Identification, sec. 4.3),
+leaves the recordings however good it is. An observer corrects its states by the outputs (Ljung 1999, System
+Identification, sec. 4.3),
 
     x̂ₖ₊₁ = f(x̂ₖ, uₖ) + L (yₖ - ŷₖ),
 
@@ -38,8 +39,8 @@ ROUNDING = 1e-9  # share of the largest entry that counts as zero
 OF_GROWTH, OF_DURATION = (3.0, 1.0, 0.3, 0.1), (0.1, 0.03, 0.01, 0.003)
 
 
-def can_be_led(simulator: Simulator, recordings: Sequence[Recording]) -> bool:
-    """Tell whether the error of an unstable simulator grows by less than a factor e within a sample."""
+def observer_keeps_up(simulator: Simulator, recordings: Sequence[Recording]) -> bool:
+    """Tell whether an observer keeps up: the error of the simulator grows by less than a factor e within a sample."""
     return growth_rate(simulator, recordings[0]) * recordings[0].dt < 1
 
 
@@ -74,15 +75,15 @@ def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, 
     memories = [max(memory, recordings[0].dt) for memory in memories]  # corrections come once a sample
     best: tuple[float, Simulator, float] | None = None
     for memory in memories:
-        led = replace(simulator, observer=observer(simulator, recordings, hold, memory))
-        bench = Workbench.of(led, recordings, hold, engine)
+        observed = replace(simulator, observer=observer(simulator, recordings, hold, memory))
+        bench = Workbench.of(observed, recordings, hold, engine)
         found = refit(bench)
         if found is None:
             continue
         if found.cost < USELESS_FIT:
-            return led, memory
+            return observed, memory
         if best is None or found.cost < best[0]:
-            best = found.cost, led, memory
+            best = found.cost, observed, memory
     if best is None:
         raise InputError(
             "Led by the recordings, the simulator still cannot follow them; check the signs and units of its equations "

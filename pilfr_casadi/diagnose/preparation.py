@@ -20,11 +20,11 @@ from ..engine import make_engine
 from ..optimise import GaussNewton, Status
 from ..simulators import Simulator, discretise_for, unit_notes
 from .arguments import stated_hold
-from .faults.channels import accept_best, find_gross_slips, find_slips, open_bench, refit_corrected
-from .faults.gates import CURED_SHARE, EQUAL_RATIO, NEAR_NOISE_RATIO, POOR_FIT, Checked, Gate
+from .faults.channels import accept_best, find_channel_errors, find_gross_channel_errors, open_bench, refit_corrected
+from .faults.gates import CURED_SHARE, EQUAL_RATIO, NEAR_NOISE_RATIO, POOR_FIT, Checked, Gate, error_ratio
 from .faults.lost_samples import find_gaps, find_output_gaps
 from .faults.offsets import find_offsets, find_wrong_start
-from .faults.samples import find_held_outputs, mend_stale_samples, open_unsettled, remove_glitches, unclip
+from .faults.samples import clean_recordings, find_held_outputs, mend_stale_samples, unclip
 from .faults.timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps
 from .fits.floor import Floor, pool, white_part
 from .fits.linearise import linearise_runs, observer_gain, sample_run
@@ -36,8 +36,8 @@ CHECKED_ABOVE = 4e-4  # mean square error up to which signs and units are not ch
 CHECKS, CHECKED = "checks and refit", 6  # the stage's name, and the number of its parts that are reported
 LEAST_REFIT = 10.0  # seconds for the first refit in any case
 UNCHECKED = (
-    "Some checks of the recordings were left out, because the time was over or somebody interrupted them: a shift, a "
-    "gap or an offset of a channel may have been missed."
+    "Some checks of the recordings were left out, because time ran out or the run was interrupted: a shift, a gap or "
+    "an offset of a channel may have been missed."
 )
 TIMED_SAMPLES = 50  # samples whose simulation is timed
 LONG_SIMULATION = 1.0  # seconds that a simulation takes without a note
@@ -71,40 +71,39 @@ def prepare(
     hold: str | None,
     engine: str,
     workers: int = 1,
-    early: bool = True,
+    correct_early: bool = True,
     say: Stages | None = None,
     until: float = np.inf,
 ) -> Prepared:
     """Correct faults of the recordings, refit from the user's values, and measure the noise.
 
-    Without `early`, an early channel counts as a fault only where nothing else is wrong. No check begins after `until`
+    Without `correct_early`, an early channel is corrected only if no other error is left. No check begins after `until`
     (a time of `time.perf_counter`), and the fits of checks end then; a note tells if checks were left out.
     """
     say = say or Stages(lambda *_: None)
     say(CHECKS, 0, CHECKED)
-    recordings, spikes = remove_glitches(recordings)
-    recordings, transients = open_unsettled(recordings)
+    recordings, cleaned = clean_recordings(recordings)
     slow = find_held_outputs(recordings)
-    said = stated_hold(simulator, recordings, hold)
-    bench, times = open_bench(simulator, recordings, said or "zero", engine)
-    checks, noted = _Checks(workers, early, say, until), (*spikes, *transients, *slow, *times)
+    stated = stated_hold(simulator, recordings, hold)
+    bench, times = open_bench(simulator, recordings, stated or "zero", engine)
+    checks, noted = _Checks(workers, correct_early, say, until), (*cleaned, *slow, *times)
     held: Sequence[Gate] = ()
-    if said:
+    if stated:
         first = checks.begin(bench, noted)
     else:
-        first, held = choose_hold(checks.begin_with_either_hold(bench, noted).with_deadline(checks.deadline))
+        first, held = choose_hold(checks.begin_with_either_hold(bench, noted).with_deadline(checks.refit_deadline()))
     nominal = errors_of(replace(bench, hold=first.bench.hold), first.fitted.model)
     say(CHECKS, 1, CHECKED)
-    now = checks.run(first, 1.0 if said else 0.5)
+    now = checks.run(first, 1.0 if stated else 0.5)
     faulty = any(g.fault for g in now.gates[len(first.gates) :])
-    if not said and faulty and not bench.interrupt.pressed:  # on faulty data the better hold says nothing
+    if not stated and faulty and not bench.interrupt.pressed:  # on faulty data the better hold says nothing
         now, held = _with_better_hold(checks, now, first, held)
     bench, without = now.bench, now.fitted
     cut_short = checks.left_out or bench.interrupt.pressed
     corrected = bool(now.gates or held)  # values and states from faulty data may be in a wrong minimum
     if corrected and not bench.interrupt.pressed:
-        led = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
-        without = min(led, bench.fit(bench.simulator, [{}, led.values], solver=THOROUGH), key=lambda f: f.cost)
+        again = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
+        without = min(again, bench.fit(bench.simulator, [{}, again.values], solver=THOROUGH), key=lambda f: f.cost)
     bench.check_followed(without)
     bench = replace(bench, typical=sample_run(bench, without))
     say(CHECKS, CHECKED, CHECKED, without.cost**0.5)
@@ -117,23 +116,23 @@ class _Checks:
     """The checks of recordings in their order; `left_out` receives the first of each run that was not begun."""
 
     workers: int
-    early: bool
+    correct_early: bool
     say: Stages
     until: float
     left_out: list[Callable[[Checked], Checked]] = field(default_factory=list)
 
-    @property
-    def deadline(self) -> float:
-        """When a first refit ends: with the checks, and after a few seconds in any case."""
+    def refit_deadline(self) -> float:
+        """Return when a refit that begins now ends: with the checks, but in LEAST_REFIT seconds at the earliest."""
         return max(self.until, time.perf_counter() + LEAST_REFIT)
 
     def begin(self, bench: Workbench, gates: tuple[Gate, ...]) -> Checked:
         """Refit from the user's values; correct a fault of a channel that shows at these values."""
         found: Checked | None = None
         with UntilInterrupted(bench.interrupt, self.say.interrupted):
-            slips = find_gross_slips(replace(bench, deadline=self.deadline), self.workers)
-            found = self._try_gross_slips(replace(bench, deadline=self.deadline), slips, gates) if slips else None
-        return found or first_refit(replace(bench, deadline=self.deadline), gates)
+            faults = find_gross_channel_errors(replace(bench, deadline=self.refit_deadline()), self.workers)
+            if faults:
+                found = self._try_gross_errors(replace(bench, deadline=self.refit_deadline()), faults, gates)
+        return found or first_refit(replace(bench, deadline=self.refit_deadline()), gates)
 
     def begin_with_either_hold(self, bench: Workbench, gates: tuple[Gate, ...]) -> Checked:
         """Begin; with the other hold too if a channel is at fault, of which the wrong hold may choose the wrong one."""
@@ -148,7 +147,7 @@ class _Checks:
             first = min(first, self.begin(other, gates), key=lambda checked: checked.cost)
         return first
 
-    def _try_gross_slips(self, bench: Workbench, slips: Sequence[Gate], gates: tuple[Gate, ...]) -> Checked | None:
+    def _try_gross_errors(self, bench: Workbench, faults: Sequence[Gate], gates: tuple[Gate, ...]) -> Checked | None:
         """Correct the likeliest fault if the rule accepts it; None if there is no fault and every run diverges.
 
         The refit to the recordings as given gets half of the time: a slow simulator is not fitted at length to what it
@@ -157,10 +156,10 @@ class _Checks:
         brief = replace(bench, deadline=(time.perf_counter() + bench.deadline) / 2)
         plain = refit(brief, solver=THOROUGH) or brief.run_given()
         now = replace(with_observer(Checked(brief, plain, gates)), bench=bench)
-        found = accept_best(now, () if bench.interrupt.pressed else slips, self.workers)
+        found = accept_best(now, () if bench.interrupt.pressed else faults, self.workers)
         if bench.interrupt.pressed:  # half a fit accepts wrong faults
             return now if np.isfinite(now.cost) else None
-        found = found.with_deadline(self.deadline)
+        found = found.with_deadline(self.refit_deadline())
         if found.adds_to(now):
             return refit_corrected(found)
         if not np.isfinite(found.cost):
@@ -168,13 +167,14 @@ class _Checks:
         bench, values, states = found.bench, found.fitted.values, found.fitted.initial
         return replace(found, fitted=bench.fit(bench.simulator, [values], states=states, solver=THOROUGH))
 
-    def run(self, first: Checked, part: float) -> Checked:
-        """Correct one fault after the other from the first refit on; `part` is the unit of shifts, see `timing`."""
-        now = with_observer(first.with_deadline(self.deadline)).weighted()
+    def run(self, first: Checked, shift_step: float) -> Checked:
+        """Correct one fault after the other from the first refit on; for `shift_step` see `timing`."""
+        now = with_observer(first.with_deadline(self.refit_deadline())).weighted()
         now = self._in_turn(now, find_wrong_start, in_any_case=True)
         now = now.with_deadline(self.until)
-        slips, shift = partial(self._correct_slips, part=part), partial(find_time_shift, part=part, early=self.early)
-        now = self._in_turn(now, self._report(2), slips, in_any_case=True)
+        channels = partial(self._correct_channel_errors, shift_step=shift_step)
+        shift = partial(find_time_shift, shift_step=shift_step, correct_early=self.correct_early)
+        now = self._in_turn(now, self._report(2), channels, in_any_case=True)
         now = self._in_turn(now, self._report(3), unclip, mend_stale_samples, find_gaps)
         now = self._in_turn(now, self._report(4), _refine_steps, in_any_case=True)
         return self._in_turn(now, shift, find_output_gaps, self._report(5), find_offsets)
@@ -199,19 +199,19 @@ class _Checks:
 
         return report
 
-    def _correct_slips(self, now: Checked, part: float) -> Checked:
+    def _correct_channel_errors(self, now: Checked, shift_step: float) -> Checked:
         """Correct wrong signs, units and exchanged channels if the refit is not at the noise, and refit."""
         if now.cost <= NEAR_NOISE_RATIO**2 * now.noise2 or np.mean(now.fitted.squares) <= CHECKED_ABOVE:
             return now
-        found = self._find_slips(now, part)
+        found = self._find_channel_errors(now, shift_step)
         return refit_corrected(found) if found.adds_to(now) else found
 
-    def _find_slips(self, now: Checked, part: float) -> Checked:
+    def _find_channel_errors(self, now: Checked, shift_step: float) -> Checked:
         """Find wrong signs, units and exchanged channels; or a shift, because half a period late looks like a sign."""
-        found = find_slips(now, self.workers)
+        found = find_channel_errors(now, self.workers)
         if not found.adds_to(now) or found.cost <= POOR_FIT:
             return found
-        late = find_time_shift(now, part, self.early)
+        late = find_time_shift(now, shift_step, self.correct_early)
         return late if late.cost < CURED_SHARE * found.cost else found
 
 
@@ -227,13 +227,13 @@ def _with_better_hold(
     If inputs are taken as held but were interpolated, a late channel is late by half a sample more or less.
     """
     try:
-        again = _with_other_hold(first.with_deadline(checks.deadline))
+        again = _with_other_hold(first.with_deadline(checks.refit_deadline()))
         both = now, checks.run(again, 0.5)
     except InputError:
         return now, held
     noise2 = np.min([found.floor.squares(found.bench.scale) for found in both], axis=0)
     costs = [_comparable_cost(found, noise2) for found in both]
-    ratio = (max(costs) / max(min(costs), 1e-300)) ** 0.5
+    ratio = error_ratio(*costs)
     if ratio > EQUAL_RATIO:
         now = both[int(costs[1] < costs[0])]
         held = [hold_note(now.bench.simulator, now.bench.hold, ratio)]
@@ -271,8 +271,8 @@ def with_observer(now: Checked) -> Checked:
     if not gain.any():
         return now
     try:
-        led = bench.fit(bench.simulator, anneal=OBSERVER_GAINS, like=bench.compile(bench.simulator, gain))
-        found = bench.fit(bench.simulator, [led.values], states=led.begin, solver=THOROUGH)
+        observed = bench.fit(bench.simulator, anneal=OBSERVER_GAINS, like=bench.compile(bench.simulator, gain))
+        found = bench.fit(bench.simulator, [observed.values], states=observed.begin, solver=THOROUGH)
     except (InputError, np.linalg.LinAlgError):
         return now
     return replace(now, fitted=found) if found.cost < now.cost else now
@@ -293,7 +293,7 @@ def choose_hold(first: Checked, solver: GaussNewton = THOROUGH) -> tuple[Checked
     if Status.TIME_LIMIT in (first.fitted.status, other.fitted.status):
         return first, ()
     costs = first.cost, other.cost
-    ratio = float(np.sqrt(max(costs) / max(min(costs), 1e-300)))
+    ratio = error_ratio(*costs)
     if not ratio >= EQUAL_RATIO:
         return first, ()
     best = other if other.cost < first.cost else first

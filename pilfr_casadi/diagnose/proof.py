@@ -146,8 +146,8 @@ def free_run_errors(
     """Compute the NRMSEs without an observer, on corrected recordings."""
     models = {}
     for name, fitted in {"nominal": without, "before": without, "after": after}.items():
-        led = simulator if name == "nominal" else fitted.corrected()
-        free = discretise(replace(led, observer=None), bench.dt, bench.hold, fitted.model.substeps)
+        one = simulator if name == "nominal" else fitted.corrected()
+        free = discretise(replace(one, observer=None), bench.dt, bench.hold, fitted.model.substeps)
         models[name] = Started.of(free, fitted)
     return compare_errors(bench.on(recordings), models).errors
 

@@ -35,7 +35,7 @@ from ..identify import regrid
 from ..laws import OPERATORS, Law, Local, display_name, hysteresis_layer, unit_forces
 from ..models import check_size, play
 from ..simulators import Simulator, discretise, in_series, on_grid
-from .fits.evidence import HeldOut, Sample, held_out_errors, spread
+from .fits.evidence import EffectiveSamples, HeldOut, held_out_errors, spread
 from .fits.floor import effective_size
 from .fits.force_recovery import signals_along
 from .fits.workbench import THOROUGH, Compiled, Fitted, Workbench
@@ -175,8 +175,8 @@ def refine(diagnosis: Any, operators: int, kind: str | None, port: str | None) -
     check_size("A layer", 2 * n)
     if kind is not None and kind not in OPERATORS:
         raise InputError(f"kind = {kind!r} was given; give {', '.join(map(repr, OPERATORS))}, or None to try them.")
-    search, after = (diagnosis.evidence.get(name) for name in ("search", "after"))
-    if not isinstance(search, Search) or not isinstance(after, Fitted):
+    search, after = diagnosis.evidence.search, diagnosis.evidence.after
+    if search is None or after is None:
         raise InputError("This diagnosis does not hold its search; refine one that `diagnose` has just returned.")
     search.bench = replace(search.bench, interrupt=Interrupt())  # an interrupt of an earlier one is over
     samples = sum(len(r) - r.skip for r in search.bench.recordings)
@@ -206,7 +206,7 @@ def refine(diagnosis: Any, operators: int, kind: str | None, port: str | None) -
     best, *others = layers
     for name in others:  # plays and stops differ only by a line; another kind has to be better in both errors
         one, other = held_out[best], held_out[name]
-        best = name if other.error < one.error and other.mean_square < one.mean_square else best
+        best = name if other.weighted_rms < one.weighted_rms and other.score < one.score else best
     return _build_refinement(diagnosis, search.bench, best, layers[best], number, held_out)
 
 
@@ -218,8 +218,8 @@ def _predict(search: Search, fitted: Fitted) -> HeldOut:
     """
     bench = search.bench
     found = held_out_errors(bench, fitted, search.workers)
-    v = found.mean_square
-    n = Sample(search.floor2, effective_size(bench.scored(fitted.residual))).effective(v)
+    v = found.score  # still without a spread
+    n = EffectiveSamples(search.floor2, effective_size(bench.scored(fitted.residual))).at(v)
     return replace(found, spread=spread(bench, fitted, search.added_laws(fitted), v, n) if np.isfinite(v) else np.inf)
 
 
@@ -361,7 +361,7 @@ def _initial_state(after: Fitted, state: np.ndarray, number: int, law: Law, z: f
 def _build_refinement(
     diagnosis: Any, bench: Workbench, kind: str, fitted: Fitted, number: int, held_out: Mapping[str, HeldOut]
 ) -> Refinement:
-    element, after = fitted.simulator.elements[number], diagnosis.evidence["after"]
+    element, after = fitted.simulator.elements[number], diagnosis.evidence.after
     values, port = element.own(fitted.values), element.port
     refined = diagnosis.with_fit(fitted)
     errors: dict[str, dict[str, float] | None] = {
@@ -374,7 +374,7 @@ def _build_refinement(
     signal = in_series(port)
     z = np.linspace(0.0, float(np.ptp(loops[0][0])) / 2, CURVE_POINTS)
     order = np.argsort(values["r"])
-    improves = held_out[kind].mean_square < held_out[DIAGNOSED].mean_square
+    improves = held_out[kind].score < held_out[DIAGNOSED].score
     old = after.simulator.elements[number].law
     return Refinement(
         port=port,

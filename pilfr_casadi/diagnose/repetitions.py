@@ -1,10 +1,17 @@
 """Prepare and search, and repeat that where something that was taken for granted proves wrong.
 
-There are five cases: with an observer if the simulator is unstable and runs away from the recordings (`prediction`);
-with the other hold if nobody stated it and the best hypothesis follows better with it; without a shift if a channel
-seemed to be early, because missing physics can look like a lead; with a shift that shows only beside the first law; and
-from unknown initial states if a wrong zero was preferred to a wrong start. Each search fits different data. Its
-evidence is therefore not comparable; the smaller error decides.
+There are five cases:
+
+- If the simulator is unstable and runs away from the recordings, search with an observer (`prediction`).
+- If nobody stated the hold of the inputs and the best hypothesis follows better with the other one, search with that.
+- If a channel seemed to be early, search without that correction, because missing physics can look like a lead.
+- If a channel proves shifted only beside the first law, search with it at its right times.
+- If a wrong zero was preferred to a wrong start, search from unknown initial states.
+
+A sixth, in predictions, is `pipeline._name_in_predictions`. The functions are nested: `search_with_repetitions` calls
+`_search_with_either_hold`, that calls `search_with_one_hold`, and that `_search_once`.
+
+Each search fits different data. Its evidence is therefore not comparable; the smaller error decides.
 """
 
 from __future__ import annotations
@@ -12,20 +19,20 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from .._base import InputError
 from .arguments import Request, stated_hold
-from .faults.gates import LEAST_GAIN, USELESS_FIT, Checked, Gate, gain
+from .faults.gates import LEAST_GAIN, USELESS_FIT, Checked, Gate, error_ratio, evidence_gain
 from .faults.offsets import Offset, WrongStart
 from .faults.timing import TimeShift
 from .fits.evidence import AS_GIVEN_RATIO
 from .fits.floor import Floor, measured_floor
 from .fits.workbench import RunsAway
-from .prediction import can_be_led, prediction_note, predictor
+from .prediction import observer_keeps_up, prediction_note, predictor
 from .preparation import CHECKS, Prepared, hold_note, prepare
 from .search.moves import Search
 
@@ -33,144 +40,158 @@ from .search.moves import Search
 PREPARATION_SHARE, SEARCH_SHARE = 0.35, 0.7
 
 
-def search_with_focus(request: Request) -> tuple[Request, Prepared, Search]:
-    """Search; if nobody stated the focus and the simulator runs away, let the recordings lead it."""
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """A search, and the preparation from which it began."""
+
+    ready: Prepared
+    search: Search
+
+    def compared_with(self, other: Attempt) -> tuple[float, float]:
+        """Compute the mean square errors of the best hypotheses of two searches, with the noise of the first."""
+        return self.search.best.mean_square, self.search.bench.pool(other.search.best.fitted.squares)
+
+
+def search_with_repetitions(request: Request) -> tuple[Request, Attempt]:
+    """Search; if nobody stated the focus and the simulator runs away, correct its states by an observer."""
     if request.focus != "prediction":
         try:
-            return request, *_search_both_holds(request)
+            return request, _search_with_either_hold(request)
         except RunsAway:  # by `Workbench`, in the first refit or as the check of it in `_search_once`
-            if request.focus == "simulation" or not can_be_led(request.simulator, request.recordings):
+            if request.focus == "simulation" or not observer_keeps_up(request.simulator, request.recordings):
                 raise
     # the gain depends little on the hold, which the search may still change
     hold = stated_hold(request.simulator, request.recordings, request.hold) or "zero"
-    led, memory = predictor(request.simulator, request.recordings, hold, request.engine)
+    observed, memory = predictor(request.simulator, request.recordings, hold, request.engine)
     note = prediction_note(request.simulator, request.recordings, memory)
-    request = replace(request, simulator=led, notes=(*request.notes, note))
-    return request, *_search_both_holds(request)
+    request = replace(request, simulator=observed, notes=(*request.notes, note))
+    return request, _search_with_either_hold(request)
 
 
-def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
+def _search_with_either_hold(request: Request) -> Attempt:
     """Search; if nobody stated the hold of the inputs and it matters, use the hold with the smaller error."""
-    ready, search = run_search(request)
-    if search.hold_said or not _prefers_other_hold(search):
-        return ready, search
+    first = search_with_one_hold(request)
+    search = first.search
+    if search.hold_stated or not _prefers_other_hold(search):
+        return first
     hold = search.bench.with_other_hold().hold
     held = replace(request, hold=hold, say=request.say.under("other hold: "))
-    found = _again(search, partial(run_search, held))
-    if found is None:
-        return ready, search.resume(request.most_effects)
-    other, again = found
-    only_refitted, before2, after2 = again.interrupted and len(again.memo) < 2, *_comparable(search, again)
+    other = _again(first, partial(search_with_one_hold, held))
+    if other is None:
+        search.resume(request.most_effects)
+        return first
+    again = other.search
+    only_refitted, before2, after2 = again.interrupted and len(again.memo) < 2, *first.compared_with(other)
     if after2 > before2 or only_refitted:
-        return ready, search.resume(request.most_effects)
+        search.resume(request.most_effects)
+        return first
     # the laws that were found since may have been what the hold had made up for
     if _prefers_other_hold(again):
         search.adopt(again.best)
-        resumed = search.resume(request.most_effects)
-        before2, after2 = _comparable(resumed, again)
+        search.resume(request.most_effects)
+        before2, after2 = first.compared_with(other)
         if before2 < after2:
-            return ready, resumed
-    ratio = float(np.sqrt(before2 / max(after2, 1e-300)))
-    return replace(other, gates=(*other.gates, hold_note(request.simulator, hold, ratio))), again
+            return first
+    note = hold_note(request.simulator, hold, error_ratio(before2, after2))
+    return replace(other, ready=replace(other.ready, gates=(*other.ready.gates, note)))
 
 
 def _prefers_other_hold(search: Search) -> bool:
     """Tell whether a search that nobody has interrupted would be better with the other hold."""
+    prefers = False
     with search.until_interrupted():
-        return search.prefers_other_hold()
-    return False
+        prefers = search.prefers_other_hold()
+    return prefers
 
 
-def _comparable(one: Search, other: Search) -> tuple[float, float]:
-    """Compute the mean square errors of the best hypotheses of two searches, with the noise of the first."""
-    return one.best.mean_square, one.bench.pool(other.best.fitted.squares)
-
-
-def run_search(request: Request) -> tuple[Prepared, Search]:
-    """Prepare and search; if a lead was corrected, repeat without, and keep that if it is clearly better.
+def search_with_one_hold(request: Request) -> Attempt:
+    """Prepare and search; if an early channel was corrected, repeat without, and keep that if it is clearly better.
 
     If a channel proves shifted beside a law, repeat with it at its right times. If a wrong zero was preferred to a
     wrong start, repeat with the start unknown.
     """
-    ready, search = _search_once(request, shift_early=True)
-    if search.shift is not None:
-        return _search_realigned(request, ready, search, search.shift)
-    start = next((g.otherwise for g in ready.gates if isinstance(g, WrongStart) and g.otherwise), None)
-    if start is not None and not search.cut_short:
-        request, ready, search = _search_from_unknown_start(request, ready, search, start)
-    leads = any(isinstance(g, TimeShift) and g.leads for g in ready.gates)
+    first = _search_once(request, correct_early=True)
+    if first.search.shift is not None:
+        return _search_realigned(request, first, first.search.shift)
+    start = next((g.otherwise for g in first.ready.gates if isinstance(g, WrongStart) and g.otherwise), None)
+    if start is not None and not first.search.cut_short:
+        request, first = _search_from_unknown_start(request, first, start)
+    search = first.search
+    leads = any(isinstance(g, TimeShift) and g.leads for g in first.ready.gates)
     if not leads or search.cut_short or not search.can_improve(search.best):
-        return ready, search
-    found = _again(search, partial(_search_once, request, shift_early=False))
-    if found is None:
-        return ready, search
-    before2, after2 = _comparable(search, found[1])
-    return found if after2 < AS_GIVEN_RATIO * before2 else (ready, search)
+        return first
+    other = _again(first, partial(_search_once, request, correct_early=False))
+    if other is None:
+        return first
+    before2, after2 = first.compared_with(other)
+    return other if after2 < AS_GIVEN_RATIO * before2 else first
 
 
-def _search_realigned(request: Request, ready: Prepared, search: Search, shift: Gate) -> tuple[Prepared, Search]:
+def _search_realigned(request: Request, first: Attempt, shift: Gate) -> Attempt:
     """Search with a shifted channel at its right times, which ended a search; go on with that if it is clearly better.
 
     Missing physics can look like a lead.
     """
-    edits = [g for g in ready.gates if g.corrected and g.change is not None]  # the shift is one of corrected channels
-    moved = replace(request.corrected((*edits, shift), ready.nominal, "shifted: "), aligned=True)
+    # the shift is one of corrected channels
+    edits = [g for g in first.ready.gates if g.corrected and g.change is not None]
+    moved = replace(request.corrected((*edits, shift), first.ready.nominal, "shifted: "), aligned=True)
+    search = first.search
     search.shift, search.aligned = None, True
-    found = _again(search, partial(_search_once, moved, shift_early=True))
-    if found is None:
-        return ready, search if search.interrupted else search.run(request.most_effects)
-    other, again = found
+    other = _again(first, partial(_search_once, moved, correct_early=True))
+    if other is None:
+        if not search.interrupted:
+            search.run(request.most_effects)
+        return first
+    again = other.search
     if again.can_improve(again.best) and not again.cut_short:
         search.run(request.most_effects)
-    before2, after2 = _comparable(search, again)
-    return (ready, search) if before2 < AS_GIVEN_RATIO * after2 else (other, again)
+    before2, after2 = first.compared_with(other)
+    return first if before2 < AS_GIVEN_RATIO * after2 else other
 
 
-def _search_from_unknown_start(
-    request: Request, ready: Prepared, search: Search, start: WrongStart
-) -> tuple[Request, Prepared, Search]:
+def _search_from_unknown_start(request: Request, first: Attempt, start: WrongStart) -> tuple[Request, Attempt]:
     """Search with the initial states estimated; keep that if it follows to the noise, and clearly better.
 
     Before the missing physics is known, it may be what makes a wrong zero more likely than a wrong start. While it is
     unknown, free initial states and an offset together make up for a part of it.
     """
-    opened = request.corrected((start,), ready.nominal, "unknown start: ")
-    found = _again(search, partial(_search_once, opened, shift_early=True))
-    if found is None:
-        return request, ready, search
-    other, again = found
+    opened = request.corrected((start,), first.ready.nominal, "unknown start: ")
+    other = _again(first, partial(_search_once, opened, correct_early=True))
+    if other is None:
+        return request, first
+    again = other.search
     changed = sum(a is not b for a, b in zip(opened.recordings, request.recordings, strict=True))
     unknown = changed * len(opened.simulator.states)
     residuals = again.bench.scored(again.best.fitted.residual)
     explained = not again.can_improve(again.best)
-    if explained and gain(*_comparable(search, again), residuals, unknown) > LEAST_GAIN:
-        return opened, other, again
-    return request, ready, search
+    if explained and evidence_gain(*first.compared_with(other), residuals, unknown) > LEAST_GAIN:
+        return opened, other
+    return request, first
 
 
-def _again(search: Search, prepare_and_search: Callable[[], tuple[Prepared, Search]]) -> tuple[Prepared, Search] | None:
+def _again(first: Attempt, prepare_and_search: Callable[[], Attempt]) -> Attempt | None:
     """Prepare and search once more; None if an interrupt came before that search began, or the simulator diverges.
 
     If that search is cut short, so is the present one.
     """
-    with search.until_interrupted(), suppress(InputError):
-        ready, again = prepare_and_search()
-        search.cut_short_with(again)
-        return ready, again
-    return None
+    found = None
+    with first.search.until_interrupted(), suppress(InputError):
+        found = prepare_and_search()
+        first.search.cut_short_with(found.search)
+    return found
 
 
-def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]:
+def _search_once(request: Request, correct_early: bool) -> Attempt:
     """Check and correct the recordings, refit the simulator, measure the noise, and search from there."""
     began = time.perf_counter()
     left = request.deadline - began
     ready = prepare(
         request.simulator,
         request.recordings,
-        request.hold,
-        request.engine,
-        request.workers,
-        early=shift_early,
+        hold=request.hold,
+        engine=request.engine,
+        workers=request.workers,
+        correct_early=correct_early,
         say=request.say,
         until=began + PREPARATION_SHARE * left,
     )
@@ -182,19 +203,19 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
     now = Checked(ready.bench, ready.without).weighted(ready.floor)
     ready = replace(ready, bench=now.bench, without=now.fitted)
     search = Search(
-        ready.bench,
-        ready.without,
-        ready.floor,
-        (*request.laws, Offset),
-        request.workers,
-        request.say,
-        hold_said=request.hold_said,
+        bench=ready.bench,
+        without=ready.without,
+        floor=ready.floor,
+        laws=(*request.laws, Offset),
+        workers=request.workers,
+        say=request.say,
+        hold_stated=request.hold_stated,
         aligned=request.aligned,
-        stand_in_error=request.stand_in_error,
+        surrogate_nrmse=request.surrogate_nrmse,
         until=began + SEARCH_SHARE * left,
         times={CHECKS: time.perf_counter() - began},
     )
-    return ready, search.run(request.most_effects)
+    return Attempt(ready, search.run(request.most_effects))
 
 
 def _noise(request: Request, ready: Prepared) -> Floor:
@@ -202,6 +223,6 @@ def _noise(request: Request, ready: Prepared) -> Floor:
     floor = ready.floor
     if request.stretches is not None and floor.source == "estimated":  # what repeats may be outside the stretches
         floor = measured_floor(request.stretches.everything(ready.bench, ready.gates).recordings) or floor
-    if not request.stand_in_error:
+    if not request.surrogate_nrmse:
         return floor
-    return floor.beside(request.stand_in_error * ready.bench.scale)
+    return floor.beside(request.surrogate_nrmse * ready.bench.scale)

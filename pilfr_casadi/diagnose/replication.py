@@ -25,9 +25,17 @@ from ..data import Recording
 from ..laws import Law
 from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
 from .arguments import match_recordings, stated_hold
-from .faults.channels import correct_gross_slips
+from .faults.channels import correct_gross_channel_errors
 from .faults.gates import Checked
-from .fits.evidence import FORMULA_ERROR, Sample, deviations, information, log_evidence, log_prior, prior_width
+from .fits.evidence import (
+    FORMULA_ERROR,
+    EffectiveSamples,
+    information,
+    log_evidence,
+    log_prior,
+    prior_width,
+    standard_errors,
+)
 from .fits.floor import effective_size, measured_floor, third_differences
 from .fits.linearise import sample_run
 from .fits.workbench import FINER_STEPS, THOROUGH, Fitted, Workbench, refit
@@ -89,7 +97,7 @@ def find_channel_faults(
     The simulator is refitted only if one is suspected. For arguments and errors see `replicate`.
     """
     bench = _bench(simulator, recordings, hold, engine)
-    now = correct_gross_slips(bench)
+    now = correct_gross_channel_errors(bench)
     bench.interrupt.raise_pending()
     return tuple(fault.sentence for fault in now.gates) if now else ()
 
@@ -178,7 +186,7 @@ def _refine_steps(bench: Workbench, fitted: Fitted) -> Fitted:
     """
     most = min(FINER_STEPS**2 * bench.chosen, MOST_SUBSTEPS)
     while fitted.model.substeps < most and not fitted.simulator.discrete and np.any(fitted.model.parameters.free):
-        error = fitted.model.parameters.pack(deviations(bench, fitted))
+        error = fitted.model.parameters.pack(standard_errors(bench, fitted))
         steps = min(FINER_STEPS * fitted.model.substeps, most)
         finer = replace(bench, substeps=steps, at_least=steps, chosen=max(bench.chosen, -(-steps // FINER_STEPS)))
         found = refit(finer, [fitted.values], fitted.simulator, states=fitted.initial, solver=THOROUGH)
@@ -217,14 +225,14 @@ def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ..
     """Compute the log evidence with the laws minus the log evidence of the simulator as given."""
     tolerance = FORMULA_ERROR * max(plain.cost - noise2, 0.0)
     costs = plain.cost + tolerance, after.cost + tolerance
-    n = Sample(noise2 + tolerance, max(effective_size(bench.scored(after.residual)), 1.0)).effective(min(costs))
+    n = EffectiveSamples(noise2 + tolerance, max(effective_size(bench.scored(after.residual)), 1.0)).at(min(costs))
     known = information(bench, after, laws)
     return log_evidence(costs[1], known, log_prior(laws, {}), n) - log_evidence(costs[0], np.zeros(0), 0.0, n)
 
 
 def _values(bench: Workbench, fitted: Fitted) -> Values:
     own = fitted.model.parameters
-    values, errors = fitted.vector, own.pack(deviations(bench, fitted))
+    values, errors = fitted.vector, own.pack(standard_errors(bench, fitted))
     free = [(k, label) for k, label in enumerate(own.labels) if own.free[k]]
     return Values({label: float(values[k]) for k, label in free}, {label: float(errors[k]) for k, label in free})
 

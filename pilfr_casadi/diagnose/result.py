@@ -197,13 +197,13 @@ class Diagnosis(ResultText):
         r, dt = self.matched(recording), self.train[0].dt
         if abs(r.dt / dt - 1) > SAME_STEP:
             raise InputError(f"The recording's step is {r.dt:g} s, the training's {dt:g} s; resample it.")
-        fitted = self.evidence.get("after" if simulator is self.corrected else "without")
+        fitted = self.evidence.after if simulator is self.corrected else self.evidence.without
         substeps = fitted.model.substeps if fitted is not None else self.substeps
         model = discretise(simulator, dt, self.hold, substeps)
         one = Started(model)
         if fitted is not None:
             follows = r.begins == "estimate" and simulator in (self.corrected, self.refitted)
-            search = self.evidence.get("search") if follows else None
+            search = self.evidence.search if follows else None
             one = Started.of(model, fitted, search.bench if search is not None else None)
         y, skip = run_free(model, make_engine(model), r, one.starts, known=one.known)
         return r, y, skip
@@ -280,7 +280,7 @@ class Diagnosis(ResultText):
 
     def with_fit(self, fitted: Fitted) -> Diagnosis:
         """Copy with another fitted simulator as the corrected one."""
-        evidence = {**self.evidence, "after": fitted}
+        evidence = replace(self.evidence, after=fitted)
         corrected = replace(fitted.corrected(), substeps=fitted.model.substeps)
         return replace(self, corrected=corrected, evidence=evidence, substeps=fitted.model.substeps)
 

@@ -18,7 +18,7 @@ from .correction import Correction
 from .effect import Effect
 from .faults.gates import TEST_FAULT, Gate, value_with_unit
 from .faults.offsets import Offset
-from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, SURE
+from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, all_sure
 from .fits.floor import ABOVE_NOISE
 from .search.learned import Learned
 
@@ -31,6 +31,16 @@ OUT_OF_TIME = (
     "The time limit ended the search: the answer rests on the fits made until then. A longer one (time_limit, "
     "--time-limit) may find more."
 )
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """The search and the fits on which a diagnosis rests; None where one is unknown."""
+
+    search: Any = None  # the `Search`
+    noise: np.ndarray | None = None  # standard deviation of each output's noise, (n_y,)
+    without: Any = None  # the refitted simulator, as `Fitted` to the recordings of the search
+    after: Any = None  # the corrected one
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +66,7 @@ class ResultText:
     times: Mapping[str, float] = field(default_factory=dict)
     interrupted: bool = False
     out_of_time: bool = False
-    evidence: Mapping[str, Any] = field(default_factory=dict)
+    evidence: Basis = Basis()
     substeps: int = 1
     freed: str = ""
     correction: Correction | None = None
@@ -65,8 +75,8 @@ class ResultText:
 
     @property
     def sure(self) -> bool:
-        """Whether every named effect has a confidence above one half; False without effects."""
-        return bool(self.effects) and min(e.confidence for e in self.effects) > SURE
+        """Whether every named effect has a confidence above SURE; False without effects."""
+        return all_sure(e.confidence for e in self.effects)
 
     @property
     def outcome(self) -> str:
@@ -124,31 +134,31 @@ class ResultText:
 
         It also says if no test recording shows what the correction is worth.
         """
-        errors, said = self.errors.get("test"), self.sentence
-        untold = self.out_of_time and "time limit" not in said
+        errors, text = self.errors.get("test"), self.sentence
+        untold = self.out_of_time and "time limit" not in text
         if untold or (self.effects and (self.interrupted or self.out_of_time)):
             by = "Ctrl-C" if self.interrupted else "the time limit"
-            said += f" The search was cut short by {by}, so that a further effect may not have been tried."
+            text += f" The search was cut short by {by}, so that a further effect may not have been tried."
         if not errors:
             untested = " This correction is not tested yet: give a recording of another experiment as test."
-            return said + untested if self._changed else said
+            return text + untested if self._changed else text
         if self.test_fault:
-            return f"{said} {self.test_fault} Until then the test error says nothing of this answer."
+            return f"{text} {self.test_fault} Until then the test error says nothing of this answer."
         given, before, after = (_percent(errors[k]) for k in ("nominal", "before", "after"))
         if self.outcome == "same":
-            said += f" On the test recordings it makes no difference: {before} before, {after} after."
-            said += " A constant would follow them as well." if errors["after"] > 1 else ""
-            said += self._better_without()
+            text += f" On the test recordings it makes no difference: {before} before, {after} after."
+            text += " A constant would follow them as well." if errors["after"] > 1 else ""
+            text += self._better_without()
         elif self.outcome == "worse":
-            said += (
+            text += (
                 f" But this correction makes the test recordings worse: their error is {before} refitted "
                 f"and {after} with it. Do not use it as a correction.{self._better_without()}"
             )
         else:
-            said += self._idle_on_tests()
+            text += self._idle_on_tests()
         if BETTER_RATIO * errors["nominal"] < min(errors["before"], errors["after"]):
-            said += f" As given, the simulator follows the test recordings better than with any fit here: {given}."
-        return said
+            text += f" As given, the simulator follows the test recordings better than with any fit here: {given}."
+        return text
 
     def worth(self, effect: Effect) -> str:
         """State the test error with and without one of several effects; empty if it is unknown."""

@@ -49,11 +49,12 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
     `closest` is the hypothesis that an unexplained mismatch is compared with, by default the most promising with a law.
     """
     off = search.bench.nrmse(search.root.fitted)
-    if search.stand_in_error and off < NEAR_RATIO * search.stand_in_error:
+    surrogate = search.surrogate_nrmse
+    if surrogate and off < NEAR_RATIO * surrogate:
         return Verdict(
             "complete",
             "Nothing is seen that the simulation lacks: refitted, what stands for it follows the recordings to "
-            f"{percent(off)} of the outputs' deviation, and the simulation itself to {percent(search.stand_in_error)}.",
+            f"{percent(off)} of the outputs' deviation, and the simulation itself to {percent(surrogate)}.",
         )
     fault = min((g for g in gates if g.fault), key=lambda g: g.left, default=None)
     cured = fault is not None and fault.left < FORMULA_ERROR
@@ -152,15 +153,15 @@ def _describe_effects(search: Hypotheses, found: Posterior) -> str:
     there = in_words(list(dict.fromkeys(e.element.port for e in found.effects if not e.confidence > SURE)))
     certain = f"not certain, only that something acts at {there}" if placed else "not certain"
     if not unsure:
-        said = f"The simulator leaves out {sure}."
+        sentence = f"The simulator leaves out {sure}."
     elif not sure:
         the = "these" if " and " in unsure else "the"
-        said = f"The simulator most likely leaves out {unsure}; {the} {names_are} {certain}."
+        sentence = f"The simulator most likely leaves out {unsure}; {the} {names_are} {certain}."
     else:
         these = "these" if " and " in unsure else "this"
         more = f"More acts beside that, most likely {unsure}; {these} {names_are} {certain}."
-        said = f"The simulator leaves out {sure}. {more}"
-    return said + _describe_vanished(search, found)
+        sentence = f"The simulator leaves out {sure}. {more}"
+    return sentence + _describe_vanished(search, found)
 
 
 def _describe_vanished(search: Hypotheses, found: Posterior) -> str:

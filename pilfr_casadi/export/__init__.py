@@ -1,4 +1,9 @@
-"""Models that leave the package: step functions, C code, `control` systems, and model files."""
+"""Models that leave the package: step functions, C code, `control` systems, and model files.
+
+`step` holds the step function `Exported` of any model, which `build_step` makes; `c_code` and `fmu` write it as C code
+and as a functional mock-up unit. `smoothing` replaces kinks for solvers. `model_file` writes and reads model files by
+the layout of `model_schema`.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -23,7 +23,7 @@ and `ranges` the bounds, as multiples of an attribute of `Local` or as a functio
 [1.4, 2.0, 3.99]
 
 `diagnose(simulator, recordings, laws=(*CATALOGUE, RubberBlock))` tries it beside the others. A class written into one
-of the files of this folder is in the catalogue without further steps.
+of the files that `catalogue` lists (`stiffness`, `friction`, ...) is in the catalogue without further steps.
 """
 
 from __future__ import annotations

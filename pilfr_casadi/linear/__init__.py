@@ -1,4 +1,8 @@
-"""Linear models: best linear approximation, subspace methods in time and frequency, order selection, Kalman gains."""
+"""Linear models: best linear approximation, subspace methods in time and frequency, order selection, Kalman gains.
+
+`bla` estimates the best linear approximation, `subspace` identifies state spaces, `statespace` transforms and analyses
+them, and `parts` linearises a closed model for small and for large motions.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -2,6 +2,10 @@
 
 A model holds the equations of one time step, with ports for elements. An element maps a local signal `z` to an internal
 signal `w` and may have memory. `close_loop` puts an element into a port.
+
+`model` holds `Model`, `parameters` the parameters of all models, `operators` the hysteresis operators and `elements`
+the elements made of them. `pilfr` holds the PI-LFR, `structures` the models to compare it with (add one there), and
+`conversion` rewrites a PI-LFR with plays as one with stops.
 """
 
 from typing import TYPE_CHECKING

@@ -76,11 +76,11 @@ class _Case:
 
     @classmethod
     def of(cls, d: Diagnosis) -> _Case:
-        search = d.evidence.get("search")
+        search, noise = d.evidence.search, d.evidence.noise
         recordings = d.train if search is None else search.bench.recordings  # stretches of long recordings
         bench = Workbench.of(d.refitted, recordings, d.hold)
-        noise = np.asarray(d.evidence.get("noise", float(d.floor["nrmse"]) * bench.scale))
-        return cls(d, bench, d.evidence["without"], d.evidence["after"], np.nan_to_num(noise))
+        noise = float(d.floor["nrmse"]) * bench.scale if noise is None else noise
+        return cls(d, bench, d.evidence.without, d.evidence.after, np.nan_to_num(noise))
 
     def unit(self, name: str) -> str:
         """Return the unit of an input or output; empty if it is unknown."""
@@ -89,7 +89,7 @@ class _Case:
 
 
 def diagnosis_page(diagnosis: Diagnosis) -> Page:
-    """Fill the page of a diagnosis; see `diagnosis_report`."""
+    """Build the page of a diagnosis; see `diagnosis_report`."""
     case, d = _Case.of(diagnosis), diagnosis
     actions = [measure_action(case.bench, case.after, e, element_of(case.after, e)) for e in d.effects]
     checks = tables.check_table(d)
@@ -181,7 +181,7 @@ def _mismatch(case: _Case) -> list[Block]:
 
 
 def _hidden_forces(case: _Case) -> list[Block]:
-    """Draw the forces of the named effects; without a name, those of the closest laws and at the most likely port."""
+    """Draw the forces of the named effects; without a name, those of the closest laws and of the likeliest port."""
     d, out = case.diagnosis, [block for learned in case.diagnosis.learned for block in _learned_force(case, learned)]
     for e in d.effects:
         if (number := element_of(case.after, e)) is not None:
@@ -190,7 +190,7 @@ def _hidden_forces(case: _Case) -> list[Block]:
             out += _strength_pictures(case, number)
     if d.verdict != "unexplained":
         return out
-    search, passes = d.evidence.get("search"), tables.candidates_by_pass(d)
+    search, passes = d.evidence.search, tables.candidates_by_pass(d)
     closest: Any = search and closest_hypothesis(search, d.correction.closest if d.correction else None)
     for acting in closest.effects if closest else ():
         number, law = closest.fitted.simulator.elements.index(acting), display_name(acting.law.id)
@@ -341,8 +341,8 @@ def _draw_comparison(case: _Case, c: BeforeAfter, i: int) -> list[Block]:
     noise = case.diagnosis.floor
     white = noise.get("white", noise["nrmse"]) / max(noise["nrmse"], 1e-300)  # the slow part is no white noise
     simulated: plots.Simulated = [("as given", c.given), ("refitted", c.before)]
-    if correction := tables.correction_words(case.diagnosis):
-        simulated.append((correction.removesuffix(" put back").removesuffix(" added"), c.after))
+    if correction := tables.correction_label(case.diagnosis):
+        simulated.append((correction, c.after))
     diverging = [label for label, y in simulated if y is None]
     note = f" The simulation diverges: {', '.join(diverging)}." if diverging else ""
     where = f"{name} in {r.name}"

@@ -39,14 +39,20 @@ def correction_words(diagnosis: Diagnosis) -> str:
 
     The text says "put back" only if the names are certain and the laws help on the test recordings.
     """
+    stated = diagnosis.sure and diagnosis.outcome in ("better", "")
+    done = f" {'put back' if stated else 'added'}" if diagnosis.effects else ""
+    return correction_label(diagnosis) + done
+
+
+def correction_label(diagnosis: Diagnosis) -> str:
+    """Name the corrected simulator in a legend; empty if it is the refitted one."""
     if diagnosis.effects:
         names = [_short_name(e) for e in diagnosis.effects]
         if any(g.finding == "unsure" for g in diagnosis.gates):
             names.append("laws of uncertain name")
         if diagnosis.learned:
             names.append("a learned force")
-        stated = diagnosis.sure and diagnosis.outcome in ("better", "")
-        return f"with {' and '.join(names)} {'put back' if stated else 'added'}"
+        return f"with {' and '.join(names)}"
     if diagnosis.nameless:
         return "corrected"
     return f"with {diagnosis.freed} let go" if diagnosis.freed else ""
@@ -193,7 +199,7 @@ def candidates_by_pass(diagnosis: Diagnosis) -> list[tuple[list[dict[str, Any]],
 
     The hypothesis is None if it is unknown.
     """
-    rows, search = list(diagnosis.candidates), diagnosis.evidence.get("search")
+    rows, search = list(diagnosis.candidates), diagnosis.evidence.search
     steps = search.passes if search is not None else []
     sizes, parents = [len(step.trials) for step in steps], [step.parent for step in steps]
     if sum(sizes) != len(rows):
@@ -262,7 +268,7 @@ def candidate_tables(
 
 def flexible_table(diagnosis: Diagnosis) -> Table | None:
     """Tabulate the share of the mismatch that a flexible force at each port could explain."""
-    search = diagnosis.evidence.get("search")
+    search = diagnosis.evidence.search
     opened = search.flexible(search.root) if search is not None else {}
     if not opened:
         return None

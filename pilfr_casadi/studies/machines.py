@@ -184,7 +184,7 @@ class MachineWork:
 
     def _hypotheses(self, found: Diagnosis) -> list[dict[str, Any]]:
         """List the fitted hypotheses whose laws are known, with their evidence relative to the plain refit."""
-        search, known = found.evidence["search"], self.known
+        search, known = found.evidence.search, self.known
         out = []
         for trial in search.memo.values():
             if any(known.get(type(e.law).__name__) is not type(e.law) for e in trial.laws):

@@ -20,7 +20,7 @@ from pilfr_casadi.diagnose.other_explanations import (
     find_untried_laws,
     find_varying_values,
 )
-from pilfr_casadi.diagnose.posterior import NamedEffect, Posterior
+from pilfr_casadi.diagnose.posterior import LikelyEffect, Posterior
 from pilfr_casadi.diagnose.search.moves import Search
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.report.diagnosis_tables import headline
@@ -98,7 +98,7 @@ def test_no_value_is_told_in_place_of_a_law_that_explains_nothing():
     right = machine()
     held = right.with_parameters({**right.parameters, "k": Parameter(20.0, fixed=True)})
     search = searched(held, recorded(20.0, 0)[0])
-    named = NamedEffect(Placed("equation:vel", laws.CubicStiffness(), "equation:vel."), 0.9, {}, 0.9)
+    named = LikelyEffect(Placed("equation:vel", laws.CubicStiffness(), "equation:vel."), 0.9, {}, 0.9)
     assert find_pinned_parameters(search, Posterior(search.root, 1.0, (named,), 0.0)) is None
 
 

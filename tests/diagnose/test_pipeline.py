@@ -238,6 +238,6 @@ def test_a_repeated_search_knows_the_corrections_of_its_recordings():
     twice = once.corrected((shown,), 0.7, "again: ")
     assert twice.recordings[0].begins == "estimate" and np.array_equal(twice.recordings[0].u, 2 * r.u)
     for asked, gates in ((once, (start,)), (twice, (start, shown))):
-        ready, search = _search_once(asked, shift_early=False)
-        assert ready.gates[: len(gates)] == gates and ready.nominal == 0.7
-        assert search.bench.recordings[0].begins == "estimate"
+        found = _search_once(asked, correct_early=False)
+        assert found.ready.gates[: len(gates)] == gates and found.ready.nominal == 0.7
+        assert found.search.bench.recordings[0].begins == "estimate"

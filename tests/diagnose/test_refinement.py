@@ -50,7 +50,7 @@ def test_a_layer_of_many_operators_predicts_better(many, refined):
     test = many.test[0]
     assert refined.nrmse(test) < 0.6 * many.nrmse(test)
     assert refined.nrmse(test) == pytest.approx(refined.errors["test"]["refined"])
-    assert refined.held_out[refined.kind].mean_square < refined.held_out["diagnosed"].mean_square
+    assert refined.held_out[refined.kind].score < refined.held_out["diagnosed"].score
     assert np.max(np.abs(refined.simulate(test) - test.y)) < 0.01 * np.max(np.abs(test.y))
 
 
@@ -63,7 +63,7 @@ def test_weights_and_thresholds_are_bounded_below_by_zero(refined):
 
 @pytest.mark.slow
 def test_an_interrupted_refinement_does_not_cut_the_next_one_short(many, refined):
-    many.evidence["search"].bench.interrupt.pressed = True
+    many.evidence.search.bench.interrupt.pressed = True
     assert many.refine(operators=12).nrmse == refined.nrmse
 
 
@@ -137,7 +137,7 @@ def test_wrong_arguments_are_told(many, arguments, says):
 
 
 def test_without_hysteresis_there_is_nothing_to_refine(many):
-    none = replace(many, correction=None, evidence={**many.evidence, "after": many.evidence["without"]})
+    none = replace(many, correction=None, evidence=replace(many.evidence, after=many.evidence.without))
     with pytest.raises(pilfr.InputError, match="nothing to add, and no hysteresis"):
         none.refine()
     with pytest.raises(pilfr.InputError, match="does not hold its search"):

@@ -71,7 +71,7 @@ def test_the_verbs_tell_what_the_diagnosis_told(diagnosed):
 def test_the_noise_is_told_relative_to_each_recording(diagnosed, tmp_path):
     found, test, _ = diagnosed
     noise = found.floor["test"]["nrmse"]
-    assert noise == pytest.approx(found.evidence["noise"][0] / np.std(test.y)) and noise != found.floor["nrmse"]
+    assert noise == pytest.approx(found.evidence.noise[0] / np.std(test.y)) and noise != found.floor["nrmse"]
     quiet = replace(found, floor={**found.floor, "test": {"nrmse": 0.1, "white": 0.1}})
     assert "(estimated), on the test recordings 0.1000" in str(quiet)
     page = diagnosis_report(quiet, tmp_path).read_text()
@@ -328,7 +328,7 @@ def test_an_offset_beyond_the_range_of_its_signal_is_doubted():
 def test_parts_of_a_diagnosis_print_briefly():
     """Their fits hold recordings and models, which nobody wants to read."""
     d = example()
-    for part in (d.correction, d.effects, dict(d.evidence)):
+    for part in (d.correction, d.effects, d.evidence):
         assert len(repr(part)) < 1500
 
 

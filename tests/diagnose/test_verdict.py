@@ -12,9 +12,9 @@ from tank import tank
 import pilfr_casadi as pilfr
 from pilfr_casadi import Recording, multisine
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.correction import Correction, find_correction
+from pilfr_casadi.diagnose.correction import Correction, find_unnamed_correction
 from pilfr_casadi.diagnose.faults.offsets import Offset, fix_idle_offsets, list_offsets, update_offsets
-from pilfr_casadi.diagnose.fits.evidence import deviations
+from pilfr_casadi.diagnose.fits.evidence import standard_errors
 from pilfr_casadi.diagnose.fits.flexible_forces import flexible_shares, innovation_share
 from pilfr_casadi.diagnose.posterior import posterior
 from pilfr_casadi.diagnose.verdict import closest_hypothesis, judge
@@ -42,7 +42,7 @@ def test_slow_noise_that_two_periods_show_is_no_missing_physics():
     slow = lfilter([1], [1, -0.98], np.random.default_rng(2).standard_normal(len(y) + 500))[500:, None]
     r = blank.with_(y=y + 0.15 * np.std(y) * slow / np.std(slow))
     found = pilfr.diagnose(cart(), r, laws=(CoulombFriction, CubicDamping), effects=1, workers=1)
-    assert max(found.evidence["search"].flexible(found.evidence["search"].root).values()) > 0.3
+    assert max(found.evidence.search.flexible(found.evidence.search.root).values()) > 0.3
     assert found.verdict == "complete"
     assert "the rest is as large as the noise" in found.sentence
 
@@ -208,7 +208,7 @@ def test_samples_that_do_not_count_do_not_make_a_value_more_certain():
     errors = []
     for counted in (r.with_(skip=400), r.slice(400).with_(initial="estimate")):
         bench = Workbench.of(cart(), [counted], "zero")
-        errors.append(deviations(bench, bench.fit(bench.simulator)))
+        errors.append(standard_errors(bench, bench.fit(bench.simulator)))
     for name in ("d", "k"):
         assert errors[0][name] == pytest.approx(errors[1][name], rel=0.3)
 
@@ -227,7 +227,7 @@ def test_a_search_that_the_time_limit_ended_does_not_blame_the_catalogue():
     blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
     y = cart().with_element("ground", CoulombFriction().at({"F_c": 3.0, "v_0": 0.01})).simulate(blank)
     found = pilfr.diagnose(cart(), blank.with_(y=y), laws=(CubicDamping,), effects=1, workers=1)
-    search = found.evidence["search"]
+    search = found.evidence.search
     answer = replace(posterior(search), effects=())
     assert "none of the laws tried (cubic damping) explains all of it" in judge(search, answer, ()).sentence
     search.laws = CATALOGUE
@@ -243,7 +243,7 @@ def test_without_laws_no_law_is_blamed_and_an_offset_is_no_closest_law():
     y = 0.2 + cart().with_element("ground", CoulombFriction().at({"F_c": 3.0, "v_0": 0.01})).simulate(blank)
     found = pilfr.diagnose(cart(), blank.with_(y=y), laws=(), workers=1)
     assert found.sentence.startswith("Physics is missing, and no law (none was allowed) explains it.")
-    search = found.evidence["search"]
+    search = found.evidence.search
     assert any(t.laws for t in search.memo.values()) and closest_hypothesis(search) is None
 
 
@@ -253,10 +253,10 @@ def test_one_hypothesis_is_told_where_the_time_ended_before_a_comparison():
     blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
     y = cart().with_element("ground", CoulombFriction().at({"F_c": 3.0, "v_0": 0.01})).simulate(blank)
     found = pilfr.diagnose(cart(), blank.with_(y=y), laws=(CubicDamping,), effects=1, workers=1)
-    search = found.evidence["search"]
+    search = found.evidence.search
     search.bench = replace(search.bench, deadline=0.0)
     answer = replace(posterior(search), effects=())
-    correction, fitted = find_correction(search, answer)
+    correction, fitted = find_unnamed_correction(search)
     assert correction.late and correction.closest.fitted is fitted
     said = judge(search, answer, (), correction.closest).sentence
     assert f"removes {100 * correction.shares['named']:.0f} % of the mismatch" in said

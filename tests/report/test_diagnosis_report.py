@@ -16,6 +16,7 @@ from test_report import EVIL, Reader, own_scripts_alone
 
 from pilfr_casadi._base import InputError
 from pilfr_casadi.diagnose import Gate, Workbench
+from pilfr_casadi.diagnose.result_text import Basis
 from pilfr_casadi.laws import CoulombFriction
 from pilfr_casadi.report import corrected_file, diagnosis_report, diagnosis_report as same, usage
 from pilfr_casadi.simulators import load_simulator
@@ -99,7 +100,7 @@ def test_it_is_simulated_in_the_steps_of_the_fits():
         "after": as_it_stands(replace(bench, at_least=5), d.corrected),
     }
     assert [f.model.substeps for f in fine.values()] == [2, 5]
-    found, known = replace(d, evidence=fine).before_and_after(d.train[0]), d.before_and_after(d.train[0])
+    found, known = replace(d, evidence=Basis(**fine)).before_and_after(d.train[0]), d.before_and_after(d.train[0])
     for name, evidence in (("before", "without"), ("after", "after")):
         assert np.allclose(getattr(found, name), fine[evidence].residual[0] + d.train[0].y, rtol=0, atol=1e-12)
         assert not np.array_equal(getattr(found, name), getattr(known, name))

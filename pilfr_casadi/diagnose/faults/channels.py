@@ -113,7 +113,7 @@ def open_bench(simulator: Any, recordings: Sequence[Recording], hold: str, engin
         raise error
 
 
-def find_gross_slips(bench: Workbench, workers: int = 1) -> list[Gate]:
+def find_gross_channel_errors(bench: Workbench, workers: int = 1) -> list[Gate]:
     """Find wrong signs and units and exchanges that show at the simulator's values, without a fit; best first.
 
     The run at these values has to be off by more than its own size, and with the channel corrected by less.
@@ -122,18 +122,18 @@ def find_gross_slips(bench: Workbench, workers: int = 1) -> list[Gate]:
     before = _unfollowed(bench, given.fitted.residual)
     if not before > 1:
         return []
-    slips = _possible_slips(given, given.fitted.residual, trust_values=True)
-    left = np.array(side_by_side(partial(_run_corrected, given), slips, workers))
+    faults = _possible_channel_errors(given, given.fitted.residual, trust_values=True)
+    left = np.array(side_by_side(partial(_run_corrected, given), faults, workers))
     near = (left < min(CURED_SHARE * before, 1.0)) & (CURED_SHARE * left <= np.min(left))
-    return [replace(slips[i], left=float(left[i])) for i in np.argsort(left, kind="stable") if near[i]]
+    return [replace(faults[i], left=float(left[i])) for i in np.argsort(left, kind="stable") if near[i]]
 
 
-def correct_gross_slips(bench: Workbench) -> Checked | None:
+def correct_gross_channel_errors(bench: Workbench) -> Checked | None:
     """Refit from the user's values, and correct the likeliest gross fault if the rule accepts it; None without one."""
-    slips = find_gross_slips(bench)
-    if not slips:
+    faults = find_gross_channel_errors(bench)
+    if not faults:
         return None
-    return accept_best(Checked(bench, refit(bench) or bench.run_given()), slips)
+    return accept_best(Checked(bench, refit(bench) or bench.run_given()), faults)
 
 
 def _run_corrected(given: Checked, fault: Gate) -> float:
@@ -165,14 +165,14 @@ def _unfollowed(bench: Workbench, residual: Sequence[np.ndarray]) -> float:
     return share if np.isfinite(share) else np.inf
 
 
-def find_slips(now: Checked, workers: int) -> Checked:
+def find_channel_errors(now: Checked, workers: int) -> Checked:
     """Find wrong signs and units, exchanged channels and a wrong unit of time, with `workers` trials at a time.
 
     If the error stays large, try each output with an offset as well; `find_offsets` reports the offset and keeps it.
     """
     bench = now.bench
     given = bench.run_given(now.fitted).residual
-    found = accept_best(now, _possible_slips(now, given), workers)
+    found = accept_best(now, _possible_channel_errors(now, given), workers)
     # with an offset there is a working point, which a run from the stated start would have to reach first
     for i, name in enumerate(bench.simulator.output_names if found.cost > POOR_FIT else ()):
         offset = describe_constant(port_name(SENSOR, name))
@@ -196,7 +196,7 @@ def refit_corrected(now: Checked) -> Checked:
     return replace(now, bench=bench, fitted=fitted)
 
 
-def _possible_slips(now: Checked, errors: Sequence[np.ndarray], trust_values: bool = False) -> list[Gate]:
+def _possible_channel_errors(now: Checked, errors: Sequence[np.ndarray], trust_values: bool = False) -> list[Gate]:
     """List the faults of sign, unit, exchange and unit of time that the outputs' sizes in a run allow.
 
     With `trust_values` the sizes count however large the errors are, and the unit of time counts as right.
@@ -265,8 +265,8 @@ def accept_best(now: Checked, faults: Sequence[Gate], workers: int = 1) -> Check
     rest = [one for one in found if one[0] is not fault and one[0].finding == fault.finding == "unit"]
     equal = [f.sentence.removeprefix(IN_RECORDINGS) for f, a in rest if CLEARLY_BETTER * a.cost < after.cost]
     if equal:
-        said = f"{fault.sentence}; or else {'; or '.join(equal)}: these recordings do not tell which"
-        fault = replace(fault, sentence=said)
+        sentence = f"{fault.sentence}; or else {'; or '.join(equal)}: these recordings do not tell which"
+        fault = replace(fault, sentence=sentence)
     return accept(now, after, fault)
 
 

@@ -184,7 +184,7 @@ class Checked:
 # the one rule
 
 
-def gain(before: float, after: float, residuals: Sequence[np.ndarray], parameters: int = 1) -> float:
+def evidence_gain(before: float, after: float, residuals: Sequence[np.ndarray], parameters: int = 1) -> float:
     """Compute the gain in log evidence, nats, of a fit with more parameters, by BIC on its effective samples.
 
     `residuals` (M, n_y) are its scored samples in each recording.
@@ -193,9 +193,14 @@ def gain(before: float, after: float, residuals: Sequence[np.ndarray], parameter
     return float(0.5 * n * np.log(before / max(after, 1e-300)) - 0.5 * parameters * np.log(n))
 
 
+def error_ratio(one: float, other: float) -> float:
+    """Compute the ratio of the larger to the smaller of two rms errors from their mean squares."""
+    return float(np.sqrt(max(one, other) / max(min(one, other), 1e-300)))
+
+
 def follows_better(one: float, other: float, residuals: Sequence[np.ndarray]) -> bool:
     """Tell whether an edit that leaves the mean square `one` is clearly better than another of as many parameters."""
-    return one < CLEARLY_BETTER * other and gain(other, one, residuals, 0) > LEAST_GAIN
+    return one < CLEARLY_BETTER * other and evidence_gain(other, one, residuals, 0) > LEAST_GAIN
 
 
 def value_with_unit(value: float, unit: str, digits: int = 3) -> str:
@@ -249,16 +254,16 @@ def settle(now: Checked, fault: G, solver: GaussNewton = QUICK) -> tuple[G, Chec
 def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
     """Return the corrected state with its finding if the rule accepts the fault, else the state before.
 
-    If the recordings as given are followed as well from the corrected refit's values, the correction only led the refit
-    out of a local minimum: that refit is returned, without a finding.
+    If the recordings as given are followed as well from the corrected refit's values, the correction only took the
+    refit out of a local minimum: that refit is returned, without a finding.
     """
     if after is None or not satisfies_rule(_cost_where_kept(now, after, fault), after, fault):
         return now
     back = refit(now.bench, [after.fitted.values], states=now.fitted.initial, like=now.fitted)
     if back is not None:
-        led = now.then(now.bench, back)
-        if not satisfies_rule(_cost_where_kept(led, after, fault), after, fault):
-            return led
+        moved = now.then(now.bench, back)
+        if not satisfies_rule(_cost_where_kept(moved, after, fault), after, fault):
+            return moved
     errors = now.bench.nrmse(now.fitted), after.bench.nrmse(after.fitted)
     sentence = f"{fault.sentence}; {fault.remedy} {describe_fall(*errors)}"
     noises = (after.cost / max(now.noise2, 1e-300)) ** 0.5
@@ -270,7 +275,7 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
 
 def satisfies_rule(before: float, after: Checked, fault: Gate) -> bool:
     """Tell whether the rule accepts a fault whose correction reduces the mean square error `before`."""
-    gained = gain(before, after.cost, after.residuals, fault.parameters)
+    gained = evidence_gain(before, after.cost, after.residuals, fault.parameters)
     return gained > LEAST_GAIN and after.cost < min(fault.most_left * before, USELESS_FIT)
 
 

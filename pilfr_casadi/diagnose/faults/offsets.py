@@ -32,8 +32,8 @@ from .gates import (
     Gate,
     accept,
     correct,
+    evidence_gain,
     follows_better,
-    gain,
     settle,
     value_with_unit,
 )
@@ -74,7 +74,7 @@ def find_wrong_start(now: Checked) -> Checked:
     words = f"The initial states are not as stated: {missed}"
     fault = WrongStart("initial state", "start", stated[0].begins, words, change=_with_unknown_start)
     after = correct(now, fault, [now.fitted.values, {}])
-    if after is None or gain(now.cost, after.cost, after.residuals, unknown) < LEAST_GAIN:
+    if after is None or evidence_gain(now.cost, after.cost, after.residuals, unknown) < LEAST_GAIN:
         return now
     zeroed = [r.with_(y=r.y + miss) for r, miss in zip(bench.recordings, misses, strict=True)]
     rival = refit(bench.on(zeroed), [now.fitted.values, {}], states=now.fitted.begin)
@@ -210,7 +210,7 @@ def find_offsets(now: Checked, otherwise: Mapping[str, str] | None = None) -> Ch
         return shared
     each = find_varying_offset(begin)
     more = len(begin.bench.recordings) - len(shared.gates) + len(begin.gates)
-    return each if gain(shared.cost, each.cost, each.residuals, more) > LEAST_GAIN else shared
+    return each if evidence_gain(shared.cost, each.cost, each.residuals, more) > LEAST_GAIN else shared
 
 
 def _stands_for_load(bench: Workbench, port: str, value: float) -> bool:
@@ -424,7 +424,7 @@ def fix_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
         simulator = fitted.simulator.with_parameters({**fitted.simulator.parameters, name: zero})
         start = {k: v for k, v in fitted.values.items() if k != name}
         found = refit(bench, [start], simulator, states=fitted.initial, solver=THOROUGH)
-        if found is not None and gain(found.cost, fitted.cost, bench.scored(fitted.residual)) <= LEAST_GAIN:
+        if found is not None and evidence_gain(found.cost, fitted.cost, bench.scored(fitted.residual)) <= LEAST_GAIN:
             fitted = found
     return fitted
 

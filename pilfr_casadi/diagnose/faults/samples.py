@@ -65,6 +65,13 @@ CHANCE_FACTOR = 3.0  # factor on the number of repeats that noise causes
 # glitches
 
 
+def clean_recordings(recordings: Sequence[Recording]) -> tuple[tuple[Recording, ...], tuple[Gate, ...]]:
+    """Remove glitches, and estimate the initial states of recordings that have not settled; note both."""
+    recordings, glitches = remove_glitches(recordings)
+    recordings, transients = open_unsettled(recordings)
+    return recordings, (*glitches, *transients)
+
+
 def remove_glitches(recordings: Sequence[Recording]) -> tuple[tuple[Recording, ...], list[Gate]]:
     """Replace glitches by interpolation between their neighbours; return the recordings and the findings."""
     gates = list[Gate]()

@@ -171,10 +171,10 @@ class TimeShift(Gate):
         """Tell whether it is a shift by whole samples, which needs no interpolation."""
         return self.finding == "alignment" and in_steps(self.value, dt)
 
-    def is_like_delay(self, dt: float, part: float) -> bool:
-        """Tell whether it may be a delay: by a fraction of `part` samples, or by few samples."""
+    def is_like_delay(self, dt: float, step: float) -> bool:
+        """Tell whether it may be a delay: by a fraction of `step` samples, or by few samples."""
         may_be = self.finding == "alignment" and self.delay > -WHOLE_SHIFT * dt
-        return may_be and not (in_steps(self.delay, dt, part) and self.delay > LONG_SHIFT * dt)
+        return may_be and not (in_steps(self.delay, dt, step) and self.delay > LONG_SHIFT * dt)
 
 
 def _samples(count: float) -> str:
@@ -203,17 +203,18 @@ def _minimise(left: Callable[[float], float], low: float, high: float) -> tuple[
     return float(found.x), float(found.fun)
 
 
-def in_steps(value: float, dt: float, part: float = 1.0) -> bool:
-    """Tell whether a shift is a multiple of `part` samples."""
-    return abs(value / dt - part * round(value / dt / part)) < WHOLE_SHIFT
+def in_steps(value: float, dt: float, step: float = 1.0) -> bool:
+    """Tell whether a shift is a multiple of `step` samples."""
+    return abs(value / dt - step * round(value / dt / step)) < WHOLE_SHIFT
 
 
-def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: bool = True) -> Checked:
+def find_time_shift(now: Checked, shift_step: float = 1.0, correct_early: bool = True, given: bool = True) -> Checked:
     """Find a shifted channel or clock, and correct it if it is a fault of the recording.
 
     With `given`, the run at the user's values is screened as well as the refit. A shift that looks like a delay counts
-    as a fault if it is a multiple of `part` samples, nothing else is wrong, and no lag follows it as well. Without
-    `early`, a shift that puts outputs before their causes also counts as a fault only if nothing else is wrong.
+    as a fault if it is a multiple of `shift_step` samples, nothing else is wrong, and no lag follows it as well.
+    Without `correct_early`, one that puts outputs before their causes also counts as a fault only if nothing else is
+    wrong.
     """
     dt, noise2 = now.bench.dt, now.noise2
     likeliest = _find_likeliest(now, given)
@@ -224,7 +225,7 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True, given: 
     if not found.adds_to(now):
         return found
     more_is_wrong = after.cost > NEAR_NOISE_RATIO**2 * noise2  # then a delay or a slow clock may be physics
-    may_be_physics = fault.is_like_delay(dt, part) or (more_is_wrong and not (fault.leads and early))
+    may_be_physics = fault.is_like_delay(dt, shift_step) or (more_is_wrong and not (fault.leads and correct_early))
     if may_be_physics or not satisfies_rule(kept.cost, after, fault) or _is_lag(now, after, fault):
         return now
     # interpolation has removed a part of the noise

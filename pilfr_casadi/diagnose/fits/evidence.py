@@ -53,7 +53,8 @@ from .workbench import DIVERGED, RUNAWAY, Fitted, Workbench
 EFFECT_PRIOR = np.log(0.5)  # log probability of each further effect: one more effect is as likely as not
 FLEXIBLE_PRIOR = np.log(0.2)  # the same of a law that can imitate others, relative to a law that cannot
 DOUBTFUL_PRIOR = np.log(0.01)  # the same of parameter values at which a law degenerates into another
-DOMAIN_PRIOR = np.log(4.0)  # the same of a law of the port's domain relative to a general one, or of that to a rare one
+# log odds of a law made for the port's domain against a general law, and of that against one that is rare there
+DOMAIN_PRIOR = np.log(4.0)
 OUTSIDE_CATALOGUE = 0.1  # probability that missing physics is in no law of the catalogue
 STRAINED_ODDS = 10.0  # how much likelier a wrong law drives a parameter of the simulator to a bound than the right one
 STATE_PRIOR = 1e-9  # precision of initial states relative to the information of a sample: hardly any prior
@@ -64,12 +65,13 @@ LEAST_FORMULA_ERROR = 1e-6  # share that the right explanation leaves in any cas
 WRONG_MODEL_SAMPLES = 8.0  # effective samples of a model whose whole error is model error (n_0)
 LEAST_MODEL_ERROR = 0.05  # least share of the error that counts as model error
 LARGE_MODEL_ERROR = 0.2  # share of model error in the error above which models are judged on held-out blocks
-DISTURBANCE_WEIGHT = 0.2  # of a law's remainder that no force at a port explains: a disturbance may act beside the law
+# weight of the remainder that no force at a port explains; it may come from a disturbance
+DISTURBANCE_WEIGHT = 0.2
 INPUT_FACTOR = 0.7  # factor on the inputs' deviation for which the spread is computed: well inside their range
-DISTURBANCE = 1e-5  # of the inputs, over their deviation, by which a motion is tried: linear, and above rounding
+PERTURBATION = 1e-5  # of the inputs, over their deviation, by which a motion is tried: linear, and above rounding
 
 # Comparison of hypotheses
-SURE = 0.5  # probability above which an answer is stated: it is more likely than not
+SURE = 0.5  # probability above which an answer is stated: more likely than not; `studies` (fleets) use it as well
 INDISTINGUISHABLE_NATS = 3.0  # nats within which two hypotheses are indistinguishable: odds of 20 (Kass & Raftery 1995)
 CONTENDING_NATS = 8.0  # nats below the best within which a hypothesis may still win after more fits
 BETTER_RATIO = 1.05  # ratio of rms errors from which one is better than another
@@ -95,22 +97,27 @@ UNKNOWN_SHARE = 1e-6  # squared share of a parameter in an unknown combination; 
 
 # Held-out data
 FOLDS, ROUNDS = 4, 2  # folds, and blocks of a recording in each fold: eight blocks, spread over the recording
-LEAD_SHARE = 0.5  # share of a block that is never held out at the start of a recording: it determines the initial state
+WARM_UP_SHARE = 0.5  # share of a block, at the start of a recording, that is never held out: it gives the initial state
 # The fit to all blocks is near each of these fits; a fit that has not converged after so many steps is used as it is.
 REFIT = GaussNewton(max_iterations=8, tolerance=1e-2, patience=2)
 
 
 @dataclass(frozen=True)
-class Sample:
-    """The recordings' mean square noise in units of the outputs' variance, and their number of samples."""
+class EffectiveSamples:
+    """The number of samples that count in an evidence, which depends on how far the error is noise."""
 
-    noise2: float
-    count: float
+    noise2: float  # mean square noise of the recordings, in units of the outputs' variance
+    count: float  # samples of the recordings over the residual's correlation time
 
-    def effective(self, v: float) -> float:
+    def at(self, v: float) -> float:
         """Compute the effective samples n if the best hypothesis leaves the mean square error v."""
         wrong = float(np.clip(1 - self.noise2 / max(v, 1e-300), LEAST_MODEL_ERROR, 1.0))
         return WRONG_MODEL_SAMPLES * self.count / (WRONG_MODEL_SAMPLES + wrong * self.count)
+
+
+def all_sure(confidences: Iterable[float]) -> bool:
+    """Tell whether all confidences are above SURE; False if there is none."""
+    return min(confidences, default=0.0) > SURE
 
 
 def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
@@ -153,8 +160,8 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     spread reveals parameters that the recordings hardly determine, such as a curve of a pressure that had two levels; a
     cross-validation on the same recordings cannot.
 
-    A motion near an unstable one, such as a pendulum's near its upper rest, enlarges any small change. If the motion
-    for the other inputs enlarges more than the recorded one, that is a matter of those inputs, and the spread is
+    A motion near an unstable one, such as a pendulum's near its upper rest, amplifies any small change. If the motion
+    for the other inputs amplifies more than the recorded one, that is a matter of those inputs, and the spread is
     divided by it.
     """
     if not np.any(fitted.model.parameters.free):
@@ -181,7 +188,7 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     found = float(np.sum(covariance * other * np.outer(width, width)))
     if not np.isfinite(found):
         return np.inf
-    as_recorded, now = _enlargement(bench, fitted), _enlargement(bench.on(smaller), fitted)
+    as_recorded, now = _amplification(bench, fitted), _amplification(bench.on(smaller), fitted)
     return found / max(now / as_recorded, 1.0) if 0 < as_recorded < np.inf and now < np.inf else found
 
 
@@ -213,13 +220,13 @@ def runs_away(bench: Workbench, fitted: Fitted, refitted: Fitted) -> bool:
     return False
 
 
-def _enlargement(bench: Workbench, fitted: Fitted) -> float:
-    """Compute the mean square change of the outputs by a small disturbance, over that of the inputs."""
-    rng, size = np.random.default_rng(0), DISTURBANCE * np.std(np.concatenate([r.u for r in bench.recordings]), axis=0)
-    disturbed = bench.on([r.with_(u=r.u + size * rng.standard_normal(r.u.shape)) for r in bench.recordings])
+def _amplification(bench: Workbench, fitted: Fitted) -> float:
+    """Compute the mean square change of the outputs by a small perturbation, over that of the inputs."""
+    rng, size = np.random.default_rng(0), PERTURBATION * np.std(np.concatenate([r.u for r in bench.recordings]), axis=0)
+    perturbed = bench.on([r.with_(u=r.u + size * rng.standard_normal(r.u.shape)) for r in bench.recordings])
     try:
         with np.errstate(all="ignore"):
-            runs = [problem.simulate(theta) for problem, theta in (b.problem_at(fitted) for b in (bench, disturbed))]
+            runs = [problem.simulate(theta) for problem, theta in (b.problem_at(fitted) for b in (bench, perturbed))]
             moved = np.concatenate([(y - x) / bench.scale for x, y in zip(*runs, strict=True)])
     except (InputError, RuntimeError):  # a run diverges
         return np.inf
@@ -252,7 +259,7 @@ def _hessian(bench: Workbench, fitted: Fitted) -> tuple[Problem, np.ndarray, np.
         return problem, theta, np.full((len(theta), len(theta)), np.inf)
 
 
-def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
+def standard_errors(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
     """Compute standard errors from the residual and its correlation time; nan for fixed parameters and at bounds.
 
     Initial states are estimated together with the parameters. Parameters that can be identified only together, such as
@@ -361,8 +368,8 @@ def log_prior(
 def log_prior_of_states(bench: Workbench, fitted: Fitted) -> float:
     """Compute the log prior density of the estimated states in which laws begin, relative to the largest.
 
-    The machine was at work before, with signals like the recorded ones or others; so the density is that of Cauchy,
-    whose tail is heavy, with the covariance of `Problem.state_priors`. States are counted from rest.
+    The machine was at work before, with signals like the recorded ones or others. The prior is therefore a multivariate
+    Cauchy density, for its heavy tails, with the covariance of `Problem.state_priors`. States are counted from rest.
     """
     own, total = len(bench.simulator.states), 0.0
     if fitted.model.n_x == own or all(r.begins != "estimate" for r in bench.recordings):
@@ -405,23 +412,23 @@ class HeldOut:
     spread: float = 0.0  # mean square uncertainty of predictions for other inputs; see `evidence.spread`
 
     @property
-    def mean_square(self) -> float:
-        """The larger of the two errors plus the spread for other inputs."""
+    def score(self) -> float:
+        """Mean square error by which models are chosen: outputs weighted by noise, plus the spread for other inputs."""
         return max(self.blocks, self.ahead) + self.spread
 
     @property
-    def error(self) -> float:
-        """Root of the larger of the two errors."""
+    def weighted_rms(self) -> float:
+        """Rms error, outputs weighted by their noise, without the spread."""
         return float(np.sqrt(max(self.blocks, self.ahead)))
 
     @property
     def rms(self) -> float:
-        """The error with all outputs alike, whatever their noise, as reports state it."""
+        """Rms error, all outputs alike, without the spread, as reports state it."""
         return float(np.sqrt(np.mean(self.squares)))
 
     @property
     def expected(self) -> float:
-        """The same with the spread for other inputs."""
+        """Rms error, all outputs alike, with the spread for other inputs."""
         return float(np.hypot(self.rms, np.sqrt(self.spread)))
 
 
@@ -429,8 +436,8 @@ def blocks_of(bench: Workbench) -> list[np.ndarray]:
     """Return the number of each sample's block, (M,) for each recording; -1 for samples in no block."""
     out = []
     for r in bench.recordings:
-        lead = int(LEAD_SHARE * (len(r) - r.skip) / (FOLDS * ROUNDS)) if r.begins == "estimate" else 0
-        numbers, begin = np.full(len(r), -1), r.skip + lead
+        warm_up = int(WARM_UP_SHARE * (len(r) - r.skip) / (FOLDS * ROUNDS)) if r.begins == "estimate" else 0
+        numbers, begin = np.full(len(r), -1), r.skip + warm_up
         numbers[begin:] = np.arange(len(r) - begin) * FOLDS * ROUNDS // max(len(r) - begin, 1)
         out.append(numbers)
     return out
@@ -452,7 +459,7 @@ def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldO
 
 
 def _at_prior_means(fitted: Fitted) -> Fitted:
-    """Return a fit with its free parameters that have a prior at the prior's mean."""
+    """Set the free parameters that have a prior to its mean."""
     means = {k: p.prior[0] for k, p in fitted.model.parameters.items() if p.prior is not None and not np.all(p.fixed)}
     values = {k: np.where(fitted.model.parameters[k].fixed, fitted.values[k], mean) for k, mean in means.items()}
     return replace(fitted, values={**fitted.values, **values})

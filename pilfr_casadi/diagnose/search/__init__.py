@@ -2,5 +2,5 @@
 
 `hypotheses` keeps what was fitted, with its evidence. `moves` leads from one hypothesis to others; `relatives` selects
 some that the screen did not, and `trials` fits them. `learned` fits forces that have no name yet. `stretches` chooses
-what a search sees of long recordings, and fits the leading hypotheses to everything.
+what a search sees of long recordings, and fits the likeliest hypotheses to everything.
 """

@@ -26,8 +26,8 @@ from ..fits.evidence import (
     LARGE_MODEL_ERROR,
     LOUDEST_NOISE,
     WRONG_MODEL_SAMPLES,
+    EffectiveSamples,
     HeldOut,
-    Sample,
     held_out_errors,
     information,
     log_evidence,
@@ -43,7 +43,7 @@ from ..fits.screen import Scored, screen
 from ..fits.workbench import DIVERGED, Fitted, Workbench
 from .trials import Key, Trial, Trials
 
-MOST_PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
+MOST_CROSS_VALIDATED = 6  # hypotheses that are cross-validated; more only until the likeliest one is
 
 
 @dataclass(eq=False, repr=False)
@@ -53,7 +53,7 @@ class Findings:
     # the scores of all further laws, and the observer's gain; see `screen`
     screened: tuple[list[Scored], np.ndarray | None] | None = None
     flexible: dict[str, float] | None = None  # the share of the residual that a flexible force at each port explains
-    innovations: float | None = None  # the share of the residual's innovations that it explains
+    innovations: float | None = None  # the share of the residual's innovations that a flexible force explains
     # the log likelihood of a sample of its residual as coloured noise, and the log prior density of its first states
     likelihood: tuple[float, float] | None = None
     learned: list[Fitted] | None = None  # the learned forces beside it, best first
@@ -74,8 +74,8 @@ class Hypotheses:
     laws: Sequence[type[Law]]
     workers: int
     say: Stages
-    hold_said: bool = True  # whether somebody stated the hold of the inputs between samples
-    stand_in_error: float = 0.0  # NRMSE between a surrogate and its simulation; the floor contains it
+    hold_stated: bool = True  # whether somebody stated the hold of the inputs between samples
+    surrogate_nrmse: float = 0.0  # NRMSE between a surrogate and its simulation; the floor contains it
     until: float = np.inf  # time (of `time.perf_counter`) at which the search ends
     memo: dict[Key, Trial] = field(default_factory=dict)  # the best trial of every fitted hypothesis, by key
     alternatives: dict[str, tuple[Law, ...]] = field(default_factory=dict)
@@ -87,10 +87,9 @@ class Hypotheses:
     selected: int = 0
     tried: int = 0
     count: float = FEWEST  # samples of the best residual over its correlation time
-    # mean square of the mismatch, all outputs alike, of which formulas may leave a share; by default the refit's error
+    # reference mean square of the mismatch for `tolerance`, all outputs alike; None: that of the refit
     mismatch2: float | None = None
-    # the key and the value of `_least_tolerant`, and what must live as long as its identity is in the key
-    _least: tuple[tuple[float, ...], float, tuple[object, ...]] | None = None
+    _least: tuple[tuple[object, ...], float] | None = None  # what `_least_tolerant` rests on, and its value
 
     @cached_property
     def fits(self) -> Trials:
@@ -110,14 +109,13 @@ class Hypotheses:
     @property
     def samples(self) -> float:
         """Effective samples, shared by all hypotheses."""
-        return self.sample.effective(self._least_tolerant())
+        return self.effective_samples.at(self._least_tolerant())
 
     def _least_tolerant(self) -> float:
         """Compute the smallest `_tolerant` of all hypotheses; kept while these stay, because each evidence needs it."""
-        kept = (self.bench, *self.memo.values())
-        key = (self.tolerance, *map(id, kept))
-        if self._least is None or self._least[0] != key:
-            self._least = key, min(map(self._tolerant, self.memo.values())), kept
+        basis = (self.tolerance, self.bench, *self.memo.values())  # objects, each equal to itself alone
+        if self._least is None or self._least[0] != basis:
+            self._least = basis, min(map(self._tolerant, self.memo.values()))
         return self._least[1]
 
     @property
@@ -153,9 +151,9 @@ class Hypotheses:
         return self.bench.pool((floor or self.floor).squares(self.bench.scale) + self.tolerance)
 
     @property
-    def sample(self) -> Sample:
-        """Noise and number of samples of the recordings."""
-        return Sample(self.may_leave(), self.count)
+    def effective_samples(self) -> EffectiveSamples:
+        """The effective samples at any error, from the noise and the number of samples of the recordings."""
+        return EffectiveSamples(self.may_leave(), self.count)
 
     @property
     def root(self) -> Trial:
@@ -169,7 +167,7 @@ class Hypotheses:
 
     def optimistic_evidence(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis with as many effective samples as at the noise level."""
-        return self._log_evidence(trial, self._tolerant(trial), self.sample.effective(0.0))
+        return self._log_evidence(trial, self._tolerant(trial), self.effective_samples.at(0.0))
 
     def evidence(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis, from its error on held-out blocks if that is known.
@@ -179,7 +177,7 @@ class Hypotheses:
         return self._judged_evidence(trial, 0.5)
 
     def _judged_evidence(self, trial: Trial, quantile: float) -> float:
-        """Compute the log evidence, with a quantile of the known ratios for a hypothesis that was not predicted."""
+        """Compute the log evidence, with a quantile of the known ratios for one that was not cross-validated."""
         known, v = self.findings[trial.key].held_out, np.inf
         if known or np.isfinite(trial.mean_square):
             ratio = self._held_out_ratio(quantile) * self._less_freedom(trial)
@@ -193,7 +191,7 @@ class Hypotheses:
         Of two ratios the median is the smaller: one hypothesis that predicts badly says nothing about the others.
         """
         known = [(self.findings[key].held_out, trial.mean_square) for key, trial in self.memo.items()]
-        ratios = [h.error**2 / fit for h, fit in known if h and np.isfinite(h.error) and fit > 0]
+        ratios = [h.weighted_rms**2 / fit for h, fit in known if h and np.isfinite(h.weighted_rms) and fit > 0]
         return float(np.quantile(ratios, quantile, method="lower")) if ratios else 1.0
 
     def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
@@ -240,7 +238,7 @@ class Hypotheses:
     def _alike(self, one: Trial, other: Trial) -> bool:
         """Tell whether two hypotheses follow the recordings so alike that these do not distinguish them."""
         ratio = one.mean_square / max(other.mean_square, 1e-300)
-        nats = 0.5 * self.sample.effective(0.0) * np.log(ratio)
+        nats = 0.5 * self.effective_samples.at(0.0) * np.log(ratio)
         return bool(ratio < EQUAL_RATIO and nats < INDISTINGUISHABLE_NATS)
 
     def held_out_errors(self, fitted: Fitted, spread: float) -> HeldOut:
@@ -249,9 +247,9 @@ class Hypotheses:
 
     def spread(self, fitted: Fitted) -> float:
         """Compute the mean square uncertainty of a fitted simulator's predictions for other inputs."""
-        own = Sample(self.floor2, count_samples(fitted, self.bench))
+        own = EffectiveSamples(self.floor2, count_samples(fitted, self.bench))
         v = self.bench.pool(fitted.squares + self.tolerance)
-        return spread(self.bench, fitted, self.added_laws(fitted), v, own.effective(0.0))
+        return spread(self.bench, fitted, self.added_laws(fitted), v, own.at(0.0))
 
     def added_laws(self, fitted: Fitted) -> tuple[Placed, ...]:
         """Return the laws that a fitted simulator has beside the one that is diagnosed."""
@@ -259,10 +257,10 @@ class Hypotheses:
 
     @property
     def _all_wrong(self) -> bool:
-        """Whether even the best model's error is mostly model error."""
+        """Whether over a fifth of even the best model's error may be model error, or samples are too few to tell."""
         return self.samples < WRONG_MODEL_SAMPLES / LARGE_MODEL_ERROR
 
-    def judge_on_held_out_data(self) -> None:
+    def cross_validate_likeliest(self) -> None:
         """Compute the held-out errors of the likeliest hypotheses.
 
         If only one is likely and its error is noise, the fit error is enough. Otherwise held-out data decide, because a
@@ -276,12 +274,12 @@ class Hypotheses:
             for done in itertools.count():
                 best = max(self.memo.values(), key=self.evidence)
                 unknown = [t for t in (best, *self._likeliest()) if self.findings[t.key].held_out is None]
-                if not unknown or (done >= MOST_PREDICTED and unknown[0] is not best):
+                if not unknown or (done >= MOST_CROSS_VALIDATED and unknown[0] is not best):
                     break
-                if not self.in_time():  # an unfinished comparison favours the hypotheses that were not judged
+                if not self.may_go_on():  # an unfinished comparison favours the hypotheses that were not judged
                     self.forget_held_out()
                     break
-                self.say("held-out blocks", done, min(done + len(unknown), max(MOST_PREDICTED, done + 1)))
+                self.say("held-out blocks", done, min(done + len(unknown), max(MOST_CROSS_VALIDATED, done + 1)))
                 self.held_out(unknown[0])
 
     def forget_held_out(self) -> None:
@@ -311,14 +309,14 @@ class Hypotheses:
     def evidence_in_noise(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis whose residual is coloured noise.
 
-        Its innovations count as far as white noise would. A law would follow slow noise by a first state that it never
-        reaches otherwise, so that counts as well.
+        Its innovations are weighted as white noise. The prior of the laws' initial states is included; otherwise a law
+        could fit slow noise by an implausible initial state.
         """
         if not np.isfinite(trial.mean_square):
             return -np.inf
         known, residuals = self.findings[trial.key], self.bench.scored(trial.fitted.residual)
         size = sum(e.size for e in residuals)
-        n = replace(self.sample, count=size).effective(0.0)
+        n = replace(self.effective_samples, count=size).at(0.0)
         if known.likelihood is None:
             known.likelihood = log_likelihood(residuals) / size, log_prior_of_states(self.bench, trial.fitted)
         likelihood, states = known.likelihood
@@ -347,7 +345,7 @@ class Hypotheses:
         if self.floor.source != "estimated":
             return self.floor
         white = white_part(self.bench.scored(self.best.fitted.residual))
-        white = np.hypot(white, self.stand_in_error * self.bench.scale)
+        white = np.hypot(white, self.surrogate_nrmse * self.bench.scale)
         return Floor(white, self.floor.source)
 
     @property
@@ -361,7 +359,7 @@ class Hypotheses:
         An error no larger than what the formulas of the present laws may leave asks for no further law.
         """
         limit = self.may_leave(noise)
-        most = 0.5 * self.sample.effective(0.0) * np.log(max(self._tolerant(trial) / limit, 1.0))
+        most = 0.5 * self.effective_samples.at(0.0) * np.log(max(self._tolerant(trial) / limit, 1.0))
         return trial.mean_square > limit and bool(most > np.log(max(len(self.alternatives), 1)) - EFFECT_PRIOR)
 
     @property
@@ -369,8 +367,8 @@ class Hypotheses:
         """Whether nothing more is fitted: Ctrl-C was pressed, or the time for the whole diagnosis is over."""
         return self.interrupted or time.perf_counter() > self.bench.deadline
 
-    def in_time(self) -> bool:
-        """Tell whether there is time for more; if not, note that in the result."""
+    def may_go_on(self) -> bool:
+        """Tell whether there is time for more; if not, set `out_of_time`, with which the result tells that."""
         self.out_of_time = self.out_of_time or time.perf_counter() > self.until
         return not self.out_of_time
 
@@ -413,7 +411,7 @@ class Hypotheses:
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
         share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
         rest = np.minimum(np.sqrt(share) * self.rms(best), LOUDEST_NOISE * self.bench.scale)
-        known, white = self.stand_in_error * self.bench.scale, white_part(self.bench.scored(best.fitted.residual))
+        known, white = self.surrogate_nrmse * self.bench.scale, white_part(self.bench.scored(best.fitted.residual))
         noise = np.minimum(np.hypot(np.maximum(white, rest), known), self.rms(nearest))
         self.floor = Floor(noise, "estimated")
 
@@ -448,7 +446,7 @@ class Hypotheses:
         converged = known is not None and known.thorough and as_fine and known.mean_square <= rest.mean_square
         if not converged and not self.past_deadline:
             found = self.fits.converge(rest)
-            self.keep(self.fits.sharpen(found) if found.error < FAR_RATIO * joint.error else found)
+            self.keep(self.fits.refine_knee(found) if found.error < FAR_RATIO * joint.error else found)
         kept = self.memo.get(rest.key)
         return kept if kept is not None and np.isfinite(kept.mean_square) else None
 

@@ -44,7 +44,7 @@ from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted, refit
 from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
 from .relatives import choose_pairs, complements, fit_pair, in_place_of_variation, relatives
-from .trials import Key, Trial, place_law, select_pairs
+from .trials import Effort, Key, Trial, place_law, select_pairs
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -72,26 +72,32 @@ class Search(Hypotheses):
     steps: list[Step] = field(default_factory=list)  # the moves, in their order
     aligned: bool = False  # whether the times of the channels are settled, so that no shift is looked for
     shift: Gate | None = None  # the shift of a channel that ended the search, because it shows only beside a law
+    other_hold: bool = False  # whether the search ended because the other hold of the inputs proved better
 
     def run(self, effects: float) -> Search:
         """Search for up to `effects` effects; an interrupt ends the search with the present results."""
+        self.other_hold = False
         self.keep(Trial.of(self.without, 0, thorough=True))
         with self.until_interrupted():
             self.estimate_noise()
-            if not self.interrupted and self._grow(effects) and self._name_rest(effects):
-                if len(self.best.effects) < effects:
-                    self._grow_to_noise()
-                self._every_sensor()
-                self._leave_out_each()
-                self.judge_on_held_out_data()
+            if not self.interrupted:
+                self._grow(effects)
+                self._name_rest(effects)
+                self._finish(effects)
         if self.interrupted:
             self.forget_held_out()
         return self
 
-    def resume(self, effects: float) -> Search:
+    @property
+    def must_repeat(self) -> bool:
+        """Whether the search goes no further: it has to be repeated with the other hold or with a channel shifted."""
+        return self.other_hold or self.shift is not None
+
+    def resume(self, effects: float) -> None:
         """Continue with the present hold because the other is no better, unless the search was interrupted."""
-        self.hold_said = True
-        return self if self.interrupted else self.run(effects)
+        self.hold_stated = True
+        if not self.interrupted:
+            self.run(effects)
 
     def adopt(self, other: Trial) -> None:
         """Fit the laws of another search's hypothesis to these recordings, from its values, and keep the fit."""
@@ -110,8 +116,8 @@ class Search(Hypotheses):
         ranked = ((parent, sorted(trials.values(), key=lambda t: t.error)) for parent, trials in found.values())
         return [Step(parent, (), tuple(trials)) for parent, trials in ranked if trials]
 
-    def _grow(self, effects: float, varied: bool = False) -> bool:
-        """Add effects while that pays; return False as soon as the other hold, or a channel's shift, proves better.
+    def _grow(self, effects: float, varied: bool = False) -> None:
+        """Add effects while that pays; end as soon as the other hold, or a channel's shift, proves better.
 
         A parameter that varies can imitate many laws. So hypotheses with one are a basis for more only if `varied`.
         The first law is fitted even if the preparation took all the time.
@@ -120,24 +126,27 @@ class Search(Hypotheses):
             self.can_improve(self.best)
             and len((parent := self._parent(varied)).effects) < effects
             and self._pays(parent)
-            and (self.in_time() or not self.steps)
+            and (self.may_go_on() or not self.steps)
         ):
             self.add(parent)
-            if not parent.laws and self.in_time() and self._escape_local_minimum():
+            if not parent.laws and self.may_go_on() and self._escape_local_minimum():
                 self.add(self.root)
-            if (not self.hold_said and self.prefers_other_hold()) or (not parent.laws and self._finds_shift()):
-                return False
-            if not parent.laws and self.can_improve(self.best) and self.in_time():
+            self.other_hold = not self.hold_stated and self.prefers_other_hold()
+            if not parent.laws and not self.must_repeat:
+                self._find_shift()
+            if self.must_repeat:
+                return
+            if not parent.laws and self.can_improve(self.best) and self.may_go_on():
                 self.vary_parameters(self.root)
             if len(self._parent(varied).effects) > len(parent.effects) >= 1:
                 self.exchange()
             if len(self._parent(varied).laws) <= len(parent.laws):  # no added law is worth its prior
                 break
-        if effects > 1 and TWO not in self.times and self.can_improve(self.best) and self.in_time():
+        if effects > 1 and TWO not in self.times and self.can_improve(self.best) and self.may_go_on():
             best = self.best
             self.add_two()
-            return self.best is best or self._grow(effects, varied)
-        return True
+            if self.best is not best:
+                self._grow(effects, varied)
 
     def _parent(self, varied: bool) -> Trial:
         """Return the best hypothesis, or the best one in which no parameter varies."""
@@ -147,20 +156,20 @@ class Search(Hypotheses):
         return max(fixed, key=self.optimistic_evidence)
 
     def _grow_to_noise(self) -> None:
-        """Add a law for a rest as small as the formula error of the laws before it.
+        """Try one more law on a residual below the formula error of the laws before it.
 
-        An inexact formula can look like one more effect. So it counts only if what is left can be white noise, and no
-        rest counts that even the right formulas may leave.
+        An inexact formula can look like one more effect. The law is therefore kept only if the remaining residual can
+        be white noise. Residuals below LEAST_FORMULA_ERROR are skipped.
         """
         base, least = self.best, LEAST_FORMULA_ERROR * self.root.mean_square
         is_noise = base.mean_square < ABOVE_NOISE**2 * self.least_noise2 + least
-        if not base.laws or is_noise or base.mean_square > self.may_leave() or not self.in_time():
+        if not base.laws or is_noise or base.mean_square > self.may_leave() or not self.may_go_on():
             return
         noise = self.floor, self.count
         self.mismatch2, found = float(np.mean(base.fitted.squares)), False
         try:
             if self.can_improve(base):
-                self.add(base, again=True)
+                self.add(base, few=True)
             at_noise = self.best.mean_square < ABOVE_NOISE**2 * self.least_noise2
             found = at_noise and len(self.best.effects) > len(base.effects)
         finally:
@@ -169,73 +178,82 @@ class Search(Hypotheses):
         if found:  # other laws may stand beside the new one in place of those before
             self.exchange()
 
-    def _name_rest(self, effects: float) -> bool:
-        """Name what is left beside the simulator, the best hypothesis, and that without its weakest effect.
+    def _name_rest(self, effects: float) -> None:
+        """Try varying parameters and laws near learned forces beside three hypotheses.
 
-        A parameter may vary with a signal; or a force that is learned there is nearly a law.
-
-        The weakest of several effects may imitate a law that only a learned force shows, such as a gain that varies
-        with the position. Go on if one of the laws leads.
+        These are the simulator, the best one, and the best one without its weakest effect, which may imitate a law that
+        only a learned force shows, such as a gain that varies with the position. Search on if one of them becomes the
+        best.
         """
+        if self.must_repeat:
+            return
         best = self._parent(varied=False)
         fewer = [t for t in self.memo.values() if t.effects and t.key < best.key]
         without_weakest = sorted(fewer, key=lambda t: (-len(t.effects), t.mean_square))[:1]
         for name_rest in (self.vary_parameters, self.name_learned):
             for base in {t.key: t for t in (self.root, best, *without_weakest)}.values():
-                if len(base.effects) < effects and self.can_improve(self.best) and self.in_time():
+                if len(base.effects) < effects and self.can_improve(self.best) and self.may_go_on():
                     name_rest(base)
-        if self.best is best:
-            return True
-        self.exchange()  # laws that were found before may have made up for this one
-        return self._grow(effects, varied=True)
+        if self.best is not best:
+            self.exchange()  # laws that were found before may have made up for this one
+            self._grow(effects, varied=True)
+
+    def _finish(self, effects: float) -> None:
+        """Look for what the moves before cannot find, and compare the likeliest hypotheses."""
+        if self.must_repeat:
+            return
+        if len(self.best.effects) < effects:
+            self._grow_to_noise()
+        self._every_sensor()
+        self._leave_out_each()
+        self.cross_validate_likeliest()
 
     def _pays(self, trial: Trial) -> bool:
-        """Tell whether the last of several laws was worth it; a wrong model can always use one more."""
+        """Tell whether the last of several laws was worth it; a wrong model gains from any further law."""
         fewer = [t for t in self.memo.values() if t.laws and len(t.effects) < len(trial.effects)]
         return len(trial.effects) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
 
     def prefers_other_hold(self) -> bool:
         """Tell whether the best hypothesis follows the recordings better with the other hold of the inputs."""
         best = self.best.fitted
-        if self.interrupted or not self.in_time():
+        if self.interrupted or not self.may_go_on():
             return False
         held = self.bench.with_other_hold()
         found = refit(held, [best.values], best.simulator, states=best.initial, solver=THOROUGH)
         return found is not None and not self.interrupted and found.cost * BETTER_RATIO**2 < best.cost
 
-    def _finds_shift(self) -> bool:
-        """Look beside each of the first laws for an output that comes before its cause; their absence may hide it.
+    def _find_shift(self) -> None:
+        """Look beside each of the first laws for an output that comes before its cause; missing physics may hide it.
 
         Filters and laws with memory are left out: they imitate a shift. A delay is a law itself.
         """
         if self.aligned or not self.can_improve(self.best):
-            return False
+            return
         first_move = {t.key for s in self.steps if not s.parent.laws for t in s.trials}
         kept = [self.memo[key] for key in first_move]
         plain = [t for t in kept if not (t.law.order or t.law.memory)]
         first = dict[tuple[str, str], Trial]()  # of each law the likeliest form, the likeliest laws first
         for trial in sorted(plain, key=self.optimistic_evidence, reverse=True):
             first.setdefault((trial.port, trial.law.id), trial)
-        best, part = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_said else 0.5
+        best, shift_step = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_stated else 0.5
         with self.stage("shifts beside a law"):
-            for trial in list(first.values())[:FEW] if self.in_time() else ():
+            for trial in list(first.values())[:FEW] if self.may_go_on() else ():
                 bench = replace(self.bench, simulator=trial.fitted.simulator)
-                found = find_time_shift(Checked(bench, trial.fitted), part, given=False)
+                found = find_time_shift(Checked(bench, trial.fitted), shift_step, given=False)
                 shift = found.gates[0] if found.gates else None
                 if isinstance(shift, TimeShift) and shift.leads and found.cost < best:
                     beside = name_at(trial.port, trial.law.id, trial.law.form)
                     sentence = f"{shift.sentence.rstrip('.')} (beside {beside})."
                     best, self.shift = found.cost, replace(shift, sentence=sentence)
         self.aligned = True
-        return self.shift is not None
 
-    def add(self, parent: Trial, again: bool = False) -> None:
-        """Fit the laws that the screen selects beside a hypothesis, fewer if `again`; polish those that may win."""
-        scored, gain = self._standing(parent)
-        if self.steps and not self.in_time():
+    def add(self, parent: Trial, few: bool = False) -> None:
+        """Fit the laws, or only a few, that the screen selects beside a hypothesis; polish those that may win."""
+        scored, observer_gain = self._standing(parent)
+        if self.steps and not self.may_go_on():
             return
         enough = float(np.sqrt(self.floor2 + NEARLY_EXPLAINED * max(parent.mean_square - self.floor2, 0.0)))
-        trials = self._with_relatives(parent, scored, scored, gain, enough, again)
+        trials = self._with_relatives(parent, scored, scored, Effort(observer_gain, enough, few))
         with self.stage("choice"):
             self._record(parent, scored, trials)
             self.estimate_noise()
@@ -246,24 +264,18 @@ class Search(Hypotheses):
 
     def _standing(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
         """Return what was screened beside a hypothesis and may stand beside its laws, and the observer's gain."""
-        scored, gain = self.screened(parent)
-        return [s for s in scored if _may_stand_beside(parent.laws, s.port, s.law)], gain
+        scored, observer_gain = self.screened(parent)
+        return [s for s in scored if _may_stand_beside(parent.laws, s.port, s.law)], observer_gain
 
     def _with_relatives(
-        self,
-        parent: Trial,
-        selected: Sequence[Scored],
-        scored: Sequence[Scored],
-        gain: np.ndarray | None,
-        enough: float,
-        again: bool,
+        self, parent: Trial, selected: Sequence[Scored], scored: Sequence[Scored], effort: Effort
     ) -> list[Trial]:
         """Fit some of the pairs screened, then those to which the best fits of these hypotheses point."""
-        found = self._fitted(parent, selected, gain, enough, again)
+        found = self._fitted(parent, selected, effort)
         trials = sorted(map(self._best_known, found), key=lambda t: t.error)
-        more = relatives(self.bench, trials, scored) if self.in_time() else []
+        more = relatives(self.bench, trials, scored) if self.may_go_on() else []
         if more:
-            trials = sorted([*trials, *self._fitted(parent, more, gain, enough, again)], key=lambda t: t.error)
+            trials = sorted([*trials, *self._fitted(parent, more, effort)], key=lambda t: t.error)
         return trials
 
     def _best_known(self, trial: Trial) -> Trial:
@@ -290,17 +302,19 @@ class Search(Hypotheses):
         self._keep_all(trials)
         self.steps.append(Step(parent, tuple(scored), tuple(trials)))
 
-    def _try(self, base: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> None:
+    def _try(self, base: Trial, entries: Sequence[Scored], observer_gain: np.ndarray | None = None) -> None:
         """Fit some pairs beside a hypothesis, none of their relatives, and note the move."""
-        self._record(base, entries, self._fitted(base, entries, gain, float(np.sqrt(self.floor2)), True))
+        self._record(base, entries, self._fitted(base, entries, self._little_effort(observer_gain)))
 
-    def _fitted(
-        self, parent: Trial, scored: Sequence[Scored], gain: np.ndarray | None, enough: float, again: bool
-    ) -> list[Trial]:
+    def _little_effort(self, observer_gain: np.ndarray | None = None) -> Effort:
+        """Fit few pairs, and refine none far behind one whose error is at the noise."""
+        return Effort(observer_gain, float(np.sqrt(self.floor2)), few=True)
+
+    def _fitted(self, parent: Trial, scored: Sequence[Scored], effort: Effort) -> list[Trial]:
         began = time.perf_counter()
         stage = f"fits, effect {len(parent.laws) + 1}" if parent.laws else "fits"
-        pairs = select_pairs(scored, again)
-        trials, tried = self.fits.fit_pairs(parent, pairs, gain, enough, partial(self.say, stage), again)
+        pairs = select_pairs(scored, effort.few)
+        trials, tried = self.fits.fit_pairs(parent, pairs, effort, partial(self.say, stage))
         if not parent.laws:
             self.tried, self.selected = self.tried + tried, self.selected + len(pairs)
         self.times["fits"] = self.times.get("fits", 0.0) + time.perf_counter() - began
@@ -323,18 +337,18 @@ class Search(Hypotheses):
         # finer steps are slow, and bring no hypothesis that is far behind to the front
         least = min([t.error for t in (*converged, self.best)])
         near = [t for t in converged if t.error < NEAR_RATIO * least]
-        for trial in self._side_by_side(self.fits.sharpen, near):
+        for trial in self._side_by_side(self.fits.refine_knee, near):
             self.keep(trial)
 
     def _finer(self, parent: Trial) -> None:
-        """Fit the best law of a step in its finer forms; then let the strength of the best that may vary do so."""
+        """Fit the best law of a step in its finer forms; then schedule the strength of the best law that allows it."""
         best = self._best_with_one_more(parent)
         if best is not None:
             self._refine(best, FINER.get(type(best.law), ()))
         self._vary_strength()
         best = self._best_with_one_more(parent)
         by = (best.law.scheduled_by or best.law.scaled_by) if best is not None else ""
-        if best is not None and by and "parallel" in best.law.places and self.in_time():
+        if best is not None and by and "parallel" in best.law.places and self.may_go_on():
             kind = constant(type(best.law))
             self._refine(best, [scheduled(kind, by, p) for p in likely_profiles(kind) if p != best.law.profile])
         self.replace_variation(parent)
@@ -349,7 +363,7 @@ class Search(Hypotheses):
         kept = [self.memo[t.key] for t in added]  # perhaps found before, with these laws added in another order
         step = [new if known.pair != new.pair else known for new, known in zip(added, kept, strict=True)]
         # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
-        if not step or not self.can_improve(self.best, self.least_floor) or not self.in_time():
+        if not step or not self.can_improve(self.best, self.least_floor) or not self.may_go_on():
             return
         likeliest = max(step, key=self.optimistic_evidence)
         forms = [t for t in step if t.law.id == likeliest.law.id and t is not likeliest]
@@ -418,8 +432,8 @@ class Search(Hypotheses):
                 if alike and _may_stand_beside(base.laws, port, near.kind):
                     entries.append(replace(alike[0], law=near.kind, starts=(near.start,)))
         if entries:
-            noise = float(np.sqrt(self.floor2))
-            self._record(base, entries, self._with_relatives(base, entries, [*entries, *scored], None, noise, True))
+            effort = self._little_effort()
+            self._record(base, entries, self._with_relatives(base, entries, [*entries, *scored], effort))
 
     def vary_parameters(self, base: Trial) -> None:
         """Let parameters of the simulator vary with a signal beside a hypothesis: fit those that explain most."""
@@ -432,18 +446,18 @@ class Search(Hypotheses):
         laws = [varying(by, profile) for by in dict.fromkeys(signals) for profile in VARIATIONS[:2]]
         laws += [heated(by) for by in dict.fromkeys(signals[1:])]
         with self.stage("varying parameters"):
-            scored, gain = screen(self.bench, base.fitted, laws, self.floor.deviation, self.workers)
+            scored, observer_gain = screen(self.bench, base.fitted, laws, self.floor.deviation, self.workers)
             self.note_alternatives(scored)
         best = list(dict.fromkeys((s.port, s.law.form) for s in scored))[:FEW]
         taken = {e.port for e in base.laws}
         entries = [s for s in scored if (s.port, s.law.form) in best and s.port not in taken]
         if not entries:
             return
-        self._try(base, entries, gain)
+        self._try(base, entries, observer_gain)
         self.replace_variation(base)
         last = self.best.laws[-1] if self.best.laws else None
         if last and kind_of(last.port) == PARAMETER and last.law.scheduled_by:
-            self._curve(base, [s for s in entries if s.pair == (last.port, type(last.law))], gain)
+            self._curve(base, [s for s in entries if s.pair == (last.port, type(last.law))], observer_gain)
 
     def replace_variation(self, base: Trial) -> None:
         """Fit laws with constant parameters whose force is like that of the best hypothesis' last law, which varies."""
@@ -451,23 +465,23 @@ class Search(Hypotheses):
         known = self.findings[best.key]
         if known.replaced or not best.laws or best.key - base.key != {best.pair} or base.key - best.key:
             return
-        if not best.law.scheduled_by or not self.in_time():
+        if not best.law.scheduled_by or not self.may_go_on():
             return
         known.replaced = True
         entries = in_place_of_variation(self.bench, best, self._standing(base)[0])
         if entries:
-            self._try(base, entries, None)
+            self._try(base, entries)
 
-    def _curve(self, base: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> None:
+    def _curve(self, base: Trial, entries: Sequence[Scored], observer_gain: np.ndarray | None) -> None:
         """Let the parameter that varies in the best hypothesis follow a curve of higher degree."""
         best = self.best
         # what the curve misses is in no force at a port, so that it may have passed for noise
-        if not (self.can_improve(best, self.least_floor) and self.in_time()):
+        if not (self.can_improve(best, self.least_floor) and self.may_go_on()):
             return
         law = varying(best.law.scheduled_by, VARIATIONS[-1])()
         finer = [replace(s, law=law, starts=(law.starts_as(best.law, best.own),)) for s in entries]
         self.note_alternatives(finer)
-        self._try(base, finer, gain)
+        self._try(base, finer, observer_gain)
 
     def exchange(self) -> None:
         """Try all other laws, and none, in place of each of several laws, the rest in place, until none changes."""
@@ -477,13 +491,13 @@ class Search(Hypotheses):
                 rest = self.run_laws([e for e in best.laws if e is not element], best)
                 if not rest.mean_square < DIVERGED:
                     continue
-                if self.in_time() and not self._expanded(rest):  # from the values of all laws, which may be right
+                if self.may_go_on() and not self._expanded(rest):  # from the values of all laws, which may be right
                     self.keep(rest)
-                    self.add(rest, again=True)
+                    self.add(rest, few=True)
                 found = self.leave_out(best, [element])
                 wrong = found is not None and not self._expanded(found, FAR_RATIO)  # it had been in a wrong minimum
-                if found is not None and wrong and self.can_improve(self.best) and self.in_time():
-                    self.add(found, again=True)
+                if found is not None and wrong and self.can_improve(self.best) and self.may_go_on():
+                    self.add(found, few=True)
             if self.best.key == best.key:
                 return
 
@@ -524,7 +538,7 @@ class Search(Hypotheses):
         """
         best, names = self.best, self.bench.simulator.output_names
         filters = [e for e in best.laws if kind_of(e.port) == ACTUATOR and (e.law.order or e.law.shifts)]
-        if len(names) < 2 or len(filters) != 1 or not self.in_time():
+        if len(names) < 2 or len(filters) != 1 or not self.may_go_on():
             return
         source = filters[0]
         others = [e for e in best.laws if e is not source]

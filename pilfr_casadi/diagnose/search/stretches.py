@@ -13,7 +13,7 @@ each candidate stretch gets features, and stretches far apart in them are chosen
 The initial state of a stretch from within a recording is estimated, with the memory of laws. All its samples are
 scored, because a state before unscored samples is hardly determined and could be far outside the recorded range.
 
-The leading hypotheses are then fitted to everything, by normal equations that are summed over the recordings piece by
+The likeliest hypotheses are then fitted to everything, by normal equations that are summed over the recordings piece by
 piece (`optimise.Problem.normal`), so that memory does not grow with their length. A hypothesis that all recordings
 together refute is dropped; errors, values and standard errors come from all recordings.
 """
@@ -136,9 +136,9 @@ def choose_stretches(
         kept = sorted(kept)
         stretches, signals = [stretches[k] for k in kept], signals[kept]
     explained = force_features(simulator, recordings, stretches, hold, engine, workers)
-    leading = signals if explained is None else explained
+    strength = signals if explained is None else explained
     features = signals if explained is None else np.hstack([explained, signals])
-    chosen = spread_out(features, count, int(np.argmax(np.sum(leading**2, axis=1))))
+    chosen = spread_out(features, count, int(np.argmax(np.sum(strength**2, axis=1))))
     return tuple(sorted((stretches[k] for k in chosen), key=lambda s: (s.recording, s.begin)))
 
 
@@ -290,14 +290,14 @@ class Everything:
 
     @classmethod
     def of(cls, search: Search, stretches: Stretches, gates: Sequence[Gate]) -> Everything | None:
-        """Fit the leading hypotheses of a search to everything, and drop the refuted ones from its memo.
+        """Fit the likeliest hypotheses of a search to everything, and drop the refuted ones from its memo.
 
         After an interrupt, or past the deadline, their values stay as they are. None if the refitted simulator runs
         away from the whole recordings.
         """
         whole = stretches.everything(search.bench, gates)
-        leading = [t for t in likeliest(list(search.memo.values()), search.evidence) if t.laws][:FEW]
-        trials = [search.root, *leading]
+        contenders = [t for t in likeliest(list(search.memo.values()), search.evidence) if t.laws][:FEW]
+        trials = [search.root, *contenders]
         limit = _seconds_left(search) / 2  # the rest is for the simulators that the conclusion adds
         fits = list[Fitted]()
         with search.until_interrupted():

@@ -27,12 +27,13 @@ from ..fits.screen import Pair, Scored
 from ..fits.step_refinement import knee_starts, refit_on_finer_steps
 from ..fits.workbench import BRIEF, COMPARED_SAMPLES, DIVERGED, FEW, QUICK, THOROUGH, Fitted, Workbench
 
-# Effort: pairs of each list of the screen that are fitted, besides the best of each port; the same if `again`
-BEST, BEST_AGAIN = 10, 4
-MOST_REFINED = 8  # pairs fitted from several starts; only FEW if `again`
+# Effort: pairs of each list of the screen that are fitted, besides the best of each port; the same with `few`
+BEST, BEST_OF_FEW = 10, 4
+MOST_REFINED = 8  # pairs fitted from several starts; only FEW with `few`
 QUIET_SHARE = 0.1  # of the residual power in the loudest stretch, below which the head of a recording says too little
 LEAST_SHARE = 0.01  # share over the largest of the same run below which start values are not used
 Key = frozenset[Pair]
+Name = tuple[str, str]  # port and law id of an effect
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -61,6 +62,11 @@ class Trial:
     def effects(self) -> tuple[Placed, ...]:
         """The laws that are effects; an offset is a finding about the recording."""
         return tuple(e for e in self.laws if not isinstance(e.law, Offset))
+
+    @property
+    def names(self) -> frozenset[Name]:
+        """Ports and law ids of the effects, which are alike for all forms of a law."""
+        return frozenset((e.port, e.law.id) for e in self.effects)
 
     def supersedes(self, other: Trial) -> bool:
         """Tell whether this fit of a hypothesis replaces another; a thorough one has priority."""
@@ -121,6 +127,15 @@ class Trial:
 
 
 @dataclass(frozen=True, eq=False)
+class Effort:
+    """How thoroughly a move fits its pairs of port and law."""
+
+    observer_gain: np.ndarray | None  # some fits begin along an observer with this gain
+    enough: float  # error of one of the first pairs below which pairs far behind it are not refined
+    few: bool  # select and refine fewer pairs, because a law is looked for in place of a known one
+
+
+@dataclass(frozen=True, eq=False)
 class Trials:
     """Fits of hypotheses to the recordings of a bench, in parallel.
 
@@ -170,7 +185,7 @@ class Trials:
 
     def polish(self, trial: Trial) -> Trial:
         """Fit a trial to convergence and to all samples, on steps that are fine enough for its knee."""
-        return self.sharpen(self.converge(trial))
+        return self.refine_knee(self.converge(trial))
 
     def converge(self, trial: Trial) -> Trial:
         """Fit a trial to convergence and to all samples, on steps for its present values."""
@@ -187,7 +202,7 @@ class Trials:
             return replace(trial, mean_square=np.inf, thorough=True)
         return Trial.of(fitted, len(trial.laws), thorough=True)
 
-    def sharpen(self, trial: Trial) -> Trial:
+    def refine_knee(self, trial: Trial) -> Trial:
         """Refit a converged trial on steps that are fine enough for its knee, if it has one."""
         if not trial.knee or not trial.mean_square < DIVERGED or time.perf_counter() > self.bench.deadline:
             return trial
@@ -198,19 +213,15 @@ class Trials:
         self,
         parent: Trial,
         pairs: Sequence[Sequence[Scored]],
-        gain: np.ndarray | None,
-        enough: float,
+        effort: Effort,
         report: Callable[[int, int, float], None],
-        again: bool,
     ) -> tuple[list[Trial], int]:
         """Fit every selected pair of port and law beside a parent's laws; return the fits, smallest error first.
 
         Also returns how many pairs were tried before the time was over, with those whose every fit diverges.
-        If one of the first pairs has an error below `enough`, pairs far behind it are not refined. With `again`, which
-        looks for a law in place of a known one, fewer pairs are refined. An interrupt ends the fits; it is marked, and
-        what was found is returned.
+        An interrupt ends the fits; it is marked, and what was found is returned.
         """
-        most = FEW if again else MOST_REFINED
+        most = FEW if effort.few else MOST_REFINED
         done, total = 0, len(pairs) + min(len(pairs), most)
 
         def least(found: Sequence[Trial | None]) -> float:
@@ -224,7 +235,7 @@ class Trials:
         prepared, found = list[_BriefFit](), list[Trial | None]()
         pool = ThreadPoolExecutor(self.workers)
         try:
-            tasks = [pool.submit(self._fit_briefly, parent, entries, gain) for entries in pairs]
+            tasks = [pool.submit(self._fit_briefly, parent, entries, effort.observer_gain) for entries in pairs]
             for task in tasks:
                 if self.over and prepared:
                     break
@@ -233,10 +244,10 @@ class Trials:
             prepared.sort(key=lambda p: p.trial.error if p.trial else np.inf)
             for group in (prepared[:FEW], prepared[FEW:most]):
                 best = least(found)
-                near = [p for p in group if best > enough or (p.trial and p.trial.error < FAR_RATIO * best)]
+                near = [p for p in group if best > effort.enough or (p.trial and p.trial.error < FAR_RATIO * best)]
                 near = [] if self.over else near
                 found += [p.trial for p in group if p not in near]
-                for refined in self._refine(near, gain is not None, pool):
+                for refined in self._refine(near, effort.observer_gain is not None, pool):
                     found.append(refined)
                     step(found)
             found += [p.trial for p in prepared[most:]]
@@ -249,11 +260,11 @@ class Trials:
             pool.shutdown(cancel_futures=True)
         return sorted((t for t in found if t is not None), key=lambda t: t.error), len(prepared)
 
-    def _fit_briefly(self, parent: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> _BriefFit:
+    def _fit_briefly(self, parent: Trial, entries: Sequence[Scored], observer_gain: np.ndarray | None) -> _BriefFit:
         """Compile a pair and fit it briefly from its best start."""
         first, base = entries[0], parent.fitted
         placed, _ = place_law(base.simulator, first, first.starts[0])
-        compiled = self.bench.compile(placed, gain)
+        compiled = self.bench.compile(placed, observer_gain)
         users = self.bench.simulator.parameters
         # the refit may have compensated for the law by an offset there, or by the term that the law is in line with
         offsets = [e for e in self.bench.simulator.elements if e.port == first.port and isinstance(e.law, Offset)]
@@ -349,16 +360,14 @@ def _head(r: Recording, share: float, power: np.ndarray) -> Recording:
     return r if cut >= len(r) else open_start(r.slice(0, cut))
 
 
-def select_pairs(scored: Sequence[Scored], again: bool) -> list[list[Scored]]:
+def select_pairs(scored: Sequence[Scored], few: bool) -> list[list[Scored]]:
     """Select the pairs worth a full fit: the best of both lists and of each port, and some whatever their score.
 
-    With `again`, which looks for a law in place of a known one, there are fewer.
-
-    These are the best law of each port with a single free parameter, which richer ones hide in the list, and the laws
-    made for a port: special laws of its domain, and laws in line with its term. Their forces are so curved that a small
-    dose says little about them. The most promising come first, because a time limit may leave the others out.
+    The latter are the best law of each port with a single free parameter, which richer ones hide in the list, and the
+    laws made for a port: special laws of its domain, and laws in line with its term. Their forces are so curved that a
+    small dose says little about them. The most promising come first, because a time limit may leave the others out.
     """
-    chosen, best = dict[Pair, list[Scored]](), BEST_AGAIN if again else BEST
+    chosen, best = dict[Pair, list[Scored]](), BEST_OF_FEW if few else BEST
     for source in ("simulation", "observer"):
         ports, plain, passed = set[str](), set[str](), list[Scored]()
         for s in (s for s in scored if s.source == source):

@@ -95,7 +95,7 @@ def test_what_seems_early_while_more_is_wrong_may_be_no_fault(stiffening):
     bench = Workbench.of(spring(), [shaken("zero", law=law, early=6)], "zero")
     plain = bench.fit(spring())
     for early in (True, False):
-        gates = find_time_shift(Checked(bench, plain), early=early).gates
+        gates = find_time_shift(Checked(bench, plain), correct_early=early).gates
         assert [g.finding for g in gates] == (["alignment"] if early or not stiffening else [])
 
 

@@ -12,7 +12,7 @@ from pilfr_casadi import laws
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.fits.evidence import (
     WRONG_MODEL_SAMPLES,
-    Sample,
+    EffectiveSamples,
     information,
     log_evidence,
     log_prior,
@@ -26,14 +26,10 @@ NONE = np.zeros(0)
 
 
 def test_samples_of_noise_count_and_those_of_a_wrong_model_do_not_shout():
-    few, many = (Sample(1e-4, count) for count in (500, 50_000))
-    assert (
-        many.effective(1.0)
-        == pytest.approx(few.effective(1.0), rel=0.02)
-        == pytest.approx(WRONG_MODEL_SAMPLES, rel=0.02)
-    )
-    assert few.effective(1e-4) > 10 * few.effective(1.0)
-    assert few.effective(1e-4) < 500
+    few, many = (EffectiveSamples(1e-4, count) for count in (500, 50_000))
+    assert many.at(1.0) == pytest.approx(few.at(1.0), rel=0.02) == pytest.approx(WRONG_MODEL_SAMPLES, rel=0.02)
+    assert few.at(1e-4) > 10 * few.at(1.0)
+    assert few.at(1e-4) < 500
 
 
 @pytest.mark.parametrize("n", [8.0, 150.0])

@@ -7,7 +7,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator, multisine
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.faults.gates import Checked
-from pilfr_casadi.diagnose.fits.evidence import deviations
+from pilfr_casadi.diagnose.fits.evidence import standard_errors
 from pilfr_casadi.diagnose.fits.flexible_forces import innovation_share
 from pilfr_casadi.diagnose.fits.workbench import THOROUGH
 from pilfr_casadi.laws import CoulombFriction
@@ -53,7 +53,7 @@ def checked(simulator, recording):
 def test_a_fit_is_as_exact_as_with_the_quiet_sensor_alone(recorded):
     both = checked(mass(1000.0, 10.0), recorded())
     alone = checked(mass(1000.0, 10.0, ("position",)), recorded(outputs=("position",)))
-    errors = [float(deviations(found.bench, found.fitted)["k"]) for found in (both, alone)]
+    errors = [float(standard_errors(found.bench, found.fitted)["k"]) for found in (both, alone)]
     assert errors[0] == pytest.approx(errors[1], rel=0.3)
     assert abs(both.fitted.values["k"] - 1100) < 4 * errors[1]
     assert np.sqrt(both.fitted.squares) == pytest.approx([QUIET, NOISY], rel=0.1)

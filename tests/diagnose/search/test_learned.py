@@ -125,28 +125,28 @@ def test_held_out_blocks_tell_a_better_simulator():
     (learned, *_) = learn_forces(bench, refit, ["ground"])
     before, after = held_out_errors(bench, refit), held_out_errors(bench, learned)
     assert after.blocks < 0.3 * before.blocks and after.ahead < 0.3 * before.ahead
-    assert after.error == pytest.approx(max(after.blocks, after.ahead) ** 0.5)
-    assert NOISE < after.error < 0.5 * before.error
+    assert after.weighted_rms == pytest.approx(max(after.blocks, after.ahead) ** 0.5)
+    assert NOISE < after.weighted_rms < 0.5 * before.weighted_rms
     exact = Workbench.of(true, bench.recordings, "zero")
-    assert held_out_errors(exact, exact.fit(true)).error == pytest.approx(NOISE, rel=0.1)
+    assert held_out_errors(exact, exact.fit(true)).weighted_rms == pytest.approx(NOISE, rel=0.1)
 
 
 @pytest.mark.parametrize("seconds", [-1.0, 1e-3])
 def test_a_refit_that_is_cut_short_predicts_nothing(nameless, seconds):
     """It begins at a fit to all samples, so that it would seem to predict those left out."""
-    bench, fitted = nameless.evidence["search"].bench, nameless.evidence["after"]
+    bench, fitted = nameless.evidence.search.bench, nameless.evidence.after
     assert np.isfinite(held_out_errors(bench, fitted).rms)
     assert held_out_errors(replace(bench, deadline=time.perf_counter() + seconds), fitted).rms == np.inf
 
 
 def test_held_out_samples_have_no_say_in_what_predicts_them(nameless):
     """The weights that a refit starts from do not matter, because what is held out has shaped them."""
-    bench, fitted = nameless.evidence["search"].bench, nameless.evidence["after"]
+    bench, fitted = nameless.evidence.search.bench, nameless.evidence.after
     name = f"{fitted.simulator.elements[-1].prefix}c"
     elsewhere = replace(fitted, values={**fitted.values, name: 2 * fitted.values[name]})
     there, here = (held_out_errors(bench, f) for f in (elsewhere, fitted))
     assert (there.blocks, there.ahead) == (here.blocks, here.ahead)
-    assert here.error > fitted.cost**0.5
+    assert here.weighted_rms > fitted.cost**0.5
 
 
 def test_laws_are_compared_with_a_force_where_it_acts():

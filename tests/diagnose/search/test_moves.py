@@ -97,7 +97,7 @@ def test_at_the_time_limit_the_search_answers_from_what_it_has():
     assert found.out_of_time and len(found.steps) == 1  # the first law is fitted in any case
     (r,) = rubbing()
     diagnosis = pilfr.diagnose(rig(OFF), r.slice(0, 800), laws=TRIED, time_limit=1e-3)
-    assert diagnosis.evidence["search"].bench.deadline == np.inf  # what is fitted later, as by `refine`, has time
+    assert diagnosis.evidence.search.bench.deadline == np.inf  # what is fitted later, as by `refine`, has time
     assert "The time limit ended the search" in str(diagnosis)
     assert "none of the laws that were fitted before the time limit (1 of " in diagnosis.sentence
     with pytest.raises(pilfr.InputError, match="time_limit=0 was given"):
@@ -110,7 +110,7 @@ def test_hypotheses_are_not_compared_by_different_errors_where_time_ran_out(monk
     found.held_out(found.best)
     found.until = 0.0
     monkeypatch.setattr(Search, "_likeliest", lambda self: [self.root, self.best])
-    found.judge_on_held_out_data()
+    found.cross_validate_likeliest()
     assert found.out_of_time and all(known.held_out is None for known in found.findings.values())
 
     def just_in_time(bench, fitted, workers):
@@ -162,16 +162,16 @@ def test_after_the_deadline_and_ctrl_c_the_correction_fits_nothing_more(monkeypa
     monkeypatch.setattr(Trials, "converge", lambda self, trial: fitted.append(trial) or converge(self, trial))
     monkeypatch.setattr(correction, "refit_learned", refit)
     found.bench, answer = replace(found.bench, deadline=0.0), posterior(found)
-    correction.find_correction(found, answer)
+    correction.find_unnamed_correction(found)
     unsure = replace(answer, effects=tuple(replace(e, confidence=0.4) for e in answer.effects))
-    assert correction.find_correction(found, unsure, named=True)[0].elements  # no comparison has refuted the name
+    assert correction.find_named_correction(found, unsure)[0].elements  # no comparison has refuted the name
     assert not fitted
     found.bench = replace(found.bench, deadline=np.inf, interrupt=Interrupt(True, True))
     with monkeypatch.context() as patch:  # after Ctrl-C not even the parts that a comparison needs
         patch.setattr(type(found), "held_out_errors", lambda *_: pytest.fail("a comparison after Ctrl-C"))
-        assert correction.find_correction(found, unsure, named=True)[0].elements
+        assert correction.find_named_correction(found, unsure)[0].elements
     found.bench = replace(found.bench, interrupt=Interrupt())
-    correction.find_correction(found, posterior(found))
+    correction.find_unnamed_correction(found)
     assert fitted
 
 

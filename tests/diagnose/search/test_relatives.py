@@ -74,9 +74,9 @@ def test_the_simplest_of_laws_that_explain_about_as_much_is_fitted_first(tiny):
         entry(CubicStiffness(), 0.90, k_3=1.0),
         entry(StribeckFriction(), 0.91, F_c=1.0, F_e=0.5, v_s=1.0, v_0=0.1),
     )
-    assert [found[0].law.id for found in select_pairs([both, cube], again=False)] == [cube.law.id, both.law.id]
+    assert [found[0].law.id for found in select_pairs([both, cube], few=False)] == [cube.law.id, both.law.id]
     far = replace(cube, share=0.5)
-    assert [found[0].law.id for found in select_pairs([both, far], again=False)] == [both.law.id, cube.law.id]
+    assert [found[0].law.id for found in select_pairs([both, far], few=False)] == [both.law.id, cube.law.id]
 
 
 def test_a_special_case_that_was_left_after_a_few_steps_is_fitted_again(asked_for, entry):

@@ -19,7 +19,7 @@ def diagnosis():
 
 @pytest.mark.slow
 def test_a_small_rest_is_explained_if_noise_alone_is_left(diagnosis):
-    search = diagnosis.evidence["search"]
+    search = diagnosis.evidence.search
     (alone,) = [t for t in search.memo.values() if [e.port for e in t.effects] == ["ground"] and len(t.laws) == 1]
     assert alone.mean_square < 1e-3 * search.root.mean_square  # less than a formula may leave
     assert [(e.port, e.law) for e in diagnosis.effects] == [
@@ -33,7 +33,7 @@ def test_a_small_rest_is_explained_if_noise_alone_is_left(diagnosis):
 
 @pytest.mark.slow
 def test_a_law_that_does_nothing_predicts_as_the_hypothesis_without_it(diagnosis):
-    search = diagnosis.evidence["search"]
+    search = diagnosis.evidence.search
     best = search.best
     idle = best.fitted.simulator.with_element("sensor:pos", laws.Saturation().at({"L": 100.0}))
     values = {**best.fitted.values, **idle.elements[-1].named({"L": 100.0})}

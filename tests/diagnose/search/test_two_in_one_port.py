@@ -68,7 +68,7 @@ def test_a_drive_may_have_a_dead_zone_and_a_delay():
     found, values = driven_with(laws.Delay, {"T": 0.013})
     assert {e.law for e in found.effects} == {"dead_zone", "delay"}  # behind the rig the delay looks the same
     at_drive = frozenset(("actuator:force", kind) for kind in (laws.DeadZone, laws.Delay))
-    assert at_drive in found.evidence["search"].memo
+    assert at_drive in found.evidence.search.memo
     assert values == pytest.approx({"g": 1.5, "T": 0.013}, rel=0.05)
 
 

@@ -11,7 +11,7 @@ from tanks_rig import DT, M, recorded, tanks
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording
 from pilfr_casadi.diagnose import preparation
-from pilfr_casadi.diagnose.faults.channels import accept_best, find_gross_slips, scale_channels, scale_time
+from pilfr_casadi.diagnose.faults.channels import accept_best, find_gross_channel_errors, scale_channels, scale_time
 from pilfr_casadi.diagnose.fits.workbench import Workbench
 from pilfr_casadi.diagnose.preparation import first_refit, prepare
 from pilfr_casadi.engine import make_engine
@@ -120,7 +120,7 @@ def test_half_of_the_time_is_left_to_try_gross_faults(monkeypatch):
 def test_a_refit_that_was_cut_short_for_no_fault_goes_on(monkeypatch):
     u, y = recorded()
     r = Recording(u, y, DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero")
-    slip, starts, fit = scale_channels("y", ("upper", "lower"), [0], 10.0), [], Workbench.fit
+    fault, starts, fit = scale_channels("y", ("upper", "lower"), [0], 10.0), [], Workbench.fit
 
     def cut_short(bench, **_):
         found = fit(bench, bench.simulator, solver=GaussNewton(max_iterations=1))
@@ -130,7 +130,7 @@ def test_a_refit_that_was_cut_short_for_no_fault_goes_on(monkeypatch):
         starts.append(given)
         return fit(bench, simulator, given, **options)
 
-    monkeypatch.setattr(preparation, "find_gross_slips", lambda bench, workers: [slip])
+    monkeypatch.setattr(preparation, "find_gross_channel_errors", lambda bench, workers: [fault])
     monkeypatch.setattr(preparation, "refit", cut_short)
     monkeypatch.setattr(Workbench, "fit", kept)
     found = prepare(tanks(1.15), [r], "zero", "auto")
@@ -146,7 +146,7 @@ def test_ctrl_c_in_the_search_of_gross_faults_keeps_the_first_refit(monkeypatch)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(
-        preparation, "find_gross_slips", lambda bench, workers: [scale_channels("y", ("a", "b"), [0], 9.0)]
+        preparation, "find_gross_channel_errors", lambda bench, workers: [scale_channels("y", ("a", "b"), [0], 9.0)]
     )
     monkeypatch.setattr(preparation, "refit", press)
     found = prepare(tanks(1.15), [r], "zero", "auto")
@@ -170,7 +170,7 @@ def with_still_output(wrong):
 @pytest.mark.parametrize("wrong", [True, False])
 def test_an_output_that_stands_still_hides_no_gross_fault(wrong):
     bench = with_still_output(wrong)
-    faults = accept_best(first_refit(bench), find_gross_slips(bench)).gates
+    faults = accept_best(first_refit(bench), find_gross_channel_errors(bench)).gates
     assert [(g.channel, g.value) for g in faults] == [("lower", 1e-3)] * wrong
 
 
