@@ -3,13 +3,13 @@
 There are five cases:
 
 - If the simulator is unstable and runs away from the recordings, search with an observer (`prediction`).
-- If nobody stated the hold of the inputs and the best hypothesis follows better with the other one, search with that.
+- If nobody stated the hold of the inputs and the best hypothesis follows better with another one, search with that.
 - If a channel seemed to be early, search without that correction, because missing physics can look like a lead.
 - If a channel proves shifted only beside the first law, search with it at its right times.
 - If a wrong zero was preferred to a wrong start, search from unknown initial states.
 
 A sixth, in predictions, is `pipeline._name_in_predictions`. The functions are nested: `search_with_repetitions` calls
-`_search_with_either_hold`, that calls `search_with_one_hold`, and that `_search_once`.
+`_search_with_each_hold`, that calls `search_with_one_hold`, and that `_search_once`.
 
 Each search fits different data. Its evidence is therefore not comparable; the smaller error decides.
 """
@@ -56,7 +56,7 @@ def search_with_repetitions(request: Request) -> tuple[Request, Attempt]:
     """Search; if nobody stated the focus and the simulator runs away, correct its states by an observer."""
     if request.focus != "prediction":
         try:
-            return request, _search_with_either_hold(request)
+            return request, _search_with_each_hold(request)
         except RunsAway:  # by `Workbench`, in the first refit or as the check of it in `_search_once`
             if request.focus == "simulation" or not observer_keeps_up(request.simulator, request.recordings):
                 raise
@@ -65,16 +65,19 @@ def search_with_repetitions(request: Request) -> tuple[Request, Attempt]:
     observed, memory = predictor(request.simulator, request.recordings, hold, request.engine)
     note = prediction_note(request.simulator, request.recordings, memory)
     request = replace(request, simulator=observed, notes=(*request.notes, note))
-    return request, _search_with_either_hold(request)
+    return request, _search_with_each_hold(request)
 
 
-def _search_with_either_hold(request: Request) -> Attempt:
-    """Search; if nobody stated the hold of the inputs and it matters, use the hold with the smaller error."""
-    first = search_with_one_hold(request)
+def _search_with_each_hold(request: Request) -> Attempt:
+    """Search; if nobody stated the hold of the inputs and it matters, use the hold with the smallest error."""
+    found = search_with_one_hold(request)
+    hold = "" if found.search.hold_stated else _find_better_hold(found.search)
+    return _search_with_better_hold(request, found, hold) if hold else found
+
+
+def _search_with_better_hold(request: Request, first: Attempt, hold: str) -> Attempt:
+    """Search with a hold that the best hypothesis prefers; keep the search with the smaller error, and note it."""
     search = first.search
-    if search.hold_stated or not _prefers_other_hold(search):
-        return first
-    hold = search.bench.with_other_hold().hold
     held = replace(request, hold=hold, say=request.say.under("other hold: "))
     other = _again(first, partial(search_with_one_hold, held))
     if other is None:
@@ -85,23 +88,26 @@ def _search_with_either_hold(request: Request) -> Attempt:
     if after2 > before2 or only_refitted:
         search.resume(request.most_effects)
         return first
+    better = _find_better_hold(again)
     # the laws that were found since may have been what the hold had made up for
-    if _prefers_other_hold(again):
+    if better == search.bench.hold:
         search.adopt(again.best)
         search.resume(request.most_effects)
         before2, after2 = first.compared_with(other)
         if before2 < after2:
             return first
     note = hold_note(request.simulator, hold, error_ratio(before2, after2))
-    return replace(other, ready=replace(other.ready, gates=(*other.ready.gates, note)))
+    other = replace(other, ready=replace(other.ready, gates=(*other.ready.gates, note)))
+    further = better and better != search.bench.hold
+    return _search_with_better_hold(request, other, better) if further else other
 
 
-def _prefers_other_hold(search: Search) -> bool:
-    """Tell whether a search that nobody has interrupted would be better with the other hold."""
-    prefers = False
+def _find_better_hold(search: Search) -> str:
+    """Return a hold with which a search that nobody has interrupted would be better; empty without one."""
+    found = ""
     with search.until_interrupted():
-        prefers = search.prefers_other_hold()
-    return prefers
+        found = search.find_better_hold()
+    return found
 
 
 def search_with_one_hold(request: Request) -> Attempt:

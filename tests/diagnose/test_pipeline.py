@@ -67,6 +67,14 @@ def test_a_law_shows_that_the_other_hold_is_nearer(press):
     assert (found.errors["train"]["after"] < 0.01) is not bool(press)
 
 
+def test_a_law_shows_that_inputs_are_band_limited():
+    found, stages = diagnosed(spring(), stiffened(1e6, 400, hold="band-limited"), (laws.CubicStiffness,), effects=1)
+    assert found.hold == "band-limited" and "other hold: checks and refit" in stages
+    (note,) = (g.sentence for g in found.gates if g.finding == "hold")
+    assert "band-limited between samples fits better" in note
+    assert [e.law for e in found.effects] == ["cubic_stiffness"] and found.errors["train"]["after"] < 0.01
+
+
 def leak(a=1.0):
     """A tank with a pinned outlet, whose smaller time constant looks like an early output."""
     return Simulator(

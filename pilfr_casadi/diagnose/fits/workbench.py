@@ -159,8 +159,12 @@ class Workbench:
         return self.recordings[0].dt
 
     def with_other_hold(self) -> Workbench:
-        """Return the bench with the other hold of the inputs between samples."""
-        return replace(self, hold="linear" if self.hold == "zero" else "zero")
+        """Return the bench with inputs interpolated between samples if they are held, else held."""
+        return self.with_hold("linear" if self.hold == "zero" else "zero")
+
+    def with_hold(self, hold: str) -> Workbench:
+        """Return the bench with another hold of the inputs between samples."""
+        return replace(self, hold=hold)
 
     def on(self, recordings: Sequence[Recording]) -> Workbench:
         """Return the bench with other recordings; errors stay in units of the training outputs' deviation."""

@@ -72,11 +72,11 @@ class Search(Hypotheses):
     steps: list[Step] = field(default_factory=list)  # the moves, in their order
     aligned: bool = False  # whether the times of the channels are settled, so that no shift is looked for
     shift: Gate | None = None  # the shift of a channel that ended the search, because it shows only beside a law
-    other_hold: bool = False  # whether the search ended because the other hold of the inputs proved better
+    better_hold: str = ""  # the hold of the inputs that ended the search, because it proved better
 
     def run(self, effects: float) -> Search:
         """Search for up to `effects` effects; an interrupt ends the search with the present results."""
-        self.other_hold = False
+        self.better_hold = ""
         self.keep(Trial.of(self.without, 0, thorough=True))
         with self.until_interrupted():
             self.estimate_noise()
@@ -90,8 +90,8 @@ class Search(Hypotheses):
 
     @property
     def must_repeat(self) -> bool:
-        """Whether the search goes no further: it has to be repeated with the other hold or with a channel shifted."""
-        return self.other_hold or self.shift is not None
+        """Whether the search goes no further: it has to be repeated with another hold or with a channel shifted."""
+        return bool(self.better_hold) or self.shift is not None
 
     def resume(self, effects: float) -> None:
         """Continue with the present hold because the other is no better, unless the search was interrupted."""
@@ -131,7 +131,7 @@ class Search(Hypotheses):
             self.add(parent)
             if not parent.laws and self.may_go_on() and self._escape_local_minimum():
                 self.add(self.root)
-            self.other_hold = not self.hold_stated and self.prefers_other_hold()
+            self.better_hold = "" if self.hold_stated else self.find_better_hold()
             if not parent.laws and not self.must_repeat:
                 self._find_shift()
             if self.must_repeat:
@@ -213,14 +213,21 @@ class Search(Hypotheses):
         fewer = [t for t in self.memo.values() if t.laws and len(t.effects) < len(trial.effects)]
         return len(trial.effects) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
 
-    def prefers_other_hold(self) -> bool:
-        """Tell whether the best hypothesis follows the recordings better with the other hold of the inputs."""
-        best = self.best.fitted
-        if self.interrupted or not self.may_go_on():
-            return False
-        held = self.bench.with_other_hold()
-        found = refit(held, [best.values], best.simulator, states=best.initial, solver=THOROUGH)
-        return found is not None and not self.interrupted and found.cost * BETTER_RATIO**2 < best.cost
+    def find_better_hold(self) -> str:
+        """Return the hold of the inputs with which the best hypothesis follows best, if clearly better; else empty.
+
+        A band-limited input is compared with an interpolated one, which it differs from by less than from a held one.
+        """
+        best, hold = self.best.fitted, self.bench.hold
+        least, found = best.cost / BETTER_RATIO**2, ""
+        for other in {"zero": ("linear",), "linear": ("zero", "band-limited")}.get(hold, ("linear",)):
+            if self.interrupted or not self.may_go_on():
+                return ""
+            held = self.bench.with_hold(other)
+            fitted = refit(held, [best.values], best.simulator, states=best.initial, solver=THOROUGH)
+            if fitted is not None and fitted.cost < least:
+                least, found = fitted.cost, other
+        return "" if self.interrupted else found
 
     def _find_shift(self) -> None:
         """Look beside each of the first laws for an output that comes before its cause; missing physics may hide it.
