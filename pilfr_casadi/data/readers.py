@@ -194,6 +194,8 @@ class _Request:
                 raise InputError(f"{name!r} is not an option of a reader; the options are {listed(known)}.")
         if not isinstance(columns or {}, Mapping):
             raise InputError(f"columns={columns!r} was given; give columns={{'NAME': 'COLUMN'}}.")
+        if not isinstance(options.get("units") or {}, Mapping):
+            raise InputError(f"units={options['units']!r} was given; give units={{'NAME': 'UNIT'}}.")
         self.columns = columns or {}
         for name in self.columns:
             if name not in {*self.inputs, *self.outputs, *TIME_NAMES}:

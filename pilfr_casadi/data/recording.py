@@ -547,5 +547,5 @@ def _check_options(r: Recording, m: int) -> None:
         )
     if r.begins == "periodic" and r.period is None:
         raise InputError(f"{r.label} was given initial='periodic' but no period; set period=SAMPLES.")
-    if not isinstance(r.units, Mapping):
+    if not isinstance(r.units, Mapping) or not all(isinstance(unit, str) for unit in r.units.values()):
         raise InputError(f"units of {r.label} is {r.units!r}; give a mapping from column to unit, as in {{'u': 'N'}}.")

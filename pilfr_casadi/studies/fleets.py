@@ -37,6 +37,7 @@ from .._base import (
     check_executor,
     deferred_interrupt,
     digest,
+    is_number,
     make_folder,
     numbers,
     processors,
@@ -154,7 +155,7 @@ def fleet(
     given = _check_machines(machines)
     count = min(whole(sample, "sample", 1), len(given))
     effort = Effort(processors() if workers is None else whole(workers, "workers", 1), time_limit)
-    if time_limit is not None and not time_limit > 0:
+    if time_limit is not None and not (is_number(time_limit) and time_limit > 0):
         raise InputError(f"time_limit={time_limit!r} was given; give seconds, a positive number.")
     own = as_simulator(simulator, next(iter(given.values())))
     given = _match_machines(own, given, hold)

@@ -478,6 +478,8 @@ def test_one_port_needs_no_tuple(record):
         (lambda: rig(parameters=[1.0]), r"parameters are \[1.0\]; give {name: Parameter"),
         (lambda: rig(parameters={"m": 1.0}), "parameter 'm' is 1.0; give Parameter"),
         (lambda: rig(units="N"), "units are 'N'; give {name: unit}"),
+        (lambda: rig(units={"position": 5}), "units are {'position': 5}; give {name: unit}"),
+        (lambda: rig(units={"x_2": "m"}), "The simulator has no 'x_2' among its inputs and outputs; they are force, "),
         (lambda: rig(dynamics=dict), "dynamics is <class 'dict'>; give a function"),
     ],
 )
