@@ -20,6 +20,7 @@ from .preprocessing import butterworth, change_step, hold_at, levels_last, remov
 from .units import conversion
 
 SAME_STEP = 1e-4  # relative difference up to which two steps count as the same; written times have few digits
+LONGEST_STEP = 1e30  # s, and its inverse the shortest one: rates are squared, and no experiment is outside
 HOLDS = ("zero", "linear", None)
 INITIALS = ("zero", "estimate", "periodic")
 
@@ -532,6 +533,10 @@ def _initial_state(values: Any, label: str) -> np.ndarray:
 def _check_options(r: Recording, m: int) -> None:
     """Check the step, `start`, `hold`, `initial`, `skip` and `period` of a recording of `m` samples."""
     positive(r.dt, f"{r.label}: dt", "the seconds from one sample to the next")
+    if not 1 / LONGEST_STEP <= r.dt <= LONGEST_STEP:
+        raise InputError(
+            f"{r.label} was given dt={r.dt:g}; give seconds from {1 / LONGEST_STEP:g} to {LONGEST_STEP:g}."
+        )
     if not (is_number(r.start) and np.isfinite(r.start)):
         raise InputError(f"start of {r.label} is {r.start!r}; give the time of its first sample in seconds.")
     if not (r.hold is None or isinstance(r.hold, str)) or r.hold not in HOLDS:

@@ -71,11 +71,11 @@ class Equations:
         object.__setattr__(self, "parameters", check_parameters(self.parameters))
         object.__setattr__(self, "ports", check_ports(self.ports))
         x, u, p, t = self.symbols()
-        found = self.by_state(self.derivatives(x, u, p, t)) | self.measured(x, u, p, t)
-        check_expressions(found, ca.vertcat(stack(x, u, p), t))
+        known = ca.vertcat(stack(x, u, p), t)
+        check_expressions(self.by_state(self.derivatives(x, u, p, t)) | self.measured(x, u, p, t), known)
         for port in self.ports:
-            self.into(port, x, u, p, t)
-            self.across(port, x, u, p, t)
+            own = {f"{port.name}: into {target}": factor for target, factor in self.into(port, x, u, p, t).items()}
+            check_expressions(own | {f"{port.name}: across": self.across(port, x, u, p, t)}, known)
             self._check_term(port, x, u, p, t)
         signals = [name for port in self.ports for name in port.signals]
         check_known(
