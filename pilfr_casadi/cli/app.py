@@ -154,6 +154,7 @@ def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
 def name_options(sentence: str) -> str:
     """Replace keyword arguments in a message by options of the command line."""
     sentence = sentence.replace("give the model as `model=`", "use it in Python with load(FILE, model=MODEL)")
+    sentence = sentence.replace("read it by `pilfr_casadi.simulators.load_simulator`", "give a model.json")
     sentence = re.sub(r"columns=\{'([^']*)': '([\w.-]*)'\}", r"--column \1=\2", sentence)
     sentence = re.sub(r"columns=\{'([^']*)': '([^']*)'\}", r'--column "\1=\2"', sentence)
     keyword = rf"`?(?<![\w-])({KEYWORDS})=(?:'([^']*)'|([^\s;,()`]*[^\s;,.()`]))?`?"

@@ -291,7 +291,8 @@ class _Request:
         units = {name: unit for name, unit in found if unit and name in names[0] + names[1]}
         units |= self.options.get("units") or {}
         try:
-            options = {"name": table.path.stem, **self.options, "hold": hold, "units": units}
+            name = table.path.stem.encode(errors="replace").decode()  # a name on disk need not be text
+            options = {"name": name, **self.options, "hold": hold, "units": units}
             return Recording(u, y, dt, *names, **options)
         except InputError as error:
             raise InputError(f"{table.path}: {error}") from None

@@ -174,11 +174,10 @@ def fleet(
 
 def _check_machines(machines: Any) -> dict[str, tuple[Recording, ...]]:
     """Return the recordings of each machine; refuse names that cannot name a folder."""
-    if not isinstance(machines, Mapping) or len(machines) < FEWEST_MACHINES:
-        raise InputError(
-            f"A fleet needs a dict of at least {FEWEST_MACHINES} machines, {{name: recordings}}; for one machine use "
-            "diagnose."
-        )
+    if not isinstance(machines, Mapping):
+        raise InputError(f"The machines are {str(machines)[:60]}; give recordings by name, {{name: recordings}}.")
+    if len(machines) < FEWEST_MACHINES:
+        raise InputError(f"A fleet needs at least {FEWEST_MACHINES} machines; for one machine use diagnose.")
     for name in machines:
         if not isinstance(name, str) or not re.fullmatch(r"[\w.+-][\w .+-]{0,99}", name, re.ASCII):
             raise InputError(
