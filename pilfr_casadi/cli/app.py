@@ -7,6 +7,7 @@ written). Each group of commands has its own file, imported only when one of its
 from __future__ import annotations
 
 import importlib
+import io
 import os
 import re
 import sys
@@ -74,6 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         The exit status.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="replace")  # a file's name need not be text
     try:
         return _run(sys.argv[1:] if arguments is None else list(arguments))
     except typer.Exit as end:  # of --help and --version

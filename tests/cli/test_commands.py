@@ -524,6 +524,27 @@ def test_an_existing_file_is_replaced_only_if_that_is_said(capsys, tmp_path, tra
 
 
 @pytest.mark.usefixtures("blank_figures")
+def test_no_more_workers_than_starts_are_begun(capsys, tmp_path, train, monkeypatch):
+    begun = []
+    monkeypatch.setattr(
+        "pilfr_casadi.cli.models.worker_pool", lambda count: begun.append(count) or contextlib.nullcontext()
+    )
+    assert run(capsys, *fit_arguments(train, tmp_path, "--workers", 900))[0] == 0
+    assert begun == [2]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes there")
+@pytest.mark.usefixtures("blank_figures")
+def test_a_recording_whose_name_is_no_text_is_fitted(tmp_path, train, monkeypatch):
+    path = os.fsdecode(os.fsencode(tmp_path / "f") + b"\xff.csv")
+    shutil.copy(train, path)
+    with (tmp_path / "said.txt").open("w", encoding="utf-8") as strict:
+        monkeypatch.setattr(sys, "stdout", strict)
+        assert main([str(a) for a in fit_arguments(path, tmp_path)]) == 0
+    assert "f?.csv" in (tmp_path / "said.txt").read_text() and (tmp_path / "out" / "report.html").exists()
+
+
+@pytest.mark.usefixtures("blank_figures")
 def test_a_result_that_came_in_between_is_kept(capsys, tmp_path, train, monkeypatch):
     out = tmp_path / "out"
 

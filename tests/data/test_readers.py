@@ -3,6 +3,7 @@
 import io
 import os
 import pickle
+import sys
 import time
 import zipfile
 
@@ -570,3 +571,21 @@ def test_commas_in_a_text_tell_nothing_of_the_numbers(write):
 def test_units_are_given_by_name(write):
     with pytest.raises(InputError, match="units='mm' was given; give units="):
         read_csv(write(GOOD), "force", "x2", units="mm")
+
+
+def test_a_step_that_makes_too_many_samples_is_refused(write):
+    path = write(GOOD)
+    for resample in (
+        lambda: read_csv(path, "force", "x2", resample=1e-12),
+        lambda: read_csv(path, "force", "x2").resample(1e-12),
+    ):
+        with pytest.raises(InputError, match=r"a step of 1e-12 s makes more than 1e\+08 samples"):
+            resample()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes there")
+def test_a_name_on_disk_that_is_no_text_becomes_one(tmp_path):
+    path = os.fsdecode(os.fsencode(tmp_path / "f") + b"\xff.csv")
+    with open(path, "w") as file:
+        file.write(GOOD)
+    assert read_csv(path, "force", "x2").name == "f?"

@@ -92,6 +92,8 @@ def test_where_it_starts():
     simulator = mass_on_spring()
     release = wave(simulator, 0.02).with_(initial=np.array([0.3, -0.1]))
     assert np.array_equal(exported(simulator, dt=0.02, start=release).x0(), [0.3, -0.1])
+    with pytest.raises(InputError, match=r"has 3 numbers; give 2\."):
+        exported(simulator, dt=0.02, start=np.zeros(3))
 
 
 def test_a_diagnosis_exports_what_it_fitted():
