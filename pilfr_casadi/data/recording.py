@@ -412,8 +412,8 @@ def check_for_identification(
 ) -> tuple[Recording, ...]:
     """Check that recordings can be fitted together, and return them as a tuple.
 
-    They need outputs that change, the same names and step, and together `n_min` scored samples, such as the number of
-    free parameters. With `excited`, at least one input has to change.
+    They need outputs that change, the same names and step, samples of their own, and together `n_min` scored samples,
+    such as the number of free parameters. With `excited`, at least one input has to change.
     """
     recordings = as_recordings(data)
     labels = _distinct_labels(recordings)
@@ -450,6 +450,10 @@ def check_for_identification(
             raise InputError(
                 f"the output {name!r} never changes in {listed(labels)}; check the sensor or leave this output out."
             )
+    seen = dict[str, str]()
+    for label, r in zip(labels, recordings, strict=True):
+        if (first_label := seen.setdefault(fingerprint(r), label)) != label:
+            raise InputError(f"{label} holds the same samples as {first_label}; leave one of them out.")
     return recordings
 
 

@@ -197,6 +197,8 @@ def test_one_varying_input_is_enough_to_identify():
         ([recording(inputs=("f",), name="b")], 2, "'b' has the inputs f and the recording has u"),
         ([recording().with_(dt=0.101, name="b")], 2, "resample"),
         ([recording(skip=10)], 31, "30 scored samples"),
+        ([recording(name="b")], 2, "recording 'b' holds the same samples as the recording; leave one"),
+        ([recording()], 2, "recording 2 holds the same samples as recording 1"),
     ],
 )
 def test_recordings_that_do_not_fit_together(others, n_min, words):
