@@ -506,7 +506,6 @@ def export_command(options: ExportOptions) -> int:
         raise InputError(f"{in_words(kinds)} were given; give one of them.")
     if options.fmi and not options.fmu:
         raise InputError("--fmi was given, which is the version of an FMU; give --fmu too, or leave it out.")
-    _check_files(options)
     simulated = Path(options.model).suffix.lower() == ".py"
     source: Any = load_simulator(options.model) if simulated else load(options.model)
     for key in ("dt", "hold"):
@@ -519,6 +518,7 @@ def export_command(options: ExportOptions) -> int:
             f"--initial {options.initial} needs a recording; give zero or each state's value, as in --initial 20,0.5."
         )
     start = None if options.initial in (None, "zero") else np.array(options.initial)
+    _check_files(options)
     more: dict[str, Any] = {"smooth": options.smooth, "name": options.name}
     step = exported(source, dt=options.dt, hold=options.hold, start=start, **more)
     if options.initial is None and step.states:
@@ -538,7 +538,8 @@ def export_command(options: ExportOptions) -> int:
 def _check_files(options: ExportOptions) -> None:
     """Refuse files that cannot be written, the model itself and, without `--overwrite`, existing files."""
     out = Path(options.out)
-    if not options.c and (out.is_dir() or not out.parent.is_dir() or not os.access(out.parent, os.W_OK)):
+    to_file = not (options.c or options.fmu)
+    if to_file and (out.is_dir() or not out.parent.is_dir() or not os.access(out.parent, os.W_OK)):
         raise InputError(f"--out {options.out} cannot be written; give a file in a folder that exists.")
     for path in options.files:
         if os.path.realpath(options.model) == os.path.realpath(path):
