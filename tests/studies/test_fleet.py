@@ -286,6 +286,11 @@ def test_bad_arguments(days, tmp_path, change, says):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_time_limit_that_ends_every_step_says_what_helps(days):
+    with pytest.raises(InputError, match=r"time limit of 0.001 s; with a longer one it is done again"):
+        pilfr.fleet(rig(), {name: days[name] for name in "ab"}, workers=1, time_limit=0.001)
+
+
 def test_recordings_that_do_not_fit_are_refused_with_their_machine(days, tmp_path):
     other = pilfr.Recording(np.arange(30.0), np.arange(30.0), 5e-3, inputs=("force",), outputs=("angle",))
     with pytest.raises(InputError, match=r"Machine 'b': .*position"):
