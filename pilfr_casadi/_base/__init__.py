@@ -37,6 +37,7 @@ if TYPE_CHECKING:
         real_array as real_array,
         usable as usable,
         whole as whole,
+        without_mask as without_mask,
     )
     from .files import (
         csv_text as csv_text,

@@ -47,7 +47,8 @@ def usable(values: np.ndarray) -> np.ndarray:
 
 def is_whole(value: Any, least: int, most: float = np.inf) -> bool:
     """Tell whether a value is a whole number from `least` to `most`."""
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(least <= value <= most)
+    whole_number = isinstance(value, int | np.integer) and not isinstance(value, bool | np.timedelta64)
+    return whole_number and bool(least <= value <= most)
 
 
 def whole(value: Any, what: str, least: int) -> int:
@@ -59,7 +60,8 @@ def whole(value: Any, what: str, least: int) -> int:
 
 def is_number(value: Any) -> TypeGuard[float]:
     """Tell whether a value is one real number."""
-    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    real = isinstance(value, int | float | np.integer | np.floating)
+    return real and not isinstance(value, bool | np.timedelta64)  # which NumPy counts among the integers
 
 
 def positive(value: Any, what: str, meaning: str = "a number", zero: bool = False) -> float:
@@ -72,10 +74,19 @@ def positive(value: Any, what: str, meaning: str = "a number", zero: bool = Fals
     return float(value)
 
 
+def without_mask(values: Any) -> np.ndarray:
+    """Return an array in which masked values are missing: nan, or not a time."""
+    array = np.asarray(values)
+    if np.ma.is_masked(values):
+        array = array.astype(float) if array.dtype.kind in "biu" else array.copy()
+        array[np.ma.getmaskarray(values)] = None
+    return array
+
+
 def real_array(values: Any) -> np.ndarray | None:
-    """Return real numbers as a new array of floats, or None if something else is given."""
+    """Return real numbers as a new array of floats, masked ones as nan, or None if something else is given."""
     try:
-        given = np.asarray(values)
+        given = without_mask(values)
         return np.array(given, dtype=float) if given.dtype.kind in "biufO" else None
     except (TypeError, ValueError, OverflowError):
         return None

@@ -1,7 +1,7 @@
-"""Interrupt long work by Ctrl-C, SIGTERM or a time limit, and defer interrupts where work must not be split.
+"""Interrupt long work by Ctrl-C, SIGTERM, SIGHUP or a time limit, and defer interrupts where work must not be split.
 
-All three raise KeyboardInterrupt in the main thread: a time limit and SIGTERM, which `timeout` and job schedulers send,
-raise the signal of Ctrl-C in this process.
+All raise KeyboardInterrupt in the main thread: a time limit, SIGTERM, which `timeout` and job schedulers send, and
+SIGHUP, which a closed terminal sends, raise the signal of Ctrl-C in this process.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
+
+TERMINATING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
 @contextlib.contextmanager
@@ -174,14 +176,17 @@ def repeated_interrupt() -> Iterator[Callable[[], None]]:
 
 @contextlib.contextmanager
 def terminable() -> Iterator[None]:
-    """Make SIGTERM act like Ctrl-C."""
+    """Make SIGTERM and SIGHUP act like Ctrl-C; `nohup` has SIGHUP ignored, which stays so."""
 
     def terminate(*_: object) -> None:
         if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in the background of a script
             raise KeyboardInterrupt
         signal.raise_signal(signal.SIGINT)
 
-    with _handler(signal.SIGTERM, terminate) if _in_main_thread() else contextlib.nullcontext():
+    with contextlib.ExitStack() as stack:
+        for number in TERMINATING:
+            if _in_main_thread() and signal.getsignal(number) is not signal.SIG_IGN:
+                stack.enter_context(_handler(number, terminate))
         yield
 
 

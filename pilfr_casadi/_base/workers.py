@@ -37,7 +37,7 @@ from dataclasses import dataclass
 from typing import Any, ParamSpec, TypeVar
 
 from .errors import InputError
-from .interrupts import Interrupt
+from .interrupts import TERMINATING, Interrupt
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -112,7 +112,7 @@ def worker_pool(count: int) -> Iterator[Executor | None]:
     masks = hasattr(signal, "pthread_sigmask")
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set()
     try:
-        pool = ProcessPoolExecutor(count, initializer=_ignore_signals)
+        pool = ProcessPoolExecutor(count, initializer=_prepare_worker)
         for _ in range(count):  # a pool starts its processes with its first tasks: start all while Ctrl-C is blocked
             pool.submit(os.getpid)
     finally:
@@ -131,10 +131,18 @@ def worker_pool(count: int) -> Iterator[Executor | None]:
                 manager.join(MANAGER_TIMEOUT)
 
 
-def _ignore_signals() -> None:
-    """Leave Ctrl-C and SIGTERM to the process that waits for the results; called in each worker."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+def _prepare_worker() -> None:
+    """Leave signals to the process that waits for the results, and end with it, even if it is killed."""
+    for number in (signal.SIGINT, *TERMINATING):
         signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _shut_down(pool: ProcessPoolExecutor) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import itertools
 import math
 import os
 import sys
@@ -326,8 +327,8 @@ def bounds_of(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
     for name, value in pairs(texts, "--bound", "LOW:HIGH").items():
         low, sign, high = value.partition(":")
         given = f"--bound {name}={value}"
-        if not sign:
-            raise InputError(f"{given} was given; write --bound NAME=LOW:HIGH.")
+        if not sign or value == sign:
+            raise InputError(f"{given} was given; write --bound NAME=LOW:HIGH, of which one may be left out.")
         ends = number(low, given) if low else -math.inf, number(high, given) if high else math.inf
         if not ends[0] <= ends[1]:
             raise InputError(
@@ -430,12 +431,34 @@ def open_cluster(dask: str | None, workers: int) -> Iterator[tuple[Any, int, int
         yield cluster
 
 
-def new_file(folder: str, name: str, overwrite: bool) -> Path:
-    """Return the path of a result; without `overwrite` refuse an existing file."""
-    target = Path(folder) / name
+def check_new(target: Path, overwrite: bool) -> None:
+    """Refuse an existing file as a result, unless `overwrite` is given."""
     if target.exists() and not overwrite:
         raise InputError(f"{target} exists already; give another --out, or --overwrite to replace it.")
-    return target
+
+
+@contextlib.contextmanager
+def reserved_file(folder: str, name: str, overwrite: bool) -> Iterator[Path]:
+    """Make the folder of a result and reserve the file there, so that no other run writes it; yield its path.
+
+    The work is not lost if another run has written the file since it was checked: another folder inside then takes the
+    result. Without a result, no file is left.
+    """
+    target = make_folder(folder) / name
+    for count in itertools.count(2):
+        try:
+            if not overwrite:
+                target.touch(exist_ok=False)
+            break
+        except FileExistsError:
+            target = make_folder(str(Path(folder) / f"run-{count}")) / name
+    if target.parent != Path(folder):
+        print_line(f"note: another run has written {Path(folder) / name} meanwhile; this result is in {target.parent}")
+    try:
+        yield target
+    finally:
+        if target.exists() and not target.stat().st_size:
+            target.unlink()
 
 
 def check_folder(path: str) -> Path:
@@ -450,6 +473,8 @@ def check_folder(path: str) -> Path:
 
 def make_folder(path: str) -> Path:
     """Make the folder of the results, and check that it is writable, before any long work."""
+    if not path:
+        raise InputError("--out '' was given; give the name of a folder.")
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)

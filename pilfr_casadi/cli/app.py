@@ -7,6 +7,7 @@ written). Each group of commands has its own file, imported only when one of its
 from __future__ import annotations
 
 import importlib
+import io
 import os
 import re
 import sys
@@ -74,6 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         The exit status.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="replace")  # a file's name need not be text
     try:
         return _run(sys.argv[1:] if arguments is None else list(arguments))
     except typer.Exit as end:  # of --help and --version
@@ -154,6 +157,7 @@ def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
 def name_options(sentence: str) -> str:
     """Replace keyword arguments in a message by options of the command line."""
     sentence = sentence.replace("give the model as `model=`", "use it in Python with load(FILE, model=MODEL)")
+    sentence = sentence.replace("read it by `pilfr_casadi.simulators.load_simulator`", "give a model.json")
     sentence = re.sub(r"columns=\{'([^']*)': '([\w.-]*)'\}", r"--column \1=\2", sentence)
     sentence = re.sub(r"columns=\{'([^']*)': '([^']*)'\}", r'--column "\1=\2"', sentence)
     keyword = rf"`?(?<![\w-])({KEYWORDS})=(?:'([^']*)'|([^\s;,()`]*[^\s;,.()`]))?`?"

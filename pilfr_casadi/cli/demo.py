@@ -158,4 +158,6 @@ def diagnose_rig(folder: Path, workers: int) -> int:
             )
     except KeyboardInterrupt:
         return say("Interrupted; the diagnosis was not written.", INTERRUPTED)
-    return max(write_diagnosis(found, make_folder(str(folder))), DONE if found.effects else NO_RESULT)
+    return max(
+        write_diagnosis(found, make_folder(str(folder)) / "diagnosis.json"), DONE if found.effects else NO_RESULT
+    )

@@ -26,15 +26,15 @@ from ._common import (
     SimulatorFile,
     SimulatorOptions,
     check_folder,
+    check_new,
     flag,
-    make_folder,
     name_list,
-    new_file,
     numbers_of,
     option,
     print_line,
     print_note,
     print_recordings,
+    reserved_file,
     say,
     seconds,
     simulator_files,
@@ -113,7 +113,7 @@ def diagnose_command(options: DiagnoseOptions) -> int:
     """Writes the answer to DIR/diagnosis.json and the report to DIR/report.html."""
     options.check_files("--simulated SIM.csv")
     laws = _law_names(options.laws)
-    new_file(options.out, "diagnosis.json", options.overwrite)
+    check_new(Path(options.out) / "diagnosis.json", options.overwrite)
     given = source = None
     if options.source is None:
         inputs, outputs = _simulated_names(options)
@@ -125,7 +125,7 @@ def diagnose_command(options: DiagnoseOptions) -> int:
     train = options.read_all(options.train, inputs, outputs)
     tests = options.read_all(options.test, inputs, outputs)
     _check_recordings(train, tests)
-    folder = check_folder(options.out)
+    check_folder(options.out)
     error, poor = 0.0, ""
     if given is not None:
         simulator = as_simulator(given, list(train.values()))
@@ -157,7 +157,8 @@ def diagnose_command(options: DiagnoseOptions) -> int:
             )
     except KeyboardInterrupt:
         return say("Interrupted before there was a diagnosis; nothing was written.", INTERRUPTED)
-    return write_diagnosis(diagnosis, folder, source)
+    with reserved_file(options.out, "diagnosis.json", options.overwrite) as target:
+        return write_diagnosis(diagnosis, target, source)
 
 
 def _law_names(text: str | None) -> tuple[str, ...] | None:
@@ -171,12 +172,14 @@ def _law_names(text: str | None) -> tuple[str, ...] | None:
     return names
 
 
-def write_diagnosis(diagnosis: Diagnosis, folder: Path, source: SimulatorFile | None = None) -> int:
+def write_diagnosis(diagnosis: Diagnosis, target: Path, source: SimulatorFile | None = None) -> int:
     """Write diagnosis.json, corrected.py, then the report; print the diagnosis and the paths; return the exit status.
 
-    corrected.py loads and corrects the simulator file `source`, if there is one.
+    `target` is the path of diagnosis.json; corrected.py loads and corrects the simulator file `source`, if there is
+    one.
     """
-    target, corrected = make_folder(str(folder)) / "diagnosis.json", folder / "corrected.py"
+    folder = target.parent
+    corrected = folder / "corrected.py"
     try:
         with deferred_interrupt():
             diagnosis.save(target)
@@ -325,11 +328,12 @@ def check_command(options: CheckOptions) -> int:
     options.check_files()
     laws = _law_names(options.laws)
     if options.out is not None:
-        new_file(options.out, "check.json", options.overwrite)
+        check_new(Path(options.out) / "check.json", options.overwrite)
     given = options.simulator_file().load()
     simulator = as_simulator(given)
     recordings = options.read_all(options.train, simulator.inputs, simulator.output_names)
-    folder = check_folder(options.out) if options.out is not None else None
+    if options.out is not None:
+        check_folder(options.out)
     print_note(simulator)
     print_recordings("training", recordings)
     with deferred_interrupt():
@@ -337,8 +341,8 @@ def check_command(options: CheckOptions) -> int:
     train = list(recordings.values())
     found = check(as_simulator(given, train), train, hold=options.hold, laws=laws)
     print(name_options(str(found)))
-    if folder is not None:
-        target = make_folder(str(folder)) / "check.json"
-        write_atomically(target, json_text(found.to_dict()))
+    if options.out is not None:
+        with reserved_file(options.out, "check.json", options.overwrite) as target:
+            write_atomically(target, json_text(found.to_dict()))
         print(f"check: {target}")
     return DONE

@@ -55,20 +55,21 @@ from ._common import (
     check_folder,
     check_given_once,
     check_names,
+    check_new,
     flag,
     initial_state,
-    make_folder,
-    new_file,
     numbers_of,
     option,
     print_line,
     print_recordings,
+    reserved_file,
     say,
     seconds,
     takes_options,
     whole,
 )
 
+DEFAULT_STARTS = 8
 # options of a search, which a saved model replaces
 SEARCH = ("nx", "operators", "operator", "channels", "structure", "hidden", "lags", "bound", "fix", "starts", "seed")
 STRUCTURE_NAMES = {"bound": "bounds"}  # option: its name in `TAKES`
@@ -95,7 +96,7 @@ class FitOptions(DataOptions):
     lags: int | None = whole("Number of past outputs and inputs of narx and noe.", 1, LARGEST_SIZE["lags"])
     bound: list[str] = option("Bounds of a parameter (repeatable).", "NAME=LOW:HIGH", [])
     fix: list[str] = option("Hold a block of parameters at a value (repeatable).", "NAME=VALUE", [])
-    starts: int | None = whole("Starts (default: 8).", 1, LARGEST_SIZE["starts"])
+    starts: int | None = whole(f"Starts (default: {DEFAULT_STARTS}).", 1, LARGEST_SIZE["starts"])
     seed: int | None = whole("Seed of all starts (default: 0).", 0, LARGEST_SIZE["seed"])
     start_from: str | None = option("Start from a saved model instead of searching.", "MODEL.json", name="--from")
     solver: Literal["gauss-newton", "ipopt"] = option(
@@ -120,7 +121,7 @@ class FitOptions(DataOptions):
 @takes_options
 def fit_command(options: FitOptions) -> int:
     """Writes the model to DIR/model.json and the report to DIR/report.html."""
-    target = _check_options(options)
+    _check_options(options)
     inputs, outputs = options.names()
     saved = load(options.start_from) if options.start_from else None
     if saved is not None:
@@ -141,10 +142,11 @@ def fit_command(options: FitOptions) -> int:
         raise
     if result.status is Status.INTERRUPTED and clock.expired:
         result = replace(result, solution=replace(result.solution, status=Status.TIME_LIMIT))
-    try:
-        _write(result, task, train, tests, target)
-    except KeyboardInterrupt:
-        return say(f"Interrupted; the model is in {target}, a report was not written.", INTERRUPTED)
+    with reserved_file(options.out, "model.json", options.overwrite) as target:
+        try:
+            _write(result, task, train, tests, target)
+        except KeyboardInterrupt:
+            return say(f"Interrupted; the model is in {target}, a report was not written.", INTERRUPTED)
     if result.status is Status.INTERRUPTED:
         return INTERRUPTED
     if result.status is Status.INFEASIBLE:
@@ -153,11 +155,11 @@ def fit_command(options: FitOptions) -> int:
     return say(NOTHING_SENTENCE, NO_RESULT) if explains_nothing(result.train_nrmse) else DONE
 
 
-def _check_options(options: FitOptions) -> Path:
-    """Refuse options that exclude each other; return the path of the model file."""
+def _check_options(options: FitOptions) -> None:
+    """Refuse options that exclude each other, and an existing model file."""
     if options.start_from and options.search:
         raise InputError(
-            f"{listed([f'--{name}' for name in options.search])} was given together with --from, whose model has its "
+            f"--from was given together with {listed([f'--{name}' for name in options.search])}, but its model has its "
             "structure and start already; leave one of them out."
         )
     check_given_once([*options.train, *options.test])
@@ -168,7 +170,7 @@ def _check_options(options: FitOptions) -> Path:
             raise InputError(f"--{name} is not for --structure {structure}; leave it out.")
     if "lags" in STRUCTURE_OPTIONS[structure] and options.lags is None:
         raise InputError(f"--structure {structure} needs --lags, the number of past outputs; give it.")
-    return new_file(options.out, "model.json", options.overwrite)
+    check_new(Path(options.out) / "model.json", options.overwrite)
 
 
 def _identify(
@@ -176,14 +178,15 @@ def _identify(
 ) -> tuple[Fit | PILFR | Lagged, Fit]:
     """Fit; return the structure or the saved model that was fitted, and the fit."""
     solver = GaussNewton() if options.solver == "gauss-newton" else Ipopt()
-    with worker_pool(options.workers) as pool:
+    starts = 1 if saved is not None else options.starts or DEFAULT_STARTS
+    with worker_pool(min(options.workers, starts)) as pool:
         task = saved if saved is not None else _build_structure(options, train, progress)
         check_recordings(task, train)  # before the engine is compiled
         progress("building the engine", 0, 0, np.nan)
         engine = announce_engine(task, train[0], options.engine)
         search: dict[str, Any] = {}
         if saved is None:
-            search = {"starts": options.starts or 8, "seed": options.seed or 0, "executor": pool}
+            search = {"starts": starts, "seed": options.seed or 0, "executor": pool}
         result = fit(task, train, solver=solver, engine=engine, progress=progress, **search)
     return task, replace(result, engine=engine)
 
@@ -227,7 +230,6 @@ def _write(
     result: Fit, task: Fit | PILFR | Lagged, train: list[Recording], tests: list[Recording], target: Path
 ) -> None:
     """Write the model and the report, and print the errors."""
-    make_folder(str(target.parent))
     with deferred_interrupt():
         result.save(target)
         from ..report import fit_report
@@ -272,6 +274,7 @@ class SimulateOptions(DataOptions):
         help=f"A recording ({FILE_TYPES}), or several in one array (.npz, .npy: samples, channels, ...).",
     )
     out: str = option("CSV file; for several records also .npz or .npy.", "FILE", ...)
+    overwrite: bool = flag("Replace an existing file.", "--overwrite")
 
 
 @dataclass(frozen=True)
@@ -344,7 +347,7 @@ def _write_simulated(options: SimulateOptions, run: _Simulated) -> int:
     recording = run.recording
     if not np.all(np.isfinite(run.y)):
         return say(f"The simulation of {options.model} diverges on {options.data}; nothing was written.", NO_RESULT)
-    write_atomically(Path(options.out), _recording_table(options, run))
+    _write_out(options, _recording_table(options, run))
     if recording.n_y:
         _print_error(recording, run.y, run.scored_from)
     else:
@@ -363,6 +366,13 @@ def _check_out(options: SimulateOptions) -> None:
             raise InputError(f"--out {options.out} would overwrite the {what}; give another file.")
     if out.suffix.lower() in (".mat", *STACK_SUFFIXES) and Path(options.data).suffix.lower() not in STACK_SUFFIXES:
         raise InputError(f"--out {options.out} is written as CSV; give a name that ends in .csv.")
+    check_new(out, options.overwrite)
+
+
+def _write_out(options: SimulateOptions, content: str | bytes) -> None:
+    """Write the file, unless another run has written it meanwhile."""
+    check_new(Path(options.out), options.overwrite)
+    write_atomically(Path(options.out), content)
 
 
 def _columns_to_read(
@@ -426,7 +436,7 @@ def _simulate_stack(options: SimulateOptions, fitted: Fit, u: np.ndarray, y: np.
             return say(f"The simulation of {options.model} diverges on {name}; nothing was written.", NO_RESULT)
         if y is not None:
             errors += _print_error(record, found[at], fitted.scored_from)
-    write_atomically(Path(options.out), _stack_content(Path(options.out), u, found, options.dt, fitted))
+    _write_out(options, _stack_content(Path(options.out), u, found, options.dt, fitted))
     if errors:
         print(f"NRMSE, mean over {len(errors)} records: {np.mean(errors):.4f}")
     print(f"simulated outputs: {options.out}")
@@ -477,6 +487,15 @@ class ExportOptions:
     dt: float | None = option("Duration of a step, needed for a simulator.", "SECONDS")
     hold: Literal["zero", "linear", "band-limited"] | None = option("Course of a simulator's inputs between samples.")
     initial: Any = initial_state("State in which it begins: zero (default), or the states' values, such as 20,0.5.")
+    overwrite: bool = flag("Replace existing files.", "--overwrite")
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that are written."""
+        out = Path(self.out)
+        if self.c:
+            return out / f"{self.name}.c", out / f"{self.name}.h"
+        return (out,) if self.fmu else (out, out.with_name(out.name + NAMES))
 
 
 @takes_options
@@ -499,11 +518,11 @@ def export_command(options: ExportOptions) -> int:
             f"--initial {options.initial} needs a recording; give zero or each state's value, as in --initial 20,0.5."
         )
     start = None if options.initial in (None, "zero") else np.array(options.initial)
+    _check_files(options)
     more: dict[str, Any] = {"smooth": options.smooth, "name": options.name}
     step = exported(source, dt=options.dt, hold=options.hold, start=start, **more)
     if options.initial is None and step.states:
         print("note: the exported model begins with every state at zero; give other values with --initial.")
-    out = Path(options.out)
     if options.c:
         code, header = step.to_c(options.out)
         print(f"C source: {code}\nheader: {header}")
@@ -511,11 +530,18 @@ def export_command(options: ExportOptions) -> int:
     if options.fmu:
         print(f"FMU: {step.to_fmu(options.out, options.fmi or '2.0')}")
         return DONE
-    if out.is_dir() or not out.parent.is_dir() or not os.access(out.parent, os.W_OK):
-        raise InputError(f"--out {options.out} cannot be written; give a file in a folder that exists.")
-    names = out.with_name(out.name + NAMES)
-    if os.path.realpath(options.model) in map(os.path.realpath, (out, names)):
-        raise InputError(f"--out {options.out} would overwrite the model; give another file.")
-    step.serialize(out)
-    print(f"casadi function: {options.out}\nnames of its signals: {names}")
+    step.serialize(options.out)
+    print(f"casadi function: {options.out}\nnames of its signals: {options.files[-1]}")
     return DONE
+
+
+def _check_files(options: ExportOptions) -> None:
+    """Refuse files that cannot be written, the model itself and, without `--overwrite`, existing files."""
+    out = Path(options.out)
+    to_file = not (options.c or options.fmu)
+    if to_file and (out.is_dir() or not out.parent.is_dir() or not os.access(out.parent, os.W_OK)):
+        raise InputError(f"--out {options.out} cannot be written; give a file in a folder that exists.")
+    for path in options.files:
+        if os.path.realpath(options.model) == os.path.realpath(path):
+            raise InputError(f"--out {options.out} would overwrite the model; give another file.")
+        check_new(path, options.overwrite)

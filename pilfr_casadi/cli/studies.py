@@ -90,7 +90,8 @@ def run_command(options: RunOptions) -> int:
     print_line(f"run: {given.file}, {count} job{'s' * (count > 1)}, results in {given.out}")
 
     def execute() -> RunResult:
-        with worker_pool(given.workers) as pool, progress_bar() as progress:
+        starts = max(cell.search.get("starts", 1) for cell in given.cells)
+        with worker_pool(min(given.workers, starts)) as pool, progress_bar() as progress:
             return run(given, overwrite=options.overwrite, executor=pool, progress=progress, tell=print_line)
 
     return _report(given, execute, TABLE, MODEL)
@@ -211,13 +212,12 @@ class FleetOptions(SimulatorOptions):
         if not folder.is_dir():
             raise InputError(f"{folder} is no folder; give a folder with a recording, or a folder, for each machine.")
 
-        def tables(where: Path) -> list[Path]:
-            return sorted(p for p in where.iterdir() if p.is_file() and p.suffix.lower() in TABLE_SUFFIXES)
-
-        files = tables(folder)
+        files = _recordings_in(folder)
         from_files = {p.stem: [str(p)] for p in files}
-        subfolders = {p.name: [str(q) for q in tables(p)] for p in sorted(folder.iterdir()) if p.is_dir()}
+        subfolders = {p.name: [str(q) for q in _recordings_in(p)] for p in sorted(folder.iterdir()) if p.is_dir()}
         from_folders = {name: paths for name, paths in subfolders.items() if paths}
+        for name in (name for name, paths in subfolders.items() if not paths):
+            print_line(f"note: {folder / name} holds no recording and is left out")
         if both := sorted(set(from_files) & set(from_folders)):
             raise InputError(f"{folder} has both a file and a folder for the machine {both[0]!r}; leave one out.")
         if len(from_files) < len(files):
@@ -236,6 +236,10 @@ class FleetOptions(SimulatorOptions):
         """Refuse to write results among the recordings: the next call would take them for a machine."""
         if Path(self.files[1]).resolve() in (Path(self.target).resolve(), *Path(self.target).resolve().parents):
             raise InputError(f"The folder {self.target} is inside {self.files[1]}; give the results another --out.")
+
+
+def _recordings_in(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.is_file() and p.suffix.lower() in TABLE_SUFFIXES)
 
 
 @takes_options

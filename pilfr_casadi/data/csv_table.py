@@ -146,7 +146,7 @@ class CsvTable:
                 raise InputError(f"{place} is empty; fill in a number or cut out that piece.")
             hint = "write a number there"
             if cell.count(",") == 1 and cell.replace(",", "").strip(" +-").isdigit():
-                hint = "write all decimals with a point"
+                hint = "write all decimals with a point, and no comma between thousands"
             raise InputError(f"{place} reads {cell.strip()[:40]!r}, which is not a number; {hint}.")
         if not usable(np.array(value)):
             raise InputError(f"{place} is {cell.strip()}; {REPAIR}.")
@@ -174,15 +174,19 @@ def parse_csv(path: Path, text: str, wanted: Sequence[str]) -> CsvTable:
 
 
 def _with_decimal_points(lines: list[str], delimiter: str) -> list[str]:
-    """Replace decimal commas by points, unless they may separate cells or thousands, or a number has a point."""
+    """Replace decimal commas by points, unless they may separate cells or thousands, or a number has a point.
+
+    Only cells that are numbers count; a text may hold commas of any kind.
+    """
     if delimiter == "," or not any("," in line for line in lines):
         return lines
     text = "\n".join(lines)
-    decimal = r"(?<![\d,])(\d*),(\d*)(?![\d,])"
-    if all(len(end) == 3 and 0 < len(begin) <= 3 and begin[0] != "0" for begin, end in set(re.findall(decimal, text))):
+    number = rf'((?:^|(?<={delimiter}))[ "]*[+-]?)(\d*){{mark}}(\d*)((?:[eE][+-]?\d+)?[ "]*(?=$|{delimiter}))'
+    with_comma, with_point = (re.compile(number.replace("{mark}", mark), re.MULTILINE) for mark in (",", r"\."))
+    parts = {(match[2], match[3]) for match in with_comma.finditer(text)}
+    if all(len(end) == 3 and 0 < len(begin) <= 3 and begin[0] != "0" for begin, end in parts):
         return lines
-    with_point = rf'(?:^|{delimiter})[ "]*[+-]?\d*\.\d*(?:[eE][+-]?\d+)?[ "]*(?:$|{delimiter})'
-    return lines if re.search(with_point, text, re.MULTILINE) else re.sub(decimal, r"\1.\2", text).split("\n")
+    return lines if with_point.search(text) else with_comma.sub(r"\1\2.\3\4", text).split("\n")
 
 
 def _find_header(

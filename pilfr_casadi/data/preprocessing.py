@@ -24,6 +24,7 @@ INTERPOLATION_WINDOW = ("kaiser", 8.0)  # of the sine cardinal: 80 dB of attenua
 FILTERS = ("lowpass", "highpass", "bandpass", "bandstop")
 LARGEST_FACTOR = 1000  # largest numerator and denominator of a rational change of step
 RATIO_ERROR = 1e-9  # relative error of that ratio, far below a sample over the longest recordings
+MOST_SAMPLES = 1e8  # of a resampled recording: 0.8 GB a channel
 PASSBAND = 0.8  # share of the new Nyquist frequency that the anti-alias filter passes; the rest is its transition band
 ANTI_ALIAS_ORDER = 8  # order of the Butterworth filter before an irrational change of step
 SAME_TIME = 1e-4  # difference of two times in steps up to which they count as the same; written times have few digits
@@ -79,6 +80,7 @@ def change_step(values: Array, dt: float, step: float) -> Array:
     A rational change of step uses a polyphase filter, any other a zero-phase low-pass and a cubic spline. The first
     sample stays the first.
     """
+    _check_count((len(values) - 1) * dt, step)
     ratio = Fraction(dt / step).limit_denominator(LARGEST_FACTOR)
     count = int(np.floor((len(values) - 1) * dt / step * (1 + RATIO_ERROR))) + 1
     if count < 2:
@@ -95,6 +97,14 @@ def change_step(values: Array, dt: float, step: float) -> Array:
     return sample_at(values, dt, np.arange(count) * step, step)
 
 
+def _check_count(seconds: float, step: float) -> None:
+    """Refuse a step that makes more samples than memory holds."""
+    if seconds > MOST_SAMPLES * step:
+        raise InputError(
+            f"a step of {step:g} s makes more than {MOST_SAMPLES:g} samples of {seconds:.6g} s; give a longer one."
+        )
+
+
 def sample_at(values: Array, dt: float, times: Array, step: float) -> Array:
     """Interpolate every column of (M, n) at times in s after its first sample; low-pass it if `step` exceeds `dt`."""
     from scipy.interpolate import CubicSpline
@@ -108,6 +118,7 @@ def sample_at(values: Array, dt: float, times: Array, step: float) -> Array:
 def common_times(spans: Sequence[tuple[float, float]], step: float) -> Array:
     """Return the times that all spans (first and last time, s) cover, from the last beginning on, (M,), in seconds."""
     begin, end = (pick(times) for pick, times in zip((max, min), zip(*spans, strict=True), strict=True))
+    _check_count(end - begin, step)
     times = begin + np.arange(int(np.floor(max(end - begin, 0.0) / step + SAME_TIME)) + 1) * step
     if end < begin or len(times) < 2:
         raise InputError(

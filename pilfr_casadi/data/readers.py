@@ -194,6 +194,8 @@ class _Request:
                 raise InputError(f"{name!r} is not an option of a reader; the options are {listed(known)}.")
         if not isinstance(columns or {}, Mapping):
             raise InputError(f"columns={columns!r} was given; give columns={{'NAME': 'COLUMN'}}.")
+        if not isinstance(options.get("units") or {}, Mapping):
+            raise InputError(f"units={options['units']!r} was given; give units={{'NAME': 'UNIT'}}.")
         self.columns = columns or {}
         for name in self.columns:
             if name not in {*self.inputs, *self.outputs, *TIME_NAMES}:
@@ -289,7 +291,8 @@ class _Request:
         units = {name: unit for name, unit in found if unit and name in names[0] + names[1]}
         units |= self.options.get("units") or {}
         try:
-            options = {"name": table.path.stem, **self.options, "hold": hold, "units": units}
+            name = table.path.stem.encode(errors="replace").decode()  # a name on disk need not be text
+            options = {"name": name, **self.options, "hold": hold, "units": units}
             return Recording(u, y, dt, *names, **options)
         except InputError as error:
             raise InputError(f"{table.path}: {error}") from None

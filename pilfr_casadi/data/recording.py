@@ -20,6 +20,7 @@ from .preprocessing import butterworth, change_step, hold_at, levels_last, remov
 from .units import conversion
 
 SAME_STEP = 1e-4  # relative difference up to which two steps count as the same; written times have few digits
+LONGEST_STEP = 1e30  # s, and its inverse the shortest one: rates are squared, and no experiment is outside
 HOLDS = ("zero", "linear", "band-limited", None)
 INITIALS = ("zero", "estimate", "periodic")
 
@@ -412,8 +413,8 @@ def check_for_identification(
 ) -> tuple[Recording, ...]:
     """Check that recordings can be fitted together, and return them as a tuple.
 
-    They need outputs that change, the same names and step, and together `n_min` scored samples, such as the number of
-    free parameters. With `excited`, at least one input has to change.
+    They need outputs that change, the same names and step, samples of their own, and together `n_min` scored samples,
+    such as the number of free parameters. With `excited`, at least one input has to change.
     """
     recordings = as_recordings(data)
     labels = _distinct_labels(recordings)
@@ -450,6 +451,10 @@ def check_for_identification(
             raise InputError(
                 f"the output {name!r} never changes in {listed(labels)}; check the sensor or leave this output out."
             )
+    seen = dict[str, str]()
+    for label, r in zip(labels, recordings, strict=True):
+        if (first_label := seen.setdefault(fingerprint(r), label)) != label:
+            raise InputError(f"{label} holds the same samples as {first_label}; leave one of them out.")
     return recordings
 
 
@@ -533,6 +538,10 @@ def _initial_state(values: Any, label: str) -> np.ndarray:
 def _check_options(r: Recording, m: int) -> None:
     """Check the step, `start`, `hold`, `initial`, `skip` and `period` of a recording of `m` samples."""
     positive(r.dt, f"{r.label}: dt", "the seconds from one sample to the next")
+    if not 1 / LONGEST_STEP <= r.dt <= LONGEST_STEP:
+        raise InputError(
+            f"{r.label} was given dt={r.dt:g}; give seconds from {1 / LONGEST_STEP:g} to {LONGEST_STEP:g}."
+        )
     if not (is_number(r.start) and np.isfinite(r.start)):
         raise InputError(f"start of {r.label} is {r.start!r}; give the time of its first sample in seconds.")
     if not (r.hold is None or isinstance(r.hold, str)) or r.hold not in HOLDS:
@@ -548,5 +557,5 @@ def _check_options(r: Recording, m: int) -> None:
         )
     if r.begins == "periodic" and r.period is None:
         raise InputError(f"{r.label} was given initial='periodic' but no period; set period=SAMPLES.")
-    if not isinstance(r.units, Mapping):
+    if not isinstance(r.units, Mapping) or not all(isinstance(unit, str) for unit in r.units.values()):
         raise InputError(f"units of {r.label} is {r.units!r}; give a mapping from column to unit, as in {{'u': 'N'}}.")

@@ -7,15 +7,16 @@ import contextlib
 import gc
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._base import REPAIR, InputError, existing_file, read_bytes, usable
+from .._base import REPAIR, InputError, existing_file, read_bytes, usable, without_mask
 from .columns import ONE_STEP, TIME_NAMES, present_samples, refuse_slow_channels, unit_in_brackets
 from .csv_table import CsvTable, parse_csv
 
@@ -137,25 +138,41 @@ def frame_table(frame: Any, wanted: Sequence[str]) -> ArrayTable:
 
     Dates and durations become seconds after the first one. Only `wanted` columns need distinct names.
     """
-    if isinstance(frame, Mapping) or not hasattr(frame, "columns") or not hasattr(frame, "__getitem__"):
+    columns = getattr(frame, "columns", None)
+    by_name = columns is not None and all(isinstance(key, Hashable) for key in columns)  # Arrow lists the data there
+    if isinstance(frame, Mapping) or not by_name or not hasattr(frame, "__getitem__"):
         raise InputError(f"a {type(frame).__name__} was given; give a data frame of pandas or polars.")
     names = [str(name) for name in frame.columns]
     arrays: dict[str, Any] = {}
     for key, name in zip(frame.columns, names, strict=True):
         if names.count(name) > 1 and name in wanted:
             raise InputError(f"the frame has {names.count(name)} columns named {name!r}; rename all but one.")
-        arrays[name] = _seconds(np.asarray(frame[key]))
+        arrays[name] = _seconds(without_mask(frame[key]))
     index = getattr(frame, "index", None)
     if index is not None and not {*TIME_NAMES} & {*names}:
         values, named = np.asarray(index), str(getattr(index, "name", None))
-        if values.dtype.kind in "mM" or named in TIME_NAMES:
-            arrays[named if named in TIME_NAMES else TIME_NAMES[0]] = _seconds(values)
+        times = _seconds(values)
+        if times is not values or named in TIME_NAMES:
+            arrays[named if named in TIME_NAMES else TIME_NAMES[0]] = times
     return ArrayTable(Path("the frame"), tuple(arrays), arrays)
 
 
 def _seconds(values: Array) -> Array:
-    """Convert dates and durations to seconds after the first one; return anything else unchanged."""
-    return (values - values[0]) / np.timedelta64(1, "s") if values.dtype.kind in "mM" and len(values) else values
+    """Convert dates and durations to seconds after the first one; return anything else unchanged.
+
+    Dates in a time zone are objects.
+    """
+    if not values.size:
+        return values
+    if values.dtype.kind in "mM":
+        return (values - values[0]) / np.timedelta64(1, "s")
+    if values.dtype.kind != "O" or not all(isinstance(date, datetime) for date in values.flat):
+        return values
+    dates = [date.astimezone(UTC) if date.tzinfo else date for date in values.flat]  # some days have 23 hours
+    try:
+        return np.array([(date - dates[0]).total_seconds() for date in dates])
+    except TypeError:  # some are in a time zone, and some in none
+        return values
 
 
 def open_table(path: Path, wanted: Sequence[str], suffix: str = "") -> CsvTable | ArrayTable:

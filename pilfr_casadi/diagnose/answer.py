@@ -97,6 +97,7 @@ def build_diagnosis(
         candidates=tuple(_candidate_row(decided, t, step.parent) for step in decided.passes for t in step.trials),
         gates=(
             *_surrogate_note(request.surrogate_nrmse),
+            *_failure_notes(request.simulator.program_failures),
             *_convergence_note(after),
             *test_notes,
             *_combination_note(after, std, blind_spots),
@@ -218,6 +219,16 @@ def _surrogate_note(error: float) -> Iterator[Gate]:
             f"A linear model stands for the simulation, which it follows to NRMSE {error:.4f}; that counts as noise."
         )
         yield Gate("simulation", "surrogate", error, f"{words} {surrogate_warning(error)}".rstrip(), False)
+
+
+def _failure_notes(failures: Mapping[str, str]) -> Iterator[Gate]:
+    """Note the functions of the simulator that failed: a fit avoids what they cannot compute."""
+    for name, error in failures.items():
+        words = (
+            f"{name} failed at some points, first with {error}. A simulation that comes there counts as diverging, so "
+            "the fit keeps away from there; let it return a number for all values."
+        )
+        yield Gate("simulation", "failure", name, words, False)
 
 
 def _convergence_note(after: Fitted) -> Iterator[Gate]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Stages, listed
+from .._base import InputError, Stages, is_number, listed
 from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification, moves_freely
 from ..laws import (
     CATALOGUE,
@@ -203,7 +203,7 @@ def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[ty
 
 def check_time_and_focus(time_limit: float | None, focus: str | None) -> None:
     """Refuse a time limit that is not positive, and an unknown focus."""
-    if time_limit is not None and not time_limit > 0:
+    if time_limit is not None and not (is_number(time_limit) and time_limit > 0):
         raise InputError(f"time_limit={time_limit!r} was given; give seconds, a positive number.")
     if focus not in (None, "simulation", "prediction"):
         raise InputError(f"focus={focus!r} was given; use 'simulation', 'prediction' or None.")
@@ -215,5 +215,5 @@ def check_limits(simulator: Simulator, limits: Mapping[str, float] | None) -> No
         if name not in simulator.inputs:
             own = listed(simulator.inputs) or "none"
             raise InputError(f"A limit was given for {name!r}, which is no input; the simulator has {own}.")
-        if not most > 0:
+        if not (is_number(most) and most > 0):
             raise InputError(f"The limit of {name} is {most!r}; give the largest amplitude allowed, a positive number.")

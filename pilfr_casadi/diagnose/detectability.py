@@ -230,7 +230,8 @@ def _local_levels(bench: Workbench, fitted: Fitted, runs: list[Run]) -> list[flo
             into = simulator.into(port, *symbols).items()
             forces = [term / factor for name, factor in into for term in _summands(equations[name])]
             rows = map_points(ca.Function("forces", [*vectors], [ca.densify(ca.vertcat(*forces))]), *at, values)[0]
-            spread = np.std(rows, axis=0)
+            with np.errstate(all="ignore"):  # a factor may be zero
+                spread = np.std(rows, axis=0)
             value = float(np.max(spread[np.isfinite(spread)], initial=0.0))
         found.append(value if np.isfinite(value) and value > 0 else None)
     return found

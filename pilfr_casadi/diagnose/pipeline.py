@@ -45,7 +45,17 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, Stages, deferred_interrupt, one_blas_thread, percent, processors, whole
+from .._base import (
+    InputError,
+    Progress,
+    Stages,
+    deferred_interrupt,
+    one_blas_thread,
+    percent,
+    positive,
+    processors,
+    whole,
+)
 from ..data import Recording, as_recordings
 from ..laws import Law, VaryingParameter, display_name
 from .answer import Conclusion, FinalFits, build_diagnosis
@@ -108,6 +118,7 @@ def diagnose_in_steps(
     workers = min(processors(), 4) if workers is None else whole(workers, "workers", 1)
     most_effects = np.inf if effects is None else whole(effects, "effects", 0)
     check_time_and_focus(time_limit, focus)
+    positive(stand_in_error, "stand_in_error", "the NRMSE of a model that replaces the simulator", zero=True)
     say = Stages(progress or (lambda stage, done, total, best: None))
     given = as_recordings(train)
     simulator, recordings = match_recordings(simulator, given, hold)

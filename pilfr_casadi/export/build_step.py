@@ -174,9 +174,8 @@ def _find_start_state(model: Any, closed: Model, step: Exported, start: Any) -> 
         return np.append(state, np.zeros(size - n))
     given = numbers(start, "The start state").ravel()
     if given.size not in (len(closed.states), n, size):
-        raise InputError(
-            f"The start state has {given.size} numbers; give {len(closed.states)} (memory zero) or {size}."
-        )
+        fewer = f"{len(closed.states)} (memory zero) or " if size > len(closed.states) else ""
+        raise InputError(f"The start state has {given.size} numbers; give {fewer}{size}.")
     return np.append(given, np.zeros(size - given.size))
 
 

@@ -89,6 +89,11 @@ class BlackBox:
         return {self.called: self.leaf.calls}
 
     @property
+    def program_failures(self) -> dict[str, str]:
+        """First error by the function's name; empty if it has not failed."""
+        return {} if self.leaf.failure is None else {self.called: repr(self.leaf.failure)}
+
+    @property
     def note(self) -> str:
         """Number of calls and first failure, in words."""
         source = "finite differences" if self.slope is None else f"the given Jacobian, called {self.slope.calls} times"

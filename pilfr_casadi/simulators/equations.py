@@ -18,7 +18,7 @@ from typing import Any, Self, cast
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, whole
+from .._base import InputError, check_known, whole
 from ..data import HOLDS
 from ..models import Named, Parameter, ParameterSet
 from .domains import MECHANICAL, UNKNOWN, common_domain, is_motion, may_be_speed
@@ -67,17 +67,21 @@ class Equations:
         if self.hold not in HOLDS:
             raise InputError(f"hold = {self.hold!r} was given; use 'zero', 'linear', 'band-limited' or None.")
         object.__setattr__(self, "substeps", whole(self.substeps, "substeps", 1))
-        if not isinstance(self.units, Mapping):
+        if not isinstance(self.units, Mapping) or not all(isinstance(unit, str) for unit in self.units.values()):
             raise InputError(f"The simulator's units are {self.units!r}; give {{name: unit}}.")
         object.__setattr__(self, "parameters", check_parameters(self.parameters))
         object.__setattr__(self, "ports", check_ports(self.ports))
         x, u, p, t = self.symbols()
-        found = self.by_state(self.derivatives(x, u, p, t)) | self.measured(x, u, p, t)
-        check_expressions(found, ca.vertcat(stack(x, u, p), t))
+        known = ca.vertcat(stack(x, u, p), t)
+        check_expressions(self.by_state(self.derivatives(x, u, p, t)) | self.measured(x, u, p, t), known)
         for port in self.ports:
-            self.into(port, x, u, p, t)
-            self.across(port, x, u, p, t)
+            own = {f"{port.name}: into {target}": factor for target, factor in self.into(port, x, u, p, t).items()}
+            check_expressions(own | {f"{port.name}: across": self.across(port, x, u, p, t)}, known)
             self._check_term(port, x, u, p, t)
+        signals = [name for port in self.ports for name in port.signals]
+        check_known(
+            list(self.units), [*self.inputs, *self.output_names, *signals], "inputs and outputs", "The simulator"
+        )
         if self.observer is not None:
             object.__setattr__(self, "observer", self._check_gain(self.observer))
 

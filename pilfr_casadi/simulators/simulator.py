@@ -173,6 +173,14 @@ class Simulator(Equations):
             found |= getattr(part, "program_calls", {})
         return found
 
+    @property
+    def program_failures(self) -> dict[str, str]:
+        """First error of each function that is called with numbers, by name; empty if none has failed."""
+        found = dict[str, str]()
+        for part in (self.dynamics, self.outputs):
+            found |= getattr(part, "program_failures", {})
+        return found
+
     def _repr_html_(self) -> str:
         return str(later("report.simulator_card")(self))
 

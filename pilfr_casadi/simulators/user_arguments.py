@@ -5,8 +5,9 @@ All are checked here, once; a fault is one sentence.
 
 from __future__ import annotations
 
+import contextlib
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import casadi as ca
@@ -30,7 +31,8 @@ def call(function: Expression, name: str, **available: Any) -> Any:
         if key not in available:
             raise InputError(f"The {name} asks for {key!r}; it can have {', '.join(available)}.")
     try:
-        return function(**{key: available[key] for key in wanted})
+        with _quiet_numpy():
+            return function(**{key: available[key] for key in wanted})
     except InputError as error:
         raise InputError(f"In the {name}: {error}") from None
     except Exception as error:
@@ -40,6 +42,19 @@ def call(function: Expression, name: str, **available: Any) -> Any:
                 "use casadi.if_else, casadi.fmin and casadi.fmax."
             ) from error
         raise InputError(f"The {name} fails: {type(error).__name__}: {error}.") from error
+
+
+@contextlib.contextmanager
+def _quiet_numpy() -> Iterator[None]:
+    """Let NumPy's functions give expressions of symbols without CasADi's notice that they may change one day."""
+    noisy = ca.GlobalOptions.getNumpyMode() == 0
+    if noisy:
+        ca.GlobalOptions.setNumpyMode(-1)
+    try:
+        yield
+    finally:
+        if noisy:
+            ca.GlobalOptions.setNumpyMode(0)
 
 
 def as_scalar(value: Any, name: str) -> Any:

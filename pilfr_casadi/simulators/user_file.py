@@ -68,8 +68,8 @@ def _compile(path: Path, source: bytes, what: str) -> Any:
 
 @contextmanager
 def _isolate_imports(folder: Path, module: types.ModuleType) -> Iterator[None]:
-    """Allow imports from the file's folder, and remove its modules afterwards."""
-    before, wrote, where = set(sys.modules), sys.dont_write_bytecode, str(folder)
+    """Allow imports from the file's folder; remove its modules and return to the working folder afterwards."""
+    before, wrote, where, here = set(sys.modules), sys.dont_write_bytecode, str(folder), os.getcwd()
     sys.dont_write_bytecode = True
     sys.path.insert(0, where)
     sys.modules[module.__name__] = module
@@ -78,6 +78,7 @@ def _isolate_imports(folder: Path, module: types.ModuleType) -> Iterator[None]:
             warnings.filterwarnings("ignore", category=FutureWarning, module="casadi")
             yield
     finally:
+        os.chdir(here)  # paths of the command line are relative to it
         sys.dont_write_bytecode = wrote
         if where in sys.path:
             sys.path.remove(where)

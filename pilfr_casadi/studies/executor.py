@@ -169,7 +169,8 @@ def _read_outcome(future: Future[Reply], last: bool, time_limit: float | None) -
         name = type(error).__name__
         reply = Reply(lost=f"{name}: {error}".splitlines()[0], begun=name == "KilledWorker")
     if reply.timed_out:
-        return failure(TIMED_OUT, f"Failed: ended after its time limit of {time_limit:g} s.", time_limit=time_limit)
+        sentence = f"Failed: ended after its time limit of {time_limit:g} s; with a longer one it is done again."
+        return failure(TIMED_OUT, sentence, time_limit=time_limit)
     if reply.lost:
         if not last:
             return None

@@ -488,6 +488,8 @@ def read_fleet(folder: Any, simulator: Any, laws: Sequence[type[Law]] | None = N
     own = as_simulator(simulator)
     tried = check_laws(laws)
     path = Path(folder) / CONTENT if Path(folder).is_dir() else Path(folder)
+    if not path.exists():
+        raise InputError(f"There is no fleet in {folder}; give the folder of a fleet.")
     text = read_bytes(path)
     try:
         content = json.loads(text)

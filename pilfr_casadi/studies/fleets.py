@@ -37,6 +37,7 @@ from .._base import (
     check_executor,
     deferred_interrupt,
     digest,
+    is_number,
     make_folder,
     numbers,
     processors,
@@ -154,7 +155,7 @@ def fleet(
     given = _check_machines(machines)
     count = min(whole(sample, "sample", 1), len(given))
     effort = Effort(processors() if workers is None else whole(workers, "workers", 1), time_limit)
-    if time_limit is not None and not time_limit > 0:
+    if time_limit is not None and not (is_number(time_limit) and time_limit > 0):
         raise InputError(f"time_limit={time_limit!r} was given; give seconds, a positive number.")
     own = as_simulator(simulator, next(iter(given.values())))
     given = _match_machines(own, given, hold)
@@ -173,11 +174,10 @@ def fleet(
 
 def _check_machines(machines: Any) -> dict[str, tuple[Recording, ...]]:
     """Return the recordings of each machine; refuse names that cannot name a folder."""
-    if not isinstance(machines, Mapping) or len(machines) < FEWEST_MACHINES:
-        raise InputError(
-            f"A fleet needs a dict of at least {FEWEST_MACHINES} machines, {{name: recordings}}; for one machine use "
-            "diagnose."
-        )
+    if not isinstance(machines, Mapping):
+        raise InputError(f"The machines are {str(machines)[:60]}; give recordings by name, {{name: recordings}}.")
+    if len(machines) < FEWEST_MACHINES:
+        raise InputError(f"A fleet needs at least {FEWEST_MACHINES} machines; for one machine use diagnose.")
     for name in machines:
         if not isinstance(name, str) or not re.fullmatch(r"[\w.+-][\w .+-]{0,99}", name, re.ASCII):
             raise InputError(

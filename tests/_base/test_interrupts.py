@@ -130,6 +130,7 @@ def struck(arguments, until, number=signal.SIGINT):
         (0.0, signal.SIGINT),
         (0.5, signal.SIGINT),
         (0.5, signal.SIGTERM),
+        (0.5, getattr(signal, "SIGHUP", None)),
         pytest.param(2.5, signal.SIGINT, marks=pytest.mark.slow),  # a model and its report are written
         pytest.param(2.5, signal.SIGTERM, marks=pytest.mark.slow),
     ],
@@ -152,6 +153,26 @@ def test_the_first_signal_ends_a_run_with_workers(tmp_path, pause, number):
     if written:
         assert "interrupted" in out
         assert json.loads((out_dir / "model.json").read_text())["parameters"]["A"]
+
+
+@linux
+def test_workers_end_with_a_process_that_is_killed():
+    program = (
+        "from pilfr_casadi._base import worker_pool\nimport time\n"
+        "with worker_pool(3) as pool:\n"
+        "    tasks = [pool.submit(time.sleep, 60) for _ in range(3)]\n    print('ready', flush=True)\n"
+        "    tasks[0].result()"
+    )
+    command = [sys.executable, "-c", program]
+    with subprocess.Popen(command, start_new_session=True, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "ready\n" and len(session(process.pid)) == 4
+        process.kill()
+        end = time.monotonic() + 10
+        while (left := session(process.pid)) and time.monotonic() < end:
+            time.sleep(0.05)
+        for number in left:
+            os.kill(number, signal.SIGKILL)
+    assert not left
 
 
 @linux

@@ -152,6 +152,8 @@ def test_too_few_samples_for_the_order(capsys, tmp_path):
     [
         (("--bound", "w=2:1"), "infeasible"),
         (("--bound", "w=2"), "LOW:HIGH"),
+        (("--bound", "w="), "LOW:HIGH"),
+        (("--bound", "w=:"), "LOW:HIGH, of which one may be left out"),
         (("--bound", "nothing=0:1"), "nothing"),
         (("--fix", "D_yu=a"), "not a number"),
         (("--fix", "D_yu=nan"), "--fix D_yu=nan was given, and 'nan' is not a number"),
@@ -390,11 +392,11 @@ def test_inputs_alone_are_enough_to_simulate(capsys, tmp_path, train, model, suf
     assert status == 0 and "NRMSE" not in said and "initial state: zero" in said and "with --initial" in said
     assert run(capsys, "simulate", model, train, "--initial", "zero", "--out", both)[0] == 0
     assert out.read_text() == both.read_text()
-    periodic = ("--initial", "periodic", "--period", 300)
-    status, said, _ = run(capsys, "simulate", model, path, *periodic, "--out", out)
+    again = ("simulate", model, path, "--out", out, "--overwrite")
+    status, said, _ = run(capsys, *again, "--initial", "periodic", "--period", 300)
     assert status == 0 and "initial state: periodic steady state" in said and "with --initial" not in said
-    refused(capsys, "simulate", model, path, "--initial", "estimate", "--out", out, says="needs measured outputs")
-    refused(capsys, "simulate", model, path, "--outputs", "y", "--out", out, says="no column 'y'")
+    refused(capsys, *again, "--initial", "estimate", says="needs measured outputs")
+    refused(capsys, *again, "--outputs", "y", says="no column 'y'")
     refused(capsys, "fit", path, "--inputs", "u", "--outputs", "y", "--out", tmp_path / "no", says="no column 'y'")
 
 
@@ -421,7 +423,7 @@ def test_times_are_written_as_read(capsys, tmp_path, train, model):
     assert [line.split(",")[0] for line in out.read_text().splitlines()[1:]] == times
     text = train.read_text().replace("t,u,y", "clock,u,y", 1)
     path.write_text(text)
-    assert run(capsys, "simulate", model, path, "--dt", 0.01, "--out", out)[0] == 0
+    assert run(capsys, "simulate", model, path, "--dt", 0.01, "--out", out, "--overwrite")[0] == 0
     written = [line.split(",")[0] for line in out.read_text().splitlines()[1:]]
     assert written[35] == "0.35" and max(map(len, written)) == 4
 
@@ -482,7 +484,7 @@ def test_an_interrupt_that_casadi_wraps_is_recognised(capsys, tmp_path, train, m
 
 
 def test_a_wrapped_interrupt_before_any_work_is_recognised(capsys, tmp_path, train, monkeypatch):
-    monkeypatch.setattr("pilfr_casadi.cli.models.make_folder", wrapped_interrupt)
+    monkeypatch.setattr("pilfr_casadi.cli.models.check_folder", wrapped_interrupt)
     status, _, err = run(capsys, *fit_arguments(train, tmp_path))
     assert status == 130 and "Interrupted" in err
 
@@ -500,3 +502,81 @@ def test_a_model_that_misses_its_constraints_is_no_usable_result(capsys, tmp_pat
     assert status == 1
     assert sentence(err).startswith("pilfr: The model does not meet its constraints: spectral radius with the")
     assert "off by" in err
+
+
+def test_an_existing_file_is_replaced_only_if_that_is_said(capsys, tmp_path, train, model):
+    out, before = write_csv(tmp_path / "measured.csv", seed=5), train.read_text()
+    kept = out.read_text()
+    simulate = ("simulate", model, train, "--initial", "zero", "--out")
+    refused(capsys, *simulate, out, says="measured.csv exists already; give another --out, or --overwrite")
+    refused(capsys, "export", model, "--out", out, says="measured.csv exists already")
+    assert out.read_text() == kept
+    refused(capsys, *simulate, train, "--overwrite", says="overwrite the recording")
+    refused(capsys, "export", model, "--out", model, "--overwrite", says="overwrite the model")
+    assert train.read_text() == before
+    assert run(capsys, *simulate, out, "--overwrite")[0] == 0
+    assert out.read_text() != kept
+    for kind, name in (((), "model"), (("--c",), "c"), (("--fmu",), "model.fmu")):
+        export = ("export", model, *kind, "--out", tmp_path / name)
+        assert run(capsys, *export)[0] == 0
+        refused(capsys, *export, says="exists already")
+        assert run(capsys, *export, "--overwrite")[0] == 0
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_no_more_workers_than_starts_are_begun(capsys, tmp_path, train, monkeypatch):
+    begun = []
+    monkeypatch.setattr(
+        "pilfr_casadi.cli.models.worker_pool", lambda count: begun.append(count) or contextlib.nullcontext()
+    )
+    assert run(capsys, *fit_arguments(train, tmp_path, "--workers", 900))[0] == 0
+    assert begun == [2]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes there")
+@pytest.mark.usefixtures("blank_figures")
+def test_a_recording_whose_name_is_no_text_is_fitted(tmp_path, train, monkeypatch):
+    path = os.fsdecode(os.fsencode(tmp_path / "f") + b"\xff.csv")
+    shutil.copy(train, path)
+    with (tmp_path / "said.txt").open("w", encoding="utf-8") as strict:
+        monkeypatch.setattr(sys, "stdout", strict)
+        assert main([str(a) for a in fit_arguments(path, tmp_path)]) == 0
+    assert "f?.csv" in (tmp_path / "said.txt").read_text() and (tmp_path / "out" / "report.html").exists()
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_a_result_that_came_in_between_is_kept(capsys, tmp_path, train, monkeypatch):
+    out = tmp_path / "out"
+
+    def fit_beside_another_run(*given, **options):
+        out.mkdir(exist_ok=True)
+        (out / "model.json").write_text("of another run")
+        return pilfr.fit(*given, **options)
+
+    monkeypatch.setattr("pilfr_casadi.cli.models.fit", fit_beside_another_run)
+    status, said, _ = run(capsys, *fit_arguments(train, tmp_path))
+    assert status == 0 and "another run has written" in said and f"this result is in {out / 'run-2'}" in said
+    assert (out / "model.json").read_text() == "of another run" and not (out / "report.html").exists()
+    assert json.loads((out / "run-2" / "model.json").read_text())["format"]
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_a_model_that_cannot_be_written_leaves_no_file(capsys, tmp_path, train, monkeypatch):
+    def full(fit, path):
+        raise pilfr.InputError(f"{path} cannot be written (No space left on device); give another path.")
+
+    monkeypatch.setattr("pilfr_casadi.identify.Fit.save", full)
+    refused(capsys, *fit_arguments(train, tmp_path), says="No space left")
+    assert not (tmp_path / "out" / "model.json").exists()
+
+
+def test_a_python_file_is_no_start_of_a_fit(capsys, tmp_path, train):
+    rig = tmp_path / "rig.py"
+    rig.write_text("simulator = None\n")
+    given = ("fit", train, "--inputs", "u", "--outputs", "y", "--from", rig)
+    refused(capsys, *given, says="a simulator in Python; give a model.json")
+
+
+def test_an_empty_name_of_a_folder_is_refused(capsys, train):
+    names = ("--inputs", "u", "--outputs", "y", "--nx", 1, "--operators", 0)
+    refused(capsys, "fit", train, *names, "--out", "", says="--out '' was given; give the name of a folder")

@@ -451,6 +451,7 @@ def test_an_export_begins_at_the_given_state(capsys, files):
     command = ("export", files / "rig.py", "--c", "--dt", 0.02, "--out", files / "c")
     status, out, _ = run(capsys, *command)
     assert status == 0 and "begins with every state at zero; give other values with --initial" in out
+    command = (*command, "--overwrite")
     status, out, _ = run(capsys, *command, "--initial", "0.125,0.5")
     assert status == 0 and "note" not in out
     assert "0.125" in (files / "c" / "model.c").read_text()

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 from scipy.signal import lsim, lti
 
@@ -290,6 +291,20 @@ def test_dates_and_durations_are_times():
     assert read_frame(frame.reset_index(names="time"), "force", "x").dt == pytest.approx(0.01)
 
 
+def test_dates_in_a_time_zone_are_times():
+    index = pd.date_range("2024-03-31 01:30", periods=100, freq="1min", tz="Europe/Berlin")  # 2:00 to 3:00 is left out
+    frame = pd.DataFrame({"force": np.arange(100.0), "x": np.arange(100)}, index=index)
+    dates = pd.Series(index.to_pydatetime(), dtype=object).array
+    for changed in (frame, frame.reset_index(names="t"), frame.assign(t=dates)):
+        assert read_frame(changed, "force", "x").dt == 60
+    frame["t"] = [*index[:-1], pd.NaT]
+    with pytest.raises(InputError, match="'t', sample 99 is nan"):
+        read_frame(frame, "force", "x")
+    frame["t"] = [*index[:-1], index[-1].tz_localize(None)]
+    with pytest.raises(InputError, match="'t' holds a cell array or objects"):
+        read_frame(frame, "force", "x")
+
+
 class Table:
     """A frame as polars has them: columns by name, no index."""
 
@@ -313,6 +328,9 @@ def test_any_table_of_named_columns_is_a_frame():
         (pd.DataFrame({"u": [1.0, 2.0], "y": [1.0, 2.0]}), "the frame has no time column"),
         (pd.DataFrame({"t": [0.0, 1.0], "u": [1.0, np.nan], "y": [1.0, 2.0]}), "'u', sample 1 is nan"),
         (pd.DataFrame({"t": [0.0, 1.0], "u": ["a", "b"], "y": [1.0, 2.0]}), "'u' holds"),
+        (Table(t=np.arange(3), u=np.ma.masked_equal(np.arange(3), 2), y=np.ones(3)), "'u', sample 2 is nan"),
+        (Table(t=np.ma.masked_equal(np.arange(3), 2), u=np.ones(3), y=np.ones(3)), "'t', sample 2 is nan"),
+        (pa.table({"t": [0.0, 1.0], "u": [1.0, 2.0], "y": [1.0, 2.0]}), "a Table was given; give a data frame"),
         (pd.DataFrame([[0.0, 1, 2], [1, 2, 3]], columns=["t", "u", "u"]), "2 columns named 'u'"),
     ],
 )

@@ -3,6 +3,7 @@
 import io
 import os
 import pickle
+import sys
 import time
 import zipfile
 
@@ -558,3 +559,33 @@ def test_a_column_may_say_its_unit_in_brackets(tmp_path):
 def test_numbers_that_may_have_thousands_separators_are_refused(write):
     with pytest.raises(InputError, match="line 3 reads '1,001'"):
         read_csv(write("u;y\n999;1\n1,001;2\n"), inputs="u", outputs="y", dt=1.0)
+
+
+def test_commas_in_a_text_tell_nothing_of_the_numbers(write):
+    rows = ["t;u;y;remark", *(f"{i};{i},5;1,{i:03d};ok, it moves" for i in range(3))]
+    assert list(read_csv(write("\n".join(rows)), "u", "y").u[:, 0]) == [0.5, 1.5, 2.5]
+    with pytest.raises(InputError, match="line 2 reads '1,000'"):
+        read_csv(write("\n".join(rows).replace(",5", "")), "u", "y")
+
+
+def test_units_are_given_by_name(write):
+    with pytest.raises(InputError, match="units='mm' was given; give units="):
+        read_csv(write(GOOD), "force", "x2", units="mm")
+
+
+def test_a_step_that_makes_too_many_samples_is_refused(write):
+    path = write(GOOD)
+    for resample in (
+        lambda: read_csv(path, "force", "x2", resample=1e-12),
+        lambda: read_csv(path, "force", "x2").resample(1e-12),
+    ):
+        with pytest.raises(InputError, match=r"a step of 1e-12 s makes more than 1e\+08 samples"):
+            resample()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes there")
+def test_a_name_on_disk_that_is_no_text_becomes_one(tmp_path):
+    path = os.fsdecode(os.fsencode(tmp_path / "f") + b"\xff.csv")
+    with open(path, "w") as file:
+        file.write(GOOD)
+    assert read_csv(path, "force", "x2").name == "f?"

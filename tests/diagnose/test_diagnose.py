@@ -2,14 +2,16 @@
 
 import json
 import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from cart import cart
 from diagnosis_rig import DT, OFF, SAMPLES, recordings, rig
 
 import pilfr_casadi as pilfr
-from pilfr_casadi import InputError
+from pilfr_casadi import InputError, Port, Recording, multisine
 from pilfr_casadi.diagnose.arguments import match_tests
 from pilfr_casadi.laws import CATALOGUE, Backlash, CoulombFriction, CubicStiffness, Delay, DirectionalDamping
 
@@ -222,12 +224,46 @@ def test_tests_may_begin_in_the_training_data_where_they_are_not_scored(plain):
         ({"progress": "yes"}, "progress = 'yes' was given; give True"),
         ({"hold": "cubic"}, "hold='cubic' was given"),
         ({"laws": ["friction"]}, "no law 'friction'; did you mean .*coulomb_friction"),
+        ({"time_limit": "5"}, "time_limit='5' was given; give seconds"),
+        ({"stand_in_error": np.nan}, "stand_in_error=nan was given"),
+        ({"limits": {"force": "5"}}, "The limit of force is '5'"),
         ({"laws": [7]}, "laws holds 7; give classes of laws"),
     ],
 )
 def test_bad_options_are_refused_at_once(plain, option, words):
     with pytest.raises(pilfr.InputError, match=words):
         pilfr.diagnose(rig(), plain, **option)
+
+
+def cart_recording():
+    u = 10 * multisine(200, f_max=3.0, fs=20, rng=np.random.default_rng(0))
+    r = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
+    return r.with_(y=cart(k=60.0).simulate(r))
+
+
+@pytest.mark.parametrize(
+    "port",
+    [
+        Port("ground", lambda x: {"vel": 1 / x.pos}, lambda x: x.pos),
+        Port("ground", {"vel": -1.0}, lambda x: 1 / x.pos, lambda x: x.vel),
+    ],
+)
+def test_a_port_that_divides_by_zero_is_refused(port):
+    with pytest.raises(InputError, match="port 'ground' is not finite along the recordings"):
+        pilfr.diagnose(cart(ports=port), cart_recording(), laws=["CoulombFriction"], effects=1, workers=1, engine="vm")
+
+
+def test_a_port_without_a_force_warns_of_nothing():
+    train = cart_recording()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pilfr.check(cart(ports=Port("ground", {"vel": 0.0}, lambda x: x.pos)), train, laws=["CoulombFriction"])
+
+
+def test_an_output_that_is_no_number_is_said():
+    broken = replace(cart(), outputs=lambda x: {"pos": x.pos / (x.vel - x.vel)})
+    with pytest.raises(InputError, match="pos is not finite 0 s into"):
+        pilfr.diagnose(broken, cart_recording(), workers=1)
 
 
 def test_a_missing_column_is_said(plain):

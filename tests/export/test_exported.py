@@ -93,6 +93,8 @@ def test_where_it_starts():
     simulator = mass_on_spring()
     release = wave(simulator, 0.02).with_(initial=np.array([0.3, -0.1]))
     assert np.array_equal(exported(simulator, dt=0.02, start=release).x0(), [0.3, -0.1])
+    with pytest.raises(InputError, match=r"has 3 numbers; give 2\."):
+        exported(simulator, dt=0.02, start=np.zeros(3))
 
 
 def test_a_diagnosis_exports_what_it_fitted():
@@ -382,8 +384,8 @@ def test_the_command(tmp_path, capsys):
     refused(capsys, "export", model, "--out", model, says="overwrite")
     refused(capsys, "export", model, "--out", tmp_path / "no" / "rig", says="folder that exists")
     refused(capsys, "export", model, "--c", "--out", model, says="cannot be made")
-    refused(capsys, "export", model, "--out", out, "--name", "a b", says="cannot be used")
-    refused(capsys, "export", model, "--out", out, "--smooth", "-1", says="smooth")
+    refused(capsys, "export", model, "--out", tmp_path / "new", "--name", "a b", says="cannot be used")
+    refused(capsys, "export", model, "--out", tmp_path / "new", "--smooth", "-1", says="smooth")
     content = json.loads(model.read_text())
     for text, says in ((json.dumps(content | {"version": 3}), "version 3"), (model.read_text()[:900], "incomplete")):
         (tmp_path / "other.json").write_text(text)

@@ -288,7 +288,8 @@ def test_without_a_compiler_nothing_is_written(tmp_path, monkeypatch):
 def test_the_command_writes_an_fmu(tmp_path, capsys):
     some_fit().save(tmp_path / "model.json")
     for more in ((), ("--fmi", "3.0")):
-        status, text, _ = run(capsys, "export", tmp_path / "model.json", "--fmu", *more, "--out", tmp_path / "a.fmu")
+        given = ("export", tmp_path / "model.json", "--fmu", *more, "--out", tmp_path / "a.fmu", "--overwrite")
+        status, text, _ = run(capsys, *given)
         assert status == 0 and "FMU: " in text
         assert validate(tmp_path / "a.fmu").fmiVersion == (more or ("", "2.0"))[1]
     model = tmp_path / "model.json"

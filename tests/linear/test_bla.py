@@ -284,6 +284,10 @@ def _recording(n=128, n_u=1, period=64):
     return Recording(u, u[:, :1] ** 2, DT, period=period)
 
 
+def _days(count):
+    return [_recording(n_u=2).with_(start=float(k)) for k in range(count)]
+
+
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [
@@ -291,8 +295,8 @@ def _recording(n=128, n_u=1, period=64):
         (lambda: robust_bla(_recording(130)), "130 samples after the skipped ones, which are not whole periods of 64"),
         (lambda: robust_bla(_recording(), period=60), "not whole periods of 60 samples"),
         (lambda: robust_bla(_recording(), period=2), "not whole periods of 2 samples"),
-        (lambda: robust_bla([_recording(n_u=2)] * 3), r"3 recording\(s\) do not make whole realizations of 2"),
-        (lambda: robust_bla([_recording(n_u=2)] * 2), "2 inputs are linearly dependent"),
+        (lambda: robust_bla(_days(3)), r"3 recording\(s\) do not make whole realizations of 2"),
+        (lambda: robust_bla(_days(2)), "2 inputs are linearly dependent"),
         (lambda: robust_bla([_recording(), _recording(192)]), r"the recordings hold \[2, 3\] periods"),
         (lambda: robust_bla(_recording(), lines=[0, 3]), "no usable excited lines among 1 to 31"),
         (lambda: robust_bla(_recording(), lines=[]), "no usable excited lines"),

@@ -293,7 +293,10 @@ def _bla(n=10, f_max=4.0, value=1.0):
         (lambda: frequency_subspace(_bla(), 2.5), "order nx is 2.5"),
         (lambda: frequency_subspace(_bla(), True), "order nx is True"),
         (lambda: time_subspace(_short(), 20), r"30 samples in 1 recording\(s\) are too few for order 20"),
-        (lambda: time_subspace([_short(8), _short(8)], 5), r"16 samples in 2 recording\(s\) are too few for order 5"),
+        (
+            lambda: time_subspace([_short(8), _short(8).with_(start=1.0)], 5),
+            r"16 samples in 2 recording\(s\) are too few for order 5",
+        ),
         (lambda: frequency_subspace(_bla(), 15), "10 frequencies are too few for order 15"),
         (lambda: frequency_subspace(_bla(1), 1), "1 frequencies are too few for order 1"),
         (lambda: frequency_subspace(_bla(f_max=40.0), 2), "outside 0 to 5 Hz"),

@@ -1,5 +1,6 @@
 """A user's simulator file: its rights, no traces after it has run, and one sentence for every error in it."""
 
+import os
 import sys
 
 import pytest
@@ -62,6 +63,12 @@ def test_a_file_finds_its_own_folder_from_any_other(tmp_path, monkeypatch):
     path = write(tmp_path, RIG + "\nimport os\n\nassert os.path.isabs(__file__), __file__\n")
     monkeypatch.chdir(tmp_path)
     assert load_simulator(path.name).states == ("pos", "vel")
+
+
+def test_a_file_does_not_move_the_program_to_another_folder(tmp_path):
+    here = os.getcwd()
+    load_simulator(write(tmp_path, f"import os\n\nos.chdir({str(tmp_path)!r})\n{RIG}"))
+    assert os.getcwd() == here
 
 
 def test_a_dataclass_may_be_defined_in_the_file(tmp_path):

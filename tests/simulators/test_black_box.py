@@ -96,17 +96,33 @@ def test_a_function_that_cannot_be_followed_is_called_with_numbers():
     assert found.parameters["k"] == pytest.approx(90.0, rel=1e-4)
 
 
-def test_a_function_that_fails_at_a_point_is_a_failed_trial():
-    def fragile(t, x, u, p):
-        if x[0] > 1.0:
-            raise ValueError("too far")
-        return [x[1], u[0] - p["k"] * x[0]]
+def fragile(t, x, u, p):
+    if x[0] > 1.0:
+        raise ValueError("too far")
+    return [(u[0] - x[0]) * p["k"]]
 
-    options = dict(states=("pos", "vel"), inputs="force", parameters={"k": Parameter(1.0)})
-    made = from_function(fragile, "pos", numeric=Numeric(), **options)
+
+def test_a_function_that_fails_at_a_point_is_a_failed_trial():
+    made = from_function(
+        fragile, "pos", numeric=Numeric(), states="pos", inputs="force", parameters={"k": Parameter(1.0)}
+    )
     given = Recording(np.full((200, 1), 5.0), np.zeros((200, 1)), 0.05, ("force",), ("pos",))
     assert np.isnan(made.simulate(given)[-1, 0]) and np.isfinite(made.simulate(given)[0, 0])
     assert "it failed first with ValueError('too far')" in str(made)
+
+
+@pytest.mark.slow
+def test_a_diagnosis_tells_that_a_function_has_failed():
+    options = dict(states="pos", inputs="force", parameters={"k": Parameter(1.0, bounds=(0.01, 3.0))})
+    made = from_function(fragile, "pos", numeric=Numeric(), **options)
+    u = np.tile([[4.0]] * 10 + [[0.0]] * 10, (3, 1))
+    given = Recording(u, u, 0.1, ("force",), ("pos",), initial="zero", hold="zero")
+    given = given.with_(y=made.with_parameters({"k": 0.1}).simulate(given))
+    with pytest.raises(InputError, match=r"pos is not finite .* fragile failed with ValueError\('too far'\)"):
+        diagnose(made, given, workers=1, engine="vm")
+    found = diagnose(made.with_parameters({"k": 0.12}), given, laws=[], effects=0, workers=1, engine="vm", time_limit=1)
+    note = next(g.sentence for g in found.gates if g.finding == "failure")
+    assert note.startswith("fragile failed at some points, first with ValueError('too far').")
 
 
 def test_a_diagnosis_says_how_often_it_calls_and_how_long_a_simulation_takes():

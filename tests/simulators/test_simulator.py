@@ -1,5 +1,6 @@
 """A simulator as a model: against an independent integrator, with laws at every kind of port, in both engines."""
 
+import warnings
 from dataclasses import replace
 from itertools import pairwise
 
@@ -457,6 +458,16 @@ def test_one_port_needs_no_tuple(record):
     )
 
 
+def with_mount(into, across=lambda x: x.pos):
+    return rig(ports=Port("mount", into, across))
+
+
+def test_a_numpy_function_of_a_symbol_warns_of_nothing():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert rig(outputs=lambda x: dict(position=np.sign(x.pos), load=x.vel)).output_names == ("position", "load")
+
+
 @pytest.mark.parametrize(
     ("make", "says"),
     [
@@ -478,6 +489,10 @@ def test_one_port_needs_no_tuple(record):
         (lambda: rig(parameters=[1.0]), r"parameters are \[1.0\]; give {name: Parameter"),
         (lambda: rig(parameters={"m": 1.0}), "parameter 'm' is 1.0; give Parameter"),
         (lambda: rig(units="N"), "units are 'N'; give {name: unit}"),
+        (lambda: rig(units={"position": 5}), "units are {'position': 5}; give {name: unit}"),
+        (lambda: rig(units={"x_2": "m"}), "The simulator has no 'x_2' among its inputs and outputs; they are force, "),
+        (lambda: with_mount(lambda x: {"vel": np.nan}), "'mount: into vel' holds a number that is none"),
+        (lambda: with_mount({"vel": 1.0}, lambda x: x.pos * np.nan), "'mount: across' holds a number that is none"),
         (lambda: rig(dynamics=dict), "dynamics is <class 'dict'>; give a function"),
     ],
 )

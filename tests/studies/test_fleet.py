@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_line import refused
+from command_line import refused, run
 from fleet_rig import LAWS, PORT, STIFFNESS, WEAR, machines, recording, rig, write_machines
 
 import pilfr_casadi as pilfr
@@ -269,6 +269,7 @@ def test_evidence_adds_up_over_the_sample():
     ("change", "says"),
     [
         ({"machines": {"a": None}}, "at least 2 machines"),
+        ({"machines": [0, 1]}, "give recordings by name"),
         ({"machines": {"a/b": 0, "c": 0}}, "is named 'a/b'"),
         ({"machines": {"a": 0, "A": 0}}, "upper and lower case"),
         ({"times": {"z": [0, 1]}}, "no machine of the fleet"),
@@ -283,6 +284,11 @@ def test_bad_arguments(days, tmp_path, change, says):
     with pytest.raises(InputError, match=says):
         pilfr.fleet(rig(), given.pop("machines"), **given)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_time_limit_that_ends_every_step_says_what_helps(days):
+    with pytest.raises(InputError, match=r"time limit of 0.001 s; with a longer one it is done again"):
+        pilfr.fleet(rig(), {name: days[name] for name in "ab"}, workers=1, time_limit=0.001)
 
 
 def test_recordings_that_do_not_fit_are_refused_with_their_machine(days, tmp_path):
@@ -300,7 +306,10 @@ def test_bad_commands(tmp_path, days, capsys):
     refused(capsys, "fleet", rig_file, data, "--out", data / "out", says="give the results another --out")
     refused(capsys, "fleet", rig_file, data, "--workers", 2, "--dask", "x", "--out", out, says="leave one of them out")
     refused(capsys, "fleet", rig_file, data, "--dask", "nonsense://", "--out", out, says="No Dask scheduler")
-    refused(capsys, "fleet", rig_file, data, "--against", folder / "none", says="there is no file")
+    refused(capsys, "fleet", rig_file, data, "--against", folder / "none", says="There is no fleet in")
+    (data / "c").mkdir()
+    _, said, _ = run(capsys, "fleet", rig_file, data, "--against", folder / "none")
+    assert said.count(f"note: {data / 'c'} holds no recording and is left out") == 1
     (data / "b" / "1.csv").write_text("t,force\n0,1\n")
     refused(capsys, "fleet", rig_file, data, "--out", out, says="position")
     (folder / "empty").mkdir()

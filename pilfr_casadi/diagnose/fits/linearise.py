@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from ..._base import one_at_a_time
+from ..._base import InputError, one_at_a_time
 from ...data import Recording
 from ...laws import Law, Local
 from ...linear import steady_state_gain, with_output_injection
@@ -216,7 +216,24 @@ def simulate_states(fitted: Fitted, r: Recording, state: np.ndarray) -> np.ndarr
 def linearise_runs(bench: Workbench, fitted: Fitted) -> tuple[Probe, list[Run]]:
     """Return the probe of a fitted simulator, and its run of every recording."""
     probe = Probe.of(bench, fitted)
-    return probe, [run(bench, probe, fitted, i) for i in range(len(bench.recordings))]
+    runs = [run(bench, probe, fitted, i) for i in range(len(bench.recordings))]
+    for i, r in enumerate(runs):
+        if not all(np.isfinite(found).all() for found in (r.z, r.lift, r.push)):
+            _refuse_infinite_port(bench, probe, fitted, i)
+    return probe, runs
+
+
+def _refuse_infinite_port(bench: Workbench, probe: Probe, fitted: Fitted, i: int) -> None:
+    """Refuse a port that is not finite along the simulator's own run, if that run is."""
+    r = bench.recordings[i]
+    states = simulate_states(fitted, r, fitted.initial[i])[:, : probe.n_x]
+    z, _, lift, push, _ = local_signals(bench, probe.local, states, r, probe.values[: -len(probe.ports)])
+    finite = np.isfinite([z, lift, push]).all(axis=(0, 1))
+    if np.isfinite(states).all() and not finite.all():
+        raise InputError(
+            f"The port {probe.ports[int(np.argmin(finite))]!r} is not finite along the recordings; correct a division "
+            "by zero, or a logarithm or root of a negative number, in its `into`, `across` or `rate`."
+        )
 
 
 def sample_run(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:

@@ -298,7 +298,9 @@ class Workbench:
             if np.any(off):
                 k = int(np.argmax(np.any(off, axis=1)))
                 name = self.simulator.output_names[int(np.argmax(off[k]))]
-                return f" ({name} is out of all bounds {k * r.dt:.3g} s into {r.label})"
+                how = "is out of all bounds" if np.isfinite(y[k]).all() else "is not finite"
+                failed = "".join(f"; {f} failed with {e}" for f, e in self.simulator.program_failures.items())
+                return f" ({name} {how} {k * r.dt:.3g} s into {r.label}{failed})"
         return ""
 
     def check_followed(self, fitted: Fitted, most: float = RUNAWAY**2) -> None:
