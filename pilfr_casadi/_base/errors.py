@@ -36,8 +36,8 @@ def in_words(names: Sequence[str]) -> str:
 
 
 def percent(share: float) -> str:
-    """Write a share, "12.3 %"."""
-    return f"{100 * share:.3g} %"
+    """Write a share, "12.3 %"; a large one without an exponent."""
+    return f"{100 * share:.0f} %" if 10 <= share < 1e4 else f"{100 * share:.3g} %"
 
 
 def usable(values: np.ndarray) -> np.ndarray:

@@ -52,6 +52,7 @@ if TYPE_CHECKING:
         written_times as written_times,
     )
     from .recording import (
+        HOLD_WORDS as HOLD_WORDS,
         HOLDS as HOLDS,
         SAME_STEP as SAME_STEP,
         Recording as Recording,

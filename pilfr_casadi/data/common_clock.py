@@ -31,7 +31,7 @@ def merge(
 
     Name, initial state, hold and skipped samples come from the first record. The initial state is kept only if the
     common time begins with the first record. If all inputs are held (`hold="zero"`) and each of their levels lasts at
-    least a new step, an input becomes its mean over each new step, and is held; else a stated hold becomes `"linear"`,
+    least a new step, an input becomes its mean over each new step, and is held; else it becomes `"linear"`,
     unless no input was resampled.
 
     Parameters

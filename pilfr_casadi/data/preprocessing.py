@@ -19,7 +19,7 @@ from .._base import InputError, is_number, listed, positive, whole
 Array = np.ndarray
 
 TRENDS = ("constant", "linear")
-INTERPOLATION_REACH = 20  # samples on each side that an interpolated value depends on
+INTERPOLATION_REACH = 10  # samples on each side that an interpolated value depends on
 INTERPOLATION_WINDOW = ("kaiser", 8.0)  # of the sine cardinal: 80 dB of attenuation
 FILTERS = ("lowpass", "highpass", "bandpass", "bandstop")
 LARGEST_FACTOR = 1000  # largest numerator and denominator of a rational change of step
@@ -187,20 +187,26 @@ def hold_at(t: Array, values: Array, times: Array, step: float) -> Array:
     return np.where(first == last, values[first], means)  # without rounding where the signal keeps its value
 
 
-def interpolate_band_limited(values: np.ndarray, n: int, periodic: bool) -> np.ndarray:
+def interpolate_band_limited(values: np.ndarray, n: int, period: int | None = None) -> np.ndarray:
     """Interpolate band-limited signals (M, k) at n points a sample; return (n M + 1, k), the samples unchanged.
 
-    The signals have no content above half the sampling rate, as behind an anti-alias filter. They repeat if `periodic`;
-    else they are reflected in their first and last points.
+    The signals have no content above half the sampling rate, as behind an anti-alias filter. With `period`, in samples,
+    they repeat, so that the whole curve is known; else they are reflected in their first and last points, near which
+    the curve is uncertain.
     """
-    from scipy.signal import resample_poly
+    from scipy.signal import firwin, upfirdn
 
-    if n == 1 or not values.size:
-        after = values[:1] if periodic else values[-1:]
-        return np.vstack([np.repeat(values, n, axis=0), after])
-    beyond = min(INTERPOLATION_REACH, len(values) - 1)
-    pad = ((beyond, beyond + 1), (0, 0))
-    more = np.pad(values, pad, "wrap") if periodic else np.pad(values, pad, "reflect", reflect_type="odd")
-    fine = resample_poly(more, n, 1, axis=0, window=INTERPOLATION_WINDOW)
-    fine[::n] = more
-    return np.asarray(fine[n * beyond : n * (beyond + len(values)) + 1])
+    reach, count = INTERPOLATION_REACH, len(values)
+    if period:
+        more = values[np.arange(-reach, count + reach + 1) % period]
+        more[reach : reach + count] = values
+    else:
+        more = np.pad(values, ((reach, reach + 1), (0, 0)), "reflect", reflect_type="odd")
+    if n == 1:
+        return np.asarray(more[reach : reach + count + 1])
+    taps = firwin(2 * reach * n + 1, 1 / n, window=INTERPOLATION_WINDOW)
+    for k in range(n):  # a constant stays one, however large
+        taps[k::n] /= np.sum(taps[k::n])
+    fine = upfirdn(taps, more, n, axis=0)[reach * n :]
+    fine[: n * len(more) : n] = more
+    return np.asarray(fine[n * reach : n * (reach + count) + 1])

@@ -22,6 +22,7 @@ from .units import conversion
 SAME_STEP = 1e-4  # relative difference up to which two steps count as the same; written times have few digits
 LONGEST_STEP = 1e30  # s, and its inverse the shortest one: rates are squared, and no experiment is outside
 HOLDS = ("zero", "linear", "band-limited", None)
+HOLD_WORDS = {"zero": "held", "linear": "interpolated", "band-limited": "band-limited"}  # in sentences
 INITIALS = ("zero", "estimate", "periodic")
 
 
@@ -281,7 +282,7 @@ class Recording:
         If inputs and outputs are filtered alike, a linear model still relates them. A model with hysteresis or friction
         does not: its memory turns at the extremes of the signal, which a filter rounds off. For such a model filter
         only above the band in which the machine moves, and use no high-pass. A filtered input is no longer held
-        between samples, so a stated `hold` becomes `"linear"`. An initial state of zero or given as numbers becomes
+        between samples, so `hold="zero"` becomes `"linear"`. An initial state of zero or given as numbers becomes
         invalid and is estimated.
 
         Parameters
@@ -307,7 +308,7 @@ class Recording:
         """Resample to another step in seconds; an anti-alias filter precedes a longer step.
 
         If `hold` is `"zero"` and each level of the inputs lasts at least a new step, an input becomes its mean over
-        each new step, and is held; else the hold becomes `"linear"`. `skip` covers the same time as before. A period
+        each new step, and is held; else it becomes `"linear"`. `skip` covers the same time as before. A period
         that is not a whole number of new samples is dropped.
 
         Raises

@@ -203,7 +203,8 @@ def _range_note(bench: Workbench, tests: Sequence[Recording]) -> Iterator[Gate]:
         reached, known = (value_with_unit(v, units.get(names[i], "")) for v in (value, limit))
         words.append(f"{names[i]} reaches {reached} ({known} in training)")
     for i, name in enumerate(simulator.inputs):
-        share = share_at_new_frequencies([r.u[:, i] for r in trained], [r.u[:, i] for r in tests], bench.dt)
+        before, now = ([r.u[r.skip :, i] for r in each] for each in (trained, tests))
+        share = share_at_new_frequencies(before, now, bench.dt)
         if share > SURE:
             words.append(f"{percent(share)} of {name} is at frequencies that it hardly has in training")
     if words:

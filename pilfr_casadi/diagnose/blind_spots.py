@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from .._base import in_words, one_blas_thread, percent, to_json
-from ..data import Recording, moves_freely
+from ..data import HOLD_WORDS, Recording, moves_freely
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, UNKNOWN, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings, stated_hold
@@ -47,8 +47,7 @@ MOTION = {  # by kind of blind spot: the record that removes it
     "no-reversal": "A slow triangle of {} with reversals, at two amplitudes.",
     "one-amplitude": "A second amplitude of {}, such as half of it.",
 }
-# by hold: its name in the printed result
-HOLD_WORDS = {"zero": "held", "linear": "interpolated", "band-limited": "band-limited"}
+GRAVEST = ("rough", "constant-input", "one-frequency")  # kinds of blind spots that stand before all others
 # by kind of initial state: its name in the printed result
 START_WORDS = {"zero": "at zero", "estimate": "estimated", "periodic": "periodic", "given": "as given"}
 # by source of the noise floor: its name in the printed result
@@ -217,7 +216,7 @@ class Check:
         yield f"noise ({self.noise['source']}): {noise}"
         if self.hold_taken:
             taken = HOLD_WORDS[self.hold_taken]
-            unsaid = f"not stated, here taken as {taken}; say hold='zero' or hold='linear' if you know"
+            unsaid = f"not stated, here taken as {taken}; say hold='zero', 'linear' or 'band-limited' if you know"
             yield f"inputs between samples: {taken if self.hold else unsaid}"
         yield f"start of each recording: {', '.join(self.starts)}"
         if self.unknown_domains:
@@ -350,9 +349,13 @@ def assess_recordings(
     )
     swings = np.ptp(np.concatenate([r.u for r in bench.recordings]), axis=0)
     still = [name for name, swing in zip(inputs, swings, strict=True) if not swing > 0]
-    spots = [*_single_frequencies(inputs, bench.recordings)]
-    spots += _find_blind_spots(found, still, _alive_as_given(quiet, fitted, parameters))
-    found = replace(found, blind_spots=(*spots, *_free_motions(bench.recordings)))
+    spots = [
+        *_find_blind_spots(found, still, _alive_as_given(quiet, fitted, parameters)),
+        *_single_frequencies(inputs, bench.recordings),
+        *_free_motions(bench.recordings),
+    ]
+    spots.sort(key=lambda spot: GRAVEST.index(spot.kind) if spot.kind in GRAVEST else len(GRAVEST))
+    found = replace(found, blind_spots=tuple(spots))
     sensors = helpful_sensors(response, runs) if ties else ()
     return replace(found, next_record=_next_record(found, inputs, sensors), seconds=time.perf_counter() - began)
 

@@ -13,6 +13,8 @@ from .fits.workbench import Workbench
 
 SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
 
+ROUNDED = 1e-6  # change of a channel, over its size, that counts as none
+LEAST_SAMPLES = 10  # of a signal of which a single frequency is told
 LONGEST_SEGMENT = 512  # samples from which a spectral density is computed
 NEW_DENSITY = SMALL_SHARE**2  # of a normalised trained spectral density over another, below which frequencies are new
 
@@ -65,7 +67,7 @@ def single_frequency(runs: Sequence[np.ndarray], dt: float) -> float:
 
     A sine, with a level, has to leave at most a tenth of the signal's deviation in each recording.
     """
-    found = [_sine(u, dt) for u in runs if np.ptp(u) > 0]
+    found = [_sine(u, dt) for u in runs if np.ptp(u) > 0 and len(u) >= LEAST_SAMPLES]
     alike = bool(found) and max(f for f, _ in found) - min(f for f, _ in found) <= SMALL_SHARE * found[0][0]
     return found[0][0] if alike and max(left for _, left in found) <= SMALL_SHARE else 0.0
 
@@ -79,7 +81,8 @@ def ranges_left(trained: np.ndarray, tested: np.ndarray) -> list[tuple[int, floa
     for i, (known, signal) in enumerate(zip(trained.T, tested.T, strict=True)):
         low, high, least, most = (float(f(x)) for x in (known, signal) for f in (np.min, np.max))
         value, limit = (most, high) if most - high > low - least else (least, low)
-        if abs(value - limit) > SMALL_SHARE * (high - low):
+        beyond = max(most - high, low - least)
+        if beyond > max(SMALL_SHARE * (high - low), ROUNDED * max(abs(low), abs(high))):
             found.append((i, value, limit))
     return found
 
@@ -91,6 +94,8 @@ def share_at_new_frequencies(trained: Sequence[np.ndarray], tested: Sequence[np.
     """
     from scipy.signal import welch
 
+    if all(np.ptp(u) <= ROUNDED * np.max(np.abs(u)) for u in tested):
+        return 0.0
     length = min(LONGEST_SEGMENT, *map(len, trained), *map(len, tested))
     known, now = (
         np.average([welch(u, 1 / dt, nperseg=length)[1] for u in signals], axis=0, weights=[len(u) for u in signals])
@@ -113,7 +118,7 @@ def _sine(u: np.ndarray, dt: float) -> tuple[float, float]:
 
     frequencies, power = periodogram(u, 1 / dt)
     peak, width = float(frequencies[np.argmax(power)]), 1 / (dt * len(u))
-    best = minimize_scalar(left, bounds=(max(peak - width, width), peak + width), method="bounded")
+    best = minimize_scalar(left, bounds=(max(peak - width, width), min(peak + width, 0.5 / dt)), method="bounded")
     return float(best.x), float(best.fun)
 
 

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from .._base import InputError, Stages, UntilInterrupted, in_words
-from ..data import Recording
+from ..data import HOLD_WORDS, Recording
 from ..engine import make_engine
 from ..optimise import GaussNewton, Status
 from ..simulators import Simulator, discretise_for, unit_notes
@@ -141,7 +141,8 @@ class _Checks:
             first = self.begin(bench, gates)
         except InputError:
             return self.begin(other, gates)
-        if len(first.gates) == len(gates) or bench.interrupt.pressed:
+        late = time.perf_counter() > self.until
+        if len(first.gates) == len(gates) or bench.interrupt.pressed or late:
             return first
         with suppress(InputError):
             first = min(first, self.begin(other, gates), key=lambda checked: checked.cost)
@@ -344,11 +345,7 @@ def slow_note(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Ga
 
 def hold_note(simulator: Simulator, hold: str, ratio: float) -> Gate:
     """Note that the hold was chosen from the data; the other's error is `ratio` times as large."""
-    words = {
-        "zero": "held over each sample",
-        "linear": "interpolated between samples",
-        "band-limited": "band-limited between samples",
-    }[hold]
+    words = f"{HOLD_WORDS[hold]} between samples"
     how = f"fits better (error {ratio:.3g} times smaller)" if ratio > EQUAL_RATIO else "fits no worse"
     how = how if np.isfinite(ratio) else "lets the simulation follow (otherwise it diverges)"
     sentence = f"The recordings do not say what inputs do between samples; {words} {how} and is used."

@@ -71,7 +71,8 @@ def search_with_repetitions(request: Request) -> tuple[Request, Attempt]:
 def _search_with_each_hold(request: Request) -> Attempt:
     """Search; if nobody stated the hold of the inputs and it matters, use the hold with the smallest error."""
     found = search_with_one_hold(request)
-    hold = "" if found.search.hold_stated else _find_better_hold(found.search)
+    search = found.search
+    hold = "" if search.hold_stated else search.better_hold or _find_better_hold(search)
     return _search_with_better_hold(request, found, hold) if hold else found
 
 
@@ -81,12 +82,14 @@ def _search_with_better_hold(request: Request, first: Attempt, hold: str) -> Att
     held = replace(request, hold=hold, say=request.say.under("other hold: "))
     other = _again(first, partial(search_with_one_hold, held))
     if other is None:
-        search.resume(request.most_effects)
+        if not search.hold_stated:
+            search.resume(request.most_effects)
         return first
     again = other.search
     only_refitted, before2, after2 = again.interrupted and len(again.memo) < 2, *first.compared_with(other)
     if after2 > before2 or only_refitted:
-        search.resume(request.most_effects)
+        if not search.hold_stated:  # else this search is finished
+            search.resume(request.most_effects)
         return first
     better = _find_better_hold(again)
     # the laws that were found since may have been what the hold had made up for

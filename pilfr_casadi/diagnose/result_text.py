@@ -147,7 +147,7 @@ class ResultText:
         given, before, after = (_percent(errors[k]) for k in ("nominal", "before", "after"))
         if self.outcome == "same":
             text += f" On the test recordings it makes no difference: {before} before, {after} after."
-            text += " A constant would follow them as well." if errors["after"] > 1 else ""
+            text += " A constant would follow them better." if errors["after"] > 1 else ""
             text += self._better_without()
         elif self.outcome == "worse":
             text += (

@@ -56,8 +56,9 @@ def exported(
         simulator.
     dt : float
         Duration of a step, s: required for a simulator and a model; a fit and a diagnosis have their own.
-    hold : {"zero", "linear"}, optional
-        Inter-sample behaviour of the inputs, for a simulator; default: its own, else "zero".
+    hold : {"zero", "linear", "band-limited"}, optional
+        Inter-sample behaviour of the inputs, for a simulator; default: its own, else "zero". A step takes band-limited
+        inputs as linear, because it does not know the samples around it.
     substeps : int, optional
         Runge-Kutta steps per sample, for a simulator; by default chosen from its fastest eigenvalue.
     start : Recording or array, optional
@@ -145,7 +146,7 @@ def _check_dt(dt: float | None) -> float:
 def _discretise_over_sample(model: Simulator, dt: float, hold: str | None, substeps: int | None) -> Model:
     hold = hold or model.hold or "zero"
     if hold not in HOLDS:
-        raise InputError(f"hold = {hold!r} was given; use 'zero' or 'linear'.")
+        raise InputError(f"hold = {hold!r} was given; use 'zero', 'linear' or 'band-limited'.")
     hold = "linear" if hold == "band-limited" else hold  # a step does not know the inputs before and after it
     chosen = _choose_substeps_at_rest(model, dt) if substeps is None else whole(substeps, "substeps", 1)
     return discretise(model, dt, hold, chosen)

@@ -93,7 +93,7 @@ def _identify(records: Sequence[Recording], n: int, hold: str | None) -> tuple[f
     p = found.parameters
     a, b, c, d = (p[k] for k in ("A", "B_u", "C_y", "D_yu"))
     options = []
-    for between in (hold,) if hold else ("zero", "linear"):
+    for between in (hold,) if hold in ("zero", "linear") else ("zero", "linear"):
         try:
             continuous = to_continuous(a, b, c, d, records[0].dt, between)
         except InputError:

@@ -118,7 +118,8 @@ class Model:
                 period = recording.period if recording.period and m % recording.period == 0 else None
                 after = values[m - period] if period else values[-1]
                 if self.band_limited and signal != "y":
-                    fine = interpolate_band_limited(values, n, periodic=period is not None)
+                    repeats = recording.period if recording.begins == "periodic" else period
+                    fine = interpolate_band_limited(values, n, repeats)
                     columns.append(fine[1:] if signal == "next" else fine[:-1])
                     continue
                 a, b = np.repeat(values, n, axis=0), np.repeat(np.vstack([values[1:], after]), n, axis=0)

@@ -29,7 +29,7 @@ from .equations import Equations, Named, stack
 from .ports import ACTUATOR, PARAMETER, SENSOR, Expression, Placed, Port, split_port
 from .user_arguments import call
 
-BAND_LIMITED_STEPS = 4  # per sample at least; lines between them miss a third of the sampling rate by 2 %
+BAND_LIMITED_STEPS = 8  # per sample at least; lines between them miss a third of the sampling rate by half a per cent
 
 E = TypeVar("E", bound=Equations)
 
@@ -175,8 +175,8 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
     """Discretise a simulator with its laws to a closed model for samples dt apart, s.
 
     `hold` says whether inputs are constant between samples ("zero"), interpolated ("linear") or band-limited;
-    `substeps` is the number of Runge-Kutta steps per sample (`choose_substeps`), at least four for band-limited inputs,
-    which are linear within a step.
+    `substeps` is the number of Runge-Kutta steps per sample (`choose_substeps`), at least eight for band-limited
+    inputs, which are linear within a step.
     """
     own = getattr(simulator.dynamics, "dt", None)  # of a program that steps by itself
     if own is not None and abs(own / dt - 1) > SAME_STEP:

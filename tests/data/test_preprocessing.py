@@ -381,17 +381,23 @@ def test_a_merged_input_is_linear_where_one_of_the_records_is():
     assert pilfr.merge(held, smooth, inputs="a", outputs="y").hold == "zero"
 
 
-@pytest.mark.parametrize("periodic", [True, False])
-def test_a_band_limited_signal_is_interpolated_through_its_samples(periodic):
+@pytest.mark.parametrize("period", [200, 20, None])
+@pytest.mark.parametrize("level", [0.0, 1e5])
+def test_a_band_limited_signal_is_interpolated_through_its_samples(period, level):
     def signal(k):
-        return np.stack([np.sin(2 * np.pi * 0.3 * k), 2 + np.cos(2 * np.pi * 0.05 * k + 1)], axis=-1)
+        return level + np.stack([np.sin(2 * np.pi * 0.3 * k), 2 + np.cos(2 * np.pi * 0.05 * k + 1)], axis=-1)
 
-    k = np.arange(200)
-    fine = interpolate_band_limited(signal(k), 5, periodic)
-    assert fine.shape == (1001, 2) and np.array_equal(fine[:-1:5], signal(k))
-    inside = slice(0, None) if periodic else slice(150, -150)
-    assert np.max(np.abs(fine - signal(np.arange(1001) / 5))[inside]) < 2e-3
-    assert interpolate_band_limited(signal(k), 1, periodic).shape == (201, 2)
+    k = np.arange(205 if period == 20 else 200)
+    fine = interpolate_band_limited(signal(k), 5, period)
+    assert fine.shape == (5 * len(k) + 1, 2) and np.array_equal(fine[:-1:5], signal(k))
+    inside = slice(0, None) if period else slice(150, -150)
+    assert np.max(np.abs(fine - signal(np.arange(len(fine)) / 5))[inside]) < 2e-3
+    assert interpolate_band_limited(signal(k), 1, period).shape == (len(k) + 1, 2)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 12])
+def test_a_constant_is_band_limited(count):
+    assert interpolate_band_limited(np.full((count, 1), 1e5), 4) == pytest.approx(1e5, rel=1e-12)
 
 
 def test_a_band_limited_input_stays_that():

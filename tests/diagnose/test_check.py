@@ -10,6 +10,7 @@ from cart import cart
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, check, multisine
+from pilfr_casadi.diagnose.excitation import ranges_left, share_at_new_frequencies, single_frequency
 from pilfr_casadi.diagnose.identifiability import Tie
 from pilfr_casadi.laws import CATALOGUE, CoulombFriction, CubicDamping, CubicStiffness
 from pilfr_casadi.models import close_loop
@@ -490,3 +491,18 @@ def test_unscored_samples_are_no_noise():
     wild[:20] += np.random.default_rng(0).standard_normal((20, wild.shape[1])) * np.ptp(wild)
     told, quiet = (check(MASS, r).noise["share"] for r in (given.with_(y=wild), given))
     assert told == pytest.approx(quiet, rel=1e-3)
+
+
+def test_a_test_inside_the_trained_range_leaves_nothing():
+    """Nor does a channel that rests."""
+    rng, rest = np.random.default_rng(0), np.full((400, 1), 0.1)
+    trained = np.hstack([rng.uniform(-1, 1, (400, 1)), rest])
+    assert ranges_left(trained, np.hstack([0.5 * trained[:, :1], rest * (1 + 1e-12)])) == []
+    ((channel, value, limit),) = ranges_left(trained, np.hstack([2 * trained[:, :1], rest]))
+    assert channel == 0 and abs(value) == pytest.approx(2 * abs(limit), rel=0.02)
+    assert share_at_new_frequencies([trained[:, 0]], [rest[:, 0]], 0.1) == 0.0
+
+
+def test_few_samples_have_no_single_frequency():
+    rng = np.random.default_rng(0)
+    assert not any(single_frequency([rng.standard_normal(n)], 0.1) for n in (2, 3, 5, 12) for _ in range(20))

@@ -234,7 +234,7 @@ def test_a_law_that_spoils_the_test_is_told_where_all_together_make_no_differenc
     errors = {role: {**e, "nominal": 4.0, "before": 2.12, "after": 2.16} for role, e in d.errors.items()}
     d = replace(d, effects=(replace(d.effects[0], test_without=2.2), drag), errors=errors)
     assert d.outcome == "same"
-    assert "makes no difference: 212 % before, 216 % after. A constant would follow them as well." in d.summary
+    assert "makes no difference: 212 % before, 216 % after. A constant would follow them better." in d.summary
     assert "Without quadratic drag at ground it is 86 %." in d.summary
 
 

@@ -222,7 +222,7 @@ class Search(Hypotheses):
         least, found = best.cost / BETTER_RATIO**2, ""
         for other in {"zero": ("linear",), "linear": ("zero", "band-limited")}.get(hold, ("linear",)):
             if self.interrupted or not self.may_go_on():
-                return ""
+                break
             held = self.bench.with_hold(other)
             fitted = refit(held, [best.values], best.simulator, states=best.initial, solver=THOROUGH)
             if fitted is not None and fitted.cost < least:
