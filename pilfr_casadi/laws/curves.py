@@ -195,7 +195,10 @@ class FreeCurve(Law):
     id = "static_curve"
     flexible = True
     form = "free"
-    equation = "w = sum_i c_i (T_i(x) - T_i(x_0)),  i = 2..9,  x = (z - z_m) / z_h,  x_0 = -z_m / z_h"
+    equation = (
+        "w = sum_i c_i (T_i(x) - T_i(x_0)),  i = 2..9,  x = (z - z_m) / z_h,  x_0 = -z_m / z_h; "
+        "along its tangents outside -1 <= x <= 1"
+    )
     source = "Plett (2015), Battery Management Systems, vol. 1, sec. 2.2; Press et al. (2007), sec. 5.8"
     sentence = "a memoryless curve of a free shape, such as an open-circuit voltage over the state of charge"
     units = {"c": "w", "z_m": "z", "z_h": "z"}
@@ -206,8 +209,11 @@ class FreeCurve(Law):
     degrees = tuple(range(2, 10))  # an offset and a slope are parameters of the simulator; nine follow a narrow knee
 
     def force(self, z: Any, p: Any) -> Any:
-        terms, at_zero = (chebyshev((at - p.z_m) / p.z_h, max(self.degrees)) for at in (z, 0.0))
-        return sum(p.c[k] * (terms[i] - at_zero[i]) for k, i in enumerate(self.degrees))
+        x, x_0 = (z - p.z_m) / p.z_h, -p.z_m / p.z_h
+        inside = ca.fmax(ca.fmin(x, 1.0), -1.0)
+        terms, at_zero = (chebyshev(at, max(self.degrees)) for at in (inside, x_0))
+        slopes = [i**2 * (inside if i % 2 == 0 else 1.0) for i in self.degrees]  # at the ends of the range
+        return sum(p.c[k] * (terms[i] + slopes[k] * (x - inside) - at_zero[i]) for k, i in enumerate(self.degrees))
 
     def parameters(self) -> dict[str, Parameter]:
         """Coefficients, one for each degree, and the middle and half of the range."""

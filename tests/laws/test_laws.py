@@ -34,6 +34,7 @@ from pilfr_casadi.laws import (
     unit_forces,
 )
 from pilfr_casadi.linear import with_output_injection
+from pilfr_casadi.models import Named
 from pilfr_casadi.simulators import discretise
 
 DT, M, RUN = 0.01, 240, 120  # step, samples of the local signals, samples of a simulation
@@ -428,3 +429,20 @@ def test_a_curve_of_the_coordinate_is_no_stiffness_where_nothing_deflects(domain
     for law in (CubicStiffness, laws.QuadraticStiffness, laws.PowerStiffness, laws.AsymmetricCubicStiffness):
         if not law.domains or domain in law.domains:
             assert not {"stiffness", "deflection"} & set(law.sentences[domain].split())
+
+
+def test_a_free_curve_goes_on_along_its_tangents():
+    """Inside its range it is the sum of the Chebyshev polynomials from the second degree on, zero at zero."""
+    law, rng = laws.FreeCurve(), np.random.default_rng(0)
+    values = {"c": rng.standard_normal(8), "z_m": 0.2, "z_h": 0.5}
+    z = np.linspace(-1.5, 1.5, 301)
+
+    def curve(at):
+        return np.polynomial.chebyshev.chebval((at - 0.2) / 0.5, [0, 0, *values["c"]])
+
+    w = np.array([float(law.force(float(at), Named("p", values))) for at in z])
+    inside = np.abs(z - 0.2) <= 0.5
+    assert np.allclose(w[inside], curve(z[inside]) - curve(0.0), rtol=0, atol=1e-12)
+    for end, side in ((-0.3, z < -0.3), (0.7, z > 0.7)):
+        slope = (curve(end + 1e-6) - curve(end - 1e-6)) / 2e-6
+        assert np.allclose(w[side], curve(end) - curve(0.0) + slope * (z[side] - end), rtol=1e-6, atol=1e-6)
