@@ -95,14 +95,18 @@ def session(leader):
 
 def struck(arguments, until, number=signal.SIGINT):
     """Run a command, signal its whole process group once `until(process)`; status, stdout, stderr, processes."""
-    process = subprocess.Popen(
-        [*PILFR, *map(str, arguments)],
-        start_new_session=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
+    ours = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored, and a command inherits that
+    try:
+        process = subprocess.Popen(
+            [*PILFR, *map(str, arguments)],
+            start_new_session=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )
+    finally:
+        signal.signal(signal.SIGHUP, ours)
     try:
         end = time.monotonic() + 60
         while not until(process):
