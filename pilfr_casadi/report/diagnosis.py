@@ -193,7 +193,7 @@ def _hidden_forces(case: _Case) -> list[Block]:
         return out
     search, passes = d.evidence.search, tables.candidates_by_pass(d)
     closest: Any = search and closest_hypothesis(search, d.correction.closest if d.correction else None)
-    for acting in closest.effects if closest else ():
+    for acting in (e for e in closest.effects if kind_of(e.port) != PARAMETER) if closest else ():
         number, law = closest.fitted.simulator.elements.index(acting), display_name(acting.law.id)
         out += _force_blocks(case, closest.fitted, acting.port, number, f"{law} (the closest law)")
     if not closest and passes:
