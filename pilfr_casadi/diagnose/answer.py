@@ -14,7 +14,7 @@ from .._base import InputError, in_words, percent
 from ..data import Recording
 from ..identify import surrogate_warning
 from ..laws import Law, display_name, readable_unit, short_name
-from ..simulators import Placed, in_series, name_at, split_port
+from ..simulators import Placed, Simulator, in_series, name_at, split_port
 from .arguments import Request
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction
@@ -23,8 +23,8 @@ from .effect import Effect
 from .excitation import ranges_left, share_at_new_frequencies
 from .faults.channels import IN_RECORDINGS, find_gross_channel_errors
 from .faults.gates import EQUAL_RATIO, TEST_FAULT, Gate, edited, value_with_unit
-from .faults.offsets import Offset, remove_idle_offsets, update_offsets
-from .fits.evidence import FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, SURE, all_sure, standard_errors
+from .faults.offsets import Offset, refit_without_offsets, remove_idle_offsets, update_offsets
+from .fits.evidence import BETTER_RATIO, FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, SURE, all_sure, standard_errors
 from .fits.floor import Floor
 from .fits.force_recovery import is_curve_along
 from .fits.workbench import Fitted, Workbench
@@ -159,6 +159,8 @@ def _compute_errors(
     if tests:
         each = {e: final.to_all(f) for e, f in _without_each_effect(search, found).items()}
         fits = {"before": without, "after": after, **{f"without {i}": f for i, f in enumerate(each.values())}}
+        plain = None if search.past_deadline else refit_without_offsets(bench, without, request.simulator)
+        fits |= {"without offsets": plain} if plain else {}
         compared = test_errors(bench, tests, found.gates, fits, bench.on(tests).model(request.simulator))
         on_tests = compared.errors
         notes = (*_edit_notes(compared), *_resting_notes(compared.find_resting()), *_scored_note(compared))
@@ -166,6 +168,7 @@ def _compute_errors(
             notes = (*_test_faults(bench, after, tests, found.gates), *notes)
         if on_tests["after"] > NEAR_RATIO * bench.nrmse(after) and all(g.finding != TEST_FAULT for g in notes):
             notes = (*notes, *_range_note(bench, edited(tests, found.gates)))
+        notes = (*notes, *_offset_note(without, request.simulator, on_tests)) if plain else notes
         fewer = {e: on_tests[f"without {i}"] for i, e in enumerate(each)}
         errors["test"] = {name: on_tests[name] for name in ("nominal", "before", "after")}
     if bench.simulator.observer is not None:
@@ -211,6 +214,22 @@ def _range_note(bench: Workbench, tests: Sequence[Recording]) -> Iterator[Gate]:
         advice = "There the corrected simulator extrapolates; train it on recordings like these, too."
         sentence = f"The test recordings go beyond the training recordings: {in_words(words)}. {advice}"
         yield Gate("recordings", "test range", None, sentence, False)
+
+
+def _offset_note(without: Fitted, given: Simulator, errors: Mapping[str, float]) -> Iterator[Gate]:
+    """Note that the test recordings hardly have the offsets of the training recordings; `errors` are those on them."""
+    left_out, corrected = errors["without offsets"], errors["after"]
+    if BETTER_RATIO * left_out < corrected:
+        offsets = []
+        for e in without.simulator.elements[len(given.elements) :]:
+            value = value_with_unit(float(without.values[f"{e.prefix}w_0"]), given.port(e.port).unit)
+            offsets.append(f"{split_port(e.port)[1]} ({value})")
+        words = (
+            f"The refitted simulator has an offset of {in_words(offsets)}, which the test recordings hardly have: "
+            f"refitted without it, the simulator's error there is {percent(left_out)}, and {percent(corrected)} "
+            "corrected. The offset may stand for something that differs between the recordings."
+        )
+        yield Gate("recordings", "test offset", None, words, False)
 
 
 def _surrogate_note(error: float) -> Iterator[Gate]:

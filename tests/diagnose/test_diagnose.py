@@ -11,7 +11,7 @@ from cart import cart
 from diagnosis_rig import DT, OFF, SAMPLES, recordings, rig
 
 import pilfr_casadi as pilfr
-from pilfr_casadi import InputError, Port, Recording, multisine
+from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, multisine
 from pilfr_casadi.diagnose.arguments import match_tests
 from pilfr_casadi.laws import CATALOGUE, Backlash, CoulombFriction, CubicStiffness, Delay, DirectionalDamping
 
@@ -202,6 +202,34 @@ def test_frequencies_of_the_test_recordings_that_training_does_not_have_are_told
     (note,) = (g.sentence for g in found.gates if g.finding == "test range")
     assert re.search(r" \S+ % of force is at frequencies that it hardly has in training", note)
     assert "force reaches" not in note
+
+
+def test_an_offset_that_the_test_recordings_do_not_have_is_told():
+    rng = np.random.default_rng(0)
+
+    def dynamics(x, u, p):
+        return {"T": (p.g * (u.heat + p.load) - x.T) / 10}
+
+    def heater(load, g=1.0):
+        gain, load = Parameter(g, bounds=(0.1, 10)), Parameter(load, fixed=True)
+        return Simulator(
+            dynamics, lambda x: {"T": x.T}, states=("T",), inputs=("heat",), parameters={"g": gain, "load": load}
+        )
+
+    def record(load, level, name):
+        heat = level + np.repeat(rng.standard_normal(30), 20)[:, None]
+        r = Recording(heat, np.zeros((600, 1)), 1.0, name=name, initial="zero", inputs="heat", outputs="T", hold="zero")
+        return r.with_(y=heater(load).simulate(r) + 1e-3 * rng.standard_normal((600, 1)))
+
+    train, test = record(1.0, 3.0, "train"), record(0.0, 0.0, "test")
+    found = pilfr.diagnose(heater(0.0, 1.2), train, test=test, laws=())
+    assert [g.finding for g in found.gates if g.fault] == ["offset"]
+    (note,) = (g.sentence for g in found.gates if g.finding == "test offset")
+    assert note.startswith("The refitted simulator has an offset of heat (")
+    plain, corrected = (float(v) for v in re.findall(r"(\S+) %", note))
+    assert plain < 40 < corrected == pytest.approx(100 * found.errors["test"]["after"], rel=0.01)
+    recurring = pilfr.diagnose(heater(0.0, 1.2), train, test=record(1.0, 0.0, "test"), laws=())
+    assert "test offset" not in {g.finding for g in recurring.gates}
 
 
 def test_tests_may_begin_in_the_training_data_where_they_are_not_scored(plain):

@@ -429,6 +429,17 @@ def fix_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
     return fitted
 
 
+def refit_without_offsets(bench: Workbench, fitted: Fitted, given: Simulator) -> Fitted | None:
+    """Refit a simulator without the offsets that the `given` one does not have; None if it has none, or diverges."""
+    simulator = fitted.simulator
+    if len(simulator.elements) == len(given.elements):
+        return None
+    for i in reversed(range(len(given.elements), len(simulator.elements))):
+        simulator = simulator.without_element(i)
+    values = {name: fitted.values[name] for name in simulator.parameters}
+    return refit(bench, [values, {}], simulator, states=fitted.initial, solver=THOROUGH)
+
+
 def remove_idle_offsets(simulator: Simulator, own: int) -> Simulator:
     """Return a simulator without the offsets that `fix_idle_offsets` has fixed; the first `own` elements are kept."""
     for i in reversed(range(own, len(simulator.elements))):
