@@ -36,7 +36,9 @@ def in_words(names: Sequence[str]) -> str:
 
 
 def percent(share: float) -> str:
-    """Write a share, "12.3 %"; a large one without an exponent."""
+    """Write a share or a relative error, "12.3 %"; a large one without an exponent, an infinite one in words."""
+    if not np.isfinite(share):
+        return "infinite (the simulation diverges)"
     return f"{100 * share:.0f} %" if 10 <= share < 1e4 else f"{100 * share:.3g} %"
 
 
