@@ -65,6 +65,10 @@ class Compiled:
     model: Model
     engine: Engine
 
+    def run_as(self, simulator: Simulator) -> Compiled:
+        """Run a simulator of the same equations, such as with other start values, by this model and engine."""
+        return Compiled(simulator, self.model, self.engine)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fitted(Compiled):
@@ -199,10 +203,8 @@ class Workbench:
         model = discretise(simulator, self.dt, self.hold, self._substeps(simulator))
         return model if gain is None else with_output_injection(model, gain)
 
-    def compile(self, simulator: Simulator, gain: np.ndarray | None = None, like: Compiled | None = None) -> Compiled:
-        """Discretise and compile a simulator, with output injection if a gain is given, or reuse a compiled model."""
-        if like is not None:
-            return Compiled(simulator, like.model, like.engine)
+    def compile(self, simulator: Simulator, gain: np.ndarray | None = None) -> Compiled:
+        """Discretise and compile a simulator, with output injection if a gain is given."""
         model = self.model(simulator, gain)
         return Compiled(simulator, model, make_engine(model, self.engine))
 
@@ -263,7 +265,7 @@ class Workbench:
         InputError
             If the simulation diverges from every start.
         """
-        one = self.compile(simulator, like=like)
+        one = self.compile(simulator) if like is None else like.run_as(simulator)
         estimated = any(r.begins == "estimate" for r in self.recordings)
         if not np.any(one.model.parameters.free) and not (estimated and one.model.n_state):
             given = self._run_as_given(one)
@@ -328,7 +330,7 @@ class Workbench:
 
         The cost of a diverging run is infinite. The compiled model of `like` is reused.
         """
-        return self._run_as_given(self.compile(self.simulator, like=like))
+        return self._run_as_given(self.compile(self.simulator) if like is None else like.run_as(self.simulator))
 
     def _run_as_given(self, one: Compiled) -> Fitted:
         parameters = one.model.parameters
