@@ -58,20 +58,20 @@ class RunsAway(InputError):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Compiled:
+class CompiledSimulator:
     """A simulator with its discretised model and the engine that runs it."""
 
     simulator: Simulator
     model: Model
     engine: Engine
 
-    def run_as(self, simulator: Simulator) -> Compiled:
+    def run_as(self, simulator: Simulator) -> CompiledSimulator:
         """Run a simulator of the same equations, such as with other start values, by this model and engine."""
-        return Compiled(simulator, self.model, self.engine)
+        return CompiledSimulator(simulator, self.model, self.engine)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fitted(Compiled):
+class Fitted(CompiledSimulator):
     """A simulator fitted to recordings."""
 
     values: dict[str, np.ndarray]  # parameters by name
@@ -203,10 +203,10 @@ class Workbench:
         model = discretise(simulator, self.dt, self.hold, self._substeps(simulator))
         return model if gain is None else with_output_injection(model, gain)
 
-    def compile(self, simulator: Simulator, gain: np.ndarray | None = None) -> Compiled:
+    def compile(self, simulator: Simulator, gain: np.ndarray | None = None) -> CompiledSimulator:
         """Discretise and compile a simulator, with output injection if a gain is given."""
         model = self.model(simulator, gain)
-        return Compiled(simulator, model, make_engine(model, self.engine))
+        return CompiledSimulator(simulator, model, make_engine(model, self.engine))
 
     def _substeps(self, simulator: Simulator) -> int:
         """Choose more sub-steps for a fast law, up to a limit: a stiff start of a law is not worth a fine grid."""
@@ -253,7 +253,7 @@ class Workbench:
         states: Sequence[np.ndarray] = (),
         anneal: Sequence[float] = (),
         solver: GaussNewton = QUICK,
-        like: Compiled | None = None,
+        like: CompiledSimulator | None = None,
     ) -> Fitted:
         """Fit from several starts (values by name), each through the sequence of injection gains `anneal`.
 
@@ -290,7 +290,7 @@ class Workbench:
         values.pop(INJECTION, None)
         return replace(self.result(one, values, problem.first_states(theta)), status=status)
 
-    def _describe_divergence(self, one: Compiled, start: Mapping[str, Any]) -> str:
+    def _describe_divergence(self, one: CompiledSimulator, start: Mapping[str, Any]) -> str:
         """Describe where a run from rest exceeds every bound."""
         vector = start_vector(one.model, start)
         for r in self.recordings:
@@ -325,14 +325,14 @@ class Workbench:
             "focus 'prediction' of a diagnosis."
         )
 
-    def run_given(self, like: Compiled | None = None) -> Fitted:
+    def run_given(self, like: CompiledSimulator | None = None) -> Fitted:
         """Run the simulator at the given values, with the states in which a fit begins.
 
         The cost of a diverging run is infinite. The compiled model of `like` is reused.
         """
         return self._run_as_given(self.compile(self.simulator) if like is None else like.run_as(self.simulator))
 
-    def _run_as_given(self, one: Compiled) -> Fitted:
+    def _run_as_given(self, one: CompiledSimulator) -> Fitted:
         parameters = one.model.parameters
         freed = parameters.change(**{name: {"fixed": False} for name in parameters})
         problem = self.problem(one.model.with_parameters(freed), one.engine)  # which needs variables
@@ -341,7 +341,7 @@ class Workbench:
 
     def _fit_from(
         self,
-        one: Compiled,
+        one: CompiledSimulator,
         start: Mapping[str, Any],
         guess: Sequence[np.ndarray],
         path: tuple[float, ...],
@@ -419,7 +419,7 @@ class Workbench:
         return out
 
     def by_cost(
-        self, one: Compiled, starts: Sequence[Mapping[str, Any]], states: Sequence[np.ndarray]
+        self, one: CompiledSimulator, starts: Sequence[Mapping[str, Any]], states: Sequence[np.ndarray]
     ) -> list[Mapping[str, Any]]:
         """Order starts by their error before a fit, from the same initial states."""
         initial = self.initial_states(one.model, start_vector(one.model, starts[0]), states)
@@ -468,7 +468,7 @@ class Workbench:
         initial = fitted.initial if initial is None else initial
         return self.result(fitted, values, initial)
 
-    def result(self, one: Compiled, values: dict[str, np.ndarray], initial: list[np.ndarray]) -> Fitted:
+    def result(self, one: CompiledSimulator, values: dict[str, np.ndarray], initial: list[np.ndarray]) -> Fitted:
         """Compute the residuals at given values and initial states."""
         model, engine = one.model, one.engine
         vector = model.parameters.pack(values)
@@ -515,7 +515,7 @@ def refit(
     *,
     states: Sequence[np.ndarray] = (),
     solver: GaussNewton = QUICK,
-    like: Compiled | None = None,
+    like: CompiledSimulator | None = None,
 ) -> Fitted | None:
     """Fit a simulator, by default the bench's; None if it diverges. The compiled model of `like` is reused."""
     try:
