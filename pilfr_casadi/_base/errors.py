@@ -72,7 +72,9 @@ def positive(value: Any, what: str, meaning: str = "a number", zero: bool = Fals
     The message names the argument `what` and asks for `meaning`.
     """
     if not is_number(value) or not np.isfinite(value) or value < 0 or (value == 0 and not zero):
-        raise InputError(f"{what}={value!r} was given; give {meaning}, {'zero or more' if zero else 'above zero'}.")
+        raise InputError(
+            f"{what}={repr(value)[:60]} was given; give {meaning}, {'zero or more' if zero else 'above zero'}."
+        )
     return float(value)
 
 
