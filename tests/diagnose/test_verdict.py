@@ -222,6 +222,15 @@ def test_an_offset_whose_error_is_unknown_stays_told():
         assert len(update_offsets([gate], fitted, {gate.parameter: np.array(error)}, True, True)) == told
 
 
+@pytest.mark.parametrize("laws", [(), (CoulombFriction,)])
+def test_nothing_is_missing_where_the_simulator_meets_the_recordings_exactly(laws):
+    """Recordings that were simulated with it leave an error of zero."""
+    u = 10 * multisine(200, f_max=3.0, fs=20.0, rng=np.random.default_rng(1))
+    blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
+    found = pilfr.diagnose(cart(), blank.with_(y=cart().simulate(blank)), laws=laws, workers=1)
+    assert found.verdict == "complete" and found.errors["train"]["after"] < 1e-12
+
+
 @pytest.fixture(scope="module")
 def dry_friction():
     """A recording of a cart with dry friction, without noise."""

@@ -30,7 +30,7 @@ from ...simulators import (
     needed_substeps,
     rate_at_start,
 )
-from .floor import DIVERGED as DIVERGED, pool
+from .floor import DIVERGED as DIVERGED, ROUNDING2, pool
 
 # Solvers: of the fits that results are based on; of other fits; of the first fit of a law, to rank the laws
 THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
@@ -476,6 +476,7 @@ class Workbench:
             runs = zip(self.recordings, initial, strict=True)
             residual = [engine.simulate(model.drive(r), vector, state)[0] - r.y for r, state in runs]
             squares = np.mean((np.concatenate(self.scored(residual)) / self.scale) ** 2, axis=0)
+            squares = np.maximum(squares, ROUNDING2)
             cost, balance = pool(squares, self.noise2)
         cost = cost if np.isfinite(cost) else np.inf
         return Fitted(one.simulator, model, engine, values, initial, residual, cost, squares, balance)
