@@ -29,7 +29,7 @@ from .faults.timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps
 from .fits.floor import Floor, pool, white_part
 from .fits.linearise import linearise_runs, observer_gain, sample_run
 from .fits.step_refinement import refine_steps
-from .fits.workbench import THOROUGH, Fitted, Workbench, refit
+from .fits.workbench import THOROUGH, Fitted, Workbench, refit, refit_with_other_holds
 from .proof import errors_of
 
 CHECKED_ABOVE = 4e-4  # mean square error up to which signs and units are not checked
@@ -39,6 +39,8 @@ UNCHECKED = (
     "Some checks of the recordings were left out, because time ran out or the run was interrupted: a shift, a gap or "
     "an offset of a channel may have been missed."
 )
+# holds compared before a search: a further one costs all checks again, and shows hardly while physics is missing
+PREPARED_HOLDS = ("zero", "linear")
 TIMED_SAMPLES = 50  # samples whose simulation is timed
 LONG_SIMULATION = 1.0  # seconds that a simulation takes without a note
 OBSERVER_GAINS = (1.0, 0.3, 0.1, 0.03, 0.01)  # gains of the observer, in turn
@@ -136,7 +138,7 @@ class _Checks:
 
     def begin_with_either_hold(self, bench: Workbench, gates: tuple[Gate, ...]) -> Checked:
         """Begin; with the other hold too if a channel is at fault, of which the wrong hold may choose the wrong one."""
-        other = bench.with_other_hold()
+        (other,) = bench.with_other_holds(PREPARED_HOLDS)
         try:
             first = self.begin(bench, gates)
         except InputError:
@@ -229,6 +231,8 @@ def _with_better_hold(
     """
     try:
         again = _with_other_hold(first.with_deadline(checks.refit_deadline()))
+        if again is None:
+            return now, held
         both = now, checks.run(again, 0.5)
     except InputError:
         return now, held
@@ -287,9 +291,8 @@ def choose_hold(first: Checked, solver: GaussNewton = THOROUGH) -> tuple[Checked
 
     It is kept without a note if a refit was cut short, which says nothing.
     """
-    try:
-        other = _with_other_hold(first, solver)
-    except InputError:
+    other = _with_other_hold(first, solver)
+    if other is None:
         return first, [hold_note(first.bench.simulator, first.bench.hold, np.inf)]
     if Status.TIME_LIMIT in (first.fitted.status, other.fitted.status):
         return first, ()
@@ -301,10 +304,11 @@ def choose_hold(first: Checked, solver: GaussNewton = THOROUGH) -> tuple[Checked
     return best, [hold_note(best.bench.simulator, best.bench.hold, ratio)]
 
 
-def _with_other_hold(first: Checked, solver: GaussNewton = THOROUGH) -> Checked:
-    """Repeat the first refit with the other hold, from its values and from the user's."""
-    bench = first.bench.with_other_hold()
-    return replace(first, bench=bench, fitted=bench.fit(bench.simulator, [first.fitted.values, {}], solver=solver))
+def _with_other_hold(first: Checked, solver: GaussNewton = THOROUGH) -> Checked | None:
+    """Repeat the first refit with the other hold, from its values and from the user's; None if it diverges."""
+    starts = [first.fitted.values, {}]
+    found = refit_with_other_holds(first.bench, starts, solver=solver, among=PREPARED_HOLDS)
+    return replace(first, bench=found[0][0], fitted=found[0][1]) if found else None
 
 
 def conversions(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Gate, ...]:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from ..._base import InputError, Interrupt, one_at_a_time
-from ...data import Recording, nrmse
+from ...data import HOLDS, Recording, nrmse
 from ...engine import Engine, make_engine
 from ...identify import solve_within_bounds
 from ...laws import Local
@@ -162,9 +162,11 @@ class Workbench:
         """Sampling interval, s."""
         return self.recordings[0].dt
 
-    def with_other_hold(self) -> Workbench:
-        """Return the bench with inputs interpolated between samples if they are held, else held."""
-        return self.with_hold("linear" if self.hold == "zero" else "zero")
+    def with_other_holds(self, among: Sequence[str | None] = HOLDS) -> list[Workbench]:
+        """Return the bench with each hold of the inputs next to its own in HOLDS: these are most like it."""
+        at = HOLDS.index(self.hold)
+        near = HOLDS[max(at - 1, 0) : at + 2]
+        return [self.with_hold(hold) for hold in near if hold in among and hold not in (None, self.hold)]
 
     def with_hold(self, hold: str) -> Workbench:
         """Return the bench with another hold of the inputs between samples."""
@@ -523,6 +525,30 @@ def refit(
         return bench.fit(simulator or bench.simulator, starts, states=states, solver=solver, like=like)
     except InputError:
         return None
+
+
+def refit_with_other_holds(
+    bench: Workbench,
+    starts: Sequence[Mapping[str, Any]],
+    simulator: Simulator | None = None,
+    *,
+    states: Sequence[np.ndarray] = (),
+    solver: GaussNewton = THOROUGH,
+    among: Sequence[str | None] = HOLDS,
+    may_go_on: Callable[[], bool] = lambda: True,
+) -> list[tuple[Workbench, Fitted]]:
+    """Refit with each other hold of the inputs; the smallest error is first, diverging ones are left out.
+
+    See `Workbench.with_other_holds`; no refit begins once `may_go_on` is false.
+    """
+    found = []
+    for held in bench.with_other_holds(among):
+        if not may_go_on():
+            break
+        fitted = refit(held, starts, simulator, states=states, solver=solver)
+        if fitted is not None:
+            found.append((held, fitted))
+    return sorted(found, key=lambda pair: pair[1].cost)
 
 
 def converge(bench: Workbench, fitted: Fitted, seconds: float) -> Fitted:
