@@ -39,6 +39,10 @@ UNCHECKED = (
     "Some checks of the recordings were left out, because time ran out or the run was interrupted: a shift, a gap or "
     "an offset of a channel may have been missed."
 )
+OTHER_HOLD_UNCHECKED = (
+    "Time ran out before the fault of a channel was also looked for with another hold of the inputs: another channel "
+    "may be at fault."
+)
 # holds compared before a search: a further one costs all checks again, and shows hardly while physics is missing
 PREPARED_HOLDS = ("zero", "linear")
 TIMED_SAMPLES = 50  # samples whose simulation is timed
@@ -101,7 +105,7 @@ def prepare(
     if not stated and faulty and not bench.interrupt.pressed:  # on faulty data the better hold says nothing
         now, held = _with_better_hold(checks, now, first, held)
     bench, without = now.bench, now.fitted
-    cut_short = checks.left_out or bench.interrupt.pressed
+    unchecked = dict.fromkeys([*checks.left_out, *([UNCHECKED] if bench.interrupt.pressed else [])])
     corrected = bool(now.gates or held)  # values and states from faulty data may be in a wrong minimum
     if corrected and not bench.interrupt.pressed:
         again = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
@@ -109,19 +113,19 @@ def prepare(
     bench.check_followed(without)
     bench = replace(bench, typical=sample_run(bench, without))
     say(CHECKS, CHECKED, CHECKED, without.cost**0.5)
-    unchecked = [Gate("recordings", "unchecked", None, UNCHECKED, corrected=False)] if cut_short else []
-    return Prepared(bench, without, nominal, (*now.gates, *held, *unchecked), Checked(bench, without).floor)
+    notes = [Gate("recordings", "unchecked", None, sentence, corrected=False) for sentence in unchecked]
+    return Prepared(bench, without, nominal, (*now.gates, *held, *notes), Checked(bench, without).floor)
 
 
 @dataclass(frozen=True)
 class _Checks:
-    """The checks of recordings in their order; `left_out` receives the first of each run that was not begun."""
+    """The checks of recordings in their order; `left_out` receives what to say about those that were not begun."""
 
     workers: int
     correct_early: bool
     say: Stages
     until: float
-    left_out: list[Callable[[Checked], Checked]] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
 
     def refit_deadline(self) -> float:
         """Return when a refit that begins now ends: with the checks, but in LEAST_REFIT seconds at the earliest."""
@@ -143,8 +147,10 @@ class _Checks:
             first = self.begin(bench, gates)
         except InputError:
             return self.begin(other, gates)
-        late = time.perf_counter() > self.until
-        if len(first.gates) == len(gates) or bench.interrupt.pressed or late:
+        if len(first.gates) == len(gates) or bench.interrupt.pressed:
+            return first
+        if time.perf_counter() > self.until:
+            self.left_out.append(OTHER_HOLD_UNCHECKED)
             return first
         with suppress(InputError):
             first = min(first, self.begin(other, gates), key=lambda checked: checked.cost)
@@ -186,7 +192,7 @@ class _Checks:
         """Carry out checks one after the other, until an interrupt comes, or the time is over, unless `in_any_case`."""
         for check in checks:
             if now.bench.interrupt.pressed or not (in_any_case or time.perf_counter() < self.until):
-                self.left_out.append(check)
+                self.left_out.append(UNCHECKED)
                 break
             with UntilInterrupted(now.bench.interrupt, self.say.interrupted):
                 before, now = now, check(now)
