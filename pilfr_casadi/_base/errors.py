@@ -36,7 +36,9 @@ def in_words(names: Sequence[str]) -> str:
 
 
 def percent(share: float) -> str:
-    """Write a share, "12.3 %"; a large one without an exponent."""
+    """Write a share or a relative error, "12.3 %"; a large one without an exponent, an infinite one in words."""
+    if not np.isfinite(share):
+        return "infinite (the simulation diverges)"
     return f"{100 * share:.0f} %" if 10 <= share < 1e4 else f"{100 * share:.3g} %"
 
 
@@ -70,7 +72,9 @@ def positive(value: Any, what: str, meaning: str = "a number", zero: bool = Fals
     The message names the argument `what` and asks for `meaning`.
     """
     if not is_number(value) or not np.isfinite(value) or value < 0 or (value == 0 and not zero):
-        raise InputError(f"{what}={value!r} was given; give {meaning}, {'zero or more' if zero else 'above zero'}.")
+        raise InputError(
+            f"{what}={repr(value)[:60]} was given; give {meaning}, {'zero or more' if zero else 'above zero'}."
+        )
     return float(value)
 
 

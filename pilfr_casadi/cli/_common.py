@@ -438,26 +438,26 @@ def check_new(target: Path, overwrite: bool) -> None:
 
 
 @contextlib.contextmanager
-def reserved_file(folder: str, name: str, overwrite: bool) -> Iterator[Path]:
+def reserved_file(path: Path, overwrite: bool) -> Iterator[Path]:
     """Make the folder of a result and reserve the file there, so that no other run writes it; yield its path.
 
     The work is not lost if another run has written the file since it was checked: another folder inside then takes the
     result. Without a result, no file is left.
     """
-    target = make_folder(folder) / name
+    target = make_folder(str(path.parent)) / path.name
     for count in itertools.count(2):
         try:
             if not overwrite:
                 target.touch(exist_ok=False)
             break
         except FileExistsError:
-            target = make_folder(str(Path(folder) / f"run-{count}")) / name
-    if target.parent != Path(folder):
-        print_line(f"note: another run has written {Path(folder) / name} meanwhile; this result is in {target.parent}")
+            target = make_folder(str(path.parent / f"run-{count}")) / path.name
+    if target.parent != path.parent:
+        print_line(f"note: another run has written {path} meanwhile; this result is in {target.parent}")
     try:
         yield target
     finally:
-        if target.exists() and not target.stat().st_size:
+        if target.is_file() and not target.stat().st_size:
             target.unlink()
 
 

@@ -157,7 +157,7 @@ def diagnose_command(options: DiagnoseOptions) -> int:
             )
     except KeyboardInterrupt:
         return say("Interrupted before there was a diagnosis; nothing was written.", INTERRUPTED)
-    with reserved_file(options.out, "diagnosis.json", options.overwrite) as target:
+    with reserved_file(Path(options.out) / "diagnosis.json", options.overwrite) as target:
         return write_diagnosis(diagnosis, target, source)
 
 
@@ -342,7 +342,7 @@ def check_command(options: CheckOptions) -> int:
     found = check(as_simulator(given, train), train, hold=options.hold, laws=laws)
     print(name_options(str(found)))
     if options.out is not None:
-        with reserved_file(options.out, "check.json", options.overwrite) as target:
+        with reserved_file(Path(options.out) / "check.json", options.overwrite) as target:
             write_atomically(target, json_text(found.to_dict()))
         print(f"check: {target}")
     return DONE

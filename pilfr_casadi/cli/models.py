@@ -38,7 +38,7 @@ from ..data import (
     written_times,
 )
 from ..engine import VirtualMachine, compiler, make_engine
-from ..export import NAMES, exported
+from ..export import NAMES, Exported, exported
 from ..identify import Fit, check_recordings, fit, load, run_simulator
 from ..linear import select_order
 from ..models import ALL_OPTIONS, PILFR, STRUCTURE_OPTIONS, Lagged, named_structure
@@ -142,7 +142,7 @@ def fit_command(options: FitOptions) -> int:
         raise
     if result.status is Status.INTERRUPTED and clock.expired:
         result = replace(result, solution=replace(result.solution, status=Status.TIME_LIMIT))
-    with reserved_file(options.out, "model.json", options.overwrite) as target:
+    with reserved_file(Path(options.out) / "model.json", options.overwrite) as target:
         try:
             _write(result, task, train, tests, target)
         except KeyboardInterrupt:
@@ -347,7 +347,7 @@ def _write_simulated(options: SimulateOptions, run: _Simulated) -> int:
     recording = run.recording
     if not np.all(np.isfinite(run.y)):
         return say(f"The simulation of {options.model} diverges on {options.data}; nothing was written.", NO_RESULT)
-    _write_out(options, _recording_table(options, run))
+    path = _write_out(options, _recording_table(options, run))
     if recording.n_y:
         _print_error(recording, run.y, run.scored_from)
     else:
@@ -355,7 +355,7 @@ def _write_simulated(options: SimulateOptions, run: _Simulated) -> int:
         print(f"{options.data} has no outputs ({listed(run.outputs)}) to compare with; initial state: {state}")
         if options.initial is None:
             print("  If the machine begins elsewhere, give each state's value with --initial.")
-    print(f"simulated outputs: {options.out}")
+    print(f"simulated outputs: {path}")
     return DONE
 
 
@@ -366,13 +366,21 @@ def _check_out(options: SimulateOptions) -> None:
             raise InputError(f"--out {options.out} would overwrite the {what}; give another file.")
     if out.suffix.lower() in (".mat", *STACK_SUFFIXES) and Path(options.data).suffix.lower() not in STACK_SUFFIXES:
         raise InputError(f"--out {options.out} is written as CSV; give a name that ends in .csv.")
+    _check_writable(out)
     check_new(out, options.overwrite)
 
 
-def _write_out(options: SimulateOptions, content: str | bytes) -> None:
-    """Write the file, unless another run has written it meanwhile."""
-    check_new(Path(options.out), options.overwrite)
-    write_atomically(Path(options.out), content)
+def _check_writable(out: Path) -> None:
+    """Refuse a file that cannot be written, before any long work."""
+    if out.is_dir() or not out.parent.is_dir() or not os.access(out.parent, os.W_OK):
+        raise InputError(f"--out {out} cannot be written; give a file in a folder that exists.")
+
+
+def _write_out(options: SimulateOptions, content: str | bytes) -> Path:
+    """Write the simulated outputs; return the path of the file."""
+    with reserved_file(Path(options.out), options.overwrite) as target:
+        write_atomically(target, content)
+    return target
 
 
 def _columns_to_read(
@@ -436,10 +444,10 @@ def _simulate_stack(options: SimulateOptions, fitted: Fit, u: np.ndarray, y: np.
             return say(f"The simulation of {options.model} diverges on {name}; nothing was written.", NO_RESULT)
         if y is not None:
             errors += _print_error(record, found[at], fitted.scored_from)
-    _write_out(options, _stack_content(Path(options.out), u, found, options.dt, fitted))
+    path = _write_out(options, _stack_content(Path(options.out), u, found, options.dt, fitted))
     if errors:
         print(f"NRMSE, mean over {len(errors)} records: {np.mean(errors):.4f}")
-    print(f"simulated outputs: {options.out}")
+    print(f"simulated outputs: {path}")
     return DONE
 
 
@@ -523,24 +531,27 @@ def export_command(options: ExportOptions) -> int:
     step = exported(source, dt=options.dt, hold=options.hold, start=start, **more)
     if options.initial is None and step.states:
         print("note: the exported model begins with every state at zero; give other values with --initial.")
-    if options.c:
-        code, header = step.to_c(options.out)
-        print(f"C source: {code}\nheader: {header}")
-        return DONE
-    if options.fmu:
-        print(f"FMU: {step.to_fmu(options.out, options.fmi or '2.0')}")
-        return DONE
-    step.serialize(options.out)
-    print(f"casadi function: {options.out}\nnames of its signals: {options.files[-1]}")
+    with reserved_file(options.files[0], options.overwrite) as target:
+        _write_exported(step, options, target)
     return DONE
+
+
+def _write_exported(step: Exported, options: ExportOptions, target: Path) -> None:
+    """Write the files of an export, of which `target` is the first, and print where they are."""
+    if options.c:
+        code, header = step.to_c(target.parent)
+        print(f"C source: {code}\nheader: {header}")
+    elif options.fmu:
+        print(f"FMU: {step.to_fmu(target, options.fmi or '2.0')}")
+    else:
+        step.serialize(target)
+        print(f"casadi function: {target}\nnames of its signals: {target}{NAMES}")
 
 
 def _check_files(options: ExportOptions) -> None:
     """Refuse files that cannot be written, the model itself and, without `--overwrite`, existing files."""
-    out = Path(options.out)
-    to_file = not (options.c or options.fmu)
-    if to_file and (out.is_dir() or not out.parent.is_dir() or not os.access(out.parent, os.W_OK)):
-        raise InputError(f"--out {options.out} cannot be written; give a file in a folder that exists.")
+    if not options.c:
+        _check_writable(Path(options.out))
     for path in options.files:
         if os.path.realpath(options.model) == os.path.realpath(path):
             raise InputError(f"--out {options.out} would overwrite the model; give another file.")

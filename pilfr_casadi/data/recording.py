@@ -21,7 +21,7 @@ from .units import conversion
 
 SAME_STEP = 1e-4  # relative difference up to which two steps count as the same; written times have few digits
 LONGEST_STEP = 1e30  # s, and its inverse the shortest one: rates are squared, and no experiment is outside
-HOLDS = ("zero", "linear", "band-limited", None)
+HOLDS = ("zero", "linear", "band-limited", None)  # from the roughest to the smoothest; None is not known
 HOLD_WORDS = {"zero": "held", "linear": "interpolated", "band-limited": "band-limited"}  # in sentences
 INITIALS = ("zero", "estimate", "periodic")
 

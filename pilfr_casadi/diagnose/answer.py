@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, in_words, percent
+from .._base import InputError, in_words
 from ..data import Recording
 from ..identify import surrogate_warning
 from ..laws import Law, display_name, readable_unit, short_name
@@ -20,11 +20,11 @@ from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction
 from .detectability import port_units
 from .effect import Effect
-from .excitation import ranges_left, share_at_new_frequencies
+from .extrapolation import range_note
 from .faults.channels import IN_RECORDINGS, find_gross_channel_errors
 from .faults.gates import EQUAL_RATIO, TEST_FAULT, Gate, edited, value_with_unit
 from .faults.offsets import Offset, refit_without_offsets, remove_idle_offsets, update_offsets
-from .fits.evidence import BETTER_RATIO, FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, SURE, all_sure, standard_errors
+from .fits.evidence import BETTER_RATIO, FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, all_sure, standard_errors
 from .fits.floor import Floor
 from .fits.force_recovery import is_curve_along
 from .fits.workbench import Fitted, Workbench
@@ -167,7 +167,7 @@ def _compute_errors(
         if not list(_edit_notes(compared)) and on_tests["after"] > FAR_RATIO * bench.nrmse(after):
             notes = (*_test_faults(bench, after, tests, found.gates), *notes)
         if on_tests["after"] > NEAR_RATIO * bench.nrmse(after) and all(g.finding != TEST_FAULT for g in notes):
-            notes = (*notes, *_range_note(bench, edited(tests, found.gates)))
+            notes = (*notes, *range_note(bench, edited(tests, found.gates)))
         notes = (*notes, *_offset_note(without, request.simulator, on_tests)) if plain else notes
         fewer = {e: on_tests[f"without {i}"] for i, e in enumerate(each)}
         errors["test"] = {name: on_tests[name] for name in ("nominal", "before", "after")}
@@ -195,25 +195,6 @@ def _test_faults(bench: Workbench, after: Fitted, tests: Sequence[Recording], ga
         words = ", or ".join(g.sentence.removeprefix(IN_RECORDINGS) for g in equal)
         advice = "It does not tell which: check both." if len(equal) > 1 else "Correct that."
         yield Gate(faults[0].channel, TEST_FAULT, faults[0].value, f"{place}{words}. {advice}", False)
-
-
-def _range_note(bench: Workbench, tests: Sequence[Recording]) -> Iterator[Gate]:
-    """Note the channels of the test recordings with values or frequencies that the training recordings do not have."""
-    simulator, trained, words = bench.simulator, bench.recordings, list[str]()
-    units, names = {**simulator.units, **trained[0].units}, (*simulator.inputs, *simulator.output_names)
-    both = (np.concatenate([np.hstack([r.u, r.y])[r.skip :] for r in each]) for each in (trained, tests))
-    for i, value, limit in ranges_left(*both):
-        reached, known = (value_with_unit(v, units.get(names[i], "")) for v in (value, limit))
-        words.append(f"{names[i]} reaches {reached} ({known} in training)")
-    for i, name in enumerate(simulator.inputs):
-        before, now = ([r.u[r.skip :, i] for r in each] for each in (trained, tests))
-        share = share_at_new_frequencies(before, now, bench.dt)
-        if share > SURE:
-            words.append(f"{percent(share)} of {name} is at frequencies that it hardly has in training")
-    if words:
-        advice = "There the corrected simulator extrapolates; train it on recordings like these, too."
-        sentence = f"The test recordings go beyond the training recordings: {in_words(words)}. {advice}"
-        yield Gate("recordings", "test range", None, sentence, False)
 
 
 def _offset_note(without: Fitted, given: Simulator, errors: Mapping[str, float]) -> Iterator[Gate]:

@@ -96,9 +96,12 @@ def match_recordings(
 def match_tests(
     simulator: Simulator, test: Recording | Sequence[Recording] | None, train: Sequence[Recording]
 ) -> tuple[Recording, ...]:
-    """Return the test recordings with the simulator's channels; refuse training data and other steps."""
+    """Return the test recordings with the simulator's channels; refuse training data, other steps and no outputs."""
     tests = tuple(simulator.matched(r) for r in as_recordings(test)) if test is not None else ()
     for t in tests:
+        if not t.n_y:
+            label = t.label.removeprefix("the ")
+            raise InputError(f"The test {label} has no outputs to compare with; name the measured columns.")
         for r in train:
             if (shared := _shared_samples(r, t)) == len(t):
                 raise InputError(

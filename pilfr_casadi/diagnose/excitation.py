@@ -1,4 +1,4 @@
-"""Describe what moves a machine in recordings: reversals, amplitudes and rests at ports, ranges and frequencies."""
+"""Describe what moves a machine in recordings: reversals, amplitudes and rests at ports, and a single frequency."""
 
 from __future__ import annotations
 
@@ -12,11 +12,7 @@ from .fits.linearise import Probe, Run
 from .fits.workbench import Workbench
 
 SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
-
-ROUNDED = 1e-6  # change of a channel, over its size, that counts as none
 LEAST_SAMPLES = 10  # of a signal of which a single frequency is told
-LONGEST_SEGMENT = 512  # samples from which a spectral density is computed
-NEW_DENSITY = SMALL_SHARE**2  # of a normalised trained spectral density over another, below which frequencies are new
 
 
 @dataclass(frozen=True)
@@ -70,39 +66,6 @@ def single_frequency(runs: Sequence[np.ndarray], dt: float) -> float:
     found = [_sine(u, dt) for u in runs if np.ptp(u) > 0 and len(u) >= LEAST_SAMPLES]
     alike = bool(found) and max(f for f, _ in found) - min(f for f, _ in found) <= SMALL_SHARE * found[0][0]
     return found[0][0] if alike and max(left for _, left in found) <= SMALL_SHARE else 0.0
-
-
-def ranges_left(trained: np.ndarray, tested: np.ndarray) -> list[tuple[int, float, float]]:
-    """Find channels that leave their trained range by more than a tenth: number, farthest value, limit of the range.
-
-    Both signals have one column for each channel.
-    """
-    found = []
-    for i, (known, signal) in enumerate(zip(trained.T, tested.T, strict=True)):
-        low, high, least, most = (float(f(x)) for x in (known, signal) for f in (np.min, np.max))
-        value, limit = (most, high) if most - high > low - least else (least, low)
-        beyond = max(most - high, low - least)
-        if beyond > max(SMALL_SHARE * (high - low), ROUNDED * max(abs(low), abs(high))):
-            found.append((i, value, limit))
-    return found
-
-
-def share_at_new_frequencies(trained: Sequence[np.ndarray], tested: Sequence[np.ndarray], dt: float) -> float:
-    """Compute the share of a signal's variance at frequencies that have 100 times less of the trained one's variance.
-
-    Each signal has one array (M,) for each recording.
-    """
-    from scipy.signal import welch
-
-    if all(np.ptp(u) <= ROUNDED * np.max(np.abs(u)) for u in tested):
-        return 0.0
-    length = min(LONGEST_SEGMENT, *map(len, trained), *map(len, tested))
-    known, now = (
-        np.average([welch(u, 1 / dt, nperseg=length)[1] for u in signals], axis=0, weights=[len(u) for u in signals])
-        for signals in (trained, tested)
-    )
-    known, now = (density / max(np.sum(density), 1e-300) for density in (known, now))
-    return float(np.sum(now[known < NEW_DENSITY * now]))
 
 
 def _sine(u: np.ndarray, dt: float) -> tuple[float, float]:

@@ -29,7 +29,7 @@ from .faults.timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps
 from .fits.floor import Floor, pool, white_part
 from .fits.linearise import linearise_runs, observer_gain, sample_run
 from .fits.step_refinement import refine_steps
-from .fits.workbench import THOROUGH, Fitted, Workbench, refit
+from .fits.workbench import THOROUGH, Fitted, Workbench, refit, refit_with_other_holds
 from .proof import errors_of
 
 CHECKED_ABOVE = 4e-4  # mean square error up to which signs and units are not checked
@@ -39,6 +39,12 @@ UNCHECKED = (
     "Some checks of the recordings were left out, because time ran out or the run was interrupted: a shift, a gap or "
     "an offset of a channel may have been missed."
 )
+OTHER_HOLD_UNCHECKED = (
+    "Time ran out before the fault of a channel was also looked for with another hold of the inputs: another channel "
+    "may be at fault."
+)
+# holds compared before a search: a further one costs all checks again, and shows hardly while physics is missing
+PREPARED_HOLDS = ("zero", "linear")
 TIMED_SAMPLES = 50  # samples whose simulation is timed
 LONG_SIMULATION = 1.0  # seconds that a simulation takes without a note
 OBSERVER_GAINS = (1.0, 0.3, 0.1, 0.03, 0.01)  # gains of the observer, in turn
@@ -99,7 +105,7 @@ def prepare(
     if not stated and faulty and not bench.interrupt.pressed:  # on faulty data the better hold says nothing
         now, held = _with_better_hold(checks, now, first, held)
     bench, without = now.bench, now.fitted
-    cut_short = checks.left_out or bench.interrupt.pressed
+    unchecked = dict.fromkeys([*checks.left_out, *([UNCHECKED] if bench.interrupt.pressed else [])])
     corrected = bool(now.gates or held)  # values and states from faulty data may be in a wrong minimum
     if corrected and not bench.interrupt.pressed:
         again = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
@@ -107,19 +113,19 @@ def prepare(
     bench.check_followed(without)
     bench = replace(bench, typical=sample_run(bench, without))
     say(CHECKS, CHECKED, CHECKED, without.cost**0.5)
-    unchecked = [Gate("recordings", "unchecked", None, UNCHECKED, corrected=False)] if cut_short else []
-    return Prepared(bench, without, nominal, (*now.gates, *held, *unchecked), Checked(bench, without).floor)
+    notes = [Gate("recordings", "unchecked", None, sentence, corrected=False) for sentence in unchecked]
+    return Prepared(bench, without, nominal, (*now.gates, *held, *notes), Checked(bench, without).floor)
 
 
 @dataclass(frozen=True)
 class _Checks:
-    """The checks of recordings in their order; `left_out` receives the first of each run that was not begun."""
+    """The checks of recordings in their order; `left_out` receives what to say about those that were not begun."""
 
     workers: int
     correct_early: bool
     say: Stages
     until: float
-    left_out: list[Callable[[Checked], Checked]] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
 
     def refit_deadline(self) -> float:
         """Return when a refit that begins now ends: with the checks, but in LEAST_REFIT seconds at the earliest."""
@@ -136,13 +142,15 @@ class _Checks:
 
     def begin_with_either_hold(self, bench: Workbench, gates: tuple[Gate, ...]) -> Checked:
         """Begin; with the other hold too if a channel is at fault, of which the wrong hold may choose the wrong one."""
-        other = bench.with_other_hold()
+        (other,) = bench.with_other_holds(PREPARED_HOLDS)
         try:
             first = self.begin(bench, gates)
         except InputError:
             return self.begin(other, gates)
-        late = time.perf_counter() > self.until
-        if len(first.gates) == len(gates) or bench.interrupt.pressed or late:
+        if len(first.gates) == len(gates) or bench.interrupt.pressed:
+            return first
+        if time.perf_counter() > self.until:
+            self.left_out.append(OTHER_HOLD_UNCHECKED)
             return first
         with suppress(InputError):
             first = min(first, self.begin(other, gates), key=lambda checked: checked.cost)
@@ -184,7 +192,7 @@ class _Checks:
         """Carry out checks one after the other, until an interrupt comes, or the time is over, unless `in_any_case`."""
         for check in checks:
             if now.bench.interrupt.pressed or not (in_any_case or time.perf_counter() < self.until):
-                self.left_out.append(check)
+                self.left_out.append(UNCHECKED)
                 break
             with UntilInterrupted(now.bench.interrupt, self.say.interrupted):
                 before, now = now, check(now)
@@ -229,6 +237,8 @@ def _with_better_hold(
     """
     try:
         again = _with_other_hold(first.with_deadline(checks.refit_deadline()))
+        if again is None:
+            return now, held
         both = now, checks.run(again, 0.5)
     except InputError:
         return now, held
@@ -287,9 +297,8 @@ def choose_hold(first: Checked, solver: GaussNewton = THOROUGH) -> tuple[Checked
 
     It is kept without a note if a refit was cut short, which says nothing.
     """
-    try:
-        other = _with_other_hold(first, solver)
-    except InputError:
+    other = _with_other_hold(first, solver)
+    if other is None:
         return first, [hold_note(first.bench.simulator, first.bench.hold, np.inf)]
     if Status.TIME_LIMIT in (first.fitted.status, other.fitted.status):
         return first, ()
@@ -301,10 +310,11 @@ def choose_hold(first: Checked, solver: GaussNewton = THOROUGH) -> tuple[Checked
     return best, [hold_note(best.bench.simulator, best.bench.hold, ratio)]
 
 
-def _with_other_hold(first: Checked, solver: GaussNewton = THOROUGH) -> Checked:
-    """Repeat the first refit with the other hold, from its values and from the user's."""
-    bench = first.bench.with_other_hold()
-    return replace(first, bench=bench, fitted=bench.fit(bench.simulator, [first.fitted.values, {}], solver=solver))
+def _with_other_hold(first: Checked, solver: GaussNewton = THOROUGH) -> Checked | None:
+    """Repeat the first refit with the other hold, from its values and from the user's; None if it diverges."""
+    starts = [first.fitted.values, {}]
+    found = refit_with_other_holds(first.bench, starts, solver=solver, among=PREPARED_HOLDS)
+    return replace(first, bench=found[0][0], fitted=found[0][1]) if found else None
 
 
 def conversions(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Gate, ...]:

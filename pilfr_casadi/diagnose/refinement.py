@@ -38,7 +38,7 @@ from ..simulators import Simulator, discretise, in_series, on_grid
 from .fits.evidence import EffectiveSamples, HeldOut, held_out_errors, spread
 from .fits.floor import effective_size
 from .fits.force_recovery import signals_along
-from .fits.workbench import THOROUGH, Compiled, Fitted, Workbench
+from .fits.workbench import THOROUGH, CompiledSimulator, Fitted, Workbench
 from .search.moves import Search
 
 FINE_THRESHOLDS = 40  # thresholds of each of the two fine grids that estimate the density of weights
@@ -255,7 +255,7 @@ def _fit_layer(bench: Workbench, after: Fitted, number: int, kind: type[Law]) ->
     placed = _replace_law(after.simulator, number, kind().at(starts[0], kind().bounds(local)))
     element = placed.elements[number]
     model = discretise(placed, bench.dt, bench.hold, after.model.substeps)
-    layered = Compiled(placed, model, make_engine(model, bench.engine))
+    layered = CompiledSimulator(placed, model, make_engine(model, bench.engine))
     first, h = np.cumsum([0, *local.lengths])[:-1], bench.dt / after.model.substeps
     states = [_initial_state(after, s, number, element.law, z[k], h) for s, k in zip(after.initial, first, strict=True)]
     own = [{**after.values, **element.named(start)} for start in starts]

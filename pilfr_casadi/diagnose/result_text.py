@@ -144,7 +144,7 @@ class ResultText:
             return text + untested if self._changed else text
         if self.test_fault:
             return f"{text} {self.test_fault} Until then the test error says nothing of this answer."
-        given, before, after = (_percent(errors[k]) for k in ("nominal", "before", "after"))
+        given, before, after = (percent(errors[k]) for k in ("nominal", "before", "after"))
         if self.outcome == "same":
             text += f" On the test recordings it makes no difference: {before} before, {after} after."
             text += " A constant would follow them better." if errors["after"] > 1 else ""
@@ -165,7 +165,7 @@ class ResultText:
         errors = self.errors.get("test")
         if not errors or self.test_fault or np.isnan(effect.test_without):
             return ""
-        with_it, without = _percent(errors["after"]), _percent(effect.test_without)
+        with_it, without = percent(errors["after"]), percent(effect.test_without)
         return f"error on the test recordings: {with_it} with it, {without} without it (the rest refitted)"
 
     def _idle_on_tests(self) -> str:
@@ -187,7 +187,7 @@ class ResultText:
         least = min(known, key=lambda e: e.test_without, default=None)
         if least is None or not BETTER_RATIO * least.test_without < errors["before"]:
             return ""
-        return f" Without {least.name} it is {_percent(least.test_without)}."
+        return f" Without {least.name} it is {percent(least.test_without)}."
 
     def warnings(self) -> list[str]:
         """List the reasons for doubt: an interrupt, parameters at their bounds, errors that stay large."""
@@ -363,10 +363,6 @@ def _error_text(nrmse: float) -> str:
 def _white(noise: Mapping[str, float]) -> float:
     """Return the white part of a noise floor, or all of it where it is not known apart."""
     return noise.get("white", noise["nrmse"])
-
-
-def _percent(value: float) -> str:
-    return f"{100 * value:.3g} %" if np.isfinite(value) else "infinite (the simulation diverges)"
 
 
 def _relative_change(row: Mapping[str, Any]) -> float:

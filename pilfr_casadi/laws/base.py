@@ -484,3 +484,16 @@ def contact_onset(z: Any, g: Any) -> Any:
 def beyond_gap(z: Any, dz: Any, g: Any) -> tuple[Any, Any]:
     """Travel beyond a gap g on both sides, and its rate."""
     return z - ca.fmin(ca.fmax(z, -g), g), contact_onset(z, g) * dz
+
+
+def continue_along_tangents(
+    x: Any, low: float, high: float, values_and_slopes: Callable[[Any], tuple[list[Any], list[Any]]]
+) -> list[Any]:
+    """Evaluate functions at x; below `low` and above `high` they go on along their tangents at these ends.
+
+    `values_and_slopes` evaluates them inside the range; the slopes matter at its ends alone.
+    """
+    number = isinstance(x, (float, np.ndarray))
+    inside = np.clip(x, low, high) if number else ca.fmin(ca.fmax(x, low), high)
+    values, slopes = values_and_slopes(inside)
+    return [value + (x - inside) * slope for value, slope in zip(values, slopes, strict=True)]

@@ -11,12 +11,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-import casadi as ca
 import numpy as np
 
 from .._base import InputError
 from ..models import Named, Parameter
-from .base import Law, Local, beyond_gap
+from .base import Law, Local, beyond_gap, continue_along_tangents
 
 GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
 RATIOS, MOST_RATIO = (0.3, 3.0), 100.0  # tried ratios of an exponential profile, and the largest
@@ -41,23 +40,22 @@ class Profile:
 
 
 @functools.cache
-def _lagrange(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the polynomials that are one at one of `count` equidistant nodes and zero at the others, with slopes."""
+def _lagrange(count: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return the polynomials that are one at one of `count` equidistant nodes and zero at the others, and slopes."""
     nodes = np.linspace(0, 1, count)
     others = (np.poly(np.delete(nodes, i)) for i in range(count))
     basis = [c / np.polyval(c, at) for c, at in zip(others, nodes, strict=True)]
-    return [(c, np.polyder(c)) for c in basis]
+    return basis, [np.polyder(c) for c in basis]
 
 
 def _interpolation_weights(share: Any, count: int) -> list[Any]:
     """Weigh values at `count` equidistant nodes by the polynomial through them; outside along its tangents."""
-    number = isinstance(share, (float, np.ndarray))
-    inside = np.clip(share, 0, 1) if number else ca.fmin(ca.fmax(share, 0), 1)
 
-    def at(coefficients: np.ndarray) -> Any:
-        return functools.reduce(lambda total, c: total * inside + c, coefficients.tolist())
+    def evaluate(polynomials: list[np.ndarray], at: Any) -> list[Any]:
+        return [functools.reduce(lambda total, c: total * at + c, p.tolist()) for p in polynomials]
 
-    return [at(value) + (share - inside) * at(slope) for value, slope in _lagrange(count)]
+    basis, slopes = _lagrange(count)
+    return continue_along_tangents(share, 0.0, 1.0, lambda at: (evaluate(basis, at), evaluate(slopes, at)))
 
 
 PROFILES = {

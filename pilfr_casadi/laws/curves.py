@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from ..models import Parameter
-from .base import Law, Local, size_to_power
+from .base import Law, Local, continue_along_tangents, size_to_power
 
 LINEAR_POWER = 0.03  # difference of a power from one, below which it is a gain
 NARROW_RANGE = 0.05  # half the range over its middle, below which any curve is a gain and an offset
@@ -209,11 +209,14 @@ class FreeCurve(Law):
     degrees = tuple(range(2, 10))  # an offset and a slope are parameters of the simulator; nine follow a narrow knee
 
     def force(self, z: Any, p: Any) -> Any:
-        x, x_0 = (z - p.z_m) / p.z_h, -p.z_m / p.z_h
-        inside = ca.fmax(ca.fmin(x, 1.0), -1.0)
-        terms, at_zero = (chebyshev(at, max(self.degrees)) for at in (inside, x_0))
-        slopes = [i**2 * (inside if i % 2 == 0 else 1.0) for i in self.degrees]  # at the ends of the range
-        return sum(p.c[k] * (terms[i] + slopes[k] * (x - inside) - at_zero[i]) for k, i in enumerate(self.degrees))
+        def terms(x: Any) -> tuple[list[Any], list[Any]]:
+            polynomials = chebyshev(x, max(self.degrees))
+            slopes_at_ends = [i**2 * (x if i % 2 == 0 else 1.0) for i in self.degrees]
+            return [polynomials[i] for i in self.degrees], slopes_at_ends
+
+        at_z = continue_along_tangents((z - p.z_m) / p.z_h, -1.0, 1.0, terms)
+        at_zero, _ = terms(-p.z_m / p.z_h)
+        return sum(p.c[k] * (at_z[k] - at_zero[k]) for k in range(len(self.degrees)))
 
     def parameters(self) -> dict[str, Parameter]:
         """Coefficients, one for each degree, and the middle and half of the range."""

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from .. import identify, laws, simulators
-from .._base import to_json, with_nan
+from .._base import percent, to_json, with_nan
 from ..diagnose import ERROR_NAMES, Diagnosis, Effect, Fitted, Workbench, law_signals, learned_force
 from ..identify import RUN_AWAY
 from ..laws import VaryingParameter, display_name, heated, readable_unit, scaled, scheduled, short_name, varying
 from ..models import Parameter, ParameterSet
 from ..simulators import MECHANICAL, PARAMETER, UNKNOWN, CoSimulation, kind_of, name_at, name_at_any
-from .page import Bar, Block, Code, Table, Text, number_text, render, uncertain_text
+from .page import Bar, Block, Code, Table, Text, number_text, render, typeset_numbers, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
 CLEAR = 0.9  # confidence below which the report says what may lower it
@@ -25,13 +25,11 @@ OPPOSING_MOTION = ("friction", "damping", "drag")  # ends of the names of laws t
 OPEN_ROWS = 12  # candidates in the open table; a folded table holds the others
 
 
-def percent(value: float | None) -> str:
-    """Write a relative error as a percentage, or a dash if it was not computed."""
+def percent_text(value: float | None) -> str:
+    """Write a relative error for a table: a dash if it was not computed, a word if the simulation runs away."""
     if value is None:
         return "\u2014"
-    if not value < RUN_AWAY:
-        return "diverges"
-    return f"{number_text(100 * value, 3)}\u00a0%"
+    return typeset_numbers(percent(value)).replace(" ", "\u00a0") if value < RUN_AWAY else "diverges"
 
 
 def correction_words(diagnosis: Diagnosis) -> str:
@@ -107,7 +105,7 @@ def answer(diagnosis: Diagnosis, forces: Sequence[str]) -> str:
     }
     words = "; ".join(named) or other.get(d.verdict, nameless)
     steps = {"nominal": "as given", "before": "refitted"} | ({"after": "corrected"} if correction_words(d) else {})
-    gain = ", ".join(f"{percent(errors.get(k))} {name}" for k, name in steps.items())
+    gain = ", ".join(f"{percent_text(errors.get(k))} {name}" for k, name in steps.items())
     worse = ", which is worse" if d.outcome == "worse" else ""
     data = "unseen data" if role == "test" else "the training data"
     return f"{words[0].upper()}{words[1:]}; error on {data} {gain}{worse}"
@@ -122,20 +120,20 @@ def headline(diagnosis: Diagnosis) -> str:
     if diagnosis.nameless:  # a section of the page describes the correction
         summary = summary.replace(f" {diagnosis.nameless.sentence}", "")
     summary = " ".join([summary, *diagnosis.corrections_made()])
-    text = f"{summary.rstrip('. ')}. {on} the error{ahead} is {percent(errors.get('nominal'))} as given"
-    text += f", {percent(errors.get('before'))} refitted"
+    text = f"{summary.rstrip('. ')}. {on} the error{ahead} is {percent_text(errors.get('nominal'))} as given"
+    text += f", {percent_text(errors.get('before'))} refitted"
     if what := correction_words(diagnosis):
-        text += f", {percent(errors.get('after'))} {what}"
-    floor = diagnosis.noise_text(diagnosis.noise_on_tests, percent)
+        text += f", {percent_text(errors.get('after'))} {what}"
+    floor = diagnosis.noise_text(diagnosis.noise_on_tests, percent_text)
     return f"{text}; the noise floor is {floor}."
 
 
 def facts(diagnosis: Diagnosis) -> dict[str, str]:
     """Collect the figures of merit."""
     role, errors = judged_errors(diagnosis)
-    out = {f"{role} error, {name}": percent(errors.get(k)) for k, name in _name_errors(diagnosis).items()}
+    out = {f"{role} error, {name}": percent_text(errors.get(k)) for k, name in _name_errors(diagnosis).items()}
     kind = {"periods": "from periods", "repeats": "from repeats"}.get(diagnosis.floor["source"], "estimated")
-    out[f"noise floor, {kind}"] = percent(diagnosis.noise_on_tests["nrmse"])
+    out[f"noise floor, {kind}"] = percent_text(diagnosis.noise_on_tests["nrmse"])
     if diagnosis.effects:
         out["confidence"] = " / ".join(f"{e.confidence:.2f}" for e in diagnosis.effects)
     return out
@@ -152,7 +150,7 @@ def error_table(diagnosis: Diagnosis) -> Table:
         errors = diagnosis.errors.get(kind)
         if errors:
             noise = diagnosis.floor if kind == "train" else diagnosis.noise_on_tests
-            rows.append([name, *(percent(errors.get(k)) for k in steps), percent(noise["nrmse"])])
+            rows.append([name, *(percent_text(errors.get(k)) for k in steps), percent_text(noise["nrmse"])])
     note = (
         f"Rms error of {'the predictions one sample ahead' if predicted else 'the free-run simulation'} divided by the "
         "standard deviation of the measured output, averaged over outputs."
@@ -251,8 +249,8 @@ def candidate_tables(
             [
                 f"{i + 1}. {display_name(r['law'])}{form}",
                 r["port"],
-                Bar(percent(r["nrmse_train"]), share(r["nrmse_train"]), share(r["nrmse_validation"])),
-                percent(r["nrmse_validation"]) if r["nrmse_validation"] is not None else "–",
+                Bar(percent_text(r["nrmse_train"]), share(r["nrmse_train"]), share(r["nrmse_validation"])),
+                percent_text(r["nrmse_validation"]) if r["nrmse_validation"] is not None else "–",
                 f"{margin:.2f} ×" if margin < 10 else f"{margin:.3g} ×" if np.isfinite(margin) else "–",
                 f"{gain:+.0f}".replace("-", "−") if np.isfinite(gain) else "–",
             ]
@@ -272,7 +270,7 @@ def flexible_table(diagnosis: Diagnosis) -> Table | None:
     opened = search.flexible(search.root) if search is not None else {}
     if not opened:
         return None
-    rows = [[port, percent(share)] for port, share in sorted(opened.items(), key=lambda item: -item[1])]
+    rows = [[port, percent_text(share)] for port, share in sorted(opened.items(), key=lambda item: -item[1])]
     note = (
         "The flexible force is a smooth function of the local coordinate and its rate, not a law of the catalogue. "
         "With few outputs, several ports can explain the mismatch; in the pictures, look for the port where the force "

@@ -51,9 +51,16 @@ MOST_POINTS, FEWEST_POINTS = 16_000, 500  # points of a line in a view of a char
 
 def number_text(value: float, digits: int = 4) -> str:
     """Write a number for people: `−1.7·10⁻⁶` rather than `-1.7e-06`."""
-    mantissa, sign, exponent = f"{value:.{digits}g}".partition("e")
-    raised = "·10" + str(int(exponent)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")) if sign else ""
-    return mantissa.replace("-", "−") + raised
+    return typeset_numbers(f"{value:.{digits}g}")
+
+
+def typeset_numbers(text: str) -> str:
+    """Replace minus signs and exponents in a text by those of print."""
+
+    def raise_exponent(exponent: re.Match[str]) -> str:
+        return "·10" + str(int(exponent[1])).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+    return re.sub(r"e([+-]\d+)", raise_exponent, text).replace("-", "−")
 
 
 def uncertain_text(value: float, error: float) -> str:

@@ -20,7 +20,7 @@ from command_line import fit_arguments, refused, run, sentence, write_csv
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import ordered_digest
-from pilfr_casadi.cli import main, name_options
+from pilfr_casadi.cli import main, models, name_options
 from pilfr_casadi.identify import multistart
 from pilfr_casadi.optimise import GaussNewton
 
@@ -558,6 +558,40 @@ def test_a_result_that_came_in_between_is_kept(capsys, tmp_path, train, monkeypa
     assert status == 0 and "another run has written" in said and f"this result is in {out / 'run-2'}" in said
     assert (out / "model.json").read_text() == "of another run" and not (out / "report.html").exists()
     assert json.loads((out / "run-2" / "model.json").read_text())["format"]
+
+
+@pytest.mark.parametrize(
+    ("command", "step", "name", "beside"),
+    [
+        (("simulate",), "load", "sim.csv", ()),
+        (("export",), "exported", "step", ("step.names.json",)),
+        (("export", "--c"), "exported", "model.c", ("model.h",)),
+    ],
+)
+def test_a_file_that_came_in_between_is_kept(capsys, tmp_path, train, model, monkeypatch, command, step, name, beside):
+    """Of two commands that write the same file at once, the later one writes to another folder."""
+    out, original = tmp_path / "out", getattr(models, step)
+    out.mkdir()
+
+    def run_beside_another_command(*given, **options):
+        (out / name).write_text("of another command")
+        return original(*given, **options)
+
+    monkeypatch.setattr(models, step, run_beside_another_command)
+    data = (train, "--initial", "zero") if command == ("simulate",) else ()
+    status, said, err = run(capsys, *command, model, *data, "--out", out if "--c" in command else out / name)
+    assert status == 0, err
+    assert "another run has written" in said and str(out / "run-2" / name) in said
+    assert {p.name for p in out.iterdir()} == {name, "run-2"} and (out / name).read_text() == "of another command"
+    assert {p.name for p in (out / "run-2").iterdir()} == {name, *beside} and (out / "run-2" / name).stat().st_size
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_the_work(capsys, tmp_path, train, model, monkeypatch):
+    monkeypatch.setattr(models, "load", None)  # nothing is loaded
+    given = ("simulate", model, train, "--out")
+    refused(capsys, *given, tmp_path / "none" / "sim.csv", says="give a file in a folder that exists")
+    refused(capsys, *given, tmp_path, "--overwrite", says="give a file in a folder that exists")
+    assert not (tmp_path / "none").exists() and tmp_path.is_dir()
 
 
 @pytest.mark.usefixtures("blank_figures")

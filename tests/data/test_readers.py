@@ -333,6 +333,26 @@ def test_time_tolerance_is_stated():
     assert step_of(t, "t", str, tolerance=0.01) == 0.01
 
 
+@pytest.mark.parametrize(
+    ("dt", "m", "begin"), [(0.01, 600, 0.0), (1e-3, 50000, 0.0), (1 / 120, 50000, 0.0), (0.02, 400, 2e4)]
+)
+def test_times_in_single_precision_are_uniform(tmp_path, dt, m, begin):
+    t = (begin + dt * np.arange(m)).astype(np.float32)
+    u = np.random.default_rng(0).standard_normal(m).astype(np.float32)
+    np.savez(tmp_path / "single.npz", t=t, u=u, y=u)
+    found = read(tmp_path / "single.npz", "u", "y")
+    assert found.dt == pytest.approx(dt, rel=1e-4) and found.u.dtype == float
+    with pytest.raises(InputError, match="not uniform"):
+        step_of(np.delete(t, m // 2).astype(float), "t", str)
+
+
+@pytest.mark.parametrize(("dt", "begin"), [(1e-3, 1e5), (1e-3, 2e4), (0.01, 2e6)])
+def test_times_too_coarse_for_their_step_are_called_so(dt, begin):
+    t = (begin + dt * np.arange(1000)).astype(np.float32).astype(float)
+    with pytest.raises(InputError, match="too coarse for their step; give them as float64, or count them from the"):
+        step_of(t, "t", str)
+
+
 @given(m=st.integers(20, 200), share=st.floats(0.001, 0.5), seed=st.integers(0, 99))
 def test_one_sample_off_is_always_found(m, share, seed):
     k = int(np.random.default_rng(seed).integers(1, m - 1))

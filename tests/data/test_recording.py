@@ -91,6 +91,7 @@ NAN = np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 6.0]])
         (dict(dt=0.0), "above zero"),
         (dict(dt=np.nan), "above zero"),
         (dict(dt="fast"), "above zero"),
+        (dict(dt=np.full(20, 0.1)), r"dt=array.{,60} was given; give the seconds from one sample to the next"),
         (dict(dt=1e-300), "dt=1e-300; give seconds from 1e-30 to 1e"),
         (dict(dt=np.timedelta64(10, "ms")), "above zero"),
         (dict(dt=None), "dt=None was given"),

@@ -10,7 +10,8 @@ from cart import cart
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, check, multisine
-from pilfr_casadi.diagnose.excitation import ranges_left, share_at_new_frequencies, single_frequency
+from pilfr_casadi.diagnose.excitation import single_frequency
+from pilfr_casadi.diagnose.extrapolation import ranges_left, share_at_new_frequencies
 from pilfr_casadi.diagnose.identifiability import Tie
 from pilfr_casadi.laws import CATALOGUE, CoulombFriction, CubicDamping, CubicStiffness
 from pilfr_casadi.models import close_loop

@@ -12,6 +12,7 @@ from diagnosis_rig import DT, OFF, SAMPLES, recordings, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, multisine
+from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.arguments import match_tests
 from pilfr_casadi.laws import CATALOGUE, Backlash, CoulombFriction, CubicStiffness, Delay, DirectionalDamping
 
@@ -141,6 +142,13 @@ def test_the_next_experiment_stays_within_the_users_limits():
     assert found.next_experiment.get("amplitude", 0.0) <= 7.0
     with pytest.raises(InputError, match="limit"):
         pilfr.diagnose(rig(OFF), train, limits={"voltage": 1.0})
+
+
+def test_a_test_recording_without_outputs_is_refused_before_the_fits(plain, monkeypatch):
+    monkeypatch.setattr(Workbench, "fit", None)  # nothing is fitted
+    inputs_alone = plain[0].with_(y=np.empty((len(plain[0]), 0)), outputs=())
+    with pytest.raises(pilfr.InputError, match="has no outputs to compare with; name the measured columns"):
+        pilfr.diagnose(rig(), plain, test=inputs_alone)
 
 
 def test_test_data_that_was_trained_on_is_refused(plain):

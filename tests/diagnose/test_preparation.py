@@ -190,6 +190,17 @@ def test_checks_that_the_time_limit_left_out_are_told():
     assert "unchecked" not in [g.finding for g in prepare(tanks(1.15), [r], "zero", "auto").gates]
 
 
+def test_another_hold_that_the_time_limit_left_out_is_told_where_a_channel_is_at_fault():
+    r = of_tanks(1e3 * recorded()[1]).with_(hold=None)
+    told = "looked for with another hold of the inputs: another channel may be at fault"
+    found = prepare(tanks(1.15), [r], None, "auto", until=0.0)
+    assert "unit" in {g.finding for g in found.gates}
+    assert [told in g.sentence for g in found.gates if g.finding == "unchecked"] == [True, False]
+    for stated, until in (("zero", 0.0), (None, np.inf)):
+        found = prepare(tanks(1.15), [r], stated, "auto", until=until)
+        assert not any(told in g.sentence for g in found.gates)
+
+
 def test_no_check_is_left_out_where_the_time_ends_with_the_last_one(monkeypatch):
     until, begun = time.perf_counter() + 1e4, []
     monkeypatch.setattr(preparation, "find_offsets", lambda now: begun.append(now) or now)

@@ -222,11 +222,26 @@ def test_an_offset_whose_error_is_unknown_stays_told():
         assert len(update_offsets([gate], fitted, {gate.parameter: np.array(error)}, True, True)) == told
 
 
-def test_a_search_that_the_time_limit_ended_does_not_blame_the_catalogue():
+@pytest.mark.parametrize("laws", [(), (CoulombFriction,)])
+def test_nothing_is_missing_where_the_simulator_meets_the_recordings_exactly(laws):
+    """Recordings that were simulated with it leave an error of zero."""
     u = 10 * multisine(200, f_max=3.0, fs=20.0, rng=np.random.default_rng(1))
     blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
-    y = cart().with_element("ground", CoulombFriction().at({"F_c": 3.0, "v_0": 0.01})).simulate(blank)
-    found = pilfr.diagnose(cart(), blank.with_(y=y), laws=(CubicDamping,), effects=1, workers=1)
+    found = pilfr.diagnose(cart(), blank.with_(y=cart().simulate(blank)), laws=laws, workers=1)
+    assert found.verdict == "complete" and found.errors["train"]["after"] < 1e-12
+
+
+@pytest.fixture(scope="module")
+def dry_friction():
+    """A recording of a cart with dry friction, without noise."""
+    u = 10 * multisine(200, f_max=3.0, fs=20.0, rng=np.random.default_rng(1))
+    blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
+    true = cart().with_element("ground", CoulombFriction().at({"F_c": 3.0, "v_0": 0.01}))
+    return blank.with_(y=true.simulate(blank))
+
+
+def test_a_search_that_the_time_limit_ended_does_not_blame_the_catalogue(dry_friction):
+    found = pilfr.diagnose(cart(), dry_friction, laws=(CubicDamping,), effects=1, workers=1)
     search = found.evidence.search
     answer = replace(posterior(search), effects=())
     assert "none of the laws tried (cubic damping) explains all of it" in judge(search, answer, ()).sentence
@@ -237,22 +252,16 @@ def test_a_search_that_the_time_limit_ended_does_not_blame_the_catalogue():
     assert "the time limit ended the search after one effect, which does not explain all of it" in said
 
 
-def test_without_laws_no_law_is_blamed_and_an_offset_is_no_closest_law():
-    u = 10 * multisine(200, f_max=3.0, fs=20.0, rng=np.random.default_rng(1))
-    blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
-    y = 0.2 + cart().with_element("ground", CoulombFriction().at({"F_c": 3.0, "v_0": 0.01})).simulate(blank)
-    found = pilfr.diagnose(cart(), blank.with_(y=y), laws=(), workers=1)
+def test_without_laws_no_law_is_blamed_and_an_offset_is_no_closest_law(dry_friction):
+    found = pilfr.diagnose(cart(), dry_friction.with_(y=0.2 + dry_friction.y), laws=(), workers=1)
     assert found.sentence.startswith("Physics is missing, and no law (none was allowed) explains it.")
     search = found.evidence.search
     assert any(t.laws for t in search.memo.values()) and closest_hypothesis(search) is None
 
 
-def test_one_hypothesis_is_told_where_the_time_ended_before_a_comparison():
+def test_one_hypothesis_is_told_where_the_time_ended_before_a_comparison(dry_friction):
     """The closest law, the corrected simulator and the shares are all of that one."""
-    u = 10 * multisine(200, f_max=3.0, fs=20.0, rng=np.random.default_rng(1))
-    blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
-    y = cart().with_element("ground", CoulombFriction().at({"F_c": 3.0, "v_0": 0.01})).simulate(blank)
-    found = pilfr.diagnose(cart(), blank.with_(y=y), laws=(CubicDamping,), effects=1, workers=1)
+    found = pilfr.diagnose(cart(), dry_friction, laws=(CubicDamping,), effects=1, workers=1)
     search = found.evidence.search
     search.bench = replace(search.bench, deadline=0.0)
     answer = replace(posterior(search), effects=())

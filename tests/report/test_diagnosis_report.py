@@ -10,14 +10,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from browser import in_a_browser, needs_chromium
+from cart import cart
 from diagnosis_contract import SCHEMA, problems
 from diagnosis_example import NOISE, PAIRS, as_it_stands, example, rig
 from test_report import EVIL, Reader, own_scripts_alone
 
+from pilfr_casadi import Recording, multisine
 from pilfr_casadi._base import InputError
-from pilfr_casadi.diagnose import Gate, Workbench
+from pilfr_casadi.diagnose import Gate, Workbench, diagnose
 from pilfr_casadi.diagnose.result_text import Basis
-from pilfr_casadi.laws import CoulombFriction
+from pilfr_casadi.laws import CoulombFriction, VaryingParameter
 from pilfr_casadi.report import corrected_file, diagnosis_report, diagnosis_report as same, usage
 from pilfr_casadi.simulators import load_simulator
 
@@ -65,6 +67,18 @@ def test_every_verdict_has_its_files(verdict, tmp_path, without_drawing):
     if verdict == "recording-fault":
         assert titles[0] == "What the recordings" + "&#39; checks found" and "wrong way round" in reader.text
         assert "The recordings are at fault: wrong sign of pos;" in reader.text  # what was not stated is no fault
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_no_force_is_looked_for_at_a_parameter_that_varies(tmp_path):
+    """Of dry friction a damping that varies with the speed explains most; it is the closest law."""
+    u = 10 * multisine(100, f_max=3.0, fs=20.0, rng=np.random.default_rng(1))
+    blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
+    true = cart().with_element("ground", CoulombFriction().at({"F_c": 3.0, "v_0": 0.01}))
+    d = diagnose(cart(), blank.with_(y=true.simulate(blank)), laws=(VaryingParameter,), effects=1, workers=1)
+    assert "The closest law, variation of d with vel" in d.sentence
+    text = Reader(diagnosis_report(d, tmp_path).read_text()).text
+    assert "The points are the force at ground" in text and "the signal at parameter:d" not in text
 
 
 @pytest.mark.usefixtures("blank_figures")

@@ -1,5 +1,6 @@
 """Run files: the same numbers again, nothing done twice, interrupted runs go on, changes are noticed."""
 
+import contextlib
 import json
 import os
 import re
@@ -42,6 +43,15 @@ def done(finished, tmp_path):
 def changed(folder, old, new):
     """The run file with one passage replaced."""
     return run_files.changed(folder, (old, new), text=RUN)
+
+
+def test_no_more_workers_than_starts_are_begun(folder, monkeypatch):
+    begun = []
+    pool = "pilfr_casadi.cli.studies.worker_pool"
+    monkeypatch.setattr(pool, lambda count: begun.append(count) or contextlib.nullcontext())
+    more = ("seeds = [0, 1, 2]", "seeds = [0]\nworkers = 900"), ("starts = 1", "starts = 2")
+    assert main(["run", str(run_files.changed(folder, *more, text=RUN))]) == 0
+    assert begun == [2]
 
 
 @pytest.mark.parametrize("drawn", [False, pytest.param(True, marks=pytest.mark.slow)])

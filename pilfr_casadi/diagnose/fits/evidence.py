@@ -46,8 +46,9 @@ from .workbench import DIVERGED, RUNAWAY, Fitted, Workbench
 # The priors and thresholds on which every answer of a search rests. Elsewhere are those of the noise (`floor`,
 # `coloured_noise`), of faults (`preparation`, and in `faults`: `gates`, `channels`, `offsets`, `timing`,
 # `lost_samples`, `samples`, `tones`), of memory that a motion does not show (`force_recovery`), the memories of an
-# observer (`prediction`), the bases of flexible forces (`flexible_forces`, `learned`) and the accuracy of integration
-# (`workbench`, `step_refinement`). All other numbers limit the effort or keep numbers finite.
+# observer (`prediction`), the bases of flexible forces (`flexible_forces`, `learned`), the accuracy of integration
+# (`workbench`, `step_refinement`) and what recordings can reveal (`detectability`, `excitation`, `identifiability`).
+# All other numbers limit the effort or keep numbers finite.
 
 # Prior probabilities
 EFFECT_PRIOR = np.log(0.5)  # log probability of each further effect: one more effect is as likely as not
@@ -94,6 +95,13 @@ OTHER_PORT_SHARE = 0.5
 
 LEAST_KNOWN = 1e-12  # eigenvalue of the scaled information, over the largest, below which a combination is unknown
 UNKNOWN_SHARE = 1e-6  # squared share of a parameter in an unknown combination; rounding gives far less
+
+# Test recordings that go beyond the training recordings, where a correction extrapolates
+BEYOND_RANGE = (
+    0.1  # share of a channel's trained range beyond it that counts: real machines follow a law no more closely
+)
+NEW_DENSITY = 0.01  # trained over tested spectral density, both normalised, below which a frequency is new: 10 in size
+NEW_SHARE = 0.5  # share of an input's variance at new frequencies that is told: more than half
 
 # Held-out data
 FOLDS, ROUNDS = 4, 2  # folds, and blocks of a recording in each fold: eight blocks, spread over the recording

@@ -31,6 +31,7 @@ DRIVEN = 0.5  # share of the differences between repeats that the input explains
 RESPONSE, SPANS, COMPARED = 150, 30, 6000  # lags of the input that are tried one by one, longer spans, and samples
 NARROW_BAND, LEAST_RANK = 1e-3, 4  # least share of a direction of the input, and the directions of a sine or a ramp
 SENSOR_RESOLUTION = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
+ROUNDING2 = float(np.finfo(float).eps) ** 2  # least mean square over a variance: simulated data may be met exactly
 DIVERGED = 1e20  # mean square error, over an output's variance, of a run that diverges
 MODEL_ERRORS = 200  # sizes of the model error that are tried where outputs with unequal noise are pooled
 SAME_LEVEL = 1e-9  # distance of two values, over the range, below which they are one level
@@ -69,7 +70,7 @@ class Floor:
 
     def squares(self, scale: np.ndarray) -> np.ndarray:
         """Compute each output's mean square noise in units of its variance, (n_y,)."""
-        return np.asarray((self.deviation / scale) ** 2)
+        return np.maximum((self.deviation / scale) ** 2, ROUNDING2)
 
     def nrmse(self, scale: np.ndarray) -> float:
         """Compute the noise over the outputs' deviation, averaged over outputs."""

@@ -254,7 +254,7 @@ def observer_gain(probe: Probe, runs: list[Run], noise: np.ndarray) -> np.ndarra
     q = np.zeros_like(a)
     for column in ports.T:
         x, total = column.copy(), 0.0
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
             for _ in range(200):
                 total += float(np.sum((c @ x / error) ** 2))
                 x = a @ x

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from ..._base import InputError, Interrupt, one_at_a_time
-from ...data import Recording, nrmse
+from ...data import HOLDS, Recording, nrmse
 from ...engine import Engine, make_engine
 from ...identify import solve_within_bounds
 from ...laws import Local
@@ -30,7 +30,7 @@ from ...simulators import (
     needed_substeps,
     rate_at_start,
 )
-from .floor import DIVERGED as DIVERGED, pool
+from .floor import DIVERGED as DIVERGED, ROUNDING2, pool
 
 # Solvers: of the fits that results are based on; of other fits; of the first fit of a law, to rank the laws
 THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
@@ -58,16 +58,20 @@ class RunsAway(InputError):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Compiled:
+class CompiledSimulator:
     """A simulator with its discretised model and the engine that runs it."""
 
     simulator: Simulator
     model: Model
     engine: Engine
 
+    def run_as(self, simulator: Simulator) -> CompiledSimulator:
+        """Run a simulator of the same equations, such as with other start values, by this model and engine."""
+        return CompiledSimulator(simulator, self.model, self.engine)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fitted(Compiled):
+class Fitted(CompiledSimulator):
     """A simulator fitted to recordings."""
 
     values: dict[str, np.ndarray]  # parameters by name
@@ -158,9 +162,11 @@ class Workbench:
         """Sampling interval, s."""
         return self.recordings[0].dt
 
-    def with_other_hold(self) -> Workbench:
-        """Return the bench with inputs interpolated between samples if they are held, else held."""
-        return self.with_hold("linear" if self.hold == "zero" else "zero")
+    def with_other_holds(self, among: Sequence[str | None] = HOLDS) -> list[Workbench]:
+        """Return the bench with each hold of the inputs next to its own in HOLDS: these are most like it."""
+        at = HOLDS.index(self.hold)
+        near = HOLDS[max(at - 1, 0) : at + 2]
+        return [self.with_hold(hold) for hold in near if hold in among and hold not in (None, self.hold)]
 
     def with_hold(self, hold: str) -> Workbench:
         """Return the bench with another hold of the inputs between samples."""
@@ -199,12 +205,10 @@ class Workbench:
         model = discretise(simulator, self.dt, self.hold, self._substeps(simulator))
         return model if gain is None else with_output_injection(model, gain)
 
-    def compile(self, simulator: Simulator, gain: np.ndarray | None = None, like: Compiled | None = None) -> Compiled:
-        """Discretise and compile a simulator, with output injection if a gain is given, or reuse a compiled model."""
-        if like is not None:
-            return Compiled(simulator, like.model, like.engine)
+    def compile(self, simulator: Simulator, gain: np.ndarray | None = None) -> CompiledSimulator:
+        """Discretise and compile a simulator, with output injection if a gain is given."""
         model = self.model(simulator, gain)
-        return Compiled(simulator, model, make_engine(model, self.engine))
+        return CompiledSimulator(simulator, model, make_engine(model, self.engine))
 
     def _substeps(self, simulator: Simulator) -> int:
         """Choose more sub-steps for a fast law, up to a limit: a stiff start of a law is not worth a fine grid."""
@@ -251,7 +255,7 @@ class Workbench:
         states: Sequence[np.ndarray] = (),
         anneal: Sequence[float] = (),
         solver: GaussNewton = QUICK,
-        like: Compiled | None = None,
+        like: CompiledSimulator | None = None,
     ) -> Fitted:
         """Fit from several starts (values by name), each through the sequence of injection gains `anneal`.
 
@@ -263,7 +267,7 @@ class Workbench:
         InputError
             If the simulation diverges from every start.
         """
-        one = self.compile(simulator, like=like)
+        one = self.compile(simulator) if like is None else like.run_as(simulator)
         estimated = any(r.begins == "estimate" for r in self.recordings)
         if not np.any(one.model.parameters.free) and not (estimated and one.model.n_state):
             given = self._run_as_given(one)
@@ -288,7 +292,7 @@ class Workbench:
         values.pop(INJECTION, None)
         return replace(self.result(one, values, problem.first_states(theta)), status=status)
 
-    def _describe_divergence(self, one: Compiled, start: Mapping[str, Any]) -> str:
+    def _describe_divergence(self, one: CompiledSimulator, start: Mapping[str, Any]) -> str:
         """Describe where a run from rest exceeds every bound."""
         vector = start_vector(one.model, start)
         for r in self.recordings:
@@ -323,14 +327,14 @@ class Workbench:
             "focus 'prediction' of a diagnosis."
         )
 
-    def run_given(self, like: Compiled | None = None) -> Fitted:
+    def run_given(self, like: CompiledSimulator | None = None) -> Fitted:
         """Run the simulator at the given values, with the states in which a fit begins.
 
         The cost of a diverging run is infinite. The compiled model of `like` is reused.
         """
-        return self._run_as_given(self.compile(self.simulator, like=like))
+        return self._run_as_given(self.compile(self.simulator) if like is None else like.run_as(self.simulator))
 
-    def _run_as_given(self, one: Compiled) -> Fitted:
+    def _run_as_given(self, one: CompiledSimulator) -> Fitted:
         parameters = one.model.parameters
         freed = parameters.change(**{name: {"fixed": False} for name in parameters})
         problem = self.problem(one.model.with_parameters(freed), one.engine)  # which needs variables
@@ -339,7 +343,7 @@ class Workbench:
 
     def _fit_from(
         self,
-        one: Compiled,
+        one: CompiledSimulator,
         start: Mapping[str, Any],
         guess: Sequence[np.ndarray],
         path: tuple[float, ...],
@@ -417,7 +421,7 @@ class Workbench:
         return out
 
     def by_cost(
-        self, one: Compiled, starts: Sequence[Mapping[str, Any]], states: Sequence[np.ndarray]
+        self, one: CompiledSimulator, starts: Sequence[Mapping[str, Any]], states: Sequence[np.ndarray]
     ) -> list[Mapping[str, Any]]:
         """Order starts by their error before a fit, from the same initial states."""
         initial = self.initial_states(one.model, start_vector(one.model, starts[0]), states)
@@ -466,7 +470,7 @@ class Workbench:
         initial = fitted.initial if initial is None else initial
         return self.result(fitted, values, initial)
 
-    def result(self, one: Compiled, values: dict[str, np.ndarray], initial: list[np.ndarray]) -> Fitted:
+    def result(self, one: CompiledSimulator, values: dict[str, np.ndarray], initial: list[np.ndarray]) -> Fitted:
         """Compute the residuals at given values and initial states."""
         model, engine = one.model, one.engine
         vector = model.parameters.pack(values)
@@ -474,6 +478,7 @@ class Workbench:
             runs = zip(self.recordings, initial, strict=True)
             residual = [engine.simulate(model.drive(r), vector, state)[0] - r.y for r, state in runs]
             squares = np.mean((np.concatenate(self.scored(residual)) / self.scale) ** 2, axis=0)
+            squares = np.maximum(squares, ROUNDING2)
             cost, balance = pool(squares, self.noise2)
         cost = cost if np.isfinite(cost) else np.inf
         return Fitted(one.simulator, model, engine, values, initial, residual, cost, squares, balance)
@@ -513,13 +518,37 @@ def refit(
     *,
     states: Sequence[np.ndarray] = (),
     solver: GaussNewton = QUICK,
-    like: Compiled | None = None,
+    like: CompiledSimulator | None = None,
 ) -> Fitted | None:
     """Fit a simulator, by default the bench's; None if it diverges. The compiled model of `like` is reused."""
     try:
         return bench.fit(simulator or bench.simulator, starts, states=states, solver=solver, like=like)
     except InputError:
         return None
+
+
+def refit_with_other_holds(
+    bench: Workbench,
+    starts: Sequence[Mapping[str, Any]],
+    simulator: Simulator | None = None,
+    *,
+    states: Sequence[np.ndarray] = (),
+    solver: GaussNewton = THOROUGH,
+    among: Sequence[str | None] = HOLDS,
+    may_go_on: Callable[[], bool] = lambda: True,
+) -> list[tuple[Workbench, Fitted]]:
+    """Refit with each other hold of the inputs; the smallest error is first, diverging ones are left out.
+
+    See `Workbench.with_other_holds`; no refit begins once `may_go_on` is false.
+    """
+    found = []
+    for held in bench.with_other_holds(among):
+        if not may_go_on():
+            break
+        fitted = refit(held, starts, simulator, states=states, solver=solver)
+        if fitted is not None:
+            found.append((held, fitted))
+    return sorted(found, key=lambda pair: pair[1].cost)
 
 
 def converge(bench: Workbench, fitted: Fitted, seconds: float) -> Fitted:

@@ -40,7 +40,7 @@ from ..fits.evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR, NEAR_R
 from ..fits.floor import ABOVE_NOISE
 from ..fits.linearise import linearise_runs
 from ..fits.screen import Pair, Remainder, Scored, screen, usable
-from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted, refit
+from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted, refit, refit_with_other_holds
 from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
 from .relatives import choose_pairs, complements, fit_pair, in_place_of_variation, relatives
@@ -214,20 +214,19 @@ class Search(Hypotheses):
         return len(trial.effects) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
 
     def find_better_hold(self) -> str:
-        """Return the hold of the inputs with which the best hypothesis follows best, if clearly better; else empty.
-
-        A band-limited input is compared with an interpolated one, which it differs from by less than from a held one.
-        """
-        best, hold = self.best.fitted, self.bench.hold
-        least, found = best.cost / BETTER_RATIO**2, ""
-        for other in {"zero": ("linear",), "linear": ("zero", "band-limited")}.get(hold, ("linear",)):
-            if self.interrupted or not self.may_go_on():
-                break
-            held = self.bench.with_hold(other)
-            fitted = refit(held, [best.values], best.simulator, states=best.initial, solver=THOROUGH)
-            if fitted is not None and fitted.cost < least:
-                least, found = fitted.cost, other
-        return "" if self.interrupted else found
+        """Return the hold of the inputs with which the best hypothesis follows best, if clearly better; else empty."""
+        best = self.best.fitted
+        found = refit_with_other_holds(
+            self.bench,
+            [best.values],
+            best.simulator,
+            states=best.initial,
+            may_go_on=lambda: not self.interrupted and self.may_go_on(),
+        )
+        if self.interrupted or not found:
+            return ""
+        held, fitted = found[0]
+        return held.hold if fitted.cost < best.cost / BETTER_RATIO**2 else ""
 
     def _find_shift(self) -> None:
         """Look beside each of the first laws for an output that comes before its cause; missing physics may hide it.

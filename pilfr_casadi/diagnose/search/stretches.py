@@ -39,7 +39,7 @@ from ..faults.gates import Gate
 from ..fits.flexible_forces import Surface
 from ..fits.linearise import Probe, loudest_stretch, run
 from ..fits.screen import Dose, Remainder, orthonormal
-from ..fits.workbench import DIVERGED, FEW, Compiled, Fitted, Workbench, output_deviation, refit
+from ..fits.workbench import DIVERGED, FEW, CompiledSimulator, Fitted, Workbench, output_deviation, refit
 from .hypotheses import Findings, count_samples, likeliest
 from .moves import Search
 from .trials import Trial
@@ -221,7 +221,7 @@ def force_features(
 
 
 def _loudest(
-    bench: Workbench, given: Compiled, i: int, stretches: Sequence[Stretch]
+    bench: Workbench, given: CompiledSimulator, i: int, stretches: Sequence[Stretch]
 ) -> Iterator[tuple[Recording, np.ndarray]]:
     """Generate the part of each stretch of recording i with the largest residual as given, and the state before it."""
     r, model = bench.recordings[i], given.model
