@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, in_words
+from .._base import InputError, in_words, percent
 from ..data import Recording
 from ..identify import surrogate_warning
 from ..laws import Law, display_name, readable_unit, short_name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -29,7 +30,8 @@ class Excitation:
         Distinct amplitudes of nine tenths of the swings between reversals, or of all without such a swing; amplitudes
         closer than a tenth of the largest count once.
     rests : int
-        Stretches longer than two typical swings in which the coordinate stays within a twentieth of the travel.
+        Stretches in which the coordinate stays within a twentieth of the travel for longer than twice the typical time
+        between the ends of a swing.
     """
 
     port: str
@@ -50,10 +52,13 @@ def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator
         for z in signals if travel > 0 else ():
             turns = _turning_points(z, least)
             reversals += max(len(turns) - 2, 0)
-            whole = turns[1:-1] if len(turns) > 3 else turns  # a recording cuts its first and last swing short
+            longest = 2 * _time_between_turns(z, turns, least) if len(turns) > 2 else SMALL_SHARE * len(z)
+            resting = _rests(z, least, longest)
+            rests += len(resting)
+            # a recording cuts its first and last swing short, unless it rests there
+            first, last = (not any(a <= end < b for a, b in resting) for end in (0, len(z) - 1))
+            whole = turns[first : len(turns) - last] if len(turns) > 3 else turns
             swings += np.abs(np.diff(z[whole])).tolist()
-            longest = 2 * float(np.median(np.diff(turns))) if len(turns) > 2 else SMALL_SHARE * len(z)
-            rests += _count_rests(z, least, longest)
         unit = port.across_unit or port_units(port, bench.recordings[0])[1]
         yield Excitation(port.name, travel, unit, reversals, _count_distinct(np.array(swings)), rests)
 
@@ -114,12 +119,23 @@ def _count_distinct(swings: np.ndarray) -> int:
     return int(np.searchsorted(share, 1 - SMALL_SHARE - 1e-9) + 1)
 
 
-def _count_rests(z: np.ndarray, least: float, samples: float) -> int:
-    """Count the stretches of more than `samples` samples in which z stays within `least`."""
-    count, begin, low, high = 0, 0, z[0], z[0]
+def _time_between_turns(z: np.ndarray, turns: Sequence[int], least: float) -> float:
+    """Compute the median number of samples that z (M,) takes from near one turning point to near the next."""
+    times = []
+    for begin, end in itertools.pairwise(turns):
+        swing = z[begin : end + 1]
+        left = np.flatnonzero(np.abs(swing - swing[0]) <= least)[-1]
+        times.append(int(np.flatnonzero(np.abs(swing[left:] - swing[-1]) <= least)[0]))
+    return float(np.median(times))
+
+
+def _rests(z: np.ndarray, least: float, samples: float) -> list[tuple[int, int]]:
+    """Find the stretches of more than `samples` samples in which z stays within `least`: first sample and end."""
+    found, begin, low, high = list[tuple[int, int]](), 0, z[0], z[0]
     for k, value in enumerate(z):
         low, high = min(low, value), max(high, value)
         if high - low > least or k == len(z) - 1:
-            count += k - begin > samples
+            end = k if high - low > least else k + 1
+            found += [(begin, end)] if end - begin > samples else []
             begin, low, high = k, value, value
-    return count
+    return found

@@ -239,7 +239,9 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
             f"{percent(search.bench.nrmse(root.fitted))} of the outputs' deviation; the noise is {least} "
             f"{percent(noise)}.{at}{rings}"
         )
-    port = where if shares.get(laws[0].port, 0.0) < OTHER_PORT_SHARE * share else laws[0].port
+    # a force at the laws' port explains what they remove, however little of it shows beside the linearised simulator
+    there = max(shares.get(laws[0].port, 0.0), 1 - left)
+    port = laws[0].port if there >= OTHER_PORT_SHARE * share else where
     # after the time limit, this may not be worth another minute
     looked = search.findings[closest.key].flexible is not None or not search.out_of_time
     rest = max(search.flexible(closest).values(), default=0.0) if looked else 0.0

@@ -356,7 +356,10 @@ def test_one_sine_is_one_amplitude_of_one_frequency():
 def test_reversals_and_amplitudes_of_steps_are_counted():
     steps = np.repeat([0.0, 30.0, 0.0, 60.0, 10.0, 40.0], SAMPLES // 6)
     row = next(e for e in check(MASS, record(MASS, steps), laws=()).excitation if e.port == "actuator:force")
-    assert (row.reversals, row.amplitudes) == (4, 3)  # swings of 30, 50 and 60
+    assert (row.reversals, row.amplitudes, row.rests) == (4, 3, 6)  # swings of 30, 50 and 60
+    stairs = np.repeat([50.0, 20, 25, 80, 70], [310, 130, 185, 60, 215])
+    row = next(e for e in check(MASS, record(MASS, stairs), laws=()).excitation if e.port == "actuator:force")
+    assert (row.reversals, row.amplitudes, row.rests) == (2, 3, 5)  # swings of 30, 60 and 10
 
 
 def test_holds_between_ramps_are_rests():

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from cart import cart
@@ -10,7 +11,7 @@ from scipy.signal import lfilter
 from tank import tank
 
 import pilfr_casadi as pilfr
-from pilfr_casadi import Recording, multisine
+from pilfr_casadi import Parameter, Port, Recording, Simulator, multisine
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.correction import Correction, find_unnamed_correction
 from pilfr_casadi.diagnose.faults.offsets import Offset, fix_idle_offsets, list_offsets, update_offsets
@@ -289,3 +290,28 @@ def test_an_offset_is_told_beside_which_nothing_is_missing():
     true = cart().with_element("sensor:pos", Offset().at({"w_0": 5e-4}))
     found = pilfr.diagnose(cart(), of_cart(1, true), laws=(CoulombFriction,), effects=1, workers=1)
     assert found.sentence.startswith("Nothing is missing but an offset of pos, as far as the laws tried can show")
+
+
+def test_a_law_that_removes_much_of_the_mismatch_says_where_it_acts():
+    """The drag of a bicycle in wind: a force beside the linearised simulator shows little at its port."""
+    rng, t = np.random.default_rng(0), 1.0
+    power, wind = np.repeat(rng.uniform(50, 400, 30), 25), np.repeat(rng.uniform(-1, 1, 75), 10)
+    speed = np.full(750, 6.0)
+    for k in range(749):
+        v = speed[k]
+        for _ in range(10):
+            v += t / 10 * (power[k] / max(v, 1) - 4 - 0.3 * abs(v + wind[k]) * (v + wind[k])) / 80
+        speed[k + 1] = v
+    bicycle = Simulator(
+        lambda x, u, p: {"v": (u.P / ca.fmax(x.v, 1.0) - p.rolling) / p.m},
+        lambda x: {"v": x.v},
+        states=("v",),
+        inputs=("P",),
+        parameters={"m": Parameter(80.0, bounds=(60, 100)), "rolling": Parameter(5.0, bounds=(0, 40))},
+        ports=Port("road", lambda p: {"v": -1 / p.m}, lambda x: x.v),
+    )
+    y = (speed + 0.02 * rng.standard_normal(750))[:, None]
+    recording = Recording(power[:, None], y, t, inputs="P", outputs="v", hold="zero")
+    found = pilfr.diagnose(bicycle, recording, laws=("quadratic_drag",), effects=1)
+    assert found.verdict == "unexplained" and "quadratic drag at road, removes 34 %" in found.sentence
+    assert found.sentence.startswith("Physics is missing, most likely at road,")
