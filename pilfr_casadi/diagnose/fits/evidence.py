@@ -58,7 +58,6 @@ DOUBTFUL_PRIOR = np.log(0.01)  # the same of parameter values at which a law deg
 DOMAIN_PRIOR = np.log(4.0)
 OUTSIDE_CATALOGUE = 0.1  # probability that missing physics is in no law of the catalogue
 STRAINED_ODDS = 10.0  # how much likelier a wrong law drives a parameter of the simulator to a bound than the right one
-STATE_PRIOR = 1e-9  # precision of initial states relative to the information of a sample: hardly any prior
 
 # Model error: no machine follows a formula exactly
 FORMULA_ERROR = 1e-3  # share of a mismatch that the right explanation may leave: 3 % of its force
@@ -143,19 +142,26 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
     infinite = np.full(shared.shape[1], np.inf)
     if not np.all(np.isfinite(hessian)):  # a run at the edge of divergence has no derivatives
         return infinite
-    rest = np.setdiff1d(np.arange(len(hessian)), laws_at)
     width = _widths(fitted, laws, problem.free, np.diag(hessian)[: len(numbers)])[laws_at]
     with np.errstate(all="ignore"):
         width = np.array([min(width[column > 0]) for column in shared[:, np.argmax(shared, axis=1)].T])  # of its group
-        block = hessian[np.ix_(laws_at, laws_at)] * np.outer(width, width)
-        size = np.sqrt(np.maximum(np.diag(hessian)[rest], 1e-300))
-        across = hessian[np.ix_(rest, laws_at)] * width / size[:, None]
-        inner = hessian[np.ix_(rest, rest)] / np.outer(size, size)
-        if not np.all(np.isfinite(inner)):  # so has one whose derivatives overflow
-            return infinite
-        block = block - across.T @ np.linalg.pinv(inner, rcond=1e-10, hermitian=True) @ across
-        block = shared.T @ block @ shared
+        block = shared.T @ _without_others(hessian, laws_at, width) @ shared
     return np.maximum(np.linalg.eigvalsh(block), 0.0) if np.all(np.isfinite(block)) else infinite
+
+
+def _without_others(hessian: np.ndarray, kept: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Compute the information on `kept` variables, times their widths, that no change of the others can follow.
+
+    It is not finite if the derivatives of the run overflow.
+    """
+    others = np.setdiff1d(np.arange(len(hessian)), kept)
+    block = hessian[np.ix_(kept, kept)] * np.outer(width, width)
+    size = np.sqrt(np.maximum(np.diag(hessian)[others], 1e-300))
+    across = hessian[np.ix_(others, kept)] * width / size[:, None]
+    inner = hessian[np.ix_(others, others)] / np.outer(size, size)
+    if not np.all(np.isfinite(inner)):
+        return np.full_like(block, np.inf)
+    return np.asarray(block - across.T @ np.linalg.pinv(inner, rcond=1e-10, hermitian=True) @ across)
 
 
 def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n: float) -> float:
@@ -164,9 +170,10 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     The other inputs are the recorded ones, their deviation from the mean times INPUT_FACTOR. The parameters have the
     covariance (n H / v + P)^-1 of Laplace's approximation, with H the Fisher information of a sample and P the
     precision of the prior. With H' the information of a sample for the other inputs, the spread is
-    tr(H' (n H / v + P)^-1). Initial states are among the parameters, because the two may make up for each other. The
-    spread reveals parameters that the recordings hardly determine, such as a curve of a pressure that had two levels; a
-    cross-validation on the same recordings cannot.
+    tr(H' (n H / v + P)^-1). The initial states are projected out of H and H', because every recording has its own: they
+    may make up for parameters, and say nothing of further recordings. The spread reveals parameters that the recordings
+    hardly determine, such as a curve of a pressure that had two levels; a cross-validation on the same recordings
+    cannot.
 
     A motion near an unstable one, such as a pendulum's near its upper rest, amplifies any small change. If the motion
     for the other inputs amplifies more than the recorded one, that is a matter of those inputs, and the spread is
@@ -178,22 +185,17 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     mean = np.mean(np.concatenate([r.u for r in bench.recordings]), axis=0)
     smaller = [r.with_(u=mean + INPUT_FACTOR * (r.u - mean)) for r in bench.recordings]
     *_, other = _hessian(bench.on(smaller), fitted)
-    free = int(problem.free.sum())
+    free = np.arange(int(problem.free.sum()))
     if not (np.all(np.isfinite(recorded)) and np.all(np.isfinite(other))):
         return np.inf
-    own = _widths(fitted, laws, problem.free, np.diag(recorded)[:free])
-    width = np.concatenate([own, 1 / np.sqrt(np.maximum(np.diag(recorded)[free:], 1e-300))])
-    prior = np.concatenate([np.ones(free), np.full(len(width) - free, STATE_PRIOR)])
-    # an initial state that the recordings do not reveal is a matter of the next recording
-    felt = (np.diag(recorded) > STATE_PRIOR * np.diag(other)) | (np.arange(len(recorded)) < free)
-    recorded, other = recorded[np.ix_(felt, felt)], other[np.ix_(felt, felt)]
-    width, prior = width[felt], prior[felt]
+    width = _widths(fitted, laws, problem.free, np.diag(recorded)[free])
     with np.errstate(all="ignore"):
-        precision = n / v * recorded * np.outer(width, width) + np.diag(prior)
+        recorded, other = (_without_others(hessian, free, width) for hessian in (recorded, other))
+        precision = n / v * recorded + np.eye(len(free))
     if not np.all(np.isfinite(precision)):  # a parameter that the recordings hardly feel
         return np.inf
     covariance = np.linalg.pinv(precision, rcond=1e-14, hermitian=True)
-    found = float(np.sum(covariance * other * np.outer(width, width)))
+    found = float(np.sum(covariance * other))
     if not np.isfinite(found):
         return np.inf
     as_recorded, now = _amplification(bench, fitted), _amplification(bench.on(smaller), fitted)

@@ -136,6 +136,31 @@ def test_other_inputs_that_lead_past_an_unstable_rest_do_not_count_as_ignorance_
     assert spread(bench, fitted, (), fitted.cost, 600.0) < 0.01 * fitted.cost  # one value from 600 samples
 
 
+def test_a_record_in_pieces_leaves_predictions_as_sure_as_in_one():
+    """Each piece has initial states of its own, which say nothing of other inputs."""
+    heater = pilfr.Simulator(
+        lambda x, u, p: {"T": (p.g * u.heat - x.T) / p.tau},
+        lambda x: {"T": x.T},
+        states=("T",),
+        inputs=("heat",),
+        parameters={"g": pilfr.Parameter(1.0, bounds=(0.1, 10)), "tau": pilfr.Parameter(5.0, bounds=(0.5, 50))},
+        hold="zero",
+    )
+    rng = np.random.default_rng(0)
+    heat = np.repeat(rng.standard_normal((40, 1)), 20, axis=0)
+    whole = pilfr.Recording(heat, np.zeros((800, 1)), 1.0, ("heat",), ("T",), initial="zero")
+    whole = whole.with_(y=heater.simulate(whole) + 0.1 * rng.standard_normal((800, 1)))
+    found = []
+    for count in (1, 2, 4, 8):
+        pieces = [
+            r.with_(initial="estimate") for r in (whole.slice(k, k + 800 // count) for k in range(0, 800, 800 // count))
+        ]
+        bench = Workbench.of(heater, pieces, "zero")
+        fitted = bench.fit(heater)
+        found.append(spread(bench, fitted, (), fitted.cost, 8.0) / fitted.cost)
+    assert max(found) < 1.3 * min(found) and 0.1 < found[0] < 0.5  # two values, eight samples
+
+
 def test_the_more_a_force_would_follow_of_the_rest_the_less_the_name_is_believed():
     shares = [share_named(s) for s in (0.0, 0.003, 0.03, 0.3, 1.0)]
     assert shares == sorted(shares, reverse=True)
