@@ -71,7 +71,10 @@ def test_a_constant_of_a_sensor_is_found_and_kept():
     assert "may be a part of that" in told.sentence and " m;" in told.sentence
     (told,) = update_offsets([gate], fitted, {gate.parameter: np.array(0.03)}, True, False)
     assert f"offset of about {gate.value:.3g} m;" in told.sentence
-    assert not update_offsets([gate], fitted, {gate.parameter: np.array(0.3)}, False, False)  # it may be none
+    uncertain = [gate], fitted, {gate.parameter: np.array(0.3)}
+    assert not update_offsets(*uncertain, True, False)  # the effects may have replaced it
+    (told,) = update_offsets(*uncertain, False, False)  # the refitted simulator has it
+    assert told.sentence.endswith("The corrected simulator hardly needs it.")
 
 
 @pytest.mark.parametrize("initial", ["zero", "estimate"])

@@ -452,7 +452,10 @@ def remove_idle_offsets(simulator: Simulator, own: int) -> Simulator:
 def update_offsets(
     gates: Sequence[Gate], after: Fitted, std: Mapping[str, np.ndarray], effects: bool, sure: bool
 ) -> tuple[Gate, ...]:
-    """Return the findings with the offsets at their fitted values; drop offsets that the effects have replaced."""
+    """Return the findings with the offsets at their fitted values; drop offsets that the effects have replaced.
+
+    Without effects they stay, because the refitted simulator has them.
+    """
     alike = {g.parameter: g.alike for g in gates if isinstance(g, Constant)}
     fitted = {g.parameter: g for g in list_offsets(after.simulator.elements, after.values, after.simulator, alike)}
     out = []
@@ -462,10 +465,13 @@ def update_offsets(
             continue
         remaining = fitted[gate.parameter]
         uncertain = abs(remaining.value) <= CERTAIN_ERRORS * float(std[gate.parameter])  # an unknown error says nothing
-        if uncertain or not abs(remaining.value) > KEPT_OFFSET * abs(gate.value):
+        replaced = uncertain or not abs(remaining.value) > KEPT_OFFSET * abs(gate.value)
+        if replaced and effects:
             continue
         sentence = remaining.sentence if effects else gate.sentence  # the value before the effects says little
         if not sure:
             sentence += " As long as the mismatch has no sure name, it may be a part of that."
+        if replaced:
+            sentence += " The corrected simulator hardly needs it."
         out.append(replace(gate, value=remaining.value, sentence=sentence))
     return tuple(out)
