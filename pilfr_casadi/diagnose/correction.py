@@ -155,8 +155,9 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
 
 def _cross_validate_refit(search: Search) -> list[_Validated]:
     """Cross-validate the refitted simulator; empty if the time is over."""
-    refit = _Candidate.of(search, search.root.fitted, search.root)
-    return [] if search.past_deadline else _cross_validate(search, [refit], [])
+    if search.past_deadline:
+        return []
+    return _cross_validate(search, [_Candidate.of(search, search.root.fitted, search.root)], [])
 
 
 def _describe_best(search: Search, validated: list[_Validated], floor: Floor) -> tuple[Correction, Fitted]:

@@ -406,7 +406,7 @@ class Hypotheses:
         best, nearest = self.best, min(self.memo.values(), key=lambda t: t.mean_square)
         best = nearest if FAR_RATIO * nearest.error < best.error else best
         self.count = count_samples(best.fitted, self.bench)
-        if self.floor.source != "estimated" or self.interrupted:
+        if self.floor.source != "estimated" or self.past_deadline:
             return
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
         share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
