@@ -105,7 +105,8 @@ def errors_by_cell(
     run: Run, jobs: Sequence[RunJob], scores: Sequence[Score]
 ) -> dict[tuple[str, str], dict[int, dict[str, float]]]:
     """Map (role, recording) -> number of the cell -> job -> NRMSE, infinite if the job has none."""
-    known = {(s.job, s.role, FOLDS if s.recording.startswith("fold ") else s.recording): s.nrmse for s in scores}
+    held_out = {job.id for job in jobs if job.fold is not None}
+    known = {(s.job, s.role, FOLDS if s.job in held_out else s.recording): s.nrmse for s in scores}
     whole = [(role, name) for role, names in run.files.items() for name in names]
     pairs = [(p, False) for p in whole] + [((role, FOLDS), True) for role in ("train", "held") if run.folds]
     out: dict[tuple[str, str], dict[int, dict[str, float]]] = {}
