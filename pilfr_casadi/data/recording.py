@@ -327,8 +327,8 @@ class Recording:
             hold = "linear"
         skip = min(int(np.ceil(self.skip * self.dt / dt * (1 - SAME_STEP))), len(u) - 2)
         period = round((self.period or 0) * self.dt / dt)
-        whole = bool(self.period) and abs(period * dt / ((self.period or 1) * self.dt) - 1) < SAME_STEP / period
-        kept = period if whole and 2 <= period <= len(u) - skip else None
+        whole = period >= 2 and abs(period * dt - (self.period or 0) * self.dt) < SAME_STEP * dt
+        kept = period if whole and period <= len(u) - skip else None
         initial = "estimate" if self.begins == "periodic" and kept is None else self.initial
         return replace(self, u=u, y=y, dt=dt, skip=skip, period=kept, initial=initial, hold=hold)
 
