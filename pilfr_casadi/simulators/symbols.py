@@ -272,9 +272,10 @@ def _where(condition: Any, *choices: Any) -> Any:
     return _if_else(condition, *choices)
 
 
-def _clip(a: Any, a_min: Any = None, a_max: Any = None, **_: Any) -> Any:
-    a = a if a_min is None else np.maximum(a, a_min)
-    return a if a_max is None else np.minimum(a, a_max)
+def _clip(a: Any, a_min: Any = None, a_max: Any = None, **named: Any) -> Any:
+    low, high = named.get("min", a_min), named.get("max", a_max)
+    a = a if low is None else np.maximum(a, low)
+    return a if high is None else np.minimum(a, high)
 
 
 def _select(conditions: Any, choices: Any, default: Any = 0) -> Any:

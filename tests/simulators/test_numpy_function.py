@@ -127,6 +127,13 @@ def test_equations_are_those_of_the_function(case):
         assert np.allclose(traced(t, *x, *u, k).full().ravel(), expected, rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.skipif(np.lib.NumpyVersion(np.__version__) < "2.1.0", reason="the names min and max are newer")
+def test_limits_have_two_names():
+    traced = equations(lambda t, x, u, p: [np.clip(x[0], min=-1, max=u[0]), np.clip(x[1], a_min=-1, a_max=None)])
+    assert traced(0, -3, -3, 2, 1).full().ravel().tolist() == [-1, -1]
+    assert traced(0, 3, 3, 2, 1).full().ravel().tolist() == [2, 3]
+
+
 def force(t):
     return 10 * np.interp(t, [0, 5, 10], [0, 1, -1])
 
