@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .._base import InputError, positive, whole
+from .._base import InputError, is_whole, positive, whole
 
 Grid = Literal["full", "odd", "odd-random"] | np.ndarray
 Amplitude = Callable[[np.ndarray], np.ndarray] | np.ndarray | None
@@ -36,6 +36,7 @@ def excited_bins(
 
     The band is rounded to the nearest bins; bin 0 and ``fs / 2`` are left out. A random grid is drawn from `rng`.
     """
+    n_samples = whole(n_samples, "n_samples", 1)
     if n_samples < 3 or not fs > 0 or not 0 <= f_min <= f_max <= fs / 2:
         raise InputError(
             f"a multisine of {n_samples} samples at {fs:g} Hz cannot excite {f_min:g} to {f_max:g} Hz; choose at least "
@@ -296,10 +297,8 @@ def prbs(
     n_values = -(-whole(n_samples, "n_samples", 1) // whole(hold, "hold", 1))
     if order is None:
         order = max(2, int(n_values).bit_length())
-    if not 2 <= order <= 32:
-        raise InputError(
-            f"the order {order} of the binary sequence lies outside 2 to 32; choose an order from 2 to 32."
-        )
+    if not is_whole(order, 2, 32):
+        raise InputError(f"the order of the binary sequence is {order!r}; give a whole number from 2 to 32.")
     seed = int(rng.integers(1, 2**order))
     state = np.array([seed >> i & 1 for i in range(order)], dtype=np.int8)
     values, _ = max_len_seq(order, state=state, length=n_values)

@@ -542,7 +542,7 @@ def select_order(
         If there is no order, an order is not a whole number above zero, or the data are too few for it.
     """
     tried = sorted({whole(n, "the order nx", 1) for n in orders})
-    if not tried or margin < 0:
+    if not tried or not margin >= 0:
         raise InputError(
             f"orders {tried} with a margin of {margin}: give at least one order and a margin of 0 or more."
         )

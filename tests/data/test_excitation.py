@@ -209,6 +209,8 @@ def test_prbs_holds_and_scales():
         (lambda: sine_sweep(2.0, 2.0, 10.0, rate=1.0), "two frequencies"),
         (lambda: prbs(0, rng()), "n_samples is 0"),
         (lambda: prbs(10, rng(), order=1), "2 to 32"),
+        (lambda: prbs(10, rng(), order=3.5), "order of the binary sequence is 3.5"),
+        (lambda: multisine(64.0, 10.0, 64.0, rng()), "n_samples is 64.0"),
     ],
 )
 def test_bad_options_are_refused(call, words):

@@ -307,6 +307,7 @@ def _bla(n=10, f_max=4.0, value=1.0):
         (lambda: select_order(_short(), []), "at least one order"),
         (lambda: select_order(_short(), [0, 1]), "order nx is 0"),
         (lambda: select_order(_short(), [1], margin=-1), "margin of -1"),
+        (lambda: select_order(_short(), [1], margin=np.nan), "margin of nan"),
         (lambda: select_order(_short(), [50]), "too few for order 50"),
     ],
 )
