@@ -57,7 +57,9 @@ def number_text(value: float, digits: int = 4) -> str:
 
 
 def uncertain_text(value: float, error: float) -> str:
-    """Write `value ± error` to two digits of the error, or only the value if the error is not finite."""
+    """Write `value ± error` to two digits of the error; only the value, or a dash, if error or value is not finite."""
+    if not np.isfinite(value):
+        return "–"
     if not np.isfinite(error):
         return number_text(value)
     decimals = 1 - int(np.floor(np.log10(error))) if error > 0 else 9
