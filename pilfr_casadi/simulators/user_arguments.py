@@ -113,6 +113,11 @@ def choose_parameters(
     return {**own.free_within({n: ends for n, ends in bounds.items() if n in own}), **made}
 
 
+def as_names(given: Any) -> Any:
+    """Return a single name as a tuple, anything else unchanged."""
+    return (given,) if isinstance(given, str) else given
+
+
 def check_names(given: Any, kind: str) -> tuple[str, ...]:
     """Return one name or several as a tuple; refuse anything else, and repeated names."""
     names = as_tuple(given)

@@ -144,7 +144,7 @@ class Manifest:
         return entries
 
     def is_settled(self, job: Any, time_limit: float | None) -> bool:
-        """Tell whether a job ended with the same inputs; not if its worker was lost, or its time limit was shorter, s."""
+        """Tell whether a job ended with the same inputs, its worker was not lost, and more time, s, would not help."""
         entry = self.entries.get(job.id, {})
         if entry.get("key") != job.key or entry["status"] == LOST:
             return False
