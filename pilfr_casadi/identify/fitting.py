@@ -213,7 +213,7 @@ def _match_units(model: Any, train: Recording | Sequence[Recording]) -> tuple[Re
 @one_blas_thread
 def _fit(
     model: PILFR | Lagged | Model | Simulator | Fit,
-    train: Recording | Sequence[Recording],
+    train: tuple[Recording, ...],
     context: FitContext,
     starts: StartOptions,
 ) -> Fit:
@@ -232,12 +232,11 @@ def _fit(
         return _fit_structure(model, train, replace(context, constraints=options.all_constraints(model)), starts)
     simulator = model if isinstance(model, Simulator) else model.simulator if isinstance(model, Fit) else None
     structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
-    recordings = as_recordings(train)
-    closed = _closed_model(model, recordings, starts.kind)
+    closed = _closed_model(model, train, starts.kind)
     check_gain(options.constraints, closed.element)
     context = replace(context, constraints=options.all_constraints(structure))
     check_radius_bounds(closed.parameters, context.constraints)
-    context = replace(context, recordings=check_recordings(closed, recordings))
+    context = replace(context, recordings=check_recordings(closed, train))
     found = fit_from_values(closed, structure, context, model if isinstance(model, Fit) else None)
     return found if simulator is None else found.with_simulator(simulator)
 
@@ -251,17 +250,14 @@ def _closed_model(model: PILFR | Model | Simulator | Fit, recordings: Sequence[R
     return discretise_for(model, recordings)
 
 
-def _fit_structure(
-    structure: PILFR, train: Recording | Sequence[Recording], context: FitContext, starts: StartOptions
-) -> Fit:
+def _fit_structure(structure: PILFR, train: tuple[Recording, ...], context: FitContext, starts: StartOptions) -> Fit:
     """Fit a PI-LFR without start values; begin at rest unless the recordings contradict it."""
     check_gain(context.options.constraints, structure.element)
     if not isinstance(structure.element, PrandtlIshlinskii | StaticNetwork | None):
         raise InputError(
             "Start values are known for PrandtlIshlinskii and StaticNetwork; else give start={name: value} or a Model."
         )
-    first = as_recordings(train)[0]
-    shape = structure.model(first.n_u, first.n_y).parameters
+    shape = structure.model(train[0].n_u, train[0].n_y).parameters
     context = replace(context, recordings=check_recordings(structure, train))
     check_radius_bounds(shape, context.constraints)
     if context.l1:
