@@ -63,7 +63,7 @@ from .fleet_result import (
 )
 from .folder import JOBS, Layout, Manifest, check_own, lock_folder, refuse_other_versions
 from .machines import (
-    CONTENT as DIAGNOSIS,
+    DIAGNOSIS,
     DONE,
     MEASURE,
     PAGE,
