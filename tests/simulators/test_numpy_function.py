@@ -331,7 +331,7 @@ BAD = {
         lambda t, y, d, m: [y[1], -m * y[0]],
         ("because d and m are no names", "u is the array of the inputs"),
     ),
-    "time behind the states": (lambda y, t, f: y, ("(y, t, f) takes the time behind", "<lambda>(t, y, ...)")),
+    "time after the states": (lambda y, t, f: y, ("(y, t, f) takes the time after", "<lambda>(t, y, ...)")),
     "too few": (lambda t, x, u, p: [x[0]], ("1 value;", "derivatives a, b")),
     "too many": (lambda t, x, u, p: [x[0], x[1], 0], ("3 values;", "derivatives a, b")),
     "a matrix": (lambda t, x, u, p: np.outer(x, x)[:, :1] * x, ("shape (2, 2)", "derivatives a, b")),
