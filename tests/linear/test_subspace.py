@@ -240,6 +240,7 @@ def test_select_order_on_a_bla_holds_out_every_second_line():
     true = control.StateSpace(np.diag([0.9, -0.7, 0.5]), np.ones((3, 1)), [[1.0, 2.0, -3.0]], [[0.0]], DT)
     bla = plain_bla(records(true, [20_000], rng, noise=0.02))
     assert select_order(bla, range(1, 7)).recommended == 3
+    assert select_order(bla, 3).orders == (3,)
     assert select_order(exact_bla(true, np.linspace(0.01, 4.9, 60)), [5, 3, 1]).recommended == 3
 
 
