@@ -103,6 +103,7 @@ FUNCTIONS = {
     "mathematics": lambda t, x, u, p: [math.sin(x[0]), copysign(p["k"], x[1]) * math.sqrt(abs(u[0]))],
     "where": lambda t, x, u, p: np.where(np.abs(x) > 0.3, x, 2 * x) * np.sign(u[0]),
     "limits": lambda t, x, u, p: [np.clip(x[0], -1, 1), np.maximum(0, x[1]) + np.minimum(x[0], u[0])],
+    "methods": lambda t, x, u, p: [np.std(x) + np.var(x), x.clip(-1, 1)[0] + x.clip(max=u[0])[1]],
     "branches": lambda t, x, u, p: [max(0, x[0]), spring(x[0] - x[1], p["k"]) if u[0] > 0 else min(x[1], 1)],
     "conditions": lambda t, x, u, p: [1.0 if 0 < x[0] < 1 or x[1] > u[0] else -1.0, (x[0] > x[1]) & (u[0] < 1)],
     "floats": lambda t, x, u, p: np.array([float(x[0]), float(len(x)) * u.astype(float)[0]], dtype=float),
