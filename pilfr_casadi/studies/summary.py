@@ -210,7 +210,8 @@ def select(
         best = [min(p, key=lambda j: entries[j.id]["train"]) if p else None for p in parts.values()]
         errors.append(float(np.mean([np.inf if j is None else judged[j.id] for j in best])))
     if not np.isfinite(min(errors)):
-        raise InputError(f"{run.file}: no structure can be judged; {jobs[0].id}: {entries[jobs[0].id]['sentence']}")
+        failed = [job.id for job in jobs if not np.isfinite(judged.get(job.id, np.inf))]
+        raise InputError(f"{run.file}: no structure can be judged; {'; '.join(reasons(entries, failed))}")
     enough = [k for k, e in enumerate(errors) if e <= (1 + SELECTION_MARGIN) * min(errors)]
     names = tuple(cell.name or "the model" for cell in run.cells)
     judge = f"{run.folds} folds" if run.folds else "validation recordings"
