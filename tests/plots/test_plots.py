@@ -443,6 +443,8 @@ def test_pictures_that_cannot_be_drawn_are_refused(fitted, data):
         fitted.plot(data, "nyquist")
     with pytest.raises(InputError, match="residual tests need at least 32"):
         plots.residual_tests(data.slice(0, 20), [("model", data.y[:20])])
+    exact = plots.residual_tests(data, [("exact", data.y), ("model", 0.9 * data.y)])
+    assert [label.partition(":")[0] for label in legend_of(exact.axes[0])] == ["model"]
 
 
 @pytest.mark.parametrize("kind", ["curve", "loop"])
