@@ -306,9 +306,9 @@ def _templates() -> Any:
 
 
 def python_literal(value: Any, width: int = 80) -> str:
-    """Write a value as Python code, with `np.inf` for infinity."""
+    """Write a value as Python code, with `np.inf` for infinity, but not in texts."""
     text = pprint.pformat(value, width=width, sort_dicts=False, compact=True)
-    return re.sub(r"(?<![\w'])inf(?![\w'])", "np.inf", text)
+    return re.sub(r"""('(?:\\.|[^'\\])*'|"(?:\\.|[^"\\])*")|\binf\b""", lambda found: found[1] or "np.inf", text)
 
 
 def write_report(path: str | os.PathLike[str], title: str, sections: Sequence[Section], **more: Any) -> Path:

@@ -32,6 +32,7 @@ from pilfr_casadi.report import (
     uncertain_text,
     write_report,
 )
+from pilfr_casadi.report.page import python_literal
 
 EVIL = "<script>alert(1)</script>\" onload='x' & $\\frac"
 
@@ -155,6 +156,7 @@ def test_tables_write_numbers_for_people():
     assert uncertain_text(1.5e-7, 2e-9) == "1.5·10⁻⁷\xa0±\xa02·10⁻⁹"
     assert uncertain_text(0.25, np.nan) == "0.25"
     assert uncertain_text(np.nan, np.nan) == "–"
+    assert python_literal({"y of inf": [np.inf, -np.inf, "inf"]}) == "{'y of inf': [np.inf, -np.inf, 'inf']}"
     with pytest.raises(InputError, match="has 1 cells and its table 2 columns"):
         Table(["a", "b"], [["x"]])
 
