@@ -101,8 +101,8 @@ def fit(
         With the same seed, more starts include all of fewer starts.
     start : {"grid", "paper", "plain"} or mapping
         How start values are chosen (`starts` is their number). "grid" (default) places thresholds on a grid, explores
-        every start and polishes the best. "paper" solves from every start of the paper (Eq. 22-24) and then places its
-        thresholds anew, an addition to the paper. "plain" only solves; with `linear="bla"` this is the paper's
+        every start and polishes the best. "paper" solves from every start of the paper (Eq. 22-24) and then moves its
+        thresholds, an addition to the paper. "plain" only solves; with `linear="bla"` this is the paper's
         protocol. A mapping of values by parameter name is the only start, for a PI-LFR with any element.
     linear : control.StateSpace or "bla", optional
         Linear model from which the search for a PI-LFR begins; "bla" estimates the best linear approximation from

@@ -32,7 +32,7 @@ from .polynomial_equations import find_polynomials
 from .user_arguments import as_names
 
 LEVELS = 5  # halvings of a step from which a derivative is extrapolated
-CONVERGED = 1e-5  # change by the last halving, over the largest derivative, above which there is none
+CONVERGED = 1e-5  # change by the last halving, over the largest derivative, up to which an extrapolation counts
 SHORTER_STEPS = (2.0**-5, 2.0**-10, 2.0**-15)  # shares of the step that are tried for a stiff unit
 EXACT = 1e-8  # relative change by the last halving below which no shorter step is tried
 REPEATED = 1e-4  # relative difference that a restart of the unit's solver may cause

@@ -84,8 +84,8 @@ def check_expressions(found: Mapping[str, Any], known: Any) -> None:
         for name in names if len(names) > 1 else ():  # find the one
             check_expressions({name: found[name]}, known)
         raise InputError(
-            f"The equation of {names[0]!r} holds a number that is none (NaN); use CasADi's functions on symbols, "
-            "as in ca.sin(x.pos) rather than math.sin(x.pos), and check constants."
+            f"The equation of {names[0]!r} holds NaN; use CasADi's functions on symbols, as in ca.sin(x.pos) rather "
+            "than math.sin(x.pos), and check constants."
         )
 
 

@@ -491,8 +491,8 @@ def test_a_numpy_function_of_a_symbol_warns_of_nothing():
         (lambda: rig(units="N"), "units are 'N'; give {name: unit}"),
         (lambda: rig(units={"position": 5}), "units are {'position': 5}; give {name: unit}"),
         (lambda: rig(units={"x_2": "m"}), "The simulator has no 'x_2' among its inputs and outputs; they are force, "),
-        (lambda: with_mount(lambda x: {"vel": np.nan}), "'mount: into vel' holds a number that is none"),
-        (lambda: with_mount({"vel": 1.0}, lambda x: x.pos * np.nan), "'mount: across' holds a number that is none"),
+        (lambda: with_mount(lambda x: {"vel": np.nan}), "'mount: into vel' holds NaN"),
+        (lambda: with_mount({"vel": 1.0}, lambda x: x.pos * np.nan), "'mount: across' holds NaN"),
         (lambda: rig(dynamics=dict), "dynamics is <class 'dict'>; give a function"),
     ],
 )
