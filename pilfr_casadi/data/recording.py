@@ -236,8 +236,8 @@ class Recording:
 
     def split(self, fraction: float) -> tuple[Self, Self]:
         """Cut in two: the first `fraction` (between 0 and 1) of the samples, and the rest; see :meth:`slice`."""
-        if not 0 < fraction < 1:
-            raise InputError(f"{self.label} cannot be split at {fraction}; give a fraction between 0 and 1.")
+        if not (is_number(fraction) and 0 < fraction < 1):
+            raise InputError(f"{self.label} cannot be split at {fraction!r}; give a fraction between 0 and 1.")
         cut = round(fraction * len(self))
         return self.slice(0, cut), self.slice(cut, None)
 

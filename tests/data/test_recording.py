@@ -163,7 +163,7 @@ def test_split_loses_nothing(fraction):
     assert len(first) == round(20 * fraction)
 
 
-@pytest.mark.parametrize("fraction", [0.0, 1.0, -1.0, float("nan")])
+@pytest.mark.parametrize("fraction", [0.0, 1.0, -1.0, float("nan"), "half"])
 def test_split_outside(fraction):
     with pytest.raises(InputError, match="between 0 and 1"):
         recording().split(fraction)
