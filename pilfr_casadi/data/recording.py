@@ -213,8 +213,11 @@ class Recording:
         Raises
         ------
         InputError
-            If fewer than two samples are left.
+            If a number is not whole, or fewer than two samples are left.
         """
+        for value, name in ((start, "start"), (stop, "stop")):
+            if value is not None and not is_whole(value, -np.inf):
+                raise InputError(f"{name}={value!r} was given; give the number of a sample, or use cut for seconds.")
         first, last, _ = slice(start, stop).indices(len(self))
         if last - first < 2:
             raise InputError(

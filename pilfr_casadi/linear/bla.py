@@ -30,7 +30,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._base import InputError, positive, whole
+from .._base import InputError, numbers, positive, whole
 from ..data import Recording, check_for_identification
 
 Array = np.ndarray
@@ -289,11 +289,13 @@ def _periodic_spectra(
     n_last = (N + 1) // 2  # the first line at or above the Nyquist frequency
     shape = (len(records) // n_u, n_u, *U[0].shape[:2])
     U_all, Y_all = np.reshape(U, (*shape, n_u)), np.reshape(Y, (*shape, -1))
-    harmonics = _find_lines(U_all[..., :n_last, :]) if lines is None else np.unique(np.asarray(lines, dtype=int))
-    if harmonics.size == 0 or harmonics[0] < 1 or harmonics[-1] >= n_last:
+    harmonics = _find_lines(U_all[..., :n_last, :]) if lines is None else np.unique(numbers(lines, "lines"))
+    if harmonics.size == 0 or harmonics[0] < 1 or harmonics[-1] >= n_last or np.any(harmonics % 1):
         raise InputError(
-            f"no usable excited lines among 1 to {n_last - 1}; check the period of {N} samples or give `lines` there."
+            f"no usable excited lines among 1 to {n_last - 1}; check the period of {N} samples or give `lines`, whole "
+            "numbers in that range."
         )
+    harmonics = harmonics.astype(int)
     U_all, Y_all = U_all[..., harmonics, :], Y_all[..., harmonics, :]
     matrix = _as_columns(U_all)
     size = np.sqrt(np.mean(np.abs(matrix) ** 2, axis=(0, 1, 3)))  # units of the inputs must not matter

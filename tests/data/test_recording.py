@@ -146,6 +146,11 @@ def test_slice_is_the_python_slice(start, stop, skip):
         assert piece.skip == max(0, skip - first)
 
 
+def test_slice_takes_numbers_of_samples():
+    with pytest.raises(InputError, match=r"stop=2.5 was given; .* use cut for seconds"):
+        recording().slice(None, 2.5)
+
+
 def test_slice_keeps_a_period_only_while_there_is_one():
     r = recording(period=5, initial="periodic", skip=2)
     assert (r.slice(5).period, r.slice(5).initial, r.slice(5).skip) == (5, "periodic", 0)

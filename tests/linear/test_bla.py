@@ -300,6 +300,8 @@ def _days(count):
         (lambda: robust_bla([_recording(), _recording(192)]), r"the recordings hold \[2, 3\] periods"),
         (lambda: robust_bla(_recording(), lines=[0, 3]), "no usable excited lines among 1 to 31"),
         (lambda: robust_bla(_recording(), lines=[]), "no usable excited lines"),
+        (lambda: robust_bla(_recording(), lines=[1, 2.5]), "give `lines`, whole numbers"),
+        (lambda: robust_bla(_recording(), lines="odd"), "lines cannot be 'odd'"),
         (lambda: robust_bla([]), "no recording was given"),
         (lambda: plain_bla(_recording(n=24, period=None)), "cannot fill windows"),
         (lambda: plain_bla(_recording(), order=-1), "order is -1"),
