@@ -34,7 +34,7 @@ from ..optimise import (
 )
 from ..simulators import Simulator, discretise_for
 from .context import FitContext, Stage, check_recordings, mark_interrupted, rms_error, without_density_prior
-from .lagged import check_lagged_options, fit_lagged
+from .lagged import fit_lagged
 from .linear_start import known_entries, linear_model, transform_to_known_basis
 from .multistart import DEFAULT_SOLVER, MOST_POLISHED, START_KINDS, StartSearch, search_starts
 from .penalty import check_penalty, solve_with_penalty
@@ -218,20 +218,16 @@ def _fit(
     starts: StartOptions,
 ) -> Fit:
     """Choose the method for the kind of model and start."""
-    if starts.linear is not None and not isinstance(model, PILFR):
-        raise InputError("linear= is for a PILFR; any other model has its own values, leave it out.")
-    if isinstance(starts.kind, Mapping) and not isinstance(model, PILFR):
-        raise InputError("Start values by name are for a PILFR; a Model and a Fit have their own, leave them out.")
     options = context.options
+    structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
+    _refuse_ignored_options(model, structure, starts, options.stable)
     if isinstance(model, Lagged):
         check_gain(options.constraints, model.element)
-        check_lagged_options(model, options.stable, starts.kind)
         context = replace(context, constraints=options.constraints)
         return fit_lagged(model, train, context, starts.count, starts.seed, starts.executor)
     if isinstance(model, PILFR) and not isinstance(starts.kind, Mapping):
         return _fit_structure(model, train, replace(context, constraints=options.all_constraints(model)), starts)
     simulator = model if isinstance(model, Simulator) else model.simulator if isinstance(model, Fit) else None
-    structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
     closed = _closed_model(model, train, starts.kind)
     check_gain(options.constraints, closed.element)
     context = replace(context, constraints=options.all_constraints(structure))
@@ -239,6 +235,17 @@ def _fit(
     context = replace(context, recordings=check_recordings(closed, train))
     found = fit_from_values(closed, structure, context, model if isinstance(model, Fit) else None)
     return found if simulator is None else found.with_simulator(simulator)
+
+
+def _refuse_ignored_options(model: Any, structure: PILFR | None, starts: StartOptions, stable: bool | float) -> None:
+    """Refuse options of the search for a PI-LFR, and of its spectral radius, for any other model."""
+    searches, kind = isinstance(model, PILFR), type(model).__name__
+    if starts.linear is not None and not searches:
+        raise InputError(f"linear= was given for a {kind}; it is for a PILFR, leave it out.")
+    if starts.kind != "grid" and not searches:
+        raise InputError(f"start = {starts.kind!r} was given for a {kind}, which has its own start; leave it out.")
+    if not isinstance(stable, bool) and structure is None:
+        raise InputError(f"stable = {stable!r} was given for a {kind}; it bounds a PILFR alone, leave it out.")
 
 
 def _closed_model(model: PILFR | Model | Simulator | Fit, recordings: Sequence[Recording], values: Any) -> Model:

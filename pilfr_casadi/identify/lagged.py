@@ -64,18 +64,6 @@ class LaggedSearch:
         return replace(self.context, recordings=self.training).problem(model, engine=engine or self.context.engine)
 
 
-def check_lagged_options(lagged: Lagged, stable: bool | float, start: Any) -> None:
-    """Refuse options that a NARX or NOE would ignore: a bound on a spectral radius, or another kind of start."""
-    kind = type(lagged).__name__
-    if not isinstance(stable, bool):
-        raise InputError(
-            f"stable = {stable!r} was given for a {kind}, whose state holds past signals and has no spectral radius to "
-            "bound; leave it out."
-        )
-    if start != "grid":
-        raise InputError(f"start = {start!r} was given for a {kind}, which has its own kind of starts; leave it out.")
-
-
 def fit_lagged(
     lagged: Lagged,
     train: tuple[Recording, ...],
