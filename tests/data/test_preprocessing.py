@@ -243,6 +243,13 @@ def test_a_slow_held_input_stays_held():
     assert r.hold == "zero"
 
 
+def test_columns_of_a_frame_may_have_numbers_as_names():
+    frame = slow_frame(1)
+    numbered = frame.rename(columns={"t": 0, "force": 1, "x": 2})
+    r = read_frame(numbered, "force", "x", columns={"t": 0, "force": 1, "x": 2}, resample=1e-3)
+    np.testing.assert_array_equal(r.u, read_frame(frame, "force", "x", resample=1e-3).u)
+
+
 def test_missing_samples_of_one_rate_are_no_other_rate():
     frame = slow_frame(1)
     frame.loc[[500, 501], "x"] = np.nan
