@@ -1,9 +1,9 @@
 /* A two-mass rig for model exchange by FMI 2.0, written by hand for the tests: linear springs and dampers.
  *
- * Value references are places in `v`: parameters, states, derivatives, inputs, outputs. It keeps neither time nor events.
+ * Value references are places in `v`: parameters, states, derivatives, inputs, outputs. It keeps no events.
  * Macros make variants: CRASHES on instantiation; FAILURE, a statement, and FAILED, a status of the
  * getters, at stiffnesses above 600 N/m or another condition WHERE; STRICT refuses parameters in continuous-time mode; SINGLE makes one instance,
- * which cannot be reset and fails at positions above 1 m.
+ * which cannot be reset and fails at positions above 1 m; TIMED adds the time to the power.
  */
 #ifndef WHERE
 #define WHERE (v[K1] > 600)
@@ -24,6 +24,8 @@ typedef struct {
   int continuous; /* in continuous-time mode */
 } rig_t;
 
+static double now; /* s; zero unless TIMED */
+
 static void evaluate(double *v) {
 #ifdef FAILURE
   if (WHERE) FAILURE;
@@ -36,7 +38,7 @@ static void evaluate(double *v) {
   v[POS1] = v[X1];
   v[POS2] = v[X2];
   v[VEL1] = v[V1];
-  v[POWER] = v[FORCE] * v[FORCE];
+  v[POWER] = v[FORCE] * v[FORCE] + now;
 }
 
 EXPORT const char *fmi2GetTypesPlatform(void) { return "default"; }
@@ -126,7 +128,12 @@ EXPORT int fmi2CompletedIntegratorStep(void *c, int final, int *event, int *term
   *event = *terminate = 0;
   return 0;
 }
-EXPORT int fmi2SetTime(void *c, double time) { return 0; }
+EXPORT int fmi2SetTime(void *c, double time) {
+#ifdef TIMED
+  now = time;
+#endif
+  return 0;
+}
 EXPORT int fmi2SetContinuousStates(void *c, const double x[], size_t n) {
   memcpy(((rig_t *)c)->v + X1, x, n * sizeof(double));
   return 0;

@@ -47,7 +47,7 @@ def usable(values: np.ndarray) -> np.ndarray:
     return np.abs(values) <= LARGEST  # False for nan
 
 
-def is_whole(value: Any, least: int, most: float = np.inf) -> bool:
+def is_whole(value: Any, least: float, most: float = np.inf) -> bool:
     """Tell whether a value is a whole number from `least` to `most`."""
     whole_number = isinstance(value, int | np.integer) and not isinstance(value, bool | np.timedelta64)
     return whole_number and bool(least <= value <= most)

@@ -369,7 +369,7 @@ def numbers_of(texts: Sequence[str], option: str) -> dict[str, float]:
 
 
 def number(text: str, given: str) -> float:
-    """Parse a number, which may be infinite; `given` begins the message if the text is none."""
+    """Parse a number, which may be infinite; `given` begins the message if it is not a number."""
     try:
         value = float(text)
     except ValueError:

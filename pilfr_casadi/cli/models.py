@@ -72,7 +72,7 @@ from ._common import (
 DEFAULT_STARTS = 8
 # options of a search, which a saved model replaces
 SEARCH = ("nx", "operators", "operator", "channels", "structure", "hidden", "lags", "bound", "fix", "starts", "seed")
-STRUCTURE_NAMES = {"bound": "bounds"}  # option: its name in `TAKES`
+STRUCTURE_NAMES = {"bound": "bounds"}  # option: its name in `STRUCTURE_OPTIONS`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,8 +302,6 @@ def simulate_command(options: SimulateOptions) -> int:
         stack = read_stack(Path(options.data), inputs, outputs)
         if stack is not None:
             return _simulate_stack(options, fitted, *stack)
-    if Path(options.out).suffix.lower() in STACK_SUFFIXES:
-        raise InputError(f"--out {options.out} is for several records in one array; give a name that ends in .csv.")
     if kind not in (".mat", ".npz"):  # there, a matrix stands for several names
         check_names(fitted, inputs, outputs)
     recording, columns, measured = _read_to_simulate(options, inputs, outputs)
@@ -318,7 +316,7 @@ def simulate_command(options: SimulateOptions) -> int:
 
 def _simulate_equations(options: SimulateOptions) -> int:
     simulator = load_simulator(options.model)
-    if {Path(options.data).suffix.lower(), Path(options.out).suffix.lower()} & set(STACK_SUFFIXES) - {".npz"}:
+    if Path(options.data).suffix.lower() == ".npy":
         raise InputError("Only a saved model simulates several records in one array; give one recording.")
     inputs, outputs = options.names(simulator.inputs, simulator.output_names)
     recording, columns, _ = _read_to_simulate(options, inputs, outputs)
@@ -333,6 +331,8 @@ def _read_to_simulate(
     options: SimulateOptions, inputs: tuple[str, ...], outputs: tuple[str, ...]
 ) -> tuple[Recording, dict[str, str], bool]:
     """Read a recording; return it, its columns by name, and whether it has the outputs."""
+    if Path(options.out).suffix.lower() in STACK_SUFFIXES:
+        raise InputError(f"--out {options.out} is for several records in one array; give a name that ends in .csv.")
     columns, measured = _columns_to_read(options, inputs, outputs)
     options = replace(
         options,

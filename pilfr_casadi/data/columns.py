@@ -38,7 +38,7 @@ def name_with_unit(name: str, unit: str) -> str:
 
 
 def unit_in_brackets(column: str) -> str:
-    """Return the unit in brackets behind the name of a column; empty if there is none."""
+    """Return the unit in brackets after the name of a column; empty if there is none."""
     parts = WITH_UNIT.fullmatch(column)
     return (parts.group(2) or parts.group(3) or "").strip() if parts else ""
 

@@ -73,7 +73,8 @@ def merge(
     held = u if all(_is_held(first, name, step) or _is_held(second, name, step) for name in u) else ()
     signals = {**_signals_at(first, times, step, held), **_signals_at(second, times - start, step, held)}
     begin = times[0]
-    as_sampled = bool(held) or (begin == 0 and step == first.dt and (step == second.dt or not second.n_u))
+    sources = [(r, at) for r, at in ((first, begin), (second, begin - start)) if {*u} & {*r.inputs, *r.outputs}]
+    as_sampled = bool(held) or all(_is_at_samples(r, at, step) for r, at in sources)
     keeps_initial = begin == 0 and first.begins != "periodic"
     return replace(
         first,
@@ -89,6 +90,11 @@ def merge(
         hold="linear" if first.hold == "zero" and not as_sampled else first.hold,
         skip=min(max(int(np.ceil((first.skip * first.dt - begin) / step - SAME_STEP)), 0), len(times) - 1),
     )
+
+
+def _is_at_samples(r: Recording, begin: float, step: float) -> bool:
+    """Tell whether times of a step from `begin` on, in s after a recording's first sample, are among its samples."""
+    return step == r.dt and abs(begin / step - round(begin / step)) < SAME_STEP
 
 
 def _is_held(r: Recording, name: str, step: float) -> bool:

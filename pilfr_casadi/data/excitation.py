@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .._base import InputError, positive, whole
+from .._base import InputError, is_whole, numbers, positive, whole
 
 Grid = Literal["full", "odd", "odd-random"] | np.ndarray
 Amplitude = Callable[[np.ndarray], np.ndarray] | np.ndarray | None
@@ -36,19 +36,22 @@ def excited_bins(
 
     The band is rounded to the nearest bins; bin 0 and ``fs / 2`` are left out. A random grid is drawn from `rng`.
     """
-    if n_samples < 3 or not fs > 0 or not 0 <= f_min <= f_max <= fs / 2:
+    n_samples, fs = whole(n_samples, "n_samples", 1), positive(fs, "fs", "the sampling frequency in Hz")
+    f_min = positive(f_min, "f_min", "the lowest frequency in Hz", zero=True)
+    f_max = positive(f_max, "f_max", "the highest frequency in Hz", zero=True)
+    if n_samples < 3 or not 0 <= f_min <= f_max <= fs / 2:
         raise InputError(
             f"a multisine of {n_samples} samples at {fs:g} Hz cannot excite {f_min:g} to {f_max:g} Hz; choose at least "
             "3 samples and 0 <= f_min <= f_max <= fs/2."
         )
     top = (n_samples - 1) // 2
     if not isinstance(grid, str):
-        bins = np.unique(np.asarray(grid, dtype=int))
-        if bins.size == 0 or bins[0] < 1 or bins[-1] > top:
+        bins = np.unique(numbers(grid, "grid"))
+        if bins.size == 0 or bins[0] < 1 or bins[-1] > top or np.any(bins % 1):
             raise InputError(
-                f"the bins of the grid must lie from 1 to {top} for {n_samples} samples; give bins in this range."
+                f"the bins of the grid must be whole numbers from 1 to {top} for {n_samples} samples; give such bins."
             )
-        return bins
+        return bins.astype(int)
     if grid not in ("full", "odd", "odd-random"):
         raise InputError(f"the grid {grid!r} is unknown; use 'full', 'odd', 'odd-random' or an array of bins.")
     low, high = max(1, round(f_min * n_samples / fs)), min(top, round(f_max * n_samples / fs))
@@ -155,6 +158,7 @@ def orthogonal_multisine(
         As :func:`multisine`, or if `matrix` does not exist for `n_u` inputs.
     """
     n_u = whole(n_u, "n_u", 1)
+    _check_generator(rng)
     bins = excited_bins(n_samples, f_max, fs, f_min=f_min, grid=grid, rng=rng)
     phases = np.exp(1j * rng.uniform(0.0, 2.0 * np.pi, (n_u, bins.size)))
     phasors = _amplitudes(bins, n_samples, fs, amplitude, rms) * phases
@@ -293,27 +297,31 @@ def prbs(
     """
     from scipy.signal import max_len_seq
 
+    _check_generator(rng)
     n_values = -(-whole(n_samples, "n_samples", 1) // whole(hold, "hold", 1))
     if order is None:
         order = max(2, int(n_values).bit_length())
-    if not 2 <= order <= 32:
-        raise InputError(
-            f"the order {order} of the binary sequence lies outside 2 to 32; choose an order from 2 to 32."
-        )
+    if not is_whole(order, 2, 32):
+        raise InputError(f"the order of the binary sequence is {order!r}; give a whole number from 2 to 32.")
     seed = int(rng.integers(1, 2**order))
     state = np.array([seed >> i & 1 for i in range(order)], dtype=np.int8)
     values, _ = max_len_seq(order, state=state, length=n_values)
-    return amplitude * np.repeat(2.0 * values - 1.0, hold)[:n_samples]
+    return numbers(amplitude, "amplitude", ()) * np.repeat(2.0 * values - 1.0, hold)[:n_samples]
+
+
+def _check_generator(rng: Any) -> None:
+    if not isinstance(rng, np.random.Generator):
+        raise InputError(f"rng={rng!r} was given; give a generator, such as numpy.random.default_rng(1).")
 
 
 def _amplitudes(bins: np.ndarray, n_samples: int, fs: float, amplitude: Amplitude, rms: float | None) -> np.ndarray:
     """Return the amplitude of the sine at each bin, (n_bins,)."""
     given = np.ones(bins.size) if amplitude is None else amplitude
-    a = np.asarray(given(bins * fs / n_samples) if callable(given) else given, dtype=float)
-    if a.shape != bins.shape or not np.isfinite(a).all() or (a < 0).any() or not a.any():
+    a = numbers(given(bins * fs / n_samples) if callable(given) else given, "amplitude")
+    if a.shape != bins.shape or (a < 0).any() or not a.any():
         raise InputError(
             f"the amplitude spectrum has the shape {a.shape} for {bins.size} excited bins; give each bin one "
-            "finite value of at least 0, not all 0."
+            "value of at least 0, not all 0."
         )
     if rms is None:
         return a / np.sqrt(n_samples)

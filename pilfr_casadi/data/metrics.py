@@ -20,7 +20,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .._base import InputError, whole
+from .._base import InputError, is_whole, whole
 
 CONSTANT_ERROR = 0.99  # NRMSE above which a simulation is no better than a constant, whose NRMSE is 1
 BAND = 2.5758  # standard deviations that a normal value exceeds in 1 of 100 cases
@@ -98,8 +98,8 @@ def _scored_samples(y: np.ndarray, y_hat: np.ndarray, skip: int) -> tuple[np.nda
             f"measured outputs have the shape {y.shape} and simulated ones {y_hat.shape}; give both as "
             "(samples, outputs)."
         )
-    if not 0 <= skip < len(y):
-        raise InputError(f"skip is {skip} of {len(y)} samples; at least one sample must be scored.")
+    if not is_whole(skip, 0, len(y) - 1):
+        raise InputError(f"skip is {skip!r} of {len(y)} samples; at least one sample must be scored.")
     measured, simulated = (a[skip:].reshape(len(y) - skip, -1) for a in (y, y_hat))
     if not np.isfinite(measured).all():
         raise InputError("the measured outputs have values that are not finite; repair or cut out that piece.")

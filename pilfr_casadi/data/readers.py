@@ -196,7 +196,7 @@ class _Request:
             raise InputError(f"columns={columns!r} was given; give columns={{'NAME': 'COLUMN'}}.")
         if not isinstance(options.get("units") or {}, Mapping):
             raise InputError(f"units={options['units']!r} was given; give units={{'NAME': 'UNIT'}}.")
-        self.columns = columns or {}
+        self.columns = {name: str(column) for name, column in (columns or {}).items()}  # pandas has numbers as names
         for name in self.columns:
             if name not in {*self.inputs, *self.outputs, *TIME_NAMES}:
                 raise InputError(

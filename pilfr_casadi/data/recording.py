@@ -213,8 +213,11 @@ class Recording:
         Raises
         ------
         InputError
-            If fewer than two samples are left.
+            If a number is not whole, or fewer than two samples are left.
         """
+        for value, name in ((start, "start"), (stop, "stop")):
+            if value is not None and not is_whole(value, -np.inf):
+                raise InputError(f"{name}={value!r} was given; give the number of a sample, or use cut for seconds.")
         first, last, _ = slice(start, stop).indices(len(self))
         if last - first < 2:
             raise InputError(
@@ -236,8 +239,8 @@ class Recording:
 
     def split(self, fraction: float) -> tuple[Self, Self]:
         """Cut in two: the first `fraction` (between 0 and 1) of the samples, and the rest; see :meth:`slice`."""
-        if not 0 < fraction < 1:
-            raise InputError(f"{self.label} cannot be split at {fraction}; give a fraction between 0 and 1.")
+        if not (is_number(fraction) and 0 < fraction < 1):
+            raise InputError(f"{self.label} cannot be split at {fraction!r}; give a fraction between 0 and 1.")
         cut = round(fraction * len(self))
         return self.slice(0, cut), self.slice(cut, None)
 
@@ -327,8 +330,8 @@ class Recording:
             hold = "linear"
         skip = min(int(np.ceil(self.skip * self.dt / dt * (1 - SAME_STEP))), len(u) - 2)
         period = round((self.period or 0) * self.dt / dt)
-        whole = bool(self.period) and abs(period * dt / ((self.period or 1) * self.dt) - 1) < SAME_STEP / period
-        kept = period if whole and 2 <= period <= len(u) - skip else None
+        whole = period >= 2 and abs(period * dt - (self.period or 0) * self.dt) < SAME_STEP * dt
+        kept = period if whole and period <= len(u) - skip else None
         initial = "estimate" if self.begins == "periodic" and kept is None else self.initial
         return replace(self, u=u, y=y, dt=dt, skip=skip, period=kept, initial=initial, hold=hold)
 

@@ -136,7 +136,7 @@ def compare(recording: Recording, models: Mapping[str, Any] | Any) -> Comparison
     Raises
     ------
     InputError
-        If the recording is none, has no outputs, or does not fit a model.
+        If `recording` is not a Recording, has no outputs, or does not fit a model.
     """
     if not isinstance(recording, Recording):
         raise InputError(f"A {type(recording).__name__} was given to compare; give a Recording first, then the models.")

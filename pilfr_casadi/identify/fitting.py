@@ -34,7 +34,7 @@ from ..optimise import (
 )
 from ..simulators import Simulator, discretise_for
 from .context import FitContext, Stage, check_recordings, mark_interrupted, rms_error, without_density_prior
-from .lagged import check_lagged_options, fit_lagged
+from .lagged import fit_lagged
 from .linear_start import known_entries, linear_model, transform_to_known_basis
 from .multistart import DEFAULT_SOLVER, MOST_POLISHED, START_KINDS, StartSearch, search_starts
 from .penalty import check_penalty, solve_with_penalty
@@ -101,8 +101,8 @@ def fit(
         With the same seed, more starts include all of fewer starts.
     start : {"grid", "paper", "plain"} or mapping
         How start values are chosen (`starts` is their number). "grid" (default) places thresholds on a grid, explores
-        every start and polishes the best. "paper" solves from every start of the paper (Eq. 22-24) and then places its
-        thresholds anew, an addition to the paper. "plain" only solves; with `linear="bla"` this is the paper's
+        every start and polishes the best. "paper" solves from every start of the paper (Eq. 22-24) and then moves its
+        thresholds, an addition to the paper. "plain" only solves; with `linear="bla"` this is the paper's
         protocol. A mapping of values by parameter name is the only start, for a PI-LFR with any element.
     linear : control.StateSpace or "bla", optional
         Linear model from which the search for a PI-LFR begins; "bla" estimates the best linear approximation from
@@ -213,33 +213,39 @@ def _match_units(model: Any, train: Recording | Sequence[Recording]) -> tuple[Re
 @one_blas_thread
 def _fit(
     model: PILFR | Lagged | Model | Simulator | Fit,
-    train: Recording | Sequence[Recording],
+    train: tuple[Recording, ...],
     context: FitContext,
     starts: StartOptions,
 ) -> Fit:
     """Choose the method for the kind of model and start."""
-    if starts.linear is not None and not isinstance(model, PILFR):
-        raise InputError("linear= is for a PILFR; any other model has its own values, leave it out.")
-    if isinstance(starts.kind, Mapping) and not isinstance(model, PILFR):
-        raise InputError("Start values by name are for a PILFR; a Model and a Fit have their own, leave them out.")
     options = context.options
+    structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
+    _refuse_ignored_options(model, structure, starts, options.stable)
     if isinstance(model, Lagged):
         check_gain(options.constraints, model.element)
-        check_lagged_options(model, options.stable, starts.kind)
         context = replace(context, constraints=options.constraints)
         return fit_lagged(model, train, context, starts.count, starts.seed, starts.executor)
     if isinstance(model, PILFR) and not isinstance(starts.kind, Mapping):
         return _fit_structure(model, train, replace(context, constraints=options.all_constraints(model)), starts)
     simulator = model if isinstance(model, Simulator) else model.simulator if isinstance(model, Fit) else None
-    structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
-    recordings = as_recordings(train)
-    closed = _closed_model(model, recordings, starts.kind)
+    closed = _closed_model(model, train, starts.kind)
     check_gain(options.constraints, closed.element)
     context = replace(context, constraints=options.all_constraints(structure))
     check_radius_bounds(closed.parameters, context.constraints)
-    context = replace(context, recordings=check_recordings(closed, recordings))
+    context = replace(context, recordings=check_recordings(closed, train))
     found = fit_from_values(closed, structure, context, model if isinstance(model, Fit) else None)
     return found if simulator is None else found.with_simulator(simulator)
+
+
+def _refuse_ignored_options(model: Any, structure: PILFR | None, starts: StartOptions, stable: bool | float) -> None:
+    """Refuse options of the search for a PI-LFR, and of its spectral radius, for any other model."""
+    searches, kind = isinstance(model, PILFR), type(model).__name__
+    if starts.linear is not None and not searches:
+        raise InputError(f"linear= was given for a {kind}; it is for a PILFR, leave it out.")
+    if starts.kind != "grid" and not searches:
+        raise InputError(f"start = {starts.kind!r} was given for a {kind}, which has its own start; leave it out.")
+    if not isinstance(stable, bool) and structure is None:
+        raise InputError(f"stable = {stable!r} was given for a {kind}; it bounds a PILFR alone, leave it out.")
 
 
 def _closed_model(model: PILFR | Model | Simulator | Fit, recordings: Sequence[Recording], values: Any) -> Model:
@@ -251,17 +257,14 @@ def _closed_model(model: PILFR | Model | Simulator | Fit, recordings: Sequence[R
     return discretise_for(model, recordings)
 
 
-def _fit_structure(
-    structure: PILFR, train: Recording | Sequence[Recording], context: FitContext, starts: StartOptions
-) -> Fit:
+def _fit_structure(structure: PILFR, train: tuple[Recording, ...], context: FitContext, starts: StartOptions) -> Fit:
     """Fit a PI-LFR without start values; begin at rest unless the recordings contradict it."""
     check_gain(context.options.constraints, structure.element)
     if not isinstance(structure.element, PrandtlIshlinskii | StaticNetwork | None):
         raise InputError(
             "Start values are known for PrandtlIshlinskii and StaticNetwork; else give start={name: value} or a Model."
         )
-    first = as_recordings(train)[0]
-    shape = structure.model(first.n_u, first.n_y).parameters
+    shape = structure.model(train[0].n_u, train[0].n_y).parameters
     context = replace(context, recordings=check_recordings(structure, train))
     check_radius_bounds(shape, context.constraints)
     if context.l1:

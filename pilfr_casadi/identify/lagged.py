@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, one_blas_thread
-from ..data import Recording, as_recordings, group_by_input, mean_period, repeats_itself
+from ..data import Recording, group_by_input, mean_period, repeats_itself
 from ..engine import Engine, make_engine
 from ..models import NARX, PILFR, Lagged, Model, lagged_start, read_measured_output
 from ..optimise import (
@@ -64,21 +64,9 @@ class LaggedSearch:
         return replace(self.context, recordings=self.training).problem(model, engine=engine or self.context.engine)
 
 
-def check_lagged_options(lagged: Lagged, stable: bool | float, start: Any) -> None:
-    """Refuse options that a NARX or NOE would ignore: a bound on a spectral radius, or another kind of start."""
-    kind = type(lagged).__name__
-    if not isinstance(stable, bool):
-        raise InputError(
-            f"stable = {stable!r} was given for a {kind}, whose state holds past signals and has no spectral radius to "
-            "bound; leave it out."
-        )
-    if start != "grid":
-        raise InputError(f"start = {start!r} was given for a {kind}, which has its own kind of starts; leave it out.")
-
-
 def fit_lagged(
     lagged: Lagged,
-    train: Recording | Sequence[Recording],
+    train: tuple[Recording, ...],
     context: FitContext,
     starts: int,
     seed: int,
@@ -89,9 +77,8 @@ def fit_lagged(
         raise InputError("An L1 penalty is for the weights of an element; leave l1 out, or give a PILFR.")
     if not isinstance(context.solver, GaussNewton) and lagged.validation:
         raise InputError("Early stopping needs the solver GaussNewton(); give that, or validation=0.")
-    first = as_recordings(train)[0]
     context = replace(context, recordings=check_recordings(lagged, train))
-    structure = lagged.structure(first.n_u, first.n_y)
+    structure = lagged.structure(train[0].n_u, train[0].n_y)
     validation: tuple[Recording, ...] = ()
     training, note = context.recordings, ""
     if lagged.validation:

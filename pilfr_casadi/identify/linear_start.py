@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, Progress
-from ..data import Recording
+from ..data import SAME_STEP, Recording
 from ..linear import (
     FrequencyProblem,
     change_basis,
@@ -130,10 +130,9 @@ def state_space_matrices(given: Any, nx: int, recording: Recording) -> tuple[Arr
             f"The linear model given has {found[0]} states, {found[1]} inputs and {found[2]} outputs; "
             f"expected {wanted[0]}, {wanted[1]} and {wanted[2]}."
         )
-    if given.dt not in (None, True) and not np.isclose(float(given.dt), recording.dt, rtol=1e-4):
-        raise InputError(
-            f"The linear model's step is {given.dt} s, the recording's {recording.dt:g} s; sample it anew."
-        )
+    stated = given.dt is not None and given.dt is not True  # 1.0 equals True
+    if stated and abs(given.dt / recording.dt - 1) > SAME_STEP:
+        raise InputError(f"The linear model's step is {given.dt} s, the recording's {recording.dt:g} s; resample it.")
     return a, b, c, d
 
 

@@ -3,7 +3,7 @@
 1. Exploration (`explore`): a short Gauss-Newton run from each start; about forty steps show how good a start is. The
    first two starts have the element at the output and at the input, the others anywhere (`grid_start`). If the
    structure fixes the place, the first start has its thresholds on a grid, and the others draw them.
-2. Polish (`polish`): some thresholds of the best few have clustered or never slip. So they are spread anew along the
+2. Polish (`polish`): some thresholds of the best few have clustered or never slip. So they are spread again along the
    smoothed density of the fitted weights (`regrid`), and the solver runs again, twice. The second time thresholds reach
    beyond the visited range, and a weak prior keeps the weights near the smoothed density where the data do not
    determine them. A last run without the prior shows the prior's cost: the fit with the prior wins if its error is at
@@ -141,7 +141,7 @@ def judge(seed: int, model: Model, problem: Problem, solution: Solution, note: s
 
 @one_blas_thread
 def polish(search: StartSearch, candidate: Candidate) -> Candidate:
-    """Spread the thresholds of a candidate anew and solve, with and without a prior that smooths the weights.
+    """Spread the thresholds of a candidate again and solve, with and without a prior that smooths the weights.
 
     The candidate with the prior (see its `note`) is returned if its training error is at most `PRIOR_MARGIN` times the
     smallest.
@@ -213,7 +213,7 @@ def regrid(
     count: int | None = None,
     spacing: float = 0.4,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Place the thresholds and weights (N,) of one channel anew along their smoothed density.
+    """Spread the thresholds and weights (N,) of one channel along their smoothed density.
 
     Each new threshold represents an equal share of `density^spacing`. With 0.4 the thresholds are the knots of a good
     piecewise-linear approximation of the loading curve. Beyond the visited range the density is extrapolated.
@@ -254,7 +254,7 @@ def regrid(
 def regrid_channels(
     structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, **options: Any
 ) -> dict[str, Any]:
-    """Spread every channel's thresholds and weights anew by `regrid`; z (M, n_w) is the fitted model's signal."""
+    """Spread every channel's thresholds and weights by `regrid`; z (M, n_w) is the fitted model's signal."""
     reaches = [threshold_range(structure, values, z_i, i) for i, z_i in enumerate(z.T)]
     channels = [regrid(r, w, reach, **options) for r, w, reach in zip(values["r"], values["w"], reaches, strict=True)]
     return {**values, "r": np.array([r for r, _ in channels]), "w": np.array([w for _, w in channels])}

@@ -193,6 +193,7 @@ def regularization_path(
     """
     structure, training, unseen = _check_path(fit, train, validation, priors is None)
     ascending = _sort_strengths(fit.solution.cost if priors is None else None, strengths, margin)
+    _replace_priors(fit, structure, priors or {})  # refuses unusable ones
     fits, errors = [fit], [fit.nrmse(unseen)]
     thin: dict[int, tuple[Fit, ...]] = {}
     for i, strength in enumerate(ascending):
@@ -219,8 +220,8 @@ def regularization_path(
 
 
 def _replace_priors(fit: Fit, structure: PILFR, priors: Mapping[str, tuple[Any, Any]]) -> Fit:
-    parameters = fit.model.parameters.change(**{k: {"prior": prior} for k, prior in priors.items()})
     changed = replace(structure, priors={**structure.priors, **priors})
+    parameters = fit.model.parameters.change(**{k: {"prior": prior} for k, prior in priors.items()})
     return replace(fit, structure=changed, model=fit.model.with_parameters(parameters))
 
 

@@ -73,7 +73,7 @@ def paper_start(structure: PILFR, linear: Values, inputs: Signals, states: Signa
     blocks = _directions(element, linear, rng)
     blocks["w"], blocks["r"] = rng.uniform(0, 1 / element.n, shape), rng.uniform(0, PAPER_RANGE, shape)
     if direction_fixed(structure):
-        blocks |= _fixed_blocks(structure, linear, blocks)
+        blocks |= _fixed_values(structure, linear, blocks)
         blocks["r"] *= or_one(np.std(_signal(inputs, states, blocks), axis=0))[:, None]
     return blocks
 
@@ -154,7 +154,7 @@ def _place_element(
         blocks["C_z"], blocks["D_zu"] = np.zeros_like(blocks["C_z"]), np.eye(n_u)[at_input]
     if is_hammerstein(structure):
         blocks["B_w"], blocks["D_yw"] = linear["B_u"], linear["D_yu"]
-    blocks |= _fixed_blocks(structure, linear, blocks)
+    blocks |= _fixed_values(structure, linear, blocks)
     z = _signal(inputs, states, blocks)
     size = or_one(np.std(z, axis=0))
     if all(is_zero(structure, k) for k in ("C_z", "D_zu", "D_yw") if k in fixed):
@@ -169,7 +169,7 @@ def _signal(inputs: Signals, states: Signals, blocks: Values) -> Array:
     return np.concatenate(states) @ blocks["C_z"].T + np.concatenate(inputs) @ blocks["D_zu"].T
 
 
-def _fixed_blocks(structure: PILFR, linear: Values, blocks: Blocks) -> Blocks:
+def _fixed_values(structure: PILFR, linear: Values, blocks: Blocks) -> Blocks:
     """Return the blocks that the structure fixes, and for a Wiener model z = the linear model's output."""
     out = {"C_z": linear["C_y"], "D_zu": linear["D_yu"]} if is_wiener(structure) else {}
     fixed = {k: np.asarray(structure.fixed[k], dtype=float) for k in fixed_blocks(structure) if k in blocks}

@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, whole
 from ..data import Recording, as_recordings, check_for_identification, nrmse
 from ..models import PILFR, Parameter
 from ..simulators import Named, Port, Simulator
@@ -51,14 +51,15 @@ def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = N
     Raises
     ------
     InputError
-        If nothing can be identified from the recordings.
+        If nothing can be identified from the recordings, or nx is not a whole number of 0 or more.
     """
     records = check_for_identification(as_recordings(recordings), 40)
     hold = next((r.hold for r in records if r.hold), None)
     # the sampled model has other states: with interpolated inputs, rest is not zero there
     records = tuple(r if r.period else r.with_(initial="estimate") for r in records)
     found: list[tuple[float, Simulator]] = []
-    for n in range(HIGHEST + 1) if nx is None else (nx,):  # a simulation has no noise, so its order is evident
+    # a simulation has no noise, so its order is evident
+    for n in range(HIGHEST + 1) if nx is None else (whole(nx, "nx", 0),):
         identified = _identify(records, n, hold)
         if identified is not None:
             found.append(identified)

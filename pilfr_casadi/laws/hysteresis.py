@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, whole
 from ..models import Parameter, play
 from .base import Law, Local, size_to_power
 
@@ -307,13 +307,13 @@ def hysteresis_layer(kind: str, n: int, series: bool) -> type[StopHysteresis]:
     Raises
     ------
     InputError
-        If the kind is unknown, or generalized plays are asked for as a force.
+        If the kind is unknown, n is not a whole number above zero, or generalized plays are asked for as a force.
     """
     if kind not in OPERATORS:
         raise InputError(f"The kind of operators is {kind!r}; give {', '.join(map(repr, OPERATORS))}.")
     if kind == "generalized_play" and not series:
         raise InputError("Generalized plays act at an actuator or a sensor, not as a force; give 'stop' or 'play'.")
-    return _layer(kind, n, series)
+    return _layer(kind, whole(n, "n", 1), series)
 
 
 @functools.cache  # the same class for the same arguments

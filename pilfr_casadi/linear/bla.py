@@ -30,7 +30,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, numbers, positive, whole
 from ..data import Recording, check_for_identification
 
 Array = np.ndarray
@@ -231,7 +231,7 @@ def plain_bla(
     Raises
     ------
     InputError
-        If samples are too few for the window, or the inputs are linearly dependent.
+        If an argument is out of range, samples are too few for the window, or the inputs are linearly dependent.
 
     Warns
     -----
@@ -243,11 +243,9 @@ def plain_bla(
     ----------
     Pintelon & Schoukens (2012), Sec. 7.2.2 and 7.3.5; Krikelis et al. (2024), Eq. 21.
     """
-    if order < 0 or n_frequencies < 1 or (window is not None and window < 1):
-        raise InputError(
-            f"order {order}, window {window} and n_frequencies {n_frequencies} must not be negative, nor the last two "
-            "zero; leave them out for the defaults."
-        )
+    order, n_frequencies = whole(order, "order", 0), whole(n_frequencies, "n_frequencies", 1)
+    window = window if window is None else whole(window, "window", 1)
+    floor = positive(floor, "floor", "a share of the largest amplitude", zero=True)
     records = check_for_identification(recordings)
     scale = np.sqrt(np.mean([np.var(r.u[r.skip :], axis=0) for r in records], axis=0))
     if np.any(scale == 0):
@@ -291,11 +289,13 @@ def _periodic_spectra(
     n_last = (N + 1) // 2  # the first line at or above the Nyquist frequency
     shape = (len(records) // n_u, n_u, *U[0].shape[:2])
     U_all, Y_all = np.reshape(U, (*shape, n_u)), np.reshape(Y, (*shape, -1))
-    harmonics = _find_lines(U_all[..., :n_last, :]) if lines is None else np.unique(np.asarray(lines, dtype=int))
-    if harmonics.size == 0 or harmonics[0] < 1 or harmonics[-1] >= n_last:
+    harmonics = _find_lines(U_all[..., :n_last, :]) if lines is None else np.unique(numbers(lines, "lines"))
+    if harmonics.size == 0 or harmonics[0] < 1 or harmonics[-1] >= n_last or np.any(harmonics % 1):
         raise InputError(
-            f"no usable excited lines among 1 to {n_last - 1}; check the period of {N} samples or give `lines` there."
+            f"no usable excited lines among 1 to {n_last - 1}; check the period of {N} samples or give `lines`, whole "
+            "numbers in that range."
         )
+    harmonics = harmonics.astype(int)
     U_all, Y_all = U_all[..., harmonics, :], Y_all[..., harmonics, :]
     matrix = _as_columns(U_all)
     size = np.sqrt(np.mean(np.abs(matrix) ** 2, axis=(0, 1, 3)))  # units of the inputs must not matter

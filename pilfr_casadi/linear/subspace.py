@@ -46,7 +46,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from .._base import InputError, Progress, whole
-from ..data import Recording, as_recordings, check_for_identification
+from ..data import Recording, as_recordings, as_tuple, check_for_identification
 from ..models import or_one
 from .bla import BLA, moving_mean
 from .statespace import propagate, reflect_poles, resolvent
@@ -515,7 +515,7 @@ class OrderSelection:
 
 def select_order(
     data: BLA | Recording | Iterable[Recording],
-    orders: Iterable[int] = range(1, 11),
+    orders: int | Iterable[int] = range(1, 11),
     margin: float = 0.05,
     offset: bool = False,
     progress: Progress | None = None,
@@ -527,7 +527,7 @@ def select_order(
     data : BLA, Recording or iterable of Recording
         The held-out part is every second frequency of a BLA, the last 30 % of the samples of a single recording, or the
         last 30 % of several recordings, at least one.
-    orders : iterable of int
+    orders : int or iterable of int
         Orders to try; orders too high for the data are skipped, unless all are too high.
     margin : float
         The recommended order is the smallest whose validation error is at most ``1 + margin`` times the best.
@@ -541,8 +541,8 @@ def select_order(
     InputError
         If there is no order, an order is not a whole number above zero, or the data are too few for it.
     """
-    tried = sorted({whole(n, "the order nx", 1) for n in orders})
-    if not tried or margin < 0:
+    tried = sorted({whole(n, "the order nx", 1) for n in as_tuple(orders)})
+    if not tried or not margin >= 0:
         raise InputError(
             f"orders {tried} with a margin of {margin}: give at least one order and a margin of 0 or more."
         )

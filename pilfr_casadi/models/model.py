@@ -299,6 +299,8 @@ def close_loop(model: Any, element: Element, port: str | None = None) -> Any:
     InputError
         If the port is already closed or unknown, or the element has another number of channels.
     """
+    if not hasattr(element, "parameters"):
+        raise InputError(f"{element!r} was given to close_loop; give an element or a law with values.")
     if not isinstance(model, Model):
         if port is None or not hasattr(model, "with_element"):
             raise InputError("An element is put into an open Model, or into a Simulator with `port=` its port's name.")

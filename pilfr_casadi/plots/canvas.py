@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.textpath import TextPath
 
+from .._base import InputError
 from ..data import name_with_unit
 
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
@@ -43,6 +44,12 @@ class ShownFigure(Figure):
 def new_figure(width: float = 5.2, height: float = 3.5) -> Figure:
     """Make an empty figure of the given size in inches, with a layout that prevents overlap and clipping."""
     return ShownFigure(figsize=(width, height), layout="constrained")
+
+
+def check_index(index: int, count: int, what: str) -> None:
+    """Refuse the number of a signal or channel that is not there."""
+    if not 0 <= index < count:
+        raise InputError(f"The {what} {index} was given, counted from 0; the number of {what}s is {count}.")
 
 
 def axes_or_new(ax: Axes | None) -> Axes:

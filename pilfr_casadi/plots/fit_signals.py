@@ -25,6 +25,7 @@ from .canvas import (
     PURPLE,
     VERMILLION,
     axes_or_new,
+    check_index,
     choose_scale,
     finish,
     line,
@@ -225,8 +226,7 @@ def compares_linear(fit: PlottedFit) -> bool:
 
 
 def _select_signal(values: np.ndarray, index: int, role: str) -> np.ndarray:
-    if not 0 <= index < values.shape[1]:
-        raise InputError(f"The {role} {index} was given; the recording has {values.shape[1]}, counted from 0.")
+    check_index(index, values.shape[1], role)
     return values[:, index]
 
 

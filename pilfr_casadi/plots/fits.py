@@ -16,7 +16,7 @@ from .._base import InputError
 from ..data import Recording, as_recordings, name_with_unit
 from ..models import weight_density
 from ..optimise import Iteration
-from .canvas import BLUE, GREY, PALE_BLUE, SKY, VERMILLION, axes_or_new, finish, new_figure
+from .canvas import BLUE, GREY, PALE_BLUE, SKY, VERMILLION, axes_or_new, check_index, finish, new_figure
 from .fit_signals import PlottedFit, as_scored, spectrum, time
 
 Records = Recording | Sequence[Recording]
@@ -31,7 +31,7 @@ def loop(
 
     `bare` subtracts the line through the origin that fits w best, so that only the hysteresis remains.
     """
-    _check_channel(fit, channel)
+    check_index(channel, fit.model.n_w, "channel")
     signals, index = fit.signals(recording), _index(fit, channel)
     first = as_scored(fit, recording).skip
     z, w = (signals[key][first:, channel] for key in "zw")
@@ -50,7 +50,7 @@ def loading_curve(
     fit: PlottedFit, recordings: Records | None = None, *, channel: int = 0, ax: Axes | None = None
 ) -> Axes:
     """Draw the element's response to z growing from rest (virgin curve), and shade the range of the recordings."""
-    _check_channel(fit, channel)
+    check_index(channel, fit.model.n_w, "channel")
     ax, reach, limit = axes_or_new(ax), _reach(fit, recordings, channel), _range(fit, recordings, channel)
     z = np.linspace(0.0, limit, CURVE_POINTS)
     if reach:
@@ -85,7 +85,7 @@ def draw_density(ax: Axes, r: np.ndarray, w: np.ndarray, limit: float) -> Axes |
 
 def weights(fit: PlottedFit, recordings: Records | None = None, *, channel: int = 0, ax: Axes | None = None) -> Axes:
     """Draw the weight over the threshold of every operator, and with four operators or more the density of weights."""
-    _check_channel(fit, channel)
+    check_index(channel, fit.model.n_w, "channel")
     values = fit.parameters
     if not {"r", "w"} <= set(values):
         raise InputError(
@@ -106,11 +106,6 @@ def weights(fit: PlottedFit, recordings: Records | None = None, *, channel: int 
     ax.set_ylim(bottom=0)
     ax.set_xlim(-0.02 * limit, limit)
     return ax
-
-
-def _check_channel(fit: PlottedFit, channel: int) -> None:
-    if not 0 <= channel < fit.model.n_w:
-        raise InputError(f"Channel {channel} of the element was given; the model has {fit.model.n_w}, counted from 0.")
 
 
 def _index(fit: PlottedFit, channel: int) -> str:

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..linear import BLA, LinearPart
-from .canvas import BLUE, GREY, GRID, INK, ORANGE, VERMILLION, decibel, finish, line, new_figure, plain
+from .canvas import BLUE, GREY, GRID, INK, ORANGE, VERMILLION, check_index, decibel, finish, line, new_figure, plain
 
 COLOURS = (INK, VERMILLION, ORANGE)
 FREQUENCIES = 600  # of a curve
@@ -28,6 +28,7 @@ def bode(
 
     `unit` is the output's unit per input unit.
     """
+    _check_signals(parts, output, input)
     figure = new_figure(6.2, 5.4)
     up, down = figure.subplots(2, 1, sharex=True)
     dt = next(iter(parts.values())).dt
@@ -49,6 +50,12 @@ def bode(
     return figure
 
 
+def _check_signals(parts: Mapping[str, LinearPart], output: int, input: int) -> None:
+    n_y, n_u = next(iter(parts.values())).D.shape
+    check_index(output, n_y, "output")
+    check_index(input, n_u, "input")
+
+
 def _phase(response: np.ndarray) -> np.ndarray:
     """Return the continuous phase in degrees."""
     return np.degrees(np.unwrap(np.angle(response)))
@@ -60,6 +67,7 @@ def pole_zero(parts: Mapping[str, LinearPart], *, output: int = 0, input: int = 
     The unit circle is the limit of stability; grey spirals are lines of equal damping ratio. Labels give the frequency
     in Hz and the damping ratio of oscillating poles. Zeros far from the poles may lie outside the picture.
     """
+    _check_signals(parts, output, input)
     ax = new_figure(6.2, 5.0).add_subplot() if ax is None else ax
     angle = np.linspace(0.0, np.pi, 300)
     ax.plot(np.cos(angle), np.sin(angle), color=GREY, linewidth=1.0)

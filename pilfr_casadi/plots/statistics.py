@@ -209,7 +209,7 @@ def residual_tests(recording: Recording, simulated: Simulated, *, lags: int | No
     recording : Recording
         Samples before its `skip` are left out.
     simulated : list of (label, outputs)
-        Outputs (M, n_y); diverging simulations are not drawn.
+        Outputs (M, n_y); simulations that diverge, or whose residual is constant, are not drawn.
     lags : int, optional
         Largest lag in samples; 100 by default, or an eighth of the samples.
 
@@ -235,6 +235,8 @@ def residual_tests(recording: Recording, simulated: Simulated, *, lags: int | No
             ax.axhline(0.0, color=INK, linewidth=0.6)
         for label, y, colour in assign_colours(drawn):
             e = y[first:, i] - r.y[first:, i]
+            if not np.ptp(e) > 0:
+                continue  # an exact model, or one that is off by a constant, leaves nothing to correlate
             _draw_correlation(row[0], correlation(e, e, most)[most + 1 :] * np.sqrt(len(e)), 1, label, colour)
             for ax, (_, x) in zip(row[1:], tested, strict=True):
                 if np.ptp(x) > 0:

@@ -207,7 +207,7 @@ def _subtitle(fit: Fit) -> str:
 
 
 def _search(fit: Fit) -> list[Block]:
-    lines = [line for line in str(fit).splitlines()[1:] if line]
+    lines = [line.rstrip(".") for line in str(fit).splitlines()[1:] if line]
     out: list[Block] = [Text(". ".join(line[0].upper() + line[1:] for line in lines) + ".")]
     if fit.solution.history or any(c.solution.history for c in fit.candidates):
         caption = "Training error over iterations: every start, and the last solve of the best one."

@@ -232,11 +232,11 @@ def _own_values(content: Mapping[str, Any], m: Mapping[str, Any]) -> Table:
         value, error = (with_nan(m[kind].get(label)) for kind in ("values", "errors"))
         mean, spread = with_nan(population["mean"]), with_nan(population["deviation"])
         off = (value - mean) / np.hypot(spread, error) if np.hypot(spread, error) > 0 else np.nan
-        usual = _uncertain(mean, with_nan(population["mean_error"]))
-        row = [label, v["unit"], _uncertain(value, error), usual, spread, float(off), m["differs"].get(label)]
+        usual = uncertain_text(mean, with_nan(population["mean_error"]))
+        row = [label, v["unit"], uncertain_text(value, error), usual, spread, float(off), m["differs"].get(label)]
         if per:
             t = {k: with_nan(m["trends"].get(label, {}).get(k)) for k in ("slope", "error", "probability")}
-            row += [_uncertain(t["slope"], t["error"]), t["probability"]]
+            row += [uncertain_text(t["slope"], t["error"]), t["probability"]]
         rows.append(row)
     columns = ["value", "unit", "this machine", "mean", "between machines", "deviations off", "differs"]
     columns += [f"drift per {per}", "drifts"] if per else []
@@ -245,10 +245,6 @@ def _own_values(content: Mapping[str, Any], m: Mapping[str, Any]) -> Table:
         "from the mean is in deviations, the standard error included. The other columns are probabilities."
     )
     return Table(columns, rows, note=note, digits=3)
-
-
-def _uncertain(value: float, error: float) -> str:
-    return uncertain_text(value, error) if np.isfinite(value) else "–"
 
 
 def _own_error(content: Mapping[str, Any], m: Mapping[str, Any], residual: Mapping[str, Any] | None) -> list[Block]:

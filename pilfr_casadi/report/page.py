@@ -64,7 +64,9 @@ def typeset_numbers(text: str) -> str:
 
 
 def uncertain_text(value: float, error: float) -> str:
-    """Write `value ± error` to two digits of the error, or only the value if the error is not finite."""
+    """Write `value ± error` to two digits of the error; only the value, or a dash, if error or value is not finite."""
+    if not np.isfinite(value):
+        return "–"
     if not np.isfinite(error):
         return number_text(value)
     decimals = 1 - int(np.floor(np.log10(error))) if error > 0 else 9
@@ -311,9 +313,9 @@ def _templates() -> Any:
 
 
 def python_literal(value: Any, width: int = 80) -> str:
-    """Write a value as Python code, with `np.inf` for infinity."""
+    """Write a value as Python code, with `np.inf` for infinity, but not in texts."""
     text = pprint.pformat(value, width=width, sort_dicts=False, compact=True)
-    return re.sub(r"(?<![\w'])inf(?![\w'])", "np.inf", text)
+    return re.sub(r"""('(?:\\.|[^'\\])*'|"(?:\\.|[^"\\])*")|\binf\b""", lambda found: found[1] or "np.inf", text)
 
 
 def write_report(path: str | os.PathLike[str], title: str, sections: Sequence[Section], **more: Any) -> Path:

@@ -109,7 +109,7 @@ class Equations:
         return self._copy_with(elements=elements)
 
     def with_ports(self, ports: tuple[Port, ...]) -> Self:
-        """Copy with other inner ports, such as `undeclared`; its cached properties are evaluated anew."""
+        """Copy with other inner ports, such as `undeclared`; its cached properties are evaluated again."""
         copy = object.__new__(type(self))
         copy.__dict__.update({f.name: getattr(self, f.name) for f in fields(self)}, ports=ports)
         return copy

@@ -34,11 +34,11 @@ from .fmu_instance import FmuFile, FmuSignals, unpack
 from .fmu_process import has_time_event
 from .ports import Port
 from .simulator import Simulator
-from .user_arguments import choose_parameters
+from .user_arguments import as_names, choose_parameters
 
 COMPARED_POINTS = 8  # trial points at which derivatives and outputs are compared with states and with forces in ports
 PORT_KEYS = ("into", "across", "rate", "unit", "across_unit")
-TIMES = (0.0, 0.7, 13.0, 400.0)  # s, at which a dependence on time is looked for
+TIMES = (0.0, 0.7, 13.0, 400.0)  # s, of the trial points; there a dependence on time is looked for too
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,12 +125,12 @@ def from_fmu(
         the units of force and coordinate, by default those of the file. The text "loss[W]:temperature[K]" says the
         same, and with the speed "force[N]:position[m]:velocity". By default each state's equation is a port. Actuators
         and sensors are always ports.
-    parameters : names, or mapping from names to Parameter, optional
+    parameters : one name or several, or mapping from names to Parameter, optional
         Parameters that a fit may change; by default all tunable ones. Fixed ones may be named too; each change of
         their values restarts the unit. Those with `bounds` are free too; the others keep the unit's values.
     bounds : mapping, optional
         `(lower, upper)` by parameter; by default the unit's bounds, else a factor of ten either way.
-    inputs, outputs : tuple of str, optional
+    inputs, outputs : str or sequence of str, optional
         Recorded inputs and outputs; by default all outputs, and all inputs that no port uses. Other inputs keep their
         start values, so name the recorded ones if the recordings lack some.
     hold : {"zero", "linear", "band-limited"}, optional
@@ -150,12 +150,15 @@ def from_fmu(
         no states that can be set.
     """
     path, bounds = Path(path), bounds or {}
+    inputs, outputs, parameters = map(as_names, (inputs, outputs, parameters))
     described = check_file(path, cosimulation is not None)
     given = {
         name: parse_port(name, port, described.variables) if isinstance(port, str) else port
         for name, port in (ports or {}).items()
     }
     unit: _Unit | SteppedUnit
+    if cosimulation is not None and not isinstance(cosimulation, CoSimulation):
+        raise InputError(f"cosimulation={cosimulation!r} was given; give CoSimulation(dt=STEP).")
     if described.identifier:
         unit = _load_unit(path, described, (*(parameters or ()), *bounds), outputs)
     else:
@@ -258,9 +261,10 @@ class _Equations:
         x, u, p = (unit.starts(names) for names in (unit.states, unit.inputs, unit.parameters))
         yield 0.0, x, u, p
         moves = np.array([n in self.free for n in unit.parameters], dtype=float)
-        for _ in range(1, COMPARED_POINTS):
+        for k in range(1, COMPARED_POINTS):
             changes = [10 ** rng.uniform(-3, 0) * rng.standard_normal(len(a)) for a in (x, u)]
-            yield 0.0, x + changes[0], u + changes[1], p * (1 + 0.1 * moves * rng.uniform(-1, 1, len(p)))
+            values = p * (1 + 0.1 * moves * rng.uniform(-1, 1, len(p)))
+            yield TIMES[k % len(TIMES)], x + changes[0], u + changes[1], values
 
     def _stack(self, x: Any, u: Any, p: Any, t: Any, added: Mapping[str, float] | None = None) -> Any:
         unit = self.unit
@@ -270,7 +274,8 @@ class _Equations:
             for n, start in zip(unit.inputs, unit.starts(unit.inputs), strict=True)
         ]
         values = zip(unit.parameters, unit.starts(unit.parameters), strict=True)
-        return ca.vertcat(t, *state, *drive, *(p[n] if n in self.free else start for n, start in values))
+        time = t if self.timed else 0.0
+        return ca.vertcat(time, *state, *drive, *(p[n] if n in self.free else start for n, start in values))
 
     def _rows(self, names: Sequence[str], x: Named, u: Named, p: Named, t: Any) -> list[Any]:
         """Evaluate derivatives `der(state)` and outputs."""
@@ -293,12 +298,11 @@ class _Equations:
 
     def __call__(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
         """Evaluate the derivatives by state: the dynamics of a `Simulator`."""
-        rows = self._rows([_rate(n) for n in self.states], x, u, p, t if self.timed else 0.0)
-        return dict(zip(self.states, rows, strict=True))
+        return dict(zip(self.states, self._rows([_rate(n) for n in self.states], x, u, p, t), strict=True))
 
     def measured(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
         """Evaluate the outputs by name."""
-        return dict(zip(self.outputs, self._rows(self.outputs, x, u, p, t if self.timed else 0.0), strict=True))
+        return dict(zip(self.outputs, self._rows(self.outputs, x, u, p, t), strict=True))
 
     def signal(self, port: str, key: str, name: str) -> Callable[..., Any]:
         """Make the local coordinate of a port, or its rate, from the name of a variable."""
@@ -310,7 +314,7 @@ class _Equations:
             raise unknown_signal(port, key, name, known)
         if same := self.equal.get(name):
             return lambda x: x[same]
-        return lambda x, u, p: self._rows([name], x, u, p, 0.0)[0]
+        return lambda x, u, p, t: self._rows([name], x, u, p, t)[0]
 
     def into(self, port: str, factors: Mapping[str, float]) -> Any:
         """Make the effect of a unit force on derivatives and outputs: constants, or differences of two calls."""
@@ -329,9 +333,9 @@ class _Equations:
         if np.all(np.abs(once - once[0]) <= np.sqrt(ROUNDING) * size):
             return {names[i]: float(once[0, k]) for k, i in moved.items()}
 
-        def into(x: Named, u: Named, p: Named) -> dict[str, Any]:
+        def into(x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
             before, after = (
-                call_external(unit.function, self._stack(x, u, p, 0.0, added)) for added in ({}, dict(factors))
+                call_external(unit.function, self._stack(x, u, p, t, added)) for added in ({}, dict(factors))
             )
             return {names[i]: after[i] - before[i] for i in moved.values()}
 
@@ -341,7 +345,8 @@ class _Equations:
 def _check_port(name: str, given: Any) -> None:
     """Refuse a port that does not give the names of the unit's variables."""
     form = (
-        "give dict(into=INPUT, across=VARIABLE, rate=VARIABLE, unit=UNIT, across_unit=UNIT); the last three are free."
+        "give dict(into=INPUT, across=VARIABLE, rate=VARIABLE, unit=UNIT, across_unit=UNIT); the last three are "
+        "optional."
     )
     if not isinstance(given, Mapping):
         raise InputError(f"The port {name!r} is {given!r}; {form}")

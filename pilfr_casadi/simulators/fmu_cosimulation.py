@@ -29,9 +29,10 @@ from .external import NOMINAL, RELATIVE_STEP
 from .fmu_description import Description, Unit
 from .fmu_slave import Slave
 from .polynomial_equations import find_polynomials
+from .user_arguments import as_names
 
 LEVELS = 5  # halvings of a step from which a derivative is extrapolated
-CONVERGED = 1e-5  # change by the last halving, over the largest derivative, above which there is none
+CONVERGED = 1e-5  # change by the last halving, over the largest derivative, up to which an extrapolation counts
 SHORTER_STEPS = (2.0**-5, 2.0**-10, 2.0**-15)  # shares of the step that are tried for a stiff unit
 EXACT = 1e-8  # relative change by the last halving below which no shorter step is tried
 REPEATED = 1e-4  # relative difference that a restart of the unit's solver may cause
@@ -47,7 +48,7 @@ class CoSimulation:
     ----------
     dt : float, optional
         Length of its steps, s: the sampling interval of the recordings. By default the step size that the file states.
-    states : tuple of str, optional
+    states : str or sequence of str, optional
         State variables; by default all outputs and local variables whose values change a step.
     """
 
@@ -85,12 +86,12 @@ class SteppedUnit(Unit):
                 f"The program inside {path} does not step ({failure}); check it with the tool that made it."
             )
         unit = replace(unit, begin=dict(zip(names, begin[0].tolist(), strict=True)))
-        if options.states is not None:
-            check_known(options.states, candidates, "outputs and local variables", path)
-        chosen = tuple(options.states) if options.states is not None else candidates
+        given = as_names(options.states)
+        check_known(given or (), candidates, "outputs and local variables", path)
+        chosen = candidates if given is None else tuple(given)
         for fresh in (False, True):
             begun = replace(unit, slave=replace(slave, fresh=fresh))
-            trial = begun._with_states(chosen, options.states is not None)
+            trial = begun._with_states(chosen, given is not None)
             if trial is not None:
                 trial._check_memory()
                 return trial

@@ -90,6 +90,8 @@ def describe(path: Path) -> Description:
         entries = list(root.iterfind("ModelVariables/*"))
         types = _read_types(root)
         variables = {v.name: v for entry in entries if (v := _read_variable(entry, types)) is not None}
+        events = len(list(root.iterfind("ModelStructure/EventIndicator")))
+        events = events or int(root.get("numberOfEventIndicators") or 0)
     except (zipfile.BadZipFile, KeyError, ET.ParseError, OSError, EOFError, ValueError) as error:
         raise InputError(f"{path} is not a functional mock-up unit ({tidy(error)}); export it again.") from None
     version = root.get("fmiVersion", "").partition(".")[0]
@@ -105,7 +107,6 @@ def describe(path: Path) -> Description:
         states = ()
     binary = binary_path(identifier or slave, version)
     others = {n: _type(entry) for entry in entries if (n := entry.get("name", "")) not in variables}
-    events = len(list(root.iterfind("ModelStructure/EventIndicator"))) or int(root.get("numberOfEventIndicators") or 0)
     numbers = step_size, varies, events
     return Description(version, token, identifier, slave, binary, variables, states, *numbers, others)
 

@@ -222,7 +222,7 @@ class FmuInstance:
         return next((status for step in steps if (status := step()) > OK), 0)
 
     def restart(self, parameters: np.ndarray) -> int:
-        """Initialise the instance anew with values of parameters, in a new instance if it cannot be reset."""
+        """Reset and initialise the unit with values of parameters; a unit that cannot be reset gets a new instance."""
         if self.call("Reset") <= OK and self._initialise(parameters):
             return 0
         free = getattr(self.library, f"fmi{self.file.version}FreeInstance")

@@ -25,7 +25,7 @@ from ..models import Named, Parameter, parameter_within, within_a_factor
 from .mujoco_model import AXES, MujocoTree
 from .ports import Port
 from .simulator import Simulator
-from .user_arguments import choose_parameters
+from .user_arguments import as_names, choose_parameters
 
 COMPARED_POINTS = 8  # at which the equations are compared with MuJoCo
 AGREE = 1e-8  # relative difference of accelerations that rounding may cause
@@ -50,7 +50,7 @@ def from_mujoco(
     ----------
     model : path, mujoco.MjModel or mujoco.MjSpec
         An MJCF or URDF file, or a model in memory, which is copied.
-    parameters : names, or mapping from names to Parameter, optional
+    parameters : one name or several, or mapping from names to Parameter, optional
         Numbers of the model that a fit may change: `<body>.mass`, with which the inertia scales; `<body>.inertia`, a
         factor on the inertia alone; `<body>.inertia_x`, `inertia_y`, `inertia_z`, the moments of inertia about the
         principal axes in the order of MuJoCo; `<body>.com_x`, `com_y`, `com_z`; `<joint>.damping`, `armature`,
@@ -59,9 +59,9 @@ def from_mujoco(
     bounds : mapping, optional
         `(lower, upper)` by parameter; by default a factor of ten either way; dampings, armatures, stiffnesses,
         friction losses and values of zero are bounded by zero below.
-    inputs : tuple of str, optional
+    inputs : str or sequence of str, optional
         Recorded actuators; by default all. The others are at zero.
-    outputs : tuple of str, optional
+    outputs : str or sequence of str, optional
         Recorded sensors, or joints; by default all sensors of joint positions and speeds, or all joints if there is
         none. Sensors of an actuator's force and of the actuators' force on a joint may be given too.
     hold : {"zero", "linear", "band-limited"}, optional
@@ -74,6 +74,7 @@ def from_mujoco(
         equations lack, such as free bodies, tendons, equality constraints or muscles.
     """
     tree, bounds = MujocoTree.load(model), bounds or {}
+    inputs, outputs, parameters = map(as_names, (inputs, outputs, parameters))
     given = tree.default_parameters if parameters is None else parameters
     tree.check_parameters((*given, *bounds))
     check_known(inputs or (), tree.actuators, "actuators", tree.label)

@@ -101,6 +101,8 @@ def from_function(
     own = check_names(states, "states"), check_names(inputs, "inputs"), check_parameters(parameters or {})
     if not own[0]:
         raise InputError("No states were given; give their names, such as ('pos', 'vel').")
+    if numeric is not None and not isinstance(numeric, Numeric):
+        raise InputError(f"numeric={numeric!r} was given; give Numeric(), or leave it out.")
     names = _Names(*own)
     dynamics = _make_equations(_UserFunction(function, "derivatives", names), numeric)
     if not callable(outputs):

@@ -103,6 +103,8 @@ class Port:
         If no term is given, the force of a drive is found in the equations.
     implied : bool
         The simulator has found `term` in its equations.
+    series : bool
+        A law acts on a signal, as at an actuator or a sensor; of built-in ports.
     domain : {"mechanical", "thermal", "electrical", "fluid", "unknown"}, optional
         Physical domain, which decides the laws that are tried; by default inferred from the units.
 

@@ -30,7 +30,7 @@ class Signature:
     inputs : tuple of str
         Names of all inputs.
     further : tuple of str or None
-        Arguments behind t and x that are passed by name; None if u and p are passed by position.
+        Arguments after t and x that are passed by name; None if u and p are passed by position.
     renamed : tuple of str
         The function's own names of u and p, if they are passed by position.
     """
@@ -78,13 +78,13 @@ def read_signature(function: Any, name: str, inputs: Sequence[str], parameters: 
     Raises
     ------
     InputError
-        If it takes neither `(t, x, u, p)` nor, behind time and states, only inputs and parameters by their names.
+        If it takes neither `(t, x, u, p)` nor, after time and states, only inputs and parameters by their names.
     """
     try:
         signature = inspect.signature(getattr(function, "py_func", function))
     except (TypeError, ValueError):
         raise InputError(
-            f"{name} does not tell its arguments; give a function of t, x, u and p that calls it."
+            f"The arguments of {name} cannot be read; give a function of t, x, u and p that calls it."
         ) from None
     own = [a for a in signature.parameters.values() if a.kind not in VARIADIC]
     first = [a.name for a in own if a.kind is not a.KEYWORD_ONLY][:2]
@@ -94,7 +94,7 @@ def read_signature(function: Any, name: str, inputs: Sequence[str], parameters: 
     unknown = [a.name for a in further if a.name not in by_name and a.default is a.empty]
     called = f"{name}({', '.join([*first, *(n.name for n in further if n.name in {*by_name, *unknown})])})"
     if first[1:] == ["t"]:
-        raise InputError(f"{called} takes the time behind the states; write {name}(t, {first[0]}, ...).")
+        raise InputError(f"{called} takes the time after the states; write {name}(t, {first[0]}, ...).")
     open_ended = bool(unknown) or len(own) < len(signature.parameters)
     if not declared & set(by_name) and (open_ended or by_name == [ALL_INPUTS, ALL_PARAMETERS]) and _binds(signature):
         return Signature(f"{name}({', '.join(ARGUMENTS)})", tuple(inputs), None, tuple(unknown))

@@ -86,22 +86,22 @@ class Simulator(Equations):
         Raises
         ------
         InputError
-            If the recording's inputs are not the simulator's, or the equations are too fast for its samples.
+            If the recording lacks an input of the simulator, or the equations are too fast for its samples.
         """
         if not isinstance(recording, Recording):
             raise InputError(f"A {type(recording).__name__} was given; give a Recording, as from pilfr.read_csv.")
-        if set(recording.inputs) != set(self.inputs):
+        if not set(self.inputs) <= set(recording.inputs):
             raise InputError(
                 f"{recording.label} has the inputs {', '.join(recording.inputs) or 'none'}; the simulator has "
                 f"{', '.join(self.inputs) or 'none'}; give the missing ones as columns, or for an FMU name the "
                 "recorded ones, as in from_fmu(..., inputs=...)."
             )
-        columns = [recording.inputs.index(name) for name in self.inputs]
-        own = recording.with_(u=recording.u[:, columns], inputs=self.inputs)
-        own = own.in_units({name: unit for name, unit in self.units.items() if name in self.inputs})
-        if self.observer is not None:
-            own = own.in_units(self.units)
-            own = own.with_(y=self._select_outputs(own), outputs=self.output_names, units={})
+        if self.observer is None:  # outputs are not read
+            units = {name: unit for name, unit in recording.units.items() if name in recording.inputs}
+            recording = recording.with_(y=np.empty((len(recording), 0)), outputs=(), units=units)
+        elif not recording.n_y:
+            raise InputError(f"{recording.label} has no outputs, and the simulator's observer reads them; give them.")
+        own = self.matched(recording)
         model = discretise_for(self, [own])
         drive, start = model.drive(own), np.zeros(model.n_state)
         if not isinstance(own.initial, str):
@@ -208,12 +208,6 @@ class Simulator(Equations):
                 port = self.port(e.port)
                 return readable_unit(unit, port.unit, port.position_unit, self.signal_units(e.port))
         return unit
-
-    def _select_outputs(self, recording: Recording) -> np.ndarray:
-        for name in self.output_names:
-            if name not in recording.outputs:
-                raise InputError(f"{recording.label} has no output {name!r}; it has {', '.join(recording.outputs)}.")
-        return recording.y[:, [recording.outputs.index(name) for name in self.output_names]]
 
     def with_parameters(self, parameters: Mapping[str, Any]) -> Simulator:
         """Copy with some parameters replaced; a number or an array replaces only the value.

@@ -104,6 +104,10 @@ class Symbols(np.ndarray):
     def __setitem__(self, key: Any, value: Any) -> None:
         super().__setitem__(_decide_index(key), value)
 
+    def clip(self, *limits: Any, **named: Any) -> Any:
+        """Clip by np.clip; NumPy's own method uses a ufunc that has no public name."""
+        return np.clip(self, *limits, **named)
+
     def astype(self, dtype: Any, *args: Any, **options: Any) -> Any:
         """Return a copy for any type of float, because symbols stand for floats."""
         dtype = float if dtype is Float else dtype
@@ -272,9 +276,10 @@ def _where(condition: Any, *choices: Any) -> Any:
     return _if_else(condition, *choices)
 
 
-def _clip(a: Any, a_min: Any = None, a_max: Any = None, **_: Any) -> Any:
-    a = a if a_min is None else np.maximum(a, a_min)
-    return a if a_max is None else np.minimum(a, a_max)
+def _clip(a: Any, a_min: Any = None, a_max: Any = None, **named: Any) -> Any:
+    low, high = named.get("min", a_min), named.get("max", a_max)
+    a = a if low is None else np.maximum(a, low)
+    return a if high is None else np.minimum(a, high)
 
 
 def _select(conditions: Any, choices: Any, default: Any = 0) -> Any:
@@ -392,7 +397,7 @@ RULES: dict[Any, Rule] = {
     np.remainder: _floored_remainder,
     **dict.fromkeys((np.power, np.float_power), lambda a, b: a**b),
     np.negative: lambda a: -a,
-    np.positive: lambda a: a,
+    **dict.fromkeys((np.positive, np.conjugate), lambda a: a),  # np.var uses the second
     np.absolute: ca.fabs,
     np.heaviside: lambda a, b: ca.if_else(ca.SX(a) == 0, b, ca.SX(a) > 0),
     np.square: lambda a: a * a,

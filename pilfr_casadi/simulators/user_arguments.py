@@ -84,8 +84,8 @@ def check_expressions(found: Mapping[str, Any], known: Any) -> None:
         for name in names if len(names) > 1 else ():  # find the one
             check_expressions({name: found[name]}, known)
         raise InputError(
-            f"The equation of {names[0]!r} holds a number that is none (NaN); use CasADi's functions on symbols, "
-            "as in ca.sin(x.pos) rather than math.sin(x.pos), and check constants."
+            f"The equation of {names[0]!r} holds NaN; use CasADi's functions on symbols, as in ca.sin(x.pos) rather "
+            "than math.sin(x.pos), and check constants."
         )
 
 
@@ -111,6 +111,11 @@ def choose_parameters(
     own = check_parameters(given if isinstance(given, Mapping) else {})
     made = {n: make(n, bounds.get(n)) for n in dict.fromkeys((*given, *bounds)) if n not in own}
     return {**own.free_within({n: ends for n, ends in bounds.items() if n in own}), **made}
+
+
+def as_names(given: Any) -> Any:
+    """Return a single name as a tuple, anything else unchanged."""
+    return (given,) if isinstance(given, str) else given
 
 
 def check_names(given: Any, kind: str) -> tuple[str, ...]:

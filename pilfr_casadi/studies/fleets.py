@@ -49,7 +49,7 @@ from ..diagnose import SURE, check_laws, match_recordings
 from ..laws import Law
 from ..simulators import Simulator, as_simulator
 from .execution import NoModel, PrintLine, RunInterrupted
-from .executor import AHEAD, LOST, Effort, run_side_by_side, versions
+from .executor import AHEAD, Effort, run_side_by_side, versions
 from .fleet_result import (
     CONTENT,
     PAGES,
@@ -63,7 +63,7 @@ from .fleet_result import (
 )
 from .folder import JOBS, Layout, Manifest, check_own, lock_folder, refuse_other_versions
 from .machines import (
-    CONTENT as DIAGNOSIS,
+    DIAGNOSIS,
     DONE,
     MEASURE,
     PAGE,
@@ -324,10 +324,8 @@ class _FleetExecution:
 
     def _is_complete(self, job: MachineJob) -> bool:
         """Tell whether a job ended with the same inputs, and its files are unchanged."""
-        entry = self.manifest.entries.get(job.id, {})
-        if entry.get("key") != job.key or entry["status"] == LOST or "time_limit" in entry:
-            return False
-        return all([self.manifest.holds(name) for name in self._file_names(job)])
+        settled = self.manifest.is_settled(job, self.effort.time_limit)
+        return settled and all([self.manifest.holds(name) for name in self._file_names(job)])
 
     def _file_names(self, job: MachineJob) -> list[str]:
         return [name for name in self.manifest.content["files"] if name.startswith(f"{JOBS}/{job.id}/")]

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from .._base import InputError, digest, listed, make_folder, read_bytes, write_atomically
-from .executor import Batch, versions
+from .executor import LOST, TIMED_OUT, Batch, versions
 from .jobs import MODEL
 
 VERSION, MANIFEST = 1, "manifest.json"
@@ -142,6 +142,13 @@ class Manifest:
         """The entries of finished jobs, by id."""
         entries: dict[str, Any] = self.content["jobs"]
         return entries
+
+    def is_settled(self, job: Any, time_limit: float | None) -> bool:
+        """Tell whether a job ended with the same inputs, its worker was not lost, and more time, s, would not help."""
+        entry = self.entries.get(job.id, {})
+        if entry.get("key") != job.key or entry["status"] == LOST:
+            return False
+        return entry["status"] != TIMED_OUT or (time_limit is not None and time_limit <= entry["time_limit"])
 
     def write(self) -> None:
         """Write the manifest with its digest."""

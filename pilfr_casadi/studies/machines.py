@@ -32,7 +32,7 @@ from .executor import Outcome
 
 REFIT, SAMPLE, MEASURE, REST = "refit", "sample", "measure", "rest"  # the steps at a machine
 DONE = "DONE"  # status of a job with a result
-PAGE, CONTENT, RESIDUAL = "report.html", "diagnosis.json", "residual.json"  # files of jobs
+PAGE, DIAGNOSIS, RESIDUAL = "report.html", "diagnosis.json", "residual.json"  # files of jobs
 MOST_POINTS = 400  # samples of a residual that its picture shows
 
 
@@ -220,7 +220,7 @@ def _diagnosis_entry(found: Diagnosis) -> dict[str, Any]:
 def _diagnosis_files(found: Diagnosis) -> dict[str, str]:
     from ..report import diagnosis_page
 
-    return {PAGE: diagnosis_page(found).html(), CONTENT: json_text(found.to_dict())}
+    return {PAGE: diagnosis_page(found).html(), DIAGNOSIS: json_text(found.to_dict())}
 
 
 def measured_entry(found: Replication) -> dict[str, Any]:

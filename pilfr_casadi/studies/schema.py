@@ -247,9 +247,9 @@ class ConstraintsTable(Table):
             raise InputError(f"[constraints]: {error}") from None
         if found and isinstance(models[0], Model):
             raise InputError("dc_gain and ordered_thresholds are for a PI-LFR, and the model is your own; use 'own'.")
-        if any(isinstance(model, Lagged) for model in models) and not isinstance(self.spectral_radius, bool):
+        if not (all(isinstance(model, PILFR) for model in models) or isinstance(self.spectral_radius, bool)):
             raise InputError(
-                "'spectral_radius' in [constraints] is not for structure = 'narx' or 'noe', whose state is the past."
+                "'spectral_radius' in [constraints] is for a PI-LFR, and another model is given; leave one of them out."
             )
         return (*found, *self.own)
 

@@ -13,7 +13,7 @@ import numpy as np
 from .._base import digest
 from ..identify import load
 from ..models import Model
-from .executor import FAILED, LOST, TIMED_OUT, Batch, versions
+from .executor import FAILED, Batch, versions
 from .folder import RUN, TABLE, Manifest, refuse_other_versions
 from .jobs import MODEL, WITHOUT_MODEL, Recordings, RunJob, error_of, scored_files
 from .run_file import Run
@@ -41,13 +41,10 @@ class Store:
 
     def is_complete(self, job: RunJob) -> bool:
         """Tell whether a job finished with the same inputs, and its model is unchanged on disk."""
-        entry = self.manifest.entries.get(job.id, {})
-        if entry.get("key") != job.key or entry["status"] == LOST:
+        if not self.manifest.is_settled(job, self.run.time_limit if self.campaign else None):
             return False
-        if entry["status"] == TIMED_OUT:  # a longer limit runs the job again
-            return self.campaign and self.run.time_limit is not None and self.run.time_limit <= entry["time_limit"]
-        if entry["status"] == FAILED:
-            return self.campaign
+        if not self.campaign and self.manifest.entries[job.id]["status"] == FAILED:
+            return False
         return not self.has_model(job) or self.manifest.holds(job.model_file)
 
     def gave_model(self, job: RunJob) -> bool:

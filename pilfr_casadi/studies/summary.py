@@ -105,7 +105,8 @@ def errors_by_cell(
     run: Run, jobs: Sequence[RunJob], scores: Sequence[Score]
 ) -> dict[tuple[str, str], dict[int, dict[str, float]]]:
     """Map (role, recording) -> number of the cell -> job -> NRMSE, infinite if the job has none."""
-    known = {(s.job, s.role, FOLDS if s.recording.startswith("fold ") else s.recording): s.nrmse for s in scores}
+    held_out = {job.id for job in jobs if job.fold is not None}
+    known = {(s.job, s.role, FOLDS if s.job in held_out else s.recording): s.nrmse for s in scores}
     whole = [(role, name) for role, names in run.files.items() for name in names]
     pairs = [(p, False) for p in whole] + [((role, FOLDS), True) for role in ("train", "held") if run.folds]
     out: dict[tuple[str, str], dict[int, dict[str, float]]] = {}
@@ -209,7 +210,8 @@ def select(
         best = [min(p, key=lambda j: entries[j.id]["train"]) if p else None for p in parts.values()]
         errors.append(float(np.mean([np.inf if j is None else judged[j.id] for j in best])))
     if not np.isfinite(min(errors)):
-        raise InputError(f"{run.file}: no structure can be judged; {jobs[0].id}: {entries[jobs[0].id]['sentence']}")
+        failed = [job.id for job in jobs if not np.isfinite(judged.get(job.id, np.inf))]
+        raise InputError(f"{run.file}: no structure can be judged; {'; '.join(reasons(entries, failed))}")
     enough = [k for k, e in enumerate(errors) if e <= (1 + SELECTION_MARGIN) * min(errors)]
     names = tuple(cell.name or "the model" for cell in run.cells)
     judge = f"{run.folds} folds" if run.folds else "validation recordings"

@@ -209,6 +209,15 @@ def test_prbs_holds_and_scales():
         (lambda: sine_sweep(2.0, 2.0, 10.0, rate=1.0), "two frequencies"),
         (lambda: prbs(0, rng()), "n_samples is 0"),
         (lambda: prbs(10, rng(), order=1), "2 to 32"),
+        (lambda: prbs(10, rng(), order=3.5), "order of the binary sequence is 3.5"),
+        (lambda: multisine(64.0, 10.0, 64.0, rng()), "n_samples is 64.0"),
+        (lambda: multisine(64, 10.0, 64.0, rng(), grid=[1.5]), "whole numbers from 1 to 31"),
+        (lambda: multisine(64, "10", 64.0, rng()), "f_max='10' was given"),
+        (lambda: multisine(64, 10.0, 0.0, rng()), "fs=0.0 was given"),
+        (lambda: multisine(64, 10.0, 64.0, 1), "rng=1 was given; give a generator"),
+        (lambda: multisine(64, 10.0, 64.0, rng(), amplitude="pink"), "amplitude cannot be 'pink'"),
+        (lambda: prbs(10, 1), "rng=1 was given"),
+        (lambda: prbs(10, rng(), amplitude="1"), "amplitude cannot be '1'"),
     ],
 )
 def test_bad_options_are_refused(call, words):

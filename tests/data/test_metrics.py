@@ -57,6 +57,7 @@ def test_a_diverged_simulation_has_an_infinite_error(value):
     [
         (Y, Y[:, :1], 0, r"\(50, 2\) and simulated ones \(50, 1\)"),
         (Y, Y, 50, "at least one sample"),
+        (Y, Y, 2.5, "skip is 2.5"),
         (np.where(Y > 150, np.nan, Y), Y, 0, "not finite"),
         (Y * [1.0, 0.0] + 0.1, Y, 0, "output 2 of 2 never changes"),
     ],

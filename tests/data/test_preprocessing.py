@@ -139,6 +139,7 @@ def test_resampling_keeps_a_period_of_whole_samples():
     r = Recording(np.tile(SLOW[:200], 5), np.tile(SLOW[:200], 5), DT, period=200, initial="periodic")
     assert r.resample(2e-3).period == 100 and r.resample(2e-3).begins == "periodic"
     assert r.resample(3e-3).period is None and r.resample(3e-3).begins == "estimate"
+    assert r.with_(period=2, initial="zero").resample(5e-3).period is None  # less than one new sample
 
 
 @pytest.mark.parametrize("dt, said", [(0.0, "dt=0.0 was given"), (10.0, "leaves 1 sample of"), ("1", "dt='1'")])
@@ -240,6 +241,13 @@ def test_a_slow_held_input_stays_held():
     r = read_frame(frame, "force", "x", resample=1e-3, hold="zero")
     np.testing.assert_array_equal(r.u[:-1, 0], frame.force.ffill()[: len(r) - 1])
     assert r.hold == "zero"
+
+
+def test_columns_of_a_frame_may_have_numbers_as_names():
+    frame = slow_frame(1)
+    numbered = frame.rename(columns={"t": 0, "force": 1, "x": 2})
+    r = read_frame(numbered, "force", "x", columns={"t": 0, "force": 1, "x": 2}, resample=1e-3)
+    np.testing.assert_array_equal(r.u, read_frame(frame, "force", "x", resample=1e-3).u)
 
 
 def test_missing_samples_of_one_rate_are_no_other_rate():
@@ -379,6 +387,16 @@ def test_a_merged_input_is_linear_where_one_of_the_records_is():
     smooth = Recording(u[:, 1:], u[:, 1:], 0.02, ("b",), ("y",), hold="linear")
     assert pilfr.merge(held, smooth).hold == "linear"
     assert pilfr.merge(held, smooth, inputs="a", outputs="y").hold == "zero"
+
+
+def test_a_merged_input_stays_held_where_no_input_is_resampled():
+    """The second logger begins whole samples away, or between two samples, before or after the first one."""
+    u = np.random.default_rng(0).standard_normal((500, 2))
+    a = Recording(u[:, :1], u[:, 1:], 0.01, ("a",), ("y",), hold="zero")
+    b = Recording(u[:, 1:], np.empty((500, 0)), 0.01, ("b",), ())
+    assert [merge(a, b, start=start).hold for start in (-0.03, 0.0, 0.03)] == ["zero"] * 3
+    assert [merge(a, b, start=start).hold for start in (-0.015, 0.015)] == ["linear"] * 2
+    assert merge(a, b, start=0.015, inputs="a", outputs="y").hold == "zero"  # by the means over each step
 
 
 @pytest.mark.parametrize("period", [200, 20, None])

@@ -147,6 +147,11 @@ def test_slice_is_the_python_slice(start, stop, skip):
         assert piece.skip == max(0, skip - first)
 
 
+def test_slice_takes_numbers_of_samples():
+    with pytest.raises(InputError, match=r"stop=2.5 was given; .* use cut for seconds"):
+        recording().slice(None, 2.5)
+
+
 def test_slice_keeps_a_period_only_while_there_is_one():
     r = recording(period=5, initial="periodic", skip=2)
     assert (r.slice(5).period, r.slice(5).initial, r.slice(5).skip) == (5, "periodic", 0)
@@ -164,7 +169,7 @@ def test_split_loses_nothing(fraction):
     assert len(first) == round(20 * fraction)
 
 
-@pytest.mark.parametrize("fraction", [0.0, 1.0, -1.0, float("nan")])
+@pytest.mark.parametrize("fraction", [0.0, 1.0, -1.0, float("nan"), "half"])
 def test_split_outside(fraction):
     with pytest.raises(InputError, match="between 0 and 1"):
         recording().split(fraction)

@@ -92,6 +92,20 @@ def test_one_sentence_where_a_stack_cannot_be_used(model, tmp_path, capsys, argu
     assert re.search(words, error) and "Traceback" not in error
 
 
+def test_an_archive_is_no_table_of_a_simulator(tmp_path, capsys):
+    u, data, simulator = np.zeros(N), tmp_path / "data.npz", tmp_path / "rig.py"
+    np.savez(data, u=u, y=u)
+    simulator.write_text(
+        "from pilfr_casadi import Simulator\n"
+        "simulator = Simulator(lambda x, u: {'x': u.u - x.x}, lambda x: {'y': x.x}, states='x', inputs='u')\n"
+    )
+    for suffix, code in ((".npz", 2), (".npy", 2), (".csv", 0)):
+        out = tmp_path / f"out{suffix}"
+        assert cli.main(["simulate", str(simulator), str(data), "--out", str(out), "--dt", "0.5"]) == code
+        assert out.exists() == (code == 0)
+    assert capsys.readouterr().err.count("give a name that ends in .csv") == 2
+
+
 def test_a_damaged_array(model, tmp_path, capsys):
     data = tmp_path / "data.npy"
     data.write_bytes(b"nothing")

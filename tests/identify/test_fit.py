@@ -102,6 +102,15 @@ def two_inputs(record):
     return record.with_(u=np.hstack([record.u, record.u[::-1]]), inputs=("a", "b"))
 
 
+@pytest.mark.parametrize("options", [{"start": "paper"}, {"start": {"A": 0.5}}, {"linear": "bla"}, {"stable": 0.9}])
+def test_options_for_a_pilfr_are_refused_for_other_models(options, linear, record):
+    with pytest.raises(InputError, match="was given for a Model"):
+        fit(linear.model, record, **options)
+    if "stable" not in options:  # which bounds the fit of a PI-LFR again
+        with pytest.raises(InputError, match="was given for a Fit"):
+            fit(linear, record, **options)
+
+
 @pytest.mark.parametrize("method", ["simulate", "signals", "initial_state"])
 def test_only_recordings_are_simulated(method, linear, record):
     with pytest.raises(InputError, match="give a Recording"):

@@ -292,6 +292,7 @@ def test_a_linear_model_of_other_sizes_is_refused():
         (structure, time_subspace([record], 3), "has 3 states"),
         (structure, "linear", "A str was given as linear model"),
         (structure, type(good)(good.A, good.B, good.C, good.D, 0.2), "step is 0.2 s"),
+        (structure, type(good)(good.A, good.B, good.C, good.D, 1.0), "step is 1.0 s"),
         (NARX(2), good, "is for a PILFR"),
     ):
         with pytest.raises(InputError, match=words):

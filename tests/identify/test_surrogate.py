@@ -183,6 +183,12 @@ def test_names_come_from_the_recording_where_the_system_has_none():
     assert as_simulator(control.tf([1.5], [1.0, 2.0])).states
 
 
+def test_an_order_that_is_none_is_refused():
+    for nx in (-1, 2.5):
+        with pytest.raises(InputError, match="give a whole number, 0 or more"):
+            surrogate(simulation(m=200), nx=nx)
+
+
 def test_a_discrete_state_space_runs_at_its_own_step():
     record = simulation(m=200)
     system = control.ss([[0.9, 0.1], [-0.2, 0.8]], [[0.0], [0.3]], [[1.0, 0.5]], [[0.25]], 0.02)

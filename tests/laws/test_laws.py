@@ -30,6 +30,7 @@ from pilfr_casadi.laws import (
     StribeckFriction,
     behind_gap,
     count_columns,
+    hysteresis_layer,
     readable_unit,
     unit_forces,
 )
@@ -373,6 +374,12 @@ def test_a_layer_refuses_weights_for_another_number_of_plays():
     with pytest.raises(InputError, match=r"has 6 values of w; 3 were given. Give one number for all, or one for each."):
         StopHysteresis().at({"w": [1.0, 2.0, 3.0]}).parameters()
     assert StopHysteresis().at({"w": 2.0}).parameters()["w"].value == pytest.approx(np.full(6, 2.0))
+
+
+def test_a_layer_of_no_operators_is_refused():
+    for n in (0, 2.5):
+        with pytest.raises(InputError, match="give a whole number, 1 or more"):
+            hysteresis_layer("stop", n, False)
 
 
 def test_hysteresis_behind_a_gap_keeps_the_gap():

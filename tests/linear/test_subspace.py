@@ -240,6 +240,7 @@ def test_select_order_on_a_bla_holds_out_every_second_line():
     true = control.StateSpace(np.diag([0.9, -0.7, 0.5]), np.ones((3, 1)), [[1.0, 2.0, -3.0]], [[0.0]], DT)
     bla = plain_bla(records(true, [20_000], rng, noise=0.02))
     assert select_order(bla, range(1, 7)).recommended == 3
+    assert select_order(bla, 3).orders == (3,)
     assert select_order(exact_bla(true, np.linspace(0.01, 4.9, 60)), [5, 3, 1]).recommended == 3
 
 
@@ -307,6 +308,7 @@ def _bla(n=10, f_max=4.0, value=1.0):
         (lambda: select_order(_short(), []), "at least one order"),
         (lambda: select_order(_short(), [0, 1]), "order nx is 0"),
         (lambda: select_order(_short(), [1], margin=-1), "margin of -1"),
+        (lambda: select_order(_short(), [1], margin=np.nan), "margin of nan"),
         (lambda: select_order(_short(), [50]), "too few for order 50"),
     ],
 )

@@ -121,6 +121,11 @@ def test_an_element_needs_the_channels_of_the_port():
         close_loop(simple(), PrandtlIshlinskii(Play, 2, channels=2))
 
 
+def test_something_else_than_an_element_is_refused():
+    with pytest.raises(InputError, match="'play' was given to close_loop"):
+        close_loop(simple(), "play")
+
+
 def test_parameters_of_element_and_model_need_different_names():
     parameters = ParameterSet({"w": Parameter(0.5)})
     model = open_model(lambda x, u, w, p: (p["w"] * x, x), lambda x, u, p: x, parameters, n_x=1, n_u=1, n_w=1)

@@ -306,6 +306,7 @@ def test_a_path_over_priors(record, full):
         ({"strengths": 5}, "strengths = 5 and"),
         ({"strengths": ("a",)}, r"strengths = \('a',\) and"),
         ({"strengths": (True,)}, r"strengths = \(True,\) and"),
+        ({"priors": {"w": 3}}, r"3 was given as prior of 'w'; give a pair of numbers"),
     ],
 )
 def test_invalid_paths_are_refused(record, full, options, says):

@@ -393,8 +393,8 @@ def test_studies(fitted):
     ("draw", "words"),
     [
         (lambda f, d: plots.time(f, d, output=1), "The output 1 was given"),
-        (lambda f, d: plots.loop(f, d, channel=1), "Channel 1 of the element"),
-        (lambda f, d: plots.loop(replace(f, model=f.linear), d), "Channel 0 of the element"),
+        (lambda f, d: plots.loop(f, d, channel=1), "The channel 1 was given"),
+        (lambda f, d: plots.loop(replace(f, model=f.linear), d), "number of channels is 0"),
         (lambda f, d: plots.linear_simulation(replace(f, linear=None), d), "no linear model"),
     ],
 )
@@ -436,10 +436,15 @@ def test_a_notebook_shows_a_figure_without_pyplot(fitted, data):
 
 
 def test_pictures_that_cannot_be_drawn_are_refused(fitted, data):
+    for kind, signal in (("bode", "output"), ("poles", "input")):
+        with pytest.raises(InputError, match=f"{signal} 1 was given, counted from 0; the number of {signal}s is 1"):
+            fitted.plot(data, kind, **{signal: 1})
     with pytest.raises(InputError, match="give fit, bode, poles or residuals"):
         fitted.plot(data, "nyquist")
     with pytest.raises(InputError, match="residual tests need at least 32"):
         plots.residual_tests(data.slice(0, 20), [("model", data.y[:20])])
+    exact = plots.residual_tests(data, [("exact", data.y), ("model", 0.9 * data.y)])
+    assert [label.partition(":")[0] for label in legend_of(exact.axes[0])] == ["model"]
 
 
 @pytest.mark.parametrize("kind", ["curve", "loop"])

@@ -32,6 +32,7 @@ from pilfr_casadi.report import (
     uncertain_text,
     write_report,
 )
+from pilfr_casadi.report.page import python_literal
 
 EVIL = "<script>alert(1)</script>\" onload='x' & $\\frac"
 
@@ -154,6 +155,8 @@ def test_tables_write_numbers_for_people():
     assert uncertain_text(-123456.0, 250.0) == "−123456\xa0±\xa0250"
     assert uncertain_text(1.5e-7, 2e-9) == "1.5·10⁻⁷\xa0±\xa02·10⁻⁹"
     assert uncertain_text(0.25, np.nan) == "0.25"
+    assert uncertain_text(np.nan, np.nan) == "–"
+    assert python_literal({"y of inf": [np.inf, -np.inf, "inf"]}) == "{'y of inf': [np.inf, -np.inf, 'inf']}"
     with pytest.raises(InputError, match="has 1 cells and its table 2 columns"):
         Table(["a", "b"], [["x"]])
 
@@ -254,7 +257,7 @@ def test_a_fit_that_did_not_converge_says_so(status, tone, tmp_path):
     fitted = example(status=status)
     html = fit_report(fitted, record(fitted), [], tmp_path).read_text()
     assert f'class="status {tone}">' in html and status.value in html
-    assert "on its training recordings" in html
+    assert "on its training recordings" in html and ".. " not in Reader(html).text
 
 
 @pytest.mark.usefixtures("blank_figures")

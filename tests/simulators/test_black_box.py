@@ -166,6 +166,7 @@ def test_a_call_costs_little_beside_the_function():
 @pytest.mark.parametrize(
     "numeric, says",
     [
+        (True, "numeric=True was given; give Numeric"),
         (Numeric(nominal={"x": 1.0}), "give a positive size by the name of a state"),
         (Numeric(nominal={"pos": 0.0}), "give a positive size by the name of a state"),
     ],

@@ -10,6 +10,7 @@ import time
 import zipfile
 from dataclasses import replace
 
+import casadi as ca
 import cloudpickle
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from pilfr_casadi.simulators import (
     fastest_rates,
     load_simulator,
     parse_port,
+    stack,
     states_along,
 )
 from pilfr_casadi.simulators.fmu_function import FmuFunction
@@ -151,6 +153,7 @@ def test_parameters_and_bounds_can_be_chosen(unit):
     [
         ({"parameters": ("m3",)}, "has no 'm3' among its parameters; they are k1"),
         ({"cosimulation": CoSimulation(dt=0.01)}, "is for model exchange alone; leave it out"),
+        ({"parameters": "m3"}, "has no 'm3' among its parameters; they are k1"),
         ({"inputs": ("moment",)}, "has no 'moment' among its inputs; they are force"),
         ({"outputs": ("acc",)}, "has no 'acc' among its outputs"),
         ({"bounds": {"k1": (1, 2)}}, "'k1' is 380, outside of its bounds 1 to 2"),
@@ -180,6 +183,8 @@ NUMBER = (
     "</ScalarVariable></ModelVariables></fmiModelDescription>"
 )
 
+EVENTS = description().replace('numberOfEventIndicators="0"', 'numberOfEventIndicators="two"')
+
 
 def test_files_that_are_no_units_are_refused(tmp_path, units):
     def zipped(name, **files):
@@ -198,6 +203,7 @@ def test_files_that_are_no_units_are_refused(tmp_path, units):
         zipped("empty.fmu"): "is not a functional mock-up unit",
         zipped("broken.fmu", **{"modelDescription.xml": "<fmi"}): "is not a functional mock-up unit",
         zipped("number.fmu", **{"modelDescription.xml": NUMBER}): "is not a functional mock-up unit",
+        zipped("events.fmu", **{"modelDescription.xml": EVENTS}): "is not a functional mock-up unit",
         zipped("bare.fmu", **{"modelDescription.xml": description()}): f"no platform; export it for {FOLDER}",
         zipped("program.fmu", **both): "cannot be evaluated",
         zipped(
@@ -478,6 +484,16 @@ def test_an_array_is_named_as_such(tmp_path, units):
     with pytest.raises(InputError, match=r"'tbl' of .* is an array of Float64") as error:
         from_fmu(unit, parameters=("tbl",))
     one_sentence(error)
+
+
+def test_a_port_reads_a_unit_that_depends_on_the_time(tmp_path):
+    path = c_rig(tmp_path / "a.fmu", "TIMED")
+    unit = from_fmu(path, ports={"odd": {"into": "guide_force", "across": "power"}}, inputs="force", outputs="pos1")
+    x, u, p, t = unit.symbols()
+    z = unit.across(unit.port("odd"), x, u, p, t)
+    evaluate = ca.Function("z", [stack(x), stack(u), stack(p), t], [z])
+    start = unit.parameter_set.start
+    assert [float(evaluate(np.zeros(4), 2.0, start, time)) for time in (0.0, 3.0)] == [4.0, 7.0]
 
 
 def test_a_port_has_units(units):

@@ -201,8 +201,10 @@ def test_options_are_checked(built):
         from_fmu(path)
     one_sentence(error)
     with pytest.raises(InputError, match="has no 'speed' among its outputs and local variables") as error:
-        from_fmu(path, cosimulation=CoSimulation(dt=DT, states=("speed",)))
+        from_fmu(path, cosimulation=CoSimulation(dt=DT, states="speed"))
     one_sentence(error)
+    with pytest.raises(InputError, match=r"cosimulation=0\.01 was given; give CoSimulation"):
+        from_fmu(path, cosimulation=0.01)
     with pytest.raises(InputError, match="memory that cannot be set"):
         from_fmu(path, cosimulation=CoSimulation(dt=DT, states=("pos",)))
     with pytest.raises(InputError, match="does not add up"):

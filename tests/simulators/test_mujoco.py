@@ -278,6 +278,7 @@ def test_unknown_names_are_refused(arm):
         from_mujoco(arm, parameters=["wrist.mass"])
     with pytest.raises(InputError, match=r"has no 'm9' among its actuators; they are m1, m2"):
         from_mujoco(arm, inputs=["m9"])
+    assert from_mujoco(arm, inputs="m1", parameters="gravity").inputs == ("m1",)
     with pytest.raises(InputError, match="outside of its bounds 2 to 3; widen them"):
         from_mujoco(arm, bounds={"upper.mass": (2, 3)})
 

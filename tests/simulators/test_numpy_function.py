@@ -103,6 +103,7 @@ FUNCTIONS = {
     "mathematics": lambda t, x, u, p: [math.sin(x[0]), copysign(p["k"], x[1]) * math.sqrt(abs(u[0]))],
     "where": lambda t, x, u, p: np.where(np.abs(x) > 0.3, x, 2 * x) * np.sign(u[0]),
     "limits": lambda t, x, u, p: [np.clip(x[0], -1, 1), np.maximum(0, x[1]) + np.minimum(x[0], u[0])],
+    "methods": lambda t, x, u, p: [np.std(x) + np.var(x), x.clip(-1, 1)[0] + x.clip(max=u[0])[1]],
     "branches": lambda t, x, u, p: [max(0, x[0]), spring(x[0] - x[1], p["k"]) if u[0] > 0 else min(x[1], 1)],
     "conditions": lambda t, x, u, p: [1.0 if 0 < x[0] < 1 or x[1] > u[0] else -1.0, (x[0] > x[1]) & (u[0] < 1)],
     "floats": lambda t, x, u, p: np.array([float(x[0]), float(len(x)) * u.astype(float)[0]], dtype=float),
@@ -125,6 +126,13 @@ def test_equations_are_those_of_the_function(case):
         t, k, u, x = rng.uniform(0, 9), rng.uniform(0.5, 2), rng.normal(size=1), rng.normal(size=2)
         expected = np.ravel(np.asarray(function(t, x, u, {"k": k}), dtype=float))
         assert np.allclose(traced(t, *x, *u, k).full().ravel(), expected, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.skipif(np.lib.NumpyVersion(np.__version__) < "2.1.0", reason="the names min and max are newer")
+def test_limits_have_two_names():
+    traced = equations(lambda t, x, u, p: [np.clip(x[0], min=-1, max=u[0]), np.clip(x[1], a_min=-1, a_max=None)])
+    assert traced(0, -3, -3, 2, 1).full().ravel().tolist() == [-1, -1]
+    assert traced(0, 3, 3, 2, 1).full().ravel().tolist() == [2, 3]
 
 
 def force(t):
@@ -324,7 +332,7 @@ BAD = {
         lambda t, y, d, m: [y[1], -m * y[0]],
         ("because d and m are no names", "u is the array of the inputs"),
     ),
-    "time behind the states": (lambda y, t, f: y, ("(y, t, f) takes the time behind", "<lambda>(t, y, ...)")),
+    "time after the states": (lambda y, t, f: y, ("(y, t, f) takes the time after", "<lambda>(t, y, ...)")),
     "too few": (lambda t, x, u, p: [x[0]], ("1 value;", "derivatives a, b")),
     "too many": (lambda t, x, u, p: [x[0], x[1], 0], ("3 values;", "derivatives a, b")),
     "a matrix": (lambda t, x, u, p: np.outer(x, x)[:, :1] * x, ("shape (2, 2)", "derivatives a, b")),

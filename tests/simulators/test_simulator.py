@@ -491,8 +491,8 @@ def test_a_numpy_function_of_a_symbol_warns_of_nothing():
         (lambda: rig(units="N"), "units are 'N'; give {name: unit}"),
         (lambda: rig(units={"position": 5}), "units are {'position': 5}; give {name: unit}"),
         (lambda: rig(units={"x_2": "m"}), "The simulator has no 'x_2' among its inputs and outputs; they are force, "),
-        (lambda: with_mount(lambda x: {"vel": np.nan}), "'mount: into vel' holds a number that is none"),
-        (lambda: with_mount({"vel": 1.0}, lambda x: x.pos * np.nan), "'mount: across' holds a number that is none"),
+        (lambda: with_mount(lambda x: {"vel": np.nan}), "'mount: into vel' holds NaN"),
+        (lambda: with_mount({"vel": 1.0}, lambda x: x.pos * np.nan), "'mount: across' holds NaN"),
         (lambda: rig(dynamics=dict), "dynamics is <class 'dict'>; give a function"),
     ],
 )
@@ -515,6 +515,10 @@ def test_a_simulator_simulates_and_scores_a_recording(record):
     assert moving.nrmse(measured) == 0.0
     assert 0.1 < rig(outputs=moving.outputs, parameters={**rig().parameters, "k": Parameter(80.0)}).nrmse(measured) < 2
     np.testing.assert_array_equal(own.simulate(swapped), y)
+    more = given.with_(u=np.column_stack([given.u, given.u]), inputs=(*given.inputs, "unused1", "unused2"))
+    np.testing.assert_array_equal(own.simulate(more), y)
+    with pytest.raises(InputError, match="has no outputs, and the simulator's observer reads them"):
+        replace(own, observer=np.zeros((2, 2))).simulate(given.with_(y=np.empty((len(given), 0)), outputs=(), units={}))
     started = rig().simulate(record.with_(initial=np.array([0.2, 0.0])))
     assert started[0, 0] == 0.2
     with pytest.raises(InputError, match="has the inputs force, valve; the simulator has force, table"):

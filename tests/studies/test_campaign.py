@@ -127,6 +127,12 @@ def test_the_output_of_a_campaign(folder, capsys):
     assert len(more.done) == 3 and len(more.skipped) == 6
 
 
+def test_a_recording_may_be_named_as_a_fold(folder):
+    (folder / "train.csv").rename(folder / "fold 1.csv")
+    result = pilfr.campaign(changed(folder, ALONE, ("train.csv", "fold 1.csv"), ("count = 4", "count = 1")))
+    assert {s.recording: s.failed for s in result.summary} == {"fold 1.csv": 0, "test.csv": 0}
+
+
 @pytest.mark.slow
 def test_a_worker_and_the_driver_are_killed(folder, serial, cluster):
     out, first = folder / "rig-campaign", command(folder, "campaign", "--dask", cluster.scheduler_address)

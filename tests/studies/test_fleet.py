@@ -210,6 +210,17 @@ def test_only_missing_jobs_are_executed_again(found, days, tmp_path, monkeypatch
         pilfr.fleet(rig(), days, **OPTIONS, workers=1, out=copy)
 
 
+def test_a_step_that_ran_out_of_time_needs_a_longer_limit(found, days, tmp_path):
+    _, folder = found
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    manifest, lines = Manifest.read(copy, pilfr.studies.FLEET), []
+    manifest.content["jobs"]["measure-c"] |= {"status": "TIMED_OUT", "sentence": "too long", "time_limit": 20.0}
+    manifest.write()
+    again = pilfr.fleet(rig(), days, **OPTIONS, workers=1, out=copy, time_limit=20.0, tell=lines.append)
+    assert again["c"].failed == "too long" and all(line.endswith("already done") for line in lines)
+
+
 def test_an_interrupt_keeps_what_is_done(days, tmp_path, monkeypatch):
     from pilfr_casadi.optimise import GaussNewton
 

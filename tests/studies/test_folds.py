@@ -56,6 +56,23 @@ def test_other_folds_are_other_jobs(folder, monkeypatch):
     assert len(pilfr.campaign(path).done) == 2
 
 
+def test_the_fold_without_a_model_is_named(folder, monkeypatch):
+    path = changed(
+        folder, ALONE, ("count = 4", "count = 1"), ("report = false", "folds = 2\nreport = false"), ("[1, 3]", "[0]")
+    )
+    calls, identify = [], jobs.identify
+
+    def fails_once(*given, **options):
+        calls.append(given)
+        if len(calls) == 2:
+            raise InputError("no model today.")
+        return identify(*given, **options)
+
+    monkeypatch.setattr(jobs, "identify", fails_once)
+    with pytest.raises(InputError, match="can be judged; operators-0_fold-1_seed-0: Failed: no model today"):
+        pilfr.campaign(path)
+
+
 def test_folds_of_steady_periods_are_refused(capsys, folder):
     """Whatever block is held out, the others have its input: it would prove nothing."""
     wave = np.random.default_rng(3).normal(size=100)
