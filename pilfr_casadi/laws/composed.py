@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+import casadi as ca
 import numpy as np
 
 from .._base import InputError
@@ -177,6 +178,10 @@ class VaryingParameter(Law):
     def force(self, p: Any) -> Any:
         return p.c
 
+    def varied(self, value: Any, change: Any, lower: float) -> Any:
+        """Evaluate a parameter of a value and a lower bound with its change."""
+        return value + change
+
     def starts_as(self, plain: Law, own: Mapping[str, Any], shape: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """Start values at which a curve equals another variation with the same signal, fitted to `own`."""
         ends = {name: own[name] for name in ("low", "high")}
@@ -212,7 +217,8 @@ def heated(by: str) -> type[Law]:
     """Make the law by which a parameter varies with a slow state that the square of a signal drives.
 
     For example, a winding's resistance follows the heat of its current: `change = c q`, `dq/dt = (s^2 / s_2 - q) / T`,
-    with the mean square s_2 of the signal s in the recordings. The law stands in the port `parameter:<name>`.
+    with the mean square s_2 of the signal s in the recordings. The law stands in the port `parameter:<name>`. A
+    parameter that cannot be negative falls exponentially, with the same slope at first, as the viscosity of oil does.
 
     Parameters
     ----------
@@ -493,8 +499,11 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
 def _heated(by: str) -> Any:
     class Heated(VaryingParameter):
         form = f"scheduled by the heat of {by}"
-        equation = f"change = c q,  dq/dt = ({by}^2 / s_2 - q) / T"
-        source = "Incropera et al. (2007), Fundamentals of Heat and Mass Transfer, sec. 5.1 (lumped capacitance)"
+        equation = f"change = c q, or p (exp(c q / p) - 1) if p is positive and falls,  dq/dt = ({by}^2 / s_2 - q) / T"
+        source = (
+            "Incropera et al. (2007), Fundamentals of Heat and Mass Transfer, sec. 5.1 (lumped capacitance); "
+            "Stachowiak & Batchelor (2013), Engineering Tribology, sec. 2.3 (Reynolds' viscosity)"
+        )
         sentence = f"a parameter that varies with a slow state which the square of {by} drives, as by self-heating"
         units = {"c": "w", "T": "s", "s_2": f"[{by}]^2"}
         order, signal = 1, by
@@ -507,6 +516,13 @@ def _heated(by: str) -> Any:
 
         def flow(self, z: Any, q: Any, p: Any) -> Any:
             return (z**2 / p.s_2 - q[0]) / p.T
+
+        def varied(self, value: Any, change: Any, lower: float) -> Any:
+            """Let a parameter that cannot be negative fall exponentially, as viscosity does; a resistance rises."""
+            if lower < 0:
+                return value + change
+            falling = ca.fmin(change, 0.0)
+            return ca.fmax(change, 0.0) + value * ca.exp(falling / ca.fmax(value, 1e-300))
 
         def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
             """Time constants, with the mean square of the signal."""

@@ -108,8 +108,9 @@ class ClosedEquations:
                 at, varied = own.position(name), ca.SX(vector)
                 signal = getattr(e.law, "signal", "")
                 z = {**laws.u, **laws.x._values}[signal] if signal else vector[at]
-                value = vector[at] + laws.apply(i, z, 0.0, laws.x._values)
-                varied[at] = ca.fmin(ca.fmax(value, own.lower[at].item()), own.upper[at].item())
+                lower, upper = own.lower[at].item(), own.upper[at].item()
+                value = e.law.varied(vector[at], laws.apply(i, z, 0.0, laws.x._values), lower)
+                varied[at] = ca.fmin(ca.fmax(value, lower), upper)
                 vector = varied
         return vector
 

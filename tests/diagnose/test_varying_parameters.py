@@ -113,6 +113,27 @@ def test_a_parameter_may_follow_the_heat_of_a_signal():
     np.testing.assert_allclose(closed.simulate(r), written.simulate(r), rtol=1e-9)
 
 
+def test_a_positive_parameter_falls_exponentially_with_the_heat():
+    """As viscous friction of warm oil: it stays positive, whatever the heat."""
+    law = heated("w")().at({"c": -1e-3, "T": 1.5, "s_2": 100.0})
+    closed, r = motor().with_element("parameter:c", law), blank(2, (20, 30))
+    written = pilfr.Simulator(
+        lambda x, u, p: {
+            "i": (u.voltage - p.R * x.i - p.K * x.w) / L,
+            "w": (p.K * x.i - p.c * ca.exp(-1e-3 * x.q / p.c) * x.w) / J,
+            "q": (x.w**2 / 100.0 - x.q) / 1.5,
+        },
+        lambda x: {"current": x.i, "speed": x.w},
+        states=("i", "w", "q"),
+        inputs=("voltage", "temperature"),
+        parameters=dict(motor().parameters),
+    )
+    np.testing.assert_allclose(closed.simulate(r), written.simulate(r), rtol=1e-9)
+    parameters = {**motor().parameters, "c": pilfr.Parameter(4e-3)}  # of any sign
+    signed = motor().with_parameters(parameters).with_element("parameter:c", law)
+    assert not np.allclose(closed.simulate(r), signed.simulate(r), rtol=1e-3)
+
+
 @pytest.mark.slow
 def test_the_heat_of_the_current_is_named():
     """Nobody records the temperature; the current heats the winding."""
