@@ -159,7 +159,7 @@ def _undetectable(
     if size == 0 or size * most < DETECTION_ERRORS:
         return replace(row, status="weak")
     changes, needed = own
-    cosines = np.abs(response @ changes) / np.maximum(lengths(changes), 1e-300)
+    cosines = np.abs(response @ changes) / np.maximum(size * lengths(changes), 1e-300)
     if not np.max(cosines, initial=0.0) > SMALL_SHARE:
         return replace(row, status="followed", why="the unknown start")
     return replace(row, status="followed", why=names[int(np.argmax(np.abs(response @ needed)))])

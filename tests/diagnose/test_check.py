@@ -510,3 +510,12 @@ def test_a_test_inside_the_trained_range_leaves_nothing():
 def test_few_samples_have_no_single_frequency():
     rng = np.random.default_rng(0)
     assert not any(single_frequency([rng.standard_normal(n)], 0.1) for n in (2, 3, 5, 12) for _ in range(20))
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-6])
+def test_the_parameter_that_imitates_a_law_is_named_in_any_unit_of_the_force(scale):
+    guide = Port("guide", {"vel": -scale}, lambda x: x.pos)
+    drive = 10 * np.repeat(np.random.default_rng(0).standard_normal(SAMPLES // 10), 10)
+    found = check(plain([guide]), record(plain(), drive, initial="estimate"))
+    rows = {row.law: row.why for row in found.laws if row.port == "guide" and row.status == "followed"}
+    assert rows == {"linear_stiffness": "k", "viscous_damping": "d"}
