@@ -58,6 +58,7 @@ DOUBTFUL_PRIOR = np.log(0.01)  # the same of parameter values at which a law deg
 DOMAIN_PRIOR = np.log(4.0)
 OUTSIDE_CATALOGUE = 0.1  # probability that missing physics is in no law of the catalogue
 STRAINED_ODDS = 10.0  # how much likelier a wrong law drives a parameter of the simulator to a bound than the right one
+STATE_PRIOR = 1e-9  # precision of initial states relative to the information of a sample: hardly any prior
 
 # Model error: no machine follows a formula exactly
 FORMULA_ERROR = 1e-3  # share of a mismatch that the right explanation may leave: 3 % of its force
@@ -170,10 +171,11 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     The other inputs are the recorded ones, their deviation from the mean times INPUT_FACTOR. The parameters have the
     covariance (n H / v + P)^-1 of Laplace's approximation, with H the Fisher information of a sample and P the
     precision of the prior. With H' the information of a sample for the other inputs, the spread is
-    tr(H' (n H / v + P)^-1). The initial states are projected out of H and H', because every recording has its own: they
-    may make up for parameters, and say nothing of further recordings. The spread reveals parameters that the recordings
-    hardly determine, such as a curve of a pressure that had two levels; a cross-validation on the same recordings
-    cannot.
+    tr(H' (n H / v + P)^-1). The simulator's initial states are among the parameters, because the two may make up for
+    each other; they count alike for all hypotheses. The states in which laws begin, such as the past of a delay, are
+    projected out of H and H': a further recording has others, and each recording would count them anew. The spread
+    reveals parameters that the recordings hardly determine, such as a curve of a pressure that had two levels; a
+    cross-validation on the same recordings cannot.
 
     A motion near an unstable one, such as a pendulum's near its upper rest, amplifies any small change. If the motion
     for the other inputs amplifies more than the recorded one, that is a matter of those inputs, and the spread is
@@ -185,13 +187,23 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     mean = np.mean(np.concatenate([r.u for r in bench.recordings]), axis=0)
     smaller = [r.with_(u=mean + INPUT_FACTOR * (r.u - mean)) for r in bench.recordings]
     *_, other = _hessian(bench.on(smaller), fitted)
-    free = np.arange(int(problem.free.sum()))
+    free = int(problem.free.sum())
     if not (np.all(np.isfinite(recorded)) and np.all(np.isfinite(other))):
         return np.inf
-    width = _widths(fitted, laws, problem.free, np.diag(recorded)[free])
+    own = _own_states(fitted, len(recorded) - free)
+    # an initial state that the recordings do not reveal is a matter of the next recording
+    felt = np.diag(recorded)[free:] > STATE_PRIOR * np.diag(other)[free:]
+    kept = np.concatenate([np.arange(free), free + np.flatnonzero(own & felt)])
+    width = np.concatenate(
+        [
+            _widths(fitted, laws, problem.free, np.diag(recorded)[:free]),
+            1 / np.sqrt(np.maximum(np.diag(recorded)[kept[free:]], 1e-300)),
+        ]
+    )
+    prior = np.concatenate([np.ones(free), np.full(len(kept) - free, STATE_PRIOR)])
     with np.errstate(all="ignore"):
-        recorded, other = (_without_others(hessian, free, width) for hessian in (recorded, other))
-        precision = n / v * recorded + np.eye(len(free))
+        recorded, other = (_without_others(hessian, kept, width) for hessian in (recorded, other))
+        precision = n / v * recorded + np.diag(prior)
     if not np.all(np.isfinite(precision)):  # a parameter that the recordings hardly feel
         return np.inf
     covariance = np.linalg.pinv(precision, rcond=1e-14, hermitian=True)
@@ -200,6 +212,13 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
         return np.inf
     as_recorded, now = _amplification(bench, fitted), _amplification(bench.on(smaller), fitted)
     return found / max(now / as_recorded, 1.0) if 0 < as_recorded < np.inf and now < np.inf else found
+
+
+def _own_states(fitted: Fitted, count: int) -> np.ndarray:
+    """Mark which of the unknown numbers of all initial states, (count,), are of the simulator's own states."""
+    basis = fitted.model.initial_basis
+    own = np.any(basis[: len(fitted.simulator.states)] != 0, axis=0)
+    return np.tile(own, count // max(len(own), 1))
 
 
 def runs_away(bench: Workbench, fitted: Fitted, refitted: Fitted) -> bool:
