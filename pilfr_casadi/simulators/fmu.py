@@ -57,7 +57,7 @@ class _Unit(Unit):
         return self.described.states
 
     @cached_property
-    def leaf(self) -> FmuFunction:
+    def program(self) -> FmuFunction:
         """The function that calls the unit."""
         folder, key = unpack(self.path)
         key = hashlib.sha256(f"{key} {self.parameters} {self.outputs}".encode()).hexdigest()[:16]
@@ -86,16 +86,16 @@ class _Unit(Unit):
         """`z -> (derivatives, outputs)` in one vector, for expressions; z holds t, x, u and p."""
 
         def evaluate(z: Any) -> Any:
-            ends = np.cumsum([0, *self.leaf.signals.sizes]).tolist()
-            return call_external(self.leaf.function, *(z[a:b] for a, b in pairwise(ends)))
+            ends = np.cumsum([0, *self.program.signals.sizes]).tolist()
+            return call_external(self.program.function, *(z[a:b] for a, b in pairwise(ends)))
 
         nominal = [1.0, *(self.variables[n].nominal for n in (*self.states, *self.inputs, *self.parameters))]
         sizes = NOMINAL * np.nan_to_num(np.array(nominal), nan=1.0)
-        return external(evaluate, sizes, self.leaf.signals.results)
+        return external(evaluate, sizes, self.program.signals.results)
 
     def values(self, t: float, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
         """Evaluate derivatives and outputs by numbers."""
-        return self.leaf.evaluate(np.concatenate([[t], x, u, p]).tobytes())
+        return self.program.evaluate(np.concatenate([[t], x, u, p]).tobytes())
 
 
 _functions: dict[str, FmuFunction] = {}  # by name
@@ -238,10 +238,10 @@ class _Equations:
         rows = (*map(_rate, unit.states), *unit.outputs)
         points = list(self._points())
         first = unit.values(*points[0])
-        if unit.leaf.failure:
+        if unit.program.failure:
             raise InputError(
-                f"The program inside {unit.path} cannot be evaluated: it {unit.leaf.failure}; check it with the tool "
-                "that made it."
+                f"The program inside {unit.path} cannot be evaluated: it {unit.program.failure}; check it with the "
+                "tool that made it."
             )
         found = np.array([first, *(unit.values(*point) for point in points[1:])])
         if not np.all(np.isfinite(found)):
@@ -253,7 +253,7 @@ class _Equations:
         equal = [equal_state(row, states, unit.states) for row in found.T]
         self.equal = {row: same for row, same in zip(rows, equal, strict=True) if same}
         self.unit = replace(unit, outputs=tuple(n for n in unit.outputs if n not in self.equal))
-        self.timed_events = has_time_event(unit.leaf.signals)
+        self.timed_events = has_time_event(unit.program.signals)
 
     def _points(self) -> Any:
         """Draw times, states, inputs and parameters near the start values; the first point holds the start values."""
