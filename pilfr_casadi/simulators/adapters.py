@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError
-from ..data import Recording, default_names
+from ..data import SAME_STEP, Recording, default_names
 from ..models import Model, Parameter
 from .equations import Named
 from .simulator import Simulator
@@ -26,7 +26,6 @@ from .user_file import user_variable
 
 FACTOR = 2.0  # by which an entry of a state space may change
 GAIN_BOUNDS = (0.7, 1.3)  # of the gain of a fitted model's output
-STEP_TOLERANCE = 1e-3  # relative difference of two equal steps: models state three digits
 VARIABLE = "simulator"  # name of the variable that a simulator file sets
 
 
@@ -60,7 +59,7 @@ def as_simulator(thing: Any, recordings: Sequence[Recording] = ()) -> Simulator:
 
 def _check_step(dt: float, recordings: Sequence[Recording]) -> None:
     for r in recordings:
-        if abs(r.dt / dt - 1) > STEP_TOLERANCE:
+        if abs(r.dt / dt - 1) > SAME_STEP:
             raise InputError(f"The model's step is {dt:g} s, that of {r.label} {r.dt:g} s; resample the recording.")
 
 
