@@ -17,7 +17,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, quote_error
 from ..data import SAME_STEP, Recording, default_names
 from ..models import Model, Parameter
 from .equations import Named
@@ -98,9 +98,7 @@ def _from_system(system: Any, recordings: Sequence[Recording]) -> Simulator:
     try:
         system = control.ss(system)
     except Exception as error:
-        raise InputError(
-            f"The system cannot be written as a state space ({' '.join(str(error).split())[:120]}); give one."
-        ) from error
+        raise InputError(f"The system cannot be written as a state space ({quote_error(error)}); give one.") from error
     matrices = {"A": system.A, "B": system.B, "C": system.C, "D": system.D}
     if not all(np.all(np.isfinite(m)) for m in matrices.values()):
         raise InputError("The state space has entries that are not finite; give numbers.")
