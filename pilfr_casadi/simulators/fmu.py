@@ -27,7 +27,15 @@ import numpy as np
 from .._base import InputError, check_known
 from ..models import Named, Parameter, parameter_within, within_a_factor
 from .external import NOMINAL, ROUNDING, call_external, equal_state, external
-from .fmu_cosimulation import CoSimulation, SteppedEquations, SteppedUnit, check_force, unknown_signal
+from .fmu_cosimulation import (
+    CoSimulation,
+    SteppedUnit,
+    UnitEquations,
+    UnitSteps,
+    check_force,
+    find_equations,
+    unknown_signal,
+)
 from .fmu_description import Description, Unit, Variable, check_file, parse_port
 from .fmu_function import FmuFunction
 from .fmu_instance import FmuFile, FmuSignals, unpack
@@ -174,12 +182,12 @@ def from_fmu(
     read = {port.get(key) for port in given.values() for key in ("across", "rate")}
     needed = tuple(n for n in all_outputs if n in measured or n in read)
     made = choose_parameters(own, bounds, lambda n, ends: _make_parameter(unit.variables[n], ends))
-    equations: _Equations | SteppedEquations
+    equations: _Equations | UnitEquations
     if isinstance(unit, _Unit):
         equations = _Equations(replace(unit, outputs=needed), drives, tuple(made), measured)
     else:
         symbols = tuple(n for n in unit.inputs if n in drives or n in used)
-        equations = SteppedEquations(unit, symbols, made, needed, measured)
+        equations = find_equations(UnitSteps(unit, symbols, made, needed), measured)
     return Simulator(
         equations,
         equations.measured,
@@ -359,7 +367,7 @@ def _check_port(name: str, given: Any) -> None:
         raise InputError(f"The port {name!r} is {given!r}; {form}")
 
 
-def _make_port(equations: _Equations | SteppedEquations, name: str, given: Mapping[str, Any]) -> Port:
+def _make_port(equations: _Equations | UnitEquations, name: str, given: Mapping[str, Any]) -> Port:
     """Make a port from the names of the unit's variables, whose units it has by default."""
     factors, across, rate = _factors(given["into"]), given["across"], given.get("rate")
     z = equations.signal(name, "across", across)
