@@ -297,12 +297,15 @@ def simulate_command(options: SimulateOptions) -> int:
         return _simulate_equations(options)
     fitted = load(options.model)
     inputs, outputs = options.names(fitted.model.inputs, fitted.model.outputs)
-    kind = Path(options.data).suffix.lower()
-    if kind in STACK_SUFFIXES:
-        stack = read_stack(Path(options.data), inputs, outputs)
-        if stack is not None:
-            return _simulate_stack(options, fitted, *stack)
-    if kind not in (".mat", ".npz"):  # there, a matrix stands for several names
+    data = Path(options.data)
+    stack = read_stack(data, inputs, outputs) if data.suffix.lower() in STACK_SUFFIXES else None
+    if stack is not None:
+        return _simulate_stack(options, fitted, *stack)
+    return _simulate_record(options, fitted, inputs, outputs)
+
+
+def _simulate_record(options: SimulateOptions, fitted: Fit, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> int:
+    if Path(options.data).suffix.lower() not in (".mat", ".npz"):  # there, a matrix stands for several names
         check_names(fitted, inputs, outputs)
     recording, columns, measured = _read_to_simulate(options, inputs, outputs)
     check_names(fitted, recording.inputs, recording.outputs if measured else fitted.model.outputs)
