@@ -1,11 +1,10 @@
 """A small fleet for tests: a mass on a spring, with friction in all machines and a second fault in one."""
 
 import numpy as np
+from simulated import outputs_of
 
 from pilfr_casadi.data import Recording
-from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness
-from pilfr_casadi.simulators import discretise
 
 DT, SAMPLES, PORT = 5e-3, 240, "ground-mass"
 LAWS = (CoulombFriction, CubicStiffness)
@@ -48,10 +47,7 @@ def recording(k, seed, cubic=0.0, friction=5.0, name=""):
     v = np.sum(np.cos(2 * np.pi * f[:, None] * t + rng.uniform(0, 2 * np.pi, (20, 1))), axis=0)
     u = (30 * v / np.std(v))[:, None]
     blank = Recording(u, u, DT, inputs=("force",), outputs=("position",), initial="zero", name=name)
-    model = discretise(true, DT, "zero", 20)
-    p = model.parameters
-    values = p.pack({**{n: q.value for n, q in p.items()}, "k": k})
-    y = make_engine(model).simulate(model.drive(blank), values, np.zeros(model.n_state))[0]
+    y = outputs_of(true.with_parameters({"k": k}), blank, substeps=20)
     return blank.with_(y=y + 3e-3 * np.std(y) * rng.standard_normal(y.shape))
 
 

@@ -1,11 +1,10 @@
 """Two tanks in a row, each with an inflow of its own, and a recording of them."""
 
 import numpy as np
+from simulated import outputs_of
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
-from pilfr_casadi.engine import make_engine
-from pilfr_casadi.simulators import discretise
 
 DT, M = 0.05, 1200
 
@@ -23,8 +22,8 @@ def tanks(off=1.0, unit=1.0):
 
 def recorded():
     """Inputs (M, 2) and noisy outputs (M, 2) of the tanks."""
-    rng, model = np.random.default_rng(0), discretise(tanks(), DT)
+    rng = np.random.default_rng(0)
     u = np.column_stack([pilfr.multisine(M, f_max=1.5, fs=1 / DT, rng=rng) for _ in range(2)])
     r = Recording(u, np.zeros((M, 2)), DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero")
-    y = make_engine(model).simulate(model.drive(r), model.parameters.start, np.zeros(model.n_state))[0]
+    y = outputs_of(tanks(), r)
     return u, y + 2e-3 * rng.standard_normal(y.shape)

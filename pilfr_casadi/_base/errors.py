@@ -10,6 +10,7 @@ LARGEST = 1e100  # samples above cannot be squared and summed in double precisio
 REPAIR = (
     f"only finite numbers up to {LARGEST:g} can be used, so repair or cut out that piece, or give it in another unit"
 )
+LONGEST_MESSAGE = 240  # characters shown of another program's message
 
 
 class InputError(ValueError):
@@ -19,6 +20,21 @@ class InputError(ValueError):
 def listed(names: Sequence[Any], most: int = 20) -> str:
     """Join names by commas for a message; abbreviate more than `most` names."""
     return ", ".join(map(str, names[:most])) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def quote_error(error: BaseException, line: int | None = None) -> str:
+    """Quote an error of another program within a sentence, without a stop; one without words by its type.
+
+    `line` chooses one of its lines, such as the last of CasADi's.
+    """
+    lines = [row for row in str(error).splitlines() if row.strip()] or [type(error).__name__]
+    return one_line((" ".join(lines) if line is None else lines[line]).rstrip(" ."))
+
+
+def one_line(text: str) -> str:
+    """Write another program's message in one line of at most `LONGEST_MESSAGE` characters."""
+    text = " ".join(text.split())
+    return text if len(text) <= LONGEST_MESSAGE else text[:LONGEST_MESSAGE].rsplit(" ", 1)[0] + " ..."
 
 
 def check_known(names: Sequence[str], known: Sequence[str], kind: str, owner: Any) -> None:

@@ -51,13 +51,13 @@ def takes_options(function: Callable[[Any], int]) -> Callable[..., int]:
     return command
 
 
-def whole(text: str, least: int, most: int, default: int | None = None, metavar: str = "N") -> Any:
+def integer(text: str, least: int, most: int, default: int | None = None, metavar: str = "N") -> Any:
     """Make an option that takes a whole number."""
     wanted = f"a whole number from {least} to {most}"
     return _parsing_option(int, lambda value: least <= value <= most, wanted, default, metavar, text)
 
 
-def seconds(text: str, default: float | None = None) -> Any:
+def duration(text: str, default: float | None = None) -> Any:
     """Make an option that takes a time above zero."""
     wanted = "a number of seconds above zero"
     return _parsing_option(float, lambda value: 0 < value < math.inf, wanted, default, "SECONDS", text)
@@ -120,9 +120,9 @@ class DataOptions:
         "State at the first sample: estimate, zero (every state is zero), periodic, or the states' values, such as "
         "20,0.5 (default: estimate; zero where no outputs were measured)."
     )
-    period: int | None = whole("Samples per period; needs --initial.", 0, MOST_SAMPLES, metavar="SAMPLES")
+    period: int | None = integer("Samples per period; needs --initial.", 0, MOST_SAMPLES, metavar="SAMPLES")
     hold: Literal["zero", "linear", "band-limited"] | None = option("Course of the inputs between samples.")
-    skip: int = whole("Leading samples that are simulated but not scored.", 0, MOST_SAMPLES, 0, "SAMPLES")
+    skip: int = integer("Leading samples that are simulated but not scored.", 0, MOST_SAMPLES, 0, "SAMPLES")
     dt: float | None = option("Step, if the file has no time column.", "SECONDS")
     time_tolerance: float | None = option(
         "Largest deviation of samples from a uniform grid (default: 1e-4 steps, beyond rounding).", "STEPS"
@@ -444,14 +444,14 @@ def reserved_file(path: Path, overwrite: bool) -> Iterator[Path]:
     The work is not lost if another run has written the file since it was checked: another folder inside then takes the
     result. Without a result, no file is left.
     """
-    target = make_folder(str(path.parent)) / path.name
+    target = make_out_folder(str(path.parent)) / path.name
     for count in itertools.count(2):
         try:
             if not overwrite:
                 target.touch(exist_ok=False)
             break
         except FileExistsError:
-            target = make_folder(str(path.parent / f"run-{count}")) / path.name
+            target = make_out_folder(str(path.parent / f"run-{count}")) / path.name
     if target.parent != path.parent:
         print_line(f"note: another run has written {path} meanwhile; this result is in {target.parent}")
     try:
@@ -461,17 +461,17 @@ def reserved_file(path: Path, overwrite: bool) -> Iterator[Path]:
             target.unlink()
 
 
-def check_folder(path: str) -> Path:
+def check_out_folder(path: str) -> Path:
     """Check that the folder of the results can be made and written, and leave nothing new behind."""
     folder = Path(path)
     missing = [part for part in (folder, *folder.parents) if not part.exists()]
-    make_folder(path)
+    make_out_folder(path)
     for part in missing:
         part.rmdir()
     return folder
 
 
-def make_folder(path: str) -> Path:
+def make_out_folder(path: str) -> Path:
     """Make the folder of the results, and check that it is writable, before any long work."""
     if not path:
         raise InputError("--out '' was given; give the name of a folder.")

@@ -21,7 +21,7 @@ from ..models import PILFR, Play, PrandtlIshlinskii
 from ..optimise import Status
 from ..simulators import load_simulator
 from ..studies import LARGEST_SIZE
-from ._common import DONE, INTERRUPTED, NO_RESULT, make_folder, option, say, takes_options, whole
+from ._common import DONE, INTERRUPTED, NO_RESULT, integer, make_out_folder, option, say, takes_options
 from .diagnose import write_diagnosis
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class DemoOptions:
     """The options of `pilfr demo`."""
 
     out: str = option("Folder for the reports (default: runs/demo).", "DIR", "runs/demo")
-    workers: int | None = whole("Processes (default: one per processor, at most four).", 1, LARGEST_SIZE["workers"])
+    workers: int | None = integer("Processes (default: one per processor, at most four).", 1, LARGEST_SIZE["workers"])
 
 
 @takes_options
@@ -76,7 +76,7 @@ def demo_command(options: DemoOptions) -> int:
     from rich.console import Console
 
     console = Console(highlight=False)
-    folder, workers = make_folder(options.out), options.workers or min(4, processors())
+    folder, workers = make_out_folder(options.out), options.workers or min(4, processors())
     status = identify_rig(folder, workers, console)
     if status == INTERRUPTED:
         return status
@@ -159,5 +159,5 @@ def diagnose_rig(folder: Path, workers: int) -> int:
     except KeyboardInterrupt:
         return say("Interrupted; the diagnosis was not written.", INTERRUPTED)
     return max(
-        write_diagnosis(found, make_folder(str(folder)) / "diagnosis.json"), DONE if found.effects else NO_RESULT
+        write_diagnosis(found, make_out_folder(str(folder)) / "diagnosis.json"), DONE if found.effects else NO_RESULT
     )

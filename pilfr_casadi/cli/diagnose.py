@@ -25,9 +25,11 @@ from ._common import (
     NO_RESULT,
     SimulatorFile,
     SimulatorOptions,
-    check_folder,
     check_new,
+    check_out_folder,
+    duration,
     flag,
+    integer,
     name_list,
     numbers_of,
     option,
@@ -36,10 +38,8 @@ from ._common import (
     print_recordings,
     reserved_file,
     say,
-    seconds,
     simulator_files,
     takes_options,
-    whole,
 )
 from .app import name_options
 
@@ -58,16 +58,16 @@ class DiagnoseOptions(SimulatorOptions):
     simulated: str | None = option("Recorded simulation (inputs and outputs), instead of the simulator file.", "SIM")
     test: list[str] = option("Test recording, never fitted (repeatable).", "FILE", [])
     laws: str | None = LAWS
-    effects: int | None = whole("Largest number of effects to look for (default: as many as the data tell).", 1, 100)
+    effects: int | None = integer("Largest number of effects to look for (default: as many as the data tell).", 1, 100)
     limit: list[str] = option(
         "Largest amplitude of an input in the proposed next experiment (repeatable; default: as recorded).",
         "INPUT=AMPLITUDE",
         [],
     )
-    workers: int | None = whole(
+    workers: int | None = integer(
         "Number of parallel fits (default: one per processor, at most four).", 1, LARGEST_SIZE["workers"]
     )
-    time_limit: float = seconds(
+    time_limit: float = duration(
         "End the search after about this time, with the best answer so far; loading the simulator and writing the "
         "report come on top (default: 600).",
         600.0,
@@ -75,7 +75,7 @@ class DiagnoseOptions(SimulatorOptions):
     focus: Literal["simulation", "prediction"] | None = option(
         "Errors of a free run, or of predictions one sample ahead (default: a free run, if the simulator can)."
     )
-    search_samples: int | None = whole(
+    search_samples: int | None = integer(
         "Training samples up to which the search uses all; of more it uses stretches (default: 60000).",
         20,
         LARGEST_SIZE["samples"],
@@ -125,7 +125,7 @@ def diagnose_command(options: DiagnoseOptions) -> int:
     train = options.read_all(options.train, inputs, outputs)
     tests = options.read_all(options.test, inputs, outputs)
     _check_recordings(train, tests)
-    check_folder(options.out)
+    check_out_folder(options.out)
     error, poor = 0.0, ""
     if given is not None:
         simulator = as_simulator(given, list(train.values()))
@@ -333,7 +333,7 @@ def check_command(options: CheckOptions) -> int:
     simulator = as_simulator(given)
     recordings = options.read_all(options.train, simulator.inputs, simulator.output_names)
     if options.out is not None:
-        check_folder(options.out)
+        check_out_folder(options.out)
     print_note(simulator)
     print_recordings("training", recordings)
     with deferred_interrupt():

@@ -52,21 +52,21 @@ from ._common import (
     NO_RESULT,
     DataOptions,
     bounds_of,
-    check_folder,
     check_given_once,
     check_names,
     check_new,
+    check_out_folder,
+    duration,
     flag,
     initial_state,
+    integer,
     numbers_of,
     option,
     print_line,
     print_recordings,
     reserved_file,
     say,
-    seconds,
     takes_options,
-    whole,
 )
 
 DEFAULT_STARTS = 8
@@ -76,39 +76,39 @@ STRUCTURE_NAMES = {"bound": "bounds"}  # option: its name in `STRUCTURE_OPTIONS`
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitOptions(DataOptions):
+class FitCommandOptions(DataOptions):
     """The options of `pilfr fit`; options of a search have no default, which shows whether they were given."""
 
     train: list[str] = typer.Argument(..., metavar="TRAIN", help=f"Training recordings ({FILE_TYPES}).")
     inputs: str = option("Names of the inputs.", "NAME[,NAME]", ...)
     outputs: str = option("Names of the outputs.", "NAME[,NAME]", ...)
     test: list[str] = option("Test recording, never fitted (repeatable).", "FILE", [])
-    nx: int | None = whole("States of the linear part (default: chosen on the training data).", 0, LARGEST_SIZE["nx"])
-    operators: int | None = whole(
+    nx: int | None = integer("States of the linear part (default: chosen on the training data).", 0, LARGEST_SIZE["nx"])
+    operators: int | None = integer(
         "Hysteresis operators per channel (default: 20); 0 for a linear model.", 0, LARGEST_SIZE["operators"]
     )
     operator: Literal["play", "stop", "generalized_play"] | None = option("Kind of operator (default: play).")
-    channels: int | None = whole("Channels of the element (default: 1).", 1, LARGEST_SIZE["channels"])
+    channels: int | None = integer("Channels of the element (default: 1).", 1, LARGEST_SIZE["channels"])
     structure: Literal["lfr", "hammerstein", "wiener", "ssnn", "network_lfr", "narx", "noe"] | None = option(
         "Where the element sits (default: lfr), or a network to compare with."
     )
-    hidden: int | None = whole("Neurons of a network (default: 15; 10 for narx and noe).", 1, LARGEST_SIZE["hidden"])
-    lags: int | None = whole("Number of past outputs and inputs of narx and noe.", 1, LARGEST_SIZE["lags"])
+    hidden: int | None = integer("Neurons of a network (default: 15; 10 for narx and noe).", 1, LARGEST_SIZE["hidden"])
+    lags: int | None = integer("Number of past outputs and inputs of narx and noe.", 1, LARGEST_SIZE["lags"])
     bound: list[str] = option("Bounds of a parameter (repeatable).", "NAME=LOW:HIGH", [])
     fix: list[str] = option("Hold a block of parameters at a value (repeatable).", "NAME=VALUE", [])
-    starts: int | None = whole(f"Starts (default: {DEFAULT_STARTS}).", 1, LARGEST_SIZE["starts"])
-    seed: int | None = whole("Seed of all starts (default: 0).", 0, LARGEST_SIZE["seed"])
+    starts: int | None = integer(f"Starts (default: {DEFAULT_STARTS}).", 1, LARGEST_SIZE["starts"])
+    seed: int | None = integer("Seed of all starts (default: 0).", 0, LARGEST_SIZE["seed"])
     start_from: str | None = option("Start from a saved model instead of searching.", "MODEL.json", name="--from")
     solver: Literal["gauss-newton", "ipopt"] = option(
         "Solver of the final problem (default: gauss-newton).", default="gauss-newton"
     )
-    workers: int = whole(
+    workers: int = integer(
         "Number of processes; it does not change the results (default: 1).", 1, LARGEST_SIZE["workers"], 1
     )
     engine: Literal["auto", "c", "vm"] = option(
         "Generated C or CasADi's virtual machine (default: C where there is a compiler).", default="auto"
     )
-    time_limit: float | None = seconds("Stop after this time and keep the best so far (default: no limit).")
+    time_limit: float | None = duration("Stop after this time and keep the best so far (default: no limit).")
     out: str = option("Folder for model.json and report.html (default: fit).", "DIR", "fit")
     overwrite: bool = flag("Replace an existing model in that folder.", "--overwrite")
 
@@ -119,7 +119,7 @@ class FitOptions(DataOptions):
 
 
 @takes_options
-def fit_command(options: FitOptions) -> int:
+def fit_command(options: FitCommandOptions) -> int:
     """Writes the model to DIR/model.json and the report to DIR/report.html."""
     _check_options(options)
     inputs, outputs = options.names()
@@ -128,7 +128,7 @@ def fit_command(options: FitOptions) -> int:
         check_names(saved, inputs, outputs)
     train_by_path = options.read_all(options.train, inputs, outputs)
     tests_by_path = options.read_all(options.test, inputs, outputs)
-    check_folder(options.out)
+    check_out_folder(options.out)
     print_recordings("training", train_by_path)
     print_recordings("test", tests_by_path)
     train, tests = list(train_by_path.values()), list(tests_by_path.values())
@@ -155,7 +155,7 @@ def fit_command(options: FitOptions) -> int:
     return say(NOTHING_SENTENCE, NO_RESULT) if explains_nothing(result.train_nrmse) else DONE
 
 
-def _check_options(options: FitOptions) -> None:
+def _check_options(options: FitCommandOptions) -> None:
     """Refuse options that exclude each other, and an existing model file."""
     if options.start_from and options.search:
         raise InputError(
@@ -174,7 +174,7 @@ def _check_options(options: FitOptions) -> None:
 
 
 def _identify(
-    options: FitOptions, saved: Fit | None, train: list[Recording], progress: Progress
+    options: FitCommandOptions, saved: Fit | None, train: list[Recording], progress: Progress
 ) -> tuple[Fit | PILFR | Lagged, Fit]:
     """Fit; return the structure or the saved model that was fitted, and the fit."""
     solver = GaussNewton() if options.solver == "gauss-newton" else Ipopt()
@@ -191,7 +191,7 @@ def _identify(
     return task, replace(result, engine=engine)
 
 
-def _build_structure(options: FitOptions, train: Sequence[Recording], progress: Progress) -> PILFR | Lagged:
+def _build_structure(options: FitCommandOptions, train: Sequence[Recording], progress: Progress) -> PILFR | Lagged:
     structure = options.structure or "lfr"
     given: dict[str, Any] = {k: getattr(options, k) for k in ("operators", "operator", "channels", "hidden", "lags")}
     if "nx" in STRUCTURE_OPTIONS[structure]:
@@ -297,12 +297,15 @@ def simulate_command(options: SimulateOptions) -> int:
         return _simulate_equations(options)
     fitted = load(options.model)
     inputs, outputs = options.names(fitted.model.inputs, fitted.model.outputs)
-    kind = Path(options.data).suffix.lower()
-    if kind in STACK_SUFFIXES:
-        stack = read_stack(Path(options.data), inputs, outputs)
-        if stack is not None:
-            return _simulate_stack(options, fitted, *stack)
-    if kind not in (".mat", ".npz"):  # there, a matrix stands for several names
+    data = Path(options.data)
+    stack = read_stack(data, inputs, outputs) if data.suffix.lower() in STACK_SUFFIXES else None
+    if stack is not None:
+        return _simulate_stack(options, fitted, *stack)
+    return _simulate_record(options, fitted, inputs, outputs)
+
+
+def _simulate_record(options: SimulateOptions, fitted: Fit, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> int:
+    if Path(options.data).suffix.lower() not in (".mat", ".npz"):  # there, a matrix stands for several names
         check_names(fitted, inputs, outputs)
     recording, columns, measured = _read_to_simulate(options, inputs, outputs)
     check_names(fitted, recording.inputs, recording.outputs if measured else fitted.model.outputs)

@@ -39,15 +39,15 @@ from ._common import (
     NO_RESULT,
     SimulatorOptions,
     check_cluster,
+    duration,
     flag,
-    make_folder,
+    integer,
+    make_out_folder,
     open_cluster,
     option,
     print_line,
     say,
-    seconds,
     takes_options,
-    whole,
 )
 
 LINE_WIDTH = 10_000  # characters: too wide to wrap or truncate a number of a table
@@ -60,7 +60,7 @@ class RunOptions:
 
     run_file: str = typer.Argument(..., metavar="RUN.toml", help="The run file (.toml, or .py that sets `run`).")
     out: str | None = option("Folder of the results (default: as in the file, else RUN-run).", "DIR")
-    workers: int | None = whole(
+    workers: int | None = integer(
         "Number of processes; it does not change the results (default: as in the file).", 1, LARGEST_SIZE["workers"]
     )
     overwrite: bool = flag("Compute everything again, even finished jobs.", "--overwrite")
@@ -70,7 +70,7 @@ class RunOptions:
         given = read_run(self.run_file, kind)
         if self.out is not None:
             check_own(Path(self.out), given.file, self.overwrite)
-            given = replace(given, out=make_folder(self.out))
+            given = replace(given, out=make_out_folder(self.out))
         return given if self.workers is None else replace(given, workers=self.workers)
 
 
@@ -79,7 +79,7 @@ class CampaignOptions(RunOptions):
     """The options of `pilfr campaign`."""
 
     dask: str | None = option("Run the jobs on the Dask cluster of this scheduler.", "ADDRESS")
-    time_limit: float | None = seconds("Stop a job after this time (default: as in the file, else no limit).")
+    time_limit: float | None = duration("Stop a job after this time (default: as in the file, else no limit).")
 
 
 @takes_options
@@ -188,12 +188,12 @@ class FleetOptions(SimulatorOptions):
         help=f"The simulator, as for `pilfr diagnose`, then a folder with a recording ({FILE_TYPES}), or a folder of "
         "recordings in the order of their names, for each machine.",
     )
-    sample: int = whole("Number of machines that are diagnosed to find the common physics (default: 4).", 1, 1000, 4)
-    workers: int | None = whole(
+    sample: int = integer("Number of machines that are diagnosed to find the common physics (default: 4).", 1, 1000, 4)
+    workers: int | None = integer(
         "Number of processes; it does not change the results (default: one per processor).", 1, LARGEST_SIZE["workers"]
     )
     dask: str | None = option("Run the jobs on the Dask cluster of this scheduler.", "ADDRESS")
-    time_limit: float | None = seconds("Stop the work at a machine after this time (default: no limit).")
+    time_limit: float | None = duration("Stop the work at a machine after this time (default: no limit).")
     out: str | None = option("Folder of the results (default: fleet).", "DIR")
     overwrite: bool = flag("Compute everything again, even finished jobs.", "--overwrite")
     against: str | None = option("Judge the machines against the fleet in this folder, and write nothing.", "DIR")
@@ -232,7 +232,7 @@ class FleetOptions(SimulatorOptions):
         """All recordings."""
         return [path for paths in self.machines.values() for path in paths]
 
-    def check_folder(self) -> None:
+    def check_target(self) -> None:
         """Refuse to write results among the recordings: the next call would take them for a machine."""
         if Path(self.files[1]).resolve() in (Path(self.target).resolve(), *Path(self.target).resolve().parents):
             raise InputError(f"The folder {self.target} is inside {self.files[1]}; give the results another --out.")
@@ -250,7 +250,7 @@ def fleet_command(options: FleetOptions) -> int:
         raise InputError("--against and --out were given; --against writes nothing, so leave one of them out.")
     options.check_files()
     if options.against is None:
-        options.check_folder()
+        options.check_target()
     given = options.simulator_file().load()
     simulator = as_simulator(given)
     inputs, outputs = simulator.inputs, simulator.output_names

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     )
     from .metrics import (
         BAND as BAND,
+        DIVERGING as DIVERGING,
         NOTHING_SENTENCE as NOTHING_SENTENCE,
         chance as chance,
         correlation as correlation,

@@ -23,6 +23,7 @@ import numpy as np
 from .._base import InputError, is_whole, whole
 
 CONSTANT_ERROR = 0.99  # NRMSE above which a simulation is no better than a constant, whose NRMSE is 1
+DIVERGING = 1e4  # NRMSE from which tables and pages only say that a simulation diverges
 BAND = 2.5758  # standard deviations that a normal value exceeds in 1 of 100 cases
 NOTHING_SENTENCE = "The model explains nothing of the training recordings: it is no better than a constant."
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import REPAIR, InputError, existing_file, read_bytes, usable, without_mask
+from .._base import REPAIR, InputError, existing_file, quote_error, read_bytes, usable, without_mask
 from .columns import ONE_STEP, TIME_NAMES, present_samples, refuse_slow_channels, unit_in_brackets
 from .csv_table import CsvTable, parse_csv
 
@@ -336,7 +336,7 @@ def _array_name(names: Sequence[str]) -> str:
 
 def _reason(error: Exception) -> str:
     """Return the first line of a parser's error as part of a sentence."""
-    text = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
+    text = quote_error(error, 0)
     return "it holds Python objects, which are not read because they can run code" if "pickle" in text else text
 
 

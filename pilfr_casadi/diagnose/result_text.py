@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from .._base import percent
-from ..data import Recording
-from ..identify import RUN_AWAY
+from ..data import DIVERGING, Recording
 from ..models import ParameterSet
 from ..simulators import ACTUATOR, Simulator, name_at, split_port
 from .blind_spots import BlindSpot
@@ -355,7 +354,7 @@ class ResultText:
 
 def _error_text(nrmse: float) -> str:
     """Write an error with four decimals, or two digits if it is below them."""
-    if not nrmse < RUN_AWAY:
+    if not nrmse < DIVERGING:
         return "runs away"
     return f"{nrmse:.4f}" if nrmse >= 1e-3 or nrmse == 0 else f"{nrmse:.2g}"
 

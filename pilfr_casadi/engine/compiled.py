@@ -5,9 +5,9 @@ up. Only the others become code, and expressions of parameters alone are evaluat
 with many operators are sparse, so the loops read them from tables. The slopes of a step of several stages are hardly
 ever zero and are written out term by term.
 
-Where a step calls another program (`simulators.leaves`), CasADi leaves a gap in the code for a callback, and calls an
-external function by its name. Both are made to call a buffer, and `simulators.bind` passes the buffers of a thread to a
-library. A functional mock-up unit is called only in a process of its own, which runs the whole library.
+Where a step calls another program, CasADi leaves a gap in the code for a callback, and calls an external function by
+its name. Both are made to call a buffer, and `simulators.bind` passes the buffers of a thread to a library. A
+functional mock-up unit is called only in a process of its own, which runs the whole library.
 
 The loops are built once, a model's library once per structure; `_base.c_compiler` keeps both. Without a
 working C compiler `make_engine` falls back to the virtual machine of `sensitivities`. It gives the same numbers, bit by
@@ -156,7 +156,7 @@ def source_code(linear: Linearization) -> str:
 
 
 def _fill_gaps(code: str) -> str:
-    """Let the gaps and the external functions in generated code call the programs of `leaves` and `units`."""
+    """Let the gaps and the external functions in generated code call other programs."""
     numbers: dict[str, int] = {}
     return GAP.sub(
         lambda gap: f"{gap[1]}  return call_external({numbers.setdefault(gap['name'], len(numbers))}, arg, res);", code

@@ -14,7 +14,6 @@ from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
     from .comparison import (
-        RUN_AWAY as RUN_AWAY,
         Comparison as Comparison,
         compare as compare,
         run_free as run_free,

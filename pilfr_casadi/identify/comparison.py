@@ -14,14 +14,12 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, later
-from ..data import Recording, as_recordings, rmse_per_output
+from ..data import DIVERGING, Recording, as_recordings, rmse_per_output
 from ..engine import Engine, make_engine
 from ..models import Model
 from ..optimise import StatePrior, estimate_initial_state, samples_to_start
 from ..simulators import Simulator, as_simulator, discretise_for
 from .result import Fit
-
-RUN_AWAY = 1e4  # error from which a simulation counts as diverging
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -111,7 +109,7 @@ class Comparison:
 
 
 def _format_error(error: float) -> str:
-    return f"{error:.4f}" if error < RUN_AWAY else "diverges"
+    return f"{error:.4f}" if error < DIVERGING else "diverges"
 
 
 def compare(recording: Recording, models: Mapping[str, Any] | Any) -> Comparison:

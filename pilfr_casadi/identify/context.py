@@ -42,7 +42,7 @@ from .undetermined import describe_open_memory, describe_reached_gain
 Stage = tuple[Model, Problem, Solution, str]  # model, problem, solution, note
 Array = np.ndarray
 BOUND_SOLVER = GaussNewton()  # solves at a bound on a spectral radius for solvers other than Gauss-Newton
-DIVERGES = 1e3  # a fit counts as diverged from this multiple of the error of a model whose outputs are zero
+FAR_WORSE = 1e3  # multiple of the error of zero outputs from which a fit has the status DIVERGES
 NOISE_ROUNDS, NOISE_AGREES = 5, 0.05  # limit of noise estimates, and the relative change below which they stop
 
 
@@ -162,7 +162,7 @@ class FitContext:
             judged = Problem(fitted, problem.recordings, **options)
         nrmse = tuple(problem.nrmse(theta))
         of_zero = [float(np.max(np.sqrt(np.mean(r.y**2, axis=0)) / problem.scale)) for r in problem.recordings]
-        if solution.status.converged and not max(nrmse) < DIVERGES * max(1.0, *of_zero):
+        if solution.status.converged and not max(nrmse) < FAR_WORSE * max(1.0, *of_zero):
             solution = replace(solution, status=Status.DIVERGES)
         notes = (
             note,

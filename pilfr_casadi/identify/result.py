@@ -389,43 +389,22 @@ class Fit:
     def __str__(self) -> str:
         errors = ", ".join(map(_format_error, self.train_nrmse))
         count = len(self.candidates)
-        starts = f"{count} start{'s' if count > 1 else ''}"
-        spent = f"{self.seconds:.1f} s{f' for {starts}' if count else ''}; " if self.seconds else ""
+        starts = f" for {count} start{'s' if count > 1 else ''}" if count else ""
+        spent = f"{self.seconds:.1f} s{starts}; " if self.seconds else ""
         steps = f"{self.solution.iterations} iteration{'' if self.solution.iterations == 1 else 's'}"
         lines = [
             self.status.value,
-            *([self.status.advice] if self.status.advice else []),
+            NOTHING_SENTENCE if explains_nothing(self.train_nrmse) else "",
+            self.status.advice,
             f"NRMSE on the training recording{'s' if len(self.train_nrmse) > 1 else ''}: {errors}",
             f"{spent}the last solve took {steps}",
+            *_describe_starts(self),
+            _describe_linear(self),
+            self.note,
+            *describe_unknown_errors(self.errors),
+            f"bounds that are active: {', '.join(self.active) if self.active else 'none'}",
+            *_describe_constraints(self),
         ]
-        if explains_nothing(self.train_nrmse):
-            lines.insert(1, NOTHING_SENTENCE)
-        if self.candidates:
-            reached = sorted(c.error for c in self.candidates)
-            several = f"the starts reached NRMSE {_format_error(reached[0])} ... {_format_error(reached[-1])}"
-            text = several if count > 1 else f"the start reached NRMSE {_format_error(reached[0])}"
-            prior = DENSITY_PRIOR in self.note and reached[0] < float(np.mean(self.train_nrmse))
-            lines.append(f"{text}, before the weak prior that makes the weights smooth" if prior else text)
-            if not any(c.drawn for c in self.candidates):
-                lines.append("no start is drawn at random, so the seed has no effect")
-        if self.linear_nrmse:
-            alone = ", ".join(f"{e:.4f}" for e in self.linear_nrmse)
-            tight = any(v.kind == "constraint" and not v.name.endswith("<= 1") for v in self.limits)
-            without = ", without the constraints" if tight else ""
-            lines.append(f"the linear model alone{without}, to judge the element by: NRMSE {alone}")
-        if self.note:
-            lines.append(self.note)
-        lines += describe_unknown_errors(self.errors)
-        lines.append(f"bounds that are active: {', '.join(self.active) if self.active else 'none'}")
-        constraints = [limit for limit in self.limits if limit.kind == "constraint"]
-        if constraints:
-            shown = [str(limit) for limit in constraints if limit.active or not limit.met]
-            idle = [limit for limit in constraints if limit.met and not limit.active]
-            shown += [str(limit) for limit in idle if "[" not in limit.name]
-            rows = [limit.name.partition("[")[0] for limit in idle if "[" in limit.name]
-            shown += [f"{len(rows)} not active ({', '.join(dict.fromkeys(rows))})"] if rows else []
-            lines.append(f"constraints: {'; '.join(shown)}")
-            lines.append(describe_unknown_multipliers(self.limits, self.status))
         return "\n".join(line for line in lines if line)
 
     __repr__ = __str__
@@ -451,6 +430,42 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
     if content.limits is not None:
         options = options_from_limits(content.limits, content.structure, noise=content.noise, weights=content.weights)
     return Fit(**{**shared, "limits": content.limits or ()}, options=options)
+
+
+def _describe_starts(fit: Fit) -> list[str]:
+    """Write the errors that the starts reached, and whether the seed has an effect."""
+    if not fit.candidates:
+        return []
+    reached = sorted(c.error for c in fit.candidates)
+    several = f"the starts reached NRMSE {_format_error(reached[0])} ... {_format_error(reached[-1])}"
+    text = several if len(reached) > 1 else f"the start reached NRMSE {_format_error(reached[0])}"
+    if DENSITY_PRIOR in fit.note and reached[0] < float(np.mean(fit.train_nrmse)):
+        text += ", before the weak prior that makes the weights smooth"
+    drawn = any(c.drawn for c in fit.candidates)
+    return [text, "" if drawn else "no start is drawn at random, so the seed has no effect"]
+
+
+def _describe_linear(fit: Fit) -> str:
+    """Write the error of the linear model without the element."""
+    if not fit.linear_nrmse:
+        return ""
+    alone = ", ".join(f"{e:.4f}" for e in fit.linear_nrmse)
+    tight = any(v.kind == "constraint" and not v.name.endswith("<= 1") for v in fit.limits)
+    without = ", without the constraints" if tight else ""
+    return f"the linear model alone{without}, to judge the element by: NRMSE {alone}"
+
+
+def _describe_constraints(fit: Fit) -> list[str]:
+    """Write the constraints: active and unmet ones, then idle ones, whose rows are only counted."""
+    constraints = [limit for limit in fit.limits if limit.kind == "constraint"]
+    if not constraints:
+        return []
+    shown = [str(limit) for limit in constraints if limit.active or not limit.met]
+    idle = [limit for limit in constraints if limit.met and not limit.active]
+    shown += [str(limit) for limit in idle if "[" not in limit.name]
+    rows = [limit.name.partition("[")[0] for limit in idle if "[" in limit.name]
+    shown += [f"{len(rows)} not active ({', '.join(dict.fromkeys(rows))})"] if rows else []
+    return [f"constraints: {'; '.join(shown)}", describe_unknown_multipliers(fit.limits, fit.status)]
 
 
 def _format_error(error: float) -> str:

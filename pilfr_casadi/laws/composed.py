@@ -370,6 +370,24 @@ def _levels(found: Law, own: str, by: str, limits: Mapping[str, float]) -> np.nd
     return levels if found.scheduled_by == by else np.array([levels.mean(axis=0)] * 3)
 
 
+def _limits(signal: np.ndarray) -> dict[str, float]:
+    """Return the range of a signal that varies a law."""
+    return {"low": float(signal.min()), "high": float(signal.max())}
+
+
+def _follow_pattern(profile: str, levels: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return the values of a profile from each strength at the low end, the middle and the high end of the signal."""
+    values: dict[str, Any] = {}
+    for own, (low, middle, high) in levels.items():
+        ends = PROFILES[profile].ends
+        chosen = {1: (low,), 2: (low, high), 3: (low, middle, high)}[len(ends)]
+        values |= {f"{own}{end}": level for end, level in zip(ends, chosen, strict=True)}
+        if profile == "exponential":
+            ratio = np.abs(np.sum(high)) / max(np.abs(np.sum(low)), 1e-300)
+            values["ratio"] = float(np.clip(ratio, 1 / MOST_RATIO, MOST_RATIO))
+    return values
+
+
 def _in_words(base: Any, varies: Profile, by: str, words: str) -> tuple[str, str, str]:
     """Return form, equation and sentence of a law whose strength varies."""
     course = varies.course.format(by=by)
@@ -399,6 +417,11 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
         weights = varies.weights(signal, p)
         own = {name: p[name] for name in base.units}
         return own | {k: sum(w * p[v] for w, v in zip(weights, names, strict=True)) for k, names in ends.items()}
+
+    def arguments(p: Any, u: Any, z: Any, **signals: Any) -> dict[str, Any]:
+        """Arguments of the law's force at a value of the signal."""
+        have = {"z": z, "p": Named("parameter", strengths(p, u, z)), **signals}
+        return {k: have[k] for k in read if k in have}
 
     class Scheduled(base):
         form, equation, sentence = _in_words(base, varies, by, words)
@@ -439,8 +462,7 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
 
         def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
             """Shapes of the law, with the range of the signal."""
-            signal = self.schedule(local)
-            limits = {"low": float(signal.min()), "high": float(signal.max())}
+            limits = _limits(self.schedule(local))
             for own in super().shapes(local):
                 for ratio in RATIOS if shape else (1.0,):
                     yield own | dict.fromkeys(shape, ratio) | limits
@@ -455,19 +477,12 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
         @classmethod
         def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:
             """Start as the found law varies, or else with every pattern of variation."""
-            signal = cls().schedule(local)
-            limits = {"low": float(signal.min()), "high": float(signal.max())}
+            limits = _limits(cls().schedule(local))
+            kept = {k: v for k, v in found.values.items() if k in base.units} | limits
+            levels = {own: _levels(found, own, by, limits) for own in base.strength}
             known = by in (found.scheduled_by, found.scaled_by)
             for pattern in ((1.0, 1.0, 1.0),) if known else PATTERNS[: None if name == "quadratic" else 2]:
-                values: dict[str, Any] = {k: v for k, v in found.values.items() if k in base.units} | limits
-                for own, names in ends.items():
-                    low, middle, high = np.multiply(pattern, _levels(found, own, by, limits).T).T
-                    levels = {1: (low,), 2: (low, high), 3: (low, middle, high)}[len(names)]
-                    values |= dict(zip(names, levels, strict=True))
-                    if shape:
-                        ratio = np.abs(np.sum(high)) / max(np.abs(np.sum(low)), 1e-300)
-                        values["ratio"] = float(np.clip(ratio, 1 / MOST_RATIO, MOST_RATIO))
-                yield values
+                yield kept | _follow_pattern(name, {k: np.multiply(pattern, v.T).T for k, v in levels.items()})
 
         if base.memory:
 
@@ -479,14 +494,12 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
         elif "q" in read:
 
             def force(self, z: Any, dz: Any, q: Any, u: Any, p: Any) -> Any:
-                have = {"z": z, "dz": dz, "q": q, "p": Named("parameter", strengths(p, u, z))}
-                return super().force(**{k: have[k] for k in read if k in have})
+                return super().force(**arguments(p, u, z, dz=dz, q=q))
 
         else:
 
             def force(self, z: Any, dz: Any, u: Any, p: Any) -> Any:  # type: ignore[misc]
-                have = {"z": z, "dz": dz, "p": Named("parameter", strengths(p, u, z))}
-                return super().force(**{k: have[k] for k in read if k in have})
+                return super().force(**arguments(p, u, z, dz=dz))
 
     return _rename(
         Scheduled,

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 Array = np.ndarray
 
 ROUNDING = 1e-8  # smaller relative errors are rounding errors
-DIVERGED = 1e150  # entry of a triangular factor above which its square overflows
+LARGEST_ENTRY = 1e150  # entry of a triangular factor above which its square overflows
 LADDER = tuple(round(4 * 1.5**k) for k in range(12))  # numbers of block rows to try: 4, 6, 9, 14, 20, 30, ...
 TRIALS = 4  # numbers of block rows tried for each order, besides the first
 BUDGET = 4e9  # multiplications (samples times rows squared) above which larger numbers of block rows are not tried
@@ -240,7 +240,7 @@ class SubspaceProblem:
         """
         with np.errstate(over="ignore", invalid="ignore"):
             blocks = self.triangular_factors(A, C)
-        if not all(np.all(np.abs(R) < DIVERGED) for R in blocks):
+        if not all(np.all(np.abs(R) < LARGEST_ENTRY) for R in blocks):
             n_u, C = len(self.u_scale), self.y_scale[:, None] * C
             return Matrices(0 * A, np.zeros((len(A), n_u)), C, np.zeros((len(C), n_u))), np.inf
         theta = [_least_squares(R[:, :-1], R[:, -1]) for R in blocks]

@@ -26,7 +26,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, filled, numbers
+from .._base import InputError, filled, numbers, quote_error
 from ..linear import spectral_radius
 from ..models import (
     PILFR,
@@ -341,7 +341,7 @@ def _expression(c: Constraint, symbols: Mapping[str, Any]) -> Any:
             f"The constraint {c.name!r} reads a parameter {e} that the model lacks; it has {', '.join(symbols)}."
         ) from e
     except Exception as e:
-        why = str(e).strip().splitlines()[-1].strip() if str(e).strip() else type(e).__name__
+        why = quote_error(e, -1)
         if "__bool__" in str(e) or "truth value" in str(e).lower():
             why = "Python's `if`, `and`, `min` and `max` cannot be used on symbols"
         raise InputError(

@@ -29,7 +29,7 @@ SCREEN_DPI = 90  # dots per inch in a notebook, whose column is about 1000 pixel
 MOST_POINTS = 3000  # points of a line before it is thinned: more than a page has pixels
 LONGEST_TITLE = 46  # letters that fit above a figure of the usual width
 DECIBEL_RANGE = 200.0  # dB below the largest value down to which curves are drawn; rounding errors lie deeper
-RUNAWAY = 1e3  # times the span of the measured signal; a simulation is not drawn above it
+DRAWN_SPANS = 1e3  # spans of the measured signal above which a simulation is not drawn
 
 
 class ShownFigure(Figure):
@@ -150,7 +150,7 @@ def thin(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.ndar
 def mask_divergence(values: np.ndarray, span: float) -> np.ndarray:
     """Replace values far beyond the span of the measured signal by nan, so that lines have gaps there."""
     with np.errstate(invalid="ignore"):
-        return np.where(np.abs(values) <= RUNAWAY * span, values, np.nan)
+        return np.where(np.abs(values) <= DRAWN_SPANS * span, values, np.nan)
 
 
 class SampledLine(Line2D):

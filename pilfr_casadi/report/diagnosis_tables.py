@@ -11,8 +11,8 @@ import numpy as np
 
 from .. import identify, laws, simulators
 from .._base import percent, to_json, with_nan
+from ..data import DIVERGING
 from ..diagnose import ERROR_NAMES, Diagnosis, Effect, Fitted, Workbench, law_signals, learned_force
-from ..identify import RUN_AWAY
 from ..laws import VaryingParameter, display_name, heated, readable_unit, scaled, scheduled, short_name, varying
 from ..models import Parameter, ParameterSet
 from ..simulators import MECHANICAL, PARAMETER, UNKNOWN, CoSimulation, kind_of, name_at, name_at_any
@@ -29,7 +29,7 @@ def percent_text(value: float | None) -> str:
     """Write a relative error for a table: a dash if it was not computed, a word if the simulation runs away."""
     if value is None:
         return "\u2014"
-    return typeset_numbers(percent(value)).replace(" ", "\u00a0") if value < RUN_AWAY else "diverges"
+    return typeset_numbers(percent(value)).replace(" ", "\u00a0") if value < DIVERGING else "diverges"
 
 
 def correction_words(diagnosis: Diagnosis) -> str:

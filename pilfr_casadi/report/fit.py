@@ -15,7 +15,7 @@ import numpy as np
 
 from .. import plots
 from .._base import make_folder, write_atomically
-from ..data import Recording, as_recordings, rmse_per_output
+from ..data import DIVERGING, Recording, as_recordings, rmse_per_output
 from ..identify import Fit
 from ..linear import LinearPart, any_bla
 from ..models import BLOCKS, ParameterSet, StaticNetwork
@@ -36,7 +36,6 @@ from .page import (
 )
 
 Records = Recording | Sequence[Recording]
-RUNAWAY = 1e3  # NRMSE from which the page calls a simulation diverging
 EXCITED_POWER = 0.999  # share of an input's power in its excited band
 FAR_OUTSIDE = 2.0  # times the highest excited frequency from which the data say nothing of an oscillation
 MOST_DRAWN = 4  # outputs of a recording that are drawn; the table has all of them
@@ -150,7 +149,7 @@ def _verdict(judged: list[dict[str, Any]]) -> str:
     several_outputs = len({r["output"] for r in judged}) > 1
     place = f"{worst['output']} in {worst['recording']}" if several_outputs else worst["recording"]
     text = f"Simulated from its inputs alone, {kind}, the model"
-    if not worst["nrmse"] < RUNAWAY:
+    if not worst["nrmse"] < DIVERGING:
         return f"{text} diverges ({place})." if len(judged) > 1 else f"{text} diverges."
     text += f" is off by {100 * worst['nrmse']:.2g}\u00a0% of the output's standard deviation"
     text += f" at worst ({place})" if len(judged) > 1 else ""
@@ -163,7 +162,7 @@ def _answer(judged: list[dict[str, Any]]) -> str:
     """Write the headline: the largest error of an output, and the error of a linear model there."""
     where = "unseen data" if judged[0]["role"] == "test" else "the training data; no other data was given"
     worst = max(judged, key=lambda r: r["nrmse"])
-    if not worst["nrmse"] < RUNAWAY:
+    if not worst["nrmse"] < DIVERGING:
         return f"The model diverges on {where}"
     linear = f"; a linear model {100 * worst['linear']:.2g}\u00a0%" if np.isfinite(worst["linear"]) else ""
     return f"{100 * worst['nrmse']:.2g}\u00a0% error on {where}{linear}"
@@ -171,7 +170,7 @@ def _answer(judged: list[dict[str, Any]]) -> str:
 
 def _tone(status: Status, judged: list[dict[str, Any]]) -> str:
     """Choose the colour of the headline: good only if the fit converged and beats a linear model and the mean."""
-    if not all(r["nrmse"] < RUNAWAY for r in judged):
+    if not all(r["nrmse"] < DIVERGING for r in judged):
         return "bad"
     helps = all(r["nrmse"] < min(1.0, r["linear"] if np.isfinite(r["linear"]) else 1.0) for r in judged)
     return status_tone(status) if helps or not status.converged else "warning"

@@ -17,8 +17,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError
-from ..data import Recording, default_names
+from .._base import InputError, quote_error
+from ..data import SAME_STEP, Recording, default_names
 from ..models import Model, Parameter
 from .equations import Named
 from .simulator import Simulator
@@ -26,7 +26,6 @@ from .user_file import user_variable
 
 FACTOR = 2.0  # by which an entry of a state space may change
 GAIN_BOUNDS = (0.7, 1.3)  # of the gain of a fitted model's output
-STEP_TOLERANCE = 1e-3  # relative difference of two equal steps: models state three digits
 VARIABLE = "simulator"  # name of the variable that a simulator file sets
 
 
@@ -60,7 +59,7 @@ def as_simulator(thing: Any, recordings: Sequence[Recording] = ()) -> Simulator:
 
 def _check_step(dt: float, recordings: Sequence[Recording]) -> None:
     for r in recordings:
-        if abs(r.dt / dt - 1) > STEP_TOLERANCE:
+        if abs(r.dt / dt - 1) > SAME_STEP:
             raise InputError(f"The model's step is {dt:g} s, that of {r.label} {r.dt:g} s; resample the recording.")
 
 
@@ -99,9 +98,7 @@ def _from_system(system: Any, recordings: Sequence[Recording]) -> Simulator:
     try:
         system = control.ss(system)
     except Exception as error:
-        raise InputError(
-            f"The system cannot be written as a state space ({' '.join(str(error).split())[:120]}); give one."
-        ) from error
+        raise InputError(f"The system cannot be written as a state space ({quote_error(error)}); give one.") from error
     matrices = {"A": system.A, "B": system.B, "C": system.C, "D": system.D}
     if not all(np.all(np.isfinite(m)) for m in matrices.values()):
         raise InputError("The state space has entries that are not finite; give numbers.")

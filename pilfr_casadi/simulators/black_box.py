@@ -64,10 +64,10 @@ class BlackBox:
     ) -> None:
         self._arguments = function, called, rows, names, jacobian, nominal
         self.called, self.rows, self.names = called, rows, names
-        self.leaf = PythonFunction(function, (len(nominal),), len(rows))
+        self.program = PythonFunction(function, (len(nominal),), len(rows))
         self.slope = None if jacobian is None else _make_slope(jacobian, len(nominal), len(rows))
         by_slope = None if self.slope is None else (lambda z, s: call_external(self.slope, z, s))
-        self.function = external(lambda z: call_external(self.leaf, z), nominal, len(rows), by_slope)
+        self.function = external(lambda z: call_external(self.program, z), nominal, len(rows), by_slope)
         self.points: list[tuple[np.ndarray, np.ndarray]] = []  # z and the values there
         self.equal: dict[str, str] = {}
 
@@ -86,19 +86,19 @@ class BlackBox:
     @property
     def program_calls(self) -> dict[str, int]:
         """Number of calls by the function's name."""
-        return {self.called: self.leaf.calls}
+        return {self.called: self.program.calls}
 
     @property
     def program_failures(self) -> dict[str, str]:
         """First error by the function's name; empty if it has not failed."""
-        return {} if self.leaf.failure is None else {self.called: repr(self.leaf.failure)}
+        return {} if self.program.failure is None else {self.called: repr(self.program.failure)}
 
     @property
     def note(self) -> str:
         """Number of calls and first failure, in words."""
         source = "finite differences" if self.slope is None else f"the given Jacobian, called {self.slope.calls} times"
-        text = f"{self.called}: called {self.leaf.calls} times; its derivatives come from {source}"
-        return text if self.leaf.failure is None else f"{text}; it failed first with {self.leaf.failure!r}"
+        text = f"{self.called}: called {self.program.calls} times; its derivatives come from {source}"
+        return text if self.program.failure is None else f"{text}; it failed first with {self.program.failure!r}"
 
     def __call__(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
         """Return the expressions of the values by name."""

@@ -9,8 +9,8 @@ So a sensitivity costs one call for each state and free parameter at each stage 
 as dependent on every argument. Second derivatives are zero: they matter only if a port has no given rate and its
 coordinate is a nonlinear function of the states.
 
-A leaf is a program of its own: a Python function or a functional mock-up unit. Generated C cannot hold it and calls it
-by its name in `leaves`.
+The program f is a Python function or a functional mock-up unit. Generated C cannot hold it and calls it by its name in
+`programs`.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ RELATIVE_STEP = float(np.sqrt(np.finfo(float).eps))  # at this step rounding and
 NOMINAL = 1e-3  # size of an argument that is zero: small compared with values in SI units, far above rounding
 ROUNDING = 1e-9  # relative difference that rounding may cause
 TINY = 1e-100  # against division by zero along a direction of zeros
-leaves: dict[str, Leaf] = {}  # by name; CasADi itself does not keep callbacks alive
-units: dict[str, FmuSignals] = {}  # of leaves that are functional mock-up units
+programs: dict[str, Program] = {}  # by name; CasADi itself does not keep callbacks alive
+units: dict[str, FmuSignals] = {}  # of programs that are functional mock-up units
 
 
 Expression = Callable[..., Any]
@@ -102,14 +102,14 @@ def equal_state(values: np.ndarray, states: np.ndarray, names: Sequence[str]) ->
     return names[int(np.argmax(same))] if np.any(same) else ""
 
 
-class Leaf(ca.Callback):
-    """A program of its own as a `casadi.Function`, from vectors of these `sizes` to one of `size` numbers."""
+class Program(ca.Callback):
+    """Another program as a `casadi.Function`, from vectors of these `sizes` to one of `size` numbers."""
 
     def __init__(self, name: str, sizes: tuple[int, ...], size: int) -> None:
         ca.Callback.__init__(self)
         self.sizes, self.size = sizes, size
         self.construct(name, {})
-        leaves[name] = self
+        programs[name] = self
 
     def get_n_in(self) -> int:
         """Return the number of arguments, for CasADi; there is one result."""
@@ -128,7 +128,7 @@ class Leaf(ca.Callback):
         return True
 
 
-class PythonFunction(Leaf):
+class PythonFunction(Program):
     """A Python function of arrays as a `casadi.Function`; if it fails, its results are NaN.
 
     Attributes
@@ -142,7 +142,7 @@ class PythonFunction(Leaf):
     def __init__(self, function: Callable[..., np.ndarray], sizes: tuple[int, ...], size: int) -> None:
         self.function, self.calls = function, 0
         self.failure: Exception | None = None
-        super().__init__(f"python{len(leaves)}", sizes, size)
+        super().__init__(f"python{len(programs)}", sizes, size)
 
     def eval_buffer(self, arguments: Sequence[memoryview], results: Sequence[memoryview]) -> int:
         """Call the function, for CasADi."""

@@ -1,4 +1,4 @@
-"""Memory by which compiled C calls other programs (`leaves`): arguments are copied in, results out.
+"""Memory by which compiled C calls other programs: arguments are copied in, results out.
 
 `_external.h` has the other side. Each thread has buffers of its own.
 """
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .._base import abandoned, build
-from .external import PythonFunction, leaves, units
+from .external import PythonFunction, programs, units
 from .fmu_instance import evaluation
 
 EXTERNAL_CALLS = Path(__file__).with_name("_external.h").read_text(encoding="utf-8")
@@ -38,7 +38,7 @@ class _External(ctypes.Structure):
 def bind(library: ctypes.CDLL, names: tuple[str, ...]) -> None:
     """Pass this thread's buffers of programs to a library's `pilfr_bind`; all libraries of a thread share them.
 
-    `names` are keys of `leaves` in the order of the calls.
+    `names` are keys of `external.programs` in the order of the calls.
     """
     table = (_External * len(names))(*(_buffer(name) for name in names))
     library.pilfr_bind(table)
@@ -59,7 +59,7 @@ def _buffer(name: str) -> _External:
 def _make_buffer(name: str) -> tuple[_External, list[object]]:
     """Make a buffer with memory for arguments and results; return it and everything that must stay alive."""
     if name not in units:
-        function = leaves[name]
+        function = programs[name]
         assert isinstance(function, PythonFunction)
         return _make_python_buffer(function)
     signals = units[name]

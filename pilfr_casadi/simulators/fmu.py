@@ -27,7 +27,15 @@ import numpy as np
 from .._base import InputError, check_known
 from ..models import Named, Parameter, parameter_within, within_a_factor
 from .external import NOMINAL, ROUNDING, call_external, equal_state, external
-from .fmu_cosimulation import CoSimulation, SteppedEquations, SteppedUnit, check_force, unknown_signal
+from .fmu_cosimulation import (
+    CoSimulation,
+    SteppedUnit,
+    UnitEquations,
+    UnitSteps,
+    check_force,
+    find_equations,
+    unknown_signal,
+)
 from .fmu_description import Description, Unit, Variable, check_file, parse_port
 from .fmu_function import FmuFunction
 from .fmu_instance import FmuFile, FmuSignals, unpack
@@ -57,7 +65,7 @@ class _Unit(Unit):
         return self.described.states
 
     @cached_property
-    def leaf(self) -> FmuFunction:
+    def program(self) -> FmuFunction:
         """The function that calls the unit."""
         folder, key = unpack(self.path)
         key = hashlib.sha256(f"{key} {self.parameters} {self.outputs}".encode()).hexdigest()[:16]
@@ -86,16 +94,16 @@ class _Unit(Unit):
         """`z -> (derivatives, outputs)` in one vector, for expressions; z holds t, x, u and p."""
 
         def evaluate(z: Any) -> Any:
-            ends = np.cumsum([0, *self.leaf.signals.sizes]).tolist()
-            return call_external(self.leaf.function, *(z[a:b] for a, b in pairwise(ends)))
+            ends = np.cumsum([0, *self.program.signals.sizes]).tolist()
+            return call_external(self.program.function, *(z[a:b] for a, b in pairwise(ends)))
 
         nominal = [1.0, *(self.variables[n].nominal for n in (*self.states, *self.inputs, *self.parameters))]
         sizes = NOMINAL * np.nan_to_num(np.array(nominal), nan=1.0)
-        return external(evaluate, sizes, self.leaf.signals.results)
+        return external(evaluate, sizes, self.program.signals.results)
 
     def values(self, t: float, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
         """Evaluate derivatives and outputs by numbers."""
-        return self.leaf.evaluate(np.concatenate([[t], x, u, p]).tobytes())
+        return self.program.evaluate(np.concatenate([[t], x, u, p]).tobytes())
 
 
 _functions: dict[str, FmuFunction] = {}  # by name
@@ -174,12 +182,12 @@ def from_fmu(
     read = {port.get(key) for port in given.values() for key in ("across", "rate")}
     needed = tuple(n for n in all_outputs if n in measured or n in read)
     made = choose_parameters(own, bounds, lambda n, ends: _make_parameter(unit.variables[n], ends))
-    equations: _Equations | SteppedEquations
+    equations: _Equations | UnitEquations
     if isinstance(unit, _Unit):
         equations = _Equations(replace(unit, outputs=needed), drives, tuple(made), measured)
     else:
         symbols = tuple(n for n in unit.inputs if n in drives or n in used)
-        equations = SteppedEquations(unit, symbols, made, needed, measured)
+        equations = find_equations(UnitSteps(unit, symbols, made, needed), measured)
     return Simulator(
         equations,
         equations.measured,
@@ -238,10 +246,10 @@ class _Equations:
         rows = (*map(_rate, unit.states), *unit.outputs)
         points = list(self._points())
         first = unit.values(*points[0])
-        if unit.leaf.failure:
+        if unit.program.failure:
             raise InputError(
-                f"The program inside {unit.path} cannot be evaluated: it {unit.leaf.failure}; check it with the tool "
-                "that made it."
+                f"The program inside {unit.path} cannot be evaluated: it {unit.program.failure}; check it with the "
+                "tool that made it."
             )
         found = np.array([first, *(unit.values(*point) for point in points[1:])])
         if not np.all(np.isfinite(found)):
@@ -253,7 +261,7 @@ class _Equations:
         equal = [equal_state(row, states, unit.states) for row in found.T]
         self.equal = {row: same for row, same in zip(rows, equal, strict=True) if same}
         self.unit = replace(unit, outputs=tuple(n for n in unit.outputs if n not in self.equal))
-        self.timed_events = has_time_event(unit.leaf.signals)
+        self.timed_events = has_time_event(unit.program.signals)
 
     def _points(self) -> Any:
         """Draw times, states, inputs and parameters near the start values; the first point holds the start values."""
@@ -359,7 +367,7 @@ def _check_port(name: str, given: Any) -> None:
         raise InputError(f"The port {name!r} is {given!r}; {form}")
 
 
-def _make_port(equations: _Equations | SteppedEquations, name: str, given: Mapping[str, Any]) -> Port:
+def _make_port(equations: _Equations | UnitEquations, name: str, given: Mapping[str, Any]) -> Port:
     """Make a port from the names of the unit's variables, whose units it has by default."""
     factors, across, rate = _factors(given["into"]), given["across"], given.get("rate")
     z = equations.signal(name, "across", across)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -188,8 +189,8 @@ def check_force(port: str, factors: Mapping[str, float], linear: bool, effective
         raise InputError(f"The input {inputs} of port {port!r} changes nothing; name another one.")
 
 
-class SteppedEquations:
-    """The equations of a unit: polynomials if these are found (`polynomials`), else its steps.
+class UnitSteps:
+    """The steps of a unit as functions of numbers, at points z that stack states, inputs and parameters.
 
     Parameters
     ----------
@@ -198,64 +199,26 @@ class SteppedEquations:
         Inputs that are symbols.
     parameters : mapping
         Parameters that are symbols.
-    needed, measured : tuple of str
-        Outputs that ports or recordings read, and outputs that are recorded.
+    needed : tuple of str
+        Outputs that ports or recordings read.
     """
 
     def __init__(
-        self,
-        unit: SteppedUnit,
-        inputs: tuple[str, ...],
-        parameters: Mapping[str, Parameter],
-        needed: tuple[str, ...],
-        measured: tuple[str, ...],
+        self, unit: SteppedUnit, inputs: tuple[str, ...], parameters: Mapping[str, Parameter], needed: tuple[str, ...]
     ) -> None:
-        self.unit, self.inputs, self.parameters, self.outputs = unit, inputs, parameters, measured
-        self.others = others = tuple(n for n in needed if n not in unit.states)
+        self.unit, self.inputs, self.parameters = unit, inputs, parameters
+        self.others = tuple(n for n in needed if n not in unit.states)
         self.names = (*unit.states, *inputs, *parameters)
-        self.rows = (*unit.states, *others)
+        self.rows = (*unit.states, *self.others)
+        self.sizes = np.nan_to_num(np.array([unit.variables[n].nominal for n in self.names]), nan=1.0)
         self._start = np.array([unit.begin[n] for n in self.names])
-        self._sizes = np.nan_to_num(np.array([unit.variables[n].nominal for n in self.names]), nan=1.0)
-        inverse = [j for j, n in enumerate(self.names) if n in parameters and np.prod(self._range(n)) > 0]
-        found = find_polynomials(self._derivatives, self._draw, inverse) if unit.described.variable_steps else None
-        self.polynomials = found
-        # an output that is no state is read after a step, so it belongs to the next sample and is kept as a state
-        self.states = unit.states if found is not None else self.rows
-        self.discrete = found is None
-        if found is None:
-            sizes = np.concatenate([[1.0], self._sizes[: len(unit.states)], np.ones(len(others))])
-            self._nominal = NOMINAL * np.concatenate([sizes, self._sizes[len(unit.states) :]])
-            kinds = (self.rows, inputs, tuple(parameters))
-            self._box = BlackBox(self._step, unit.path.name, self.rows, kinds, self._slopes, self._nominal)
 
-    @property
-    def note(self) -> str:
-        """Origin of the equations, in words; a `Simulator` prints it."""
-        if self.discrete:
-            why = (
-                "no equations were found"
-                if self.unit.described.variable_steps
-                else "the length of its steps cannot be changed"
-            )
-            return (
-                f"steps of {self.unit.dt:g} s, because {why}; so the unit is called at every sample, and a diagnosis "
-                "may take hours. Equations are polynomials in states, inputs and parameters; nominal values in the "
-                f"file help to find them. {self._box.note}"
-            )
-        return (
-            f"{self.unit.path.name}: equations found from its steps, at states and inputs up to ten times their "
-            "nominal size (1 where the file gives none); it is not called any more"
-        )
-
-    @property
-    def program_calls(self) -> dict[str, int]:
-        """Number of calls by the file's name; empty if equations were found."""
-        return self._box.program_calls if self.discrete else {}
-
-    @property
-    def dt(self) -> float | None:
-        """Length of the steps, s; None if equations were found."""
-        return self.unit.dt if self.discrete else None
+    def find_polynomials(self) -> ca.Function | None:
+        """Look for polynomials that are the unit's derivatives and outputs."""
+        if not self.unit.described.variable_steps:
+            return None
+        inverse = [j for j, n in enumerate(self.names) if n in self.parameters and np.prod(self._range(n)) > 0]
+        return find_polynomials(self.derivatives, self.draw, inverse)
 
     def _range(self, name: str) -> tuple[float, float]:
         """Return the range of a parameter in which equations are looked for."""
@@ -264,11 +227,11 @@ class SteppedEquations:
         reach = 10 * abs(value) or 1.0
         return max(low, value - reach), min(high, value + reach)
 
-    def _draw(self, count: int, wide: bool) -> np.ndarray:
+    def draw(self, count: int, wide: bool) -> np.ndarray:
         """Draw states and inputs about the start values, and parameters within their bounds."""
         rng, n = np.random.default_rng(int(wide)), len(self.names) - len(self.parameters)
         spread = 10 ** rng.uniform(*DECADES, (count, 1)) if wide else np.ones((count, 1))
-        z = self._start + self._sizes * spread * rng.uniform(-1, 1, (count, len(self.names)))
+        z = self._start + self.sizes * spread * rng.uniform(-1, 1, (count, len(self.names)))
         for j, name in enumerate(self.parameters, n):
             low, high = self._range(name)
             log = low > 0
@@ -278,7 +241,7 @@ class SteppedEquations:
         z[:, :n] -= self._start[:n] * np.array([name in self.unit.states for name in self.names[:n]])
         return z
 
-    def _results(self, z: np.ndarray, h: float) -> np.ndarray:
+    def results(self, z: np.ndarray, h: float) -> np.ndarray:
         """Step from points z of `names`, states from their start values; (K, n_rows)."""
         values = np.array(z, dtype=float)
         n, start = len(self.unit.states), self.unit.begin
@@ -292,7 +255,7 @@ class SteppedEquations:
         return out - np.append(self._start[:n], np.zeros(len(self.others)))
 
     @np.errstate(over="ignore", invalid="ignore")  # a step may fail or diverge
-    def _derivatives(self, z: np.ndarray) -> np.ndarray:
+    def derivatives(self, z: np.ndarray) -> np.ndarray:
         """Extrapolate derivatives and outputs to steps of length zero; NaN without convergence.
 
         Where a step is too long for a stiff unit, shorter ones are tried, and the best is used.
@@ -313,7 +276,7 @@ class SteppedEquations:
         n, table = len(self.unit.states), list[np.ndarray]()
         for k in range(LEVELS):
             h = step / 2**k
-            found = self._results(z, h)
+            found = self.results(z, h)
             table.append(np.hstack([(found[:, :n] - z[:, :n]) / h, found[:, n:]]))
         before = table[-1]
         for order in range(1, LEVELS):
@@ -321,35 +284,23 @@ class SteppedEquations:
             table = [(2**order * b - a) / (2**order - 1) for a, b in pairwise(table)]
         return table[0], np.abs(table[0] - before)
 
-    def _step(self, z: np.ndarray) -> np.ndarray:
-        """Step from one point z = (t, x, u, p)."""
-        return self._results(self._reduced(z[None]), self.unit.dt)[0]
 
-    def _slopes(self, z: np.ndarray) -> np.ndarray:
-        """Compute the differences by x, u and p in one call."""
-        h = RELATIVE_STEP * np.maximum(np.abs(z), self._nominal)[1:]
-        points = np.vstack([z, z + np.hstack([np.zeros((len(h), 1)), np.diag(h)])])
-        found = self._results(self._reduced(points), self.unit.dt)
-        return np.asarray((found[1:] - found[0]).T / h)
+class UnitEquations:
+    """The dynamics, outputs and ports of a unit, from expressions of its derivatives or its steps (`_evaluate`)."""
 
-    def _reduced(self, z: np.ndarray) -> np.ndarray:
-        """Drop time, and outputs that are kept as states."""
-        n = 1 + len(self.unit.states)
-        return np.delete(z, [0, *range(n, n + len(self.others))], axis=1)
+    def __init__(
+        self, steps: UnitSteps, states: tuple[str, ...], measured: tuple[str, ...], numbers: Callable[..., np.ndarray]
+    ) -> None:
+        self.steps, self.unit, self.states, self.outputs = steps, steps.unit, states, measured
+        self._numbers = numbers  # evaluates the same at points z, (K, n_rows)
 
-    def _evaluate(self, x: Any, u: Mapping[str, Any], p: Any) -> dict[str, Any]:
+    def _evaluate(self, x: Named, u: Mapping[str, Any], p: Named) -> dict[str, Any]:
         """Evaluate the derivatives or the next values of states, and the other outputs, by name."""
-        if self.polynomials is not None:
-            return self._by_name(self.polynomials(self._stack(x, u, p)), self.rows)
-        return self._box(x, Named("input", {n: u.get(n, self.unit.begin[n]) for n in self.inputs}), p, 0.0)
+        raise NotImplementedError
 
-    def _stack(self, x: Named, u: Mapping[str, Any], p: Named) -> Any:
-        drives = (u.get(n, self.unit.begin[n]) for n in self.inputs)
-        return ca.vertcat(*(x[n] for n in self.unit.states), *drives, *(p[n] for n in self.parameters))
-
-    def _by_name(self, rows: Any, names: Sequence[str]) -> dict[str, Any]:
-        found = dict(zip(self.rows, ca.vertsplit(rows), strict=True))
-        return {n: found[n] for n in names}
+    def _effect(self, factors: Mapping[str, float], moved: Sequence[str]) -> Callable[..., Any]:
+        """Make the effect of a unit force on the rows that it moves."""
+        raise NotImplementedError
 
     def __call__(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
         """Evaluate the derivatives, or the next states, by name: the dynamics of a `Simulator`."""
@@ -370,17 +321,16 @@ class SteppedEquations:
         if name in self.states:
             start = self._start_of(name)
             return lambda x: x[name] + start
-        if name in self.others:
+        if name in self.steps.others:
             return lambda x, u, p: self._evaluate(x, u._values, p)[name]
         known = [*self.unit.outputs, *(n for n in self.unit.states if n not in self.unit.outputs)]
         raise unknown_signal(port, key, name, known)
 
     def into(self, port: str, factors: Mapping[str, float]) -> Any:
-        """Make the effect of a unit force on states and outputs, evaluated at rest if the unit is stepped."""
-        z = self._draw(PROBED_POINTS, True)
-        step = np.array([factors.get(n, 0.0) for n in self.names])
-        evaluate = self._derivatives if self.polynomials is not None else (lambda z: self._results(z, self.unit.dt))
-        none, once, twice = (evaluate(z + k * step) for k in (0, 1, 2))
+        """Make the effect of a unit force on states and outputs."""
+        z = self.steps.draw(PROBED_POINTS, True)
+        step = np.array([factors.get(n, 0.0) for n in self.steps.names])
+        none, once, twice = (self._numbers(z + k * step) for k in (0, 1, 2))
         usable = np.all(np.isfinite(np.hstack([none, once, twice])), axis=1)
         if not np.any(usable):
             raise InputError(
@@ -390,21 +340,123 @@ class SteppedEquations:
         none, once, twice = (found[usable] for found in (none, once, twice))
         once, twice = once - none, twice - none
         size = np.max(np.abs(once), axis=0) + NOMINAL * np.max(np.abs(none), axis=0)
-        moved = [n for n, change in zip(self.rows, once.T, strict=True) if np.any(np.abs(change) > RELATIVE_STEP)]
+        moved = [n for n, change in zip(self.steps.rows, once.T, strict=True) if np.any(np.abs(change) > RELATIVE_STEP)]
         moved = [n for n in moved if n in self.states or n in self.outputs]
         linear = not np.any(np.abs(twice - 2 * once) > NOMINAL * size)
         check_force(port, factors, linear, bool(moved))
-        if self.polynomials is not None:
-            z = ca.SX.sym("z", len(step))
-            slopes = ca.jtimes(self.polynomials(z), z, ca.SX(ca.DM(step)))
-            along = ca.Function("along", [z], [slopes])
-            return lambda x, u, p: self._by_name(along(self._stack(x, u._values, p)), moved)
+        return self._effect(factors, moved)
 
-        def effect(p: Named) -> dict[str, Any]:
-            at, start = Named("state", dict.fromkeys(self.states, ca.SX(0.0))), self.unit.begin
+
+class PolynomialEquations(UnitEquations):
+    """Polynomials that are the derivatives and the outputs of a unit, which is not called any more."""
+
+    discrete = False
+
+    def __init__(self, steps: UnitSteps, measured: tuple[str, ...], polynomials: ca.Function) -> None:
+        super().__init__(steps, steps.unit.states, measured, steps.derivatives)
+        self.polynomials = polynomials
+
+    @property
+    def note(self) -> str:
+        """Origin of the equations, in words; a `Simulator` prints it."""
+        return (
+            f"{self.unit.path.name}: equations found from its steps, at states and inputs up to ten times their "
+            "nominal size (1 where the file gives none); it is not called any more"
+        )
+
+    def _stack(self, x: Named, u: Mapping[str, Any], p: Named) -> Any:
+        drives = (u.get(n, self.unit.begin[n]) for n in self.steps.inputs)
+        return ca.vertcat(*(x[n] for n in self.states), *drives, *(p[n] for n in self.steps.parameters))
+
+    def _by_name(self, rows: Any) -> dict[str, Any]:
+        return dict(zip(self.steps.rows, ca.vertsplit(rows), strict=True))
+
+    def _evaluate(self, x: Named, u: Mapping[str, Any], p: Named) -> dict[str, Any]:
+        return self._by_name(self.polynomials(self._stack(x, u, p)))
+
+    def _effect(self, factors: Mapping[str, float], moved: Sequence[str]) -> Callable[..., Any]:
+        z = ca.SX.sym("z", len(self.steps.names))
+        force = ca.SX(ca.DM([factors.get(n, 0.0) for n in self.steps.names]))
+        along = ca.Function("along", [z], [ca.jtimes(self.polynomials(z), z, force)])
+
+        def effect(x: Named, u: Named, p: Named) -> dict[str, Any]:
+            found = self._by_name(along(self._stack(x, u._values, p)))
+            return {n: found[n] for n in moved}
+
+        return effect
+
+
+class SteppedEquations(UnitEquations):
+    """The steps of a unit, which is called at every sample.
+
+    An output that is no state is read after a step, so it belongs to the next sample and is kept as a state.
+    """
+
+    discrete = True
+
+    def __init__(self, steps: UnitSteps, measured: tuple[str, ...]) -> None:
+        super().__init__(steps, steps.rows, measured, partial(steps.results, h=steps.unit.dt))
+        n = len(steps.unit.states)
+        sizes = np.concatenate([[1.0], steps.sizes[:n], np.ones(len(steps.others)), steps.sizes[n:]])
+        self._nominal = NOMINAL * sizes
+        kinds = (self.states, steps.inputs, tuple(steps.parameters))
+        self._box = BlackBox(self._step, self.unit.path.name, self.states, kinds, self._slopes, self._nominal)
+
+    @property
+    def note(self) -> str:
+        """Origin of the equations, in words; a `Simulator` prints it."""
+        searched = self.unit.described.variable_steps
+        why = "no equations were found" if searched else "the length of its steps cannot be changed"
+        return (
+            f"steps of {self.unit.dt:g} s, because {why}; so the unit is called at every sample, and a diagnosis "
+            "may take hours. Equations are polynomials in states, inputs and parameters; nominal values in the "
+            f"file help to find them. {self._box.note}"
+        )
+
+    @property
+    def program_calls(self) -> dict[str, int]:
+        """Number of calls by the file's name."""
+        return self._box.program_calls
+
+    @property
+    def dt(self) -> float:
+        """Length of the steps, s."""
+        return self.unit.dt
+
+    def _evaluate(self, x: Named, u: Mapping[str, Any], p: Named) -> dict[str, Any]:
+        return self._box(x, Named("input", {n: u.get(n, self.unit.begin[n]) for n in self.steps.inputs}), p, 0.0)
+
+    def _step(self, z: np.ndarray) -> np.ndarray:
+        """Step from one point z = (t, x, u, p)."""
+        return self._numbers(self._reduced(z[None]))[0]
+
+    def _slopes(self, z: np.ndarray) -> np.ndarray:
+        """Compute the differences by x, u and p in one call."""
+        h = RELATIVE_STEP * np.maximum(np.abs(z), self._nominal)[1:]
+        points = np.vstack([z, z + np.hstack([np.zeros((len(h), 1)), np.diag(h)])])
+        found = self._numbers(self._reduced(points))
+        return np.asarray((found[1:] - found[0]).T / h)
+
+    def _reduced(self, z: np.ndarray) -> np.ndarray:
+        """Drop time, and outputs that are kept as states."""
+        n = 1 + len(self.unit.states)
+        return np.delete(z, [0, *range(n, n + len(self.steps.others))], axis=1)
+
+    def _effect(self, factors: Mapping[str, float], moved: Sequence[str]) -> Callable[..., Any]:
+        start = self.unit.begin
+
+        def effect(p: Named) -> dict[str, Any]:  # at rest
+            at = Named("state", dict.fromkeys(self.states, ca.SX(0.0)))
             before, after = (
-                self._evaluate(at, {n: start[n] + k * factors.get(n, 0.0) for n in self.inputs}, p) for k in (0, 1)
+                self._evaluate(at, {n: start[n] + k * factors.get(n, 0.0) for n in self.steps.inputs}, p)
+                for k in (0, 1)
             )
             return {n: after[n] - before[n] for n in moved}
 
         return effect
+
+
+def find_equations(steps: UnitSteps, measured: tuple[str, ...]) -> PolynomialEquations | SteppedEquations:
+    """Look for the equations of a unit; without them, step it. `measured` are the recorded outputs."""
+    found = steps.find_polynomials()
+    return SteppedEquations(steps, measured) if found is None else PolynomialEquations(steps, measured, found)

@@ -14,7 +14,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from .._base import InputError, existing_file, listed
+from .._base import InputError, existing_file, listed, quote_error
 
 SYSTEMS = {  # folders of programs in FMI 2.0 and 3.0, and their suffix
     "linux": ("linux", "linux", ".so"),
@@ -93,7 +93,9 @@ def describe(path: Path) -> Description:
         events = len(list(root.iterfind("ModelStructure/EventIndicator")))
         events = events or int(root.get("numberOfEventIndicators") or 0)
     except (zipfile.BadZipFile, KeyError, ET.ParseError, OSError, EOFError, ValueError) as error:
-        raise InputError(f"{path} is not a functional mock-up unit ({tidy(error)}); export it again.") from None
+        raise InputError(
+            f"{path} is not a functional mock-up unit ({quote_error(error, -1)}); export it again."
+        ) from None
     version = root.get("fmiVersion", "").partition(".")[0]
     token = root.get("guid" if version == "2" else "instantiationToken", "")
     kinds = [root.find(kind) for kind in ("ModelExchange", "CoSimulation")]
@@ -217,9 +219,3 @@ def parse_port(name: str, text: str, variables: Collection[str]) -> dict[str, st
         if found and unit_key:  # the unit of a rate follows from that of the coordinate
             out[unit_key] = found[2].strip()
     return out
-
-
-def tidy(error: Exception) -> str:
-    """Shorten an error of CasADi to its last line."""
-    lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
-    return " ".join(lines[-1].split())[:160].rstrip(".")

@@ -20,7 +20,7 @@ import numpy as np
 
 from .._base import InputError, abandoned, build
 from ..models import accumulate_steps as accumulate_here, map_points as map_here
-from .external import Leaf, leaves, units
+from .external import Program, programs, units
 from .external_buffers import EXTERNAL_CALLS, bind
 from .fmu_instance import FmuSignals
 from .fmu_process import evaluate_in_unit, run_in_unit
@@ -102,7 +102,7 @@ class FmuFunction:
         return none
 
 
-class _Callback(Leaf):
+class _Callback(Program):
     """A unit as a callback of CasADi."""
 
     def __init__(self, name: str, signals: FmuSignals, evaluate: Callable[[bytes], np.ndarray]) -> None:
@@ -164,7 +164,7 @@ def _run_elsewhere(
 def _called_unit(function: ca.Function) -> str:
     """Return the name of the unit that a function calls, or "" if it calls none, or programs that cannot be sent."""
     names = [f.name() for f in function.find_functions()]
-    return next((n for n in names if n in _libraries), "") if leaves.keys().isdisjoint(names) else ""
+    return next((n for n in names if n in _libraries), "") if programs.keys().isdisjoint(names) else ""
 
 
 @functools.lru_cache(maxsize=KEPT_FUNCTIONS)

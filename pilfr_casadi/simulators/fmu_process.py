@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import ChildProcess, abandoned, open_replies, read_message, write_message
-from .fmu_description import tidy
+from .._base import ChildProcess, abandoned, open_replies, quote_error, read_message, write_message
 from .fmu_instance import FmuFile, FmuSignals, UnitError, calls, evaluation, owns_folder
 
 LOADING_SECONDS = 60.0  # seconds that the start of a unit may take
@@ -161,9 +160,9 @@ def serve() -> None:
                 function, arguments = pickle.loads(body)
                 found = pickle.dumps((function(*arguments), ""))
         except (UnitError, OSError, AttributeError) as error:
-            found = tidy(error).encode() if kind == POINT else pickle.dumps((None, tidy(error)))
+            found = quote_error(error, -1).encode() if kind == POINT else pickle.dumps((None, quote_error(error, -1)))
         except Exception as error:
-            found = tidy(error).encode() if kind == POINT else pickle.dumps((None, error))
+            found = quote_error(error, -1).encode() if kind == POINT else pickle.dumps((None, error))
         write_message(replies, found)
 
 

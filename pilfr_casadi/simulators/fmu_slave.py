@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, run_in_worker
-from .fmu_description import tidy
+from .._base import InputError, quote_error, run_in_worker
 from .fmu_instance import unpack
 
 CALL_SECONDS = 60.0  # seconds that a call may take, with a start of the unit
@@ -131,7 +130,7 @@ def _serve(job: tuple[Any, ...]) -> tuple[np.ndarray, str]:
                 _instances[slave] = _Instance(slave, folder)
             out[k] = _instances[slave].step(references, values[k], float(h[k]), read)
         except Exception as error:
-            failure = failure or tidy(error)
+            failure = failure or quote_error(error, -1)
             if (instance := _instances.pop(slave, None)) is not None:
                 instance.close()
             elif not k:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, existing_file, in_words
+from .._base import InputError, existing_file, in_words, quote_error
 
 AXES = ("x", "y", "z")
 OF_BODIES = ("mass", "inertia", *(f"inertia_{axis}" for axis in AXES), *(f"com_{axis}" for axis in AXES))
@@ -44,8 +44,7 @@ class MujocoTree:
             else:
                 model = copy.copy(source) if isinstance(source, mujoco.MjModel) else source.copy().compile()
         except Exception as error:
-            reason = " ".join(str(error).split())
-            raise InputError(f"MuJoCo cannot read {path or 'the MjSpec'} ({reason}); correct it.") from None
+            raise InputError(f"MuJoCo cannot read {path or 'the MjSpec'} ({quote_error(error)}); correct it.") from None
         tree = cls(path or model, mujoco, model)
         if not model.njnt:
             raise InputError(f"{tree.label} has no joint, so nothing in it can move; give a model with joints.")

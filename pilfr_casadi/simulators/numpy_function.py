@@ -21,7 +21,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, in_words, listed
+from .._base import InputError, in_words, listed, one_line
 from ..models import Named, Parameter, ParameterSet
 from .black_box import BlackBox, Numeric, nominal_sizes
 from .equations import stack
@@ -252,7 +252,7 @@ class _UserFunction:
         if isinstance(error, KeyError) and error.args and error.args[0] not in parameters:
             known = listed(list(parameters)) or "none"
             return f"{place} asks for the parameter {error.args[0]!r}; there are {known}."
-        said = f"{type(error).__name__}: {' '.join(str(error).split())[:160]}".rstrip(".: ")
+        said = one_line(f"{type(error).__name__}: {error}").rstrip(".: ")
         if symbolic:
             return (
                 f"{place} fails with symbols in place of numbers, for which every branch is entered ({said}); use "

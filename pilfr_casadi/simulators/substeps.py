@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, usable
 from ..data import Recording
 from ..models import Model
 from .equations import Equations
@@ -23,7 +23,6 @@ LARGEST_STEP = 0.25  # largest |λ| h: a phase error of (λh)⁴/120 = 3e-5 of t
 MOST_SUBSTEPS = 200  # per sample
 VERY_FAST = 8 * LARGEST_STEP  # |λ| times the sampling interval above which the rates along a trial run decide
 INFINITE_RATE = 1e12  # replaces an infinite rate, rad/s
-DIVERGED = 1e100  # size of a state above which it has diverged
 TRIAL_SUBSTEPS = 20  # sub-steps per sample of the trial run
 # samples of the trial run, samples skipped at its beginning, and spacing of those that count
 TRIAL_SAMPLES, SETTLING_SAMPLES, SPACING = 400, 40, 20
@@ -169,12 +168,12 @@ def _describe_non_finite(simulator: Equations, recording: Recording) -> str:
     if all(np.all(np.isfinite(derivative(*point))) for point in points):  # a later point of the run
         short, states = _run_trial(simulator, recording)
         states = states[:, :n_x]
-        last = int(np.argmin(np.append(np.all(np.abs(states) < DIVERGED, axis=1), False))) - 1
+        last = int(np.argmin(np.append(np.all(usable(states), axis=1), False))) - 1
         x, u = states[last], short.u[last // TRIAL_SUBSTEPS]
         points += [(x + share * recording.dt / TRIAL_SUBSTEPS * derivative(x, u), u) for share in (0.0, 0.5, 1.0)]
     for x, u in points:
         off = ~np.isfinite(derivative(x, u)[: len(names)])
-        if np.all(np.abs(x) < DIVERGED) and np.any(off):
+        if np.all(usable(x)) and np.any(off):
             return _describe_point(simulator, f"The derivative of the state {names[int(np.argmax(off))]!r}", x, u)
     slope = ~np.isfinite(np.asarray(flow(*points[0], p)[1])[: len(names), : len(names)])
     if not np.any(slope):

@@ -16,9 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from .._base import InputError, existing_file, listed
-
-LONGEST_MESSAGE = 240  # characters shown of another program's message
+from .._base import InputError, existing_file, one_line
 
 
 def user_variable(
@@ -61,9 +59,9 @@ def _compile(path: Path, source: bytes, what: str) -> Any:
     except SyntaxError as error:
         place = f"{path}, line {error.lineno}" if error.lineno else str(path)
         shown = f" in `{error.text.strip()}`" if error.text and error.text.strip() else ""
-        raise InputError(f"{place}: {_shorten(error.msg)}{shown}; correct it.") from None
+        raise InputError(f"{place}: {one_line(error.msg)}{shown}; correct it.") from None
     except (ValueError, RecursionError, MemoryError) as error:  # null bytes, too deep
-        raise InputError(f"{path} is not a Python file ({_shorten(str(error))}); give {what}'s.") from None
+        raise InputError(f"{path} is not a Python file ({one_line(str(error))}); give {what}'s.") from None
 
 
 @contextmanager
@@ -99,12 +97,12 @@ def _describe_error(path: Path, error: BaseException, what: str) -> str:
     line = _find_line(path, error)
     place = f"{path}, line {line}" if line else str(path)
     if isinstance(error, InputError):
-        return f"{place}: {_shorten(str(error))}"
+        return f"{place}: {one_line(str(error))}"
     if isinstance(error, SystemExit):
         return f"{place}: the file ends the program; let it only define {what}."
     if isinstance(error, SyntaxError):  # in a module that the file imports
-        return f"{place}: {Path(error.filename or '').name}, line {error.lineno}: {_shorten(error.msg)}; correct it."
-    said = _shorten(str(error)).rstrip(".")
+        return f"{place}: {Path(error.filename or '').name}, line {error.lineno}: {one_line(error.msg)}; correct it."
+    said = one_line(str(error)).rstrip(".")
     return f"{place}: {type(error).__name__}{f': {said}' if said else ''}; correct the file."
 
 
@@ -118,9 +116,3 @@ def _find_line(path: Path, error: BaseException | None) -> int | None:
         found = lines[-1] if lines else found
         error = error.__cause__ or error.__context__
     return found
-
-
-def _shorten(text: str) -> str:
-    """Shorten a message to one line of at most `LONGEST_MESSAGE` characters."""
-    text = " ".join(text.split())
-    return text if len(text) <= LONGEST_MESSAGE else listed([text[:LONGEST_MESSAGE].rsplit(" ", 1)[0]]) + " ..."

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Reply, __version__, close_workers, run_in_worker
+from .._base import InputError, Reply, __version__, close_workers, quote_error, run_in_worker
 
 AHEAD = 64  # jobs submitted to an executor at a time
 PAUSE = 1.0  # seconds without an outcome after which an empty batch lets the caller report the time
@@ -232,10 +232,9 @@ def dask_executor(address: str) -> Iterator[tuple[Executor, int, int]]:
             other.submit(asyncio.run, reach_scheduler()).result()
         client = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(
-            f"No Dask scheduler can be used at {address} ({reason}); check the address, or start one with "
-            "`dask scheduler` and workers with `dask worker`."
+            f"No Dask scheduler can be used at {address} ({quote_error(error, 0)}); check the address, or start one "
+            "with `dask scheduler` and workers with `dask worker`."
         ) from None
     try:
         threads = sum(client.nthreads().values())

@@ -484,7 +484,7 @@ def test_an_interrupt_that_casadi_wraps_is_recognised(capsys, tmp_path, train, m
 
 
 def test_a_wrapped_interrupt_before_any_work_is_recognised(capsys, tmp_path, train, monkeypatch):
-    monkeypatch.setattr("pilfr_casadi.cli.models.check_folder", wrapped_interrupt)
+    monkeypatch.setattr("pilfr_casadi.cli.models.check_out_folder", wrapped_interrupt)
     status, _, err = run(capsys, *fit_arguments(train, tmp_path))
     assert status == 130 and "Interrupted" in err
 

@@ -4,11 +4,11 @@ import os
 
 import numpy as np
 import pytest
+from command_line import run
 from scipy.io import savemat
 from scipy.sparse import csc_array
 
 from pilfr_casadi import PILFR, Recording, fit
-from pilfr_casadi.cli import main
 
 M = 400
 T = np.arange(M) * 0.01
@@ -27,17 +27,8 @@ def train(tmp_path):
     return write_csv(tmp_path / "train.csv")
 
 
-def run(capsys, *arguments):
-    """Exit status and stderr of a command."""
-    try:
-        status = main([str(a) for a in arguments])
-    except SystemExit as stop:
-        status = stop.code
-    return status, capsys.readouterr().err
-
-
 def refused(capsys, *arguments, says):
-    status, err = run(capsys, *arguments)
+    status, _, err = run(capsys, *arguments)
     assert status == 2
     assert err.startswith("pilfr: ") and err.count("\n") == 1 and "Traceback" not in err
     assert says in err

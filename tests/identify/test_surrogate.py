@@ -196,6 +196,9 @@ def test_a_discrete_state_space_runs_at_its_own_step():
     assert np.max(np.abs(run(as_simulator(system, [record]), record)[:, 0] - expected)) < 1e-10
     with pytest.raises(InputError, match=r"0\.05 s.*0\.02 s"):
         as_simulator(control.ss([[0.9]], [[1.0]], [[1.0]], [[0.0]], 0.05), [record])
+    assert as_simulator(system, [record.with_(dt=record.dt * (1 + 5e-5))]).discrete  # written with few digits
+    with pytest.raises(InputError, match="resample"):
+        as_simulator(system, [record.with_(dt=record.dt * (1 + 5e-4))])
 
 
 def test_a_fitted_pilfr_runs_as_it_is():

@@ -5,12 +5,12 @@ import importlib
 import casadi as ca
 import numpy as np
 import pytest
+from simulated import outputs_of
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
 from pilfr_casadi.diagnose import add_scaled_laws
 from pilfr_casadi.diagnose.fits.screen import start_values
-from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
     CATALOGUE,
     SCHEDULES,
@@ -37,7 +37,6 @@ from pilfr_casadi.laws import (
     unit_forces,
 )
 from pilfr_casadi.models import Named
-from pilfr_casadi.simulators import discretise
 
 DT, SAMPLES = 2e-3, 3000
 
@@ -69,14 +68,8 @@ def recorded(true, seed):
         np.column_stack([force, voltage]), np.zeros(SAMPLES), DT, ("force", "voltage"), ("position",),
         initial="zero", hold="zero",
     )  # fmt: skip
-    y = simulated(true, blank)
+    y = outputs_of(true, blank, substeps=8)
     return blank.with_(y=y + 1e-3 * np.std(y) * rng.standard_normal(y.shape))
-
-
-def simulated(true, r):
-    """What the true machine does from rest, without noise."""
-    model = discretise(true, DT, "zero", 8)
-    return make_engine(model).simulate(model.drive(r), model.parameters.start, np.zeros(model.n_state))[0]
 
 
 @pytest.mark.slow
@@ -172,8 +165,8 @@ def test_a_scheduled_law_is_the_law_where_the_signal_stands_still():
     )
     r = recorded(rig(), 3)
     still = r.with_(u=np.column_stack([r.u[:, 0], np.ones(len(r))]))
-    y = simulated(rig().with_element("damper", law), still)
-    np.testing.assert_allclose(y, simulated(rig().with_element("damper", plain), still), atol=1e-12)
+    y = outputs_of(rig().with_element("damper", law), still, substeps=8)
+    np.testing.assert_allclose(y, outputs_of(rig().with_element("damper", plain), still, substeps=8), atol=1e-12)
     assert law.parameters()["low"].fixed and law.parameters()["k_t_high"].unit == "w/z"
 
 
@@ -269,10 +262,10 @@ def test_a_scaled_law_is_the_law_times_the_signal():
     """Half the strength at twice the voltage is the same; and it is not nothing."""
     law, half = (scaled(PreslidingFriction, "voltage")().at({"k_t": k, "r": 0.004}) for k in (400.0, 200.0))
     r = recorded(rig(), 3)
-    y = simulated(rig().with_element("damper", law), r)
-    again = simulated(rig().with_element("damper", half), r.with_(u=r.u * [1.0, 2.0]))
+    y = outputs_of(rig().with_element("damper", law), r, substeps=8)
+    again = outputs_of(rig().with_element("damper", half), r.with_(u=r.u * [1.0, 2.0]), substeps=8)
     np.testing.assert_allclose(y, again, atol=1e-12)
-    assert np.std(y - simulated(rig(), r)) > 0.05 * np.std(y)
+    assert np.std(y - outputs_of(rig(), r, substeps=8)) > 0.05 * np.std(y)
     assert law.parameters()["k_t"].unit == "w/z/[voltage]"
 
 

@@ -274,6 +274,15 @@ def test_unusual_fits_have_a_page_too(tmp_path):
     assert "model=model)" in fit_report(own, record(own), [], tmp_path).read_text()
 
 
+@pytest.mark.usefixtures("blank_figures")
+def test_the_page_calls_a_simulation_diverging_from_the_error_of_other_tables(tmp_path):
+    fitted = example()
+    for error, diverges in ((2e3, False), (2e4, True)):
+        test = record(fitted).with_(y=record(fitted).y / error)
+        html = fit_report(fitted, record(fitted), test, tmp_path).read_text()
+        assert ("The model diverges on unseen data" in html) is diverges
+
+
 def test_a_folder_that_cannot_be_made(tmp_path):
     (tmp_path / "file").touch()
     fitted = example()

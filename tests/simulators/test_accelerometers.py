@@ -3,12 +3,11 @@
 import casadi as ca
 import numpy as np
 import pytest
+from simulated import outputs_of
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator
-from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, ViscousDamping
-from pilfr_casadi.simulators import discretise
 
 DT, SAMPLES = 2e-3, 1500
 MOUNT = Port("mount", lambda p: {"vel": -1 / p.m}, lambda x: x.pos, lambda x: x.vel, "N", "m")
@@ -118,11 +117,6 @@ def blank(seed=0):
     return Recording(u, np.zeros(SAMPLES), DT, ("force",), ("acc",), hold="zero", initial="zero")
 
 
-def simulated(simulator, r):
-    model = discretise(simulator, DT, "zero", 8)
-    return make_engine(model).simulate(model.drive(r), model.parameters.start, np.zeros(model.n_state))[0]
-
-
 def with_law(outputs):
     return rig(outputs).with_element("mount", CubicStiffness().at({"k_3": 4e7}))
 
@@ -131,10 +125,11 @@ def test_the_ways_to_write_an_acceleration_simulate_alike():
     own = Port("mount", lambda p: {"vel": -1 / p.m, "acc": -1 / p.m}, lambda x: x.pos, lambda x: x.vel)
     named = rig(by_formula, (own,)).with_element("mount", CubicStiffness().at({"k_3": 4e7}))
     r = blank()
-    expected = simulated(named, r)
+    expected = outputs_of(named, r, substeps=8)
     for outputs in (by_formula, by_rates):
-        np.testing.assert_allclose(simulated(with_law(outputs), r), expected, atol=1e-12 * np.std(expected))
-    assert np.std(expected - simulated(rig(by_formula), r)) > 0.1 * np.std(expected)
+        y = outputs_of(with_law(outputs), r, substeps=8)
+        np.testing.assert_allclose(y, expected, atol=1e-12 * np.std(expected))
+    assert np.std(expected - outputs_of(rig(by_formula), r, substeps=8)) > 0.1 * np.std(expected)
 
 
 @pytest.mark.slow
@@ -142,7 +137,7 @@ def test_a_stiffening_mount_is_found_by_an_accelerometer():
     rng = np.random.default_rng(5)
     recordings = []
     for seed in (1, 2):
-        y = simulated(with_law(by_formula), blank(seed))
+        y = outputs_of(with_law(by_formula), blank(seed), substeps=8)
         recordings.append(blank(seed).with_(y=y + 3e-3 * np.std(y) * rng.standard_normal(y.shape)))
     laws = (CubicStiffness, CoulombFriction, ViscousDamping)
     found = pilfr.diagnose(rig(by_formula, k=7000.0), recordings[0], test=recordings[1], laws=laws, workers=1)

@@ -148,8 +148,8 @@ def test_a_diagnosis_says_how_often_it_calls_and_how_long_a_simulation_takes():
 
 
 def test_a_call_costs_little_beside_the_function():
-    leaf = PythonFunction(lambda z: z[:2], (9,), 2)
-    many, points = leaf.map(2000), ca.DM(np.ones((9, 2000)))
+    program = PythonFunction(lambda z: z[:2], (9,), 2)
+    many, points = program.map(2000), ca.DM(np.ones((9, 2000)))
     one, matrix = np.ones(9), ca.DM(np.ones(9))
 
     def convert():
@@ -237,9 +237,9 @@ def test_an_interrupt_ends_a_run_of_slow_calls_without_a_word(engine, capfd):
 
 def test_an_interrupt_outside_a_run_is_raised_and_leaves_no_numbers_wrong():
     called = Interrupted()
-    leaf = PythonFunction(lambda z: np.array(called(0.0, z[:2], z[2:], {"k": 90.0, "d": 1.0})), (3,), 2)
+    program = PythonFunction(lambda z: np.array(called(0.0, z[:2], z[2:], {"k": 90.0, "d": 1.0})), (3,), 2)
     z, called.left = np.ones(3), 2
-    first = leaf(z).full()
+    first = program(z).full()
     with pytest.raises((KeyboardInterrupt, RuntimeError)):
-        leaf(z)
-    assert np.array_equal(leaf(z).full(), first) and np.all(np.isfinite(first))
+        program(z)
+    assert np.array_equal(program(z).full(), first) and np.all(np.isfinite(first))

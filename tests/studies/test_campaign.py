@@ -45,12 +45,6 @@ run["campaign"] = {"time_limit": 10.0}
 """
 
 
-@pytest.fixture
-def folder(tmp_path, blank_figures):
-    """A prepared folder, for tests that read only the numbers of a campaign."""
-    return prepared(tmp_path)
-
-
 @pytest.fixture(scope="module")
 def cluster():
     """A scheduler and two worker processes of one thread."""

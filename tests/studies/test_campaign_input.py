@@ -7,18 +7,13 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 from command_line import refused, sentence
-from run_files import ALONE, changed, prepared
+from run_files import ALONE, changed
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.cli import main
 from pilfr_casadi.models import named_structure
 from pilfr_casadi.studies import Cell, Manifest, executor, reasons, seeds_advice
-
-
-@pytest.fixture
-def folder(tmp_path, blank_figures):
-    return prepared(tmp_path)
 
 
 @pytest.mark.parametrize(

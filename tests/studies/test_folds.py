@@ -3,17 +3,12 @@
 import numpy as np
 import pytest
 from command_line import refused, write_csv
-from run_files import ALONE, changed, prepared
+from run_files import ALONE, changed
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import repeats_itself, same_input
 from pilfr_casadi.studies import fold, jobs
-
-
-@pytest.fixture
-def folder(tmp_path, blank_figures):
-    return prepared(tmp_path)
 
 
 def test_folds_hold_out_every_sample_once(folder):

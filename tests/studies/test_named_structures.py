@@ -3,7 +3,7 @@
 import csv
 
 import pytest
-from command_line import fit_arguments, refused, run, write_csv
+from command_line import fit_arguments, refused, run
 from run_files import DATA
 
 import pilfr_casadi as pilfr
@@ -22,13 +22,6 @@ MODEL
 starts = 1
 max_iterations = 15
 """
-
-
-@pytest.fixture
-def folder(tmp_path, blank_figures):
-    for seed, name in enumerate(("train", "test")):
-        write_csv(tmp_path / f"{name}.csv", seed=seed, m=400)
-    return tmp_path
 
 
 def written(folder, model, more=""):
