@@ -269,7 +269,7 @@ class Fit:
         return float(np.mean(errors))
 
     def matched(self, recording: Recording) -> Recording:
-        """Return a recording with the model's units, for a simulator in its columns' order; check that it fits."""
+        """Return a recording with the model's units and, where its names are the model's, order; check that it fits."""
         if not isinstance(recording, Recording):
             raise InputError(
                 f"A {type(recording).__name__} was given to simulate; give a Recording, which holds inputs, outputs "
@@ -277,7 +277,7 @@ class Fit:
             )
         if self.simulator is not None:
             recording = self.simulator.matched(recording)
-        recording = recording.in_units(self.units)
+        recording = self.model.in_order(recording).in_units(self.units)
         n_u, n_y = len(self.model.inputs), self.model.n_y
         unmeasured = recording.n_y == 0 and recording.begins != "estimate"
         if recording.n_u != n_u or not (recording.n_y == n_y or unmeasured):
