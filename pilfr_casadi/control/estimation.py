@@ -165,7 +165,7 @@ class KalmanFilter:
         Raises
         ------
         InputError
-            If u, y, x0 or P0 do not fit the model.
+            If u, y, x0 or P0 do not fit the model, or the process noise is too small for the arithmetic.
         """
         n = len(self.x0)
         u, y = (numbers(v, name) for v, name in ((u, "u"), (y, "y")))
@@ -186,7 +186,13 @@ class KalmanFilter:
                 f"{n_u}), (samples, {n_y}) and {n} numbers."
             )
         steps = self.step.mapaccum("run", len(u), 2)
-        xs, ps, predicted = (np.asarray(v) for v in steps(x, P, u.T, y.T))
+        try:
+            xs, ps, predicted = (np.asarray(v) for v in steps(x, P, u.T, y.T))
+        except RuntimeError as error:  # of the factorisation of the innovation's covariance
+            raise InputError(
+                "The filter's covariance became singular: its process noise is too small beside the states; give "
+                "kalman_filter a larger share, such as 1e-2."
+            ) from error
         return np.vstack([x, xs.T]), predicted.T, ps[:, -n:]
 
 
@@ -308,9 +314,15 @@ def _build_filter(function: ca.Function, spread: Array, noise: Array, share: flo
 
 
 def _prediction_cost(observer: KalmanFilter, u: Array, y: Array, start: Array) -> float:
-    """Compute minus twice the mean log-likelihood of one-step predictions, with the variance of their errors."""
+    """Compute minus twice the mean log-likelihood of one-step predictions, with the variance of their errors.
+
+    It is infinite if the filter cannot be computed with its noise, as with little beside a model without any error.
+    """
     u, y = u[:CANDIDATE_SAMPLES], y[:CANDIDATE_SAMPLES]
-    _, predicted, _ = observer.run(u, y, start, observer.Q + 1e-6 * observer.P0)
+    try:
+        _, predicted, _ = observer.run(u, y, start, observer.Q + 1e-6 * observer.P0)
+    except InputError:
+        return np.inf
     error = (y - predicted)[len(y) // 10 :]
     size = np.mean(error**2, axis=0)
     return float(np.sum(np.log(size))) if np.all(np.isfinite(size)) else np.inf

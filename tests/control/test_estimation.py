@@ -121,6 +121,21 @@ def test_two_inputs_and_outputs_are_observed(square):
     assert "no memory" in str(visibility(fit, observer, np.zeros(4), record.u[:10]))
 
 
+def test_a_model_without_any_error_is_observed():
+    from scipy.linalg import block_diag, expm
+    from scipy.signal import dlsim
+
+    u = np.random.default_rng(0).standard_normal((800, 2))
+    a = block_diag(*(expm(0.01 * np.array([[0.0, 1.0], [-k, -3.0]])) for k in (130.0, 60.0, 200.0)))
+    b, c = np.zeros((6, 2)), np.zeros((2, 6))
+    b[[1, 3, 5], [0, 1, 1]], c[[0, 0, 1], [0, 2, 4]] = 0.01, (3.0, 0.2, 2.0)
+    exact = pilfr.Recording(u, dlsim((a, b, c, np.zeros((2, 2)), 1.0), u)[1], 0.01, initial="zero")
+    found = pilfr.fit(pilfr.PILFR(6), exact, starts=1)
+    predicted = kalman_filter(found, exact).run(exact.u, exact.y)[1]
+    assert np.all(np.std((exact.y - predicted)[50:], axis=0) < 1e-6 * np.std(exact.y, axis=0))
+    refused(lambda: kalman_filter(found, exact, share=1e-9).run(exact.u, exact.y), "a larger share")
+
+
 def test_covariances_of_states_of_unlike_sizes_are_taken(small):
     _, record, observer = small
     for P0 in (np.zeros((5, 5)), np.diag([1e-20, 1.0, 1e9, 0.0, 1e-6]), np.ones((5, 5)), observer.P0):
