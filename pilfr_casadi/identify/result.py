@@ -37,7 +37,7 @@ from ..optimise import (
     samples_for_state,
     stability_limits,
 )
-from ..simulators import Simulator
+from ..simulators import Simulator, check_hold
 from .uncertainty import describe_unknown_errors
 
 DENSITY_PRIOR = "weights held near a smooth density by a weak prior"  # note of a candidate and of its fit
@@ -277,6 +277,7 @@ class Fit:
             )
         if self.simulator is not None:
             recording = self.simulator.matched(recording)
+            check_hold(self.simulator, recording, self.model.hold)
         recording = self.model.in_order(recording).in_units(self.units)
         n_u, n_y = len(self.model.inputs), self.model.n_y
         unmeasured = recording.n_y == 0 and recording.begins != "estimate"

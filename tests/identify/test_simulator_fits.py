@@ -59,6 +59,16 @@ def test_recordings_with_different_holds_are_refused(record):
         pilfr.fit(simulator(), [record, record.with_(hold="linear")], engine="vm")
 
 
+def test_a_recording_with_another_hold_than_the_fit_is_refused(record, fitted):
+    sloped = record.with_(hold="linear")
+    for verb in (fitted.simulate, fitted.nrmse, lambda r: pilfr.fit(fitted, r)):
+        with pytest.raises(InputError, match="states hold='linear', and the simulator was fitted with 'zero'"):
+            verb(sloped)
+    assert fitted.nrmse(record.with_(hold="zero")) == fitted.nrmse(record)
+    again = pilfr.fit(fitted.simulator, sloped, engine="vm")
+    assert np.max(np.abs(again.simulate(sloped) - fitted.simulate(record))) > 0
+
+
 def test_run_simulator_equals_simulate_from_zero(record):
     placed = simulator().with_element("actuator:force", Delay({"T": 0.025}))
     for hold in ("zero", "linear"):
