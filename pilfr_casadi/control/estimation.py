@@ -118,7 +118,7 @@ class KalmanFilter:
     step : casadi.Function
         `(x, P, u, y) -> (x_next, P_next, y_pred)`. x and y_pred are predictions from earlier samples only.
     x0, P0 : array, shape (n,), (n, n)
-        State at rest, and the covariance of an unknown state.
+        State at rest, at the time of the recording's first sample, and the covariance of an unknown state.
     Q, R : array, shape (n, n), (n_y, n_y)
         Covariances of process and measurement noise.
     spread : array, shape (n,)
@@ -241,10 +241,12 @@ def kalman_filter(
         function = add_disturbances(function)
         size = np.maximum(np.sqrt(level), DISTURBANCE * np.std(recording.y, axis=0))
         start, spread = np.concatenate([start, np.zeros(len(level))]), np.concatenate([spread, size])
+    rest = np.zeros(len(start))
+    rest[run.clock] = start[run.clock]
     noise = np.diag(np.maximum(level, 1e-16 * np.mean(recording.y**2, axis=0) + 1e-300))
     if share is not None:
-        return _build_filter(function, spread, noise, share)
-    filters = [_build_filter(function, spread, noise, s) for s in NOISE_SHARES]
+        return _build_filter(function, rest, spread, noise, share)
+    filters = [_build_filter(function, rest, spread, noise, s) for s in NOISE_SHARES]
     return min(filters, key=lambda f: _prediction_cost(f, run.u, recording.y, start))
 
 
@@ -307,10 +309,10 @@ def observer_function(observer: Any, function: ca.Function, recording: Recording
     return observed
 
 
-def _build_filter(function: ca.Function, spread: Array, noise: Array, share: float) -> KalmanFilter:
+def _build_filter(function: ca.Function, rest: Array, spread: Array, noise: Array, share: float) -> KalmanFilter:
     process = np.diag((share * spread) ** 2)
     step = ekf_step(function, process, noise)
-    return KalmanFilter(function, step, np.zeros(len(spread)), np.diag(spread**2), process, noise, spread)
+    return KalmanFilter(function, step, rest, np.diag(spread**2), process, noise, spread)
 
 
 def _prediction_cost(observer: KalmanFilter, u: Array, y: Array, start: Array) -> float:

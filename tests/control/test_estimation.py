@@ -197,6 +197,21 @@ def test_interpolated_inputs_are_observed_and_not_inverted():
     refused(lambda: feedforward(found, data[0]), "input is interpolated between samples")
 
 
+def test_an_observer_begins_at_the_time_of_the_recording():
+    simulator = pilfr.Simulator(
+        lambda x, u, t: {"a": -x.a + u.f + ca.sin(t)}, lambda x: {"y": x.a}, states=("a",), inputs=("f",)
+    )
+    u = np.random.default_rng(0).standard_normal((300, 1))
+    planned = pilfr.Recording(u, np.empty((300, 0)), 0.05, ("f",), (), initial=[0.3], hold="zero", start=7.0)
+    y = simulator.simulate(planned)
+    exported = pilfr.exported(simulator, dt=0.05, start=planned)
+    assert exported.x0() == pytest.approx([0.3, 7.0])
+    assert np.asarray(exported.step.mapaccum("run", 300)(exported.x0(), u.T)[1]).ravel() == pytest.approx(y[:, 0])
+    observer = kalman_filter(simulator, planned.with_(y=y, outputs=("y",)))
+    assert observer.x0 == pytest.approx([0.0, 7.0])
+    assert np.max(np.abs(observer.run(u, y)[1] - y)[5:]) < 1e-6
+
+
 def test_an_observer_does_not_correct_the_time():
     simulator = pilfr.Simulator(
         lambda x, u, t: {"a": -x.a + u.f + 0.1 * ca.sin(t)}, lambda x: {"y": x.a}, states=("a",), inputs=("f",)
