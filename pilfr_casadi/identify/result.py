@@ -359,7 +359,7 @@ class Fit:
         ----------
         path : path
             The file, usually `*.json`. For your own model or simulator it holds only the values (for a simulator with a
-            warning); give the model to `load`.
+            warning); give the model or the simulator to `load`.
 
         Raises
         ------
@@ -370,7 +370,7 @@ class Fit:
         if self.simulator is not None:
             warnings.warn(
                 f"{os.fspath(path)} holds the fitted values, not the simulator's equations, which are code; load it "
-                "with load(path, model=fit.model).",
+                "with load(path, model=simulator).",
                 stacklevel=2,
             )
 
@@ -440,9 +440,10 @@ def save(fit: Fit, path: str | os.PathLike[str]) -> None:
     fit.save(path)
 
 
-def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fit:
+def load(path: str | os.PathLike[str], model: Model | PILFR | Simulator | None = None) -> Fit:
     """Read a fit that `save` wrote; simulations are the same to the last digit.
 
+    A fit of a simulator needs it as `model`, with its equations; the parameters' values come from the file.
     See `export.read_model_file` for parameters, errors and warnings. Each candidate has its seed, error and status, an
     empty `theta` and the fitted model.
     """
@@ -451,7 +452,8 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
     options = FitOptions()  # files of the first versions have none
     if content.limits is not None:
         options = options_from_limits(content.limits, content.structure, noise=content.noise, weights=content.weights)
-    return Fit(**{**shared, "limits": content.limits or ()}, options=options)
+    fit = Fit(**{**shared, "limits": content.limits or ()}, options=options)
+    return fit.with_simulator(model) if isinstance(model, Simulator) else fit
 
 
 def _format_error(error: float) -> str:

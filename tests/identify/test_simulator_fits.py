@@ -101,6 +101,30 @@ def test_the_verbs(record, fitted, tmp_path):
     assert pilfr.fit(fitted, record, engine="vm").simulator is not None
 
 
+@pytest.mark.parametrize("hold", ["zero", "linear", "band-limited"])
+def test_a_saved_fit_of_a_simulator_is_loaded_with_it(record, tmp_path, hold):
+    given = record.with_(hold=hold)
+    fit = pilfr.fit(simulator(), given, engine="vm")
+    with pytest.warns(UserWarning, match="model=simulator"):
+        fit.save(tmp_path / "sim.json")
+    closed = pilfr.load(tmp_path / "sim.json", model=fit.model)
+    np.testing.assert_array_equal(closed.simulate(given), fit.simulate(given))
+    again = pilfr.load(tmp_path / "sim.json", model=simulator())
+    np.testing.assert_array_equal(again.simulate(given), fit.simulate(given))
+    assert again.simulator.parameters["k"].value == fit.parameters["k"]
+    assert again.simulator.nrmse(given) == pytest.approx(fit.simulator.nrmse(given))
+    thrust = Simulator(
+        lambda x, u, p: dict(pos=x.vel, vel=u.thrust - p.k * x.pos - p.d * x.vel - p.m),
+        simulator().outputs,
+        states=("pos", "vel"),
+        inputs=("thrust",),
+        parameters=simulator().parameters,
+    )
+    for other, words in ((thrust, "other inputs or outputs"), (fit, "Model, PILFR or Simulator")):
+        with pytest.raises(InputError, match=words):
+            pilfr.load(tmp_path / "sim.json", model=other)
+
+
 def test_an_exact_fit_has_no_warning(record):
     """Nothing is left whose colour could be estimated; a warning would be an error here."""
     exact = simulator(1500.0, 25.0)
