@@ -118,7 +118,7 @@ class KalmanFilter:
     step : casadi.Function
         `(x, P, u, y) -> (x_next, P_next, y_pred)`. x and y_pred are predictions from earlier samples only.
     x0, P0 : array, shape (n,), (n, n)
-        State at rest, and the covariance of an unknown state.
+        State at rest, at the time of the recording's first sample, and the covariance of an unknown state.
     Q, R : array, shape (n, n), (n_y, n_y)
         Covariances of process and measurement noise.
     spread : array, shape (n,)
@@ -165,7 +165,7 @@ class KalmanFilter:
         Raises
         ------
         InputError
-            If u, y, x0 or P0 do not fit the model.
+            If u, y, x0 or P0 do not fit the model, or the process noise is too small for the arithmetic.
         """
         n = len(self.x0)
         u, y = (numbers(v, name) for v, name in ((u, "u"), (y, "y")))
@@ -186,7 +186,13 @@ class KalmanFilter:
                 f"{n_u}), (samples, {n_y}) and {n} numbers."
             )
         steps = self.step.mapaccum("run", len(u), 2)
-        xs, ps, predicted = (np.asarray(v) for v in steps(x, P, u.T, y.T))
+        try:
+            xs, ps, predicted = (np.asarray(v) for v in steps(x, P, u.T, y.T))
+        except RuntimeError as error:  # of the factorisation of the innovation's covariance
+            raise InputError(
+                "The filter's covariance became singular: its process noise is too small beside the states; give "
+                "kalman_filter a larger share, such as 1e-2."
+            ) from error
         return np.vstack([x, xs.T]), predicted.T, ps[:, -n:]
 
 
@@ -235,10 +241,12 @@ def kalman_filter(
         function = add_disturbances(function)
         size = np.maximum(np.sqrt(level), DISTURBANCE * np.std(recording.y, axis=0))
         start, spread = np.concatenate([start, np.zeros(len(level))]), np.concatenate([spread, size])
+    rest = np.zeros(len(start))
+    rest[run.clock] = start[run.clock]
     noise = np.diag(np.maximum(level, 1e-16 * np.mean(recording.y**2, axis=0) + 1e-300))
     if share is not None:
-        return _build_filter(function, spread, noise, share)
-    filters = [_build_filter(function, spread, noise, s) for s in NOISE_SHARES]
+        return _build_filter(function, rest, spread, noise, share)
+    filters = [_build_filter(function, rest, spread, noise, s) for s in NOISE_SHARES]
     return min(filters, key=lambda f: _prediction_cost(f, run.u, recording.y, start))
 
 
@@ -301,16 +309,22 @@ def observer_function(observer: Any, function: ca.Function, recording: Recording
     return observed
 
 
-def _build_filter(function: ca.Function, spread: Array, noise: Array, share: float) -> KalmanFilter:
+def _build_filter(function: ca.Function, rest: Array, spread: Array, noise: Array, share: float) -> KalmanFilter:
     process = np.diag((share * spread) ** 2)
     step = ekf_step(function, process, noise)
-    return KalmanFilter(function, step, np.zeros(len(spread)), np.diag(spread**2), process, noise, spread)
+    return KalmanFilter(function, step, rest, np.diag(spread**2), process, noise, spread)
 
 
 def _prediction_cost(observer: KalmanFilter, u: Array, y: Array, start: Array) -> float:
-    """Compute minus twice the mean log-likelihood of one-step predictions, with the variance of their errors."""
+    """Compute minus twice the mean log-likelihood of one-step predictions, with the variance of their errors.
+
+    It is infinite if the filter cannot be computed with its noise, as with little beside a model without any error.
+    """
     u, y = u[:CANDIDATE_SAMPLES], y[:CANDIDATE_SAMPLES]
-    _, predicted, _ = observer.run(u, y, start, observer.Q + 1e-6 * observer.P0)
+    try:
+        _, predicted, _ = observer.run(u, y, start, observer.Q + 1e-6 * observer.P0)
+    except InputError:
+        return np.inf
     error = (y - predicted)[len(y) // 10 :]
     size = np.mean(error**2, axis=0)
     return float(np.sum(np.log(size))) if np.all(np.isfinite(size)) else np.inf

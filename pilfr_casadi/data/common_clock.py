@@ -29,10 +29,10 @@ def merge(
 ) -> Recording:
     """Put the channels of two records of one experiment on one clock, over the time that both cover.
 
-    Name, initial state, hold and skipped samples come from the first record. The initial state is kept only if the
-    common time begins with the first record. If all inputs are held (`hold="zero"`) and each of their levels lasts at
-    least a new step, an input becomes its mean over each new step, and is held; else it becomes `"linear"`,
-    unless no input was resampled.
+    Name, initial state and skipped samples come from the first record. The initial state is kept only if the common
+    time begins with the first record. The hold comes from the records whose channels are inputs; if theirs differ, it
+    is `"linear"`. If all inputs are held (`hold="zero"`) and each of their levels lasts at least a new step, an input
+    becomes its mean over each new step, and is held; else it becomes `"linear"`, unless no input was resampled.
 
     Parameters
     ----------
@@ -74,6 +74,8 @@ def merge(
     signals = {**_signals_at(first, times, step, held), **_signals_at(second, times - start, step, held)}
     begin = times[0]
     sources = [(r, at) for r, at in ((first, begin), (second, begin - start)) if {*u} & {*r.inputs, *r.outputs}]
+    holds = {r.hold for r, _ in sources if r.hold}
+    hold = "linear" if len(holds) > 1 else next(iter(holds), None)
     as_sampled = bool(held) or all(_is_at_samples(r, at, step) for r, at in sources)
     keeps_initial = begin == 0 and first.begins != "periodic"
     return replace(
@@ -87,7 +89,7 @@ def merge(
         period=None,
         start=first.start + begin,
         initial=first.initial if keeps_initial else "estimate",
-        hold="linear" if first.hold == "zero" and not as_sampled else first.hold,
+        hold="linear" if hold == "zero" and not as_sampled else hold,
         skip=min(max(int(np.ceil((first.skip * first.dt - begin) / step - SAME_STEP)), 0), len(times) - 1),
     )
 

@@ -193,6 +193,14 @@ class Recording:
         u, y = (v * [factors[n] for n in own] for v, own in ((self.u, self.inputs), (self.y, self.outputs)))
         return replace(self, u=u, y=y, units={**self.units, **changed})
 
+    def in_order(self, inputs: Sequence[str], outputs: Sequence[str]) -> Self:
+        """Return the recording with these of its channels alone, in this order."""
+        if (self.inputs, self.outputs) == (tuple(inputs), tuple(outputs)):
+            return self
+        u, y = self.u[:, list(map(self.inputs.index, inputs))], self.y[:, list(map(self.outputs.index, outputs))]
+        units = {name: unit for name, unit in self.units.items() if name in (*inputs, *outputs)}
+        return replace(self, u=u, y=y, inputs=tuple(inputs), outputs=tuple(outputs), units=units)
+
     def factor_to(self, wanted: Mapping[str, str], name: str) -> float:
         """Return the factor from a channel's unit to the wanted one; 1 if a unit or the conversion is unknown."""
         unit, other = self.units.get(name, ""), wanted.get(name, "")

@@ -96,7 +96,8 @@ def diagnose(
     test : Recording or sequence of Recording, optional
         Recordings to report on, never used to fit or to choose.
     hold : {"zero", "linear", "band-limited"}, optional
-        Course of the inputs between samples, if neither recordings nor simulator say; by default the data decide.
+        Course of the inputs between samples for recordings that do not state it; by default the simulator's, or else
+        the data decide.
     laws : sequence of Law classes or names, optional
         A name is an id, such as "coulomb_friction", which stands for all forms of a law, or the name of a class. By
         default the whole catalogue, and `laws.VaryingParameter`, with which parameters may vary. Inputs that the

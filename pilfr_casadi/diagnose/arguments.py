@@ -23,7 +23,7 @@ from ..laws import (
     scheduled,
     seen_by,
 )
-from ..simulators import Simulator, as_simulator
+from ..simulators import Simulator, as_simulator, check_hold, one_hold
 from .faults.gates import Gate, edited
 from .search.stretches import Stretches
 
@@ -65,11 +65,13 @@ class Request:
 
 
 def stated_hold(simulator: Any, recordings: Sequence[Recording], hold: str | None) -> str | None:
-    """Return the hold that the user, the simulator or a recording states; None if none of them does.
+    """Return the hold that a recording, the user or the simulator states, in this order; None if none of them does.
 
-    Without an input that changes, there is nothing to state: any hold is the same.
+    A simulator in discrete time keeps its own. Without an input that changes, any hold is the same.
     """
-    stated = next((h for h in (hold, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
+    given = [r.hold for r in recordings]
+    order = (hold, simulator.hold, *given) if simulator.discrete else (*given, hold, simulator.hold)
+    stated = next((h for h in order if h is not None), None)
     return stated or ("zero" if moves_freely(recordings) else None)
 
 
@@ -90,18 +92,29 @@ def match_recordings(
     given = as_recordings(train)
     simulator = as_simulator(simulator, given)
     recordings = [simulator.matched(r) for r in given]
+    if not simulator.discrete:
+        one_hold(recordings)
     return simulator, check_for_identification(recordings, FEWEST_SAMPLES, excited=False)
 
 
 def match_tests(
-    simulator: Simulator, test: Recording | Sequence[Recording] | None, train: Sequence[Recording]
+    simulator: Simulator, test: Recording | Sequence[Recording] | None, train: Sequence[Recording], hold: str | None
 ) -> tuple[Recording, ...]:
-    """Return the test recordings with the simulator's channels; refuse training data, other steps and no outputs."""
+    """Return the test recordings with the simulator's channels; `hold` is what is stated for the training.
+
+    Training data, other steps, another hold of the inputs, and recordings without outputs are refused.
+    """
     tests = tuple(simulator.matched(r) for r in as_recordings(test)) if test is not None else ()
     for t in tests:
         if not t.n_y:
             label = t.label.removeprefix("the ")
             raise InputError(f"The test {label} has no outputs to compare with; name the measured columns.")
+        if hold is None and t.hold is not None and not simulator.discrete:
+            raise InputError(
+                f"The test {t.label.removeprefix('the ')} states hold={t.hold!r}, and no training recording states "
+                "any; state it for both, or for none."
+            )
+        check_hold(simulator, t, hold or "zero")
         for r in train:
             if (shared := _shared_samples(r, t)) == len(t):
                 raise InputError(
@@ -214,6 +227,8 @@ def check_time_and_focus(time_limit: float | None, focus: str | None) -> None:
 
 def check_limits(simulator: Simulator, limits: Mapping[str, float] | None) -> None:
     """Refuse a limit on a name that is not an input, and a limit that is not positive."""
+    if limits is not None and not isinstance(limits, Mapping):
+        raise InputError(f'limits={limits!r} was given; give amplitudes by input, like {{"force": 2.0}}.')
     for name, most in (limits or {}).items():
         if name not in simulator.inputs:
             own = listed(simulator.inputs) or "none"

@@ -259,8 +259,8 @@ def check(
     train : Recording or sequence of Recording
         The recordings that are to be diagnosed.
     hold : {"zero", "linear", "band-limited"}, optional
-        Course of the inputs between samples, if neither recordings nor simulator say; by default the one with which
-        the refitted simulator follows better.
+        Course of the inputs between samples for recordings that do not state it; by default the simulator's, or else
+        the one with which the refitted simulator follows better.
     laws : sequence of Law classes or names, optional
         Names are as in `diagnose`. By default the plainest form of each law of the catalogue.
     engine : {"auto", "c", "vm"}

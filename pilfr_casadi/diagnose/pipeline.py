@@ -122,7 +122,7 @@ def diagnose_in_steps(
     say = Stages(progress or (lambda stage, done, total, best: None))
     given = as_recordings(train)
     simulator, recordings = match_recordings(simulator, given, hold)
-    tests = match_tests(simulator, test, recordings)
+    tests = match_tests(simulator, test, recordings, stated_hold(simulator, recordings, hold))
     check_limits(simulator, limits)
     tried = (*add_scaled_laws(check_laws(laws), simulator), *((VaryingParameter,) if laws is None else ()))
     deadline = np.inf if time_limit is None else began + float(time_limit)

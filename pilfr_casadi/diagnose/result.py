@@ -15,7 +15,7 @@ from .._base import InputError, later, to_json, write_atomically
 from ..data import SAME_STEP, Recording, as_recordings, nrmse
 from ..engine import make_engine
 from ..identify import run_free
-from ..simulators import Simulator, discretise
+from ..simulators import Simulator, check_hold, discretise
 from .faults.gates import edited
 from .fits.workbench import Fitted, output_deviation
 from .proof import Started
@@ -195,6 +195,7 @@ class Diagnosis(ResultText):
         """
         simulator = simulator or self.corrected
         r, dt = self.matched(recording), self.train[0].dt
+        check_hold(simulator, r, self.hold)
         if abs(r.dt / dt - 1) > SAME_STEP:
             raise InputError(f"The recording's step is {r.dt:g} s, the training's {dt:g} s; resample it.")
         fitted = self.evidence.after if simulator is self.corrected else self.evidence.without

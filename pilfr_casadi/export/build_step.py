@@ -172,7 +172,7 @@ def _find_start_state(model: Any, closed: Model, step: Exported, start: Any) -> 
             state = estimate_initial_state(closed, make_engine(closed), start)
         if not np.all(np.isfinite(state)):
             raise InputError("The state at the recording's first sample is not finite; give another start.")
-        return np.append(state, np.zeros(size - n))
+        return np.append(state, np.full(size - n, start.start))  # the time, if it is a state
     given = numbers(start, "The start state").ravel()
     if given.size not in (len(closed.states), n, size):
         fewer = f"{len(closed.states)} (memory zero) or " if size > len(closed.states) else ""
@@ -181,7 +181,8 @@ def _find_start_state(model: Any, closed: Model, step: Exported, start: Any) -> 
 
 
 def _check_recording(model: Model, step: Exported, recording: Recording) -> None:
-    if (recording.inputs, recording.outputs) != (model.inputs, model.outputs):
+    unmeasured = not recording.n_y and recording.begins != "estimate"
+    if recording.inputs != model.inputs or not (unmeasured or recording.outputs == model.outputs):
         raise InputError(
             f"The recording has {', '.join((*recording.inputs, *recording.outputs))}, the model "
             f"{', '.join((*model.inputs, *model.outputs))}; they must be the same, in this order."

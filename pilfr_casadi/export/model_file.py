@@ -51,6 +51,7 @@ from ..models import (
     block_shapes,
 )
 from ..optimise import Candidate, Iteration, Limit, Solution, Status
+from ..simulators import Simulator, discretise
 
 if TYPE_CHECKING:
     from . import model_schema as schema
@@ -126,6 +127,7 @@ def _make_tables(fit: FitContent) -> dict[str, Any]:
             "outputs": [{"name": name, "unit": fit.units.get(name, "")} for name in model.outputs],
             "states": model.states,
             "memory": model.n_s,
+            **({"hold": model.hold, "substeps": model.substeps} if fit.structure is None else {}),
         },
         "structure": None if fit.structure is None else _make_structure_table(fit.structure),
         "parameters": {
@@ -217,13 +219,15 @@ def _format_json(value: Any, depth: int = 0) -> str:
     return json.dumps(value, allow_nan=False)
 
 
-def read_model_file(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> FitContent:
+def read_model_file(path: str | os.PathLike[str], model: Model | PILFR | Simulator | None = None) -> FitContent:
     """Read a file that `write_model_file` wrote, as `identify.load` describes.
 
     Candidates and their solutions have an empty `theta`: a file keeps only their results.
     """
     from .model_schema import read_tables
 
+    if not isinstance(model, Model | PILFR | Simulator | None):
+        raise InputError(f"model = {model!r} was given; give the Model, PILFR or Simulator that was fitted.")
     name = path_text(path, "model file")
     text = _read_text(name)
     try:
@@ -319,7 +323,7 @@ def _check_content(content: Any) -> dict[str, Any]:
     return content
 
 
-def _build_content(tables: schema.ModelTables, given: Model | PILFR | None) -> FitContent:
+def _build_content(tables: schema.ModelTables, given: Model | PILFR | Simulator | None) -> FitContent:
     training = tables.training
     structure, start = _build_model(tables, given)
     model = _restore_values(tables, start, structure)
@@ -355,15 +359,30 @@ def _build_content(tables: schema.ModelTables, given: Model | PILFR | None) -> F
     )
 
 
-def _build_model(tables: schema.ModelTables, given: Model | PILFR | None) -> tuple[PILFR | None, Model]:
+def _build_model(tables: schema.ModelTables, given: Model | PILFR | Simulator | None) -> tuple[PILFR | None, Model]:
     """Build the structure (None for the user's own equations) and the closed model, without the file's values."""
     n_u, n_y = len(tables.model.inputs), len(tables.model.outputs)
+    if isinstance(given, Simulator):
+        given = _discretise_as_saved(given, tables.model)
     if isinstance(given, Model):
-        if (given.n_u, given.n_y) != (n_u, n_y):
-            raise InputError(f"it has {given.n_u} inputs and {given.n_y} outputs, the file {n_u} and {n_y}")
+        own = len(given.inputs), len(given.outputs)  # the step may read further signals, such as the time
+        if own != (n_u, n_y):
+            raise InputError(f"it has {own[0]} inputs and {own[1]} outputs, the file {n_u} and {n_y}")
         return None, given
     structure = given or _build_structure(tables, n_u, n_y)
     return structure, _build_closed_model(structure, tables.model)
+
+
+def _discretise_as_saved(simulator: Simulator, saved: schema.Signals) -> Model:
+    """Discretise a simulator as it was for the fit."""
+    if saved.hold is None or not saved.substeps:
+        raise _Unusable(
+            "does not state how inputs change between samples, because an earlier release wrote it; fit the simulator "
+            "again, or give the fit's closed model"
+        )
+    if (simulator.inputs, simulator.output_names) != saved.names:
+        raise _Unusable("has other inputs or outputs than the simulator; give the one that was fitted")
+    return discretise(simulator, saved.dt, saved.hold, saved.substeps)
 
 
 def _build_structure(tables: schema.ModelTables, n_u: int, n_y: int) -> PILFR:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 from functools import partial
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
@@ -75,6 +75,8 @@ class Signals(Table):
     outputs: list[Channel]
     states: list[str]
     memory: Count
+    hold: Literal["zero", "linear", "band-limited"] | None = None
+    substeps: Count = 0
 
     @property
     def names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -181,8 +181,8 @@ def _residual(model: Any, recording: Recording) -> tuple[np.ndarray, int]:
             model = replace(model, initial={})  # no model uses a state from the whole recording
         seen, y, first = model.run(recording)
     elif isinstance(model, Model):
-        seen = recording
-        y, first = run_free(model, make_engine(model), recording)
+        seen = model.in_order(recording)
+        y, first = run_free(model, make_engine(model), seen)
     else:
         seen, y, first = run_simulator(as_simulator(model, [recording]), recording)
     missing = [name for name in recording.outputs if name not in seen.outputs]

@@ -196,13 +196,12 @@ def _match_units(model: Any, train: Recording | Sequence[Recording]) -> tuple[Re
     Values without a unit count as in these units.
     """
     recordings = as_recordings(train)
-    simulator = model if isinstance(model, Simulator) else model.simulator if isinstance(model, Fit) else None
     # the first unit of each channel
     units: Mapping[str, str] = {name: unit for r in reversed(recordings) for name, unit in r.units.items()}
-    if simulator is not None:
-        units, recordings = simulator.units, tuple(map(simulator.matched, recordings))
-    elif isinstance(model, Fit):
-        units = model.units
+    if isinstance(model, Fit | Simulator):
+        units, recordings = model.units, tuple(map(model.matched, recordings))
+    elif isinstance(model, Model):
+        recordings = tuple(map(model.in_order, recordings))
     matched = []
     for r in (r.in_units(units) for r in recordings):
         own = {name: unit for name, unit in units.items() if name in (*r.inputs, *r.outputs)}

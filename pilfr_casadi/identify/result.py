@@ -37,7 +37,7 @@ from ..optimise import (
     samples_for_state,
     stability_limits,
 )
-from ..simulators import Simulator
+from ..simulators import Simulator, check_hold
 from .uncertainty import describe_unknown_errors
 
 DENSITY_PRIOR = "weights held near a smooth density by a weak prior"  # note of a candidate and of its fit
@@ -269,7 +269,7 @@ class Fit:
         return float(np.mean(errors))
 
     def matched(self, recording: Recording) -> Recording:
-        """Return a recording with the model's units, for a simulator in its columns' order; check that it fits."""
+        """Return a recording with the model's units and, where its names are the model's, order; check that it fits."""
         if not isinstance(recording, Recording):
             raise InputError(
                 f"A {type(recording).__name__} was given to simulate; give a Recording, which holds inputs, outputs "
@@ -277,7 +277,8 @@ class Fit:
             )
         if self.simulator is not None:
             recording = self.simulator.matched(recording)
-        recording = recording.in_units(self.units)
+            check_hold(self.simulator, recording, self.model.hold)
+        recording = self.model.in_order(recording).in_units(self.units)
         n_u, n_y = len(self.model.inputs), self.model.n_y
         unmeasured = recording.n_y == 0 and recording.begins != "estimate"
         if recording.n_u != n_u or not (recording.n_y == n_y or unmeasured):
@@ -358,7 +359,7 @@ class Fit:
         ----------
         path : path
             The file, usually `*.json`. For your own model or simulator it holds only the values (for a simulator with a
-            warning); give the model to `load`.
+            warning); give the model or the simulator to `load`.
 
         Raises
         ------
@@ -369,7 +370,7 @@ class Fit:
         if self.simulator is not None:
             warnings.warn(
                 f"{os.fspath(path)} holds the fitted values, not the simulator's equations, which are code; load it "
-                "with load(path, model=fit.model).",
+                "with load(path, model=simulator).",
                 stacklevel=2,
             )
 
@@ -418,9 +419,10 @@ def save(fit: Fit, path: str | os.PathLike[str]) -> None:
     fit.save(path)
 
 
-def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fit:
+def load(path: str | os.PathLike[str], model: Model | PILFR | Simulator | None = None) -> Fit:
     """Read a fit that `save` wrote; simulations are the same to the last digit.
 
+    A fit of a simulator needs it as `model`, with its equations; the parameters' values come from the file.
     See `export.read_model_file` for parameters, errors and warnings. Each candidate has its seed, error and status, an
     empty `theta` and the fitted model.
     """
@@ -429,7 +431,8 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
     options = FitOptions()  # files of the first versions have none
     if content.limits is not None:
         options = options_from_limits(content.limits, content.structure, noise=content.noise, weights=content.weights)
-    return Fit(**{**shared, "limits": content.limits or ()}, options=options)
+    fit = Fit(**{**shared, "limits": content.limits or ()}, options=options)
+    return fit.with_simulator(model) if isinstance(model, Simulator) else fit
 
 
 def _describe_starts(fit: Fit) -> list[str]:

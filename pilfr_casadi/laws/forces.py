@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import one_at_a_time
+from .._base import InputError, one_at_a_time
 from ..models import Named, accumulate_steps, map_points
 from .base import Law, Local
 from .composed import PROFILES
@@ -97,7 +97,7 @@ def _build_lane(kind: Any, h: float) -> ca.Function:
             rate = {"dz": dz} if "dz" in law.reads() else {}
             w, end = law.step(z, own, values, **rate)
         else:
-            w = _call(law.force, z=z, dz=dz, q=own, t=t, p=values)
+            w = _call(law, "force", z=z, dz=dz, q=own, t=t, p=values)
             end = _advance(law, own, (z, following), (dz, dz_next), t, values, dt) if n_q else own
         forces.append(w)
     return ca.Function("lane", [own, signals, vector, dt], [ca.densify(end), ca.densify(ca.vertcat(*forces))])
@@ -115,8 +115,23 @@ def _names(function: Any) -> tuple[str, ...]:
     return tuple(inspect.signature(function).parameters)
 
 
-def _call(function: Any, **available: Any) -> Any:
-    return function(**{k: available[k] for k in _names(function)})
+def _call(law: Law, name: str, **available: Any) -> Any:
+    """Call a function of a law, which may be a user's, with the signals that its arguments name."""
+    function, what = getattr(law, name), f"`{name}` of the law {law.id!r}"
+    if getattr(type(law), name) is getattr(Law, name, None):
+        raise InputError(f"The law {law.id!r} has no `{name}`; write one, as in {name}(self, z, p).")
+    for wanted in _names(function):
+        if wanted not in available:
+            raise InputError(f"The {what} asks for {wanted!r}; in a diagnosis it can have {', '.join(available)}.")
+    try:
+        return function(**{k: available[k] for k in _names(function)})
+    except RuntimeError as error:
+        if "truth value" not in str(error):
+            raise
+        raise InputError(
+            f"The {what} decides by the value of a symbol (if, and, or, min, max), which has none yet; use "
+            "casadi.if_else, casadi.fmin and casadi.fmax."
+        ) from error
 
 
 def _advance(law: Law, q: Any, z: tuple[Any, Any], dz: tuple[Any, Any], t: Any, p: Any, h: Any) -> Any:
@@ -124,7 +139,7 @@ def _advance(law: Law, q: Any, z: tuple[Any, Any], dz: tuple[Any, Any], t: Any, 
 
     def flow(state: Any, share: float) -> Any:
         at = {k: a + share * (b - a) for k, (a, b) in {"z": z, "dz": dz}.items()}
-        return _call(law.flow, **at, q=state, t=t + share * h, p=p)  # type: ignore[attr-defined]
+        return _call(law, "flow", **at, q=state, t=t + share * h, p=p)
 
     k1 = flow(q, 0.0)
     k2 = flow(q + h / 2 * k1, 0.5)

@@ -95,6 +95,17 @@ class Model:
         """Return the unknowns (n,) of an initial state (n_state,): of entries that begin alike, the first."""
         return np.asarray(state)[np.argmax(self.initial_basis, axis=0)] if self.n_state else np.zeros(0)
 
+    @property
+    def hold(self) -> str:
+        """How the step takes inputs between samples; see `Recording.hold`."""
+        return "band-limited" if self.band_limited else "linear" if "next" in self.reads else "zero"
+
+    def in_order(self, recording: Recording) -> Recording:
+        """Return a recording with its channels in the model's order if it has the model's names; else as it is."""
+        outputs = self.outputs if recording.outputs else ()
+        same = (set(recording.inputs), set(recording.outputs)) == (set(self.inputs), set(outputs))
+        return recording.in_order(self.inputs, outputs) if same else recording
+
     def drive(self, recording: Recording) -> np.ndarray:
         """Collect the signals that the step reads along a recording, (M * substeps, n_u), in the order of `reads`.
 

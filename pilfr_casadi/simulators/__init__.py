@@ -76,12 +76,14 @@ if TYPE_CHECKING:
     from .substeps import (
         LARGEST_STEP as LARGEST_STEP,
         MOST_SUBSTEPS as MOST_SUBSTEPS,
+        check_hold as check_hold,
         choose_substeps as choose_substeps,
         discretise_for as discretise_for,
         fastest_rates as fastest_rates,
         growth_rate as growth_rate,
         least_substeps as least_substeps,
         needed_substeps as needed_substeps,
+        one_hold as one_hold,
         rate_at_start as rate_at_start,
         states_along as states_along,
     )

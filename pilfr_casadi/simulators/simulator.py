@@ -117,27 +117,15 @@ class Simulator(Equations):
         InputError
             If a column is missing, or its unit measures something else; a recording without outputs needs none.
         """
-        changes: dict[str, Any] = {}
-        for kind, names, own, values in (
-            ("input", self.inputs, recording.inputs, recording.u),
-            ("output", self.output_names, recording.outputs, recording.y),
-        ):
-            if kind == "output" and not own:
-                continue
+        outputs = self.output_names if recording.outputs else ()
+        for kind, names, own in (("input", self.inputs, recording.inputs), ("output", outputs, recording.outputs)):
             for name in names:
                 if name not in own:
                     raise InputError(
                         f"{recording.label} has no {kind} {name!r}; it has {', '.join(own) or 'none'}. Map a column to "
                         "it by name."
                     )
-            if tuple(own) != tuple(names):
-                changes["u" if kind == "input" else "y"] = values[:, [own.index(n) for n in names]]
-                changes[f"{kind}s"] = tuple(names)
-        if changes:
-            known = (*self.inputs, *self.output_names)
-            units = {name: unit for name, unit in recording.units.items() if name in known}
-            recording = recording.with_(**changes, units=units)
-        return recording.in_units(self.units)
+        return recording.in_order(self.inputs, outputs).in_units(self.units)
 
     def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
         """Compute the NRMSE (Krikelis et al. 2024, Eq. 27) of a simulation, averaged over outputs and recordings.

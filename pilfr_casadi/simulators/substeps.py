@@ -109,12 +109,28 @@ def choose_substeps(simulator: Equations, recordings: Sequence[Recording]) -> in
 
 def discretise_for(simulator: Equations, recordings: Sequence[Recording]) -> Model:
     """Discretise on the recordings' grid, with their hold of the inputs (else the simulator's) and enough sub-steps."""
-    holds = {r.hold or simulator.hold or "zero" for r in recordings}
-    if len(holds) > 1:
+    hold = one_hold(recordings, simulator.hold or "zero") or "zero"
+    return discretise(simulator, recordings[0].dt, hold, choose_substeps(simulator, recordings))
+
+
+def one_hold(recordings: Sequence[Recording], default: str | None = None) -> str | None:
+    """Return the hold that the recordings state, or the default where they do not; refuse several."""
+    first, *others = dict.fromkeys(hold for r in recordings if (hold := r.hold or default)) or [default]
+    if others:
         raise InputError(
-            "The recordings differ in `hold`, and a simulator is integrated with one of them; fit them one by one."
+            f"The recordings differ in `hold` ({first!r} and {others[0]!r}), and a simulator is integrated with one of "
+            "them; give all the same, as by recording.with_(hold=...), or use them one by one."
         )
-    return discretise(simulator, recordings[0].dt, holds.pop(), choose_substeps(simulator, recordings))
+    return first
+
+
+def check_hold(simulator: Equations, recording: Recording, hold: str) -> None:
+    """Refuse a recording that states another hold of its inputs than the one that a simulator was fitted with."""
+    if recording.n_u and not simulator.discrete and recording.hold not in (None, hold):
+        raise InputError(
+            f"{recording.label} states hold={recording.hold!r}, and the simulator was fitted with {hold!r}; give that "
+            f"by with_(hold={hold!r}), or simulate with the fitted `Simulator` itself, which takes each recording's."
+        )
 
 
 def least_substeps(simulator: Equations) -> int:

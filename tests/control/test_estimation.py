@@ -121,6 +121,21 @@ def test_two_inputs_and_outputs_are_observed(square):
     assert "no memory" in str(visibility(fit, observer, np.zeros(4), record.u[:10]))
 
 
+def test_a_model_without_any_error_is_observed():
+    from scipy.linalg import block_diag, expm
+    from scipy.signal import dlsim
+
+    u = np.random.default_rng(0).standard_normal((800, 2))
+    a = block_diag(*(expm(0.01 * np.array([[0.0, 1.0], [-k, -3.0]])) for k in (130.0, 60.0, 200.0)))
+    b, c = np.zeros((6, 2)), np.zeros((2, 6))
+    b[[1, 3, 5], [0, 1, 1]], c[[0, 0, 1], [0, 2, 4]] = 0.01, (3.0, 0.2, 2.0)
+    exact = pilfr.Recording(u, dlsim((a, b, c, np.zeros((2, 2)), 1.0), u)[1], 0.01, initial="zero")
+    found = pilfr.fit(pilfr.PILFR(6), exact, starts=1)
+    predicted = kalman_filter(found, exact).run(exact.u, exact.y)[1]
+    assert np.all(np.std((exact.y - predicted)[50:], axis=0) < 1e-6 * np.std(exact.y, axis=0))
+    refused(lambda: kalman_filter(found, exact, share=1e-9).run(exact.u, exact.y), "a larger share")
+
+
 def test_covariances_of_states_of_unlike_sizes_are_taken(small):
     _, record, observer = small
     for P0 in (np.zeros((5, 5)), np.diag([1e-20, 1.0, 1e9, 0.0, 1e-6]), np.ones((5, 5)), observer.P0):
@@ -180,6 +195,21 @@ def test_interpolated_inputs_are_observed_and_not_inverted():
     error = (observer.run(u, data[0].y)[1] - data[0].y)[100:]
     assert np.std(error) < 2e-3 * np.std(data[0].y)
     refused(lambda: feedforward(found, data[0]), "input is interpolated between samples")
+
+
+def test_an_observer_begins_at_the_time_of_the_recording():
+    simulator = pilfr.Simulator(
+        lambda x, u, t: {"a": -x.a + u.f + ca.sin(t)}, lambda x: {"y": x.a}, states=("a",), inputs=("f",)
+    )
+    u = np.random.default_rng(0).standard_normal((300, 1))
+    planned = pilfr.Recording(u, np.empty((300, 0)), 0.05, ("f",), (), initial=[0.3], hold="zero", start=7.0)
+    y = simulator.simulate(planned)
+    exported = pilfr.exported(simulator, dt=0.05, start=planned)
+    assert exported.x0() == pytest.approx([0.3, 7.0])
+    assert np.asarray(exported.step.mapaccum("run", 300)(exported.x0(), u.T)[1]).ravel() == pytest.approx(y[:, 0])
+    observer = kalman_filter(simulator, planned.with_(y=y, outputs=("y",)))
+    assert observer.x0 == pytest.approx([0.0, 7.0])
+    assert np.max(np.abs(observer.run(u, y)[1] - y)[5:]) < 1e-6
 
 
 def test_an_observer_does_not_correct_the_time():

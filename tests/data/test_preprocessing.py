@@ -389,6 +389,16 @@ def test_a_merged_input_is_linear_where_one_of_the_records_is():
     assert pilfr.merge(held, smooth, inputs="a", outputs="y").hold == "zero"
 
 
+def test_the_hold_of_a_merger_is_that_of_its_inputs():
+    u = np.random.default_rng(0).standard_normal((500, 2))
+    force = Recording(u[:, :1], np.empty((500, 0)), 0.01, ("a",), (), hold="zero")
+    sensor = Recording(u[:, 1:], np.empty((500, 0)), 0.01, ("y",), ())
+    for pair in ((force, sensor), (sensor, force)):
+        assert merge(*pair, inputs="a", outputs="y").hold == "zero"
+    assert merge(force, sensor.with_(hold="linear"), inputs="a", outputs="y").hold == "zero"
+    assert merge(force, sensor.with_(hold="linear")).hold == "linear"
+
+
 def test_a_merged_input_stays_held_where_no_input_is_resampled():
     """The second logger begins whole samples away, or between two samples, before or after the first one."""
     u = np.random.default_rng(0).standard_normal((500, 2))

@@ -240,16 +240,35 @@ def test_an_offset_that_the_test_recordings_do_not_have_is_told():
     assert "test offset" not in {g.finding for g in recurring.gates}
 
 
+def test_recordings_say_what_inputs_do_between_samples_before_arguments_and_simulator():
+    train, test = (r.slice(0, 600) for r in recordings(hold="linear"))
+    sloped = replace(rig(), hold="zero")
+    found = pilfr.diagnose(sloped, train, test=test, hold="zero", laws=())
+    assert found.hold == "linear"
+    assert found.errors["test"]["nominal"] == pytest.approx(sloped.nrmse(test), rel=1e-3)
+    held = test.with_(hold="zero")
+    for call, words in (
+        (lambda: found.nrmse(held), "states hold='zero', and the simulator was fitted with 'linear'"),
+        (lambda: pilfr.diagnose(rig(), train, test=held, laws=()), "states hold='zero'"),
+        (lambda: pilfr.diagnose(rig(), [train, held], laws=()), "differ in `hold`"),
+        (lambda: pilfr.check(rig(), [train, held]), "differ in `hold`"),
+        (lambda: pilfr.diagnose(rig(), train.with_(hold=None), test=test, laws=()), "state it for both"),
+        (lambda: pilfr.diagnose(rig(), train, laws=(), limits=[1.0]), "amplitudes by input"),
+    ):
+        with pytest.raises(InputError, match=words):
+            call()
+
+
 def test_tests_may_begin_in_the_training_data_where_they_are_not_scored(plain):
     whole = plain[0]
     train, after = (
         whole.with_(u=whole.u[part], y=whole.y[part], initial="estimate") for part in (slice(0, 500), slice(400, 900))
     )
-    assert len(match_tests(rig(), after.with_(skip=100), [train])) == 1
+    assert len(match_tests(rig(), after.with_(skip=100), [train], "zero")) == 1
     still = np.zeros((600, 1))
     quiet = train.with_(u=still[:500], y=np.vstack([train.y[:400], still[:100]]))
     begin = train.with_(u=still[:500], y=np.vstack([still[:60], train.y[:440]]))
-    assert len(match_tests(rig(), begin, [quiet])) == 1
+    assert len(match_tests(rig(), begin, [quiet], "zero")) == 1
 
 
 @pytest.mark.parametrize(

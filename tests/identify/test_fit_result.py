@@ -10,7 +10,7 @@ from random_models import random_input, random_lfr, reference
 
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording, nrmse
-from pilfr_casadi.identify import DENSITY_PRIOR, FitContext, fit, standard_errors
+from pilfr_casadi.identify import DENSITY_PRIOR, FitContext, compare, fit, standard_errors
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
 from pilfr_casadi.optimise import Constraint, GaussNewton, Problem, Status
 
@@ -287,3 +287,19 @@ def test_the_command_line_reports_unscored_samples(of_record):
     assert describe_test_error(of_record, Recording(u[:50], y[:50], 0.01, name="short")).startswith(
         "no NRMSE on short: The recording"
     )
+
+
+def test_channels_in_another_order_are_matched_by_name():
+    u = np.random.default_rng(0).standard_normal((300, 2))
+    y = np.column_stack([np.convolve(u[:, 0], [0, 1, 0.5])[:300], np.convolve(u[:, 1], [0, 0, 2.0])[:300]])
+    given = Recording(u, y, 0.01, inputs=("left", "right"), outputs=("near", "far"), initial="zero")
+    turned = given.in_order(("right", "left"), ("far", "near"))
+    found = fit(PILFR(4), given, starts=1)
+    np.testing.assert_array_equal(found.simulate(turned), found.simulate(given))
+    assert found.nrmse(turned) == pytest.approx(found.nrmse(given), rel=1e-6)
+    again = fit(found, turned)
+    np.testing.assert_allclose(again.simulate(given), found.simulate(given), atol=1e-6)
+    np.testing.assert_allclose(fit(found.model, turned).simulate(given), found.simulate(given), atol=1e-6)
+    errors = compare(turned, {"fit": found, "model": found.model}).errors
+    np.testing.assert_allclose(errors["fit"], errors["model"], atol=1e-9)
+    assert np.all(errors["fit"] < 1e-3)

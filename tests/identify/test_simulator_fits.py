@@ -59,6 +59,16 @@ def test_recordings_with_different_holds_are_refused(record):
         pilfr.fit(simulator(), [record, record.with_(hold="linear")], engine="vm")
 
 
+def test_a_recording_with_another_hold_than_the_fit_is_refused(record, fitted):
+    sloped = record.with_(hold="linear")
+    for verb in (fitted.simulate, fitted.nrmse, lambda r: pilfr.fit(fitted, r)):
+        with pytest.raises(InputError, match="states hold='linear', and the simulator was fitted with 'zero'"):
+            verb(sloped)
+    assert fitted.nrmse(record.with_(hold="zero")) == fitted.nrmse(record)
+    again = pilfr.fit(fitted.simulator, sloped, engine="vm")
+    assert np.max(np.abs(again.simulate(sloped) - fitted.simulate(record))) > 0
+
+
 def test_run_simulator_equals_simulate_from_zero(record):
     placed = simulator().with_element("actuator:force", Delay({"T": 0.025}))
     for hold in ("zero", "linear"):
@@ -89,6 +99,30 @@ def test_the_verbs(record, fitted, tmp_path):
     assert fitted.to_casadi().size1_in(0) == 2
     assert fitted.plot(record) is not None
     assert pilfr.fit(fitted, record, engine="vm").simulator is not None
+
+
+@pytest.mark.parametrize("hold", ["zero", "linear", "band-limited"])
+def test_a_saved_fit_of_a_simulator_is_loaded_with_it(record, tmp_path, hold):
+    given = record.with_(hold=hold)
+    fit = pilfr.fit(simulator(), given, engine="vm")
+    with pytest.warns(UserWarning, match="model=simulator"):
+        fit.save(tmp_path / "sim.json")
+    closed = pilfr.load(tmp_path / "sim.json", model=fit.model)
+    np.testing.assert_array_equal(closed.simulate(given), fit.simulate(given))
+    again = pilfr.load(tmp_path / "sim.json", model=simulator())
+    np.testing.assert_array_equal(again.simulate(given), fit.simulate(given))
+    assert again.simulator.parameters["k"].value == fit.parameters["k"]
+    assert again.simulator.nrmse(given) == pytest.approx(fit.simulator.nrmse(given))
+    thrust = Simulator(
+        lambda x, u, p: dict(pos=x.vel, vel=u.thrust - p.k * x.pos - p.d * x.vel - p.m),
+        simulator().outputs,
+        states=("pos", "vel"),
+        inputs=("thrust",),
+        parameters=simulator().parameters,
+    )
+    for other, words in ((thrust, "other inputs or outputs"), (fit, "Model, PILFR or Simulator")):
+        with pytest.raises(InputError, match=words):
+            pilfr.load(tmp_path / "sim.json", model=other)
 
 
 def test_an_exact_fit_has_no_warning(record):
