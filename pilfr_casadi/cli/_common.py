@@ -442,8 +442,9 @@ def reserved_file(path: Path, overwrite: bool) -> Iterator[Path]:
     """Make the folder of a result and reserve the file there, so that no other run writes it; yield its path.
 
     The work is not lost if another run has written the file since it was checked: another folder inside then takes the
-    result. Without a result, no file is left.
+    result. Without a result, neither the file nor a new folder is left.
     """
+    missing = _missing_folders(path.parent)
     target = make_out_folder(str(path.parent)) / path.name
     for count in itertools.count(2):
         try:
@@ -459,12 +460,20 @@ def reserved_file(path: Path, overwrite: bool) -> Iterator[Path]:
     finally:
         if target.is_file() and not target.stat().st_size:
             target.unlink()
+        for folder in missing:
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
+
+
+def _missing_folders(folder: Path) -> list[Path]:
+    """List the folders on the way to a folder that do not exist, the innermost first."""
+    return [part for part in (folder, *folder.parents) if not part.exists()]
 
 
 def check_out_folder(path: str) -> Path:
     """Check that the folder of the results can be made and written, and leave nothing new behind."""
     folder = Path(path)
-    missing = [part for part in (folder, *folder.parents) if not part.exists()]
+    missing = _missing_folders(folder)
     make_out_folder(path)
     for part in missing:
         part.rmdir()

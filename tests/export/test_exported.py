@@ -383,7 +383,7 @@ def test_the_command(tmp_path, capsys):
     refused(capsys, "export", model, "--dt", "1", "--out", out, says="--dt")
     refused(capsys, "export", model, "--out", model, says="overwrite")
     refused(capsys, "export", model, "--out", tmp_path / "no" / "rig", says="folder that exists")
-    refused(capsys, "export", model, "--c", "--out", model, says="cannot be made")
+    refused(capsys, "export", model, "--c", "--out", model, says="cannot be written")
     refused(capsys, "export", model, "--out", tmp_path / "new", "--name", "a b", says="cannot be used")
     refused(capsys, "export", model, "--out", tmp_path / "new", "--smooth", "-1", says="smooth")
     content = json.loads(model.read_text())
