@@ -315,3 +315,12 @@ def test_a_law_that_removes_much_of_the_mismatch_says_where_it_acts():
     found = pilfr.diagnose(bicycle, recording, laws=("quadratic_drag",), effects=1)
     assert found.verdict == "unexplained" and "quadratic drag at road, removes 34 %" in found.sentence
     assert found.sentence.startswith("Physics is missing, most likely at road,")
+
+
+def test_samples_at_rest_are_no_evidence():
+    """A cart moves for 120 samples, and every model lets it stand afterwards."""
+    u = np.concatenate([np.repeat([8.0, 0, -8.0, 0], 15), np.zeros(3060)])[:, None]
+    blank = Recording(u, u, 0.05, ("force",), ("pos",), initial="zero", hold="zero")
+    dry = cart().with_element("ground", CoulombFriction(values={"F_c": 3.0}))
+    found = pilfr.diagnose(cart(), blank.with_(y=dry.simulate(blank)), laws=(CoulombFriction,), effects=1)
+    assert found.evidence.search.count < 120

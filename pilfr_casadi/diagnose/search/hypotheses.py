@@ -37,7 +37,7 @@ from ..fits.evidence import (
     spread,
 )
 from ..fits.flexible_forces import flexible_shares, innovation_share
-from ..fits.floor import FEWEST, Floor, effective_size, white_part
+from ..fits.floor import FEWEST, Floor, acting_samples, effective_size, white_part
 from ..fits.force_recovery import is_curve_along
 from ..fits.screen import Scored, screen
 from ..fits.workbench import DIVERGED, Fitted, Workbench
@@ -400,12 +400,14 @@ class Hypotheses:
 
         A measured noise is kept. Third differences give a lower limit: the white noise in the residual. The
         smallest error of any hypothesis is an upper limit. The effective samples follow from the residual's
-        correlation. The slow residual of a wrong model would make them so few that no evidence could refute it; so a
-        hypothesis that leaves a far smaller error takes its place.
+        correlation, and are no more than those in which the mismatch acts. The slow residual of a wrong model would
+        make them so few that no evidence could refute it; so a hypothesis that leaves a far smaller error takes its
+        place.
         """
         best, nearest = self.best, min(self.memo.values(), key=lambda t: t.mean_square)
         best = nearest if FAR_RATIO * nearest.error < best.error else best
-        self.count = count_samples(best.fitted, self.bench)
+        acting = max(acting_samples(self.bench.scored(self.root.fitted.residual)), FEWEST)
+        self.count = min(count_samples(best.fitted, self.bench), acting)
         if self.floor.source != "estimated" or self.past_deadline:
             return
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]

@@ -5,7 +5,15 @@ import pytest
 from scipy.signal import lfilter
 
 from pilfr_casadi import Recording
-from pilfr_casadi.diagnose.fits.floor import Floor, effective_size, measured_floor, pool, swells_with, white_part
+from pilfr_casadi.diagnose.fits.floor import (
+    Floor,
+    acting_samples,
+    effective_size,
+    measured_floor,
+    pool,
+    swells_with,
+    white_part,
+)
 
 N, DEVIATION = 200, (0.02, 0.5)
 
@@ -82,6 +90,14 @@ def test_one_period_and_one_recording_show_nothing():
 def test_slow_error_does_not_count_as_white_noise():
     rng, slow = np.random.default_rng(0), np.sin(np.arange(4000) * 0.01)[:, None]
     assert white_part([slow + 0.01 * rng.standard_normal((4000, 1))]) == pytest.approx([0.01], rel=0.1)
+
+
+def test_samples_at_which_a_machine_stands_do_not_count():
+    noise = np.random.default_rng(0).standard_normal((2000, 2))
+    assert acting_samples([noise]) == pytest.approx(4000, rel=0.05)
+    rest = np.zeros((8000, 2))
+    assert acting_samples([noise, rest]) == pytest.approx(acting_samples([noise]), rel=0.05)
+    assert acting_samples([np.ones((500, 1))]) == 500
 
 
 def test_samples_that_are_alike_count_less():
