@@ -168,14 +168,14 @@ class ResultText:
         return f"error on the test recordings: {with_it} with it, {without} without it (the rest refitted)"
 
     def _idle_on_tests(self) -> str:
-        """Name the effects without which, one at a time, the test recordings are followed as well."""
+        """Name the effects without which, one at a time, the test recordings are followed at least as well."""
         after = (self.errors.get("test") or {}).get("after", np.nan)
         idle = [e.name for e in self.effects if e.test_without <= after]
         if not idle:
             return ""
         rest = "their names rest" if idle[1:] else "its name rests"
         return (
-            f" The test recordings are followed as well without {', or without '.join(idle)}; {rest} on the training "
+            f" The test recordings are followed at least as well without {', or without '.join(idle)}; {rest} on the training "
             "recordings alone."
         )
 

@@ -171,7 +171,9 @@ def test_an_effect_that_the_test_recordings_do_not_need_is_told():
     d = with_test_errors(0.5, 0.1, 0.9)
     drag = replace(d.effects[0], law="quadratic_drag", form="", test_without=0.09)
     both = replace(d, effects=(replace(d.effects[0], test_without=0.4), drag))
-    told = "followed as well without quadratic drag at ground; its name rests on the training recordings alone."
+    told = (
+        "followed at least as well without quadratic drag at ground; its name rests on the training recordings alone."
+    )
     assert told in both.summary and "rests on the training" not in d.summary
 
 
