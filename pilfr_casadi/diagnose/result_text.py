@@ -175,8 +175,8 @@ class ResultText:
             return ""
         rest = "their names rest" if idle[1:] else "its name rests"
         return (
-            f" The test recordings are followed at least as well without {', or without '.join(idle)}; {rest} on the training "
-            "recordings alone."
+            f" The test recordings are followed at least as well without {', or without '.join(idle)}; {rest} on the "
+            "training recordings alone."
         )
 
     def _better_without(self) -> str:
