@@ -452,7 +452,9 @@ def reserved_file(path: Path, overwrite: bool) -> Iterator[Path]:
                 target.touch(exist_ok=False)
             break
         except FileExistsError:
-            target = make_out_folder(str(path.parent / f"run-{count}")) / path.name
+            inside = path.parent / f"run-{count}"
+            missing = [*_missing_folders(inside), *missing]
+            target = make_out_folder(str(inside)) / path.name
     if target.parent != path.parent:
         print_line(f"note: another run has written {path} meanwhile; this result is in {target.parent}")
     try:

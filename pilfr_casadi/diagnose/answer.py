@@ -199,16 +199,17 @@ def _test_faults(bench: Workbench, after: Fitted, tests: Sequence[Recording], ga
 
 def _offset_note(without: Fitted, given: Simulator, errors: Mapping[str, float]) -> Iterator[Gate]:
     """Note that the test recordings hardly have the offsets of the training recordings; `errors` are those on them."""
-    left_out, corrected = errors["without offsets"], errors["after"]
-    if BETTER_RATIO * left_out < corrected:
+    left_out, refitted = errors["without offsets"], errors["before"]
+    if BETTER_RATIO * left_out < refitted:
         offsets = []
         for e in without.simulator.elements[len(given.elements) :]:
             value = value_with_unit(float(without.values[f"{e.prefix}w_0"]), given.port(e.port).unit)
             offsets.append(f"{split_port(e.port)[1]} ({value})")
+        an, it = ("an offset", "it") if len(offsets) == 1 else ("offsets", "them")
         words = (
-            f"The refitted simulator has an offset of {in_words(offsets)}, which the test recordings hardly have: "
-            f"refitted without it, the simulator's error there is {percent(left_out)}, and {percent(corrected)} "
-            "corrected. The offset may stand for something that differs between the recordings."
+            f"The refitted simulator has {an} of {in_words(offsets)}, which the test recordings hardly have: refitted "
+            f"without {it}, the simulator's error there is {percent(left_out)}, and {percent(refitted)} with {it}. "
+            "Something may differ between the recordings."
         )
         yield Gate("recordings", "test offset", None, words, False)
 

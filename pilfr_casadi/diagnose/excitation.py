@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -13,7 +12,7 @@ from .fits.linearise import Probe, Run
 from .fits.workbench import Workbench
 
 SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
-LEAST_SAMPLES = 10  # of a signal of which a single frequency is told
+LEAST_SAMPLES = 10  # of a signal of which a single frequency is told, and of a rest
 
 
 @dataclass(frozen=True)
@@ -30,8 +29,8 @@ class Excitation:
         Distinct amplitudes of nine tenths of the swings between reversals, or of all without such a swing; amplitudes
         closer than a tenth of the largest count once.
     rests : int
-        Stretches in which the coordinate stays within a twentieth of the travel for longer than twice the typical time
-        between the ends of a swing.
+        Stretches in which the coordinate stays within a twentieth of the travel for longer than twice the time that a
+        typical swing takes in motion.
     """
 
     port: str
@@ -52,7 +51,7 @@ def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator
         for z in signals if travel > 0 else ():
             turns = _turning_points(z, least)
             reversals += max(len(turns) - 2, 0)
-            longest = 2 * _time_between_turns(z, turns, least) if len(turns) > 2 else SMALL_SHARE * len(z)
+            longest = max(2 * _time_in_motion(z, turns), LEAST_SAMPLES) if np.ptp(z) > least else SMALL_SHARE * len(z)
             resting = _rests(z, least, longest)
             rests += len(resting)
             # a recording cuts its first and last swing short, unless it rests there
@@ -119,14 +118,11 @@ def _count_distinct(swings: np.ndarray) -> int:
     return int(np.searchsorted(share, 1 - SMALL_SHARE - 1e-9) + 1)
 
 
-def _time_between_turns(z: np.ndarray, turns: Sequence[int], least: float) -> float:
-    """Compute the median number of samples that z (M,) takes from near one turning point to near the next."""
-    times = []
-    for begin, end in itertools.pairwise(turns):
-        swing = z[begin : end + 1]
-        left = np.flatnonzero(np.abs(swing - swing[0]) <= least)[-1]
-        times.append(int(np.flatnonzero(np.abs(swing[left:] - swing[-1]) <= least)[0]))
-    return float(np.median(times))
+def _time_in_motion(z: np.ndarray, turns: Sequence[int]) -> float:
+    """Compute how many samples the median swing of z (M,) takes at the speed with which half of all travel is done."""
+    speeds = np.sort(np.abs(np.diff(z)))
+    half = np.searchsorted(np.cumsum(speeds), np.sum(speeds) / 2)
+    return float(np.median(np.abs(np.diff(z[list(turns)]))) / max(speeds[half], 1e-300))
 
 
 def _rests(z: np.ndarray, least: float, samples: float) -> list[tuple[int, int]]:

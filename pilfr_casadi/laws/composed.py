@@ -512,7 +512,7 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
 def _heated(by: str) -> Any:
     class Heated(VaryingParameter):
         form = f"scheduled by the heat of {by}"
-        equation = f"change = c q, or p (exp(c q / p) - 1) if p is positive and falls,  dq/dt = ({by}^2 / s_2 - q) / T"
+        equation = f"change = c q, or p (exp(c q / p) - 1) if p >= 0 and it falls,  dq/dt = ({by}^2 / s_2 - q) / T"
         source = (
             "Incropera et al. (2007), Fundamentals of Heat and Mass Transfer, sec. 5.1 (lumped capacitance); "
             "Stachowiak & Batchelor (2013), Engineering Tribology, sec. 2.3 (Reynolds' viscosity)"
@@ -535,7 +535,8 @@ def _heated(by: str) -> Any:
             if lower < 0:
                 return value + change
             falling = ca.fmin(change, 0.0)
-            return ca.fmax(change, 0.0) + value * ca.exp(falling / ca.fmax(value, 1e-300))
+            least = 1e-150 - falling / 700  # keeps the derivatives finite where the value is zero
+            return ca.fmax(change, 0.0) + value * ca.exp(falling / ca.fmax(value, least))
 
         def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
             """Time constants, with the mean square of the signal."""

@@ -117,9 +117,10 @@ def _names(function: Any) -> tuple[str, ...]:
 
 def _call(law: Law, name: str, **available: Any) -> Any:
     """Call a function of a law, which may be a user's, with the signals that its arguments name."""
-    function, what = getattr(law, name), f"`{name}` of the law {law.id!r}"
-    if getattr(type(law), name) is getattr(Law, name, None):
+    what = f"`{name}` of the law {law.id!r}"
+    if getattr(type(law), name, None) in (None, getattr(Law, name, None)):
         raise InputError(f"The law {law.id!r} has no `{name}`; write one, as in {name}(self, z, p).")
+    function = getattr(law, name)
     for wanted in _names(function):
         if wanted not in available:
             raise InputError(f"The {what} asks for {wanted!r}; in a diagnosis it can have {', '.join(available)}.")

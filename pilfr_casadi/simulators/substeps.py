@@ -109,13 +109,14 @@ def choose_substeps(simulator: Equations, recordings: Sequence[Recording]) -> in
 
 def discretise_for(simulator: Equations, recordings: Sequence[Recording]) -> Model:
     """Discretise on the recordings' grid, with their hold of the inputs (else the simulator's) and enough sub-steps."""
-    hold = one_hold(recordings, simulator.hold or "zero") or "zero"
+    stated = None if simulator.discrete else one_hold(recordings)
+    hold = stated or simulator.hold or "zero"
     return discretise(simulator, recordings[0].dt, hold, choose_substeps(simulator, recordings))
 
 
-def one_hold(recordings: Sequence[Recording], default: str | None = None) -> str | None:
-    """Return the hold that the recordings state, or the default where they do not; refuse several."""
-    first, *others = dict.fromkeys(hold for r in recordings if (hold := r.hold or default)) or [default]
+def one_hold(recordings: Sequence[Recording]) -> str | None:
+    """Return the hold that the recordings state, None if none does; refuse several."""
+    first, *others = dict.fromkeys(r.hold for r in recordings if r.hold) or [None]
     if others:
         raise InputError(
             f"The recordings differ in `hold` ({first!r} and {others[0]!r}), and a simulator is integrated with one of "

@@ -362,6 +362,16 @@ def test_reversals_and_amplitudes_of_steps_are_counted():
     assert (row.reversals, row.amplitudes, row.rests) == (2, 3, 5)  # swings of 30, 60 and 10
 
 
+@pytest.mark.parametrize(
+    ("levels", "each", "rests"),
+    [([0, 1, 2, 3, 4, 3, 2, 1, 0], 60, 9), (range(12), 50, 12), ([0, 1, 0, 1, 1, 0] * 25, 4, 0)],
+)
+def test_steps_are_rests_if_they_are_long(levels, each, rests):
+    steps = 10 * np.repeat(np.array(levels, dtype=float), each)
+    row = next(e for e in check(MASS, record(MASS, steps), laws=()).excitation if e.port == "actuator:force")
+    assert row.rests == rests
+
+
 def test_holds_between_ramps_are_rests():
     ramps = np.concatenate([np.linspace(0, 40, 50), np.full(SAMPLES - 50, 40.0)])
     found = check(MASS, record(MASS, ramps, initial="estimate"), laws=())

@@ -129,6 +129,11 @@ def test_a_positive_parameter_falls_exponentially_with_the_heat():
         parameters=dict(motor().parameters),
     )
     np.testing.assert_allclose(closed.simulate(r), written.simulate(r), rtol=1e-9)
+    p, change = ca.SX.sym("p"), ca.SX.sym("change")
+    slope = ca.Function(
+        "slope", [p, change], [ca.gradient(heated("w")().varied(p, change, 0.0), ca.vertcat(p, change))]
+    )
+    assert all(np.all(np.isfinite(np.array(slope(*at)))) for at in ((0, -1), (0, 0), (0, -1e-9), (1, -1e3), (1, 1)))
     parameters = {**motor().parameters, "c": pilfr.Parameter(4e-3)}  # of any sign
     signed = motor().with_parameters(parameters).with_element("parameter:c", law)
     assert not np.allclose(closed.simulate(r), signed.simulate(r), rtol=1e-3)

@@ -472,6 +472,6 @@ def update_offsets(
         if not sure:
             sentence += " As long as the mismatch has no sure name, it may be a part of that."
         if replaced:
-            sentence += " The corrected simulator hardly needs it."
+            sentence += " Beside the correction its value is uncertain: it may be zero."
         out.append(replace(gate, value=remaining.value, sentence=sentence))
     return tuple(out)

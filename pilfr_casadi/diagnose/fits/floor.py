@@ -239,15 +239,16 @@ def effective_size(residuals: Sequence[np.ndarray]) -> float:
     return total
 
 
-def acting_samples(residuals: Sequence[np.ndarray]) -> float:
+def acting_samples(residuals: Sequence[np.ndarray], scale: np.ndarray) -> float:
     """Count the samples in which residuals act: all of Gaussian noise, few of bursts.
 
-    For each output it is 3 (Σ e²)² / Σ e⁴: all samples times the kurtosis of noise over that of the residual. Samples
-    in which a machine stands, and every model lets it stand, say nothing for or against a law.
+    With q the sum of a sample's squares over n_y outputs, each in units of its `scale`, it is (n_y + 2) (Σ q)² / Σ q².
+    Samples in which a machine stands, and every model lets it stand, say nothing for or against a law.
     """
-    squares = np.concatenate(residuals) ** 2
-    acting = 3 * np.sum(squares, axis=0) ** 2 / np.maximum(np.sum(squares**2, axis=0), 1e-300)
-    return float(np.sum(np.minimum(acting, len(squares))))
+    errors = np.concatenate(residuals) / scale
+    q = np.sum((errors / max(np.max(np.abs(errors)), 1e-300)) ** 2, axis=1)
+    acting = (errors.shape[1] + 2) * np.sum(q) ** 2 / max(np.sum(q**2), 1e-300)
+    return float(min(acting, errors.size))
 
 
 def swells_with(residuals: Sequence[np.ndarray], signals: Sequence[np.ndarray]) -> bool:

@@ -247,7 +247,7 @@ class Hypotheses:
 
     def spread(self, fitted: Fitted) -> float:
         """Compute the mean square uncertainty of a fitted simulator's predictions for other inputs."""
-        own = EffectiveSamples(self.floor2, count_samples(fitted, self.bench))
+        own = EffectiveSamples(self.floor2, self.count_samples(fitted))
         v = self.bench.pool(fitted.squares + self.tolerance)
         return spread(self.bench, fitted, self.added_laws(fitted), v, own.at(0.0))
 
@@ -406,8 +406,7 @@ class Hypotheses:
         """
         best, nearest = self.best, min(self.memo.values(), key=lambda t: t.mean_square)
         best = nearest if FAR_RATIO * nearest.error < best.error else best
-        acting = max(acting_samples(self.bench.scored(self.root.fitted.residual)), FEWEST)
-        self.count = min(count_samples(best.fitted, self.bench), acting)
+        self.count = self.count_samples(best.fitted)
         if self.floor.source != "estimated" or self.past_deadline:
             return
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
@@ -416,6 +415,11 @@ class Hypotheses:
         known, white = self.surrogate_nrmse * self.bench.scale, white_part(self.bench.scored(best.fitted.residual))
         noise = np.minimum(np.hypot(np.maximum(white, rest), known), self.rms(nearest))
         self.floor = Floor(noise, "estimated")
+
+    def count_samples(self, fitted: Fitted) -> float:
+        """Count the samples over the correlation time of a fit's residual, at most those in which the mismatch acts."""
+        acting = acting_samples(self.bench.scored(self.root.fitted.residual), self.bench.scale)
+        return max(min(effective_size(self.bench.scored(fitted.residual)), acting), FEWEST)
 
     def rms(self, trial: Trial) -> np.ndarray:
         """Compute the rms error of each output, (n_y,)."""
@@ -478,8 +482,3 @@ def likeliest(trials: Sequence[Trial], evidence: Callable[[Trial], float]) -> li
     """List the hypotheses whose evidence is near the largest, the likeliest first."""
     ranked = sorted(trials, key=evidence, reverse=True)
     return [t for t in ranked if evidence(t) > evidence(ranked[0]) - CONTENDING_NATS]
-
-
-def count_samples(fitted: Fitted, bench: Workbench) -> float:
-    """Compute the number of samples over the correlation time of a fit's residual."""
-    return max(effective_size(bench.scored(fitted.residual)), FEWEST)

@@ -336,7 +336,8 @@ class Search(Hypotheses):
         kept = {t.key: self.memo[t.key] for t in trials}.values()
         ranked = sorted(kept, key=self.optimistic_evidence, reverse=True)
         most = min(NEAR_RATIO * ranked[0].error if ranked else np.inf, FAR_RATIO * self.best.error)
-        count = MOST_CONVERGED if self.may_go_on() else 1  # the rest of the time is for the comparison with the refit
+        # after the time of the search, the rest is for the comparison with the refit
+        count = MOST_CONVERGED if time.perf_counter() < self.until else 1
         near = [t for t in ranked[:count] if not t.thorough and t.error < most]
         converged = self._side_by_side(self.fits.converge, near)
         for trial in converged:

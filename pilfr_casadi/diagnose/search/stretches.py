@@ -40,7 +40,7 @@ from ..fits.flexible_forces import Surface
 from ..fits.linearise import Probe, loudest_stretch, run
 from ..fits.screen import Dose, Remainder, orthonormal
 from ..fits.workbench import DIVERGED, FEW, CompiledSimulator, Fitted, Workbench, output_deviation, refit
-from .hypotheses import Findings, count_samples, likeliest
+from .hypotheses import Findings, likeliest
 from .moves import Search
 from .trials import Trial
 
@@ -309,7 +309,7 @@ class Everything:
         for trial, fitted in zip(trials, fits, strict=True):
             there.keep(Trial.of(fitted, len(trial.laws), thorough=True))
         best = max(there.memo.values(), key=there.evidence)
-        there.count = count_samples(best.fitted, whole)
+        there.count = there.count_samples(best.fitted)
         kept = {t.key for t in likeliest(list(there.memo.values()), there.evidence)} | {search.root.key}
         for trial in trials:
             if trial.key not in kept:

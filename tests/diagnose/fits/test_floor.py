@@ -94,10 +94,15 @@ def test_slow_error_does_not_count_as_white_noise():
 
 def test_samples_at_which_a_machine_stands_do_not_count():
     noise = np.random.default_rng(0).standard_normal((2000, 2))
-    assert acting_samples([noise]) == pytest.approx(4000, rel=0.05)
+    scale = np.array([1.0, 1.0])
+    assert acting_samples([noise], scale) == pytest.approx(4000, rel=0.05)
     rest = np.zeros((8000, 2))
-    assert acting_samples([noise, rest]) == pytest.approx(acting_samples([noise]), rel=0.05)
-    assert acting_samples([np.ones((500, 1))]) == 500
+    assert acting_samples([noise, rest], scale) == pytest.approx(acting_samples([noise], scale), rel=0.05)
+    assert acting_samples([np.ones((500, 1))], np.ones(1)) == 500
+    burst = np.zeros((4000, 1))
+    burst[:20] = 1e3
+    quiet = 1e-3 * np.random.default_rng(1).standard_normal((4000, 1))
+    assert acting_samples([np.hstack([burst, quiet])], scale) < 100  # an output without mismatch adds nothing
 
 
 def test_samples_that_are_alike_count_less():
