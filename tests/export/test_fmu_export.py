@@ -296,5 +296,5 @@ def test_the_command_writes_an_fmu(tmp_path, capsys):
     refused(capsys, "export", model, "--fmu", "--c", "--out", tmp_path / "b.fmu", says="--c and --fmu were given")
     refused(capsys, "export", model, "--fmi", "3.0", "--out", tmp_path / "b.fmu", says="give --fmu too")
     refused(capsys, "export", model, "--fmu", "--out", tmp_path / "b.zip", says="ends in .fmu")
-    refused(capsys, "export", model, "--fmu", "--out", tmp_path / "no" / "b.fmu", says="does not exist")
+    refused(capsys, "export", model, "--fmu", "--out", tmp_path / "no" / "b.fmu", says="folder that exists")
     assert not (tmp_path / "b.fmu").exists()

@@ -313,7 +313,7 @@ def test_the_response_is_bounded_and_the_bound_holds():
         (lambda: fit(PILFR(1), steady_records(*machine()), start={"Q": 1}), "'Q', which the model lacks"),
         (lambda: fit(PILFR(1), steady_records(*machine()), start={"A": np.eye(3)}), "start of 'A'"),
         (lambda: fit(PILFR(1), steady_records(*machine()), start={"A": 0.5}, weights=[1, 0]), "one above zero"),
-        (lambda: fit(PILFR(1).model(2, 2), steady_records(*machine()), start={"A": 0.5}), "are for a PILFR"),
+        (lambda: fit(PILFR(1).model(2, 2), steady_records(*machine()), start={"A": 0.5}), "has its own start"),
         (lambda: fit(PILFR(1), steady_records(*machine()), start="near"), "'near' is unknown"),
     ],
 )

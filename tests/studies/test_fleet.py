@@ -219,6 +219,8 @@ def test_a_step_that_ran_out_of_time_needs_a_longer_limit(found, days, tmp_path)
     manifest.write()
     again = pilfr.fleet(rig(), days, **OPTIONS, workers=1, out=copy, time_limit=20.0, tell=lines.append)
     assert again["c"].failed == "too long" and all(line.endswith("already done") for line in lines)
+    longer = pilfr.fleet(rig(), days, **OPTIONS, workers=1, out=copy, time_limit=60.0)
+    assert not longer["c"].failed
 
 
 def test_an_interrupt_keeps_what_is_done(days, tmp_path, monkeypatch):
