@@ -51,7 +51,7 @@ def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator
         for z in signals if travel > 0 else ():
             turns = _turning_points(z, least)
             reversals += max(len(turns) - 2, 0)
-            longest = max(2 * _time_in_motion(z, turns), LEAST_SAMPLES) if np.ptp(z) > least else SMALL_SHARE * len(z)
+            longest = max(2 * _time_in_motion(z, turns), LEAST_SAMPLES) if turns[1:] else SMALL_SHARE * len(z)
             resting = _rests(z, least, longest)
             rests += len(resting)
             # a recording cuts its first and last swing short, unless it rests there

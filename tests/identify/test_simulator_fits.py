@@ -56,7 +56,9 @@ def test_a_fit_and_a_simulation_use_the_substeps_of_a_law(record):
 
 def test_recordings_with_different_holds_are_refused(record):
     with pytest.raises(InputError, match="differ in `hold`"):
-        pilfr.fit(simulator(), [record, record.with_(hold="linear")], engine="vm")
+        pilfr.fit(simulator(), [record.with_(hold=hold) for hold in ("zero", "linear")], engine="vm")
+    one_states = [record.with_(hold=None), record.with_(y=record.y + 1e-3, hold="linear")]
+    assert pilfr.fit(simulator(), one_states, engine="vm").model.hold == "linear"  # as in a diagnosis
 
 
 def test_a_recording_with_another_hold_than_the_fit_is_refused(record, fitted):
