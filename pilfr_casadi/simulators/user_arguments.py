@@ -1,6 +1,6 @@
-"""What a user gives to a simulator: functions, called with the symbols that they name, and names, parameters and ports.
+"""Check what a user gives to a simulator: functions, names, parameters and ports.
 
-All are checked here, once; a fault is one sentence.
+A function gets the symbols that its arguments name. A fault is one sentence.
 """
 
 from __future__ import annotations

@@ -95,21 +95,26 @@ def test_a_parameter_may_vary_with_a_state():
     np.testing.assert_allclose(closed.simulate(r), written.simulate(r), rtol=1e-9)
 
 
-def test_a_parameter_may_follow_the_heat_of_a_signal():
-    """The law has a slow state of its own, which the square of the current drives from a cold start."""
-    law = heated("i")().at({"c": 0.4, "T": 1.5, "s_2": 4.0})
-    closed, r = motor().with_element("parameter:R", law), blank(2, (20, 30))
-    written = pilfr.Simulator(
+def warm_motor(heat, resistance=lambda x, p: p.R, friction=lambda x, p: p.c):
+    """Write a motor with a slow state `q`, which `heat` drives."""
+    return pilfr.Simulator(
         lambda x, u, p: {
-            "i": (u.voltage - (p.R + 0.4 * x.q) * x.i - p.K * x.w) / L,
-            "w": (p.K * x.i - p.c * x.w) / J,
-            "q": (x.i**2 / 4.0 - x.q) / 1.5,
+            "i": (u.voltage - resistance(x, p) * x.i - p.K * x.w) / L,
+            "w": (p.K * x.i - friction(x, p) * x.w) / J,
+            "q": (heat(x) - x.q) / 1.5,
         },
         lambda x: {"current": x.i, "speed": x.w},
         states=("i", "w", "q"),
         inputs=("voltage", "temperature"),
         parameters=dict(motor().parameters),
     )
+
+
+def test_a_parameter_may_follow_the_heat_of_a_signal():
+    """The law has a slow state of its own, which the square of the current drives from a cold start."""
+    law = heated("i")().at({"c": 0.4, "T": 1.5, "s_2": 4.0})
+    closed, r = motor().with_element("parameter:R", law), blank(2, (20, 30))
+    written = warm_motor(lambda x: x.i**2 / 4.0, resistance=lambda x, p: p.R + 0.4 * x.q)
     np.testing.assert_allclose(closed.simulate(r), written.simulate(r), rtol=1e-9)
 
 
@@ -117,17 +122,7 @@ def test_a_positive_parameter_falls_exponentially_with_the_heat():
     """As viscous friction of warm oil: it stays positive, whatever the heat."""
     law = heated("w")().at({"c": -1e-3, "T": 1.5, "s_2": 100.0})
     closed, r = motor().with_element("parameter:c", law), blank(2, (20, 30))
-    written = pilfr.Simulator(
-        lambda x, u, p: {
-            "i": (u.voltage - p.R * x.i - p.K * x.w) / L,
-            "w": (p.K * x.i - p.c * ca.exp(-1e-3 * x.q / p.c) * x.w) / J,
-            "q": (x.w**2 / 100.0 - x.q) / 1.5,
-        },
-        lambda x: {"current": x.i, "speed": x.w},
-        states=("i", "w", "q"),
-        inputs=("voltage", "temperature"),
-        parameters=dict(motor().parameters),
-    )
+    written = warm_motor(lambda x: x.w**2 / 100.0, friction=lambda x, p: p.c * ca.exp(-1e-3 * x.q / p.c))
     np.testing.assert_allclose(closed.simulate(r), written.simulate(r), rtol=1e-9)
     p, change = ca.SX.sym("p"), ca.SX.sym("change")
     slope = ca.Function(

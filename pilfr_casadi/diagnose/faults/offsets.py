@@ -434,8 +434,8 @@ def refit_without_offsets(bench: Workbench, fitted: Fitted, given: Simulator) ->
     simulator = fitted.simulator
     if len(simulator.elements) == len(given.elements):
         return None
-    for i in reversed(range(len(given.elements), len(simulator.elements))):
-        simulator = simulator.without_element(i)
+    while len(simulator.elements) > len(given.elements):
+        simulator = simulator.without_element()
     values = {name: fitted.values[name] for name in simulator.parameters}
     return refit(bench, [values, {}], simulator, states=fitted.initial, solver=THOROUGH)
 

@@ -97,9 +97,7 @@ LEAST_KNOWN = 1e-12  # eigenvalue of the scaled information, over the largest, b
 UNKNOWN_SHARE = 1e-6  # squared share of a parameter in an unknown combination; rounding gives far less
 
 # Test recordings that go beyond the training recordings, where a correction extrapolates
-BEYOND_RANGE = (
-    0.1  # share of a channel's trained range beyond it that counts: real machines follow a law no more closely
-)
+BEYOND_RANGE = 0.1  # distance from a channel's trained range, over the range, that counts
 NEW_DENSITY = 0.01  # trained over tested spectral density, both normalised, below which a frequency is new: 10 in size
 NEW_SHARE = 0.5  # share of an input's variance at new frequencies that is told: more than half
 
