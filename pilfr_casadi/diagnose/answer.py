@@ -14,7 +14,7 @@ from .._base import InputError, in_words, percent
 from ..data import Recording
 from ..identify import surrogate_warning
 from ..laws import Law, display_name, readable_unit, short_name
-from ..simulators import Placed, Simulator, in_series, name_at, split_port
+from ..simulators import Placed, in_series, name_at, split_port
 from .arguments import Request
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction
@@ -22,8 +22,8 @@ from .detectability import port_units
 from .effect import Effect
 from .extrapolation import range_note
 from .faults.channels import IN_RECORDINGS, find_gross_channel_errors
-from .faults.gates import EQUAL_RATIO, TEST_FAULT, Gate, edited, value_with_unit
-from .faults.offsets import Offset, refit_without_offsets, remove_idle_offsets, update_offsets
+from .faults.gates import EQUAL_RATIO, TEST_FAULT, TEST_OFFSET, Gate, edited
+from .faults.offsets import Offset, describe_offsets, remove_offsets, update_offsets
 from .fits.evidence import BETTER_RATIO, FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, all_sure, standard_errors
 from .fits.floor import Floor
 from .fits.force_recovery import is_curve_along
@@ -108,7 +108,8 @@ def build_diagnosis(
         errors=errors,
         floor=_describe_noise(floor, search.least_floor, bench, compared),
         corrected=replace(
-            remove_idle_offsets(after.corrected(), len(request.simulator.elements)), substeps=after.model.substeps
+            remove_offsets(after.corrected(), len(request.simulator.elements), idle=True),
+            substeps=after.model.substeps,
         ),
         refitted=replace(without.corrected(), substeps=without.model.substeps),
         hold=bench.hold,
@@ -159,8 +160,7 @@ def _compute_errors(
     if tests:
         each = {e: final.to_all(f) for e, f in _without_each_effect(search, found).items()}
         fits = {"before": without, "after": after, **{f"without {i}": f for i, f in enumerate(each.values())}}
-        plain = None if search.past_deadline else refit_without_offsets(bench, without, request.simulator)
-        fits |= {"without offsets": plain} if plain else {}
+        offsets, fits["at zero offsets"] = _at_zero_offsets(bench, after, len(request.simulator.elements))
         compared = test_errors(bench, tests, found.gates, fits, bench.on(tests).model(request.simulator))
         on_tests = compared.errors
         notes = (*_edit_notes(compared), *_resting_notes(compared.find_resting()), *_scored_note(compared))
@@ -168,7 +168,7 @@ def _compute_errors(
             notes = (*_test_faults(bench, after, tests, found.gates), *notes)
         if on_tests["after"] > NEAR_RATIO * bench.nrmse(after) and all(g.finding != TEST_FAULT for g in notes):
             notes = (*notes, *range_note(bench, edited(tests, found.gates)))
-        notes = (*notes, *_offset_note(without, request.simulator, on_tests)) if plain else notes
+        notes = (*notes, *_offset_note(offsets, on_tests))
         fewer = {e: on_tests[f"without {i}"] for i, e in enumerate(each)}
         errors["test"] = {name: on_tests[name] for name in ("nominal", "before", "after")}
     if bench.simulator.observer is not None:
@@ -197,21 +197,23 @@ def _test_faults(bench: Workbench, after: Fitted, tests: Sequence[Recording], ga
         yield Gate(faults[0].channel, TEST_FAULT, faults[0].value, f"{place}{words}. {advice}", False)
 
 
-def _offset_note(without: Fitted, given: Simulator, errors: Mapping[str, float]) -> Iterator[Gate]:
+def _at_zero_offsets(bench: Workbench, after: Fitted, own: int) -> tuple[str, Fitted]:
+    """Run a fit with its offsets after the first `own` elements at zero; also name the offsets, "" if there is none."""
+    found = [e for e in after.simulator.elements[own:] if isinstance(e.law, Offset)]
+    found = [e for e in found if np.any(after.values[f"{e.prefix}w_0"])]
+    zero = {f"{e.prefix}w_0": np.zeros_like(after.values[f"{e.prefix}w_0"]) for e in found}
+    return describe_offsets(found), bench.rerun(after, {**after.values, **zero}) if found else after
+
+
+def _offset_note(offsets: str, errors: Mapping[str, float]) -> Iterator[Gate]:
     """Note that the test recordings hardly have the offsets of the training recordings; `errors` are those on them."""
-    left_out, refitted = errors["without offsets"], errors["before"]
-    if BETTER_RATIO * left_out < refitted:
-        offsets = []
-        for e in without.simulator.elements[len(given.elements) :]:
-            value = value_with_unit(float(without.values[f"{e.prefix}w_0"]), given.port(e.port).unit)
-            offsets.append(f"{split_port(e.port)[1]} ({value})")
-        an, it = ("an offset", "it") if len(offsets) == 1 else ("offsets", "them")
+    zero, after = errors["at zero offsets"], errors["after"]
+    if offsets and BETTER_RATIO * zero < after:
         words = (
-            f"The refitted simulator has {an} of {in_words(offsets)}, which the test recordings hardly have: refitted "
-            f"without {it}, the simulator's error there is {percent(left_out)}, and {percent(refitted)} with {it}. "
-            "Something may differ between the recordings."
+            f"The test recordings hardly have {offsets}: at zero offset, the error of the corrected simulator there is "
+            f"{percent(zero)} in place of {percent(after)}. Something may differ between the recordings."
         )
-        yield Gate("recordings", "test offset", None, words, False)
+        yield Gate("recordings", TEST_OFFSET, None, words, False)
 
 
 def _surrogate_note(error: float) -> Iterator[Gate]:

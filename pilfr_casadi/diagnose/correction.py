@@ -21,6 +21,7 @@ import numpy as np
 from .._base import InputError, percent
 from ..laws import CATALOGUE
 from ..simulators import name_at
+from .faults.offsets import describe_offsets
 from .fits.evidence import FORMULA_ERROR, NEAR_RATIO, SURE, HeldOut, runs_away
 from .fits.floor import Floor
 from .fits.workbench import FEW, Fitted
@@ -45,6 +46,7 @@ class Correction:
     after: float = np.nan  # the same of the corrected simulator
     closest: Trial | None = None  # the hypothesis with its named laws, if it was chosen among others
     late: bool = False  # whether there was no time left to compare it with others
+    offsets: str = ""  # words for the offsets that the refit has, as in "the offset of u"
 
     @property
     def words(self) -> str:
@@ -65,7 +67,8 @@ class Correction:
         if not self.elements:
             why = "nothing that was tried is expected to predict further recordings better"
             late = "there was no time left to compare it with others"
-            return f"The corrected simulator is still the refitted one: {why if np.isfinite(self.after) else late}."
+            still = f"has only {self.offsets}" if self.offsets else "is still the refitted one"
+            return f"The corrected simulator {still}: {why if np.isfinite(self.after) else late}."
         if self.late:
             return (
                 f"The corrected simulator has {self.words}, with which it follows the training recordings far better. "
@@ -75,8 +78,8 @@ class Correction:
             return shares
         return (
             f"The corrected simulator has {self.words}. On parts of the training recordings that it was not fitted to, "
-            f"its error is {percent(self.after)} of the outputs' deviation; that of the refit is "
-            f"{percent(self.before)}. {shares}"
+            f"its error is {percent(self.after)} of the outputs' deviation; that of the refit "
+            f"{f'with {self.offsets} ' if self.offsets else ''}is {percent(self.before)}. {shares}"
         )
 
     def to_dict(self) -> dict[str, Any] | None:
@@ -170,7 +173,8 @@ def _describe_best(search: Search, validated: list[_Validated], floor: Floor) ->
         laws = dict.fromkeys((*CATALOGUE, *search.laws))
         elements = (describe_learned(search.bench, fitted, shares["learned"], laws),)
     errors = validated[0][1].rms, held_out.rms
-    return Correction(_describe_elements(search, fitted), shares, elements, *errors, base), fitted
+    offsets = describe_offsets(search.bench.simulator.elements)
+    return Correction(_describe_elements(search, fitted), shares, elements, *errors, base, offsets=offsets), fitted
 
 
 def _is_settled(search: Search, answer: Posterior) -> bool:
@@ -253,7 +257,10 @@ def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()
 
 def uncompared_correction(search: Search, fitted: Fitted, floor: Floor | None = None) -> Correction:
     """Describe a simulator without a learned element, which was not compared with others."""
-    return Correction(_describe_elements(search, fitted), _shares(search, fitted, fitted, floor or search.floor))
+    shares = _shares(search, fitted, fitted, floor or search.floor)
+    return Correction(
+        _describe_elements(search, fitted), shares, offsets=describe_offsets(search.bench.simulator.elements)
+    )
 
 
 def _may_recur(search: Search, trial: Trial) -> bool:

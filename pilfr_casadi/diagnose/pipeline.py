@@ -23,7 +23,8 @@ How an answer comes about:
 7. If the named laws may imitate a law where no port is declared, they are weighed against that
    (`find_undeclared_port`). If nothing has a name, such laws, those that were not tried, and parameters that vary are
    looked for, and `find_unnamed_correction` chooses the corrected simulator.
-8. `_final_fits` sets offsets to zero that no longer improve the fit beside the effects, and fits to convergence.
+8. `_final_fits` sets offsets to zero that no longer improve the fit beside the effects, refits the simulator as given
+   without offsets, and fits to convergence.
    `build_diagnosis` adds the proof (`proof`): errors on test recordings, placebos and standard errors. It changes no
    verdict.
 
@@ -72,7 +73,7 @@ from .arguments import (
 )
 from .correction import Correction, find_named_correction, find_unnamed_correction, uncompared_correction
 from .faults.gates import EQUAL_RATIO, Gate
-from .faults.offsets import fix_idle_offsets, list_offsets
+from .faults.offsets import fix_idle_offsets, list_offsets, refit_without_offsets
 from .faults.samples import clean_recordings, find_clipped_input
 from .faults.tones import find_tones
 from .fits.evidence import SURE
@@ -86,7 +87,7 @@ from .other_explanations import (
 )
 from .posterior import Posterior, posterior
 from .prediction import drift_note, drifts, predictor
-from .preparation import Prepared, conversions, slow_note
+from .preparation import LEAST_REFIT, Prepared, conversions, slow_note
 from .proof import errors_of
 from .repetitions import search_with_one_hold, search_with_repetitions
 from .result import Diagnosis
@@ -188,7 +189,7 @@ def _final_fits(
     request: Request, ready: Prepared, search: Search, found: Conclusion, everything: Everything | None
 ) -> FinalFits:
     """Return the fits that the answer states: those of the search, or fits to everything if it ran on stretches."""
-    bench, without, after = search.bench, search.root.fitted, found.fitted
+    bench, without, after = search.bench, _refit_as_given(request, search), found.fitted
     # after a held-out comparison, the offsets stay as they were compared
     if found.effects and not np.isfinite(found.correction.after):
         with search.until_interrupted():
@@ -204,6 +205,16 @@ def _final_fits(
         drawn = [back_on_stretches(bench, f, one.initial) for f, one in zip(to_all, pair, strict=True)]
         nominal = errors_of(whole, whole.model(request.simulator))
     return FinalFits(whole, to_all[0], to_all[1], nominal, (drawn[0], drawn[1]), partial(everything.fit, search))
+
+
+def _refit_as_given(request: Request, search: Search) -> Fitted:
+    """Refit the simulator without the offsets that the checks have added; after an interrupt it keeps them."""
+    fitted = search.root.fitted
+    if not search.interrupted:
+        with search.until_interrupted():
+            bench = replace(search.bench, deadline=max(search.bench.deadline, time.perf_counter() + LEAST_REFIT))
+            fitted = refit_without_offsets(bench, fitted, len(request.simulator.elements))
+    return fitted
 
 
 # the conclusion

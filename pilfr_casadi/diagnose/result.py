@@ -166,7 +166,7 @@ class Diagnosis(ResultText):
         found = self.before_and_after(recording)
         r = found.recording
         simulated: Simulated = [("refitted", found.before)]
-        simulated += [("corrected", found.after)] if self._changed else []
+        simulated += [("corrected", found.after)] if self.changed else []
         return plot_comparison(r, simulated, self.floor["nrmse"] * np.std(r.y[r.skip :], axis=0))
 
     def before_and_after(self, recording: Recording) -> BeforeAfter:
@@ -175,7 +175,7 @@ class Diagnosis(ResultText):
         values = own.change(**{name: {"value": p["nominal"]} for name, p in self.parameters.items()})
         given = self.run(recording, self.refitted.with_parameters(values))[1]
         r, before, _ = self.run(recording, self.refitted)
-        after = self.run(recording)[1] if self._changed else None
+        after = self.run(recording)[1] if self.changed else None
         finite = (y if y is not None and np.all(np.isfinite(y)) else None for y in (given, before, after))
         return BeforeAfter(r, *finite)
 

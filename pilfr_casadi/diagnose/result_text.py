@@ -11,12 +11,12 @@ import numpy as np
 from .._base import percent
 from ..data import DIVERGING, Recording
 from ..models import ParameterSet
-from ..simulators import ACTUATOR, Simulator, name_at, split_port
+from ..simulators import ACTUATOR, Placed, Simulator, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
 from .effect import Effect
-from .faults.gates import TEST_FAULT, Gate, value_with_unit
-from .faults.offsets import Offset
+from .faults.gates import TEST_FAULT, TEST_OFFSET, Gate, value_with_unit
+from .faults.offsets import Offset, describe_offsets
 from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, all_sure
 from .fits.floor import ABOVE_NOISE
 from .search.learned import Learned
@@ -85,7 +85,7 @@ class ResultText:
         refitted one.
         """
         errors = self.errors.get("test")
-        if not errors or not self._changed or self.test_fault:
+        if not errors or not self.changed or self.test_fault:
             return ""
         before, after = errors["before"], errors["after"]
         if not after <= BETTER_RATIO * before:
@@ -93,9 +93,25 @@ class ResultText:
         return "better" if after < before else "same"
 
     @property
-    def _changed(self) -> bool:
+    def changed(self) -> bool:
         """Whether the corrected simulator differs from the refitted one."""
-        return bool(self.effects or self.nameless or self.freed)
+        return bool(self.effects or self.nameless or self.freed or self.offsets)
+
+    @property
+    def added(self) -> tuple[Placed, ...]:
+        """The elements of the corrected simulator that the refitted one does not have."""
+        own = {e.prefix for e in self.refitted.elements}
+        return tuple(e for e in self.corrected.elements if e.prefix not in own)
+
+    @property
+    def offsets(self) -> str:
+        """Words for the offsets among `added`, such as "the offset of u"; empty if there is none."""
+        return describe_offsets(self.added)
+
+    @property
+    def only_offsets(self) -> bool:
+        """Whether the corrected simulator differs from the refitted one by offsets alone."""
+        return self.changed and not (self.effects or self.nameless or self.freed)
 
     @property
     def shares(self) -> dict[str, float]:
@@ -140,12 +156,18 @@ class ResultText:
             text += f" The search was cut short by {by}, so that a further effect may not have been tried."
         if not errors:
             untested = " This correction is not tested yet: give a recording of another experiment as test."
-            return text + untested if self._changed else text
+            return text + untested if self.changed else text
         if self.test_fault:
             return f"{text} {self.test_fault} Until then the test error says nothing of this answer."
         given, before, after = (percent(errors[k]) for k in ("nominal", "before", "after"))
-        if self.outcome == "same":
-            text += f" On the test recordings it makes no difference: {before} before, {after} after."
+        if self.outcome == "worse" and self.only_offsets:
+            text += (
+                f" But with {self.offsets} it follows the test recordings worse than without: {before} without, "
+                f"{after} with. Something may differ between the recordings."
+            )
+        elif self.outcome == "same":
+            that = f"correcting {self.offsets}" if self.only_offsets else "it"
+            text += f" On the test recordings {that} makes no difference: {before} before, {after} after."
             text += " A constant would follow them better." if errors["after"] > 1 else ""
             text += self._better_without()
         elif self.outcome == "worse":
@@ -153,6 +175,7 @@ class ResultText:
                 f" But this correction makes the test recordings worse: their error is {before} refitted "
                 f"and {after} with it. Do not use it as a correction.{self._better_without()}"
             )
+            text += "".join(f" {g.sentence}" for g in self.gates if g.finding == TEST_OFFSET)
         else:
             text += self._idle_on_tests()
         if BETTER_RATIO * errors["nominal"] < min(errors["before"], errors["after"]):
@@ -325,7 +348,7 @@ class ResultText:
         if self.nameless is None:
             return []
         lines, parameters = list[str](), self.corrected.readable_parameters()
-        for e in self.corrected.elements[len(self.refitted.elements) :]:
+        for e in (e for e in self.added if not isinstance(e.law, Offset)):
             own = {name: parameters[f"{e.prefix}{name}"] for name in e.law.parameters()}
             numbers = {name: p for name, p in own.items() if p.value.ndim == 0 and not np.all(p.fixed)}
             if numbers:

@@ -15,6 +15,7 @@ from .._base import in_words, percent
 from ..laws import CATALOGUE, display_name
 from ..simulators import name_at
 from .faults.gates import Gate
+from .faults.offsets import describe_offsets
 from .faults.tones import find_ringing_mode
 from .fits.evidence import (
     AT_NOISE_RATIO,
@@ -88,8 +89,8 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
             rest = "the rest is slow noise: hardly any force explains its changes from sample to sample"
         return Verdict(
             "complete",
-            f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {percent(off)} of the "
-            f"outputs' deviation, and {rest}.",
+            f"Nothing is missing{beside}: {_refitted(search)}, the simulator follows the recordings to {percent(off)} "
+            f"of the outputs' deviation, and {rest}.",
         )
     closest = closest_hypothesis(search, closest) or found.best
     return Verdict("unexplained", _describe_unexplained(search, closest, shares, mode))
@@ -101,6 +102,12 @@ def _describe_beside(tones: Sequence[Gate], gates: Sequence[Gate]) -> str:
     offsets = [g.channel for g in gates if g.parameter and g.finding == "offset"]
     found += [f"an offset of {in_words(offsets)}"] if offsets else []
     return f" but {in_words(found)}" if found else ""
+
+
+def _refitted(search: Hypotheses) -> str:
+    """Say that the simulator was refitted, and with which offsets."""
+    offsets = describe_offsets(search.bench.simulator.elements)
+    return f"refitted with {offsets}" if offsets else "refitted"
 
 
 def closest_hypothesis(search: Hypotheses, chosen: Trial | None = None) -> Trial | None:
@@ -234,8 +241,9 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
             and times_of_noise(search) < WHITE_NOISE_RATIO
         )
         or_noise = ", or the noise is large and slow" if large and not mode else ""
+        refitted = _refitted(search).replace("refitted", "Refitted", 1)
         return (
-            f"Physics is missing{or_noise}, and {_which_laws(search)} explains it. The refitted simulator is off by "
+            f"Physics is missing{or_noise}, and {_which_laws(search)} explains it. {refitted}, the simulator is off by "
             f"{percent(search.bench.nrmse(root.fitted))} of the outputs' deviation; the noise is {least} "
             f"{percent(noise)}.{at}{rings}"
         )

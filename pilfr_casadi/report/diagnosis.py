@@ -388,11 +388,11 @@ def _next_experiment(d: Diagnosis) -> list[Block]:
 
 
 def _usage_title(d: Diagnosis) -> str:
-    corrected = (d.effects or d.nameless) and d.outcome != "worse"
-    return "How to use the corrected simulator" if corrected else "How to use the result"
+    useful = d.changed and d.outcome != "worse"
+    return "How to use the corrected simulator" if useful else "How to use the result"
 
 
 def _usage(d: Diagnosis) -> list[Block]:
-    kind = "with the correction and the fitted values" if d.effects or d.nameless else "with the refitted values"
+    kind = "with the correction and the fitted values" if d.changed else "with the refitted values"
     text = f"In the session that made the diagnosis, diagnosis.corrected is the simulator {kind}. Anywhere else, run:"
     return [Text(text), Code(tables.usage(d))]

@@ -53,7 +53,9 @@ def correction_label(diagnosis: Diagnosis) -> str:
         return f"with {' and '.join(names)}"
     if diagnosis.nameless:
         return "corrected"
-    return f"with {diagnosis.freed} let go" if diagnosis.freed else ""
+    if diagnosis.freed:
+        return f"with {diagnosis.freed} let go"
+    return f"with {diagnosis.offsets}" if diagnosis.offsets else ""
 
 
 def _short_name(e: Effect) -> str:
@@ -65,7 +67,8 @@ def tone(diagnosis: Diagnosis) -> str:
     """Choose the colour of the headline: good only if the answer is certain and helps on the test recordings."""
     if diagnosis.outcome == "worse":
         return "bad"
-    doubtful = diagnosis.outcome == "same" or (bool(diagnosis.effects) and not diagnosis.sure)
+    idle = diagnosis.outcome == "same" and not diagnosis.only_offsets
+    doubtful = idle or (bool(diagnosis.effects) and not diagnosis.sure)
     return "warning" if doubtful else TONES.get(diagnosis.verdict, "plain")
 
 

@@ -232,12 +232,23 @@ def test_an_offset_that_the_test_recordings_do_not_have_is_told():
     train, test = record(1.0, 3.0, "train"), record(0.0, 0.0, "test")
     found = pilfr.diagnose(heater(0.0, 1.2), train, test=test, laws=())
     assert [g.finding for g in found.gates if g.fault] == ["offset"]
-    (note,) = (g.sentence for g in found.gates if g.finding == "test offset")
-    assert note.startswith("The refitted simulator has an offset of heat (")
-    plain, corrected = (float(v) for v in re.findall(r"(\S+) %", note))
-    assert plain < 40 < corrected == pytest.approx(100 * found.errors["test"]["after"], rel=0.01)
+    errors = found.errors["test"]
+    assert errors["before"] < 0.4 < errors["after"] and found.outcome == "worse"
+    assert "with the offset of heat it follows the test recordings worse than without" in found.summary
+    assert not found.refitted.elements and len(found.corrected.elements) == 1
     recurring = pilfr.diagnose(heater(0.0, 1.2), train, test=record(1.0, 0.0, "test"), laws=())
-    assert "test offset" not in {g.finding for g in recurring.gates}
+    errors = recurring.errors["test"]
+    assert recurring.outcome == "better" and errors["after"] < 0.01 < errors["before"]
+
+
+def test_an_offset_beside_an_effect_that_the_test_recordings_do_not_have_is_told():
+    train, test = recordings(CubicStiffness(values={"k_3": 4e5}), count=2)
+    shifted = train.with_(y=train.y + 2 * np.std(train.y))
+    found = pilfr.diagnose(rig(OFF), shifted, test=test, laws=(CubicStiffness,))
+    assert [e.law for e in found.effects] == ["cubic_stiffness"] and found.outcome == "worse"
+    (note,) = (g.sentence for g in found.gates if g.finding == "test offset")
+    assert note in found.summary and note.startswith("The test recordings hardly have the offset of x2: at zero offset")
+    assert float(re.search(r"there is (\S+) %", note)[1]) < 1
 
 
 def test_recordings_say_what_inputs_do_between_samples_before_arguments_and_simulator():

@@ -43,6 +43,7 @@ EQUAL_RATIO = 1.02  # ratio of errors that count as equal
 NEAR_NOISE_RATIO = 5.0  # rms error over the noise up to which nothing else is wrong
 MOST_ROUNDS = 8  # alternations of edit and refit at most
 TEST_FAULT = "test fault"  # the finding that a channel of the test recordings is wrong
+TEST_OFFSET = "test offset"  # the finding that test recordings lack an offset of the training recordings
 
 
 @dataclass(frozen=True)

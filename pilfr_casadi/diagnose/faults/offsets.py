@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ..._base import in_words
 from ...data import Recording, moves_freely
 from ...laws import Gain, Law
 from ...simulators import ACTUATOR, EQUATION, SENSOR, Simulator, in_series, kind_of, port_name, split_port
@@ -429,24 +430,31 @@ def fix_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
     return fitted
 
 
-def refit_without_offsets(bench: Workbench, fitted: Fitted, given: Simulator) -> Fitted | None:
-    """Refit a simulator without the offsets that the `given` one does not have; None if it has none, or diverges."""
-    simulator = fitted.simulator
-    if len(simulator.elements) == len(given.elements):
-        return None
-    while len(simulator.elements) > len(given.elements):
-        simulator = simulator.without_element()
+def refit_without_offsets(bench: Workbench, fitted: Fitted, own: int) -> Fitted:
+    """Refit a simulator with its first `own` elements only; as fitted if the rest has no offset, or if it diverges."""
+    simulator = remove_offsets(fitted.simulator, own)
+    if simulator is fitted.simulator:
+        return fitted
     values = {name: fitted.values[name] for name in simulator.parameters}
-    return refit(bench, [values, {}], simulator, states=fitted.initial, solver=THOROUGH)
+    return refit(bench, [values, {}], simulator, states=fitted.initial, solver=THOROUGH) or fitted
 
 
-def remove_idle_offsets(simulator: Simulator, own: int) -> Simulator:
-    """Return a simulator without the offsets that `fix_idle_offsets` has fixed; the first `own` elements are kept."""
+def remove_offsets(simulator: Simulator, own: int, idle: bool = False) -> Simulator:
+    """Return a simulator without its offsets after the first `own` elements.
+
+    With `idle` only those are removed that `fix_idle_offsets` has fixed.
+    """
     for i in reversed(range(own, len(simulator.elements))):
         e = simulator.elements[i]
-        if isinstance(e.law, Offset) and np.all(simulator.parameters[f"{e.prefix}w_0"].fixed):
+        if isinstance(e.law, Offset) and (not idle or np.all(simulator.parameters[f"{e.prefix}w_0"].fixed)):
             simulator = simulator.without_element(i)
     return simulator
+
+
+def describe_offsets(elements: Sequence[Any]) -> str:
+    """Name the channels of the offsets among elements, such as "the offsets of u and y"; "" if there is none."""
+    channels = [split_port(e.port)[1] for e in elements if isinstance(e.law, Offset)]
+    return f"the offset{'s' * (len(channels) > 1)} of {in_words(channels)}" if channels else ""
 
 
 def update_offsets(
