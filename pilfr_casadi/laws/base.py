@@ -170,8 +170,9 @@ class Law:
         Allowed places: inside the dynamics, at an actuator or a sensor, at a sensor only, or at a parameter.
     domains : tuple of {"mechanical", "thermal", "electrical", "fluid"}
         Physical domains in which it occurs; left out, all of them.
-    rare : tuple of domain
-        Physical domains in which it hardly occurs; there it is less likely before the data are seen.
+    rare : tuple of domain or "sensor"
+        Physical domains in which it hardly occurs, or that it hardly occurs at sensors; there it is less likely before
+        the data are seen.
     absent : tuple of domain
         Physical domains in which it cannot occur; there it is not tried.
     sentences : mapping

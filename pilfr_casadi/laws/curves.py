@@ -321,6 +321,7 @@ class DeadZone(Law):
     sentence = "a dead zone: small signals have no effect"
     units = {"g": "z"}
     places = ("series",)
+    rare = ("sensor",)  # sensors show small signals; friction in front of one looks like this while it slips
     starts = {"g": ("reach", 0.02, 0.06, 0.12, 0.25, 0.4)}
     ranges = {"g": ("reach", 0.001, 0.8)}
 

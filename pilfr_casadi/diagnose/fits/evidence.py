@@ -368,9 +368,9 @@ def log_prior(
     """Compute the log prior probability of laws: all ports are alike, in a port all laws, and in a law all its forms.
 
     The parameters, which nobody declared as ports, count as one port together. At a port of a known domain (`domains`)
-    the laws of that domain are likelier than general ones, and these than laws that are rare there. One law in several
-    sensors, such as a logger's filters, counts once. `alternatives` are the laws allowed in each port; `doubtful` tells
-    that a law degenerates at its fitted values.
+    the laws of that domain are likelier than general ones, and these than laws that are rare there; so are laws that
+    are rare at sensors. One law in several sensors, such as a logger's filters, counts once. `alternatives` are the laws
+    allowed in each port; `doubtful` tells that a law degenerates at its fitted values.
     """
     total = DOUBTFUL_PRIOR if doubtful else 0.0
     in_sensors = set[type[Law]]()
@@ -387,7 +387,7 @@ def log_prior(
         total -= np.log(max(parameters, 1)) if kind_of(e.port) == PARAMETER else 0.0
         domain = (domains or {}).get(e.port, UNKNOWN)
         total += _log_share(e.law.id, there, domain)
-        total -= DOMAIN_PRIOR if domain in e.law.rare else 0.0
+        total -= DOMAIN_PRIOR if {domain, kind_of(e.port)} & set(e.law.rare) else 0.0
         total += FLEXIBLE_PRIOR if e.law.flexible else 0.0
     return float(total)
 

@@ -81,6 +81,16 @@ def test_a_law_that_is_rare_in_the_domain_of_a_port_is_less_likely():
         )
 
 
+def test_a_dead_zone_is_less_likely_at_a_sensor_than_at_an_actuator():
+    machine = pilfr.Simulator(lambda x, u: {"v": u.f - x.v}, lambda x: {"y": x.v}, states=("v",), inputs=("f",))
+    ratios = []
+    for port in ("actuator:f", "sensor:y"):
+        there = {port: (laws.DeadZone(), laws.Saturation())}
+        gap, limit = (log_prior(machine.with_element(port, law).elements, there) for law in there[port])
+        ratios.append(gap - limit)
+    assert ratios == pytest.approx([0, -np.log(4)])
+
+
 def test_a_parameters_unit_does_not_change_its_information():
     train = recordings(laws.CubicStiffness(values={"k_3": 3e5}), count=1)
     bench = Workbench.of(rig(OFF), train, "zero")
