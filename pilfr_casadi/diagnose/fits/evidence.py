@@ -369,8 +369,8 @@ def log_prior(
 
     The parameters, which nobody declared as ports, count as one port together. At a port of a known domain (`domains`)
     the laws of that domain are likelier than general ones, and these than laws that are rare there; so are laws that
-    are rare at sensors. One law in several sensors, such as a logger's filters, counts once. `alternatives` are the laws
-    allowed in each port; `doubtful` tells that a law degenerates at its fitted values.
+    are rare at sensors. One law in several sensors, such as a logger's filters, counts once. `alternatives` are the
+    laws allowed in each port; `doubtful` tells that a law degenerates at its fitted values.
     """
     total = DOUBTFUL_PRIOR if doubtful else 0.0
     in_sensors = set[type[Law]]()
