@@ -10,7 +10,7 @@ import numpy as np
 
 from .._base import percent
 from ..data import DIVERGING, Recording
-from ..models import ParameterSet
+from ..models import ParameterSet, at_bounds
 from ..simulators import ACTUATOR, Placed, Simulator, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
@@ -278,11 +278,10 @@ class ResultText:
         own, out = self.corrected.parameters, []
         for name in self.parameters:
             p = own[name]
-            low, high = (np.broadcast_to(b, p.value.shape) for b in p.bounds)
-            labels = ParameterSet({name: p}).labels
-            columns = [np.ravel(a, order="F") for a in (p.value, low, high, np.broadcast_to(p.fixed, p.value.shape))]
-            for label, v, below, above, fixed in zip(labels, *columns, strict=True):
-                if not fixed and (v <= below or v >= above) and (v or not self.effects):
+            at, fixed = at_bounds(p.value, *p.bounds), np.broadcast_to(p.fixed, p.value.shape)
+            columns = (np.ravel(a, order="F") for a in (p.value, at & ~fixed))
+            for label, v, ended in zip(ParameterSet({name: p}).labels, *columns, strict=True):
+                if ended and (v or not self.effects):
                     out.append(f"{label} ({v:.4g})")
         return out
 
@@ -365,8 +364,8 @@ class ResultText:
         for name in moved[:MOST_PRINTED]:
             p = free[name]
             std = "" if p["std"] is None else f" ± {float(p['std']):.2g}"
-            value, nominal, (low, high) = float(p["refit_with"]), float(p["nominal"]), own[name].bounds
-            bound = "" if low < value < high else ", at its bound"
+            value, nominal = float(p["refit_with"]), float(p["nominal"])
+            bound = ", at its bound" if at_bounds(value, *own[name].bounds) else ""
             lines.append(f"  {name} = {value:.5g}{std} {p['unit']}".rstrip() + f", given as {nominal:.5g}{bound}")
         more = [f"  and {len(moved) - MOST_PRINTED} more"] if len(moved) > MOST_PRINTED else []
         for e in (e for e in self.corrected.elements if isinstance(e.law, Offset)):

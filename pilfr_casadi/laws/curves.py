@@ -197,7 +197,7 @@ class FreeCurve(Law):
     form = "free"
     equation = (
         "w = sum_i c_i (T_i(x) - T_i(x_0)),  i = 2..9,  x = (z - z_m) / z_h,  x_0 = -z_m / z_h; "
-        "along its tangents outside -1 <= x <= 1"
+        "T_i along its tangents outside -1 <= x <= 1"
     )
     source = "Plett (2015), Battery Management Systems, vol. 1, sec. 2.2; Press et al. (2007), sec. 5.8"
     sentence = "a memoryless curve of a free shape, such as an open-circuit voltage over the state of charge"
@@ -214,8 +214,7 @@ class FreeCurve(Law):
             slopes_at_ends = [i**2 * (x if i % 2 == 0 else 1.0) for i in self.degrees]
             return [polynomials[i] for i in self.degrees], slopes_at_ends
 
-        at_z = continue_along_tangents((z - p.z_m) / p.z_h, -1.0, 1.0, terms)
-        at_zero, _ = terms(-p.z_m / p.z_h)
+        at_z, at_zero = (continue_along_tangents((one - p.z_m) / p.z_h, -1.0, 1.0, terms) for one in (z, 0.0))
         return sum(p.c[k] * (at_z[k] - at_zero[k]) for k in range(len(self.degrees)))
 
     def parameters(self) -> dict[str, Parameter]:
@@ -224,8 +223,7 @@ class FreeCurve(Law):
         return {**out, "c": replace(out["c"], value=np.broadcast_to(out["c"].value, len(self.degrees)))}
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        low, high = min(local.low, 0.0), max(local.high, 0.0)
-        yield {"z_m": (low + high) / 2, "z_h": max((high - low) / 2, 1e-300)}
+        yield {"z_m": (local.low + local.high) / 2, "z_h": max((local.high - local.low) / 2, 1e-300)}
 
 
 def chebyshev(x: Any, degree: int) -> list[Any]:

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
         Neighbours as Neighbours,
         Parameter as Parameter,
         ParameterSet as ParameterSet,
+        at_bounds as at_bounds,
         check_size as check_size,
         or_one as or_one,
         parameter_within as parameter_within,

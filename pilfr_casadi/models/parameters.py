@@ -17,6 +17,7 @@ import numpy as np
 from .._base import InputError, filled, listed
 
 Array = np.ndarray
+NEAR_BOUND = 1e-3  # of a bound, or of the range if that is smaller: a value that is nearer counts as at the bound
 LARGEST_MODEL = 20_000  # parameters, whose Gauss-Newton Hessian takes 3.2 GB, and its factorisation a minute per step
 
 
@@ -41,6 +42,19 @@ def _check_within(name: str, value: Any, bounds: Any) -> None:
             raise InputError(
                 f"The parameter {name!r} is {entry:g}, outside of its bounds {low:g} to {high:g}; widen them."
             )
+
+
+def at_bounds(value: Any, lower: Any, upper: Any) -> Array:
+    """Mark values at one of their bounds; a solver ends a little inside of it.
+
+    Zero has no size, so that only zero itself is at the bound zero.
+    """
+    value, lower, upper = np.broadcast_arrays(*(np.asarray(v, dtype=float) for v in (value, lower, upper)))
+    found = (value <= lower) | (value >= upper)
+    for bound in (lower, upper):
+        with np.errstate(invalid="ignore"):
+            found |= np.abs(value - bound) < NEAR_BOUND * np.minimum(np.abs(bound), upper - lower)
+    return np.asarray(found)
 
 
 def check_size(owner: str, count: int) -> None:

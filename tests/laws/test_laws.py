@@ -453,3 +453,13 @@ def test_a_free_curve_goes_on_along_its_tangents():
     for end, side in ((-0.3, z < -0.3), (0.7, z > 0.7)):
         slope = (curve(end + 1e-6) - curve(end - 1e-6)) / 2e-6
         assert np.allclose(w[side], curve(end) - curve(0.0) + slope * (z[side] - end), rtol=1e-6, atol=1e-6)
+
+
+def test_a_free_curve_is_free_where_the_signal_was_alone():
+    """Between zero and the recorded range nothing would determine it; it is zero at zero all the same."""
+    law, z = laws.FreeCurve(), np.linspace(5.0, 10.0, 50)
+    (shape,) = law.shapes(Local(z=z, dz=np.ones(50), dt=0.1, lengths=(50,)))
+    assert shape == {"z_m": 7.5, "z_h": 2.5}
+    values = {"c": np.ones(8), **shape}
+    w = np.array([float(law.force(at, Named("p", values))) for at in (0.0, 2.0, 4.0, 5.0)])
+    assert w[0] == pytest.approx(0, abs=1e-12) and np.diff(w) / [2, 2, 1] == pytest.approx([w[3] / 5] * 3)

@@ -172,7 +172,10 @@ def mend_stale_samples(now: Checked) -> Checked:
             fault = Stale(name, "stale", repeated, words, change=partial(_interpolate_repeats, side=side, column=i))
             found = accept(now, correct(now, fault, [{}, now.fitted.values], now.fitted.begin), fault)
             if not found.adds_to(now) and side == "y":
-                words = f"{words}; the error that this causes counts as noise: record again, or leave them out."
+                words = (
+                    f"{words}, or from a coarse sensor while the machine is slow; the error that this causes counts as "
+                    "noise. If samples were lost, leave them out (empty cells), or record again."
+                )
                 found = found.then(found.bench, found.fitted, Gate(name, "stale", repeated, words, False))
             now = found
     return now

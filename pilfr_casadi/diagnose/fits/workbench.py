@@ -15,7 +15,7 @@ from ...engine import Engine, make_engine
 from ...identify import solve_within_bounds
 from ...laws import Local
 from ...linear import INJECTION, with_output_injection
-from ...models import Model, ParameterSet
+from ...models import Model, ParameterSet, at_bounds
 from ...optimise import GaussNewton, Problem, Status
 from ...simulators import (
     LARGEST_STEP,
@@ -96,13 +96,12 @@ class Fitted(CompiledSimulator):
     @property
     def at_bounds(self) -> float:
         """Share of the free parameters at a bound."""
-        p, at = self.model.parameters, self.vector
-        return float(np.mean(((at <= p.lower) | (at >= p.upper))[p.free])) if np.any(p.free) else 0.0
+        p = self.model.parameters
+        return float(np.mean(at_bounds(self.vector, p.lower, p.upper)[p.free])) if np.any(p.free) else 0.0
 
     def at_bound(self, name: str) -> np.ndarray:
         """Mark the entries of a parameter that are at one of its bounds."""
-        (low, high), value = self.model.parameters[name].bounds, self.values[name]
-        return np.asarray((value <= low) | (value >= high))
+        return at_bounds(self.values[name], *self.model.parameters[name].bounds)
 
     def strained(self, names: Iterable[str]) -> bool:
         """Tell whether a free parameter of some is at a bound other than zero, so that the fit wants it beyond."""
