@@ -459,7 +459,7 @@ def test_a_free_curve_is_free_where_the_signal_was_alone():
     """Between zero and the recorded range nothing would determine it; it is zero at zero all the same."""
     law, z = laws.FreeCurve(), np.linspace(5.0, 10.0, 50)
     (shape,) = law.shapes(Local(z=z, dz=np.ones(50), dt=0.1, lengths=(50,)))
-    assert shape == {"z_m": 7.5, "z_h": 2.5}
+    assert shape["z_m"] - shape["z_h"] == pytest.approx(5, abs=0.1)
     values = {"c": np.ones(8), **shape}
     w = np.array([float(law.force(at, Named("p", values))) for at in (0.0, 2.0, 4.0, 5.0)])
     assert w[0] == pytest.approx(0, abs=1e-12) and np.diff(w) / [2, 2, 1] == pytest.approx([w[3] / 5] * 3)
