@@ -150,7 +150,7 @@ def may_act_elsewhere(search: Search, trial: Trial) -> bool:
     if not search.bench.simulator.unreached:
         return False
     at_ends = any(in_series(e.port) for e in trial.effects)
-    return strained(search, trial) or (at_ends and trial.mean_square > AT_NOISE_RATIO**2 * search.least_noise2)
+    return strained(search, trial) > 0 or (at_ends and trial.mean_square > AT_NOISE_RATIO**2 * search.least_noise2)
 
 
 def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[tuple[Gate, ...], float]:

@@ -12,9 +12,9 @@ law leaves and that a flexible force at some port would explain. The density of 
 
 and the probability of a hypothesis is divided between a named and an unnamed answer in this ratio. s_0 is the share
 that the formula of the right law may leave. A wrong law often drives a parameter of the simulator to a bound; then the
-odds against the law rise by STRAINED_ODDS. The confidence of an effect is the probability that it is included, that its
-law is the physics, and that its strength is not zero. An effect beside others is included if its probability exceeds
-SURE (median probability model, Barbieri & Berger 2004).
+odds against the law rise by STRAINED_ODDS for each. The confidence of an effect is the probability that it is
+included, that its law is the physics, and that its strength is not zero. An effect beside others is included if its
+probability exceeds SURE (median probability model, Barbieri & Berger 2004).
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ def _named_beside(search: Hypotheses, best: Trial, effect: LikelyEffect) -> floa
 def _odds_against(search: Hypotheses, trial: Trial, elements: Sequence[Placed]) -> float:
     """Compute how much likelier the fitted values are of wrong laws: at a bound, or where every law degenerates."""
     degenerate = all(search.doubtful(trial, e) for e in elements)
-    return (STRAINED_ODDS if strained(search, trial) else 1.0) * (float(np.exp(-DOUBTFUL_PRIOR)) if degenerate else 1.0)
+    return STRAINED_ODDS ** strained(search, trial) * (float(np.exp(-DOUBTFUL_PRIOR)) if degenerate else 1.0)
 
 
 def _acts(search: Hypotheses, best: Trial, element: Placed) -> float:
@@ -210,8 +210,8 @@ def _without(search: Hypotheses, best: Trial, effect: LikelyEffect) -> Trial | N
     return min(fitted, key=lambda t: t.mean_square, default=None)
 
 
-def strained(search: Hypotheses, trial: Trial) -> bool:
-    """Tell whether a hypothesis needs a value of the simulator that the user has excluded."""
+def strained(search: Hypotheses, trial: Trial) -> int:
+    """Count the parameters of the simulator that a hypothesis would have beyond the user's bounds."""
     return trial.fitted.strained(search.bench.simulator.parameters)
 
 

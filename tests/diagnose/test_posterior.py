@@ -199,12 +199,15 @@ def test_a_mismatch_below_the_noise_hardly_shows_what_explains_it(search, trial)
 
 def test_a_value_that_the_user_has_excluded_makes_a_law_less_sure(search, trial, tiny):
     bench, _ = tiny
-    name, p = next((k, p) for k, p in bench.simulator.parameters.items() if not np.all(p.fixed))
-    at_bound = trial(DRY)
-    values = {**at_bound.fitted.values, name: np.array(p.bounds[1])}
-    strained = replace(at_bound, fitted=replace(at_bound.fitted, values=values))
-    assert strained.fitted.strained([name]) and not at_bound.fitted.strained([name])
-    assert sure_of(posterior(search(strained)))[DRY_NAME] == pytest.approx(share_named(0.0, STRAINED_ODDS))
+    free = [k for k, p in bench.simulator.parameters.items() if not np.all(p.fixed)]
+    for names in (free[:1], free[:2]):
+        at_bound = trial(DRY)
+        ends = {k: np.array(bench.simulator.parameters[k].bounds[1]) for k in names}
+        values = {**at_bound.fitted.values, **ends}
+        strained = replace(at_bound, fitted=replace(at_bound.fitted, values=values))
+        assert strained.fitted.strained(free) == len(names) and not at_bound.fitted.strained(free)
+        odds = STRAINED_ODDS ** len(names)
+        assert posterior(search(strained)).named == pytest.approx(share_named(0.0, odds))
     assert 0.75 < share_named(0.0, STRAINED_ODDS) < 0.9
 
 

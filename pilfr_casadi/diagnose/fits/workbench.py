@@ -103,10 +103,10 @@ class Fitted(CompiledSimulator):
         """Mark the entries of a parameter that are at one of its bounds."""
         return at_bounds(self.values[name], *self.model.parameters[name].bounds)
 
-    def strained(self, names: Iterable[str]) -> bool:
-        """Tell whether a free parameter of some is at a bound other than zero, so that the fit wants it beyond."""
+    def strained(self, names: Iterable[str]) -> int:
+        """Count the free parameters of some at a bound other than zero, which the fit wants beyond."""
         free = (name for name in names if not np.all(self.model.parameters[name].fixed))
-        return any(bool(np.any(self.at_bound(name) & (self.values[name] != 0))) for name in free)
+        return sum(bool(np.any(self.at_bound(name) & (self.values[name] != 0))) for name in free)
 
     @property
     def begin(self) -> list[np.ndarray]:
