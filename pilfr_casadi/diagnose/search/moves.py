@@ -33,7 +33,7 @@ from ...laws import (
     scheduled,
     varying,
 )
-from ...simulators import ACTUATOR, PARAMETER, SENSOR, Placed, kind_of, name_at, port_name
+from ...simulators import ACTUATOR, PARAMETER, SENSOR, Placed, in_series, kind_of, name_at, port_name
 from ..faults.gates import CLEARLY_BETTER, Checked, Gate
 from ..faults.timing import TimeShift, find_time_shift
 from ..fits.evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR, NEAR_RATIO
@@ -340,6 +340,7 @@ class Search(Hypotheses):
         count = MOST_CONVERGED if time.perf_counter() < self.until else 1
         near = [t for t in ranked[:count] if not t.thorough and t.error < most]
         converged = self._side_by_side(self.fits.converge, near)
+        converged += filter(None, self._side_by_side(self._reorder, converged))
         for trial in converged:
             self.keep(trial)
         # finer steps are slow, and bring no hypothesis that is far behind to the front
@@ -347,6 +348,18 @@ class Search(Hypotheses):
         near = [t for t in converged if t.error < NEAR_RATIO * least]
         for trial in self._side_by_side(self.fits.refine_knee, near):
             self.keep(trial)
+
+    def _reorder(self, trial: Trial) -> Trial | None:
+        """Fit a hypothesis with its last law before the others of the same signal.
+
+        A curve behind a lag is not a lag behind a curve (Wiener and Hammerstein models). Only linear laws commute.
+        """
+        *others, last = trial.laws
+        at = next((i for i, e in enumerate(others) if e.port == last.port), None)
+        if at is None or not in_series(last.port) or (_is_filter(last.law) and _is_filter(others[at].law)):
+            return None
+        found = self.run_laws([*others[:at], last, *others[at:]], trial)
+        return self.fits.converge(found) if found.mean_square < DIVERGED else None
 
     def _finer(self, parent: Trial) -> None:
         """Fit the best law of a step in its finer forms; then schedule the strength of the best law that allows it."""
@@ -545,7 +558,7 @@ class Search(Hypotheses):
         Linear time-invariant systems commute (Oppenheim & Willsky 1997, Signals and Systems, sec. 2.3).
         """
         best, names = self.best, self.bench.simulator.output_names
-        filters = [e for e in best.laws if kind_of(e.port) == ACTUATOR and (e.law.order or e.law.shifts)]
+        filters = [e for e in best.laws if kind_of(e.port) == ACTUATOR and _is_filter(e.law)]
         if len(names) < 2 or len(filters) != 1 or not self.may_go_on():
             return
         source = filters[0]
@@ -576,6 +589,11 @@ class Search(Hypotheses):
         self.findings.clear()
         self.keep(Trial.of(alone, 0, thorough=True))
         return True
+
+
+def _is_filter(law: Law) -> bool:
+    """Tell whether a law of a signal is a lag, a mode or a delay."""
+    return bool(law.order or law.shifts)
 
 
 def _may_stand_beside(laws: Sequence[Placed], port: str, law: Law) -> bool:

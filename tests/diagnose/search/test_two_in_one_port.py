@@ -73,6 +73,22 @@ def test_a_drive_may_have_a_dead_zone_and_a_delay():
 
 
 @pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (laws.Lag().at({"T": 0.02}), laws.Saturation().at({"L": 9.0})),
+        (laws.DeadZone().at({"g": 1.0}), laws.Lag().at({"T": 0.15})),
+    ],
+)
+def test_a_curve_behind_a_lag_is_told_from_a_lag_behind_a_curve(first, second):
+    true = example_rig().with_element("actuator:force", first).with_element("actuator:force", second)
+    train, test = recorded(true, 0, samples=500), recorded(true, 1, samples=400)
+    tried = (type(first), type(second))
+    found = pilfr.diagnose(example_rig(430.0, 5.0), train, test=test, laws=tried, hold="zero", workers=1)
+    assert tuple(type(e.law) for e in found.corrected.elements) == tried
+    assert found.errors["test"]["after"] < 1.2 * found.floor["nrmse"]
+
+
+@pytest.mark.parametrize(
     ("one", "other", "apart"),
     [
         (laws.CoulombFriction, laws.CubicStiffness, True),
