@@ -36,7 +36,7 @@ from .fits.evidence import (
     prior_width,
     standard_errors,
 )
-from .fits.floor import effective_size, measured_floor, third_differences
+from .fits.floor import count_samples, effective_size, measured_floor, third_differences
 from .fits.linearise import sample_run
 from .fits.workbench import FINER_STEPS, THOROUGH, Fitted, Workbench, refit
 from .search.trials import Trials
@@ -225,7 +225,8 @@ def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ..
     """Compute the log evidence with the laws minus the log evidence of the simulator as given."""
     tolerance = FORMULA_ERROR * max(plain.cost - noise2, 0.0)
     costs = plain.cost + tolerance, after.cost + tolerance
-    n = EffectiveSamples(noise2 + tolerance, max(effective_size(bench.scored(after.residual)), 1.0)).at(min(costs))
+    count = count_samples(bench.scored(after.residual), bench.scored(plain.residual), bench.scale)
+    n = EffectiveSamples(noise2 + tolerance, count).at(min(costs))
     known = information(bench, after, laws)
     return log_evidence(costs[1], known, log_prior(laws, {}), n) - log_evidence(costs[0], np.zeros(0), 0.0, n)
 
