@@ -24,7 +24,7 @@ from .._base import one_blas_thread
 from ..data import Recording
 from ..laws import Law
 from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
-from .arguments import match_recordings, stated_hold
+from .arguments import match_recordings
 from .faults.channels import correct_gross_channel_errors
 from .faults.gates import Checked
 from .fits.evidence import (
@@ -103,8 +103,8 @@ def find_channel_faults(
 
 
 def _bench(simulator: Any, recordings: Any, hold: str | None, engine: str) -> Workbench:
-    own, given = match_recordings(as_simulator(simulator), recordings, hold)
-    return Workbench.of(own, given, stated_hold(own, given, hold) or "zero", engine)
+    own, given, stated = match_recordings(as_simulator(simulator), recordings, hold)
+    return Workbench.of(own, given, stated or "zero", engine)
 
 
 @one_blas_thread
