@@ -310,7 +310,7 @@ def _combination_note(after: Fitted, std: Mapping[str, np.ndarray], blind_spots:
 
 def _blind_spots(request: Request, ready: Prepared, search: Search) -> tuple[BlindSpot, ...]:
     """Find the blind spots of the recordings for the refitted simulator; empty if they cannot be computed."""
-    stated = search.bench.hold if request.hold_stated else ""
+    stated = search.bench.hold if request.stated_hold else ""
     with suppress(InputError, np.linalg.LinAlgError):
         return assess_recordings(search.bench, search.root.fitted, ready.floor, stated).blind_spots
     return ()

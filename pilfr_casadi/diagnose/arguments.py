@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, Stages, is_number, listed
-from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification, moves_freely
+from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
 from ..laws import (
     CATALOGUE,
     SCALABLE,
@@ -23,7 +23,7 @@ from ..laws import (
     scheduled,
     seen_by,
 )
-from ..simulators import Simulator, as_simulator, check_hold, one_hold
+from ..simulators import Simulator, as_simulator, check_hold, stated_hold
 from .faults.gates import Gate, edited
 from .search.stretches import Stretches
 
@@ -59,26 +59,15 @@ class Request:
         return replace(self, recordings=recordings, edits=(*self.edits, *edits), nominal=nominal, say=say)
 
     @property
-    def hold_stated(self) -> bool:
-        """Whether somebody stated what inputs do between samples."""
-        return stated_hold(self.simulator, self.recordings, self.hold) is not None
-
-
-def stated_hold(simulator: Any, recordings: Sequence[Recording], hold: str | None) -> str | None:
-    """Return the hold that a recording, the user or the simulator states, in this order; None if none of them does.
-
-    A simulator in discrete time keeps its own. Without an input that changes, any hold is the same.
-    """
-    given = [r.hold for r in recordings]
-    order = (hold, simulator.hold, *given) if simulator.discrete else (*given, hold, simulator.hold)
-    stated = next((h for h in order if h is not None), None)
-    return stated or ("zero" if moves_freely(recordings) else None)
+    def stated_hold(self) -> str | None:
+        """What inputs do between samples, if somebody stated it."""
+        return stated_hold(self.simulator, self.recordings, self.hold)
 
 
 def match_recordings(
     simulator: Any, train: Recording | Sequence[Recording], hold: str | None
-) -> tuple[Simulator, tuple[Recording, ...]]:
-    """Return the simulator, and the recordings with its channels in its order.
+) -> tuple[Simulator, tuple[Recording, ...], str | None]:
+    """Return the simulator, the recordings with its channels in its order, and their hold if somebody stated it.
 
     Inputs may be constant or absent: the motion from a start, such as a decay, excites as well.
 
@@ -92,9 +81,8 @@ def match_recordings(
     given = as_recordings(train)
     simulator = as_simulator(simulator, given)
     recordings = [simulator.matched(r) for r in given]
-    if not simulator.discrete:
-        one_hold(recordings)
-    return simulator, check_for_identification(recordings, FEWEST_SAMPLES, excited=False)
+    stated = stated_hold(simulator, recordings, hold)
+    return simulator, check_for_identification(recordings, FEWEST_SAMPLES, excited=False), stated
 
 
 def match_tests(

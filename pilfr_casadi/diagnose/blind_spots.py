@@ -19,7 +19,7 @@ from .._base import in_words, one_blas_thread, percent, to_json
 from ..data import HOLD_WORDS, Recording, moves_freely
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, UNKNOWN, in_series, kind_of, port_name, split_port
-from .arguments import check_laws, match_recordings, stated_hold
+from .arguments import check_laws, match_recordings
 from .detectability import SMALL_SHARE, LawRow, assess_laws, group_alike
 from .excitation import Excitation, excitations, single_frequency
 from .faults.channels import correct_gross_channel_errors, refit_corrected
@@ -275,9 +275,8 @@ def check(
     InputError
         If simulator and recordings do not fit each other, or the simulation diverges or runs away from them.
     """
-    simulator, recordings = match_recordings(simulator, train, hold)
+    simulator, recordings, stated = match_recordings(simulator, train, hold)
     wanted = None if laws is None else check_laws(laws)
-    stated = stated_hold(simulator, recordings, hold)
     now = _refit(Workbench.of(simulator, recordings, stated or "zero", engine), hold_stated=stated is not None)
     found = assess_recordings(now.bench, now.fitted, now.floor, stated or "", wanted)
     slow = find_held_outputs(recordings)

@@ -127,8 +127,8 @@ def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction
         return uncompared_correction(search, best.fitted), best.fitted
     refit = _cross_validate_refit(search)
     candidates = [_Candidate.of(search, t.fitted, t) for t in _named_hypotheses(search, answer)]
-    validated = _cross_validate(search, candidates, refit) if refit else []
-    if search.past_deadline and (len(validated) < 2 or _may_be_best(candidates[0], validated)):
+    validated = _compare(search, candidates, refit, candidates[0])
+    if not validated:
         stays = candidates[0].base
         return replace(uncompared_correction(search, stays.fitted), closest=stays), stays.fitted
     chosen = _choose(validated)[0].base
@@ -145,8 +145,8 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
     """
     refit = _cross_validate_refit(search)
     candidates = [_Candidate.of(search, t.fitted, t) for t in _hypotheses_with_laws(search)]
-    validated = _cross_validate(search, candidates, refit) if refit else []
-    if search.past_deadline and len(validated) < 2:
+    validated = _compare(search, candidates, refit)
+    if not validated:
         stays = _far_better(search, candidates)
         late = uncompared_correction(search, stays.fitted, search.least_floor)
         return replace(late, late=True, closest=stays), stays.fitted
@@ -158,8 +158,6 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
 
 def _cross_validate_refit(search: Search) -> list[_Validated]:
     """Cross-validate the refitted simulator; empty if the time is over."""
-    if search.past_deadline:
-        return []
     return _cross_validate(search, [_Candidate.of(search, search.root.fitted, search.root)], [])
 
 
@@ -183,11 +181,11 @@ def _is_settled(search: Search, answer: Posterior) -> bool:
 
 
 def _cross_validate(search: Search, candidates: Sequence[_Candidate], validated: list[_Validated]) -> list[_Validated]:
-    """Cross-validate further candidates, the most promising first, as long as they can be best."""
+    """Cross-validate further candidates, the most promising first, as long as they can be best and there is time."""
     out = list(validated)
     for c in sorted(candidates, key=lambda c: c.least):
         least = min((h.score for _, h in out), default=np.inf)
-        if out and (c.least >= least or search.past_deadline):
+        if search.past_deadline or (out and c.least >= least):
             break
         bare = c.fitted is c.base.fitted
         found = search.held_out(c.base) if bare else search.held_out_errors(c.fitted, c.spread)
@@ -196,10 +194,17 @@ def _cross_validate(search: Search, candidates: Sequence[_Candidate], validated:
     return out
 
 
-def _may_be_best(candidate: _Candidate, validated: Sequence[_Validated]) -> bool:
-    """Tell whether a candidate that was not cross-validated may have a smaller error than those that were."""
-    left_out = all(c is not candidate for c, _ in validated)
-    return left_out and candidate.least < min(h.score for _, h in validated)
+def _compare(
+    search: Search, candidates: Sequence[_Candidate], refit: list[_Validated], wanted: _Candidate | None = None
+) -> list[_Validated]:
+    """Cross-validate candidates beside the refit; empty if the time ended before any of them, or a wanted one, was.
+
+    A wanted candidate that cannot be best need not be cross-validated.
+    """
+    validated = _cross_validate(search, candidates, refit)
+    least = min((h.score for _, h in validated), default=np.inf)
+    left_out = wanted is not None and wanted.least < least and all(c is not wanted for c, _ in validated)
+    return [] if search.past_deadline and (len(validated) < 2 or left_out) else validated
 
 
 def _far_better(search: Search, candidates: Sequence[_Candidate]) -> Trial:

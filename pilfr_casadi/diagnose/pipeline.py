@@ -69,7 +69,6 @@ from .arguments import (
     check_time_and_focus,
     match_recordings,
     match_tests,
-    stated_hold,
 )
 from .correction import Correction, find_named_correction, find_unnamed_correction, uncompared_correction
 from .faults.gates import EQUAL_RATIO, Gate
@@ -122,8 +121,8 @@ def diagnose_in_steps(
     positive(stand_in_error, "stand_in_error", "the NRMSE of a model that replaces the simulator", zero=True)
     say = Stages(progress or (lambda stage, done, total, best: None))
     given = as_recordings(train)
-    simulator, recordings = match_recordings(simulator, given, hold)
-    tests = match_tests(simulator, test, recordings, stated_hold(simulator, recordings, hold))
+    simulator, recordings, stated = match_recordings(simulator, given, hold)
+    tests = match_tests(simulator, test, recordings, stated)
     check_limits(simulator, limits)
     tried = (*add_scaled_laws(check_laws(laws), simulator), *((VaryingParameter,) if laws is None else ()))
     deadline = np.inf if time_limit is None else began + float(time_limit)
@@ -168,7 +167,7 @@ def _on_stretches(request: Request, most: int) -> Request:
         return request
     request.say("choice of stretches", 0, 1)
     recordings, notes = clean_recordings(request.recordings)
-    hold = stated_hold(request.simulator, recordings, request.hold) or "zero"
+    hold = request.stated_hold or "zero"
     chosen = choose_stretches(request.simulator, recordings, hold, request.engine, most, request.workers)
     stretches = Stretches(recordings, chosen)
     request.say("choice of stretches", 1, 1)

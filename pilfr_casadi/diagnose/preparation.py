@@ -18,8 +18,7 @@ from .._base import InputError, Stages, UntilInterrupted, in_words
 from ..data import HOLD_WORDS, Recording
 from ..engine import make_engine
 from ..optimise import GaussNewton, Status
-from ..simulators import Simulator, discretise_for, unit_notes
-from .arguments import stated_hold
+from ..simulators import Simulator, discretise_for, stated_hold, unit_notes
 from .faults.channels import accept_best, find_channel_errors, find_gross_channel_errors, open_bench, refit_corrected
 from .faults.gates import CURED_SHARE, EQUAL_RATIO, NEAR_NOISE_RATIO, POOR_FIT, Checked, Gate, error_ratio
 from .faults.lost_samples import find_gaps, find_output_gaps

@@ -36,7 +36,6 @@ from ..laws import OPERATORS, Law, Local, display_name, hysteresis_layer, unit_f
 from ..models import check_size, play
 from ..simulators import Simulator, discretise, in_series, on_grid
 from .fits.evidence import EffectiveSamples, HeldOut, held_out_errors, spread
-from .fits.floor import effective_size
 from .fits.force_recovery import signals_along
 from .fits.workbench import THOROUGH, CompiledSimulator, Fitted, Workbench
 from .search.moves import Search
@@ -219,7 +218,7 @@ def _predict(search: Search, fitted: Fitted) -> HeldOut:
     bench = search.bench
     found = held_out_errors(bench, fitted, search.workers)
     v = found.score  # still without a spread
-    n = EffectiveSamples(search.floor2, effective_size(bench.scored(fitted.residual))).at(v)
+    n = EffectiveSamples(search.floor2, search.count_samples(fitted)).at(v)
     return replace(found, spread=spread(bench, fitted, search.added_laws(fitted), v, n) if np.isfinite(v) else np.inf)
 
 

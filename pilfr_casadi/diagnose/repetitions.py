@@ -25,7 +25,7 @@ from functools import partial
 import numpy as np
 
 from .._base import InputError
-from .arguments import Request, stated_hold
+from .arguments import Request
 from .faults.gates import LEAST_GAIN, USELESS_FIT, Checked, Gate, error_ratio, evidence_gain
 from .faults.offsets import Offset, WrongStart
 from .faults.timing import TimeShift
@@ -61,7 +61,7 @@ def search_with_repetitions(request: Request) -> tuple[Request, Attempt]:
             if request.focus == "simulation" or not observer_keeps_up(request.simulator, request.recordings):
                 raise
     # the gain depends little on the hold, which the search may still change
-    hold = stated_hold(request.simulator, request.recordings, request.hold) or "zero"
+    hold = request.stated_hold or "zero"
     observed, memory = predictor(request.simulator, request.recordings, hold, request.engine)
     note = prediction_note(request.simulator, request.recordings, memory)
     request = replace(request, simulator=observed, notes=(*request.notes, note))
@@ -218,7 +218,7 @@ def _search_once(request: Request, correct_early: bool) -> Attempt:
         laws=(*request.laws, Offset),
         workers=request.workers,
         say=request.say,
-        hold_stated=request.hold_stated,
+        hold_stated=request.stated_hold is not None,
         aligned=request.aligned,
         surrogate_nrmse=request.surrogate_nrmse,
         until=began + SEARCH_SHARE * left,

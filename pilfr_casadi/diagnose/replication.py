@@ -24,7 +24,7 @@ from .._base import one_blas_thread
 from ..data import Recording
 from ..laws import Law
 from ..simulators import MOST_SUBSTEPS, Placed, Simulator, as_simulator
-from .arguments import match_recordings, stated_hold
+from .arguments import match_recordings
 from .faults.channels import correct_gross_channel_errors
 from .faults.gates import Checked
 from .fits.evidence import (
@@ -36,7 +36,7 @@ from .fits.evidence import (
     prior_width,
     standard_errors,
 )
-from .fits.floor import effective_size, measured_floor, third_differences
+from .fits.floor import count_samples, effective_size, measured_floor, third_differences
 from .fits.linearise import sample_run
 from .fits.workbench import FINER_STEPS, THOROUGH, Fitted, Workbench, refit
 from .search.trials import Trials
@@ -103,8 +103,8 @@ def find_channel_faults(
 
 
 def _bench(simulator: Any, recordings: Any, hold: str | None, engine: str) -> Workbench:
-    own, given = match_recordings(as_simulator(simulator), recordings, hold)
-    return Workbench.of(own, given, stated_hold(own, given, hold) or "zero", engine)
+    own, given, stated = match_recordings(as_simulator(simulator), recordings, hold)
+    return Workbench.of(own, given, stated or "zero", engine)
 
 
 @one_blas_thread
@@ -225,7 +225,8 @@ def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ..
     """Compute the log evidence with the laws minus the log evidence of the simulator as given."""
     tolerance = FORMULA_ERROR * max(plain.cost - noise2, 0.0)
     costs = plain.cost + tolerance, after.cost + tolerance
-    n = EffectiveSamples(noise2 + tolerance, max(effective_size(bench.scored(after.residual)), 1.0)).at(min(costs))
+    count = count_samples(bench.scored(after.residual), bench.scored(plain.residual), bench.scale)
+    n = EffectiveSamples(noise2 + tolerance, count).at(min(costs))
     known = information(bench, after, laws)
     return log_evidence(costs[1], known, log_prior(laws, {}), n) - log_evidence(costs[0], np.zeros(0), 0.0, n)
 

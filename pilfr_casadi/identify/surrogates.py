@@ -16,7 +16,7 @@ import numpy as np
 from .._base import InputError, whole
 from ..data import Recording, as_recordings, check_for_identification, nrmse
 from ..models import PILFR, Parameter
-from ..simulators import Named, Port, Simulator
+from ..simulators import Named, Port, Simulator, one_hold
 from .fitting import fit
 from .modal_form import Mode, modes, to_continuous
 
@@ -51,10 +51,11 @@ def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = N
     Raises
     ------
     InputError
-        If nothing can be identified from the recordings, or nx is not a whole number of 0 or more.
+        If nothing can be identified from the recordings or they differ in `hold`, or nx is not a whole number of 0 or
+        more.
     """
     records = check_for_identification(as_recordings(recordings), 40)
-    hold = next((r.hold for r in records if r.hold), None)
+    hold = one_hold(records)
     # the sampled model has other states: with interpolated inputs, rest is not zero there
     records = tuple(r if r.period else r.with_(initial="estimate") for r in records)
     found: list[tuple[float, Simulator]] = []

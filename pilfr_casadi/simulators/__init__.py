@@ -85,6 +85,7 @@ if TYPE_CHECKING:
         needed_substeps as needed_substeps,
         one_hold as one_hold,
         rate_at_start as rate_at_start,
+        stated_hold as stated_hold,
         states_along as states_along,
     )
     from .user_file import user_variable as user_variable

@@ -285,80 +285,18 @@ class UnitSteps:
         return table[0], np.abs(table[0] - before)
 
 
-class UnitEquations:
-    """The dynamics, outputs and ports of a unit, from expressions of its derivatives or its steps (`_evaluate`)."""
-
-    def __init__(
-        self, steps: UnitSteps, states: tuple[str, ...], measured: tuple[str, ...], numbers: Callable[..., np.ndarray]
-    ) -> None:
-        self.steps, self.unit, self.states, self.outputs = steps, steps.unit, states, measured
-        self._numbers = numbers  # evaluates the same at points z, (K, n_rows)
-
-    def _evaluate(self, x: Named, u: Mapping[str, Any], p: Named) -> dict[str, Any]:
-        """Evaluate the derivatives or the next values of states, and the other outputs, by name."""
-        raise NotImplementedError
-
-    def _effect(self, factors: Mapping[str, float], moved: Sequence[str]) -> Callable[..., Any]:
-        """Make the effect of a unit force on the rows that it moves."""
-        raise NotImplementedError
-
-    def __call__(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
-        """Evaluate the derivatives, or the next states, by name: the dynamics of a `Simulator`."""
-        found = self._evaluate(x, u._values, p)
-        return {n: found[n] for n in self.states}
-
-    def measured(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
-        """Evaluate the outputs by name."""
-        found = {} if all(n in self.states for n in self.outputs) else self._evaluate(x, u._values, p)
-        return {n: x[n] + self._start_of(n) if n in self.states else found[n] for n in self.outputs}
-
-    def _start_of(self, state: str) -> float:
-        """Return the start value of a state, its zero; an output that is kept as a state has none."""
-        return self.unit.begin[state] if state in self.unit.states else 0.0
-
-    def signal(self, port: str, key: str, name: str) -> Callable[..., Any]:
-        """Make the local coordinate of a port, or its rate, from the name of a variable."""
-        if name in self.states:
-            start = self._start_of(name)
-            return lambda x: x[name] + start
-        if name in self.steps.others:
-            return lambda x, u, p: self._evaluate(x, u._values, p)[name]
-        known = [*self.unit.outputs, *(n for n in self.unit.states if n not in self.unit.outputs)]
-        raise unknown_signal(port, key, name, known)
-
-    def into(self, port: str, factors: Mapping[str, float]) -> Any:
-        """Make the effect of a unit force on states and outputs."""
-        z = self.steps.draw(PROBED_POINTS, True)
-        step = np.array([factors.get(n, 0.0) for n in self.steps.names])
-        none, once, twice = (self._numbers(z + k * step) for k in (0, 1, 2))
-        usable = np.all(np.isfinite(np.hstack([none, once, twice])), axis=1)
-        if not np.any(usable):
-            raise InputError(
-                f"{self.unit.path} fails at all values of its parameters that were tried for port {port!r}, within "
-                "their bounds; give narrower bounds."
-            )
-        none, once, twice = (found[usable] for found in (none, once, twice))
-        once, twice = once - none, twice - none
-        size = np.max(np.abs(once), axis=0) + NOMINAL * np.max(np.abs(none), axis=0)
-        moved = [n for n, change in zip(self.steps.rows, once.T, strict=True) if np.any(np.abs(change) > RELATIVE_STEP)]
-        moved = [n for n in moved if n in self.states or n in self.outputs]
-        linear = not np.any(np.abs(twice - 2 * once) > NOMINAL * size)
-        check_force(port, factors, linear, bool(moved))
-        return self._effect(factors, moved)
-
-
-class PolynomialEquations(UnitEquations):
+class Polynomials:
     """Polynomials that are the derivatives and the outputs of a unit, which is not called any more."""
 
-    discrete = False
+    discrete, dt, program_calls = False, None, dict[str, int]()
 
-    def __init__(self, steps: UnitSteps, measured: tuple[str, ...], polynomials: ca.Function) -> None:
-        super().__init__(steps, steps.unit.states, measured, steps.derivatives)
-        self.polynomials = polynomials
+    def __init__(self, steps: UnitSteps, polynomials: ca.Function) -> None:
+        self.steps, self.unit, self.polynomials = steps, steps.unit, polynomials
+        self.states, self.numbers = steps.unit.states, steps.derivatives
 
     @property
     def note(self) -> str:
-        """Origin of the equations, in words; a `Simulator` prints it."""
+        """Origin of the equations, in words."""
         return (
             f"{self.unit.path.name}: equations found from its steps, at states and inputs up to ten times their "
             "nominal size (1 where the file gives none); it is not called any more"
@@ -371,10 +309,12 @@ class PolynomialEquations(UnitEquations):
     def _by_name(self, rows: Any) -> dict[str, Any]:
         return dict(zip(self.steps.rows, ca.vertsplit(rows), strict=True))
 
-    def _evaluate(self, x: Named, u: Mapping[str, Any], p: Named) -> dict[str, Any]:
+    def evaluate(self, x: Named, u: Mapping[str, Any], p: Named) -> dict[str, Any]:
+        """Evaluate the derivatives of states, and the other outputs, by name."""
         return self._by_name(self.polynomials(self._stack(x, u, p)))
 
-    def _effect(self, factors: Mapping[str, float], moved: Sequence[str]) -> Callable[..., Any]:
+    def effect(self, factors: Mapping[str, float], moved: Sequence[str]) -> Callable[..., Any]:
+        """Make the effect of a unit force on the rows that it moves."""
         z = ca.SX.sym("z", len(self.steps.names))
         force = ca.SX(ca.DM([factors.get(n, 0.0) for n in self.steps.names]))
         along = ca.Function("along", [z], [ca.jtimes(self.polynomials(z), z, force)])
@@ -386,7 +326,7 @@ class PolynomialEquations(UnitEquations):
         return effect
 
 
-class SteppedEquations(UnitEquations):
+class Steps:
     """The steps of a unit, which is called at every sample.
 
     An output that is no state is read after a step, so it belongs to the next sample and is kept as a state.
@@ -394,8 +334,9 @@ class SteppedEquations(UnitEquations):
 
     discrete = True
 
-    def __init__(self, steps: UnitSteps, measured: tuple[str, ...]) -> None:
-        super().__init__(steps, steps.rows, measured, partial(steps.results, h=steps.unit.dt))
+    def __init__(self, steps: UnitSteps) -> None:
+        self.steps, self.unit, self.states, self.dt = steps, steps.unit, steps.rows, steps.unit.dt
+        self.numbers = partial(steps.results, h=self.dt)
         n = len(steps.unit.states)
         sizes = np.concatenate([[1.0], steps.sizes[:n], np.ones(len(steps.others)), steps.sizes[n:]])
         self._nominal = NOMINAL * sizes
@@ -404,7 +345,7 @@ class SteppedEquations(UnitEquations):
 
     @property
     def note(self) -> str:
-        """Origin of the equations, in words; a `Simulator` prints it."""
+        """Origin of the equations, in words."""
         searched = self.unit.described.variable_steps
         why = "no equations were found" if searched else "the length of its steps cannot be changed"
         return (
@@ -418,23 +359,19 @@ class SteppedEquations(UnitEquations):
         """Number of calls by the file's name."""
         return self._box.program_calls
 
-    @property
-    def dt(self) -> float:
-        """Length of the steps, s."""
-        return self.unit.dt
-
-    def _evaluate(self, x: Named, u: Mapping[str, Any], p: Named) -> dict[str, Any]:
+    def evaluate(self, x: Named, u: Mapping[str, Any], p: Named) -> dict[str, Any]:
+        """Evaluate the next values of states, and the other outputs, by name."""
         return self._box(x, Named("input", {n: u.get(n, self.unit.begin[n]) for n in self.steps.inputs}), p, 0.0)
 
     def _step(self, z: np.ndarray) -> np.ndarray:
         """Step from one point z = (t, x, u, p)."""
-        return self._numbers(self._reduced(z[None]))[0]
+        return self.numbers(self._reduced(z[None]))[0]
 
     def _slopes(self, z: np.ndarray) -> np.ndarray:
         """Compute the differences by x, u and p in one call."""
         h = RELATIVE_STEP * np.maximum(np.abs(z), self._nominal)[1:]
         points = np.vstack([z, z + np.hstack([np.zeros((len(h), 1)), np.diag(h)])])
-        found = self._numbers(self._reduced(points))
+        found = self.numbers(self._reduced(points))
         return np.asarray((found[1:] - found[0]).T / h)
 
     def _reduced(self, z: np.ndarray) -> np.ndarray:
@@ -442,21 +379,84 @@ class SteppedEquations(UnitEquations):
         n = 1 + len(self.unit.states)
         return np.delete(z, [0, *range(n, n + len(self.steps.others))], axis=1)
 
-    def _effect(self, factors: Mapping[str, float], moved: Sequence[str]) -> Callable[..., Any]:
+    def effect(self, factors: Mapping[str, float], moved: Sequence[str]) -> Callable[..., Any]:
+        """Make the effect of a unit force on the rows that it moves."""
         start = self.unit.begin
 
         def effect(p: Named) -> dict[str, Any]:  # at rest
             at = Named("state", dict.fromkeys(self.states, ca.SX(0.0)))
             before, after = (
-                self._evaluate(at, {n: start[n] + k * factors.get(n, 0.0) for n in self.steps.inputs}, p)
-                for k in (0, 1)
+                self.evaluate(at, {n: start[n] + k * factors.get(n, 0.0) for n in self.steps.inputs}, p) for k in (0, 1)
             )
             return {n: after[n] - before[n] for n in moved}
 
         return effect
 
 
-def find_equations(steps: UnitSteps, measured: tuple[str, ...]) -> PolynomialEquations | SteppedEquations:
+class UnitEquations:
+    """The dynamics, outputs and ports of a unit, from expressions of its derivatives or its steps."""
+
+    def __init__(self, steps: UnitSteps, expressions: Polynomials | Steps, measured: tuple[str, ...]) -> None:
+        self.steps, self.unit, self.expressions, self.outputs = steps, steps.unit, expressions, measured
+        self.states, self.discrete, self.dt = expressions.states, expressions.discrete, expressions.dt
+
+    @property
+    def note(self) -> str:
+        """Origin of the equations, in words; a `Simulator` prints it."""
+        return self.expressions.note
+
+    @property
+    def program_calls(self) -> dict[str, int]:
+        """Number of calls by the file's name."""
+        return self.expressions.program_calls
+
+    def __call__(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
+        """Evaluate the derivatives, or the next states, by name: the dynamics of a `Simulator`."""
+        found = self.expressions.evaluate(x, u._values, p)
+        return {n: found[n] for n in self.states}
+
+    def measured(self, x: Named, u: Named, p: Named) -> dict[str, Any]:
+        """Evaluate the outputs by name."""
+        read = not all(n in self.states for n in self.outputs)
+        found = self.expressions.evaluate(x, u._values, p) if read else {}
+        return {n: x[n] + self._start_of(n) if n in self.states else found[n] for n in self.outputs}
+
+    def _start_of(self, state: str) -> float:
+        """Return the start value of a state, its zero; an output that is kept as a state has none."""
+        return self.unit.begin[state] if state in self.unit.states else 0.0
+
+    def signal(self, port: str, key: str, name: str) -> Callable[..., Any]:
+        """Make the local coordinate of a port, or its rate, from the name of a variable."""
+        if name in self.states:
+            start = self._start_of(name)
+            return lambda x: x[name] + start
+        if name in self.steps.others:
+            return lambda x, u, p: self.expressions.evaluate(x, u._values, p)[name]
+        known = [*self.unit.outputs, *(n for n in self.unit.states if n not in self.unit.outputs)]
+        raise unknown_signal(port, key, name, known)
+
+    def into(self, port: str, factors: Mapping[str, float]) -> Any:
+        """Make the effect of a unit force on states and outputs."""
+        z = self.steps.draw(PROBED_POINTS, True)
+        step = np.array([factors.get(n, 0.0) for n in self.steps.names])
+        none, once, twice = (self.expressions.numbers(z + k * step) for k in (0, 1, 2))
+        usable = np.all(np.isfinite(np.hstack([none, once, twice])), axis=1)
+        if not np.any(usable):
+            raise InputError(
+                f"{self.unit.path} fails at all values of its parameters that were tried for port {port!r}, within "
+                "their bounds; give narrower bounds."
+            )
+        none, once, twice = (found[usable] for found in (none, once, twice))
+        once, twice = once - none, twice - none
+        size = np.max(np.abs(once), axis=0) + NOMINAL * np.max(np.abs(none), axis=0)
+        moved = [n for n, change in zip(self.steps.rows, once.T, strict=True) if np.any(np.abs(change) > RELATIVE_STEP)]
+        moved = [n for n in moved if n in self.states or n in self.outputs]
+        linear = not np.any(np.abs(twice - 2 * once) > NOMINAL * size)
+        check_force(port, factors, linear, bool(moved))
+        return self.expressions.effect(factors, moved)
+
+
+def find_equations(steps: UnitSteps, measured: tuple[str, ...]) -> UnitEquations:
     """Look for the equations of a unit; without them, step it. `measured` are the recorded outputs."""
     found = steps.find_polynomials()
-    return SteppedEquations(steps, measured) if found is None else PolynomialEquations(steps, measured, found)
+    return UnitEquations(steps, Steps(steps) if found is None else Polynomials(steps, found), measured)

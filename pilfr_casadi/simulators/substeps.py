@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, usable
-from ..data import Recording
+from ..data import Recording, moves_freely
 from ..models import Model
 from .equations import Equations
 from .fmu_function import accumulate_steps, map_points
@@ -108,10 +108,21 @@ def choose_substeps(simulator: Equations, recordings: Sequence[Recording]) -> in
 
 
 def discretise_for(simulator: Equations, recordings: Sequence[Recording]) -> Model:
-    """Discretise on the recordings' grid, with their hold of the inputs (else the simulator's) and enough sub-steps."""
-    stated = None if simulator.discrete else one_hold(recordings)
-    hold = stated or simulator.hold or "zero"
+    """Discretise on the recordings' grid, with the stated hold of the inputs, else zero, and enough sub-steps."""
+    hold = stated_hold(simulator, recordings) or "zero"
     return discretise(simulator, recordings[0].dt, hold, choose_substeps(simulator, recordings))
+
+
+def stated_hold(simulator: Equations, recordings: Sequence[Recording], hold: str | None = None) -> str | None:
+    """Return the hold that the recordings, the caller or the simulator state, in this order; None if none of them does.
+
+    A simulator in discrete time reads its inputs at the samples, whatever the recordings state between them. Without an
+    input that changes, any hold is the same.
+    """
+    stated = hold or simulator.hold
+    if simulator.discrete:
+        return stated or "zero"
+    return one_hold(recordings) or stated or ("zero" if moves_freely(recordings) else None)
 
 
 def one_hold(recordings: Sequence[Recording]) -> str | None:

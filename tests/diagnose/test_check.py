@@ -440,6 +440,21 @@ def test_hold_and_start_are_told(mass):
     assert unsaid.hold == "" and "not stated" in str(unsaid) and unsaid.starts == ("estimated",)
 
 
+@pytest.mark.parametrize("hold", [None, "linear"])
+def test_a_simulator_in_discrete_time_reads_inputs_at_the_samples(mass, hold):
+    slow = Simulator(
+        lambda x, u, p: {"pos": p.a * x.pos + u[mass[0].inputs[0]]},
+        lambda x: {mass[0].outputs[0]: x.pos},
+        ("pos",),
+        mass[0].inputs,
+        parameters={"a": Parameter(0.9, bounds=(0.1, 1))},
+        discrete=True,
+    )
+    given = mass[0].with_(initial="zero", hold=hold)
+    found = check(slow, given.with_(y=slow.simulate(given) + given.y * 1e-3), laws=())
+    assert found.hold == found.hold_taken == "zero"
+
+
 def test_an_unstated_hold_is_the_one_that_fits_better(mass):
     given, _ = mass
     for hold in ("zero", "linear"):

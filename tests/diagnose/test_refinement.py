@@ -8,6 +8,7 @@ import pytest
 from diagnosis_example import example, recorded, rig
 
 import pilfr_casadi as pilfr
+from pilfr_casadi.diagnose.search.moves import Search
 from pilfr_casadi.laws import Law, Local, PlayHysteresis, StopHysteresis, hysteresis_layer, unit_forces
 from pilfr_casadi.models import play, stop
 
@@ -52,6 +53,12 @@ def test_a_layer_of_many_operators_predicts_better(many, refined):
     assert refined.nrmse(test) == pytest.approx(refined.errors["test"]["refined"])
     assert refined.held_out[refined.kind].score < refined.held_out["diagnosed"].score
     assert np.max(np.abs(refined.simulate(test) - test.y)) < 0.01 * np.max(np.abs(test.y))
+
+
+def test_a_refinement_counts_samples_as_the_search_does(many, refined, monkeypatch):
+    monkeypatch.setattr(Search, "count_samples", lambda *_: 1.0)
+    found = many.refine(operators=2, kind="stop")
+    assert found.held_out["diagnosed"].spread > 5 * refined.held_out["diagnosed"].spread
 
 
 def test_weights_and_thresholds_are_bounded_below_by_zero(refined):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from fleet_rig import PORT, recording, rig
+from simulated import outputs_of
 
 from pilfr_casadi._base import InputError
 from pilfr_casadi.diagnose import refit_error, replicate
@@ -33,6 +34,17 @@ def test_a_law_that_a_machine_lacks_gains_nothing():
     smooth = recording(1300.0, 3, friction=0.0)
     found = replicate(rig(), smooth, FRICTION)
     assert found.gain < 0 and found.by_recording == () and found.remainder < 0.2
+
+
+def test_samples_at_rest_are_no_evidence(days):
+    """A machine moves for 240 samples, and then stands."""
+    rng, moved, gains = np.random.default_rng(1), days[0], []
+    true = rig().with_element(PORT, CoulombFriction({"F_c": 5.0, "v_0": 5e-3})).with_parameters({"k": 1300.0})
+    for count in (1000, 4000):
+        r = moved.with_(u=np.vstack([moved.u, np.zeros((count, 1))]), y=np.zeros((len(moved) + count, 1)))
+        noise = 3e-3 * np.std(moved.y) * rng.standard_normal(r.y.shape)
+        gains.append(replicate(rig(), r.with_(y=outputs_of(true, r, substeps=20) + noise), FRICTION).gain)
+    assert 0 < gains[1] <= gains[0]
 
 
 def test_without_laws_the_rest_is_told(days):

@@ -14,6 +14,7 @@ from pilfr_casadi import (
     Combined,
     Envelope,
     GeneralizedPlay,
+    Parameter,
     Part,
     Play,
     PrandtlIshlinskii,
@@ -26,7 +27,7 @@ from pilfr_casadi import (
     ssnn,
 )
 from pilfr_casadi.engine import VirtualMachine, compiler
-from pilfr_casadi.laws import CubicStiffness, StopHysteresis
+from pilfr_casadi.laws import CubicStiffness, StopHysteresis, heated
 from pilfr_casadi.linear import modal
 from pilfr_casadi.models import ParameterSet
 from pilfr_casadi.simulators import discretise, fastest_rates, load_simulator
@@ -122,6 +123,10 @@ def simulators(every):
     out["masing, corrected"] = spring.with_element("ground-m2", dose(CubicStiffness)), 1 / 120, "zero", None
     out["interpolated"] = mass_on_spring().with_element("ground", dose(StopHysteresis)), 0.02, "linear", 3
     out["many sub-steps"] = mass_on_spring().with_element("ground", dose(StopHysteresis)), 0.05, "linear", 9
+    heat = {"c": -0.5, "T": 0.5, "s_2": 4.0}
+    out["a warm damper"] = mass_on_spring().with_element("parameter:d", heated("vel")().at(heat)), 0.02, "zero", 2
+    oily = mass_on_spring().with_parameters({"d": Parameter(1.0, bounds=(0, 10))})  # its viscosity falls exponentially
+    out["warm oil"] = oily.with_element("parameter:d", heated("force")().at(heat)), 0.02, "zero", 2
     element = PrandtlIshlinskii(Stop, 3)
     out["stops in a port"] = close_loop(mass_on_spring(), element, "ground"), 0.02, "zero", None
     return out

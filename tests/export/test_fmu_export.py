@@ -12,7 +12,7 @@ from exported_fits import CASES, mass_on_spring, one_sentence, recording_for, so
 
 from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, exported
 from pilfr_casadi.engine import compiler
-from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Delay, Drift, Relaxation, StopHysteresis
+from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Delay, Drift, Relaxation, StopHysteresis, heated
 
 pytest.importorskip("fmpy")
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler")
@@ -78,11 +78,12 @@ def close(found, wanted):
 
 
 def with_laws():
-    """A simulator with memory, an own state, a delay and time, each from a law of its own."""
+    """A simulator with memory, an own state, a delay, heat and time, each from a law of its own."""
     held = StopHysteresis({"w": 5.0, "r": np.linspace(0.1, 0.6, 6)})
     simulator = mass_on_spring().with_element("ground", held)
     simulator = simulator.with_element("ground", Relaxation({"k_v": 2.0, "T": 0.3}))
     simulator = simulator.with_element("actuator:force", Delay({"T": 0.05}))
+    simulator = simulator.with_element("parameter:d", heated("vel")().at({"c": 0.5, "T": 0.5, "s_2": 0.01}))
     return simulator.with_element("sensor:y", Drift({"a": 0.1, "b": 0.0}))
 
 

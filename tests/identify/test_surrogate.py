@@ -127,6 +127,11 @@ def test_a_surrogate_finds_the_modes_of_a_simulation(hold):
     assert np.std(again - record.y) < 2e-3 * np.std(record.y)
 
 
+def test_simulations_with_different_holds_are_refused():
+    with pytest.raises(InputError, match="differ in `hold`"):
+        surrogate([simulation(seed).with_(hold=hold) for seed, hold in enumerate(("zero", "linear"))])
+
+
 def test_a_lag_has_one_real_mode():
     simulator, error = surrogate(simulation(lag=True))
     assert error < 1e-3

@@ -199,14 +199,19 @@ def test_users_text_is_text(drawn, tmp_path, without_drawing):
     assert all("<" not in f.name and "/" not in f.name for f in (tmp_path / "figures").iterdir())
 
 
-@pytest.mark.parametrize(("port", "law"), PAIRS)
-def test_the_lines_of_code_run(port, law, tmp_path, monkeypatch):
-    d = example(port=port, law=law)
+@pytest.mark.parametrize(
+    ("port", "law", "hold"),
+    [*((*pair, "zero") for pair in PAIRS), ("ground", "ground", "linear"), ("ground", "ground", "band-limited")],
+)
+def test_the_lines_of_code_run(port, law, hold, tmp_path, monkeypatch):
+    d = replace(example(port=port, law=law), hold=hold)
     module = types.ModuleType("your_file")
     module.simulator = rig(380.0, 4.4)
     monkeypatch.setitem(sys.modules, "your_file", module)
     monkeypatch.chdir(tmp_path)
-    r = d.train[0]
+    r = d.train[0].with_(hold=hold)
+    step_hold = "zero" if hold == "zero" else "linear"  # a step does not know the inputs around it
+    r = r.with_(y=d.corrected.simulate(r.with_(hold=step_hold)))
     rows = np.column_stack([r.t, r.u, r.y])
     np.savetxt("new.csv", rows, delimiter=",", header="t,force,pos", comments="", fmt="%.12g")
     space = {}

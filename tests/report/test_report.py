@@ -10,10 +10,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from browser import in_a_browser, needs_chromium
+from diagnosis_example import recorded, rig
 
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording
-from pilfr_casadi.identify import Fit, load
+from pilfr_casadi.identify import Fit, fit, load
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, block_shapes
 from pilfr_casadi.optimise import Iteration, Solution, Status
 from pilfr_casadi.plots import chart, new_figure
@@ -26,6 +27,7 @@ from pilfr_casadi.report import (
     Section,
     Table,
     Text,
+    fit_page,
     fit_report,
     mode_tables,
     number_text,
@@ -201,6 +203,22 @@ def test_the_page_of_a_fit(tmp_path):
     assert len(images) == 2 * 4 + 4 + 1 + 1 + 1 and all(i["alt"] for i in images)
     assert len(reader.all("figcaption")) == len(images)
     assert len(html) < 3_000_000
+
+
+@pytest.mark.filterwarnings("ignore:.*holds the fitted values, not the simulator's equations")
+def test_the_lines_of_code_of_a_fit_with_interpolated_inputs_run(tmp_path, monkeypatch):
+    simulator = rig()
+    r = recorded(rig(), 0, samples=200, hold="linear")
+    fitted = fit(simulator, r, engine="vm")
+    page = fit_page(fitted, [r], [])
+    (code,) = [block.code for section in page.sections for block in section.blocks if isinstance(block, Code)]
+    monkeypatch.chdir(tmp_path)
+    fitted.save("model.json")
+    rows = np.column_stack([r.t, r.u, r.y])
+    np.savetxt("new.csv", rows, delimiter=",", header="t,force,pos", comments="", fmt="%.17g")
+    space = {"model": simulator}
+    exec(code, space)
+    assert float(space["y0"]) == pytest.approx(space["y"][0, 0])
 
 
 def test_the_table_of_errors_is_that_of_the_fit():

@@ -251,6 +251,11 @@ def acting_samples(residuals: Sequence[np.ndarray], scale: np.ndarray) -> float:
     return float(min(acting, errors.size))
 
 
+def count_samples(residuals: Sequence[np.ndarray], mismatch: Sequence[np.ndarray], scale: np.ndarray) -> float:
+    """Count the independent samples of a fit's residuals, at most those in which the mismatch it explains acts."""
+    return max(min(effective_size(residuals), acting_samples(mismatch, scale)), FEWEST)
+
+
 def swells_with(residuals: Sequence[np.ndarray], signals: Sequence[np.ndarray]) -> bool:
     """Tell whether a residual's power follows any column of signals of the same length; that of noise does not.
 

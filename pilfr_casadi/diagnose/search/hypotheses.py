@@ -37,7 +37,7 @@ from ..fits.evidence import (
     spread,
 )
 from ..fits.flexible_forces import flexible_shares, innovation_share
-from ..fits.floor import FEWEST, Floor, acting_samples, effective_size, white_part
+from ..fits.floor import FEWEST, Floor, count_samples, white_part
 from ..fits.force_recovery import is_curve_along
 from ..fits.screen import Scored, screen
 from ..fits.workbench import DIVERGED, Fitted, Workbench
@@ -418,8 +418,8 @@ class Hypotheses:
 
     def count_samples(self, fitted: Fitted) -> float:
         """Count the samples over the correlation time of a fit's residual, at most those in which the mismatch acts."""
-        acting = acting_samples(self.bench.scored(self.root.fitted.residual), self.bench.scale)
-        return max(min(effective_size(self.bench.scored(fitted.residual)), acting), FEWEST)
+        residuals, mismatch = (self.bench.scored(f.residual) for f in (fitted, self.root.fitted))
+        return count_samples(residuals, mismatch, self.bench.scale)
 
     def rms(self, trial: Trial) -> np.ndarray:
         """Compute the rms error of each output, (n_y,)."""

@@ -146,8 +146,8 @@ def test_other_inputs_that_lead_past_an_unstable_rest_do_not_count_as_ignorance_
     assert spread(bench, fitted, (), fitted.cost, 600.0) < 0.01 * fitted.cost  # one value from 600 samples
 
 
-def test_a_law_with_states_does_not_make_predictions_less_sure_the_more_recordings_there_are():
-    """Each piece of a recording has a first state of the lag, which says nothing of other inputs."""
+def test_first_states_of_laws_do_not_make_predictions_less_sure_and_those_of_the_simulator_do():
+    """Each piece of a recording has a first state of the lag, which says nothing of other inputs, and of the heater."""
     heater = pilfr.Simulator(
         lambda x, u, p: {"T": (p.g * u.heat - x.T) / p.tau},
         lambda x: {"T": x.T},
@@ -160,7 +160,7 @@ def test_a_law_with_states_does_not_make_predictions_less_sure_the_more_recordin
     heat = np.repeat(rng.standard_normal((40, 1)), 20, axis=0)
     whole = pilfr.Recording(heat, np.zeros((800, 1)), 1.0, ("heat",), ("T",), initial="zero")
     whole = whole.with_(y=heater.simulate(whole) + 0.1 * rng.standard_normal((800, 1)))
-    found = []
+    by_heater, by_lag = [], []
     for count in (1, 2, 4, 8):
         pieces = [
             r.with_(initial="estimate") for r in (whole.slice(k, k + 800 // count) for k in range(0, 800, 800 // count))
@@ -168,8 +168,10 @@ def test_a_law_with_states_does_not_make_predictions_less_sure_the_more_recordin
         bench = Workbench.of(heater, pieces, "zero")
         alone, lagged = (bench.fit(s) for s in (heater, heater.with_element("sensor:T", laws.Lag().at({"T": 2.0}))))
         of_both = [spread(bench, f, f.simulator.elements, f.cost, 8.0) / f.cost for f in (alone, lagged)]
-        found.append(of_both[1] - of_both[0])
-    assert max(found) < 0.4  # one value more, eight samples
+        by_heater.append(of_both[0])
+        by_lag.append(of_both[1] - of_both[0])
+    assert max(by_lag) < 0.4  # one value more, eight samples
+    assert by_heater[-1] - by_heater[0] == pytest.approx(7 / 8, abs=0.1)  # seven states more
 
 
 def test_the_more_a_force_would_follow_of_the_rest_the_less_the_name_is_believed():

@@ -104,6 +104,25 @@ def test_at_the_time_limit_the_search_answers_from_what_it_has():
         pilfr.diagnose(rig(OFF), r, time_limit=0)
 
 
+@pytest.mark.parametrize("late", [False, True])
+def test_after_the_time_of_the_search_only_the_best_new_fit_is_converged(monkeypatch, late):
+    converge, fit_pairs, converged = Trials.converge, Trials.fit_pairs, list[Trial]()
+
+    def fit_until_the_limit(*given):
+        trials = fit_pairs(*given)
+        found.until = 0.0 if late else np.inf
+        return trials
+
+    found = searching(rubbing())
+    found.laws = (laws.CubicStiffness, laws.ViscousDamping)  # they follow about alike
+    monkeypatch.setattr(Trials, "fit_pairs", fit_until_the_limit)
+    monkeypatch.setattr(Trials, "converge", lambda self, trial: converged.append(trial) or converge(self, trial))
+    found.run(1)
+    assert len(found.memo) > 3
+    assert (len(converged) == 1) == late
+    assert converged[0].key == max((t for t in found.memo.values() if t.laws), key=found.optimistic_evidence).key
+
+
 def test_hypotheses_are_not_compared_by_different_errors_where_time_ran_out(monkeypatch):
     """Held-out errors are larger than fit errors: a law that was judged on them lost to one that was not."""
     found = searching(rubbing()).run(1)
