@@ -87,6 +87,9 @@ class Check:
         `source`; `deviation` and its `share` of the output's deviation, both by output.
     error : float
         NRMSE of the refitted simulator.
+    rough : bool
+        Whether the simulated motion is not the machine's, so that nothing that follows from it is exact. All recordings
+        are judged together, because in a quiet one among loud ones the relative error says little.
     hold, starts : str, tuple of str
         Stated course of the inputs between samples ("" if not stated), and the start of each recording.
     hold_taken : str
@@ -111,6 +114,7 @@ class Check:
     excitation: tuple[Excitation, ...]
     noise: dict[str, Any]
     error: float
+    rough: bool
     hold: str
     starts: tuple[str, ...]
     hold_taken: str = "zero"
@@ -124,11 +128,6 @@ class Check:
     def detectable(self) -> tuple[LawRow, ...]:
         """Laws that are detectable."""
         return tuple(r for r in self.laws if r.status == "detectable")
-
-    @property
-    def rough(self) -> bool:
-        """Whether the simulated motion is not the machine's, so that nothing that follows from it is exact."""
-        return self.error**2 > USELESS_FIT
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of check.json; numbers that are not finite are None."""
@@ -339,6 +338,7 @@ def assess_recordings(
             "share": dict(zip(outputs, (noise / bench.scale).tolist(), strict=True)),
         },
         error=bench.nrmse(fitted),
+        rough=bool(np.mean(fitted.squares) > USELESS_FIT),
         hold=stated if inputs else "",
         hold_taken=bench.hold if inputs else "",
         idle_inputs=bench.simulator.idle_inputs,

@@ -224,8 +224,9 @@ class ResultText:
         out += self._doubtful_offsets()
         train, test = self.errors["train"], None if self.test_fault else self.errors["test"]
         if train and train["before"] > NEAR_CONSTANT and self.verdict in ("missing-physics", "unexplained"):
+            than = "worse than" if train["before"] > 1 / NEAR_CONSTANT else "hardly better than"
             out.append(
-                f"Refitted, the simulator alone is hardly better than a constant (error {percent(train['before'])} of "
+                f"Refitted, the simulator alone is {than} a constant (error {percent(train['before'])} of "
                 "the outputs' deviation). Either its values, units or bounds are wrong: check them before you "
                 "trust a name. Or large physics is missing: then the corrected simulator follows far better."
             )

@@ -193,6 +193,13 @@ def _which_laws(search: Hypotheses) -> str:
     return f"none of the laws that were fitted before the time limit ({pairs})"
 
 
+def _fails(search: Hypotheses) -> str:
+    """Say that no law explains the mismatch, or that none was fitted."""
+    if len(search.memo) == 1 and not search.out_of_time and _allowed_laws(search) != "":
+        return "no law was fitted, because all that is left may be noise"
+    return f"{_which_laws(search)} explains it"
+
+
 def _allowed_laws(search: Hypotheses) -> str | None:
     """List the laws that were allowed; None if all of the catalogue were."""
     if {law.__name__ for law in search.laws} >= {law.__name__ for law in CATALOGUE}:
@@ -243,7 +250,7 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
         or_noise = ", or the noise is large and slow" if large and not mode else ""
         refitted = _refitted(search).replace("refitted", "Refitted", 1)
         return (
-            f"Physics is missing{or_noise}, and {_which_laws(search)} explains it. {refitted}, the simulator is off by "
+            f"Physics is missing{or_noise}, and {_fails(search)}. {refitted}, the simulator is off by "
             f"{percent(search.bench.nrmse(root.fitted))} of the outputs' deviation; the noise is {least} "
             f"{percent(noise)}.{at}{rings}"
         )

@@ -258,6 +258,9 @@ def test_without_laws_no_law_is_blamed_and_an_offset_is_no_closest_law(dry_frict
     assert found.sentence.startswith("Physics is missing, and no law (none was allowed) explains it.")
     search = found.evidence.search
     assert any(t.laws for t in search.memo.values()) and closest_hypothesis(search) is None
+    search.laws, search.memo = CATALOGUE, {frozenset(): search.root}
+    said = judge(search, replace(posterior(search), effects=()), ()).sentence
+    assert said.startswith("Physics is missing, and no law was fitted, because all that is left may be noise.")
 
 
 def test_one_hypothesis_is_told_where_the_time_ended_before_a_comparison(dry_friction):

@@ -39,7 +39,8 @@ def find_tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
         unit = bench.recordings[0].units.get(name, "")
         sentence = (
             f"{name} holds a steady tone of {f:.4g} Hz, amplitude {value_with_unit(amplitude, unit)}, that is in no "
-            "input, as from mains hum or a fan: shield or filter it, or record what causes it."
+            "input, as from mains hum, a fan, or a mode with little damping that the simulator lacks: shield or filter "
+            "it, record what causes it, or add the mode."
         )
         scale = bench.balanced(fitted).scale
         share = amplitude**2 / 2 / scale[i] ** 2 / len(scale) / fitted.cost

@@ -24,6 +24,7 @@ CORRELATED, P_VALUE = 0.5, 1e-4  # rank correlation, and its p-value, from which
 REFUTED = 0.01  # probability under measured noise below which an error is not that noise
 ABOVE_NOISE = 2.0  # ratio of the error to the noise from which results say that more is missing
 FEWEST = 30.0  # effective samples that a residual has at least
+OUTSTANDING = 5.0  # standard errors by which third differences exceed white noise, above which they hold oscillations
 LONGEST = 400  # longest correlation of a residual, in samples
 DISTINCT_SHARE = 0.5  # share of the samples with distinct values above which a signal is not quantised
 FEWEST_LEVELS = 10  # of a quantised signal; one with fewer is a switch
@@ -216,8 +217,25 @@ def white_part(residuals: Sequence[np.ndarray]) -> np.ndarray:
 
     Recordings with too few samples for such a difference say nothing, unless there are no others.
     """
-    long = [third_differences(e) for e in residuals if len(e) > 3] or residuals
-    return np.asarray(np.min([np.sqrt(np.mean(e**2, axis=0)) for e in long], axis=0))
+    long = [_without_lines(third_differences(e)) for e in residuals if len(e) > 3]
+    return np.asarray(np.min(long or [np.sqrt(np.mean(e**2, axis=0)) for e in residuals], axis=0))
+
+
+def _without_lines(differences: np.ndarray) -> np.ndarray:
+    """Compute the rms of third differences (M, n_y), without fast oscillations, which stand out of the upper spectrum.
+
+    Over its expected course the spectrum of white noise is exponentially distributed, so that its median is ln 2 of its
+    mean, with a standard error of 1 / ln 2 over the root of the number of lines. The median does not see a few of them.
+    """
+    mean2, n = np.mean(differences**2, axis=0), len(differences)
+    f = np.arange(n // 4, (n + 1) // 2) / n
+    if len(f) < FEWEST:
+        return np.asarray(np.sqrt(mean2))
+    course = (2 * np.sin(np.pi * f)) ** 6 / 20
+    lines = np.abs(np.fft.fft(differences, axis=0)[n // 4 : (n + 1) // 2]) ** 2 / n
+    median2 = np.median(lines / course[:, None], axis=0) / np.log(2)
+    most = (1 + OUTSTANDING / (np.log(2) * np.sqrt(len(f)))) * median2
+    return np.asarray(np.sqrt(np.where(mean2 > most, median2, mean2)))
 
 
 def times_white(residual: np.ndarray) -> float:

@@ -12,6 +12,7 @@ from pilfr_casadi.diagnose.fits.floor import (
     measured_floor,
     pool,
     swells_with,
+    third_differences,
     white_part,
 )
 
@@ -208,3 +209,12 @@ def test_no_error_and_no_finite_error_are_pooled_as_they_are():
     assert pool(np.zeros(2), noise2)[0] == 0
     assert pool(np.array([np.inf, 1.0]), noise2)[0] == np.inf
     assert pool(np.array([1e-6, 1e-6]), np.zeros(2))[0] == pytest.approx(1e-6)
+
+
+def test_a_mode_near_half_the_sampling_rate_is_no_white_noise():
+    rng, t = np.random.default_rng(0), np.arange(1400)
+    noise = 0.05 * rng.standard_normal((1400, 1))
+    mode = (np.exp(-t / 400) * np.sin(2 * np.pi * 0.452 * t))[:, None]
+    assert white_part([noise]) == pytest.approx(np.sqrt(np.mean(third_differences(noise) ** 2)), rel=1e-12)
+    assert 0.045 < white_part([noise + mode])[0] < 0.1
+    assert np.sqrt(np.mean(third_differences(noise + mode) ** 2)) > np.std(noise + mode)
