@@ -107,6 +107,10 @@ class Gate:
         """Return which samples of a recording are still scored after the correction."""
         return slice(r.skip, None)
 
+    def count_samples(self, residuals: Sequence[np.ndarray]) -> float:
+        """Count the samples that speak for the correction, from the residuals (M, n_y) that it leaves."""
+        return max(effective_size(residuals), FEWEST)
+
     def begin(self, previous: Fitted) -> Sequence[np.ndarray]:
         """Return guesses of the initial states of the corrected recordings."""
         return previous.begin
@@ -185,12 +189,14 @@ class Checked:
 # the one rule
 
 
-def evidence_gain(before: float, after: float, residuals: Sequence[np.ndarray], parameters: int = 1) -> float:
+def evidence_gain(
+    before: float, after: float, residuals: Sequence[np.ndarray], parameters: int = 1, samples: float | None = None
+) -> float:
     """Compute the gain in log evidence, nats, of a fit with more parameters, by BIC on its effective samples.
 
-    `residuals` (M, n_y) are its scored samples in each recording.
+    `residuals` (M, n_y) are its scored samples in each recording; `samples` is their effective number, if it is known.
     """
-    n = max(effective_size(residuals), FEWEST)
+    n = max(effective_size(residuals), FEWEST) if samples is None else samples
     return float(0.5 * n * np.log(before / max(after, 1e-300)) - 0.5 * parameters * np.log(n))
 
 
@@ -276,7 +282,8 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
 
 def satisfies_rule(before: float, after: Checked, fault: Gate) -> bool:
     """Tell whether the rule accepts a fault whose correction reduces the mean square error `before`."""
-    gained = evidence_gain(before, after.cost, after.residuals, fault.parameters)
+    samples = fault.count_samples(after.residuals)
+    gained = evidence_gain(before, after.cost, after.residuals, fault.parameters, samples)
     return gained > LEAST_GAIN and after.cost < min(fault.most_left * before, USELESS_FIT)
 
 

@@ -18,7 +18,7 @@ from ...data import Recording, moves_freely
 from ...laws import Gain, Law
 from ...simulators import ACTUATOR, EQUATION, SENSOR, Simulator, in_series, kind_of, port_name, split_port
 from ..fits.evidence import FORMULA_ERROR
-from ..fits.floor import ABOVE_NOISE, noise_floor
+from ..fits.floor import ABOVE_NOISE, noise_floor, samples_of_mean
 from ..fits.screen import block_diagonal, lengths
 from ..fits.workbench import FEW, THOROUGH, Fitted, Workbench, refit
 from .gates import (
@@ -165,6 +165,10 @@ class Constant(Gate):
     def apply(self, bench: Workbench) -> Workbench:
         """Return the bench with the constant in its simulator."""
         return replace(bench, simulator=bench.simulator.with_element(self.port, _law_of_constant(self.port)))
+
+    def count_samples(self, residuals: Sequence[np.ndarray]) -> float:
+        """Count the samples that determine a mean: slow physics that is missing hides a constant."""
+        return samples_of_mean(residuals)
 
 
 def describe_constant(port: str, value: float = 0.0, parameter: str = "", unit: str = "", alike: str = "") -> Constant:
@@ -425,7 +429,8 @@ def fix_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
         simulator = fitted.simulator.with_parameters({**fitted.simulator.parameters, name: zero})
         start = {k: v for k, v in fitted.values.items() if k != name}
         found = refit(bench, [start], simulator, states=fitted.initial, solver=THOROUGH)
-        if found is not None and evidence_gain(found.cost, fitted.cost, bench.scored(fitted.residual)) <= LEAST_GAIN:
+        rest = bench.scored(fitted.residual)
+        if found and evidence_gain(found.cost, fitted.cost, rest, samples=samples_of_mean(rest)) <= LEAST_GAIN:
             fitted = found
     return fitted
 

@@ -257,6 +257,21 @@ def effective_size(residuals: Sequence[np.ndarray]) -> float:
     return total
 
 
+def samples_of_mean(residuals: Sequence[np.ndarray]) -> float:
+    """Count the independent samples that determine the residuals' means: the samples times variance over density.
+
+    The density is that of the slowest part of the spectrum, √M / 2 lines of M samples (Welch 1967 averages as many). A
+    slow residual hides a constant; a fast oscillation does not, however long it lasts.
+    """
+    total = 0.0
+    for e in residuals:
+        centred = e - e.mean(axis=0)
+        lines = np.abs(np.fft.rfft(centred, axis=0)) ** 2 / max(len(e), 1)
+        slow = np.mean(lines[1 : 2 + int(np.sqrt(len(e)) / 2)], axis=0) if len(e) > 2 else np.zeros(e.shape[1])
+        total += len(e) * float(np.sum(np.minimum(np.var(centred, axis=0) / np.maximum(slow, 1e-300), 1.0)))
+    return max(total, 1.0)
+
+
 def acting_samples(residuals: Sequence[np.ndarray], scale: np.ndarray) -> float:
     """Count the samples in which residuals act: all of Gaussian noise, few of bursts.
 

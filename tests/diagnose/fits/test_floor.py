@@ -11,6 +11,7 @@ from pilfr_casadi.diagnose.fits.floor import (
     effective_size,
     measured_floor,
     pool,
+    samples_of_mean,
     swells_with,
     third_differences,
     white_part,
@@ -218,3 +219,14 @@ def test_a_mode_near_half_the_sampling_rate_is_no_white_noise():
     assert white_part([noise]) == pytest.approx(np.sqrt(np.mean(third_differences(noise) ** 2)), rel=1e-12)
     assert 0.045 < white_part([noise + mode])[0] < 0.1
     assert np.sqrt(np.mean(third_differences(noise + mode) ** 2)) > np.std(noise + mode)
+
+
+def test_a_slow_residual_hides_a_mean_and_a_fast_oscillation_does_not():
+    rng, t = np.random.default_rng(0), np.arange(4000)
+    white = rng.standard_normal((4000, 1))
+    slow = lfilter([1.0], [1.0, -0.95], rng.standard_normal((4000, 1)), axis=0)
+    ringing = np.sin(2 * np.pi * 0.17 * t)[:, None]
+    assert 3000 < samples_of_mean([white]) <= 4000
+    assert samples_of_mean([slow]) == pytest.approx(4000 * 0.05 / 1.95, rel=0.4)
+    assert samples_of_mean([white + 5 * ringing]) == 4000 > 30 * effective_size([white + 5 * ringing])
+    assert samples_of_mean([slow, slow]) == pytest.approx(2 * samples_of_mean([slow]))
