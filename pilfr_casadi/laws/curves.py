@@ -200,7 +200,7 @@ class FreeCurve(Law):
         "T_i along its tangents outside -1 <= x <= 1"
     )
     source = "Plett (2015), Battery Management Systems, vol. 1, sec. 2.2; Press et al. (2007), sec. 5.8"
-    sentence = "a memoryless curve of a free shape, such as an open-circuit voltage over the state of charge"
+    sentence = "a memoryless curve of a shape that no formula has"
     units = {"c": "w", "z_m": "z", "z_h": "z"}
     strength = ("c",)
     constants = ("z_m", "z_h")
