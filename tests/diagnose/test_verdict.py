@@ -221,6 +221,8 @@ def test_an_offset_whose_error_is_unknown_stays_told():
     (gate,) = list_offsets(fitted.simulator.elements, fitted.values)
     for error, told in ((np.nan, 1), (0.3, 0), (1e-3, 1)):
         assert len(update_offsets([gate], fitted, {gate.parameter: np.array(error)}, True, True)) == told
+    ringing = replace(fitted, residual=[np.sin(np.arange(len(e)))[:, None] for e in fitted.residual])
+    assert update_offsets([gate], ringing, {gate.parameter: np.array(0.3)}, True, True)  # whose mean is known well
 
 
 @pytest.mark.parametrize("laws", [(), (CoulombFriction,)])

@@ -18,7 +18,7 @@ from ...data import Recording, moves_freely
 from ...laws import Gain, Law
 from ...simulators import ACTUATOR, EQUATION, SENSOR, Simulator, in_series, kind_of, port_name, split_port
 from ..fits.evidence import FORMULA_ERROR
-from ..fits.floor import ABOVE_NOISE, noise_floor, samples_of_mean
+from ..fits.floor import ABOVE_NOISE, effective_size, noise_floor, samples_of_mean
 from ..fits.screen import block_diagonal, lengths
 from ..fits.workbench import FEW, THOROUGH, Fitted, Workbench, refit
 from .gates import (
@@ -467,17 +467,19 @@ def update_offsets(
 ) -> tuple[Gate, ...]:
     """Return the findings with the offsets at their fitted values; drop offsets that the effects have replaced.
 
-    Without effects they stay, because the refitted simulator has them.
+    Without effects they stay, because the corrected simulator has them.
     """
     alike = {g.parameter: g.alike for g in gates if isinstance(g, Constant)}
     fitted = {g.parameter: g for g in list_offsets(after.simulator.elements, after.values, after.simulator, alike)}
+    # standard errors count the samples that are independent for any parameter
+    ratio = (effective_size(after.residual) / samples_of_mean(after.residual)) ** 0.5
     out = []
     for gate in gates:
         if not gate.parameter:
             out.append(gate)
             continue
-        remaining = fitted[gate.parameter]
-        uncertain = abs(remaining.value) <= CERTAIN_ERRORS * float(std[gate.parameter])  # an unknown error says nothing
+        remaining, error = fitted[gate.parameter], ratio * float(std[gate.parameter])
+        uncertain = abs(remaining.value) <= CERTAIN_ERRORS * error  # an unknown error says nothing
         replaced = uncertain or not abs(remaining.value) > KEPT_OFFSET * abs(gate.value)
         if replaced and effects:
             continue
