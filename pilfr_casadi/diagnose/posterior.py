@@ -120,28 +120,38 @@ def explainable_remainder(search: Hypotheses, trial: Trial, before: Trial | None
 
     The mismatch is that of the refit, or of another hypothesis `before`. A remainder that no force at a port explains
     counts little: it may be a disturbance that acts beside the law. The noise is known only so well
-    (LEAST_MODEL_ERROR), so that a mismatch below the noise hardly shows what explains it.
+    (LEAST_MODEL_ERROR), so that a mismatch below the noise hardly shows what explains it. What the law leaves on data
+    that it was not fitted to counts in full: a flexible law may follow what it cannot predict.
     """
     share = float(np.clip(max(search.flexible(trial).values(), default=0.0), 0.0, 1.0))
-    left = share_left(search, trial.fitted, before, least=1 + LEAST_MODEL_ERROR)
-    return left * (share + DISTURBANCE_WEIGHT * (1 - share))
+    left, elsewhere = (
+        share_left(search, trial.fitted, before, least=1 + LEAST_MODEL_ERROR, squares=squares)
+        for squares in (trial.fitted.squares, search.squares_elsewhere(trial))
+    )
+    return left * (share + DISTURBANCE_WEIGHT * (1 - share)) + max(elsewhere - left, 0.0)
 
 
 def share_left(
-    search: Hypotheses, fitted: Fitted, before: Trial | None = None, floor: Floor | None = None, least: float = 0.0
+    search: Hypotheses,
+    fitted: Fitted,
+    before: Trial | None = None,
+    floor: Floor | None = None,
+    least: float = 0.0,
+    squares: np.ndarray | None = None,
 ) -> float:
     """Compute the share that a fit leaves of a hypothesis' mean square error above the noise.
 
     The hypothesis is by default the refit, and the noise the floor. The estimated floor may contain physics that
     nothing explains; the white noise is a lower limit of the noise. `least` is the multiple of the noise below which no
     error counts. The error before is limited to the outputs' variance, because free-run errors can grow without limit.
+    `squares` (n_y,) are the fit's mean square errors on other data, if these are meant.
     """
 
     def pooled(squares: np.ndarray | float) -> float:
         return float(np.mean(squares / fitted.balance))
 
     noise = pooled((floor or search.floor).squares(search.bench.scale))
-    left = pooled(fitted.squares)
+    left = pooled(fitted.squares if squares is None else squares)
     most = min(pooled((before or search.root).fitted.squares), pooled(1.0))
     return float(np.clip((max(left, least * noise) - noise) / max(most - noise, 1e-300), 0.0, 1.0))
 

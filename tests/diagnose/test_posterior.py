@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pilfr_casadi.diagnose.faults.offsets import Offset
-from pilfr_casadi.diagnose.fits.evidence import STRAINED_ODDS, significance
+from pilfr_casadi.diagnose.fits.evidence import STRAINED_ODDS, HeldOut, significance
 from pilfr_casadi.diagnose.posterior import explainable_remainder, posterior, share_named
 from pilfr_casadi.diagnose.verdict import closest_hypothesis, judge
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Delay, DirectionalFriction, QuadraticDrag
@@ -50,6 +50,16 @@ def test_two_laws_that_tie_share_the_confidence(search, trial, behind, share):
     assert found.named == pytest.approx(SURE) and found.nothing < 1e-6
     assert sure_of(found) == {DRY_NAME: pytest.approx(SURE * share, rel=1e-3)}
     assert list(found.effects[0].alike) == ([CUBIC_NAME] if behind < 3 else [])
+
+
+def test_a_law_that_predicts_other_data_badly_is_hardly_sure(search, trial):
+    dry = trial(DRY)
+    found = search(dry)
+    for elsewhere, least, most in ((1e-6, 0.97, 0.99), (1e-2, 0.6, 0.95), (0.3, 0.0, 0.2)):
+        squares = np.full(len(dry.fitted.squares), elsewhere)
+        found.findings[dry.key].held_out = HeldOut(elsewhere, elsewhere, squares)
+        assert least < posterior(found).named < most
+    assert sure_of(posterior(search(trial(DRY)))) == {DRY_NAME: pytest.approx(SURE)}
 
 
 def test_laws_that_all_diverge_leave_the_simulator_alone(search, trial):

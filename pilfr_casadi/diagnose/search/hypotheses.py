@@ -58,6 +58,7 @@ class Findings:
     likelihood: tuple[float, float] | None = None
     learned: list[Fitted] | None = None  # the learned forces beside it, best first
     held_out: HeldOut | None = None  # its errors on held-out data
+    spread: float | None = None  # the mean square uncertainty of its predictions for other inputs
     # whether the force of a law with memory is a curve along the runs, by the prefix of its parameters
     curves: dict[str, bool] = field(default_factory=dict)
     varied: bool = False  # whether variations of parameters were tried beside it
@@ -172,7 +173,7 @@ class Hypotheses:
     def evidence(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis, from its error on held-out blocks if that is known.
 
-        Where all models are wrong, the spread of predictions for other inputs counts as an error.
+        Where all models are wrong, the spread of predictions for other inputs counts as an error, where it is known.
         """
         return self._judged_evidence(trial, 0.5)
 
@@ -182,8 +183,15 @@ class Hypotheses:
         if known or np.isfinite(trial.mean_square):
             ratio = self._held_out_ratio(quantile) * self._less_freedom(trial)
             squares = known.squares if known else ratio * trial.fitted.squares
-            v = self.bench.pool(squares + self.tolerance) + (known.spread if known and self._all_wrong else 0.0)
+            spread = self.findings[trial.key].spread or 0.0
+            v = self.bench.pool(squares + self.tolerance) + (spread if self._all_wrong else 0.0)
         return self._log_evidence(trial, v, self.samples)
+
+    def squares_elsewhere(self, trial: Trial) -> np.ndarray:
+        """Return the mean square errors that are expected of a hypothesis on other data, (n_y,), as far as known."""
+        known = self.findings[trial.key]
+        squares = known.held_out.squares if known.held_out else trial.fitted.squares
+        return np.asarray(squares + (known.spread or 0.0 if self._all_wrong else 0.0))
 
     def _held_out_ratio(self, quantile: float) -> float:
         """Compute a quantile of the known ratios of held-out to fit error (mean squares).
@@ -230,9 +238,10 @@ class Hypotheses:
             alike = [t for t in self.memo.values() if t.key < trial.key and t.thorough and self._alike(t, trial)]
             shown = min([*alike, trial], key=lambda t: len(t.key))
             known = self.findings[shown.key].held_out
-            known = known or self.held_out_errors(shown.fitted, self.spread(shown.fitted))
+            known = known or self.held_out_errors(shown.fitted, self.spread_of(shown))
             if np.isfinite(known.rms) or not self.past_deadline:  # otherwise the time was over before they were known
-                self.findings[shown.key].held_out = self.findings[trial.key].held_out = known
+                for key in (shown.key, trial.key):
+                    self.findings[key].held_out, self.findings[key].spread = known, known.spread
         return known
 
     def _alike(self, one: Trial, other: Trial) -> bool:
@@ -244,6 +253,13 @@ class Hypotheses:
     def held_out_errors(self, fitted: Fitted, spread: float) -> HeldOut:
         """Compute the held-out errors of a fitted simulator with a known spread for other inputs."""
         return replace(held_out_errors(self.bench, fitted, self.workers), spread=spread)
+
+    def spread_of(self, trial: Trial) -> float:
+        """Compute the spread of a hypothesis, once."""
+        known = self.findings[trial.key]
+        if known.spread is None:
+            known.spread = self.spread(trial.fitted)
+        return known.spread
 
     def spread(self, fitted: Fitted) -> float:
         """Compute the mean square uncertainty of a fitted simulator's predictions for other inputs."""
@@ -265,9 +281,12 @@ class Hypotheses:
 
         If only one is likely and its error is noise, the fit error is enough. Otherwise held-out data decide, because a
         wrong model may overfit, and among models that follow the recordings equally well the right one predicts best.
+        If the search took all its time, the comparison has half of what is left for the conclusion.
         """
         if not self._all_wrong and len({frozenset((e.port, e.law.id) for e in t.laws) for t in self._likeliest()}) < 2:
             return
+        now = time.perf_counter()
+        until = max(self.until, now + (self.bench.deadline - now) / 2)
         with self.stage("held-out blocks"):
             if self._all_wrong:
                 self.held_out(self.root)
@@ -276,8 +295,10 @@ class Hypotheses:
                 unknown = [t for t in (best, *self._likeliest()) if self.findings[t.key].held_out is None]
                 if not unknown or (done >= MOST_CROSS_VALIDATED and unknown[0] is not best):
                     break
-                if not self.may_go_on():  # an unfinished comparison favours the hypotheses that were not judged
+                if time.perf_counter() > until:  # an unfinished comparison favours the hypotheses that were not judged
+                    self.out_of_time = True
                     self.forget_held_out()
+                    self._judge_by_spread()
                     break
                 self.say("held-out blocks", done, min(done + len(unknown), max(MOST_CROSS_VALIDATED, done + 1)))
                 self.held_out(unknown[0])
@@ -285,7 +306,16 @@ class Hypotheses:
     def forget_held_out(self) -> None:
         """Forget the held-out errors, so that all hypotheses are compared by their fit errors."""
         for known in self.findings.values():
-            known.held_out = None
+            known.held_out = known.spread = None
+
+    def _judge_by_spread(self) -> None:
+        """Compute the spread of the likeliest hypotheses, which takes less time than to hold data out."""
+        while self._all_wrong and not self.past_deadline:
+            unknown = [t for t in likeliest(list(self.memo.values()), self.evidence) if t.laws]
+            unknown = [t for t in unknown if self.findings[t.key].spread is None]
+            if not unknown:
+                break
+            self.spread_of(unknown[0])
 
     def _likeliest(self) -> list[Trial]:
         """List the hypotheses that may be the likeliest if they predict as well as any that did."""

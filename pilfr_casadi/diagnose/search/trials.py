@@ -393,8 +393,8 @@ def _promise(one: Scored) -> float:
 
 
 def _is_plain(one: Scored) -> bool:
-    """Tell whether a law has a single free parameter."""
-    return one.law.size(one.starts[0]) == 1
+    """Tell whether a law has a single free parameter, besides the width of a knee that only makes it smooth."""
+    return one.law.size(one.starts[0]) - bool(one.law.knee) == 1
 
 
 def _is_redundant(one: Scored, other: Scored) -> bool:

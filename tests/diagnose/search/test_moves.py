@@ -2,10 +2,12 @@
 
 import functools
 import sys
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from diagnosis_example import recorded, rig as example_rig
 from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
@@ -127,10 +129,12 @@ def test_hypotheses_are_not_compared_by_different_errors_where_time_ran_out(monk
     """Held-out errors are larger than fit errors: a law that was judged on them lost to one that was not."""
     found = searching(rubbing()).run(1)
     found.held_out(found.best)
-    found.until = 0.0
+    endless, found.until = found.bench, 0.0
+    found.bench = replace(endless, deadline=time.perf_counter())
     monkeypatch.setattr(Search, "_likeliest", lambda self: [self.root, self.best])
     found.cross_validate_likeliest()
     assert found.out_of_time and all(known.held_out is None for known in found.findings.values())
+    found.bench = endless
 
     def just_in_time(bench, fitted, workers):
         found.bench = replace(bench, deadline=0.0)
@@ -140,6 +144,26 @@ def test_hypotheses_are_not_compared_by_different_errors_where_time_ran_out(monk
     monkeypatch.setattr(hypotheses, "held_out_errors", just_in_time)
     assert found.held_out(found.root) is found.findings[found.root.key].held_out  # it was complete
     assert found.held_out(found.best).rms == np.inf and found.findings[found.best.key].held_out is None
+
+
+def test_where_the_time_ends_before_laws_are_compared_their_spread_counts(monkeypatch):
+    """After the search, the comparison has half of the time that is left; a spread takes two derivatives."""
+    found, clock = searching(rubbing()).run(1), [0.0]
+
+    def slowly(search, trial):
+        clock[0] += 60.0
+
+    monkeypatch.setattr(hypotheses.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(Search, "_all_wrong", property(lambda self: True))
+    monkeypatch.setattr(Search, "held_out", slowly)
+    monkeypatch.setattr(Search, "spread", lambda self, fitted: 1e6 if fitted is friction.fitted else 1e-9)
+    friction = found.best
+    assert friction.law.id == "coulomb_friction"
+    found.until, found.bench = -1.0, replace(found.bench, deadline=100.0)
+    found.cross_validate_likeliest()
+    assert clock[0] == 60.0 and found.out_of_time
+    assert found.findings[friction.key].spread == 1e6
+    assert max(found.memo.values(), key=found.evidence) is not friction
 
 
 def test_a_law_found_only_beside_another_one_may_do_without_it():
@@ -282,3 +306,12 @@ def test_samples_that_a_delay_follows_by_its_unknown_beginning_do_not_count_for_
         found.keep(Trial.of(found.without, 0, thorough=True))
         evidences.append(found.optimistic_evidence(alike) - found.optimistic_evidence(found.root))
     assert evidences[0] < evidences[1] - 1
+
+
+def test_if_nothing_explains_the_mismatch_laws_are_added_beside_several_first_laws():
+    true = example_rig().with_element("ground", laws.CoulombFriction().at({"F_c": 2.0, "v_0": 0.01}))
+    true = true.with_element("actuator:force", laws.Saturation().at({"L": 10.0}))
+    tried = (laws.CubicDamping, laws.DeadZone)
+    found = pilfr.diagnose(example_rig(430.0, 5.0), recorded(true, 0, samples=300), laws=tried, hold="zero", workers=1)
+    parents = {step.parent.names for step in found.evidence.search.steps if len(step.parent.effects) == 1}
+    assert found.verdict == "unexplained" and len(parents) > 1

@@ -136,6 +136,16 @@ def test_a_parameter_that_varies_with_its_own_coordinate_is_a_force_at_that_port
     assert in_place_of_variation(bench, best, [replace(s, port="elsewhere") for s in scored]) == []
 
 
+def test_dry_friction_is_tried_at_each_port_where_it_is_the_best_law_with_a_single_parameter(tiny):
+    """The width within which its force reverses is no parameter of the physics."""
+    local = port_signals(*tiny, "a")
+    elsewhere = [Scored(f"sensor:{i}", Backlash(), 0.99, ({},), local) for i in range(12)]
+    shares = ((StribeckFriction, 0.95), (CoulombFriction, 0.92), (CubicDamping, 0.9))
+    here = [Scored("a", kind(), share, ({},), local) for kind, share in shares]
+    chosen = {found[0].pair for found in select_pairs([*elsewhere, *here], few=False)}
+    assert {kind for port, kind in chosen if port == "a"} == {StribeckFriction, CoulombFriction}
+
+
 def test_no_force_acts_as_a_parameter_that_an_output_reads(tiny):
     bench, refit = tiny
     simulator = bench.simulator
