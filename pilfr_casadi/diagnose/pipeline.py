@@ -9,9 +9,9 @@ How an answer comes about:
    (`evidence`, which lists the numbers on which an answer rests).
 3. `posterior` turns the evidences into probabilities. The confidence of an effect is the probability of all hypotheses
    that have it, times the probability that its law is the physics (`share_named`), times the probability that its
-   strength is not zero. Three things lower it: a remainder that a flexible force explains, a parameter at a bound, and
-   values at which the law degenerates into another. Among forms of a law that fit equally well, the one with the fewest
-   parameters is stated.
+   strength is not zero. Four things lower it: a remainder that a flexible force explains, what the law leaves on data
+   that it was not fitted to, parameters at a bound, and values at which the law degenerates into another. Among forms
+   of a law that fit equally well, the one with the fewest parameters is stated.
 4. `judge` chooses the verdict. It is a recording fault if its correction removed the mismatch; missing physics if the
    law of the likeliest hypothesis is more likely than not the physics; complete if the refit's residual can be noise;
    else unexplained. Steps 5 to 7 judge again if they change the probabilities.
