@@ -183,15 +183,28 @@ class Hypotheses:
         if known or np.isfinite(trial.mean_square):
             ratio = self._held_out_ratio(quantile) * self._less_freedom(trial)
             squares = known.squares if known else ratio * trial.fitted.squares
-            spread = self.findings[trial.key].spread or 0.0
-            v = self.bench.pool(squares + self.tolerance) + (spread if self._all_wrong else 0.0)
+            v = self.bench.pool(squares + self.tolerance) + self._known_spread(trial)
         return self._log_evidence(trial, v, self.samples)
 
     def squares_elsewhere(self, trial: Trial) -> np.ndarray:
-        """Return the mean square errors that are expected of a hypothesis on other data, (n_y,), as far as known."""
-        known = self.findings[trial.key]
-        squares = known.held_out.squares if known.held_out else trial.fitted.squares
-        return np.asarray(squares + (known.spread or 0.0 if self._all_wrong else 0.0))
+        """Return a hypothesis' mean square errors, (n_y,), as large as on held-out blocks if those are known.
+
+        Not the predicted second halves: a motion that nearly is unstable amplifies the errors of the right laws.
+        """
+        known = self.findings[trial.key].held_out
+        ratio = max(known.blocks / max(trial.mean_square, 1e-300), 1.0) if known else 1.0
+        return np.asarray(ratio * trial.fitted.squares)
+
+    def _known_spread(self, trial: Trial) -> float:
+        """Return the spread of a hypothesis where all models are wrong, as far as it is known; zero elsewhere.
+
+        Further laws determine nothing better, so that it is at least the largest that is known with fewer laws.
+        """
+        if not self._all_wrong:
+            return 0.0
+        own = self.findings[trial.key].spread
+        fewer = (self.findings[key].spread or 0.0 for key in self.memo if key < trial.key) if own is None else (own,)
+        return max(fewer, default=0.0)
 
     def _held_out_ratio(self, quantile: float) -> float:
         """Compute a quantile of the known ratios of held-out to fit error (mean squares).
