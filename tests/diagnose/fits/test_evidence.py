@@ -140,7 +140,7 @@ def test_held_out_samples_do_not_tell_the_strength_of_a_law_that_acts_there_alon
     assert np.max(np.abs(y[:700])) < 0.05
     bench = Workbench.of(true, [blank.with_(y=y + 1e-3 * np.std(y) * rng.standard_normal(y.shape))], "zero")
     fitted, plain = bench.fit(true), bench.fit(example_rig())
-    assert fitted.cost**0.5 < 0.0011 and 0.2 < plain.cost**0.5
+    assert fitted.cost**0.5 < 0.0011 and plain.cost**0.5 > 0.2
     assert held_out_errors(bench, fitted).weighted_rms > 0.2
 
 
