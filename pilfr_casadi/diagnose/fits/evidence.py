@@ -17,14 +17,13 @@ samples, and n_0 the number of samples that a wholly wrong model is worth,
 
 Where models are wrong, v is an error on data that a model was not fitted to. Every recording is cut into blocks, and
 the blocks are dealt to a few folds in turn. For each fold, a simulator is refitted to the other folds, starting at its
-fitted values; but the strengths of laws start at zero, and parameters with a prior, such as the weights of a learned
-force, at its mean. The held-out samples would otherwise decide what the others leave open. It is simulated through the
-held-out blocks, whose samples are not scored. The state at the beginning of a block therefore needs no estimate: it
-follows from the inputs and the time before. Neighbouring samples are correlated, and so whole blocks are held out
-(Burman, Chow & Nolan 1994, Biometrika 81(2)). Samples after a block still constrain a simulation that drifts, for
-example behind a free integrator. Therefore the second half of every recording is also predicted, from a fit to the
-first half (Tashman 2000, Int. J. Forecasting 16(4)). The larger of both errors counts, plus the spread of predictions
-for other inputs (`spread`).
+fitted values. Parameters with a prior, such as the weights of a learned force, start at its mean; the held-out samples
+would otherwise decide what the others leave open. It is simulated through the held-out blocks, whose samples are not
+scored. The state at the beginning of a block therefore needs no estimate: it follows from the inputs and the time
+before. Neighbouring samples are correlated, and so whole blocks are held out (Burman, Chow & Nolan 1994, Biometrika
+81(2)). Samples after a block still constrain a simulation that drifts, for example behind a free integrator. Therefore
+the second half of every recording is also predicted, from a fit to the first half (Tashman 2000, Int. J. Forecasting
+16(4)). The larger of both errors counts, plus the spread of predictions for other inputs (`spread`).
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ import itertools
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -487,13 +485,10 @@ def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldO
     return HeldOut(*pooled, both[int(pooled[1] > pooled[0])])
 
 
-def _without_knowledge(fitted: Fitted) -> Fitted:
-    """Set the strengths of laws to zero, and the free parameters that have a prior to its mean."""
-    own = fitted.model.parameters
-    strengths = [f"{e.prefix}{name}" for e in fitted.simulator.elements for name in e.law.strength]
-    means: dict[str, Any] = {name: np.clip(0.0, *own[name].bounds) for name in strengths}
-    means |= {name: p.prior[0] for name, p in own.items() if p.prior is not None}
-    values = {name: np.where(own[name].fixed, fitted.values[name], mean) for name, mean in means.items()}
+def _at_prior_means(fitted: Fitted) -> Fitted:
+    """Set the free parameters that have a prior to its mean."""
+    means = {k: p.prior[0] for k, p in fitted.model.parameters.items() if p.prior is not None and not np.all(p.fixed)}
+    values = {k: np.where(fitted.model.parameters[k].fixed, fitted.values[k], mean) for k, mean in means.items()}
     return replace(fitted, values={**fitted.values, **values})
 
 
@@ -508,7 +503,7 @@ def _sum_of_squares(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]
         seconds = bench.deadline - time.perf_counter()
         if seconds <= 0:
             return infinite
-        problem, theta = bench.problem_at(_without_knowledge(fitted), [~mask for mask in left])
+        problem, theta = bench.problem_at(_at_prior_means(fitted), [~mask for mask in left])
         try:
             with np.errstate(all="ignore"):
                 found = solve_within_bounds(problem, theta, replace(REFIT, time_limit=seconds))
