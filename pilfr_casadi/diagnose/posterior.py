@@ -121,12 +121,14 @@ def explainable_remainder(search: Hypotheses, trial: Trial, before: Trial | None
     The mismatch is that of the refit, or of another hypothesis `before`. A remainder that no force at a port explains
     counts little: it may be a disturbance that acts beside the law. The noise is known only so well
     (LEAST_MODEL_ERROR), so that a mismatch below the noise hardly shows what explains it. What the law leaves on data
-    that it was not fitted to counts in full: a flexible law may follow what it cannot predict.
+    that it was not fitted to counts in full: a flexible law may follow what it cannot predict. Beside other laws that
+    does not count, because without the law the error there is larger as well.
     """
     share = float(np.clip(max(search.flexible(trial).values(), default=0.0), 0.0, 1.0))
+    known = search.squares_elsewhere(trial) if before is None else trial.fitted.squares
     left, elsewhere = (
         share_left(search, trial.fitted, before, least=1 + LEAST_MODEL_ERROR, squares=squares)
-        for squares in (trial.fitted.squares, search.squares_elsewhere(trial))
+        for squares in (trial.fitted.squares, known)
     )
     return left * (share + DISTURBANCE_WEIGHT * (1 - share)) + max(elsewhere - left, 0.0)
 
