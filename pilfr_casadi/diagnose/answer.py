@@ -160,7 +160,8 @@ def _compute_errors(
     if tests:
         each = {e: final.to_all(f) for e, f in _without_each_effect(search, found).items()}
         fits = {"before": without, "after": after, **{f"without {i}": f for i, f in enumerate(each.values())}}
-        offsets, fits["at zero offsets"] = _at_zero_offsets(bench, after, len(request.simulator.elements))
+        offsets, at_zero = _at_zero_offsets(bench, after, len(request.simulator.elements))
+        fits |= {"at zero offsets": at_zero} if offsets else {}
         compared = test_errors(bench, tests, found.gates, fits, bench.on(tests).model(request.simulator))
         on_tests = compared.errors
         notes = (*_edit_notes(compared), *_resting_notes(compared.find_resting()), *_scored_note(compared))
@@ -168,7 +169,7 @@ def _compute_errors(
             notes = (*_test_faults(bench, after, tests, found.gates), *notes)
         if on_tests["after"] > NEAR_RATIO * bench.nrmse(after) and all(g.finding != TEST_FAULT for g in notes):
             notes = (*notes, *range_note(bench, edited(tests, found.gates)))
-        notes = (*notes, *_offset_note(offsets, on_tests))
+        notes = (*notes, *_offset_note(offsets, on_tests)) if offsets else notes
         fewer = {e: on_tests[f"without {i}"] for i, e in enumerate(each)}
         errors["test"] = {name: on_tests[name] for name in ("nominal", "before", "after")}
     if bench.simulator.observer is not None:
@@ -208,7 +209,7 @@ def _at_zero_offsets(bench: Workbench, after: Fitted, own: int) -> tuple[str, Fi
 def _offset_note(offsets: str, errors: Mapping[str, float]) -> Iterator[Gate]:
     """Note that the test recordings hardly have the offsets of the training recordings; `errors` are those on them."""
     zero, after = errors["at zero offsets"], errors["after"]
-    if offsets and BETTER_RATIO * zero < after:
+    if BETTER_RATIO * zero < after:
         words = (
             f"The test recordings hardly have {offsets}: at zero offset, the error of the corrected simulator there is "
             f"{percent(zero)} in place of {percent(after)}. Something may differ between the recordings."

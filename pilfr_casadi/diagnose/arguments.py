@@ -60,7 +60,7 @@ class Request:
 
     @property
     def stated_hold(self) -> str | None:
-        """What inputs do between samples, if somebody stated it."""
+        """Course of the inputs between samples; None if nobody stated it."""
         return stated_hold(self.simulator, self.recordings, self.hold)
 
 

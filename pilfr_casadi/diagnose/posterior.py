@@ -125,10 +125,10 @@ def explainable_remainder(search: Hypotheses, trial: Trial, before: Trial | None
     does not count, because without the law the error there is larger as well.
     """
     share = float(np.clip(max(search.flexible(trial).values(), default=0.0), 0.0, 1.0))
-    known = search.squares_elsewhere(trial) if before is None else trial.fitted.squares
+    predicted = search.squares_elsewhere(trial) if before is None else trial.fitted.squares
     left, elsewhere = (
         share_left(search, trial.fitted, before, least=1 + LEAST_MODEL_ERROR, squares=squares)
-        for squares in (trial.fitted.squares, known)
+        for squares in (trial.fitted.squares, predicted)
     )
     return left * (share + DISTURBANCE_WEIGHT * (1 - share)) + max(elsewhere - left, 0.0)
 

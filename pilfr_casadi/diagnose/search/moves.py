@@ -195,9 +195,7 @@ class Search(Hypotheses):
             for base in {t.key: t for t in (self.root, best, *without_weakest)}.values():
                 if len(base.effects) < effects and self.can_improve(self.best) and self.may_go_on():
                     name_rest(base)
-        if self.best is not best:
-            self.exchange()  # laws that were found before may have made up for this one
-            self._grow(effects, varied=True)
+        self._go_on(best, effects)
 
     def _widen(self, effects: float) -> None:
         """Add laws beside other likely hypotheses with one law, because the best one may be on a wrong track.
@@ -212,7 +210,11 @@ class Search(Hypotheses):
         for parent in left[:FEW] if effects > 1 else ():
             if not self.must_repeat and self.can_improve(self.best) and self.may_go_on():
                 self.add(parent, few=True)
-        if self.best is not best:
+        self._go_on(best, effects)
+
+    def _go_on(self, before: Trial, effects: float) -> None:
+        """Go on from a new best hypothesis: laws that were found before may have made up for its last one."""
+        if self.best is not before:
             self.exchange()
             self._grow(effects, varied=True)
 
