@@ -8,6 +8,7 @@
 | coil | constant inductance, over the current | a core that saturates; the dead time of a bridge |
 | core | constant inductance, over the flux | hysteresis of the iron |
 | clamp | resistors and a capacitor | a diode; a clamp of two diodes |
+| heater | a mixed volume of water that flows through, heated | a pipe before the thermometer |
 
 The truths are integrated here, without the catalogue. All values are drawn anew for every seed, and the simulator's are
 off by up to a fifth. Each output has white noise of 0.1 to 0.5 % of its deviation. An answer is right if it names the
@@ -282,6 +283,36 @@ def clamp(rng: np.random.Generator, kind: str) -> Rig:
     return Rig(simulator, flow, lambda x, u: x, lambda rng: levels(rng, -most, most, 5, 40), dt, np.zeros(1))
 
 
+def heater(rng: np.random.Generator, kind: str) -> Rig:
+    """A flow heater; a pipe of some length may lead from it to the thermometer."""
+    heat, dt = 4180.0, 1.0  # J/(kg K), s
+    p = {"mass": rng.uniform(0.5, 2.0), "loss": rng.uniform(2.0, 10.0)}
+    held = rng.uniform(0.5, 2.0)  # kg in the pipe
+
+    def flow(x: Array, u: Array) -> Array:
+        gain = u[1] - p["loss"] * (x[0] - 20.0) + heat * u[0] * (u[2] - x[0])
+        return np.array([gain / (heat * p["mass"])])
+
+    def outputs(x: Array, u: Array) -> Array:
+        passed = dt * np.concatenate([[0.0], np.cumsum(u[:-1, 0])])
+        return np.interp(passed - (held if kind == "pipe" else 0.0), passed, x[:, 0])[:, None]
+
+    def drive(rng: np.random.Generator) -> Array:
+        mass, power, inlet = ((0.02, 0.2), (0.0, 8e3), (10.0, 20.0))
+        return np.hstack([levels(rng, *mass, 40, 120), levels(rng, *power, 20, 80), levels(rng, *inlet, 60, 200)])
+
+    simulator = Simulator(
+        lambda x, u, p: {"T": (u.power - p.loss * (x.T - 20) + heat * u.flow * (u.inlet - x.T)) / (heat * p.mass)},
+        lambda x: {"outlet": x.T},
+        states=("T",),
+        inputs=("flow", "power", "inlet"),
+        parameters=guesses(rng, p, {"mass": "kg", "loss": "W/K"}),
+        ports=(Port("wall", lambda p: {"T": -1 / (heat * p.mass)}, lambda x: x.T - 20, unit="W", across_unit="K"),),
+        units={"flow": "kg/s", "power": "W", "inlet": "degC", "outlet": "degC"},
+    )
+    return Rig(simulator, flow, outputs, drive, dt, np.array([20.0]))
+
+
 # kind -> rig, and the place and law to be named; no law where nothing is missing
 KINDS: dict[str, tuple[Callable[[np.random.Generator, str], Rig], str, str]] = {
     "voltage-curve": (battery, "electrode", "static_curve"),
@@ -296,8 +327,9 @@ KINDS: dict[str, tuple[Callable[[np.random.Generator, str], Rig], str, str]] = {
     "iron-loops": (core, "core", "hysteresis"),
     "diode": (clamp, "load", "static_curve"),
     "diode-pair": (clamp, "load", "static_curve"),
+    "pipe": (heater, "sensor:outlet", "delay"),
 }
-COMPLETE = {f"complete {rig.__name__}": rig for rig in (battery, oven, tank, coil, core, clamp)}
+COMPLETE = {f"complete {rig.__name__}": rig for rig in (battery, oven, tank, coil, core, clamp, heater)}
 
 
 def recorded(kind: str, number: int) -> tuple[Simulator, Recording, Recording]:

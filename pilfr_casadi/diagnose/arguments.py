@@ -19,6 +19,7 @@ from ..laws import (
     LinearStiffness,
     UnreadInput,
     ViscousDamping,
+    carried,
     scaled,
     scheduled,
     seen_by,
@@ -186,9 +187,10 @@ def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[ty
     """Return the laws, and versions of some of them whose strength varies with a signal.
 
     An input that the equations do not read may act itself, or scale a law; any other may reach a sensor, or the channel
-    of another input, directly. A spring or damper of the simulator's own may vary with the time, an input, or a port's
-    own signal, and a damper with the position. Other laws are found first, and then let vary (`Search`). Of several
-    sensors at an elastic joint or drive, one alone may be on the far side.
+    of another input, directly. Any input may be a flow that carries signals along. A spring or damper of the
+    simulator's own may vary with the time, an input, or a port's own signal, and a damper with the position. Other laws
+    are found first, and then let vary (`Search`). Of several sensors at an elastic joint or drive, one alone may be on
+    the far side.
     """
     given = {law.__name__ for law in laws}  # in a worker, classes made at run time are others of the same name
     all_laws = given >= {law.__name__ for law in CATALOGUE}
@@ -197,12 +199,19 @@ def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[ty
     by_input = [scaled(law, by) for law in may_scale for by in simulator.idle_inputs]
     by_input += [scheduled(law, by) for law in alone for by in simulator.idle_inputs]  # with a constant beside it
     by_input += [scaled(Feedthrough, by) for by in simulator.inputs if all_laws and by not in simulator.idle_inputs]
+    carrying = [carried(by) for by in simulator.inputs if all_laws]
     signals = ["t", *simulator.inputs, *sorted({name for port in simulator.ports for name in port.signals})]
     pairs = [(law, by) for law in (LinearStiffness, ViscousDamping) for by in signals] + [(ViscousDamping, "z")]
     varying = [scheduled(law, by, "quadratic") for law, by in pairs if law in laws]
     read = [names for port in simulator.all_ports() if len(names := simulator.readers(port)) > 1]
     sensors = sorted({name for names in read for name in names})
-    return (*laws, *by_input, *varying, *(seen_by(law, name) for law in laws if law.sensed for name in sensors))
+    return (
+        *laws,
+        *by_input,
+        *carrying,
+        *varying,
+        *(seen_by(law, name) for law in laws if law.sensed for name in sensors),
+    )
 
 
 def check_time_and_focus(time_limit: float | None, focus: str | None) -> None:

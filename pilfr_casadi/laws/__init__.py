@@ -3,7 +3,8 @@
 `base` holds the class `Law` and shows how to add a law in ten lines. Laws are grouped by kind: `stiffness` (springs,
 contacts, gaps, periodic forces), `friction` (forces of speed), `hysteresis` (loops), `curves` (saturation and other
 curves of actuators and sensors), `dynamic` (delays, creep, modes, trends), `in_line` (in line with a term of the
-equations), `thermal` and `electrical` (laws of one domain). `composed` makes laws of laws (scaled, scheduled, behind a
+equations), `thermal` and `electrical` (laws of one domain),
+`transport` (delays by a flow). `composed` makes laws of laws (scaled, scheduled, behind a
 gap). `catalogue` lists the laws that a diagnosis tries. `forces` evaluates laws along given signals.
 """
 
@@ -156,5 +157,6 @@ if TYPE_CHECKING:
         Convection as Convection,
         Radiation as Radiation,
     )
+    from .transport import carried as carried
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -219,6 +219,8 @@ class Law:
         Input that multiplies the force, or signal with which the strengths vary, if any; see `scaled`, `scheduled`.
     profile : str
         How they vary.
+    carried_by : str
+        Input whose flow carries the signal along, if any; see `carried`.
     of_input : bool
         It is the effect of an input alone, whose name `scaled` and `scheduled` put into its texts in place of "{by}".
     signal : str
@@ -277,6 +279,7 @@ class Law:
     scaled_by: ClassVar[str] = ""
     scheduled_by: ClassVar[str] = ""
     profile: ClassVar[str] = ""
+    carried_by: ClassVar[str] = ""
     of_input: ClassVar[bool] = False
     signal: ClassVar[str] = ""
 
@@ -498,3 +501,10 @@ def continue_along_tangents(
     inside = np.clip(x, low, high) if number else ca.fmin(ca.fmax(x, low), high)
     values, slopes = values_and_slopes(inside)
     return [value + (x - inside) * slope for value, slope in zip(values, slopes, strict=True)]
+
+
+def rename_class(law: Any, name: str, doc: str) -> Any:
+    """Give a class that was made at run time its own name and docstring."""
+    law.__name__ = law.__qualname__ = name
+    law.__doc__ = doc
+    return law

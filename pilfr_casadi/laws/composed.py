@@ -16,7 +16,7 @@ import numpy as np
 
 from .._base import InputError
 from ..models import Named, Parameter
-from .base import Law, Local, beyond_gap, continue_along_tangents
+from .base import Law, Local, beyond_gap, continue_along_tangents, rename_class
 
 GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
 RATIOS, MOST_RATIO = (0.3, 3.0), 100.0  # tried ratios of an exponential profile, and the largest
@@ -326,7 +326,9 @@ def _seen_by(base: Any, output: str) -> Any:
         units, strength = base.units, base.strength
         seen_by = output
 
-    return _rename(Seen, f"{base.__name__}SeenBy_{output}", f"{base.__doc__}\n\n    {output} alone reads its far side.")
+    return rename_class(
+        Seen, f"{base.__name__}SeenBy_{output}", f"{base.__doc__}\n\n    {output} alone reads its far side."
+    )
 
 
 @functools.cache  # the same class for the same arguments
@@ -350,7 +352,9 @@ def _scaled(base: Any, by: str) -> Any:
         def why_not(self, local: Local) -> str:
             return super().why_not(local) or _missing_signal(by, local)
 
-    return _rename(Scaled, f"{base.__name__}ScaledBy_{by}", f"{base.__doc__}\n\n    Its strength is scaled by {by}.")
+    return rename_class(
+        Scaled, f"{base.__name__}ScaledBy_{by}", f"{base.__doc__}\n\n    Its strength is scaled by {by}."
+    )
 
 
 def _levels(found: Law, own: str, by: str, limits: Mapping[str, float]) -> np.ndarray:
@@ -501,7 +505,7 @@ def _scheduled(base: Any, by: str, name: str) -> Any:
             def force(self, z: Any, dz: Any, u: Any, p: Any) -> Any:  # type: ignore[misc]
                 return super().force(**arguments(p, u, z, dz=dz))
 
-    return _rename(
+    return rename_class(
         Scheduled,
         f"{base.__name__}ScheduledBy_{by}{name.capitalize() if varies.how else ''}",
         f"{base.__doc__}\n\n    Its strength varies{varies.how} with {words}.",
@@ -546,7 +550,7 @@ def _heated(by: str) -> Any:
         def why_not(self, local: Local) -> str:
             return "" if np.ptp(local.z) > 0 else f"{by} is constant"
 
-    return _rename(Heated, f"Heated_{by}", f"{VaryingParameter.__doc__}")
+    return rename_class(Heated, f"Heated_{by}", f"{VaryingParameter.__doc__}")
 
 
 @functools.cache
@@ -585,10 +589,4 @@ def _behind_gap(base: Any) -> Any:
             def force(self, z: Any, dz: Any, p: Any) -> Any:
                 return super().force(**past(z, dz, p))
 
-    return _rename(Behind, f"{base.__name__}BehindGap", f"{base.__doc__}\n\n    It acts beyond a gap.")
-
-
-def _rename(law: Any, name: str, doc: str) -> Any:
-    law.__name__ = law.__qualname__ = name
-    law.__doc__ = doc
-    return law
+    return rename_class(Behind, f"{base.__name__}BehindGap", f"{base.__doc__}\n\n    It acts beyond a gap.")

@@ -13,7 +13,17 @@ from .. import identify, laws, simulators
 from .._base import percent, to_json, with_nan
 from ..data import DIVERGING
 from ..diagnose import ERROR_NAMES, Diagnosis, Effect, Fitted, Workbench, law_signals, learned_force
-from ..laws import VaryingParameter, display_name, heated, readable_unit, scaled, scheduled, short_name, varying
+from ..laws import (
+    VaryingParameter,
+    carried,
+    display_name,
+    heated,
+    readable_unit,
+    scaled,
+    scheduled,
+    short_name,
+    varying,
+)
 from ..models import Parameter, ParameterSet
 from ..simulators import MECHANICAL, PARAMETER, UNKNOWN, CoSimulation, kind_of, name_at, name_at_any
 from .page import Bar, Block, Code, Table, Text, number_text, render, typeset_numbers, uncertain_text
@@ -386,6 +396,8 @@ def _write_law_expression(law: Any) -> tuple[tuple[Any, ...], str]:
         return (heated,), f"heated({law.signal!r})"
     if issubclass(law, VaryingParameter):
         return (varying,), f"varying({law.scheduled_by!r}, {law.profile!r})"
+    if law.carried_by:
+        return (carried,), f"carried({law.carried_by!r})"
     if by := law.scaled_by or law.scheduled_by:
         compose, base = (scaled if law.scaled_by else scheduled), law.__base__
         how = f", {law.profile!r}" if law.profile not in ("", "linear") else ""

@@ -204,8 +204,8 @@ class Port:
             return False
         if law.in_line and not self.has_term_for(law):
             return False
-        if kind_of(self.name) == ACTUATOR and law.scaled_by == self.name.partition(":")[2]:
-            return False  # a signal that it scales itself is a square, and one that is added to itself a gain
+        if kind_of(self.name) == ACTUATOR and self.name.partition(":")[2] in (law.scaled_by, law.carried_by):
+            return False  # a signal that it scales itself is a square, one that is added to itself a gain
         if self.domain in law.absent or (law.angular and np.isnan(self.revolution)):
             return False
         if not self.kinds & set(law.places) or (law.across and not may_convert(self.across_unit, law.across)):

@@ -27,7 +27,7 @@ from pilfr_casadi import (
     ssnn,
 )
 from pilfr_casadi.engine import VirtualMachine, compiler
-from pilfr_casadi.laws import CubicStiffness, StopHysteresis, heated
+from pilfr_casadi.laws import CubicStiffness, StopHysteresis, carried, heated
 from pilfr_casadi.linear import modal
 from pilfr_casadi.models import ParameterSet
 from pilfr_casadi.simulators import discretise, fastest_rates, load_simulator
@@ -127,6 +127,8 @@ def simulators(every):
     out["a warm damper"] = mass_on_spring().with_element("parameter:d", heated("vel")().at(heat)), 0.02, "zero", 2
     oily = mass_on_spring().with_parameters({"d": Parameter(1.0, bounds=(0, 10))})  # its viscosity falls exponentially
     out["warm oil"] = oily.with_element("parameter:d", heated("force")().at(heat)), 0.02, "zero", 2
+    pipe = carried("force")().at({"V": 2.0})
+    out["a signal in a pipe"] = mass_on_spring().with_element("sensor:y", pipe), 0.02, "zero", None
     element = PrandtlIshlinskii(Stop, 3)
     out["stops in a port"] = close_loop(mass_on_spring(), element, "ground"), 0.02, "zero", None
     return out
