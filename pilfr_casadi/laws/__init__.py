@@ -125,7 +125,10 @@ if TYPE_CHECKING:
         Compliance as Compliance,
         ElasticDrive as ElasticDrive,
         ElasticDriveSeenAtLoad as ElasticDriveSeenAtLoad,
+        LimitedTerm as LimitedTerm,
         LineGap as LineGap,
+        SoftlyLimitedTerm as SoftlyLimitedTerm,
+        TermLimit as TermLimit,
     )
     from .stiffness import (
         AsymmetricCubicStiffness as AsymmetricCubicStiffness,

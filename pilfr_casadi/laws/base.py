@@ -204,8 +204,8 @@ class Law:
         The force depends on where the motion last turned round; a motion that never does leaves a curve of z.
     in_line : bool
         The law stands in line with the port's `term`, which `force` and `flow` may call: `term(z, dz)`.
-    driven : bool
-        The term is the force of a drive, which the equations show if the port names no term.
+    implied : {"", "drive", "balance"}
+        What the equations show as the term if the port names none: the force of a drive, or all that changes a state.
     sensed : bool
         Outputs that read the port's coordinate or its rate read `far_side(q, p)` instead. The law is tried only where
         the coordinate is a state that outputs read.
@@ -271,7 +271,7 @@ class Law:
     shifts: ClassVar[bool] = False
     turns: ClassVar[bool] = False
     in_line: ClassVar[bool] = False
-    driven: ClassVar[bool] = False
+    implied: ClassVar[str] = ""
     sensed: ClassVar[bool] = False
     seen_by: ClassVar[str] = ""
     substeps: ClassVar[int] = 1

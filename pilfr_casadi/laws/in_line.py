@@ -9,12 +9,13 @@ so that F(q, dq/dt) takes the place of F(z, dz/dt) in the equations.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
+from ..models import Named
 from .base import Law, Local, beyond_gap
 from .dynamic import SprungMass
 
@@ -121,7 +122,7 @@ class ElasticDrive(SprungMass, _InLine):
     domains = ("mechanical",)
     strength: ClassVar[tuple[str, ...]] = ()  # the force is not linear in k
     position = False
-    driven = True
+    implied = "drive"
     sensed = True
     starts = {
         "k": lambda at: _stiffness(at) * np.array([2.0, 10.0, 50.0]),
@@ -160,6 +161,79 @@ class ElasticDriveSeenAtLoad(ElasticDrive):
     equation = ElasticDrive.equation.removesuffix("; outputs read q")
     sentence = "an elastic drive: a spring stands between the motor and the joint, where the sensor is"
     sensed = False
+
+
+class TermLimit(_InLine):
+    """The common part of limits of a term: a force that the equations have, and that the machine cannot exceed."""
+
+    id = "saturation"
+    implied = "balance"
+    source = "Khalil (2002), Nonlinear Systems, sec. 1.2"
+
+    def force(self, given: Any, p: Any) -> Any:
+        return self.limited(given, p) - given
+
+    def limited(self, given: Any, p: Any) -> Any:
+        """Limit the term's force."""
+        raise NotImplementedError
+
+    def forces_along(self, local: Local, shapes: Sequence[Mapping[str, Any]]) -> np.ndarray:
+        """Forces along a port's signals, shape (M, len(shapes), 1)."""
+        given = _term_along(local)
+        found = [np.asarray(self.limited(ca.DM(given), Named("parameter", shape))).ravel() - given for shape in shapes]
+        return np.column_stack(found)[:, :, None]
+
+
+class LimitedTerm(TermLimit):
+    """A force of the equations with a hard limit on either side, such as the torque of a drive with limited current."""
+
+    form = "of a term"
+    equation = "w = clip(F, low, high) - F"
+    sentence = "saturation of a modelled force F: the machine does not exceed a limit on either side"
+    units = {"low": "w", "high": "w"}
+    strength: ClassVar[tuple[str, ...]] = ()  # the force is not linear in the limits
+    starts = {
+        "low": lambda at: np.quantile(_term_along(at), (0.0, 0.02, 0.1, 0.3)),
+        "high": lambda at: np.quantile(_term_along(at), (1.0, 0.98, 0.9, 0.7)),
+    }
+    ranges = {
+        "low": lambda at: (_reach(at, 0.0, -0.1), _reach(at, 0.5)),
+        "high": lambda at: (_reach(at, 0.5), _reach(at, 1.0, 0.1)),
+    }
+
+    def limited(self, given: Any, p: Any) -> Any:
+        return ca.fmax(ca.fmin(given, p.high), p.low)
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        """Generate limits of which at least one is reached."""
+        _, *reached = super().shapes(local)
+        yield from reached
+
+
+class SoftlyLimitedTerm(TermLimit):
+    """A force of the equations that approaches a limit gradually, such as the grip of a tyre."""
+
+    form = "of a term, soft"
+    equation = "w = L tanh(F / L) - F"
+    sentence = "saturation of a modelled force F: it approaches a limit gradually"
+    units = {"L": "w"}
+    strength: ClassVar[tuple[str, ...]] = ()  # the force is not linear in the limits
+    starts = {"L": lambda at: float(np.quantile(np.abs(_term_along(at)), 0.99)) * np.array([0.3, 0.6, 1.0, 2.0])}
+    ranges = {"L": lambda at: float(np.quantile(np.abs(_term_along(at)), 0.99)) * np.array([0.1, 10.0])}
+
+    def limited(self, given: Any, p: Any) -> Any:
+        return p.L * ca.tanh(given / p.L)
+
+
+def _term_along(local: Local) -> np.ndarray:
+    """Force of the term along a port's signals; zero if the port names none."""
+    return np.zeros(len(local.z)) if local.term is None else local.term(local.z, local.dz)
+
+
+def _reach(local: Local, share: float, beyond: float = 0.0) -> float:
+    """A quantile of the term's force, moved by a share of its span."""
+    given = _term_along(local)
+    return float(np.quantile(given, share) + beyond * np.ptp(given))
 
 
 def _stiffness(local: Local) -> float:

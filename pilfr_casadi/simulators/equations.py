@@ -366,9 +366,10 @@ class Equations:
         return replace(port, rate=port.across) if speed else port
 
     def _add_drives(self, ports: tuple[Port, ...]) -> tuple[Port, ...]:
-        """Find the force of a drive in the equations, as `term` of the first port at each driven motion without one.
+        """Find what drives a motion in the equations, as `term` of the first port at each driven motion without one.
 
-        A drive may be elastic wherever a force acts on a position, whether its user has thought of that or not.
+        A drive may be elastic wherever a force acts on a position, and limited wherever it moves a state of first
+        order, whether its user has thought of that or not.
         """
         if self.discrete or not self.states:
             return ports
@@ -379,7 +380,10 @@ class Equations:
         for port, target in zip(ports, targets, strict=True):
             if target not in taken and (drive := self._find_drive(port, *at)) is not None:
                 taken.add(target)
-                port = replace(port, term=drive, implied=True)
+                port = replace(port, term=drive, implied="drive")
+            elif target not in taken and (balance := self._find_balance(port, *at)) is not None:
+                taken.add(target)
+                port = replace(port, term=balance, implied="balance")
             out.append(port)
         return tuple(out)
 
@@ -412,6 +416,27 @@ class Equations:
             return ca.mtimes(of(states, values), ca.vertcat(*(u[n] for n in forces), *(x[n] for n in own)))
 
         return drive
+
+    def _find_balance(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Expression | None:
+        """Return all that changes a state which a port's force changes at once, with the sign of w.
+
+        None if the port's coordinate is no such state, or if no input drives it.
+        """
+        into, z = self.into(port, x, u, p, t), self.across(port, x, u, p, t)
+        (name, factor), *more = into.items()
+        if more or not z.is_symbolic() or z.name() != name:
+            return None
+        rate = self.by_state(self.derivatives(x, u, p, t))[name]
+        if not ca.depends_on(rate, stack(u)) or ca.depends_on(rate / factor, ca.vertcat(t)):
+            return None
+        of = ca.Function("balance", [stack(x), stack(u), stack(p)], [rate / factor])
+        names = self.states, self.inputs, tuple(self.parameters)
+
+        def balance(x: Named, u: Named, p: Named) -> Any:
+            sides = zip((x, u, p), names, strict=True)
+            return of(*(ca.vertcat(*(ca.vec(ca.SX(one[n])) for n in some)) for one, some in sides))
+
+        return balance
 
     @cached_property
     def state_units(self) -> dict[str, str]:

@@ -149,6 +149,7 @@ class _LawsAtInstant:
         e = self.equations.simulator.elements[i]
         p, u = self.equations.law_values(e), Named("input", {**self.u, **(port_signals or {}), "t": self.t})
         have = {"z": z, "dz": dz, "q": self.q[i], "p": p, "t": self.t, "x": self.x, "u": u, "term": term}
+        have["given"] = None if term is None else term(z, dz)
         if hasattr(e.law, "step"):
             read = {k: have[k] for k in ("dz", "u") if k in inspect.signature(e.law.step).parameters}
             w, self.memory[i] = e.law.step(z, self.s[i], p, **read)

@@ -100,9 +100,10 @@ class Port:
         of a spring, `lambda z, p: p.k * z`, or minus the torque of a motor, `lambda u: -u.torque`. It takes any of z,
         dz, x, u, p by name, where z and dz are the local coordinate and its rate. Laws in line with it (a gap, a
         compliance, a rotor on a spring) are then tried: they change its z and dz.
-        If no term is given, the force of a drive is found in the equations.
-    implied : bool
-        The simulator has found `term` in its equations.
+        If no term is given, the force of a drive is found in the equations; where a force changes z at once, as in a
+        drive of first order, all that changes z is the term.
+    implied : {"", "drive", "balance"}
+        What the simulator has found as `term` in its equations, if none is given.
     series : bool
         A law acts on a signal, as at an actuator or a sensor; of built-in ports.
     domain : {"mechanical", "thermal", "electrical", "fluid", "unknown"}, optional
@@ -130,7 +131,7 @@ class Port:
     domain: str = ""
     signals: Mapping[str, Expression] = field(default_factory=dict)
     term: Expression | None = None
-    implied: bool = False
+    implied: str = ""
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -189,8 +190,8 @@ class Port:
         return revolution_in("rad" if position else self.across_unit)
 
     def has_term_for(self, law: Any) -> bool:
-        """Tell whether it has the force that a law in line needs: its own term, or that of a drive."""
-        return self.term is not None and (law.driven or not self.implied)
+        """Tell whether it has the force that a law in line needs: its own term, or one found in the equations."""
+        return self.term is not None and self.implied in ("", law.implied)
 
     def admits(self, law: Any) -> bool:
         """Tell whether a law (or its class) may be missing here: by its places, physical domains and coordinate.

@@ -19,7 +19,20 @@ from typing import Any
 
 import numpy as np
 
-from ...laws import DRAGS, DRY, SMALL_AND_LARGE, Attached, Delay, Lag, Law, Local, Resonance, SprungMass, unit_forces
+from ...laws import (
+    DRAGS,
+    DRY,
+    SMALL_AND_LARGE,
+    Attached,
+    Delay,
+    Lag,
+    Law,
+    Local,
+    Resonance,
+    SprungMass,
+    TermLimit,
+    unit_forces,
+)
 from ...simulators import PARAMETER, in_series, kind_of
 from ..fits.evidence import FAR_RATIO, NEAR_RATIO
 from ..fits.force_recovery import forces_of_change
@@ -41,10 +54,13 @@ def complements(one: Law, other: Law) -> bool:
 
     So are dry friction and a drag that grows with speed, a dead zone and a saturation, and two curves of position if a
     signal, such as a pressure, varies the strength of one alone. A constant offset may stand beside any other law, and
-    a mass on a spring beside any force without such a mass. The path of a signal may have a delay, a lag, and a curve
+    so may a limit of a force that the equations have, because it acts on that force alone. A mass on a spring may
+    stand beside any force without such a mass. The path of a signal may have a delay, a lag, and a curve
     or a memory of its size.
     """
     if "offset" in (one.id, other.id):
+        return one.id != other.id
+    if any(isinstance(law, TermLimit) for law in (one, other)):
         return one.id != other.id
     if "delay" in (one.id, other.id) or any(
         law.id == "extra_mode" and law.places == ("series",) for law in (one, other)
