@@ -349,11 +349,17 @@ class Law:
         """Tell whether the law degenerates at its fitted values, so that its sentence is hardly true."""
         return False
 
+    def as_base(self, own: Mapping[str, Any]) -> dict[str, Any]:
+        """Values at which it equals its base class with the values `own`; empty if only strengths tell them apart."""
+        return {}
+
     def starts_as(self, plain: Law, own: Mapping[str, Any], shape: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """Start values at which it equals a plainer law with the values `own`; empty if it does not refine that law.
 
         `shape` has values of the shape parameters of its further terms, which have no strength yet.
         """
+        if type(plain) is type(self).__base__ and (same := self.as_base(own)):
+            return same
         more = [name for name in self.strength if name not in plain.units]
         refines = plain.strength and plain.units.items() <= self.units.items()
         return {**(shape or {}), **dict.fromkeys(more, 0.0), **own} if more and refines else {}

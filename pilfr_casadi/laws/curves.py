@@ -269,6 +269,9 @@ class AsymmetricSaturation(Saturation):
     def force(self, z: Any, p: Any) -> Any:
         return ca.fmax(ca.fmin(z, p.high), p.low) - z
 
+    def as_base(self, own: Mapping[str, Any]) -> dict[str, Any]:
+        return {"low": -own["L"], "high": own["L"]}
+
 
 class SoftSaturation(Saturation):
     """A limit that is approached gradually."""
@@ -341,6 +344,9 @@ class AsymmetricDeadZone(DeadZone):
 
     def force(self, z: Any, p: Any) -> Any:
         return -ca.fmax(ca.fmin(z, p.g_2), -p.g_1)
+
+    def as_base(self, own: Mapping[str, Any]) -> dict[str, Any]:
+        return {"g_1": own["g"], "g_2": own["g"]}
 
     def why_not(self, local: Local) -> str:
         return "" if local.low < 0 < local.high else "one side is never visited"

@@ -73,6 +73,9 @@ class PowerStiffness(CubicStiffness):
     def force(self, z: Any, p: Any) -> Any:
         return p.k_n * ca.sign(z) * size_to_power(z, p.n)
 
+    def as_base(self, own: Mapping[str, Any]) -> dict[str, Any]:
+        return {"k_n": own["k_3"], "n": 3.0}
+
 
 class GeometricStiffness(CubicStiffness):
     """A spring across the motion, such as a taut string: cubic at small and linear at large deflections."""
@@ -122,6 +125,9 @@ class AsymmetricCubicStiffness(CubicStiffness):
     def force(self, z: Any, p: Any) -> Any:
         return super().force(z, p) + p.k_3 * p.b * z**2
 
+    def as_base(self, own: Mapping[str, Any]) -> dict[str, Any]:
+        return {**own, "b": 0.0}
+
 
 class QuadraticStiffness(Law):
     """A spring that is stiffer in one direction (Nayfeh & Mook 1979)."""
@@ -154,6 +160,9 @@ class ProgressiveStiffness(QuadraticStiffness):
 
     def force(self, z: Any, p: Any) -> Any:
         return super().force(z, p) * (1 + p.b * z)
+
+    def as_base(self, own: Mapping[str, Any]) -> dict[str, Any]:
+        return {**own, "b": 0.0}
 
 
 class PiecewiseStiffness(Law):
@@ -294,6 +303,9 @@ class OffCentreClearance(Clearance):
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_g * (ca.fmax(z - p.m - p.g, 0) - ca.fmax(p.m - z - p.g, 0))
+
+    def as_base(self, own: Mapping[str, Any]) -> dict[str, Any]:
+        return {**own, "m": 0.0}
 
 
 def _periods(local: Local) -> np.ndarray:
