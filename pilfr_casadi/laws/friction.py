@@ -18,6 +18,7 @@ SHARP = 2e-3  # narrowest reversal that is tried at any steps, over the speed
 SHARPEST_REVERSAL = 1e-4  # narrowest reversal that is tried where the steps resolve it, over the speed
 STABLE_STEP = 2.5  # |λ| h up to which a Runge-Kutta step is stable
 BROAD = 0.1  # width of the reversal over the largest speed from which an answer says that it is broad
+NO_FRICTION = 1e-3  # share of a constant load below which dry friction beside it is none
 WIDE = 0.4  # width of the reversal over the widest that is tried; above it the force is damping that saturates
 
 
@@ -64,6 +65,10 @@ class AsymmetricFriction(CoulombFriction):
 
     def force(self, dz: Any, p: Any) -> Any:
         return super().force(dz, p) + p.F_0
+
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """Tell whether nothing of it opposes the motion: then it is a constant load."""
+        return super().doubtful(values) or bool(values["F_c"] < NO_FRICTION * np.abs(values["F_0"]))
 
 
 class DirectionalFriction(AsymmetricFriction):

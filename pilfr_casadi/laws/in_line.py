@@ -168,6 +168,7 @@ class TermLimit(_InLine):
 
     id = "saturation"
     implied = "balance"
+    absent: ClassVar[tuple[str, ...]] = ("thermal",)  # a flow of heat has no limit of its own
     source = "Khalil (2002), Nonlinear Systems, sec. 1.2"
 
     def force(self, given: Any, p: Any) -> Any:

@@ -209,9 +209,11 @@ def test_the_catalogue_has_no_law_twice():
         (laws.Orifice, {"a": 0.2, "z_t": 0.1}, False),
         (laws.SlackCoupling, {"k_g": 0.0, "c_g": 2.0, "g": 0.1}, True),
         (laws.SlackCoupling, {"k_g": 30.0, "c_g": 0.0, "g": 0.1}, False),
+        (laws.DirectionalFriction, {"F_c": 0.0, "F_0": -199.0, "c_0": 0.3, "v_0": 0.1}, True),
+        (laws.AsymmetricFriction, {"F_c": 2.0, "F_0": -199.0, "v_0": 0.1}, False),
     ],
 )
-def test_a_power_of_one_is_no_curve_and_a_damper_without_a_spring_no_clearance(kind, values, doubtful):
+def test_a_law_whose_own_part_has_vanished_is_doubtful(kind, values, doubtful):
     assert kind().doubtful(values) is doubtful
 
 
