@@ -22,7 +22,7 @@ from .._base import InputError, percent
 from ..laws import CATALOGUE
 from ..simulators import name_at
 from .faults.offsets import describe_offsets
-from .fits.evidence import FORMULA_ERROR, NEAR_RATIO, SURE, HeldOut, runs_away
+from .fits.evidence import FORMULA_ERROR, NEAR_RATIO, SURE, ExpectedError, held_out_errors, runs_away
 from .fits.floor import Floor
 from .fits.workbench import FEW, Fitted
 from .posterior import Posterior, explainable_remainder, hypotheses_named, share_left
@@ -112,7 +112,7 @@ class _Candidate:
         return self.fitted.cost + self.spread
 
 
-_Validated = tuple[_Candidate, HeldOut]
+_Validated = tuple[_Candidate, ExpectedError]
 
 
 def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction, Fitted]:
@@ -163,14 +163,14 @@ def _cross_validate_refit(search: Search) -> list[_Validated]:
 
 def _describe_best(search: Search, validated: list[_Validated], floor: Floor) -> tuple[Correction, Fitted]:
     """Describe the candidate with the smallest expected error, beside the refit, which comes first."""
-    candidate, held_out = _choose(validated)
+    candidate, expected = _choose(validated)
     fitted, base = candidate.fitted, candidate.base
     shares = _shares(search, base.fitted, fitted, floor)
     elements: tuple[Learned, ...] = ()
     if fitted is not base.fitted:
         laws = dict.fromkeys((*CATALOGUE, *search.laws))
         elements = (describe_learned(search.bench, fitted, shares["learned"], laws),)
-    errors = validated[0][1].rms, held_out.rms
+    errors = validated[0][1].held_out.rms, expected.held_out.rms
     offsets = describe_offsets(search.bench.simulator.elements)
     return Correction(_describe_elements(search, fitted), shares, elements, *errors, base, offsets=offsets), fitted
 
@@ -184,13 +184,13 @@ def _cross_validate(search: Search, candidates: Sequence[_Candidate], validated:
     """Cross-validate further candidates, the most promising first, as long as they can be best and there is time."""
     out = list(validated)
     for c in sorted(candidates, key=lambda c: c.least):
-        least = min((h.score for _, h in out), default=np.inf)
+        least = min((e.mean_square for _, e in out), default=np.inf)
         if search.past_deadline or (out and c.least >= least):
             break
         bare = c.fitted is c.base.fitted
-        found = search.held_out(c.base) if bare else search.held_out_errors(c.fitted, c.spread)
+        found = search.held_out(c.base) if bare else held_out_errors(search.bench, c.fitted, search.workers)
         if np.isfinite(found.rms) or not search.past_deadline:  # otherwise the time was over before it was known
-            out.append((c, found))
+            out.append((c, ExpectedError(found, search.spread_of(c.base) if bare else c.spread)))
     return out
 
 
@@ -202,7 +202,7 @@ def _compare(
     A wanted candidate that cannot be best need not be cross-validated.
     """
     validated = _cross_validate(search, candidates, refit)
-    least = min((h.score for _, h in validated), default=np.inf)
+    least = min((e.mean_square for _, e in validated), default=np.inf)
     left_out = wanted is not None and wanted.least < least and all(c is not wanted for c, _ in validated)
     return [] if search.past_deadline and (len(validated) < 2 or left_out) else validated
 
@@ -216,7 +216,7 @@ def _far_better(search: Search, candidates: Sequence[_Candidate]) -> Trial:
 
 def _choose(validated: Sequence[_Validated]) -> _Validated:
     """Choose the candidate with the smallest expected error on other recordings."""
-    return min(validated, key=lambda p: p[1].score)
+    return min(validated, key=lambda p: p[1].mean_square)
 
 
 def _named_hypotheses(search: Search, answer: Posterior) -> list[Trial]:

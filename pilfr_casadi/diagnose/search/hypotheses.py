@@ -242,19 +242,20 @@ class Hypotheses:
         return {port.name: port.domain for port in self.bench.simulator.all_ports()}
 
     def held_out(self, trial: Trial) -> HeldOut:
-        """Compute the held-out errors of a hypothesis, once.
+        """Compute the held-out errors and the spread of a hypothesis, once, and return the errors.
 
-        If it follows no better than with fewer laws, it has the errors of the hypothesis with fewer laws.
+        If it follows no better than with fewer laws, it has those of the hypothesis with fewer laws.
         """
         known = self.findings[trial.key].held_out
         if known is None:
             alike = [t for t in self.memo.values() if t.key < trial.key and t.thorough and self._alike(t, trial)]
             shown = min([*alike, trial], key=lambda t: len(t.key))
             known = self.findings[shown.key].held_out
-            known = known or self.held_out_errors(shown.fitted, self.spread_of(shown))
+            spread = self.spread_of(shown)
+            known = known or held_out_errors(self.bench, shown.fitted, self.workers)
             if np.isfinite(known.rms) or not self.past_deadline:  # otherwise the time was over before they were known
                 for key in (shown.key, trial.key):
-                    self.findings[key].held_out, self.findings[key].spread = known, known.spread
+                    self.findings[key].held_out, self.findings[key].spread = known, spread
         return known
 
     def _alike(self, one: Trial, other: Trial) -> bool:
@@ -262,10 +263,6 @@ class Hypotheses:
         ratio = one.mean_square / max(other.mean_square, 1e-300)
         nats = 0.5 * self.effective_samples.at(0.0) * np.log(ratio)
         return bool(ratio < EQUAL_RATIO and nats < INDISTINGUISHABLE_NATS)
-
-    def held_out_errors(self, fitted: Fitted, spread: float) -> HeldOut:
-        """Compute the held-out errors of a fitted simulator with a known spread for other inputs."""
-        return replace(held_out_errors(self.bench, fitted, self.workers), spread=spread)
 
     def spread_of(self, trial: Trial) -> float:
         """Compute the spread of a hypothesis, once."""

@@ -211,7 +211,8 @@ def test_after_the_deadline_and_ctrl_c_the_correction_fits_nothing_more(monkeypa
     assert not fitted
     found.bench = replace(found.bench, deadline=np.inf, interrupt=Interrupt(True, True))
     with monkeypatch.context() as patch:  # after Ctrl-C not even the parts that a comparison needs
-        patch.setattr(type(found), "held_out_errors", lambda *_: pytest.fail("a comparison after Ctrl-C"))
+        for module in (hypotheses, correction):
+            patch.setattr(module, "held_out_errors", lambda *_: pytest.fail("a comparison after Ctrl-C"))
         assert correction.find_named_correction(found, unsure)[0].elements
     found.bench = replace(found.bench, interrupt=Interrupt())
     correction.find_unnamed_correction(found)
