@@ -23,7 +23,7 @@ from .effect import Effect
 from .extrapolation import range_note
 from .faults.channels import IN_RECORDINGS, find_gross_channel_errors
 from .faults.gates import EQUAL_RATIO, TEST_FAULT, TEST_OFFSET, Gate, edited
-from .faults.offsets import Offset, describe_offsets, remove_offsets, update_offsets
+from .faults.offsets import Offset, describe_offsets, find_placed_offsets, remove_offsets, update_offsets
 from .fits.evidence import BETTER_RATIO, FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, all_sure, standard_errors
 from .fits.floor import Floor
 from .fits.force_recovery import is_curve_along
@@ -200,10 +200,10 @@ def _test_faults(bench: Workbench, after: Fitted, tests: Sequence[Recording], ga
 
 def _at_zero_offsets(bench: Workbench, after: Fitted, own: int) -> tuple[str, Fitted]:
     """Run a fit with its offsets after the first `own` elements at zero; also name the offsets, "" if there is none."""
-    found = [e for e in after.simulator.elements[own:] if isinstance(e.law, Offset)]
-    found = [e for e in found if np.any(after.values[f"{e.prefix}w_0"])]
-    zero = {f"{e.prefix}w_0": np.zeros_like(after.values[f"{e.prefix}w_0"]) for e in found}
-    return describe_offsets(found), bench.rerun(after, {**after.values, **zero}) if found else after
+    added = find_placed_offsets(after.simulator.elements[own:])
+    found = {name: e for name, e in added.items() if np.any(after.values[name])}
+    zero = {name: np.zeros_like(after.values[name]) for name in found}
+    return describe_offsets(found.values()), bench.rerun(after, {**after.values, **zero}) if found else after
 
 
 def _offset_note(offsets: str, errors: Mapping[str, float]) -> Iterator[Gate]:

@@ -21,7 +21,6 @@ import numpy as np
 from .._base import InputError, percent
 from ..laws import CATALOGUE
 from ..simulators import name_at
-from .faults.offsets import describe_offsets
 from .fits.evidence import FORMULA_ERROR, NEAR_RATIO, SURE, ExpectedError, held_out_errors, runs_away
 from .fits.floor import Floor
 from .fits.workbench import FEW, Fitted
@@ -166,13 +165,13 @@ def _describe_best(search: Search, validated: list[_Validated], floor: Floor) ->
     candidate, expected = _choose(validated)
     fitted, base = candidate.fitted, candidate.base
     shares = _shares(search, base.fitted, fitted, floor)
-    elements: tuple[Learned, ...] = ()
+    learned: tuple[Learned, ...] = ()
     if fitted is not base.fitted:
         laws = dict.fromkeys((*CATALOGUE, *search.laws))
-        elements = (describe_learned(search.bench, fitted, shares["learned"], laws),)
-    errors = validated[0][1].held_out.rms, expected.held_out.rms
-    offsets = describe_offsets(search.bench.simulator.elements)
-    return Correction(_describe_elements(search, fitted), shares, elements, *errors, base, offsets=offsets), fitted
+        learned = (describe_learned(search.bench, fitted, shares["learned"], laws),)
+    before, after = validated[0][1].held_out.rms, expected.held_out.rms
+    described = _describe(search, fitted, shares)
+    return replace(described, learned=learned, before=before, after=after, closest=base), fitted
 
 
 def _is_settled(search: Search, answer: Posterior) -> bool:
@@ -262,10 +261,7 @@ def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()
 
 def uncompared_correction(search: Search, fitted: Fitted, floor: Floor | None = None) -> Correction:
     """Describe a simulator without a learned element, which was not compared with others."""
-    shares = _shares(search, fitted, fitted, floor or search.floor)
-    return Correction(
-        _describe_elements(search, fitted), shares, offsets=describe_offsets(search.bench.simulator.elements)
-    )
+    return _describe(search, fitted, _shares(search, fitted, fitted, floor or search.floor))
 
 
 def _may_recur(search: Search, trial: Trial) -> bool:
@@ -282,6 +278,7 @@ def _shares(search: Search, named: Fitted, whole: Fitted, floor: Floor) -> dict[
     return {"named": 1 - beside_names, "learned": beside_names - left, "left": left}
 
 
-def _describe_elements(search: Search, fitted: Fitted) -> tuple[tuple[str, str, str], ...]:
-    """Return port, law and form of the elements that the diagnosis has added."""
-    return tuple((e.port, e.law.id, e.law.form) for e in search.added_laws(fitted))
+def _describe(search: Search, fitted: Fitted, shares: dict[str, float]) -> Correction:
+    """Describe a simulator by the elements that the diagnosis has added."""
+    elements = tuple((e.port, e.law.id, e.law.form) for e in search.added_laws(fitted))
+    return Correction(elements, shares, offsets=search.offsets)

@@ -16,7 +16,7 @@ from .blind_spots import BlindSpot
 from .correction import Correction
 from .effect import Effect
 from .faults.gates import TEST_FAULT, TEST_OFFSET, Gate, value_with_unit
-from .faults.offsets import Offset, describe_offsets
+from .faults.offsets import Offset, describe_offsets, find_placed_offsets
 from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, all_sure
 from .fits.floor import ABOVE_NOISE
 from .search.learned import Learned
@@ -259,12 +259,12 @@ class ResultText:
 
     def _doubtful_offsets(self) -> Iterator[str]:
         """Generate a note on each offset that is larger than its signal ever was."""
-        own = self.corrected.parameters
-        for e in (e for e in self.corrected.elements if isinstance(e.law, Offset) and self.train):
+        for parameter, e in find_placed_offsets(self.corrected.elements if self.train else ()).items():
             kind, name = split_port(e.port)
             values = [r.u if kind == ACTUATOR else r.y for r in self.train]
             at = (self.train[0].inputs if kind == ACTUATOR else self.train[0].outputs).index(name)
-            reach, value = max(float(np.max(np.abs(v[:, at]))) for v in values), float(own[f"{e.prefix}w_0"].value)
+            reach = max(float(np.max(np.abs(v[:, at]))) for v in values)
+            value = float(self.corrected.parameters[parameter].value)
             if abs(value) > reach:
                 yield (
                     f"The offset of {name} ({value:.3g}) is larger than {name} ever was ({reach:.3g}): it may make up "
@@ -369,8 +369,8 @@ class ResultText:
             bound = ", at its bound" if at_bounds(value, *own[name].bounds) else ""
             lines.append(f"  {name} = {value:.5g}{std} {p['unit']}".rstrip() + f", given as {nominal:.5g}{bound}")
         more = [f"  and {len(moved) - MOST_PRINTED} more"] if len(moved) > MOST_PRINTED else []
-        for e in (e for e in self.corrected.elements if isinstance(e.law, Offset)):
-            value, unit = float(own[f"{e.prefix}w_0"].value), self.corrected.port(e.port).unit
+        for name, e in find_placed_offsets(self.corrected.elements).items():
+            value, unit = float(own[name].value), self.corrected.port(e.port).unit
             more.append(f"  offset of {split_port(e.port)[1]} = {value_with_unit(value, unit, 4)}")
         return ["the simulator's own values, refitted:", *lines, *more] if lines or more else []
 

@@ -16,6 +16,7 @@ from ..._base import Stages, UntilInterrupted
 from ...laws import Law
 from ...simulators import Placed, Simulator
 from ..faults.gates import EQUAL_RATIO
+from ..faults.offsets import describe_offsets
 from ..fits.coloured_noise import log_likelihood
 from ..fits.evidence import (
     CONTENDING_NATS,
@@ -160,6 +161,11 @@ class Hypotheses:
     def root(self) -> Trial:
         """The hypothesis without laws."""
         return self.memo[frozenset()]
+
+    @property
+    def offsets(self) -> str:
+        """Words for the offsets that all hypotheses have, such as "the offset of u"; empty if there is none."""
+        return describe_offsets(self.bench.simulator.elements)
 
     @property
     def best(self) -> Trial:

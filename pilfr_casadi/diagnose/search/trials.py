@@ -21,7 +21,7 @@ from ...data import Recording
 from ...laws import Law
 from ...simulators import Placed, Simulator
 from ..faults.gates import EQUAL_RATIO, open_start
-from ..faults.offsets import Offset
+from ..faults.offsets import Offset, find_placed_offsets
 from ..fits.evidence import FAR_RATIO, FORMULA_ERROR, WRONG_MODEL_SAMPLES
 from ..fits.screen import Pair, Scored
 from ..fits.step_refinement import knee_starts, refit_on_finer_steps
@@ -267,8 +267,8 @@ class Trials:
         compiled = self.bench.compile(placed, observer_gain)
         users = self.bench.simulator.parameters
         # the refit may have compensated for the law by an offset there, or by the term that the law is in line with
-        offsets = [e for e in self.bench.simulator.elements if e.port == first.port and isinstance(e.law, Offset)]
-        reset = tuple(f"{e.prefix}{name}" for e in offsets for name in e.law.strength)
+        offsets = find_placed_offsets(self.bench.simulator.elements)
+        reset = tuple(name for name, e in offsets.items() if e.port == first.port)
         if first.law.in_line:
             reset = (*reset, *self.bench.simulator.term_parameters(first.port))
         afresh = bool(reset) or first.law.special  # strongly curved forces may leave the refit far off
