@@ -295,7 +295,7 @@ def _combination_note(after: Fitted, std: Mapping[str, np.ndarray], blind_spots:
         and not p.value.ndim
         and not np.all(p.fixed)
         and not np.isfinite(std[name])
-        and not after.at_bound(name)
+        and not after.is_at_bound(name)
     ]
     if len(tied) < 2:
         return
@@ -350,7 +350,7 @@ def _make_effect(
     shown: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
         unit = readable_unit(element.law.units[name.removeprefix(element.prefix)], w_unit, z_unit, signals)
-        flat, at_bound = np.ravel(value), np.ravel(fitted.at_bound(name) & ~fitted.model.parameters[name].fixed)
+        flat, at_bound = np.ravel(value), np.ravel(fitted.is_at_bound(name) & ~fitted.model.parameters[name].fixed)
         for i, v in enumerate(flat):
             label = name.removeprefix(element.prefix) + (f"[{i}]" if len(flat) > 1 else "")
             error = float(np.ravel(std[name])[i])

@@ -70,7 +70,7 @@ def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameter
         for name, p in bench.simulator.parameters.items()
         if not p.value.ndim  # a matrix or a zero represents no physics
         and float(p.value) != 0
-        and bool(np.all(p.fixed) or np.all(without.at_bound(name)))
+        and bool(np.all(p.fixed) or np.all(without.is_at_bound(name)))
     ]
     most = max(1, answer.best.size)
     freed: tuple[str, ...] = ()
