@@ -63,7 +63,7 @@ class Findings:
     # whether the force of a law with memory is a curve along the runs, by the prefix of its parameters
     curves: dict[str, bool] = field(default_factory=dict)
     varied: bool = False  # whether variations of parameters were tried beside it
-    replaced: bool = False  # whether laws with constant parameters were tried in place of its last law, which varies
+    replaced: bool = False  # whether laws with constant parameters were tried in place of its added law, which varies
 
 
 @dataclass(eq=False, repr=False)

@@ -39,7 +39,7 @@ from ..faults.timing import TimeShift, find_time_shift
 from ..fits.evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR, NEAR_RATIO
 from ..fits.floor import ABOVE_NOISE
 from ..fits.linearise import linearise_runs
-from ..fits.screen import Pair, Remainder, Scored, screen, usable
+from ..fits.screen import Remainder, Scored, screen, usable
 from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted, refit, refit_with_other_holds
 from .hypotheses import Hypotheses, likeliest
 from .learned import learn_forces, nearest_to_learned
@@ -309,19 +309,13 @@ class Search(Hypotheses):
         known = self.memo.get(trial.key, trial)
         if not known.error < trial.error:
             return trial
-        return self._with_last(known, trial.pair)
-
-    def _with_last(self, trial: Trial, pair: Pair) -> Trial:
-        """Return a hypothesis with one of its laws as the last."""
-        if trial.pair == pair:
-            return trial
-        return self.run_laws(sorted(trial.laws, key=lambda e: (e.port, type(e.law)) == pair), trial)
+        return known.with_added(trial.pair)
 
     def _best_with_one_more(self, parent: Trial) -> Trial | None:
-        """Return the best hypothesis, its further law as the last, if it has one law more than a parent."""
+        """Return the best hypothesis if it has one law more than a parent, with that as the added one."""
         best = self.best
         added = best.key - parent.key
-        return self._with_last(best, *added) if len(added) == 1 and parent.key < best.key else None
+        return best.with_added(*added) if len(added) == 1 and parent.key < best.key else None
 
     def _record(self, parent: Trial, scored: Sequence[Scored], trials: Sequence[Trial]) -> None:
         """Keep the trials of a move, and note the move."""
@@ -378,7 +372,7 @@ class Search(Hypotheses):
         at = next((i for i, e in enumerate(others) if e.port == last.port), None)
         if at is None or not in_series(last.port) or (_is_filter(last.law) and _is_filter(others[at].law)):
             return None
-        found = self.run_laws([*others[:at], last, *others[at:]], trial)
+        found = self.run_laws([*others[:at], last, *others[at:]], trial).with_added(trial.pair)
         return self.fits.converge(found) if found.mean_square < DIVERGED else None
 
     def _finer(self, parent: Trial) -> None:
@@ -402,7 +396,7 @@ class Search(Hypotheses):
         may_vary = [kind for kind in SCALABLE if kind.id not in LINEAR]
         added = [t for t in self.steps[-1].trials if constant(type(t.law)) in may_vary]
         kept = [self.memo[t.key] for t in added]  # perhaps found before, with these laws added in another order
-        step = [new if known.pair != new.pair else known for new, known in zip(added, kept, strict=True)]
+        step = [known.with_added(new.pair) for new, known in zip(added, kept, strict=True)]
         # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
         if not step or not self.can_improve(self.best, self.least_floor) or not self.may_go_on():
             return
@@ -414,13 +408,13 @@ class Search(Hypotheses):
             self._vary(forms, (self.best.law.scheduled_by,))
 
     def _vary(self, trials: Sequence[Trial], signals: Sequence[str]) -> None:
-        """Fit hypotheses with the strength of their last law varying with each signal."""
+        """Fit hypotheses with the strength of their added law varying with each signal."""
         for trial in trials:
             kind = constant(type(trial.law))
             self._refine(trial, [scheduled(kind, by, likely_profiles(kind)[0]) for by in signals])
 
     def _entry(self, trial: Trial) -> Scored | None:
-        """Return how the last law of a trial, or another with the same sense, was first screened at its port.
+        """Return how the added law of a trial, or another with the same sense, was first screened at its port.
 
         None if none was there: the hypothesis comes from another search.
         """
@@ -428,20 +422,25 @@ class Search(Hypotheses):
         return min(there, key=lambda s: s.law.dissipative != trial.law.dissipative, default=None)
 
     def _refine(self, trial: Trial, kinds: Sequence[Any]) -> None:
-        """Fit a hypothesis with its last law in other forms, which start from its values and oppose motion alike."""
+        """Fit a hypothesis with its added law in other forms, which start from its values and oppose motion alike.
+
+        The law keeps its place, because laws of one signal act one after the other.
+        """
         entry, base, law = self._entry(trial), trial.fitted, trial.law
         if entry is None or not kinds:
             return
         if law.dissipative and not entry.sense:
             total = sum(np.sum(trial.own[name]) for name in law.strength if name not in law.signed)
             entry = replace(entry, sense=int(np.sign(total)))
-        bare = base.simulator.without_element()
+        index = base.simulator.elements.index(trial.element)
+        bare = base.simulator.without_element(index)
 
         def fit(kind: Any) -> Trial | None:
             starts = list(kind.finer_starts(trial.law.at(trial.own), entry.local))
-            placed = [place_law(bare, replace(entry, law=kind()), own) for own in starts]
+            placed = [place_law(bare, replace(entry, law=kind()), own, index) for own in starts]
             values = [{**base.values, **named} for _, named in placed]
-            return self.fits.fit(placed[0][0], values, len(trial.laws), states=base.begin)
+            found = self.fits.fit(placed[0][0], values, len(trial.laws), states=base.begin)
+            return found and found.with_added((trial.port, kind))
 
         found = self._side_by_side(fit, [kind for kind in kinds if usable(kind(), entry.local)])
         self._keep_all([t for t in found if t is not None])
@@ -496,12 +495,12 @@ class Search(Hypotheses):
             return
         self._try(base, entries, observer_gain)
         self.replace_variation(base)
-        last = self.best.laws[-1] if self.best.laws else None
-        if last and kind_of(last.port) == PARAMETER and last.law.scheduled_by:
-            self._curve(base, [s for s in entries if s.pair == (last.port, type(last.law))], observer_gain)
+        found = self.best
+        if found.laws and kind_of(found.port) == PARAMETER and found.law.scheduled_by:
+            self._curve(base, [s for s in entries if s.pair == found.pair], observer_gain)
 
     def replace_variation(self, base: Trial) -> None:
-        """Fit laws with constant parameters whose force is like that of the best hypothesis' last law, which varies."""
+        """Fit laws with constant parameters whose force is like that of the law that the best hypothesis lets vary."""
         best = self.best
         known = self.findings[best.key]
         if known.replaced or not best.laws or best.key - base.key != {best.pair} or base.key - best.key:
@@ -553,8 +552,8 @@ class Search(Hypotheses):
                     self.leave_out(best, [element])
                     plain = constant(type(element.law))
                     if plain is not type(element.law) and kind_of(element.port) != PARAMETER:
-                        others = [e for e in best.laws if e is not element]
-                        self._refine(self.run_laws([*others, element], best), [plain])
+                        pair = element.port, type(element.law)
+                        self._refine(self.run_laws(best.laws, best).with_added(pair), [plain])
                 if self.best.key == best.key:
                     return
 
