@@ -323,7 +323,7 @@ def _without_each_effect(search: Search, found: Conclusion) -> dict[LikelyEffect
         return {}
     joint, out = Trial.of(found.fitted, len(found.correction.elements)), dict[LikelyEffect, Fitted]()
     for effect in found.effects:
-        rest = search.leave_out(joint, [e for e in joint.laws if (e.port, e.law.id) == effect.name])
+        rest = search.leave_out(joint, [e for e in joint.laws if e.name == effect.name])
         if rest is not None:
             out[effect] = rest.fitted
     return out
@@ -338,7 +338,7 @@ def _make_effect(
     test_without: float,
 ) -> Effect:
     bench, fitted = search.bench, final.after
-    element = next(e for e in fitted.simulator.elements if (e.port, e.law.id) == named.name)  # its form may differ
+    element = next(e for e in fitted.simulator.elements if e.name == named.name)  # its form may differ
     law = element.law
     own, unrelated = placebo(bench, search.root.fitted, element.port, law)
     port = bench.simulator.port(element.port)
@@ -387,7 +387,7 @@ def _other_forms(search: Search, effects: Sequence[LikelyEffect], effect: Likely
     found = dict[str, Law]()
     for t in sorted((t for t in alike if search.evidence(t) > least), key=search.evidence, reverse=True):
         for e in t.effects:
-            if (e.port, e.law.id) == effect.name and len(e.law.units) <= len(law.units):
+            if e.name == effect.name and len(e.law.units) <= len(law.units):
                 found.setdefault(e.law.form, e.law)
     return [other for form, other in found.items() if form != law.form]
 
@@ -428,7 +428,7 @@ def _design_experiment(
 
 def _candidate_row(search: Search, t: Trial, parent: Trial) -> dict[str, Any]:
     """Return a candidate's row for diagnosis.json, with the law that it adds to its parent."""
-    added = next((e for e in t.laws if (e.port, type(e.law)) not in parent.key), t.element)
+    added = next((e for e in t.laws if e.pair not in parent.key), t.element)
     held_out = search.findings[t.key].held_out
     gain = search.evidence(t) - search.evidence(parent)
     return {

@@ -131,7 +131,7 @@ def _describe_pinned(search: Search, names: Sequence[str], found: Fitted, named:
         kept = "held at" if np.all(p.fixed) else "kept by its bounds at"
         was = value_with_unit(float(without.values[name]), p.unit, 4)
         parts.append(f"{name} = {value_with_unit(value, p.unit, 5)}, which is {kept} {was}")
-    words = " and ".join(f"the {name_at(placed.port, placed.law.id)}" for placed in named)
+    words = " and ".join(f"the {name_at(*placed.name)}" for placed in named)
     like = f", no further off than with {words}" if named else ""
     what, it, its, given = (
         ("a value", "it", "its", "value is") if len(names) == 1 else ("values", "them", "their", "values are")

@@ -252,7 +252,8 @@ def _fit_layer(bench: Workbench, after: Fitted, number: int, kind: type[Law]) ->
     z, dz, force = signals_along(bench, after, number)
     local = bench.local(z, dz)
     starts = _start_values(kind(), local, force, old.own(after.values))
-    placed = _replace_law(after.simulator, number, kind().at(starts[0], kind().bounds(local)))
+    layer = kind().at(starts[0], kind().bounds(local))
+    placed = after.simulator.without_element(number).with_element(old.port, layer, number)
     element = placed.elements[number]
     model = discretise(placed, bench.dt, bench.hold, after.model.substeps)
     layered = CompiledSimulator(placed, model, make_engine(model, bench.engine))
@@ -333,17 +334,6 @@ def _spread_thresholds(r: np.ndarray, w: np.ndarray, half: float, n: int) -> dic
     reach = min(EXTENT * float(r[order][np.searchsorted(mass, 0.99 * mass[-1])]), 0.95 * half)
     r, w = regrid(r, w, reach, extent=1.0, count=n)
     return {"r": r, "w": np.maximum(w, LEAST_START_WEIGHT * np.mean(w))}
-
-
-def _replace_law(simulator: Simulator, number: int, law: Law) -> Simulator:
-    """Return the simulator with another law in place of an element; all other parameters keep value and bounds."""
-    kept = {k: p for k, p in simulator.parameters.items() if not k.startswith(simulator.elements[number].prefix)}
-    bare = simulator
-    for _ in simulator.elements:
-        bare = bare.without_element()
-    for i, e in enumerate(simulator.elements):
-        bare = bare.with_element(e.port, law if i == number else e.law)
-    return bare.with_parameters({**bare.parameters, **kept})
 
 
 def _initial_state(after: Fitted, state: np.ndarray, number: int, law: Law, z: float, h: float) -> np.ndarray:

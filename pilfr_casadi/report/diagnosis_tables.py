@@ -441,4 +441,4 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
 def element_of(fitted: Fitted, effect: Effect) -> int | None:
     """Return the index of an effect's element in the fitted simulator, where offsets may precede it, or None."""
     placed = enumerate(fitted.simulator.elements)
-    return next((i for i, p in placed if (p.port, p.law.id) == (effect.port, effect.law)), None)
+    return next((i for i, p in placed if p.name == (effect.port, effect.law)), None)

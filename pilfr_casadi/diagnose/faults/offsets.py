@@ -161,8 +161,8 @@ def _law_of_constant(port: str) -> Offset:
 
 
 @dataclass(frozen=True)
-class Constant(Gate):
-    """A constant at a port, a parameter of the simulator; other physics may remain beside it.
+class SharedOffset(Gate):
+    """A constant at a port that all recordings share, a parameter of the simulator; other physics may remain beside it.
 
     `alike` says in the sentence what else the recordings may show.
     """
@@ -182,13 +182,15 @@ class Constant(Gate):
         return samples_of_mean(residuals)
 
 
-def describe_constant(port: str, value: float = 0.0, parameter: str = "", unit: str = "", alike: str = "") -> Constant:
+def describe_constant(
+    port: str, value: float = 0.0, parameter: str = "", unit: str = "", alike: str = ""
+) -> SharedOffset:
     """Return the fault that a channel has a constant offset; `alike` says what else it may be."""
     kind, name = split_port(port)
     own = ", or a constant load acts like one, as do dry friction and a dead zone while the input keeps its sign"
     where, load = ("input", own) if kind == ACTUATOR else ("output", "")
     words = f"The {where} {name} has a constant offset of about {value_with_unit(value, unit)}{load}{alike}"
-    return Constant(name, "offset", value, words, parameter=parameter, port=port, alike=alike)
+    return SharedOffset(name, "offset", value, words, parameter=parameter, port=port, alike=alike)
 
 
 def find_offsets(now: Checked, otherwise: Mapping[str, str] | None = None) -> Checked:
@@ -473,7 +475,7 @@ def update_offsets(
 
     Without effects they stay, because the corrected simulator has them.
     """
-    alike = {g.parameter: g.alike for g in gates if isinstance(g, Constant)}
+    alike = {g.parameter: g.alike for g in gates if isinstance(g, SharedOffset)}
     fitted = {g.parameter: g for g in list_offsets(after.simulator.elements, after.values, after.simulator, alike)}
     # standard errors count the samples that are independent for any parameter
     ratio = (effective_size(after.residual) / samples_of_mean(after.residual)) ** 0.5

@@ -41,7 +41,7 @@ from ...simulators import (
     states_along,
 )
 from .evidence import FORMULA_ERROR
-from .linearise import Constant, compose_substeps, input_slope, local_signals, loudest_stretch, simulate_states
+from .linearise import ProbeForce, compose_substeps, input_slope, local_signals, loudest_stretch, simulate_states
 from .workbench import Fitted, Workbench, pack_known
 
 NOISE_FACTORS = (1.0, 3.0, 9.0)  # factors on the given noise that are tried
@@ -338,7 +338,7 @@ def _recover(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
     """Smooth the force in passes; return local coordinate and rate (M,), force and standard deviation (M - 1,)."""
     n, window, r = fitted.model.substeps, target.window, target.recording
-    open_ = target.simulator.with_element(target.port, Constant())
+    open_ = target.simulator.with_element(target.port, ProbeForce())
     model = discretise(open_, bench.dt, bench.hold, n)
     drive = model.drive(r)
     values = {k: v for k, v in fitted.values.items() if k in target.simulator.parameters}

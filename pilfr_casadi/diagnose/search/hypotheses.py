@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -299,7 +299,7 @@ class Hypotheses:
         wrong model may overfit, and among models that follow the recordings equally well the right one predicts best.
         If the search took all its time, the comparison has half of what is left for the conclusion.
         """
-        if not self._all_wrong and len({frozenset((e.port, e.law.id) for e in t.laws) for t in self._likeliest()}) < 2:
+        if not self._all_wrong and len({frozenset(e.name for e in t.laws) for t in self._likeliest()}) < 2:
             return
         now = time.perf_counter()
         until = max(self.until, now + (self.bench.deadline - now) / 2)
@@ -327,7 +327,7 @@ class Hypotheses:
     def _judge_by_spread(self) -> None:
         """Compute the spread of the likeliest hypotheses, which takes less time than to hold data out."""
         while self._all_wrong and not self.past_deadline:
-            unknown = [t for t in likeliest(list(self.memo.values()), self.evidence) if t.laws]
+            unknown = [t for t in likeliest(self.memo.values(), self.evidence) if t.laws]
             unknown = [t for t in unknown if self.findings[t.key].spread is None]
             if not unknown:
                 break
@@ -335,7 +335,7 @@ class Hypotheses:
 
     def _likeliest(self) -> list[Trial]:
         """List the hypotheses that may be the likeliest if they predict as well as any that did."""
-        return likeliest(list(self.memo.values()), partial(self._judged_evidence, quantile=0.0))
+        return likeliest(self.memo.values(), partial(self._judged_evidence, quantile=0.0))
 
     def flexible(self, trial: Trial) -> dict[str, float]:
         """Compute the share of a trial's residual that a flexible force explains, by port."""
@@ -524,7 +524,7 @@ class Hypotheses:
         return UntilInterrupted(self.bench.interrupt, self.say.interrupted)
 
 
-def likeliest(trials: Sequence[Trial], evidence: Callable[[Trial], float]) -> list[Trial]:
+def likeliest(trials: Iterable[Trial], evidence: Callable[[Trial], float]) -> list[Trial]:
     """List the hypotheses whose evidence is near the largest, the likeliest first."""
     ranked = sorted(trials, key=evidence, reverse=True)
     return [t for t in ranked if evidence(t) > evidence(ranked[0]) - CONTENDING_NATS]

@@ -260,7 +260,7 @@ class Search(Hypotheses):
         plain = [t for t in kept if not (t.law.order or t.law.memory)]
         first = dict[tuple[str, str], Trial]()  # of each law the likeliest form, the likeliest laws first
         for trial in sorted(plain, key=self.optimistic_evidence, reverse=True):
-            first.setdefault((trial.port, trial.law.id), trial)
+            first.setdefault(trial.name, trial)
         best, shift_step = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_stated else 0.5
         with self.stage("shifts beside a law"):
             for trial in list(first.values())[:FEW] if self.may_go_on() else ():
@@ -552,8 +552,7 @@ class Search(Hypotheses):
                     self.leave_out(best, [element])
                     plain = constant(type(element.law))
                     if plain is not type(element.law) and kind_of(element.port) != PARAMETER:
-                        pair = element.port, type(element.law)
-                        self._refine(self.run_laws(best.laws, best).with_added(pair), [plain])
+                        self._refine(self.run_laws(best.laws, best).with_added(element.pair), [plain])
                 if self.best.key == best.key:
                     return
 

@@ -61,7 +61,7 @@ class Trial:
     @property
     def key(self) -> Key:
         """Ports and classes of the laws; equal keys mean the same hypothesis."""
-        return frozenset((e.port, type(e.law)) for e in self.laws)
+        return frozenset(e.pair for e in self.laws)
 
     @property
     def effects(self) -> tuple[Placed, ...]:
@@ -71,7 +71,7 @@ class Trial:
     @property
     def names(self) -> frozenset[Name]:
         """Ports and law ids of the effects, which are alike for all forms of a law."""
-        return frozenset((e.port, e.law.id) for e in self.effects)
+        return frozenset(e.name for e in self.effects)
 
     def supersedes(self, other: Trial) -> bool:
         """Tell whether this fit of a hypothesis replaces another; a thorough one has priority."""
@@ -82,7 +82,7 @@ class Trial:
     @property
     def element(self) -> Placed:
         """The law that was added."""
-        return next((e for e in self.laws if (e.port, type(e.law)) == self.added), self.laws[-1])
+        return next((e for e in self.laws if e.pair == self.added), self.laws[-1])
 
     @property
     def port(self) -> str:
@@ -97,12 +97,12 @@ class Trial:
     @property
     def pair(self) -> Pair:
         """Port and class of the law that was added."""
-        return self.port, type(self.law)
+        return self.element.pair
 
     @property
     def name(self) -> tuple[str, str]:
         """Port and id of the law that was added."""
-        return self.port, self.law.id
+        return self.element.name
 
     @property
     def own(self) -> dict[str, Any]:
