@@ -94,7 +94,7 @@ def build_diagnosis(
         verdict=found.verdict.kind,
         sentence=found.verdict.sentence,
         effects=effects,
-        candidates=tuple(_candidate_row(decided, t, step.parent) for step in decided.passes for t in step.trials),
+        candidates=tuple(_candidate_row(decided, t, m.parent) for m in decided.moves_by_parent for t in m.trials),
         gates=(
             *_surrogate_note(request.surrogate_nrmse),
             *_failure_notes(request.simulator.program_failures),

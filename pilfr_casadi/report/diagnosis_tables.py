@@ -201,8 +201,8 @@ def candidates_by_pass(diagnosis: Diagnosis) -> list[tuple[list[dict[str, Any]],
     The hypothesis is None if it is unknown.
     """
     rows, search = list(diagnosis.candidates), diagnosis.evidence.search
-    steps = search.passes if search is not None else []
-    sizes, parents = [len(step.trials) for step in steps], [step.parent for step in steps]
+    moves = search.moves_by_parent if search is not None else []
+    sizes, parents = [len(move.trials) for move in moves], [move.parent for move in moves]
     if sum(sizes) != len(rows):
         sizes, parents = [len(rows)], parents[:1] or [None]
     ends = pairwise(np.cumsum([0, *sizes]))

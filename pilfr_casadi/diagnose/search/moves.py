@@ -50,14 +50,14 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 # Effort
-MOST_CONVERGED = 5  # trials of a step that are fitted to convergence at most
+MOST_CONVERGED = 5  # trials of a move that are fitted to convergence at most
 NEARLY_EXPLAINED = 0.05  # share of the excess left by one law below which far worse laws are not refined
 TWO = "two at once"  # a stage, entered once
 MOST_LEARNED = 2  # learned forces that are kept: those with the smallest error
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class Move:
     """One move of the search: its parent hypothesis, the screen's scores, and the trials, best first."""
 
     parent: Trial
@@ -69,7 +69,7 @@ class Step:
 class Search(Hypotheses):
     """A search, filled by `run`."""
 
-    steps: list[Step] = field(default_factory=list)  # the moves, in their order
+    moves: list[Move] = field(default_factory=list)  # the moves, in their order
     aligned: bool = False  # whether the times of the channels are settled, so that no shift is looked for
     shift: Gate | None = None  # the shift of a channel that ended the search, because it shows only beside a law
     better_hold: str = ""  # the hold of the inputs that ended the search, because it proved better
@@ -108,14 +108,14 @@ class Search(Hypotheses):
                 self.keep(self.fits.polish(there))
 
     @property
-    def passes(self) -> list[Step]:
+    def moves_by_parent(self) -> list[Move]:
         """The moves, those from one hypothesis together, with the best fit of each trial once, smallest error first."""
         found = dict[Key, tuple[Trial, dict[Key, Trial]]]()
-        for step in self.steps:
-            own = found.setdefault(step.parent.key, (step.parent, {}))[1]
-            own |= {t.key: self.memo.get(t.key, t) for t in step.trials}
+        for move in self.moves:
+            own = found.setdefault(move.parent.key, (move.parent, {}))[1]
+            own |= {t.key: self.memo.get(t.key, t) for t in move.trials}
         ranked = ((parent, sorted(trials.values(), key=lambda t: t.error)) for parent, trials in found.values())
-        return [Step(parent, (), tuple(trials)) for parent, trials in ranked if trials]
+        return [Move(parent, (), tuple(trials)) for parent, trials in ranked if trials]
 
     def _grow(self, effects: float, varied: bool = False) -> None:
         """Add effects while that pays; end as soon as the other hold, or a channel's shift, proves better.
@@ -127,7 +127,7 @@ class Search(Hypotheses):
             self.can_improve(self.best)
             and len((parent := self._parent(varied)).effects) < effects
             and self._pays(parent)
-            and (self.may_go_on() or not self.steps)
+            and (self.may_go_on() or not self.moves)
         ):
             self.add(parent)
             if not parent.laws and self.may_go_on() and self._escape_local_minimum():
@@ -255,7 +255,7 @@ class Search(Hypotheses):
         """
         if self.aligned or not self.can_improve(self.best):
             return
-        first_move = {t.key for s in self.steps if not s.parent.laws for t in s.trials}
+        first_move = {t.key for m in self.moves if not m.parent.laws for t in m.trials}
         kept = [self.memo[key] for key in first_move]
         plain = [t for t in kept if not (t.law.order or t.law.memory)]
         first = dict[tuple[str, str], Trial]()  # of each law the likeliest form, the likeliest laws first
@@ -276,7 +276,7 @@ class Search(Hypotheses):
     def add(self, parent: Trial, few: bool = False) -> None:
         """Fit the laws, or only a few, that the screen selects beside a hypothesis; polish those that may win."""
         scored, observer_gain = self._standing(parent)
-        if self.steps and not self.may_go_on():
+        if self.moves and not self.may_go_on():
             return
         enough = float(np.sqrt(self.floor2 + NEARLY_EXPLAINED * max(parent.mean_square - self.floor2, 0.0)))
         trials = self._with_relatives(parent, scored, scored, Effort(observer_gain, enough, few))
@@ -320,7 +320,7 @@ class Search(Hypotheses):
     def _record(self, parent: Trial, scored: Sequence[Scored], trials: Sequence[Trial]) -> None:
         """Keep the trials of a move, and note the move."""
         self._keep_all(trials)
-        self.steps.append(Step(parent, tuple(scored), tuple(trials)))
+        self.moves.append(Move(parent, tuple(scored), tuple(trials)))
 
     def _try(self, base: Trial, entries: Sequence[Scored], observer_gain: np.ndarray | None = None) -> None:
         """Fit some pairs beside a hypothesis, none of their relatives, and note the move."""
@@ -376,7 +376,7 @@ class Search(Hypotheses):
         return self.fits.converge(found) if found.mean_square < DIVERGED else None
 
     def _finer(self, parent: Trial) -> None:
-        """Fit the best law of a step in its finer forms; then schedule the strength of the best law that allows it."""
+        """Fit the best law of a move in its finer forms; then schedule the strength of the best law that allows it."""
         best = self._best_with_one_more(parent)
         if best is not None:
             self._refine(best, FINER.get(type(best.law), ()))
@@ -389,19 +389,18 @@ class Search(Hypotheses):
         self.replace_variation(parent)
 
     def _vary_strength(self) -> None:
-        """Let the strength of the likeliest law of the last step that may vary do so, with every signal.
+        """Let the strength of the likeliest law of the last move that may vary do so, with every signal.
 
         With the signal found, its other forms may be the physics. A linear law was screened with every signal.
         """
         may_vary = [kind for kind in SCALABLE if kind.id not in LINEAR]
-        added = [t for t in self.steps[-1].trials if constant(type(t.law)) in may_vary]
-        kept = [self.memo[t.key] for t in added]  # perhaps found before, with these laws added in another order
-        step = [known.with_added(new.pair) for new, known in zip(added, kept, strict=True)]
+        added = [t for t in self.moves[-1].trials if constant(type(t.law)) in may_vary]
+        kept = [self.memo[t.key].with_added(t.pair) for t in added]  # perhaps found before in another order
         # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
-        if not step or not self.can_improve(self.best, self.least_floor) or not self.may_go_on():
+        if not kept or not self.can_improve(self.best, self.least_floor) or not self.may_go_on():
             return
-        likeliest = max(step, key=self.optimistic_evidence)
-        forms = [t for t in step if t.law.id == likeliest.law.id and t is not likeliest]
+        likeliest = max(kept, key=self.optimistic_evidence)
+        forms = [t for t in kept if t.law.id == likeliest.law.id and t is not likeliest]
         entry = self._entry(likeliest)
         self._vary([likeliest], ("z", *entry.local.inputs) if entry else ())
         if self.best.laws and self.best.law.scheduled_by:
@@ -418,7 +417,7 @@ class Search(Hypotheses):
 
         None if none was there: the hypothesis comes from another search.
         """
-        there = [s for step in self.steps for s in step.scored if s.port == trial.port]
+        there = [s for move in self.moves for s in move.scored if s.port == trial.port]
         return min(there, key=lambda s: s.law.dissipative != trial.law.dissipative, default=None)
 
     def _refine(self, trial: Trial, kinds: Sequence[Any]) -> None:
@@ -558,7 +557,7 @@ class Search(Hypotheses):
 
     def _expanded(self, trial: Trial, ratio: float = np.inf) -> bool:
         """Tell whether laws were added to a hypothesis, at an error of at most `ratio` times the present one."""
-        return any(s.parent.key == trial.key and s.parent.error <= ratio * trial.error for s in self.steps)
+        return any(m.parent.key == trial.key and m.parent.error <= ratio * trial.error for m in self.moves)
 
     def add_two(self) -> None:
         """Fit two laws at once beside the simulator alone, because one after the other may hide each other."""
@@ -603,7 +602,7 @@ class Search(Hypotheses):
             alone = refit(bench, [best.values], states=best.begin, solver=THOROUGH)
         if alone is None or alone.cost > CLEARLY_BETTER * self.root.mean_square:
             return False
-        self.without, self.memo, self.steps = alone, {}, []
+        self.without, self.memo, self.moves = alone, {}, []
         self.findings.clear()
         self.keep(Trial.of(alone, 0, thorough=True))
         return True

@@ -305,7 +305,7 @@ class Everything:
         fits = fits or [fit_to_all(whole, t.fitted, 0.0) for t in trials]
         if not fits[0].cost < DIVERGED:
             return None
-        there = replace(search, bench=whole, memo={}, steps=[], findings=defaultdict(Findings))
+        there = replace(search, bench=whole, memo={}, moves=[], findings=defaultdict(Findings))
         for trial, fitted in zip(trials, fits, strict=True):
             there.keep(Trial.of(fitted, len(trial.laws), thorough=True))
         best = max(there.memo.values(), key=there.evidence)
