@@ -101,9 +101,15 @@ class _Candidate:
     spread: float
 
     @classmethod
-    def of(cls, search: Search, fitted: Fitted, base: Trial) -> _Candidate:
-        """Compute the spread of a fitted simulator."""
+    def of(cls, search: Search, base: Trial, learned: Fitted | None = None) -> _Candidate:
+        """Make the candidate of a hypothesis, or of its fit with a learned force beside it."""
+        fitted = learned or base.fitted
         return cls(fitted, base, search.spread(fitted))
+
+    @property
+    def has_learned(self) -> bool:
+        """Whether a learned force stands beside the hypothesis."""
+        return self.fitted is not self.base.fitted
 
     @property
     def least(self) -> float:
@@ -125,7 +131,7 @@ def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction
     if search.interrupted or _is_settled(search, answer):
         return uncompared_correction(search, best.fitted), best.fitted
     refit = _cross_validate_refit(search)
-    candidates = [_Candidate.of(search, t.fitted, t) for t in _named_hypotheses(search, answer)]
+    candidates = [_Candidate.of(search, t) for t in _named_hypotheses(search, answer)]
     validated = _compare(search, candidates, refit, candidates[0])
     if not validated:
         stays = candidates[0].base
@@ -143,7 +149,7 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
     contain error that no law explains, so that shares are told of the least noise.
     """
     refit = _cross_validate_refit(search)
-    candidates = [_Candidate.of(search, t.fitted, t) for t in _hypotheses_with_laws(search)]
+    candidates = [_Candidate.of(search, t) for t in _hypotheses_with_laws(search)]
     validated = _compare(search, candidates, refit)
     if not validated:
         stays = _far_better(search, candidates)
@@ -157,7 +163,7 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
 
 def _cross_validate_refit(search: Search) -> list[_Validated]:
     """Cross-validate the refitted simulator; empty if the time is over."""
-    return _cross_validate(search, [_Candidate.of(search, search.root.fitted, search.root)], [])
+    return _cross_validate(search, [_Candidate.of(search, search.root)], [])
 
 
 def _describe_best(search: Search, validated: list[_Validated], floor: Floor) -> tuple[Correction, Fitted]:
@@ -166,7 +172,7 @@ def _describe_best(search: Search, validated: list[_Validated], floor: Floor) ->
     fitted, base = candidate.fitted, candidate.base
     shares = _shares(search, base.fitted, fitted, floor)
     learned: tuple[Learned, ...] = ()
-    if fitted is not base.fitted:
+    if candidate.has_learned:
         laws = dict.fromkeys((*CATALOGUE, *search.laws))
         learned = (describe_learned(search.bench, fitted, shares["learned"], laws),)
     before, after = validated[0][1].held_out.rms, expected.held_out.rms
@@ -186,10 +192,9 @@ def _cross_validate(search: Search, candidates: Sequence[_Candidate], validated:
         least = min((e.mean_square for _, e in out), default=np.inf)
         if search.past_deadline or (out and c.least >= least):
             break
-        bare = c.fitted is c.base.fitted
-        found = search.held_out(c.base) if bare else held_out_errors(search.bench, c.fitted, search.workers)
+        found = held_out_errors(search.bench, c.fitted, search.workers) if c.has_learned else search.held_out(c.base)
         if np.isfinite(found.rms) or not search.past_deadline:  # otherwise the time was over before it was known
-            out.append((c, ExpectedError(found, search.spread_of(c.base) if bare else c.spread)))
+            out.append((c, ExpectedError(found, c.spread if c.has_learned else search.spread_of(c.base))))
     return out
 
 
@@ -256,7 +261,7 @@ def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()
         fitted = refit_learned(search.bench, found)
     except InputError:  # it diverges
         return []
-    return [_Candidate.of(search, fitted, base)]
+    return [_Candidate.of(search, base, fitted)]
 
 
 def uncompared_correction(search: Search, fitted: Fitted, floor: Floor | None = None) -> Correction:

@@ -443,11 +443,6 @@ class HeldOut:
         return max(self.blocks, self.ahead)
 
     @property
-    def weighted_rms(self) -> float:
-        """Rms error, outputs weighted by their noise."""
-        return float(np.sqrt(self.mean_square))
-
-    @property
     def rms(self) -> float:
         """Rms error, all outputs alike, as reports state it."""
         return float(np.sqrt(np.mean(self.squares)))

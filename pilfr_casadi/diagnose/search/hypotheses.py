@@ -218,7 +218,7 @@ class Hypotheses:
         Of two ratios the median is the smaller: one hypothesis that predicts badly says nothing about the others.
         """
         known = [(self.findings[key].held_out, trial.mean_square) for key, trial in self.memo.items()]
-        ratios = [h.weighted_rms**2 / fit for h, fit in known if h and np.isfinite(h.weighted_rms) and fit > 0]
+        ratios = [h.mean_square / fit for h, fit in known if h and np.isfinite(h.mean_square) and fit > 0]
         return float(np.quantile(ratios, quantile, method="lower")) if ratios else 1.0
 
     def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
