@@ -342,20 +342,6 @@ def _make_effect(
     law = element.law
     own, unrelated = placebo(bench, search.root.fitted, element.port, law)
     port = bench.simulator.port(element.port)
-    w_unit, z_unit = port_units(port, bench.recordings[0])
-    if port.series and not w_unit:  # in the unit of its signal, such as [force]
-        w_unit = z_unit = f"[{split_port(port.name)[1]}]"
-    values = {k: v for k, v in fitted.values.items() if k.startswith(element.prefix)}
-    signals = bench.simulator.signal_units(port.name, bench.recordings[0].units)
-    shown: dict[str, dict[str, Any]] = {}
-    for name, value in values.items():
-        unit = readable_unit(element.law.units[name.removeprefix(element.prefix)], w_unit, z_unit, signals)
-        flat, at_bound = np.ravel(value), np.ravel(fitted.is_at_bound(name) & ~fitted.model.parameters[name].fixed)
-        for i, v in enumerate(flat):
-            label = name.removeprefix(element.prefix) + (f"[{i}]" if len(flat) > 1 else "")
-            error = float(np.ravel(std[name])[i])
-            shown[label] = {"value": float(v), "std": error if np.isfinite(error) else None, "unit": unit}
-            shown[label]["at_limit"] = bool(v and at_bound[i])
     remarks = [law.remark(element.own(fitted.values)), *_order(fitted, element)]
     if law.turns and is_curve_along(bench, final.drawn[1], fitted.simulator.elements.index(element)):
         remarks.append("these recordings do not show its memory: a curve follows them as well")
@@ -369,13 +355,36 @@ def _make_effect(
         confidence=named.confidence,
         sentence="; ".join(filter(None, [law.sentences.get(port.domain, law.sentence), *remarks])),
         equation=law.equation.replace("dz/dt", "v") if port.is_speed else law.equation,
-        parameters=shown,
+        parameters=_effect_parameters(bench, fitted, element, std),
         indistinguishable=tuple(named.alike),
         form=law.form,
         placebo={"own": own, "unrelated": unrelated},
         test_without=test_without,
         at_port=named.at_port,
     )
+
+
+def _effect_parameters(
+    bench: Workbench, fitted: Fitted, element: Placed, std: Mapping[str, np.ndarray]
+) -> dict[str, dict[str, Any]]:
+    """Return the numbers of a law, each with its standard error and unit, and whether it is at a limit."""
+    port, recorded = bench.simulator.port(element.port), bench.recordings[0]
+    w_unit, z_unit = port_units(port, recorded)
+    if port.series and not w_unit:  # in the unit of its signal, such as [force]
+        w_unit = z_unit = f"[{split_port(port.name)[1]}]"
+    signals = bench.simulator.signal_units(port.name, recorded.units)
+    out: dict[str, dict[str, Any]] = {}
+    for own, value in element.own(fitted.values).items():
+        name, unit = f"{element.prefix}{own}", readable_unit(element.law.units[own], w_unit, z_unit, signals)
+        limited = np.ravel(fitted.is_at_bound(name) & ~fitted.model.parameters[name].fixed)
+        for i, (v, error) in enumerate(zip(np.ravel(value).tolist(), np.ravel(std[name]).tolist(), strict=True)):
+            out[own + (f"[{i}]" if np.size(value) > 1 else "")] = {
+                "value": v,
+                "std": error if np.isfinite(error) else None,
+                "unit": unit,
+                "at_limit": bool(v and limited[i]),
+            }
+    return out
 
 
 def _other_forms(search: Search, effects: Sequence[LikelyEffect], effect: LikelyEffect) -> list[Law]:
