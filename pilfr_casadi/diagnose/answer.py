@@ -23,7 +23,7 @@ from .effect import Effect
 from .extrapolation import range_note
 from .faults.channels import IN_RECORDINGS, find_gross_channel_errors
 from .faults.gates import EQUAL_RATIO, TEST_FAULT, TEST_OFFSET, Gate, edited
-from .faults.offsets import Offset, describe_offsets, remove_offsets, update_offsets
+from .faults.offsets import Offset, describe_offsets, find_placed_offsets, remove_offsets, update_offsets
 from .fits.evidence import BETTER_RATIO, FAR_RATIO, INDISTINGUISHABLE_NATS, NEAR_RATIO, all_sure, standard_errors
 from .fits.floor import Floor
 from .fits.force_recovery import is_curve_along
@@ -94,7 +94,7 @@ def build_diagnosis(
         verdict=found.verdict.kind,
         sentence=found.verdict.sentence,
         effects=effects,
-        candidates=tuple(_candidate_row(decided, t, step.parent) for step in decided.passes for t in step.trials),
+        candidates=tuple(_candidate_row(decided, t, m.parent) for m in decided.moves_by_parent for t in m.trials),
         gates=(
             *_surrogate_note(request.surrogate_nrmse),
             *_failure_notes(request.simulator.program_failures),
@@ -200,10 +200,10 @@ def _test_faults(bench: Workbench, after: Fitted, tests: Sequence[Recording], ga
 
 def _at_zero_offsets(bench: Workbench, after: Fitted, own: int) -> tuple[str, Fitted]:
     """Run a fit with its offsets after the first `own` elements at zero; also name the offsets, "" if there is none."""
-    found = [e for e in after.simulator.elements[own:] if isinstance(e.law, Offset)]
-    found = [e for e in found if np.any(after.values[f"{e.prefix}w_0"])]
-    zero = {f"{e.prefix}w_0": np.zeros_like(after.values[f"{e.prefix}w_0"]) for e in found}
-    return describe_offsets(found), bench.rerun(after, {**after.values, **zero}) if found else after
+    added = find_placed_offsets(after.simulator.elements[own:])
+    found = {name: e for name, e in added.items() if np.any(after.values[name])}
+    zero = {name: np.zeros_like(after.values[name]) for name in found}
+    return describe_offsets(found.values()), bench.rerun(after, {**after.values, **zero}) if found else after
 
 
 def _offset_note(offsets: str, errors: Mapping[str, float]) -> Iterator[Gate]:
@@ -295,7 +295,7 @@ def _combination_note(after: Fitted, std: Mapping[str, np.ndarray], blind_spots:
         and not p.value.ndim
         and not np.all(p.fixed)
         and not np.isfinite(std[name])
-        and not after.at_bound(name)
+        and not after.is_at_bound(name)
     ]
     if len(tied) < 2:
         return
@@ -323,7 +323,7 @@ def _without_each_effect(search: Search, found: Conclusion) -> dict[LikelyEffect
         return {}
     joint, out = Trial.of(found.fitted, len(found.correction.elements)), dict[LikelyEffect, Fitted]()
     for effect in found.effects:
-        rest = search.leave_out(joint, [e for e in joint.laws if (e.port, e.law.id) == effect.name])
+        rest = search.leave_out(joint, [e for e in joint.laws if e.name == effect.name])
         if rest is not None:
             out[effect] = rest.fitted
     return out
@@ -338,24 +338,10 @@ def _make_effect(
     test_without: float,
 ) -> Effect:
     bench, fitted = search.bench, final.after
-    element = next(e for e in fitted.simulator.elements if (e.port, e.law.id) == named.name)  # its form may differ
+    element = next(e for e in fitted.simulator.elements if e.name == named.name)  # its form may differ
     law = element.law
     own, unrelated = placebo(bench, search.root.fitted, element.port, law)
     port = bench.simulator.port(element.port)
-    w_unit, z_unit = port_units(port, bench.recordings[0])
-    if port.series and not w_unit:  # in the unit of its signal, such as [force]
-        w_unit = z_unit = f"[{split_port(port.name)[1]}]"
-    values = {k: v for k, v in fitted.values.items() if k.startswith(element.prefix)}
-    signals = bench.simulator.signal_units(port.name, bench.recordings[0].units)
-    shown: dict[str, dict[str, Any]] = {}
-    for name, value in values.items():
-        unit = readable_unit(element.law.units[name.removeprefix(element.prefix)], w_unit, z_unit, signals)
-        flat, at_bound = np.ravel(value), np.ravel(fitted.at_bound(name) & ~fitted.model.parameters[name].fixed)
-        for i, v in enumerate(flat):
-            label = name.removeprefix(element.prefix) + (f"[{i}]" if len(flat) > 1 else "")
-            error = float(np.ravel(std[name])[i])
-            shown[label] = {"value": float(v), "std": error if np.isfinite(error) else None, "unit": unit}
-            shown[label]["at_limit"] = bool(v and at_bound[i])
     remarks = [law.remark(element.own(fitted.values)), *_order(fitted, element)]
     if law.turns and is_curve_along(bench, final.drawn[1], fitted.simulator.elements.index(element)):
         remarks.append("these recordings do not show its memory: a curve follows them as well")
@@ -369,13 +355,36 @@ def _make_effect(
         confidence=named.confidence,
         sentence="; ".join(filter(None, [law.sentences.get(port.domain, law.sentence), *remarks])),
         equation=law.equation.replace("dz/dt", "v") if port.is_speed else law.equation,
-        parameters=shown,
+        parameters=_effect_parameters(bench, fitted, element, std),
         indistinguishable=tuple(named.alike),
         form=law.form,
         placebo={"own": own, "unrelated": unrelated},
         test_without=test_without,
         at_port=named.at_port,
     )
+
+
+def _effect_parameters(
+    bench: Workbench, fitted: Fitted, element: Placed, std: Mapping[str, np.ndarray]
+) -> dict[str, dict[str, Any]]:
+    """Return the numbers of a law, each with its standard error and unit, and whether it is at a limit."""
+    port, recorded = bench.simulator.port(element.port), bench.recordings[0]
+    w_unit, z_unit = port_units(port, recorded)
+    if port.series and not w_unit:  # in the unit of its signal, such as [force]
+        w_unit = z_unit = f"[{split_port(port.name)[1]}]"
+    signals = bench.simulator.signal_units(port.name, recorded.units)
+    out: dict[str, dict[str, Any]] = {}
+    for own, value in element.own(fitted.values).items():
+        name, unit = f"{element.prefix}{own}", readable_unit(element.law.units[own], w_unit, z_unit, signals)
+        limited = np.ravel(fitted.is_at_bound(name) & ~fitted.model.parameters[name].fixed)
+        for i, (v, error) in enumerate(zip(np.ravel(value).tolist(), np.ravel(std[name]).tolist(), strict=True)):
+            out[own + (f"[{i}]" if np.size(value) > 1 else "")] = {
+                "value": v,
+                "std": error if np.isfinite(error) else None,
+                "unit": unit,
+                "at_limit": bool(v and limited[i]),
+            }
+    return out
 
 
 def _other_forms(search: Search, effects: Sequence[LikelyEffect], effect: LikelyEffect) -> list[Law]:
@@ -387,7 +396,7 @@ def _other_forms(search: Search, effects: Sequence[LikelyEffect], effect: Likely
     found = dict[str, Law]()
     for t in sorted((t for t in alike if search.evidence(t) > least), key=search.evidence, reverse=True):
         for e in t.effects:
-            if (e.port, e.law.id) == effect.name and len(e.law.units) <= len(law.units):
+            if e.name == effect.name and len(e.law.units) <= len(law.units):
                 found.setdefault(e.law.form, e.law)
     return [other for form, other in found.items() if form != law.form]
 
@@ -428,7 +437,7 @@ def _design_experiment(
 
 def _candidate_row(search: Search, t: Trial, parent: Trial) -> dict[str, Any]:
     """Return a candidate's row for diagnosis.json, with the law that it adds to its parent."""
-    added = next((e for e in t.laws if (e.port, type(e.law)) not in parent.key), t.element)
+    added = next((e for e in t.laws if e.pair not in parent.key), t.element)
     held_out = search.findings[t.key].held_out
     gain = search.evidence(t) - search.evidence(parent)
     return {

@@ -21,8 +21,7 @@ import numpy as np
 from .._base import InputError, percent
 from ..laws import CATALOGUE
 from ..simulators import name_at
-from .faults.offsets import describe_offsets
-from .fits.evidence import FORMULA_ERROR, NEAR_RATIO, SURE, HeldOut, runs_away
+from .fits.evidence import FORMULA_ERROR, NEAR_RATIO, SURE, ExpectedError, held_out_errors, runs_away
 from .fits.floor import Floor
 from .fits.workbench import FEW, Fitted
 from .posterior import Posterior, explainable_remainder, hypotheses_named, share_left
@@ -102,9 +101,15 @@ class _Candidate:
     spread: float
 
     @classmethod
-    def of(cls, search: Search, fitted: Fitted, base: Trial) -> _Candidate:
-        """Compute the spread of a fitted simulator."""
+    def of(cls, search: Search, base: Trial, learned: Fitted | None = None) -> _Candidate:
+        """Make the candidate of a hypothesis, or of its fit with a learned force beside it."""
+        fitted = learned or base.fitted
         return cls(fitted, base, search.spread(fitted))
+
+    @property
+    def has_learned(self) -> bool:
+        """Whether a learned force stands beside the hypothesis."""
+        return self.fitted is not self.base.fitted
 
     @property
     def least(self) -> float:
@@ -112,7 +117,7 @@ class _Candidate:
         return self.fitted.cost + self.spread
 
 
-_Validated = tuple[_Candidate, HeldOut]
+_Validated = tuple[_Candidate, ExpectedError]
 
 
 def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction, Fitted]:
@@ -126,7 +131,7 @@ def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction
     if search.interrupted or _is_settled(search, answer):
         return uncompared_correction(search, best.fitted), best.fitted
     refit = _cross_validate_refit(search)
-    candidates = [_Candidate.of(search, t.fitted, t) for t in _named_hypotheses(search, answer)]
+    candidates = [_Candidate.of(search, t) for t in _named_hypotheses(search, answer)]
     validated = _compare(search, candidates, refit, candidates[0])
     if not validated:
         stays = candidates[0].base
@@ -144,7 +149,7 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
     contain error that no law explains, so that shares are told of the least noise.
     """
     refit = _cross_validate_refit(search)
-    candidates = [_Candidate.of(search, t.fitted, t) for t in _hypotheses_with_laws(search)]
+    candidates = [_Candidate.of(search, t) for t in _hypotheses_with_laws(search)]
     validated = _compare(search, candidates, refit)
     if not validated:
         stays = _far_better(search, candidates)
@@ -158,21 +163,21 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
 
 def _cross_validate_refit(search: Search) -> list[_Validated]:
     """Cross-validate the refitted simulator; empty if the time is over."""
-    return _cross_validate(search, [_Candidate.of(search, search.root.fitted, search.root)], [])
+    return _cross_validate(search, [_Candidate.of(search, search.root)], [])
 
 
 def _describe_best(search: Search, validated: list[_Validated], floor: Floor) -> tuple[Correction, Fitted]:
     """Describe the candidate with the smallest expected error, beside the refit, which comes first."""
-    candidate, held_out = _choose(validated)
+    candidate, expected = _choose(validated)
     fitted, base = candidate.fitted, candidate.base
     shares = _shares(search, base.fitted, fitted, floor)
-    elements: tuple[Learned, ...] = ()
-    if fitted is not base.fitted:
+    learned: tuple[Learned, ...] = ()
+    if candidate.has_learned:
         laws = dict.fromkeys((*CATALOGUE, *search.laws))
-        elements = (describe_learned(search.bench, fitted, shares["learned"], laws),)
-    errors = validated[0][1].rms, held_out.rms
-    offsets = describe_offsets(search.bench.simulator.elements)
-    return Correction(_describe_elements(search, fitted), shares, elements, *errors, base, offsets=offsets), fitted
+        learned = (describe_learned(search.bench, fitted, shares["learned"], laws),)
+    before, after = validated[0][1].held_out.rms, expected.held_out.rms
+    described = _describe(search, fitted, shares)
+    return replace(described, learned=learned, before=before, after=after, closest=base), fitted
 
 
 def _is_settled(search: Search, answer: Posterior) -> bool:
@@ -184,13 +189,12 @@ def _cross_validate(search: Search, candidates: Sequence[_Candidate], validated:
     """Cross-validate further candidates, the most promising first, as long as they can be best and there is time."""
     out = list(validated)
     for c in sorted(candidates, key=lambda c: c.least):
-        least = min((h.score for _, h in out), default=np.inf)
+        least = min((e.mean_square for _, e in out), default=np.inf)
         if search.past_deadline or (out and c.least >= least):
             break
-        bare = c.fitted is c.base.fitted
-        found = search.held_out(c.base) if bare else search.held_out_errors(c.fitted, c.spread)
+        found = held_out_errors(search.bench, c.fitted, search.workers) if c.has_learned else search.held_out(c.base)
         if np.isfinite(found.rms) or not search.past_deadline:  # otherwise the time was over before it was known
-            out.append((c, found))
+            out.append((c, ExpectedError(found, c.spread if c.has_learned else search.spread_of(c.base))))
     return out
 
 
@@ -202,7 +206,7 @@ def _compare(
     A wanted candidate that cannot be best need not be cross-validated.
     """
     validated = _cross_validate(search, candidates, refit)
-    least = min((h.score for _, h in validated), default=np.inf)
+    least = min((e.mean_square for _, e in validated), default=np.inf)
     left_out = wanted is not None and wanted.least < least and all(c is not wanted for c, _ in validated)
     return [] if search.past_deadline and (len(validated) < 2 or left_out) else validated
 
@@ -216,7 +220,7 @@ def _far_better(search: Search, candidates: Sequence[_Candidate]) -> Trial:
 
 def _choose(validated: Sequence[_Validated]) -> _Validated:
     """Choose the candidate with the smallest expected error on other recordings."""
-    return min(validated, key=lambda p: p[1].score)
+    return min(validated, key=lambda p: p[1].mean_square)
 
 
 def _named_hypotheses(search: Search, answer: Posterior) -> list[Trial]:
@@ -257,15 +261,12 @@ def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()
         fitted = refit_learned(search.bench, found)
     except InputError:  # it diverges
         return []
-    return [_Candidate.of(search, fitted, base)]
+    return [_Candidate.of(search, base, fitted)]
 
 
 def uncompared_correction(search: Search, fitted: Fitted, floor: Floor | None = None) -> Correction:
     """Describe a simulator without a learned element, which was not compared with others."""
-    shares = _shares(search, fitted, fitted, floor or search.floor)
-    return Correction(
-        _describe_elements(search, fitted), shares, offsets=describe_offsets(search.bench.simulator.elements)
-    )
+    return _describe(search, fitted, _shares(search, fitted, fitted, floor or search.floor))
 
 
 def _may_recur(search: Search, trial: Trial) -> bool:
@@ -282,6 +283,7 @@ def _shares(search: Search, named: Fitted, whole: Fitted, floor: Floor) -> dict[
     return {"named": 1 - beside_names, "learned": beside_names - left, "left": left}
 
 
-def _describe_elements(search: Search, fitted: Fitted) -> tuple[tuple[str, str, str], ...]:
-    """Return port, law and form of the elements that the diagnosis has added."""
-    return tuple((e.port, e.law.id, e.law.form) for e in search.added_laws(fitted))
+def _describe(search: Search, fitted: Fitted, shares: dict[str, float]) -> Correction:
+    """Describe a simulator by the elements that the diagnosis has added."""
+    elements = tuple((e.port, e.law.id, e.law.form) for e in search.added_laws(fitted))
+    return Correction(elements, shares, offsets=search.offsets)

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import in_words
-from ..models import at_bounds
+from ..models import is_at_bound
 from ..simulators import Simulator, stack
 from .fits.evidence import prior_width
 from .fits.linearise import Run, sample_run
@@ -150,7 +150,7 @@ def assess_parameters(response: Sensitivity) -> tuple[tuple[ParameterRow, ...], 
     for i, error in zip(rest, (response.span[rest] * errors).tolist(), strict=True):
         std[i] = error if status[i] == "identifiable" else None
     units = np.repeat([p.unit for p in own.values()], [p.size for p in own.values()])[own.free]
-    at_bound = at_bounds(response.values, own.lower[own.free], own.upper[own.free]).tolist()
+    at_bound = is_at_bound(response.values, own.lower[own.free], own.upper[own.free]).tolist()
     columns = (response.names, response.values.tolist(), units.tolist(), std, status, at_bound)
     rows = tuple(ParameterRow(*row) for row in zip(*columns, strict=True))
     return rows, tuple(

@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +21,7 @@ import numpy as np
 from .._base import InputError, listed, percent
 from ..data import Recording
 from ..laws import display_name
-from ..simulators import UNKNOWN, Placed, in_series, name_at
+from ..simulators import EQUATION, UNKNOWN, Placed, in_series, name_at, split_port
 from .faults.gates import (
     CERTAIN_ERRORS,
     CURED_SHARE,
@@ -70,7 +71,7 @@ def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameter
         for name, p in bench.simulator.parameters.items()
         if not p.value.ndim  # a matrix or a zero represents no physics
         and float(p.value) != 0
-        and bool(np.all(p.fixed) or np.all(without.at_bound(name)))
+        and bool(np.all(p.fixed) or np.all(without.is_at_bound(name)))
     ]
     most = max(1, answer.best.size)
     freed: tuple[str, ...] = ()
@@ -131,7 +132,7 @@ def _describe_pinned(search: Search, names: Sequence[str], found: Fitted, named:
         kept = "held at" if np.all(p.fixed) else "kept by its bounds at"
         was = value_with_unit(float(without.values[name]), p.unit, 4)
         parts.append(f"{name} = {value_with_unit(value, p.unit, 5)}, which is {kept} {was}")
-    words = " and ".join(f"the {name_at(placed.port, placed.law.id)}" for placed in named)
+    words = " and ".join(f"the {name_at(*placed.name)}" for placed in named)
     like = f", no further off than with {words}" if named else ""
     what, it, its, given = (
         ("a value", "it", "its", "value is") if len(names) == 1 else ("values", "them", "their", "values are")
@@ -159,46 +160,16 @@ def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[tu
     `named` is the hypothesis that has a name at declared ports, if there is one.
     """
     nothing = tuple[Gate, ...](), 0.0
-    ports = search.bench.simulator.undeclared
-    if not ports or search.interrupted:
-        return nothing
-    open_ = search.bench.simulator.with_ports(ports)
-    bench = replace(search.bench, simulator=open_)
-    forces = [law for law in search.laws if "parallel" in law.places]  # actuators and sensors were already searched
-    other: Search | None = None
-    try:
-        with search.until_interrupted():
-            without = bench.fit(open_, [search.root.fitted.values], states=search.root.fitted.begin)
-            there = Search(
-                bench,
-                without,
-                search.floor,
-                forces,
-                search.workers,
-                search.say,
-                aligned=True,
-                surrogate_nrmse=search.surrogate_nrmse,
-                until=search.until,
-            )
-            there.alternatives |= {port: laws for port, laws in search.alternatives.items() if in_series(port)}
-            for trial in search.memo.values():
-                if trial.laws and all(in_series(e.port) for e in trial.laws):
-                    known = replace(trial.fitted, simulator=trial.fitted.simulator.with_ports(ports))
-                    there.memo[trial.key] = replace(trial, fitted=known)
-            other = there.run(1)
-    except InputError:
-        return nothing
+    other = _search_undeclared_ports(search)
     if other is None:
         return nothing
-    search.cut_short_with(other)
-    if other.interrupted:
-        return nothing
     found = posterior(other)
-    if found.sure <= SURE or not found.effects[0].name[0].startswith("equation:"):
+    if found.sure <= SURE:
         return nothing
-    if named is not None and not found.best.error < BETTER_RATIO * named.error:
+    port, law = found.effects[0].name
+    kind, state = split_port(port)
+    if kind != EQUATION or (named is not None and not found.best.error < BETTER_RATIO * named.error):
         return nothing
-    state, law = found.effects[0].name[0].removeprefix("equation:"), found.effects[0].name[1]
     sentence = (
         f"No declared port {'may ' * bool(named)}reach{'' if named else 'es'} it: in the equation of {state}, "
         f"{display_name(law)} explains it{' as well' * bool(named)} (refitted with it, the error is "
@@ -209,6 +180,41 @@ def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[tu
     ahead = other.log_prior(found.best) - search.log_prior(found.best)  # as many samples count in both
     ahead += search.optimistic_evidence(found.best) - search.optimistic_evidence(named or search.root)
     return (gate,), float(np.exp(np.clip(ahead, -CONTENDING_NATS, CONTENDING_NATS)))
+
+
+def _search_undeclared_ports(search: Search) -> Search | None:
+    """Search a law in the equations that no declared port reaches; None without one, after an interrupt or divergence.
+
+    The hypotheses at actuators and sensors are taken over.
+    """
+    ports = search.bench.simulator.undeclared
+    if not ports or search.interrupted:
+        return None
+    open_ = search.bench.simulator.with_ports(ports)
+    bench = replace(search.bench, simulator=open_)
+    other: Search | None = None
+    with search.until_interrupted(), suppress(InputError):
+        there = Search(
+            bench,
+            without=bench.fit(open_, [search.root.fitted.values], states=search.root.fitted.begin),
+            floor=search.floor,
+            laws=[law for law in search.laws if "parallel" in law.places],
+            workers=search.workers,
+            say=search.say,
+            aligned=True,
+            surrogate_nrmse=search.surrogate_nrmse,
+            until=search.until,
+        )
+        there.alternatives |= {port: laws for port, laws in search.alternatives.items() if in_series(port)}
+        for trial in search.memo.values():
+            if trial.laws and all(in_series(e.port) for e in trial.laws):
+                known = replace(trial.fitted, simulator=trial.fitted.simulator.with_ports(ports))
+                there.memo[trial.key] = replace(trial, fitted=known)
+        other = there.run(1)
+    if other is None:
+        return None
+    search.cut_short_with(other)
+    return None if other.interrupted else other
 
 
 def find_untried_laws(search: Search) -> tuple[Gate, ...]:
@@ -294,13 +300,13 @@ def _clearest_differences(
     whole: Fitted, fits: Sequence[Fitted], benches: Sequence[Workbench]
 ) -> list[tuple[str, list[float]]]:
     """List the parameters with the most significant differences, the most significant first."""
-    spreads = [standard_errors(part, f) for part, f in zip(benches, fits, strict=True)]
+    std = [standard_errors(part, f) for part, f in zip(benches, fits, strict=True)]
     out = list[tuple[float, str, list[float]]]()
     for name, p in whole.simulator.parameters.items():
         if np.size(p.value) != 1 or np.all(p.fixed):
             continue
         values = [float(np.ravel(f.values[name])[0]) for f in fits]
-        errors = [float(np.ravel(s[name])[0]) for s in spreads]
+        errors = [float(np.ravel(s[name])[0]) for s in std]
         error = np.sqrt(np.nanmean(np.square(errors))) if np.any(np.isfinite(errors)) else np.inf
         clear = np.ptp(values) / max(error, 1e-300)
         if clear > CERTAIN_ERRORS:

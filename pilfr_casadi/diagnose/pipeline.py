@@ -385,8 +385,8 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
         before, after = search.held_out(search.root), search.held_out(trial)
     answer = replace(answer, effects=named.effects).acting(search, trial)
     verdict = judge(predicting, answer, ())
-    known = np.isfinite(before.weighted_rms) or not search.past_deadline
-    better = known and after.weighted_rms < before.weighted_rms
+    known = np.isfinite(before.mean_square) or not search.past_deadline
+    better = known and after.mean_square < before.mean_square
     if verdict.kind != "missing-physics" or not better or after.rms > EQUAL_RATIO * found.correction.after:
         return found
     correction = replace(uncompared_correction(search, trial.fitted), before=before.rms, after=after.rms, closest=trial)

@@ -62,7 +62,7 @@ class LikelyEffect:
     @property
     def name(self) -> Name:
         """Port and law id."""
-        return self.element.port, self.element.law.id
+        return self.element.name
 
     def times(self, probability: float) -> LikelyEffect:
         """Weigh the effect by the probability of something else that it rests on."""
@@ -100,7 +100,7 @@ class Posterior:
 
     def acting(self, search: Hypotheses, trial: Trial) -> Posterior:
         """Weigh the effects by the probability that their strengths are not zero in a fit of the same laws."""
-        acts = {(e.port, e.law.id): _acts(search, trial, e) for e in trial.effects}
+        acts = {e.name: _acts(search, trial, e) for e in trial.effects}
         effects = tuple(e.times(acts[e.name]) for e in self.effects)
         return replace(self, named=max(acts.values()) * self.named, effects=effects)
 
@@ -279,7 +279,7 @@ def _indistinguishable(search: Hypotheses, best: Trial, element: Placed) -> dict
 
     The same law in every sensor is one effect, at "sensor:a + sensor:b".
     """
-    own = (element.port, element.law.id)
+    own = element.name
     rest, out = best.names - {own}, dict[Name, Trial]()
     least = search.evidence(best) - INDISTINGUISHABLE_NATS
     every = [port_name(SENSOR, name) for name in search.bench.simulator.output_names]

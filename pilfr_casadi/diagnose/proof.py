@@ -240,10 +240,8 @@ def _describe_experiment(bench: Workbench, best: Mapping[str, Any], recorded: fl
     unit = {**bench.simulator.units, **bench.recordings[0].units}.get(best["input"], "")
     so_far = f"by {recorded:.2g} times" if recorded > VISIBLE_DIFFERENCE else "not at all"
     about = abs(best["level"]) > VISIBLE_LEVEL * best["amplitude"]
-    swing, level = (
-        value_with_unit(best["amplitude"], unit),
-        f" about {value_with_unit(best['level'], unit)}" if about else "",
-    )
+    swing = value_with_unit(best["amplitude"], unit)
+    level = f" about {value_with_unit(best['level'], unit)}" if about else ""
     return (
         f"A {best['waveform']} of {best['frequency']:.3g} Hz with amplitude {swing}{level} at "
         f"{best['input']} separates {rivals} best: their outputs then differ by {best['separation']:.3g} times the "

@@ -35,7 +35,7 @@ from ..identify import regrid
 from ..laws import OPERATORS, Law, Local, display_name, hysteresis_layer, unit_forces
 from ..models import check_size, play
 from ..simulators import Simulator, discretise, in_series, on_grid
-from .fits.evidence import EffectiveSamples, HeldOut, held_out_errors, spread
+from .fits.evidence import EffectiveSamples, ExpectedError, held_out_errors, spread
 from .fits.force_recovery import signals_along
 from .fits.workbench import THOROUGH, CompiledSimulator, Fitted, Workbench
 from .search.moves import Search
@@ -73,9 +73,9 @@ class Refinement:
     loading_curve : tuple of array, shape (G,)
         z from 0 to half its range in the training recordings, and w there from empty memory; at an actuator or a sensor
         the whole signal z + w.
-    held_out : mapping
-        Rms errors on held-out training data with the spread for other inputs, in units of the outputs' deviation, of
-        the "diagnosed" law and of each kind of layer that was tried.
+    expected : mapping
+        Errors on held-out training data and the spread for other inputs, in units of the outputs' deviation, of the
+        "diagnosed" law and of each kind of layer that was tried.
     errors : mapping
         "train", "test" -> "diagnosed", "refined": NRMSE, averaged over outputs and recordings; "test" is None without
         test recordings.
@@ -90,7 +90,7 @@ class Refinement:
     weights: np.ndarray
     linear: float
     loading_curve: tuple[np.ndarray, np.ndarray]
-    held_out: Mapping[str, HeldOut]
+    expected: Mapping[str, ExpectedError]
     errors: Mapping[str, Mapping[str, float] | None]
     layer: Simulator
     _chosen: Any  # the Diagnosis with `simulator`; its file imports this one
@@ -107,7 +107,7 @@ class Refinement:
     def sentence(self) -> str:
         """Say whether the layer replaces the diagnosed law, and why."""
         what = f"A layer of {len(self.weights)} {self.kind.replace('_', ' ')}s at {self.port}"
-        before, after = (percent(self.held_out[k].expected) for k in (DIAGNOSED, self.kind))
+        before, after = (percent(self.expected[k].rms) for k in (DIAGNOSED, self.kind))
         errors = f"the expected error is {after} of the outputs' deviation with the layer and {before} with the law"
         if self.improves:
             return f"{what} takes the place of {self._law}: by held-out training data {errors}."
@@ -155,8 +155,8 @@ class Refinement:
             if errors is not None:
                 lines.append(f"  {kind:<10}" + "".join(f"{errors[k]:>11.4g}" for k in (DIAGNOSED, "refined")))
         lines.append(f"{'held-out training data':<24}{'error':>9}{'expected':>11}  (with the spread for other inputs)")
-        for name, found in self.held_out.items():
-            lines.append(f"  {name.replace('_', ' '):<22}{found.rms:>9.4g}{found.expected:>11.4g}")
+        for name, found in self.expected.items():
+            lines.append(f"  {name.replace('_', ' '):<22}{found.held_out.rms:>9.4g}{found.rms:>11.4g}")
         port = self.layer.port(self.port)
         unit = f" [{port.across_unit}]" if port.across_unit else ""
         used = self.weights > PRINTED_WEIGHT * np.max(self.weights)
@@ -190,12 +190,12 @@ def refine(diagnosis: Any, operators: int, kind: str | None, port: str | None) -
     if kind is not None:
         kinds = (kind,)
     laws = {name: hysteresis_layer(name, n, series) for name in kinds}  # refuses kinds that the port does not allow
-    held_out = {DIAGNOSED: _predict(search, after)}
+    expected = {DIAGNOSED: _predict(search, after)}
     layers: dict[str, Fitted] = {}
     for name, law in laws.items():
         fitted = _fit_layer(search.bench, after, number, law)
         if fitted is not None:
-            layers[name], held_out[name] = fitted, _predict(search, fitted)
+            layers[name], expected[name] = fitted, _predict(search, fitted)
         search.bench.interrupt.raise_pending()
     if not layers:
         raise InputError(
@@ -204,22 +204,23 @@ def refine(diagnosis: Any, operators: int, kind: str | None, port: str | None) -
         )
     best, *others = layers
     for name in others:  # plays and stops differ only by a line; another kind has to be better in both errors
-        one, other = held_out[best], held_out[name]
-        best = name if other.weighted_rms < one.weighted_rms and other.score < one.score else best
-    return _build_refinement(diagnosis, search.bench, best, layers[best], number, held_out)
+        one, other = expected[best], expected[name]
+        better = other.held_out.mean_square < one.held_out.mean_square and other.mean_square < one.mean_square
+        best = name if better else best
+    return _build_refinement(diagnosis, search.bench, best, layers[best], number, expected)
 
 
-def _predict(search: Search, fitted: Fitted) -> HeldOut:
-    """Compute the errors of a fitted simulator on held-out data, and its spread for other inputs.
+def _predict(search: Search, fitted: Fitted) -> ExpectedError:
+    """Compute the error that is expected of a fitted simulator on other recordings.
 
     The spread uses the held-out error as mean square error, without the error that a search allows the formula of a
     named law.
     """
     bench = search.bench
     found = held_out_errors(bench, fitted, search.workers)
-    v = found.score  # still without a spread
+    v = found.mean_square
     n = EffectiveSamples(search.floor2, search.count_samples(fitted)).at(v)
-    return replace(found, spread=spread(bench, fitted, search.added_laws(fitted), v, n) if np.isfinite(v) else np.inf)
+    return ExpectedError(found, spread(bench, fitted, search.added_laws(fitted), v, n) if np.isfinite(v) else np.inf)
 
 
 def _found_hysteresis(diagnosis: Any, after: Fitted, given: int, port: str | None) -> int:
@@ -251,7 +252,8 @@ def _fit_layer(bench: Workbench, after: Fitted, number: int, kind: type[Law]) ->
     z, dz, force = signals_along(bench, after, number)
     local = bench.local(z, dz)
     starts = _start_values(kind(), local, force, old.own(after.values))
-    placed = _replace_law(after.simulator, number, kind().at(starts[0], kind().bounds(local)))
+    layer = kind().at(starts[0], kind().bounds(local))
+    placed = after.simulator.without_element(number).with_element(old.port, layer, number)
     element = placed.elements[number]
     model = discretise(placed, bench.dt, bench.hold, after.model.substeps)
     layered = CompiledSimulator(placed, model, make_engine(model, bench.engine))
@@ -334,17 +336,6 @@ def _spread_thresholds(r: np.ndarray, w: np.ndarray, half: float, n: int) -> dic
     return {"r": r, "w": np.maximum(w, LEAST_START_WEIGHT * np.mean(w))}
 
 
-def _replace_law(simulator: Simulator, number: int, law: Law) -> Simulator:
-    """Return the simulator with another law in place of an element; all other parameters keep value and bounds."""
-    kept = {k: p for k, p in simulator.parameters.items() if not k.startswith(simulator.elements[number].prefix)}
-    bare = simulator
-    for _ in simulator.elements:
-        bare = bare.without_element()
-    for i, e in enumerate(simulator.elements):
-        bare = bare.with_element(e.port, law if i == number else e.law)
-    return bare.with_parameters({**bare.parameters, **kept})
-
-
 def _initial_state(after: Fitted, state: np.ndarray, number: int, law: Law, z: float, h: float) -> np.ndarray:
     """Return an initial state in which the layer's memory is z, so that no operator is saturated."""
     own = len(after.simulator.states)
@@ -358,7 +349,7 @@ def _initial_state(after: Fitted, state: np.ndarray, number: int, law: Law, z: f
 
 
 def _build_refinement(
-    diagnosis: Any, bench: Workbench, kind: str, fitted: Fitted, number: int, held_out: Mapping[str, HeldOut]
+    diagnosis: Any, bench: Workbench, kind: str, fitted: Fitted, number: int, expected: Mapping[str, ExpectedError]
 ) -> Refinement:
     element, after = fitted.simulator.elements[number], diagnosis.evidence.after
     values, port = element.own(fitted.values), element.port
@@ -373,7 +364,7 @@ def _build_refinement(
     signal = in_series(port)
     z = np.linspace(0.0, float(np.ptp(loops[0][0])) / 2, CURVE_POINTS)
     order = np.argsort(values["r"])
-    improves = held_out[kind].score < held_out[DIAGNOSED].score
+    improves = expected[kind].mean_square < expected[DIAGNOSED].mean_square
     old = after.simulator.elements[number].law
     return Refinement(
         port=port,
@@ -383,7 +374,7 @@ def _build_refinement(
         weights=np.asarray(values["w"])[order],
         linear=float(values.get("k_0", 0.0)),
         loading_curve=(z, _loading_curve(element.law, values, z) + signal * z),
-        held_out=dict(held_out),
+        expected=dict(expected),
         errors=errors,
         layer=refined.corrected,
         _chosen=refined if improves else diagnosis,

@@ -10,13 +10,13 @@ import numpy as np
 
 from .._base import percent
 from ..data import DIVERGING, Recording
-from ..models import ParameterSet, at_bounds
+from ..models import ParameterSet, is_at_bound
 from ..simulators import ACTUATOR, Placed, Simulator, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
 from .effect import Effect
 from .faults.gates import TEST_FAULT, TEST_OFFSET, Gate, value_with_unit
-from .faults.offsets import Offset, describe_offsets
+from .faults.offsets import Offset, describe_offsets, find_placed_offsets
 from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, all_sure
 from .fits.floor import ABOVE_NOISE
 from .search.learned import Learned
@@ -214,11 +214,11 @@ class ResultText:
     def warnings(self) -> list[str]:
         """List the reasons for doubt: an interrupt, parameters at their bounds, errors that stay large."""
         out = [INTERRUPTED] * self.interrupted + [OUT_OF_TIME] * self.out_of_time
-        at_bounds = self._at_bounds()
-        if at_bounds:
-            one = len(at_bounds) == 1
+        ended = self._values_at_bounds()
+        if ended:
+            one = len(ended) == 1
             out.append(
-                f"{', '.join(at_bounds)} came out at {'its bound' if one else 'their bounds'}: more is missing, or "
+                f"{', '.join(ended)} came out at {'its bound' if one else 'their bounds'}: more is missing, or "
                 f"{'it has' if one else 'they have'} too little room. The ± of the other values do not include that."
             )
         out += self._doubtful_offsets()
@@ -259,19 +259,19 @@ class ResultText:
 
     def _doubtful_offsets(self) -> Iterator[str]:
         """Generate a note on each offset that is larger than its signal ever was."""
-        own = self.corrected.parameters
-        for e in (e for e in self.corrected.elements if isinstance(e.law, Offset) and self.train):
+        for parameter, e in find_placed_offsets(self.corrected.elements if self.train else ()).items():
             kind, name = split_port(e.port)
             values = [r.u if kind == ACTUATOR else r.y for r in self.train]
             at = (self.train[0].inputs if kind == ACTUATOR else self.train[0].outputs).index(name)
-            reach, value = max(float(np.max(np.abs(v[:, at]))) for v in values), float(own[f"{e.prefix}w_0"].value)
+            reach = max(float(np.max(np.abs(v[:, at]))) for v in values)
+            value = float(self.corrected.parameters[parameter].value)
             if abs(value) > reach:
                 yield (
                     f"The offset of {name} ({value:.3g}) is larger than {name} ever was ({reach:.3g}): it may make up "
                     "for something else, such as a wrong level or gain, or missing physics."
                 )
 
-    def _at_bounds(self) -> list[str]:
+    def _values_at_bounds(self) -> list[str]:
         """List the free entries of parameters at a bound, each with its value.
 
         Zeros are left out if effects are named: there an effect has replaced the parameter (friction a damper).
@@ -279,7 +279,7 @@ class ResultText:
         own, out = self.corrected.parameters, []
         for name in self.parameters:
             p = own[name]
-            at, fixed = at_bounds(p.value, *p.bounds), np.broadcast_to(p.fixed, p.value.shape)
+            at, fixed = is_at_bound(p.value, *p.bounds), np.broadcast_to(p.fixed, p.value.shape)
             columns = (np.ravel(a, order="F") for a in (p.value, at & ~fixed))
             for label, v, ended in zip(ParameterSet({name: p}).labels, *columns, strict=True):
                 if ended and (v or not self.effects):
@@ -366,11 +366,11 @@ class ResultText:
             p = free[name]
             std = "" if p["std"] is None else f" ± {float(p['std']):.2g}"
             value, nominal = float(p["refit_with"]), float(p["nominal"])
-            bound = ", at its bound" if at_bounds(value, *own[name].bounds) else ""
+            bound = ", at its bound" if is_at_bound(value, *own[name].bounds) else ""
             lines.append(f"  {name} = {value:.5g}{std} {p['unit']}".rstrip() + f", given as {nominal:.5g}{bound}")
         more = [f"  and {len(moved) - MOST_PRINTED} more"] if len(moved) > MOST_PRINTED else []
-        for e in (e for e in self.corrected.elements if isinstance(e.law, Offset)):
-            value, unit = float(own[f"{e.prefix}w_0"].value), self.corrected.port(e.port).unit
+        for name, e in find_placed_offsets(self.corrected.elements).items():
+            value, unit = float(own[name].value), self.corrected.port(e.port).unit
             more.append(f"  offset of {split_port(e.port)[1]} = {value_with_unit(value, unit, 4)}")
         return ["the simulator's own values, refitted:", *lines, *more] if lines or more else []
 

@@ -15,7 +15,7 @@ from .._base import in_words, percent
 from ..laws import CATALOGUE, display_name
 from ..simulators import name_at
 from .faults.gates import Gate
-from .faults.offsets import describe_offsets
+from .faults.offsets import find_placed_offsets
 from .faults.tones import find_ringing_mode
 from .fits.evidence import (
     AT_NOISE_RATIO,
@@ -81,7 +81,7 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
     if fault and (noise or cured):
         return Verdict("recording-fault", fault.sentence)
     if noise:
-        beside = _describe_beside(steady, gates) + _among_laws(search)
+        beside = _describe_beside(search, steady) + _among_laws(search)
         rest = "no force at any port explains any of the rest"
         if measured:
             rest = "the rest is as large as the noise"
@@ -96,18 +96,16 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
     return Verdict("unexplained", _describe_unexplained(search, closest, shares, mode))
 
 
-def _describe_beside(tones: Sequence[Gate], gates: Sequence[Gate]) -> str:
+def _describe_beside(search: Hypotheses, tones: Sequence[Gate]) -> str:
     """Describe the steady tones and the fitted offsets, beside which nothing is missing."""
-    found = [f"a steady tone in {in_words([g.channel for g in tones])}"] if tones else []
-    offsets = [g.channel for g in gates if g.parameter and g.finding == "offset"]
-    found += [f"an offset of {in_words(offsets)}"] if offsets else []
+    steady = f"a steady tone in {in_words([g.channel for g in tones])}" if tones else ""
+    found = list(filter(None, (steady, search.offsets)))
     return f" but {in_words(found)}" if found else ""
 
 
 def _refitted(search: Hypotheses) -> str:
     """Say that the simulator was refitted, and with which offsets."""
-    offsets = describe_offsets(search.bench.simulator.elements)
-    return f"refitted with {offsets}" if offsets else "refitted"
+    return f"refitted with {search.offsets}" if search.offsets else "refitted"
 
 
 def closest_hypothesis(search: Hypotheses, chosen: Trial | None = None) -> Trial | None:
@@ -174,10 +172,9 @@ def _describe_effects(search: Hypotheses, found: Posterior) -> str:
 def _describe_vanished(search: Hypotheses, found: Posterior) -> str:
     """Describe the simulator's own parameters that vanish beside the effects, which may replace them."""
     simulator = search.bench.simulator
-    offsets = tuple(e.prefix for e in simulator.elements if e.law.id == "offset")
-    names = [k for k in simulator.parameters if not k.startswith(offsets)]
+    offsets = find_placed_offsets(simulator.elements)
     before, after = search.root.fitted.values, found.best.fitted.values
-    gone = [k for k in names if np.any(before[k]) and not np.any(after[k])]
+    gone = [k for k in simulator.parameters if k not in offsets and np.any(before[k]) and not np.any(after[k])]
     come = "come out as zero: they are replaced" if gone[1:] else "comes out as zero: it is replaced"
     return f" The simulator's own {' and '.join(gone)} {come}." if gone else ""
 

@@ -44,7 +44,7 @@ def _check_within(name: str, value: Any, bounds: Any) -> None:
             )
 
 
-def at_bounds(value: Any, lower: Any, upper: Any) -> Array:
+def is_at_bound(value: Any, lower: Any, upper: Any) -> Array:
     """Mark values at one of their bounds; a solver ends a little inside of it.
 
     Zero has no size, so that only zero itself is at the bound zero.

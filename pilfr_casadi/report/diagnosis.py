@@ -295,7 +295,7 @@ def _strength_pictures(case: _Case, number: int) -> list[Block]:
     out: list[Block] = []
     for name, found in strengths_over(law, values, grid).items():
         unit = readable_unit(law.units[name], port.unit, port.across_unit)
-        total, title = found if found.ndim == 1 else found.sum(axis=1), f"{name} of the {name_at(element.port, law.id)}"
+        total, title = found if found.ndim == 1 else found.sum(axis=1), f"{name} of the {name_at(*element.name)}"
         if kind_of(element.port) == PARAMETER:
             name = title = split_port(element.port)[1]
             total = total + float(case.after.values[name])
@@ -308,7 +308,7 @@ def _candidates(d: Diagnosis) -> list[Block]:
     passes = tables.candidates_by_pass(d)
     out: list[Block] = [Text(tables.CANDIDATES)] if passes else []
     for rows, parent in passes:
-        laws = "" if parent is None else " and ".join(name_at(e.port, e.law.id) for e in parent.laws)
+        laws = "" if parent is None else " and ".join(name_at(*e.name) for e in parent.laws)
         title = f"Fitted in addition to {laws}" if laws else "All fitted pairs of port and law"
         error = None if parent is None else float(parent.error)
         out += tables.candidate_tables(rows, d.effects, title, d.floor["nrmse"], error)

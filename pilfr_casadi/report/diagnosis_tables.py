@@ -211,8 +211,8 @@ def candidates_by_pass(diagnosis: Diagnosis) -> list[tuple[list[dict[str, Any]],
     The hypothesis is None if it is unknown.
     """
     rows, search = list(diagnosis.candidates), diagnosis.evidence.search
-    steps = search.passes if search is not None else []
-    sizes, parents = [len(step.trials) for step in steps], [step.parent for step in steps]
+    moves = search.moves_by_parent if search is not None else []
+    sizes, parents = [len(move.trials) for move in moves], [move.parent for move in moves]
     if sum(sizes) != len(rows):
         sizes, parents = [len(rows)], parents[:1] or [None]
     ends = pairwise(np.cumsum([0, *sizes]))
@@ -453,4 +453,4 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
 def element_of(fitted: Fitted, effect: Effect) -> int | None:
     """Return the index of an effect's element in the fitted simulator, where offsets may precede it, or None."""
     placed = enumerate(fitted.simulator.elements)
-    return next((i for i, p in placed if (p.port, p.law.id) == (effect.port, effect.law)), None)
+    return next((i for i, p in placed if p.name == (effect.port, effect.law)), None)

@@ -222,6 +222,16 @@ class Placed:
     law: Any
     prefix: str
 
+    @property
+    def pair(self) -> tuple[str, type[Any]]:
+        """Port and class of the law."""
+        return self.port, type(self.law)
+
+    @property
+    def name(self) -> tuple[str, str]:
+        """Port and id of the law, which are alike for all its forms."""
+        return self.port, self.law.id
+
     def own(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Select the law's values, by its own names, from values by full name."""
         return {name: values[f"{self.prefix}{name}"] for name in self.law.parameters()}

@@ -230,8 +230,8 @@ class Simulator(Equations):
         self._check_parameters(bounds)
         return self._copy_with(parameters=self.parameter_set.free_within(bounds))
 
-    def with_element(self, port: str, law: Any) -> Simulator:
-        """Copy with a law in a port; see `close_loop`."""
+    def with_element(self, port: str, law: Any, index: int | None = None) -> Simulator:
+        """Copy with a law in a port, behind all `elements` or before one of them; see `close_loop`."""
         place = self.port(port)
         if isinstance(law, type):
             names = [*getattr(law, "units", ())]
@@ -257,7 +257,8 @@ class Simulator(Equations):
             raise InputError(f"The law {law.id!r} cannot be closed in at {port!r} yet: {lacks}.")
         placed = Placed(port, law, self._choose_prefix(port))
         own = self.parameter_set | placed.named(law.parameters())
-        return self._copy_with(parameters=own, elements=(*self.elements, placed))
+        at = len(self.elements) if index is None else index
+        return self._copy_with(parameters=own, elements=(*self.elements[:at], placed, *self.elements[at:]))
 
     def _choose_prefix(self, port: str) -> str:
         """Choose the prefix of a further law's parameters at a port; no other parameter's name begins with it."""

@@ -51,14 +51,14 @@ def test_a_layer_of_many_operators_predicts_better(many, refined):
     test = many.test[0]
     assert refined.nrmse(test) < 0.6 * many.nrmse(test)
     assert refined.nrmse(test) == pytest.approx(refined.errors["test"]["refined"])
-    assert refined.held_out[refined.kind].score < refined.held_out["diagnosed"].score
+    assert refined.expected[refined.kind].mean_square < refined.expected["diagnosed"].mean_square
     assert np.max(np.abs(refined.simulate(test) - test.y)) < 0.01 * np.max(np.abs(test.y))
 
 
 def test_a_refinement_counts_samples_as_the_search_does(many, refined, monkeypatch):
     monkeypatch.setattr(Search, "count_samples", lambda *_: 1.0)
     found = many.refine(operators=2, kind="stop")
-    assert found.held_out["diagnosed"].spread > 5 * refined.held_out["diagnosed"].spread
+    assert found.expected["diagnosed"].spread > 5 * refined.expected["diagnosed"].spread
 
 
 def test_weights_and_thresholds_are_bounded_below_by_zero(refined):
@@ -126,7 +126,7 @@ def test_hysteresis_of_an_actuator():
     refined = diagnosis.refine(6)
     assert refined.port in ("actuator:volt", "sensor:pos")
     assert refined.errors["test"]["refined"] <= 1.05 * refined.errors["test"]["diagnosed"]
-    assert "generalized_play" in refined.held_out
+    assert "generalized_play" in refined.expected
 
 
 @pytest.mark.parametrize(

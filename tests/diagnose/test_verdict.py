@@ -299,7 +299,7 @@ def test_a_large_error_of_a_few_times_the_noise_is_not_said_to_be_complete():
 def test_an_offset_is_told_beside_which_nothing_is_missing():
     true = cart().with_element("sensor:pos", Offset().at({"w_0": 5e-4}))
     found = pilfr.diagnose(cart(), of_cart(1, true), laws=(CoulombFriction,), effects=1, workers=1)
-    assert found.sentence.startswith("Nothing is missing but an offset of pos, as far as the laws tried can show")
+    assert found.sentence.startswith("Nothing is missing but the offset of pos, as far as the laws tried can show")
 
 
 def test_a_law_that_removes_much_of_the_mismatch_says_where_it_acts():

@@ -9,7 +9,7 @@ from hypothesis import given, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from pilfr_casadi._base import InputError
-from pilfr_casadi.models import Parameter, ParameterSet, at_bounds
+from pilfr_casadi.models import Parameter, ParameterSet, is_at_bound
 
 shapes = st.one_of(st.just(()), st.tuples(st.integers(1, 4)), st.tuples(st.integers(0, 3), st.integers(1, 3)))
 values = shapes.flatmap(lambda s: hnp.arrays(float, s, elements=st.floats(-5, 5)))
@@ -20,9 +20,9 @@ sets = st.lists(values, min_size=1, max_size=4).map(
 
 def test_values_a_little_inside_their_bounds_count_as_at_them_and_small_values_do_not_as_zero():
     values, high = [0.0005 + 3e-15, 19.9986, 19.9, 1e-9, 0.0, 5.0], [0.05, 20, 20, 10, 10, np.inf]
-    found = at_bounds(values, [0.0005, 0, 0, 0, 0, -np.inf], high)
+    found = is_at_bound(values, [0.0005, 0, 0, 0, 0, -np.inf], high)
     assert found.tolist() == [True, True, False, False, True, False]
-    assert not at_bounds(1.0005, 0.999, 1.002) and at_bounds(2.0, 2.0, 2.0)
+    assert not is_at_bound(1.0005, 0.999, 1.002) and is_at_bound(2.0, 2.0, 2.0)
 
 
 @given(sets)

@@ -276,5 +276,5 @@ def _try(now: Checked, fault: Gate) -> Checked | None:
     if glanced is None or not glanced.cost < now.cost:
         return None
     after = correct(now, fault, [{}, glanced.fitted.values], glanced.fitted.begin)
-    bent = fault.finding == "time-unit" and after is not None and after.fitted.at_bounds > MOST_AT_BOUNDS
+    bent = fault.finding == "time-unit" and after is not None and after.fitted.share_at_bounds > MOST_AT_BOUNDS
     return None if bent else after

@@ -7,7 +7,7 @@ told instead if the output's is larger than its deviation, or a constant load, w
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -16,7 +16,7 @@ import numpy as np
 from ..._base import in_words
 from ...data import Recording, moves_freely
 from ...laws import Gain, Law
-from ...simulators import ACTUATOR, EQUATION, SENSOR, Simulator, in_series, kind_of, port_name, split_port
+from ...simulators import ACTUATOR, EQUATION, SENSOR, Placed, Simulator, in_series, kind_of, port_name, split_port
 from ..fits.evidence import FORMULA_ERROR
 from ..fits.floor import ABOVE_NOISE, effective_size, noise_floor, samples_of_mean
 from ..fits.screen import block_diagonal, lengths
@@ -145,13 +145,24 @@ class Load(Offset):
     places: ClassVar[tuple[str, ...]] = ("parallel",)
 
 
+def find_placed_offsets(elements: Iterable[Placed]) -> dict[str, Placed]:
+    """Return the offsets among elements, by the full name of their parameter."""
+    return {f"{e.prefix}w_0": e for e in elements if isinstance(e.law, Offset)}
+
+
+def describe_offsets(elements: Iterable[Placed]) -> str:
+    """Name the channels of the offsets among elements, such as "the offsets of u and y"; "" if there is none."""
+    channels = [split_port(e.port)[1] for e in find_placed_offsets(elements).values()]
+    return f"the offset{'s' * (len(channels) > 1)} of {in_words(channels)}" if channels else ""
+
+
 def _law_of_constant(port: str) -> Offset:
     return Offset() if in_series(port) else Load()
 
 
 @dataclass(frozen=True)
-class Constant(Gate):
-    """A constant at a port, a parameter of the simulator; other physics may remain beside it.
+class SharedOffset(Gate):
+    """A constant at a port that all recordings share, a parameter of the simulator; other physics may remain beside it.
 
     `alike` says in the sentence what else the recordings may show.
     """
@@ -171,13 +182,15 @@ class Constant(Gate):
         return samples_of_mean(residuals)
 
 
-def describe_constant(port: str, value: float = 0.0, parameter: str = "", unit: str = "", alike: str = "") -> Constant:
+def describe_constant(
+    port: str, value: float = 0.0, parameter: str = "", unit: str = "", alike: str = ""
+) -> SharedOffset:
     """Return the fault that a channel has a constant offset; `alike` says what else it may be."""
     kind, name = split_port(port)
     own = ", or a constant load acts like one, as do dry friction and a dead zone while the input keeps its sign"
     where, load = ("input", own) if kind == ACTUATOR else ("output", "")
     words = f"The {where} {name} has a constant offset of about {value_with_unit(value, unit)}{load}{alike}"
-    return Constant(name, "offset", value, words, parameter=parameter, port=port, alike=alike)
+    return SharedOffset(name, "offset", value, words, parameter=parameter, port=port, alike=alike)
 
 
 def find_offsets(now: Checked, otherwise: Mapping[str, str] | None = None) -> Checked:
@@ -237,7 +250,7 @@ def _with_constant(now: Checked, port: str) -> Checked | None:
 
 def _name_of_constant(after: Checked) -> str:
     """Return the parameter of the constant that was fitted last."""
-    return f"{after.bench.simulator.elements[-1].prefix}w_0"
+    return list(find_placed_offsets(after.bench.simulator.elements))[-1]
 
 
 def _constant(after: Checked) -> float:
@@ -403,7 +416,7 @@ def share_of_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -
 
 
 def list_offsets(
-    elements: Sequence[Any],
+    elements: Iterable[Placed],
     values: Mapping[str, Any],
     simulator: Simulator | None = None,
     alike: Mapping[str, str] | None = None,
@@ -412,19 +425,19 @@ def list_offsets(
 
     `alike` says by parameter what else a constant may be.
     """
-    placed = [(e.port, f"{e.prefix}w_0") for e in elements if isinstance(e.law, Offset)]
-    units = {port: simulator.port(port).unit if simulator else "" for port, _ in placed}
-    words = alike or {}
-    found = [describe_constant(p, float(values[name]), name, units[p], words.get(name, "")) for p, name in placed]
-    return [replace(c, sentence=f"{c.sentence}; it is a parameter of the corrected simulator.") for c in found]
+    out, words = list[Gate](), alike or {}
+    for name, e in find_placed_offsets(elements).items():
+        unit = simulator.port(e.port).unit if simulator else ""
+        constant = describe_constant(e.port, float(values[name]), name, unit, words.get(name, ""))
+        out.append(replace(constant, sentence=f"{constant.sentence}; it is a parameter of the corrected simulator."))
+    return out
 
 
 def fix_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
     """Fix offsets at zero that gain nothing beside effects, because an effect may have looked like an offset."""
     before = len(bench.simulator.elements)
     placed = fitted.simulator.elements
-    for offset in list_offsets(placed[:before], fitted.values) if len(placed) > before else ():
-        name = offset.parameter
+    for name in find_placed_offsets(placed[:before]) if len(placed) > before else ():
         zero = replace(fitted.simulator.parameters[name], value=0.0, fixed=True)
         simulator = fitted.simulator.with_parameters({**fitted.simulator.parameters, name: zero})
         start = {k: v for k, v in fitted.values.items() if k != name}
@@ -449,17 +462,10 @@ def remove_offsets(simulator: Simulator, own: int, idle: bool = False) -> Simula
 
     With `idle` only those are removed that `fix_idle_offsets` has fixed.
     """
-    for i in reversed(range(own, len(simulator.elements))):
-        e = simulator.elements[i]
-        if isinstance(e.law, Offset) and (not idle or np.all(simulator.parameters[f"{e.prefix}w_0"].fixed)):
-            simulator = simulator.without_element(i)
+    for name, e in find_placed_offsets(simulator.elements[own:]).items():
+        if not idle or np.all(simulator.parameters[name].fixed):
+            simulator = simulator.without_element(simulator.elements.index(e))
     return simulator
-
-
-def describe_offsets(elements: Sequence[Any]) -> str:
-    """Name the channels of the offsets among elements, such as "the offsets of u and y"; "" if there is none."""
-    channels = [split_port(e.port)[1] for e in elements if isinstance(e.law, Offset)]
-    return f"the offset{'s' * (len(channels) > 1)} of {in_words(channels)}" if channels else ""
 
 
 def update_offsets(
@@ -469,7 +475,7 @@ def update_offsets(
 
     Without effects they stay, because the corrected simulator has them.
     """
-    alike = {g.parameter: g.alike for g in gates if isinstance(g, Constant)}
+    alike = {g.parameter: g.alike for g in gates if isinstance(g, SharedOffset)}
     fitted = {g.parameter: g for g in list_offsets(after.simulator.elements, after.values, after.simulator, alike)}
     # standard errors count the samples that are independent for any parameter
     ratio = (effective_size(after.residual) / samples_of_mean(after.residual)) ** 0.5

@@ -436,27 +436,34 @@ class HeldOut:
     blocks: float  # on held-out blocks; infinite if the simulation diverges
     ahead: float  # the same on the second halves
     squares: np.ndarray  # (n_y,), the larger of the two, of each output
-    spread: float = 0.0  # mean square uncertainty of predictions for other inputs; see `evidence.spread`
 
     @property
-    def score(self) -> float:
-        """Mean square error by which models are chosen: outputs weighted by noise, plus the spread for other inputs."""
-        return max(self.blocks, self.ahead) + self.spread
-
-    @property
-    def weighted_rms(self) -> float:
-        """Rms error, outputs weighted by their noise, without the spread."""
-        return float(np.sqrt(max(self.blocks, self.ahead)))
+    def mean_square(self) -> float:
+        """Mean square error, outputs weighted by their noise."""
+        return max(self.blocks, self.ahead)
 
     @property
     def rms(self) -> float:
-        """Rms error, all outputs alike, without the spread, as reports state it."""
+        """Rms error, all outputs alike, as reports state it."""
         return float(np.sqrt(np.mean(self.squares)))
 
+
+@dataclass(frozen=True)
+class ExpectedError:
+    """The error that is expected on other recordings: that on held-out data, plus the spread for other inputs."""
+
+    held_out: HeldOut
+    spread: float  # mean square uncertainty of predictions for other inputs; see `evidence.spread`
+
     @property
-    def expected(self) -> float:
-        """Rms error, all outputs alike, with the spread for other inputs."""
-        return float(np.hypot(self.rms, np.sqrt(self.spread)))
+    def mean_square(self) -> float:
+        """Mean square error by which models are chosen, outputs weighted by their noise."""
+        return self.held_out.mean_square + self.spread
+
+    @property
+    def rms(self) -> float:
+        """Rms error, all outputs alike."""
+        return float(np.hypot(self.held_out.rms, np.sqrt(self.spread)))
 
 
 def blocks_of(bench: Workbench) -> list[np.ndarray]:

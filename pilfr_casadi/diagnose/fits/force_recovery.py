@@ -13,7 +13,7 @@ simulator is linearised again along the result.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -22,7 +22,7 @@ import numpy as np
 from ..._base import one_at_a_time
 from ...data import Recording
 from ...linear import measurement_update
-from ...models import Model, ParameterSet
+from ...models import Model
 from ...simulators import (
     ACTUATOR,
     PARAMETER,
@@ -41,7 +41,7 @@ from ...simulators import (
     states_along,
 )
 from .evidence import FORMULA_ERROR
-from .linearise import Constant, compose_substeps, input_slope, local_signals, loudest_stretch, simulate_states
+from .linearise import ProbeForce, compose_substeps, input_slope, local_signals, loudest_stretch, simulate_states
 from .workbench import Fitted, Workbench, pack_known
 
 NOISE_FACTORS = (1.0, 3.0, 9.0)  # factors on the given noise that are tried
@@ -309,15 +309,11 @@ def _remove_element(fitted: Fitted, number: int | None, start: np.ndarray, h: fl
     simulator = fitted.simulator
     if number is None:
         return simulator, start
-    own = simulator.parameter_set
-    equations = ClosedEquations(on_grid(simulator, h), ca.SX.sym("p", own.size))
+    equations = ClosedEquations(on_grid(simulator, h), ca.SX.sym("p", simulator.parameter_set.size))
     at_q = np.cumsum([len(simulator.states), *equations.n_q])
     at_s = np.cumsum([at_q[-1], *equations.n_s])
     dropped = [*range(at_q[number], at_q[number + 1]), *range(at_s[number], at_s[number + 1])]
-    prefix = simulator.elements[number].prefix
-    kept = {k: p for k, p in own.items() if not k.startswith(prefix)}
-    elements = tuple(e for k, e in enumerate(simulator.elements) if k != number)
-    return replace(simulator, elements=elements, parameters=ParameterSet(kept)), np.delete(start, dropped)
+    return simulator.without_element(number), np.delete(start, dropped)
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,7 +334,7 @@ def _recover(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
     """Smooth the force in passes; return local coordinate and rate (M,), force and standard deviation (M - 1,)."""
     n, window, r = fitted.model.substeps, target.window, target.recording
-    open_ = target.simulator.with_element(target.port, Constant())
+    open_ = target.simulator.with_element(target.port, ProbeForce())
     model = discretise(open_, bench.dt, bench.hold, n)
     drive = model.drive(r)
     values = {k: v for k, v in fitted.values.items() if k in target.simulator.parameters}

@@ -43,7 +43,7 @@ CHUNK, ENTRIES = 300, 2e7  # samples linearised at a time, and entries of their 
 POINTS, MOST_SAMPLED = 60, 3000  # samples at which the user's equations are evaluated, among the first of a run
 
 
-class Constant(Law):
+class ProbeForce(Law):
     """A constant force, the probe that measures a port's response."""
 
     id = "probe"
@@ -75,7 +75,7 @@ class Probe:
         """Differentiate the probed simulator."""
         simulator = probed = fitted.simulator
         for port in simulator.all_ports():
-            probed = probed.with_element(port.name, Constant())
+            probed = probed.with_element(port.name, ProbeForce())
         model = discretise(probed, bench.dt, bench.hold, fitted.model.substeps)
         x, (u, p) = ca.SX.sym("x", model.n_state), model.symbols()[2:]
         following, y = model.closed(x, u, p)

@@ -15,7 +15,7 @@ from ...engine import Engine, make_engine
 from ...identify import solve_within_bounds
 from ...laws import Local
 from ...linear import INJECTION, with_output_injection
-from ...models import Model, ParameterSet, at_bounds
+from ...models import Model, ParameterSet, is_at_bound
 from ...optimise import GaussNewton, Problem, Status
 from ...simulators import (
     LARGEST_STEP,
@@ -94,19 +94,19 @@ class Fitted(CompiledSimulator):
         return self.model.with_parameters(self.model.parameters.at(self.vector))
 
     @property
-    def at_bounds(self) -> float:
+    def share_at_bounds(self) -> float:
         """Share of the free parameters at a bound."""
         p = self.model.parameters
-        return float(np.mean(at_bounds(self.vector, p.lower, p.upper)[p.free])) if np.any(p.free) else 0.0
+        return float(np.mean(is_at_bound(self.vector, p.lower, p.upper)[p.free])) if np.any(p.free) else 0.0
 
-    def at_bound(self, name: str) -> np.ndarray:
+    def is_at_bound(self, name: str) -> np.ndarray:
         """Mark the entries of a parameter that are at one of its bounds."""
-        return at_bounds(self.values[name], *self.model.parameters[name].bounds)
+        return is_at_bound(self.values[name], *self.model.parameters[name].bounds)
 
     def strained(self, names: Iterable[str]) -> int:
         """Count the free parameters of some at a bound other than zero, which the fit wants beyond."""
         free = (name for name in names if not np.all(self.model.parameters[name].fixed))
-        return sum(bool(np.any(self.at_bound(name) & (self.values[name] != 0))) for name in free)
+        return sum(bool(np.any(self.is_at_bound(name) & (self.values[name] != 0))) for name in free)
 
     @property
     def begin(self) -> list[np.ndarray]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -16,6 +16,7 @@ from ..._base import Stages, UntilInterrupted
 from ...laws import Law
 from ...simulators import Placed, Simulator
 from ..faults.gates import EQUAL_RATIO
+from ..faults.offsets import describe_offsets
 from ..fits.coloured_noise import log_likelihood
 from ..fits.evidence import (
     CONTENDING_NATS,
@@ -62,7 +63,7 @@ class Findings:
     # whether the force of a law with memory is a curve along the runs, by the prefix of its parameters
     curves: dict[str, bool] = field(default_factory=dict)
     varied: bool = False  # whether variations of parameters were tried beside it
-    replaced: bool = False  # whether laws with constant parameters were tried in place of its last law, which varies
+    replaced: bool = False  # whether laws with constant parameters were tried in place of its added law, which varies
 
 
 @dataclass(eq=False, repr=False)
@@ -162,6 +163,11 @@ class Hypotheses:
         return self.memo[frozenset()]
 
     @property
+    def offsets(self) -> str:
+        """Words for the offsets that all hypotheses have, such as "the offset of u"; empty if there is none."""
+        return describe_offsets(self.bench.simulator.elements)
+
+    @property
     def best(self) -> Trial:
         """The most promising hypothesis, from which the search continues."""
         return max(self.memo.values(), key=self.optimistic_evidence)
@@ -212,7 +218,7 @@ class Hypotheses:
         Of two ratios the median is the smaller: one hypothesis that predicts badly says nothing about the others.
         """
         known = [(self.findings[key].held_out, trial.mean_square) for key, trial in self.memo.items()]
-        ratios = [h.weighted_rms**2 / fit for h, fit in known if h and np.isfinite(h.weighted_rms) and fit > 0]
+        ratios = [h.mean_square / fit for h, fit in known if h and np.isfinite(h.mean_square) and fit > 0]
         return float(np.quantile(ratios, quantile, method="lower")) if ratios else 1.0
 
     def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
@@ -242,19 +248,20 @@ class Hypotheses:
         return {port.name: port.domain for port in self.bench.simulator.all_ports()}
 
     def held_out(self, trial: Trial) -> HeldOut:
-        """Compute the held-out errors of a hypothesis, once.
+        """Compute the held-out errors and the spread of a hypothesis, once, and return the errors.
 
-        If it follows no better than with fewer laws, it has the errors of the hypothesis with fewer laws.
+        If it follows no better than with fewer laws, it has those of the hypothesis with fewer laws.
         """
         known = self.findings[trial.key].held_out
         if known is None:
             alike = [t for t in self.memo.values() if t.key < trial.key and t.thorough and self._alike(t, trial)]
             shown = min([*alike, trial], key=lambda t: len(t.key))
             known = self.findings[shown.key].held_out
-            known = known or self.held_out_errors(shown.fitted, self.spread_of(shown))
+            spread = self.spread_of(shown)
+            known = known or held_out_errors(self.bench, shown.fitted, self.workers)
             if np.isfinite(known.rms) or not self.past_deadline:  # otherwise the time was over before they were known
                 for key in (shown.key, trial.key):
-                    self.findings[key].held_out, self.findings[key].spread = known, known.spread
+                    self.findings[key].held_out, self.findings[key].spread = known, spread
         return known
 
     def _alike(self, one: Trial, other: Trial) -> bool:
@@ -262,10 +269,6 @@ class Hypotheses:
         ratio = one.mean_square / max(other.mean_square, 1e-300)
         nats = 0.5 * self.effective_samples.at(0.0) * np.log(ratio)
         return bool(ratio < EQUAL_RATIO and nats < INDISTINGUISHABLE_NATS)
-
-    def held_out_errors(self, fitted: Fitted, spread: float) -> HeldOut:
-        """Compute the held-out errors of a fitted simulator with a known spread for other inputs."""
-        return replace(held_out_errors(self.bench, fitted, self.workers), spread=spread)
 
     def spread_of(self, trial: Trial) -> float:
         """Compute the spread of a hypothesis, once."""
@@ -296,7 +299,7 @@ class Hypotheses:
         wrong model may overfit, and among models that follow the recordings equally well the right one predicts best.
         If the search took all its time, the comparison has half of what is left for the conclusion.
         """
-        if not self._all_wrong and len({frozenset((e.port, e.law.id) for e in t.laws) for t in self._likeliest()}) < 2:
+        if not self._all_wrong and len({frozenset(e.name for e in t.laws) for t in self._likeliest()}) < 2:
             return
         now = time.perf_counter()
         until = max(self.until, now + (self.bench.deadline - now) / 2)
@@ -324,7 +327,7 @@ class Hypotheses:
     def _judge_by_spread(self) -> None:
         """Compute the spread of the likeliest hypotheses, which takes less time than to hold data out."""
         while self._all_wrong and not self.past_deadline:
-            unknown = [t for t in likeliest(list(self.memo.values()), self.evidence) if t.laws]
+            unknown = [t for t in likeliest(self.memo.values(), self.evidence) if t.laws]
             unknown = [t for t in unknown if self.findings[t.key].spread is None]
             if not unknown:
                 break
@@ -332,7 +335,7 @@ class Hypotheses:
 
     def _likeliest(self) -> list[Trial]:
         """List the hypotheses that may be the likeliest if they predict as well as any that did."""
-        return likeliest(list(self.memo.values()), partial(self._judged_evidence, quantile=0.0))
+        return likeliest(self.memo.values(), partial(self._judged_evidence, quantile=0.0))
 
     def flexible(self, trial: Trial) -> dict[str, float]:
         """Compute the share of a trial's residual that a flexible force explains, by port."""
@@ -521,7 +524,7 @@ class Hypotheses:
         return UntilInterrupted(self.bench.interrupt, self.say.interrupted)
 
 
-def likeliest(trials: Sequence[Trial], evidence: Callable[[Trial], float]) -> list[Trial]:
+def likeliest(trials: Iterable[Trial], evidence: Callable[[Trial], float]) -> list[Trial]:
     """List the hypotheses whose evidence is near the largest, the likeliest first."""
     ranked = sorted(trials, key=evidence, reverse=True)
     return [t for t in ranked if evidence(t) > evidence(ranked[0]) - CONTENDING_NATS]

@@ -39,7 +39,7 @@ from ..faults.timing import TimeShift, find_time_shift
 from ..fits.evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR, NEAR_RATIO
 from ..fits.floor import ABOVE_NOISE
 from ..fits.linearise import linearise_runs
-from ..fits.screen import Pair, Remainder, Scored, screen, usable
+from ..fits.screen import Remainder, Scored, screen, usable
 from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted, refit, refit_with_other_holds
 from .hypotheses import Hypotheses, likeliest
 from .learned import learn_forces, nearest_to_learned
@@ -50,14 +50,14 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 # Effort
-MOST_CONVERGED = 5  # trials of a step that are fitted to convergence at most
+MOST_CONVERGED = 5  # trials of a move that are fitted to convergence at most
 NEARLY_EXPLAINED = 0.05  # share of the excess left by one law below which far worse laws are not refined
 TWO = "two at once"  # a stage, entered once
 MOST_LEARNED = 2  # learned forces that are kept: those with the smallest error
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class Move:
     """One move of the search: its parent hypothesis, the screen's scores, and the trials, best first."""
 
     parent: Trial
@@ -69,7 +69,7 @@ class Step:
 class Search(Hypotheses):
     """A search, filled by `run`."""
 
-    steps: list[Step] = field(default_factory=list)  # the moves, in their order
+    moves: list[Move] = field(default_factory=list)  # the moves, in their order
     aligned: bool = False  # whether the times of the channels are settled, so that no shift is looked for
     shift: Gate | None = None  # the shift of a channel that ended the search, because it shows only beside a law
     better_hold: str = ""  # the hold of the inputs that ended the search, because it proved better
@@ -108,14 +108,14 @@ class Search(Hypotheses):
                 self.keep(self.fits.polish(there))
 
     @property
-    def passes(self) -> list[Step]:
+    def moves_by_parent(self) -> list[Move]:
         """The moves, those from one hypothesis together, with the best fit of each trial once, smallest error first."""
         found = dict[Key, tuple[Trial, dict[Key, Trial]]]()
-        for step in self.steps:
-            own = found.setdefault(step.parent.key, (step.parent, {}))[1]
-            own |= {t.key: self.memo.get(t.key, t) for t in step.trials}
+        for move in self.moves:
+            own = found.setdefault(move.parent.key, (move.parent, {}))[1]
+            own |= {t.key: self.memo.get(t.key, t) for t in move.trials}
         ranked = ((parent, sorted(trials.values(), key=lambda t: t.error)) for parent, trials in found.values())
-        return [Step(parent, (), tuple(trials)) for parent, trials in ranked if trials]
+        return [Move(parent, (), tuple(trials)) for parent, trials in ranked if trials]
 
     def _grow(self, effects: float, varied: bool = False) -> None:
         """Add effects while that pays; end as soon as the other hold, or a channel's shift, proves better.
@@ -127,7 +127,7 @@ class Search(Hypotheses):
             self.can_improve(self.best)
             and len((parent := self._parent(varied)).effects) < effects
             and self._pays(parent)
-            and (self.may_go_on() or not self.steps)
+            and (self.may_go_on() or not self.moves)
         ):
             self.add(parent)
             if not parent.laws and self.may_go_on() and self._escape_local_minimum():
@@ -255,12 +255,12 @@ class Search(Hypotheses):
         """
         if self.aligned or not self.can_improve(self.best):
             return
-        first_move = {t.key for s in self.steps if not s.parent.laws for t in s.trials}
+        first_move = {t.key for m in self.moves if not m.parent.laws for t in m.trials}
         kept = [self.memo[key] for key in first_move]
         plain = [t for t in kept if not (t.law.order or t.law.memory)]
         first = dict[tuple[str, str], Trial]()  # of each law the likeliest form, the likeliest laws first
         for trial in sorted(plain, key=self.optimistic_evidence, reverse=True):
-            first.setdefault((trial.port, trial.law.id), trial)
+            first.setdefault(trial.name, trial)
         best, shift_step = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_stated else 0.5
         with self.stage("shifts beside a law"):
             for trial in list(first.values())[:FEW] if self.may_go_on() else ():
@@ -276,7 +276,7 @@ class Search(Hypotheses):
     def add(self, parent: Trial, few: bool = False) -> None:
         """Fit the laws, or only a few, that the screen selects beside a hypothesis; polish those that may win."""
         scored, observer_gain = self._standing(parent)
-        if self.steps and not self.may_go_on():
+        if self.moves and not self.may_go_on():
             return
         enough = float(np.sqrt(self.floor2 + NEARLY_EXPLAINED * max(parent.mean_square - self.floor2, 0.0)))
         trials = self._with_relatives(parent, scored, scored, Effort(observer_gain, enough, few))
@@ -309,24 +309,18 @@ class Search(Hypotheses):
         known = self.memo.get(trial.key, trial)
         if not known.error < trial.error:
             return trial
-        return self._with_last(known, trial.pair)
-
-    def _with_last(self, trial: Trial, pair: Pair) -> Trial:
-        """Return a hypothesis with one of its laws as the last."""
-        if trial.pair == pair:
-            return trial
-        return self.run_laws(sorted(trial.laws, key=lambda e: (e.port, type(e.law)) == pair), trial)
+        return known.with_added(trial.pair)
 
     def _best_with_one_more(self, parent: Trial) -> Trial | None:
-        """Return the best hypothesis, its further law as the last, if it has one law more than a parent."""
+        """Return the best hypothesis if it has one law more than a parent, with that as the added one."""
         best = self.best
         added = best.key - parent.key
-        return self._with_last(best, *added) if len(added) == 1 and parent.key < best.key else None
+        return best.with_added(*added) if len(added) == 1 and parent.key < best.key else None
 
     def _record(self, parent: Trial, scored: Sequence[Scored], trials: Sequence[Trial]) -> None:
         """Keep the trials of a move, and note the move."""
         self._keep_all(trials)
-        self.steps.append(Step(parent, tuple(scored), tuple(trials)))
+        self.moves.append(Move(parent, tuple(scored), tuple(trials)))
 
     def _try(self, base: Trial, entries: Sequence[Scored], observer_gain: np.ndarray | None = None) -> None:
         """Fit some pairs beside a hypothesis, none of their relatives, and note the move."""
@@ -378,11 +372,11 @@ class Search(Hypotheses):
         at = next((i for i, e in enumerate(others) if e.port == last.port), None)
         if at is None or not in_series(last.port) or (_is_filter(last.law) and _is_filter(others[at].law)):
             return None
-        found = self.run_laws([*others[:at], last, *others[at:]], trial)
+        found = self.run_laws([*others[:at], last, *others[at:]], trial).with_added(trial.pair)
         return self.fits.converge(found) if found.mean_square < DIVERGED else None
 
     def _finer(self, parent: Trial) -> None:
-        """Fit the best law of a step in its finer forms; then schedule the strength of the best law that allows it."""
+        """Fit the best law of a move in its finer forms; then schedule the strength of the best law that allows it."""
         best = self._best_with_one_more(parent)
         if best is not None:
             self._refine(best, FINER.get(type(best.law), ()))
@@ -395,53 +389,57 @@ class Search(Hypotheses):
         self.replace_variation(parent)
 
     def _vary_strength(self) -> None:
-        """Let the strength of the likeliest law of the last step that may vary do so, with every signal.
+        """Let the strength of the likeliest law of the last move that may vary do so, with every signal.
 
         With the signal found, its other forms may be the physics. A linear law was screened with every signal.
         """
         may_vary = [kind for kind in SCALABLE if kind.id not in LINEAR]
-        added = [t for t in self.steps[-1].trials if constant(type(t.law)) in may_vary]
-        kept = [self.memo[t.key] for t in added]  # perhaps found before, with these laws added in another order
-        step = [new if known.pair != new.pair else known for new, known in zip(added, kept, strict=True)]
+        added = [t for t in self.moves[-1].trials if constant(type(t.law)) in may_vary]
+        kept = [self.memo[t.key].with_added(t.pair) for t in added]  # perhaps found before in another order
         # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
-        if not step or not self.can_improve(self.best, self.least_floor) or not self.may_go_on():
+        if not kept or not self.can_improve(self.best, self.least_floor) or not self.may_go_on():
             return
-        likeliest = max(step, key=self.optimistic_evidence)
-        forms = [t for t in step if t.law.id == likeliest.law.id and t is not likeliest]
+        likeliest = max(kept, key=self.optimistic_evidence)
+        forms = [t for t in kept if t.law.id == likeliest.law.id and t is not likeliest]
         entry = self._entry(likeliest)
         self._vary([likeliest], ("z", *entry.local.inputs) if entry else ())
         if self.best.laws and self.best.law.scheduled_by:
             self._vary(forms, (self.best.law.scheduled_by,))
 
     def _vary(self, trials: Sequence[Trial], signals: Sequence[str]) -> None:
-        """Fit hypotheses with the strength of their last law varying with each signal."""
+        """Fit hypotheses with the strength of their added law varying with each signal."""
         for trial in trials:
             kind = constant(type(trial.law))
             self._refine(trial, [scheduled(kind, by, likely_profiles(kind)[0]) for by in signals])
 
     def _entry(self, trial: Trial) -> Scored | None:
-        """Return how the last law of a trial, or another with the same sense, was first screened at its port.
+        """Return how the added law of a trial, or another with the same sense, was first screened at its port.
 
         None if none was there: the hypothesis comes from another search.
         """
-        there = [s for step in self.steps for s in step.scored if s.port == trial.port]
+        there = [s for move in self.moves for s in move.scored if s.port == trial.port]
         return min(there, key=lambda s: s.law.dissipative != trial.law.dissipative, default=None)
 
     def _refine(self, trial: Trial, kinds: Sequence[Any]) -> None:
-        """Fit a hypothesis with its last law in other forms, which start from its values and oppose motion alike."""
+        """Fit a hypothesis with its added law in other forms, which start from its values and oppose motion alike.
+
+        The law keeps its place, because laws of one signal act one after the other.
+        """
         entry, base, law = self._entry(trial), trial.fitted, trial.law
         if entry is None or not kinds:
             return
         if law.dissipative and not entry.sense:
             total = sum(np.sum(trial.own[name]) for name in law.strength if name not in law.signed)
             entry = replace(entry, sense=int(np.sign(total)))
-        bare = base.simulator.without_element()
+        index = base.simulator.elements.index(trial.element)
+        bare = base.simulator.without_element(index)
 
         def fit(kind: Any) -> Trial | None:
             starts = list(kind.finer_starts(trial.law.at(trial.own), entry.local))
-            placed = [place_law(bare, replace(entry, law=kind()), own) for own in starts]
+            placed = [place_law(bare, replace(entry, law=kind()), own, index) for own in starts]
             values = [{**base.values, **named} for _, named in placed]
-            return self.fits.fit(placed[0][0], values, len(trial.laws), states=base.begin)
+            found = self.fits.fit(placed[0][0], values, len(trial.laws), states=base.begin)
+            return found and found.with_added((trial.port, kind))
 
         found = self._side_by_side(fit, [kind for kind in kinds if usable(kind(), entry.local)])
         self._keep_all([t for t in found if t is not None])
@@ -496,12 +494,12 @@ class Search(Hypotheses):
             return
         self._try(base, entries, observer_gain)
         self.replace_variation(base)
-        last = self.best.laws[-1] if self.best.laws else None
-        if last and kind_of(last.port) == PARAMETER and last.law.scheduled_by:
-            self._curve(base, [s for s in entries if s.pair == (last.port, type(last.law))], observer_gain)
+        found = self.best
+        if found.laws and kind_of(found.port) == PARAMETER and found.law.scheduled_by:
+            self._curve(base, [s for s in entries if s.pair == found.pair], observer_gain)
 
     def replace_variation(self, base: Trial) -> None:
-        """Fit laws with constant parameters whose force is like that of the best hypothesis' last law, which varies."""
+        """Fit laws with constant parameters whose force is like that of the law that the best hypothesis lets vary."""
         best = self.best
         known = self.findings[best.key]
         if known.replaced or not best.laws or best.key - base.key != {best.pair} or base.key - best.key:
@@ -553,14 +551,13 @@ class Search(Hypotheses):
                     self.leave_out(best, [element])
                     plain = constant(type(element.law))
                     if plain is not type(element.law) and kind_of(element.port) != PARAMETER:
-                        others = [e for e in best.laws if e is not element]
-                        self._refine(self.run_laws([*others, element], best), [plain])
+                        self._refine(self.run_laws(best.laws, best).with_added(element.pair), [plain])
                 if self.best.key == best.key:
                     return
 
     def _expanded(self, trial: Trial, ratio: float = np.inf) -> bool:
         """Tell whether laws were added to a hypothesis, at an error of at most `ratio` times the present one."""
-        return any(s.parent.key == trial.key and s.parent.error <= ratio * trial.error for s in self.steps)
+        return any(m.parent.key == trial.key and m.parent.error <= ratio * trial.error for m in self.moves)
 
     def add_two(self) -> None:
         """Fit two laws at once beside the simulator alone, because one after the other may hide each other."""
@@ -605,7 +602,7 @@ class Search(Hypotheses):
             alone = refit(bench, [best.values], states=best.begin, solver=THOROUGH)
         if alone is None or alone.cost > CLEARLY_BETTER * self.root.mean_square:
             return False
-        self.without, self.memo, self.steps = alone, {}, []
+        self.without, self.memo, self.moves = alone, {}, []
         self.findings.clear()
         self.keep(Trial.of(alone, 0, thorough=True))
         return True

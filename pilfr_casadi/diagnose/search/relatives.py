@@ -229,16 +229,16 @@ def _matching_forces(bench: Workbench, trials: Sequence[Trial], scored: Sequence
         return []
     there = (s for s in scored if s.port == best.port and s.pair not in near)
     entries = _first_of_pairs(s for s in there if s.law.size(s.starts[0]) < best.law.size(best.own))
-    return _most_alike(bench, best, entries, {best.port: _last_force(bench, best)}) if entries else []
+    return _most_alike(bench, best, entries, {best.port: _added_force(bench, best)}) if entries else []
 
 
 def in_place_of_variation(bench: Workbench, best: Trial, scored: Sequence[Scored]) -> list[Scored]:
     """Select laws with constant parameters, no more of them, whose force is most like that of a law that varies.
 
-    The last law of the best hypothesis varies with a signal. If it is a parameter, its change acts at some ports as a
+    The added law of the best hypothesis varies with a signal. If it is a parameter, its change acts at some ports as a
     force: a stiffness that varies with its own deflection is a stiffening spring.
     """
-    force, most = _last_force(bench, best), best.law.size(best.own)
+    force, most = _added_force(bench, best), best.law.size(best.own)
     forces = (
         forces_of_change(bench, best.fitted, best.port, force)
         if kind_of(best.port) == PARAMETER
@@ -248,8 +248,8 @@ def in_place_of_variation(bench: Workbench, best: Trial, scored: Sequence[Scored
     return _most_alike(bench, best, _first_of_pairs(s for s in plain if s.law.size(s.starts[0]) <= most), forces)
 
 
-def _last_force(bench: Workbench, trial: Trial) -> np.ndarray:
-    """Compute the force, or the change of a parameter, by the last law of a hypothesis along its runs, (M,)."""
+def _added_force(bench: Workbench, trial: Trial) -> np.ndarray:
+    """Compute the force, or the change of a parameter, by the added law of a hypothesis along its runs, (M,)."""
     values, law = trial.own, trial.law
     shape = {k: v for k, v in values.items() if k not in law.strength}
     strengths = np.concatenate([np.ravel(values[k]) for k in law.strength]) if law.strength else np.ones(1)

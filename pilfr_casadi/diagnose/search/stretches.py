@@ -296,7 +296,7 @@ class Everything:
         away from the whole recordings.
         """
         whole = stretches.everything(search.bench, gates)
-        contenders = [t for t in likeliest(list(search.memo.values()), search.evidence) if t.laws][:FEW]
+        contenders = [t for t in likeliest(search.memo.values(), search.evidence) if t.laws][:FEW]
         trials = [search.root, *contenders]
         limit = _seconds_left(search) / 2  # the rest is for the simulators that the conclusion adds
         fits = list[Fitted]()
@@ -305,12 +305,12 @@ class Everything:
         fits = fits or [fit_to_all(whole, t.fitted, 0.0) for t in trials]
         if not fits[0].cost < DIVERGED:
             return None
-        there = replace(search, bench=whole, memo={}, steps=[], findings=defaultdict(Findings))
+        there = replace(search, bench=whole, memo={}, moves=[], findings=defaultdict(Findings))
         for trial, fitted in zip(trials, fits, strict=True):
             there.keep(Trial.of(fitted, len(trial.laws), thorough=True))
         best = max(there.memo.values(), key=there.evidence)
         there.count = there.count_samples(best.fitted)
-        kept = {t.key for t in likeliest(list(there.memo.values()), there.evidence)} | {search.root.key}
+        kept = {t.key for t in likeliest(there.memo.values(), there.evidence)} | {search.root.key}
         for trial in trials:
             if trial.key not in kept:
                 del search.memo[trial.key]

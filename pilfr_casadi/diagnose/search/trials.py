@@ -21,7 +21,7 @@ from ...data import Recording
 from ...laws import Law
 from ...simulators import Placed, Simulator
 from ..faults.gates import EQUAL_RATIO, open_start
-from ..faults.offsets import Offset
+from ..faults.offsets import Offset, find_placed_offsets
 from ..fits.evidence import FAR_RATIO, FORMULA_ERROR, WRONG_MODEL_SAMPLES
 from ..fits.screen import Pair, Scored
 from ..fits.step_refinement import knee_starts, refit_on_finer_steps
@@ -47,16 +47,21 @@ class Trial:
     mean_square: float  # the same on all recordings
     thorough: bool = False  # whether it was fitted to convergence and to all samples
     information: np.ndarray | None = None  # see `evidence.information`
+    added: Pair | None = None  # the law that its move has added or changed; by default the last one
 
     @classmethod
-    def of(cls, fitted: Fitted, count: int, thorough: bool = False) -> Trial:
+    def of(cls, fitted: Fitted, count: int, thorough: bool = False, added: Pair | None = None) -> Trial:
         """Make the trial of a fit to all recordings, whose last `count` elements are the hypothesis' laws."""
-        return cls(fitted.last_elements(count), fitted, fitted.cost, fitted.cost, thorough)
+        return cls(fitted.last_elements(count), fitted, fitted.cost, fitted.cost, thorough, added=added)
+
+    def with_added(self, pair: Pair) -> Trial:
+        """Return the hypothesis with another one of its laws as the one that was added."""
+        return self if self.pair == pair else replace(self, added=pair)
 
     @property
     def key(self) -> Key:
         """Ports and classes of the laws; equal keys mean the same hypothesis."""
-        return frozenset((e.port, type(e.law)) for e in self.laws)
+        return frozenset(e.pair for e in self.laws)
 
     @property
     def effects(self) -> tuple[Placed, ...]:
@@ -66,7 +71,7 @@ class Trial:
     @property
     def names(self) -> frozenset[Name]:
         """Ports and law ids of the effects, which are alike for all forms of a law."""
-        return frozenset((e.port, e.law.id) for e in self.effects)
+        return frozenset(e.name for e in self.effects)
 
     def supersedes(self, other: Trial) -> bool:
         """Tell whether this fit of a hypothesis replaces another; a thorough one has priority."""
@@ -76,32 +81,32 @@ class Trial:
 
     @property
     def element(self) -> Placed:
-        """The law added last."""
-        return self.laws[-1]
+        """The law that was added."""
+        return next((e for e in self.laws if e.pair == self.added), self.laws[-1])
 
     @property
     def port(self) -> str:
-        """Port of the law added last."""
+        """Port of the law that was added."""
         return self.element.port
 
     @property
     def law(self) -> Law:
-        """The law added last."""
+        """The law that was added."""
         return self.element.law
 
     @property
     def pair(self) -> Pair:
-        """Port and class of the law added last."""
-        return self.port, type(self.law)
+        """Port and class of the law that was added."""
+        return self.element.pair
 
     @property
     def name(self) -> tuple[str, str]:
-        """Port and id of the law added last."""
-        return self.port, self.law.id
+        """Port and id of the law that was added."""
+        return self.element.name
 
     @property
     def own(self) -> dict[str, Any]:
-        """Fitted values of the law added last, by its own names."""
+        """Fitted values of the law that was added, by its own names."""
         return self.element.own(self.fitted.values)
 
     @property
@@ -111,7 +116,7 @@ class Trial:
 
     @property
     def knee(self) -> str:
-        """Full name of the knee, the speed within which the last law's force reverses, if it has one."""
+        """Full name of the knee, the speed within which the added law's force reverses, if it has one."""
         knee = getattr(self.law, "knee", "")
         return f"{self.element.prefix}{knee}" if knee else ""
 
@@ -200,14 +205,14 @@ class Trials:
             fitted = bench.fit(placed, starts, states=states, solver=THOROUGH, like=compiled)
         except InputError:
             return replace(trial, mean_square=np.inf, thorough=True)
-        return Trial.of(fitted, len(trial.laws), thorough=True)
+        return Trial.of(fitted, len(trial.laws), True, trial.added)
 
     def refine_knee(self, trial: Trial) -> Trial:
         """Refit a converged trial on steps that are fine enough for its knee, if it has one."""
         if not trial.knee or not trial.mean_square < DIVERGED or time.perf_counter() > self.bench.deadline:
             return trial
         fitted = refit_on_finer_steps(self.bench, trial.fitted, trial.knee)
-        return Trial.of(fitted, len(trial.laws), thorough=True)
+        return Trial.of(fitted, len(trial.laws), True, trial.added)
 
     def fit_pairs(
         self,
@@ -267,8 +272,8 @@ class Trials:
         compiled = self.bench.compile(placed, observer_gain)
         users = self.bench.simulator.parameters
         # the refit may have compensated for the law by an offset there, or by the term that the law is in line with
-        offsets = [e for e in self.bench.simulator.elements if e.port == first.port and isinstance(e.law, Offset)]
-        reset = tuple(f"{e.prefix}{name}" for e in offsets for name in e.law.strength)
+        offsets = find_placed_offsets(self.bench.simulator.elements)
+        reset = tuple(name for name, e in offsets.items() if e.port == first.port)
         if first.law.in_line:
             reset = (*reset, *self.bench.simulator.term_parameters(first.port))
         afresh = bool(reset) or first.law.special  # strongly curved forces may leave the refit far off
@@ -403,13 +408,15 @@ def _is_redundant(one: Scored, other: Scored) -> bool:
     return one.port == other.port and (issubclass(a, b) or issubclass(b, a)) and other.share - one.share < FORMULA_ERROR
 
 
-def place_law(simulator: Simulator, entry: Scored, start: Mapping[str, Any]) -> tuple[Simulator, dict[str, Any]]:
-    """Put a law into its port; return the simulator and the law's start values by full name."""
+def place_law(
+    simulator: Simulator, entry: Scored, start: Mapping[str, Any], index: int | None = None
+) -> tuple[Simulator, dict[str, Any]]:
+    """Put a law into its port, by default behind all others; return the simulator and start values by full name."""
     law = entry.law
     limits: dict[str, tuple[Any, Any]] = dict(law.at(start).bounds(entry.local))
     if entry.sense:
         side = (0.0, np.inf) if entry.sense > 0 else (-np.inf, 0.0)
         limits |= {name: side for name in law.strength if name not in law.signed}
     inside = {k: np.clip(v, *limits[k]) if k in limits else v for k, v in start.items()}
-    placed = simulator.with_element(entry.port, law.at(inside, limits))
-    return placed, placed.elements[-1].named(inside)
+    placed = simulator.with_element(entry.port, law.at(inside, limits), index)
+    return placed, placed.elements[-1 if index is None else index].named(inside)

@@ -125,10 +125,10 @@ def test_held_out_blocks_tell_a_better_simulator():
     (learned, *_) = learn_forces(bench, refit, ["ground"])
     before, after = held_out_errors(bench, refit), held_out_errors(bench, learned)
     assert after.blocks < 0.3 * before.blocks and after.ahead < 0.3 * before.ahead
-    assert after.weighted_rms == pytest.approx(max(after.blocks, after.ahead) ** 0.5)
-    assert NOISE < after.weighted_rms < 0.5 * before.weighted_rms
+    assert after.mean_square == max(after.blocks, after.ahead)
+    assert NOISE**2 < after.mean_square < 0.25 * before.mean_square
     exact = Workbench.of(true, bench.recordings, "zero")
-    assert held_out_errors(exact, exact.fit(true)).weighted_rms == pytest.approx(NOISE, rel=0.1)
+    assert held_out_errors(exact, exact.fit(true)).mean_square ** 0.5 == pytest.approx(NOISE, rel=0.1)
 
 
 @pytest.mark.parametrize("seconds", [-1.0, 1e-3])
@@ -146,7 +146,7 @@ def test_held_out_samples_have_no_say_in_what_predicts_them(nameless):
     elsewhere = replace(fitted, values={**fitted.values, name: 2 * fitted.values[name]})
     there, here = (held_out_errors(bench, f) for f in (elsewhere, fitted))
     assert (there.blocks, there.ahead) == (here.blocks, here.ahead)
-    assert here.weighted_rms > fitted.cost**0.5
+    assert here.mean_square > fitted.cost
 
 
 def test_laws_are_compared_with_a_force_where_it_acts():

@@ -43,7 +43,7 @@ def searching(train, simulator=None, until=np.inf):
 
 def test_where_nothing_is_missing_nothing_is_fitted():
     found = searching(recordings(None, count=1)).run(2)
-    assert list(found.memo) == [frozenset()] and not found.steps
+    assert list(found.memo) == [frozenset()] and not found.moves
 
 
 def test_a_law_is_found_and_no_hypothesis_is_kept_twice():
@@ -96,7 +96,7 @@ def test_an_interrupt_leaves_what_there_is(monkeypatch):
 
 def test_at_the_time_limit_the_search_answers_from_what_it_has():
     found = searching(rubbing(), until=0.0).run(2)
-    assert found.out_of_time and len(found.steps) == 1  # the first law is fitted in any case
+    assert found.out_of_time and len(found.moves) == 1  # the first law is fitted in any case
     (r,) = rubbing()
     diagnosis = pilfr.diagnose(rig(OFF), r.slice(0, 800), laws=TRIED, time_limit=1e-3)
     assert diagnosis.evidence.search.bench.deadline == np.inf  # what is fitted later, as by `refine`, has time
@@ -211,7 +211,8 @@ def test_after_the_deadline_and_ctrl_c_the_correction_fits_nothing_more(monkeypa
     assert not fitted
     found.bench = replace(found.bench, deadline=np.inf, interrupt=Interrupt(True, True))
     with monkeypatch.context() as patch:  # after Ctrl-C not even the parts that a comparison needs
-        patch.setattr(type(found), "held_out_errors", lambda *_: pytest.fail("a comparison after Ctrl-C"))
+        for module in (hypotheses, correction):
+            patch.setattr(module, "held_out_errors", lambda *_: pytest.fail("a comparison after Ctrl-C"))
         assert correction.find_named_correction(found, unsure)[0].elements
     found.bench = replace(found.bench, interrupt=Interrupt())
     correction.find_unnamed_correction(found)
@@ -313,5 +314,5 @@ def test_if_nothing_explains_the_mismatch_laws_are_added_beside_several_first_la
     true = true.with_element("actuator:force", laws.Saturation().at({"L": 10.0}))
     tried = (laws.CubicDamping, laws.DeadZone)
     found = pilfr.diagnose(example_rig(430.0, 5.0), recorded(true, 0, samples=300), laws=tried, hold="zero", workers=1)
-    parents = {step.parent.names for step in found.evidence.search.steps if len(step.parent.effects) == 1}
+    parents = {move.parent.names for move in found.evidence.search.moves if len(move.parent.effects) == 1}
     assert found.verdict == "unexplained" and len(parents) > 1

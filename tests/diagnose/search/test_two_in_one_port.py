@@ -88,6 +88,20 @@ def test_a_curve_behind_a_lag_is_told_from_a_lag_behind_a_curve(first, second):
     assert found.errors["test"]["after"] < 1.2 * found.floor["nrmse"]
 
 
+def test_a_finer_form_takes_the_place_of_its_law_in_series():
+    """Behind the lag, which was found first, plays could not follow; the finer form was fitted there alone."""
+    plays = laws.PlayHysteresis().at({"w": [-0.4, *[0.1] * 5], "r": [0.0, 1.2, 2.4, 3.6, 4.8, 6.0]})
+    true = example_rig().with_element("actuator:force", plays).with_element("actuator:force", laws.Lag().at({"T": 0.1}))
+    train, tried = recorded(true, 0, samples=500), (laws.PlayHysteresis, laws.Lag)
+    found = pilfr.diagnose(example_rig(430.0, 5.0), train, laws=tried, hold="zero", workers=1)
+    finer, plain = (
+        found.evidence.search.memo[frozenset(("actuator:force", kind) for kind in (first, laws.Lag))]
+        for first in (*laws.FINER[laws.PlayHysteresis], laws.PlayHysteresis)
+    )
+    assert [type(e.law) for e in plain.laws] == [laws.PlayHysteresis, laws.Lag]
+    assert finer.laws[0].law.n > plain.laws[0].law.n and finer.error < plain.error
+
+
 @pytest.mark.parametrize(
     ("one", "other", "apart"),
     [
