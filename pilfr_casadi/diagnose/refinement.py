@@ -35,7 +35,7 @@ from ..identify import regrid
 from ..laws import OPERATORS, Law, Local, display_name, hysteresis_layer, unit_forces
 from ..models import check_size, play
 from ..simulators import Simulator, discretise, in_series, on_grid
-from .fits.evidence import EffectiveSamples, ExpectedError, held_out_errors, spread
+from .fits.evidence import EffectiveSamples, ExpectedError, HeldOut, held_out_errors, spread
 from .fits.force_recovery import signals_along
 from .fits.workbench import THOROUGH, CompiledSimulator, Fitted, Workbench
 from .search.moves import Search
@@ -102,6 +102,11 @@ class Refinement:
         """The simulator with the layer, or with the diagnosed law if the layer does not predict better."""
         corrected: Simulator = self._chosen.corrected
         return corrected
+
+    @property
+    def held_out(self) -> dict[str, HeldOut]:
+        """The errors on held-out training data alone, without the spread: an old spelling of `expected`."""
+        return {name: one.held_out for name, one in self.expected.items()}
 
     @property
     def sentence(self) -> str:

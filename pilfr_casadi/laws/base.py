@@ -358,8 +358,8 @@ class Law:
 
         `shape` has values of the shape parameters of its further terms, which have no strength yet.
         """
-        if type(plain) is type(self).__base__ and (same := self.as_base(own)):
-            return same
+        if "as_base" in vars(type(self)) and type(plain) is type(self).__base__:
+            return self.as_base(own)
         more = [name for name in self.strength if name not in plain.units]
         refines = plain.strength and plain.units.items() <= self.units.items()
         return {**(shape or {}), **dict.fromkeys(more, 0.0), **own} if more and refines else {}

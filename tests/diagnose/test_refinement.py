@@ -52,6 +52,7 @@ def test_a_layer_of_many_operators_predicts_better(many, refined):
     assert refined.nrmse(test) < 0.6 * many.nrmse(test)
     assert refined.nrmse(test) == pytest.approx(refined.errors["test"]["refined"])
     assert refined.expected[refined.kind].mean_square < refined.expected["diagnosed"].mean_square
+    assert refined.held_out[refined.kind] is refined.expected[refined.kind].held_out
     assert np.max(np.abs(refined.simulate(test) - test.y)) < 0.01 * np.max(np.abs(test.y))
 
 

@@ -481,3 +481,8 @@ def test_a_form_that_contains_its_base_equals_it_where_it_starts(kind):
     np.testing.assert_allclose(form, unit_forces(plain, local, [shape])[:, 0], atol=1e-9)
     assert set(start) == set(kind.units) and all(start[name] == 1.0 for name in kind.strength)
     assert kind().starts_as(kind(), start) == {}
+
+
+def test_only_the_class_itself_knows_its_base():
+    """A law that is derived from a form which contains its base does not contain that form in the same way."""
+    assert laws.SkewSaturation().starts_as(laws.AsymmetricSaturation(), {"low": -1.0, "high": 1.0}) == {}
