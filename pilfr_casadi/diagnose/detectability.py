@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import casadi as ca
@@ -17,7 +18,7 @@ import numpy as np
 
 from .._base import one_at_a_time
 from ..data import Recording
-from ..laws import CATALOGUE, Law, readable_unit
+from ..laws import CATALOGUE, LINEAR, Law, readable_unit
 from ..simulators import ACTUATOR, EQUATION, Port, Simulator, map_points, port_name, split_port, stack
 from .fits.linearise import Probe, Run, sample_run
 from .fits.screen import Remainder, Task, lengths, orthonormal, own_changes, project_off
@@ -68,10 +69,13 @@ def assess_laws(
 ) -> tuple[tuple[LawRow, ...], tuple[tuple[tuple[str, str], ...], ...]]:
     """Assess every law at every port, and group laws that look the same; the bench's scale is the noise.
 
-    Without `laws`, take the plainest form of each law of the catalogue. `names` are the names of the free parameters.
+    Without `laws`, take the plainest form of each law of the catalogue, or if own parameters imitate that, the first
+    that is detectable. `names` are the names of the free parameters.
     """
     tried = {port.name: _select_laws(port, laws) for port in live_ports(bench.simulator)}
-    rest = Remainder.of(bench, probe, runs, tuple(dict.fromkeys(law for own in tried.values() for law in own)))
+    wished = {law.id for own in tried.values() for law in own}
+    every = tuple(law for law in CATALOGUE if law.id in wished) if laws is None else laws
+    rest = Remainder.of(bench, probe, runs, tuple(dict.fromkeys(every)))
     own, start = own_changes(bench, rest.runs, known=[r.from_zero for r in rest.runs])
     base, needed = orthonormal(np.hstack([own, start])), _needed_directions(own, start)
     rest = replace(rest, base=base[:, :0])
@@ -82,8 +86,13 @@ def assess_laws(
         wanted = tried.get(task.port.name, ())
         if not wanted:
             continue
-        task = replace(task, pairs=[(law, shapes) for law, shapes in task.pairs if type(law) in wanted])
-        for form, row, response in _assess_port(rest, task, base, (own, needed), levels[task.index], names):
+        whole, task = task, replace(task, pairs=[(law, shapes) for law, shapes in task.pairs if type(law) in wanted])
+        if not task.pairs:
+            continue
+        assess = partial(_assess_port, rest, base=base, own=(own, needed), level=levels[task.index], names=names)
+        for form, row, response in assess(task):
+            if laws is None and row.status == "followed" and row.law not in LINEAR:
+                row, response = _other_form(whole, wanted, row, assess)
             rows.append(row if laws is None else replace(row, form=form))
             responses += [response] if response else []
         seen = {type(law) for law, _ in task.pairs}
@@ -96,10 +105,28 @@ def assess_laws(
 
 
 def _select_laws(port: Port, laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
-    """Return the laws allowed at a port; from the catalogue only the first form of each, because all are alike."""
+    """Return the laws allowed at a port; from the catalogue only the first form of each, because most are alike."""
     placed = [law for law in (CATALOGUE if laws is None else laws) if port.admits(law)]
     first = {law.id: law for law in reversed(placed)}
     return tuple(law for law in placed if laws is not None or law is first[law.id])
+
+
+def _other_form(
+    task: Task,
+    assessed: Sequence[type[Law]],
+    row: LawRow,
+    assess: Callable[[Task], Iterator[tuple[str, LawRow, _Response | None]]],
+) -> tuple[LawRow, _Response | None]:
+    """Return the first form of a law that is detectable, in place of its plainest one, which own parameters imitate.
+
+    A root may look like a gain where a free curve does not. If no form is detectable, the row stays.
+    """
+    for pair in task.pairs:
+        if pair[0].id == row.law and type(pair[0]) not in assessed:
+            _, other, response = next(assess(replace(task, pairs=[pair])))
+            if other.status == "detectable":
+                return other, response
+    return row, None
 
 
 def _assess_port(

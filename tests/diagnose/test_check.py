@@ -13,7 +13,7 @@ from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, chec
 from pilfr_casadi.diagnose.excitation import single_frequency
 from pilfr_casadi.diagnose.extrapolation import ranges_left, share_at_new_frequencies
 from pilfr_casadi.diagnose.identifiability import Tie
-from pilfr_casadi.laws import CATALOGUE, CoulombFriction, CubicDamping, CubicStiffness
+from pilfr_casadi.laws import CATALOGUE, CoulombFriction, CubicDamping, CubicStiffness, Root
 from pilfr_casadi.models import close_loop
 from problems.blind_spots import DT, NOISE, SAMPLES, controls, noise_like, plain, record, rigs
 
@@ -544,3 +544,25 @@ def test_the_parameter_that_imitates_a_law_is_named_in_any_unit_of_the_force(sca
     found = check(plain([guide]), record(plain(), drive, initial="estimate"))
     rows = {row.law: row.why for row in found.laws if row.port == "guide" and row.status == "followed"}
     assert rows == {"linear_stiffness": "k", "viscous_damping": "d"}
+
+
+def test_a_law_can_be_told_from_a_parameter_if_one_of_its_forms_can():
+    """A root of the charge looks like the straight open-circuit voltage of the simulator; a free curve does not."""
+    cell = Simulator(
+        lambda x, u, p: {"soc": -u.current / 17000.0},
+        lambda x, u, p: {"voltage": p.E0 + p.E1 * x.soc - p.R * u.current},
+        states=("soc",),
+        inputs=("current",),
+        parameters={"E0": Parameter(3.2), "E1": Parameter(0.9), "R": Parameter(0.02)},
+        ports=(Port("ocv", {"voltage": 1.0}, lambda x: x.soc, unit="V", across_unit="1"),),
+    )
+    rng = np.random.default_rng(0)
+    current = np.repeat(rng.uniform(-2.0, 8.0, 60), 40)[:, None]
+    still = Recording(current, np.zeros((len(current), 1)), 1.0, ["current"], ["voltage"], initial=[0.9], hold="zero")
+    noisy = still.with_(y=cell.simulate(still) + 1e-3 * rng.standard_normal((len(current), 1)))
+    (root,) = (r for r in check(cell, noisy, laws=[Root]).laws if r.port == "ocv")
+    assert root.status == "followed"
+    found = check(cell, noisy)
+    (curve,) = (r for r in found.laws if r.port == "ocv" and r.law == "static_curve")
+    assert curve.status == "detectable"
+    assert not [b for b in found.blind_spots if b.kind == "followed" and "static_curve" in b.names and "ocv" in b.names]
