@@ -300,8 +300,8 @@ def test_friction_that_springs_back_over_much_of_the_travel_is_hardly_friction(k
 
 @pytest.mark.parametrize("kind", (laws.CoulombFriction, laws.AsymmetricFriction, laws.DirectionalFriction))
 def test_friction_that_reverses_over_most_speeds_is_hardly_dry(kind):
-    law = kind().at({}, {"v_0": (0.002, 0.5)})
-    assert law.doubtful({"v_0": 0.3}) and not law.doubtful({"v_0": 0.1})
+    law, own = kind().at({}, {"v_0": (0.002, 0.5)}), dict.fromkeys(kind.units, 1.0)
+    assert law.doubtful({**own, "v_0": 0.3}) and not law.doubtful({**own, "v_0": 0.1})
 
 
 @pytest.mark.parametrize(
