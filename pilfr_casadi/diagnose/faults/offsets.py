@@ -215,6 +215,7 @@ def find_offsets(now: Checked, otherwise: Mapping[str, str] | None = None) -> Ch
         name, unit = _name_of_constant(after), now.bench.simulator.port(port).unit
         if _stands_for_load(now.bench, port, _constant(after)):
             break
+        words += _doubt_size(now.bench, port, _constant(after))
         constant = describe_constant(port, _constant(after), name, unit, words)
         before, now = now, accept(now, after, constant)
         if now.bench is before.bench:
@@ -241,6 +242,16 @@ def _stands_for_load(bench: Workbench, port: str, value: float) -> bool:
         return False
     at = bench.simulator.output_names.index(name)
     return abs(value) > max(float(np.max(np.abs(r.y[:, at]))) for r in bench.recordings)
+
+
+def _doubt_size(bench: Workbench, port: str, value: float) -> str:
+    """Say that an offset of an input is larger than the input ever was; "" if it is not."""
+    kind, name = split_port(port)
+    if kind != ACTUATOR:
+        return ""
+    at = bench.simulator.inputs.index(name)
+    largest = max(float(np.max(np.abs(r.u[:, at]))) for r in bench.recordings)
+    return f"; that is more than {name} ever was, so that it is hardly an offset" if abs(value) > largest else ""
 
 
 def _with_constant(now: Checked, port: str) -> Checked | None:
