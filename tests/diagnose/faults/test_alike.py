@@ -121,6 +121,23 @@ def test_a_constant_that_may_be_a_load_is_told_as_that():
     assert ", or a constant load at car acts like one, or the input slope has one of about 0.001" in found.sentence
 
 
+@pytest.mark.parametrize("load", [0.05, 3.0])
+def test_an_offset_above_all_that_its_input_ever_was_is_doubted(load):
+    u = 0.5 * np.sin(0.05 * np.arange(600))[:, None]
+    vessel = Simulator(
+        lambda x, u, p: {"level": u.flow - p.out * x.level},
+        lambda x: {"level": x.level},
+        states=("level",),
+        inputs=("flow",),
+        parameters={"out": Parameter(0.5, bounds=(0.05, 5.0))},
+    )
+    blank = Recording(u + load, np.zeros_like(u), 0.1, ("flow",), ("level",), initial=[0.0], hold="zero")
+    y = vessel.simulate(blank) + 1e-3 * np.random.default_rng(0).standard_normal(u.shape)
+    (found,) = find_offsets(refitted(vessel, blank.with_(u=u, y=y))).gates
+    assert found.channel == "flow" and found.value == pytest.approx(load, rel=0.05)
+    assert ("that is more than flow ever was, so that it is hardly an offset" in found.sentence) is (load > 1)
+
+
 def test_friction_that_an_offset_hides_is_not_said_to_look_like_damping():
     offset = car().with_element("sensor:speed", Offset())
     found = pilfr.check(offset, rolled_out(0), laws=(CoulombFriction, QuadraticDrag))
