@@ -267,7 +267,9 @@ def test_without_laws_no_law_is_blamed_and_an_offset_is_no_closest_law(dry_frict
 
 def test_where_no_effect_is_allowed_the_rest_is_not_called_noise(dry_friction):
     found = pilfr.diagnose(cart(), dry_friction, laws=None, effects=0, workers=1)
-    assert found.sentence.startswith("Physics is missing, and no law was fitted. Refitted,"), found.sentence
+    assert found.sentence.startswith("Physics is missing, and no law was fitted, as asked for. Refitted,"), (
+        found.sentence
+    )
 
 
 def test_one_hypothesis_is_told_where_the_time_ended_before_a_comparison(dry_friction):

@@ -84,6 +84,7 @@ class Hypotheses:
     # further results about each fitted hypothesis, by key
     findings: defaultdict[Key, Findings] = field(default_factory=lambda: defaultdict(Findings))
     times: dict[str, float] = field(default_factory=dict)
+    most_effects: float = np.inf  # effects that may be named
     out_of_time: bool = False  # whether the time limit ended the search
     # pairs of port and law that were selected for a fit beside the simulator alone, and those that were tried
     selected: int = 0

@@ -76,7 +76,7 @@ class Search(Hypotheses):
 
     def run(self, effects: float) -> Search:
         """Search for up to `effects` effects; an interrupt ends the search with the present results."""
-        self.better_hold = ""
+        self.better_hold, self.most_effects = "", effects
         self.keep(Trial.of(self.without, 0, thorough=True))
         with self.until_interrupted():
             self.estimate_noise()
