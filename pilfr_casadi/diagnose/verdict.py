@@ -193,9 +193,8 @@ def _which_laws(search: Hypotheses) -> str:
 def _fails(search: Hypotheses) -> str:
     """Say that no law explains the mismatch, or that none was fitted."""
     if len(search.memo) == 1 and not search.out_of_time and _allowed_laws(search) != "":
-        return "no law was fitted, " + (
-            "because all that is left may be noise" if search.most_effects else "as asked for"
-        )
+        why = "because all that is left may be noise" if search.most_effects else "as asked for"
+        return f"no law was fitted, {why}"
     return f"{_which_laws(search)} explains it"
 
 
