@@ -125,6 +125,24 @@ def test_after_the_time_of_the_search_only_the_best_new_fit_is_converged(monkeyp
     assert converged[0].key == max((t for t in found.memo.values() if t.laws), key=found.optimistic_evidence).key
 
 
+@pytest.mark.parametrize("follows_its_part", [True, False])
+def test_a_brief_fit_that_only_follows_its_part_is_converged(follows_its_part):
+    """On the rest it may be far off only because it has not converged; this way a richer form lost to its plain one."""
+    found = searching(rubbing())
+    found.keep(Trial.of(found.without, 0, thorough=True))
+    dry, richer = (
+        found.bench.simulator.with_element("ground-m1", kind()) for kind in (type(FRICTION), laws.StribeckFriction)
+    )
+    plain = found.fits.fit(dry, [{"ground-m1.F_c": 9.0, "ground-m1.v_0": 0.01}], 1)
+    start = {**plain.fitted.values, "ground-m1.F_c": 4.0, "ground-m1.F_e": 0.0, "ground-m1.v_s": 0.05}
+    off = Trial.of(found.bench.run(richer, start, plain.fitted.initial), 1)
+    off = replace(off, part_mean_square=plain.part_mean_square) if follows_its_part else off
+    assert off.error > 3 * plain.error
+    found._keep_all([plain, off])
+    assert found.memo[off.key].thorough is follows_its_part
+    assert (found.memo[off.key].error < 1.05 * plain.error) is follows_its_part
+
+
 def test_hypotheses_are_not_compared_by_different_errors_where_time_ran_out(monkeypatch):
     """Held-out errors are larger than fit errors: a law that was judged on them lost to one that was not."""
     found = searching(rubbing()).run(1)
