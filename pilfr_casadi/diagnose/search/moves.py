@@ -353,8 +353,7 @@ class Search(Hypotheses):
         # after the time of the search, the rest is for the comparison with the refit
         count = MOST_CONVERGED if time.perf_counter() < self.until else 1
         # where a brief fit follows the part that it was made to, the rest may only lack convergence
-        least = {t.key: min(t.error, float(np.sqrt(t.part_mean_square))) for t in ranked[:count]}
-        near = [t for t in ranked[:count] if not t.thorough and least[t.key] < most]
+        near = [t for t in ranked[:count] if not t.thorough and t.least_error < most]
         converged = self._side_by_side(self.fits.converge, near)
         converged += filter(None, self._side_by_side(self._reorder, converged))
         for trial in converged:

@@ -110,6 +110,11 @@ class Trial:
         return self.element.own(self.fitted.values)
 
     @property
+    def least_error(self) -> float:
+        """Rms error on all recordings, or on the part that it was fitted to if that is smaller."""
+        return min(self.error, float(np.sqrt(self.part_mean_square)))
+
+    @property
     def error(self) -> float:
         """Root of the mean square error."""
         return float(self.mean_square**0.5)
