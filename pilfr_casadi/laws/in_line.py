@@ -188,7 +188,7 @@ class TermLimit(_InLine):
 class LimitedTerm(TermLimit):
     """A force of the equations with a hard limit on either side, such as the torque of a drive with limited current."""
 
-    form = "of a term"
+    form = "of a modelled force"
     equation = "w = clip(F, low, high) - F"
     sentence = "saturation of a modelled force F: the machine does not exceed a limit on either side"
     units = {"low": "w", "high": "w"}
@@ -214,7 +214,7 @@ class LimitedTerm(TermLimit):
 class SoftlyLimitedTerm(TermLimit):
     """A force of the equations that approaches a limit gradually, such as the grip of a tyre."""
 
-    form = "of a term, soft"
+    form = "of a modelled force, soft"
     equation = "w = L tanh(F / L) - F"
     sentence = "saturation of a modelled force F: it approaches a limit gradually"
     units = {"L": "w"}
