@@ -177,8 +177,10 @@ class Port:
     @property
     def position_unit(self) -> str:
         """Unit of the position at the port, in which laws are written: the unit of z; for a speed, times s."""
-        if not (self.is_speed and self.across_unit):
+        if not self.is_speed:
             return self.across_unit
+        if not self.across_unit:
+            return "[z] s"
         before, per_second, after = self.across_unit.rpartition("/s")
         return before if per_second and not after else f"{self.across_unit} s"
 

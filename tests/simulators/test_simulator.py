@@ -18,9 +18,11 @@ from pilfr_casadi.laws import (
     CoulombFriction,
     CubicStiffness,
     Delay,
+    LinearStiffness,
     Relaxation,
     Saturation,
     StopHysteresis,
+    ViscousDamping,
 )
 from pilfr_casadi.models import ParameterSet, close_loop
 from pilfr_casadi.optimise import GaussNewton, Problem
@@ -582,3 +584,13 @@ def test_a_band_limited_input_is_followed_between_its_samples():
     assert off["band-limited"] < 0.01 < 0.05 < off["linear"] < off["zero"]
     same = replace(lag, hold="band-limited")
     assert same.nrmse(r.with_(hold=None)) == off["band-limited"]
+
+
+@pytest.mark.parametrize(("unit", "damping", "stiffness"), [("", "N/[z]", "N/([z] s)"), ("rpm", "N/rpm", "N/(rpm s)")])
+def test_laws_at_a_speed_are_written_in_its_position(unit, damping, stiffness):
+    """Whatever the unit of the speed: a force over a position has another unit than one over the speed."""
+    speed = lambda x: x.w  # noqa: E731
+    port = Port("shaft", {"w": -1.0}, across=speed, rate=speed, unit="N", across_unit=unit)
+    own = Simulator(lambda x, u, p: {"w": u.f - x.w}, lambda x: {"w": x.w}, states=("w",), inputs=("f",), ports=port)
+    placed = own.with_element("shaft", ViscousDamping()).with_element("shaft", LinearStiffness())
+    assert [p.unit for p in placed.readable_parameters().values()] == [damping, stiffness]
