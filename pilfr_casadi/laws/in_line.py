@@ -32,7 +32,10 @@ class _InLine(Law):
         """Say why the law cannot stand in line with the port's term; empty if it can."""
         if local.term is None:
             return "the port names no term of the equations"
-        moved = not _alike(local.term(local.z + local.half, local.dz), local.term(local.z, local.dz))
+        given = _term_along(local)
+        if not np.all(np.isfinite(given)):  # the simulator divides by a parameter that is zero
+            return "the term is not finite"
+        moved = not _alike(local.term(local.z + local.half, local.dz), given)
         if self.position is not None and moved is not self.position:
             return f"the term {'varies' if moved else 'does not vary'} with the coordinate"
         return super().why_not(local)

@@ -420,11 +420,12 @@ class Equations:
     def _find_balance(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Expression | None:
         """Return all that changes a state which a port's force changes at once, with the sign of w.
 
-        None if the port's coordinate is no such state, or if no input drives it.
+        None if the port's coordinate is no such state, if no input drives it, or if the force acts with a factor that
+        varies along a recording, which may pass through zero.
         """
         into, z = self.into(port, x, u, p, t), self.across(port, x, u, p, t)
         (name, factor), *more = into.items()
-        if more or not z.is_symbolic() or z.name() != name:
+        if more or not z.is_symbolic() or z.name() != name or ca.depends_on(factor, ca.vertcat(stack(x), stack(u))):
             return None
         rate = self.by_state(self.derivatives(x, u, p, t))[name]
         if not ca.depends_on(rate, stack(u)) or ca.depends_on(rate / factor, ca.vertcat(t)):

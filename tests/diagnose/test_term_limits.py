@@ -12,6 +12,7 @@ from pilfr_casadi.laws import (
     CoulombFriction,
     ElasticDrive,
     LimitedTerm,
+    Local,
     QuadraticDrag,
     SoftlyLimitedTerm,
     TermLimit,
@@ -57,6 +58,21 @@ def test_the_balance_of_a_driven_lag_is_the_term_of_its_port():
     assert not coasting.port("equation:speed").implied
     elsewhere = replace(declared, across=lambda x: 2 * x.speed)
     assert not drive(ports=(elsewhere,)).port("rotor").implied
+
+
+@pytest.mark.parametrize("into", [lambda u: {"speed": -u.voltage}, lambda x, p: {"speed": -x.speed / p.lag}])
+def test_a_balance_is_not_divided_by_a_factor_that_may_pass_through_zero(into):
+    declared = Port("rotor", into, lambda x: x.speed)
+    assert not drive(ports=(declared,)).port("rotor").implied
+
+
+@pytest.mark.parametrize("law", [LimitedTerm, SoftlyLimitedTerm])
+def test_a_term_over_a_parameter_that_is_zero_has_no_limits(law):
+    z = np.sin(np.arange(50.0))
+    for term in (lambda z, dz: z / 0.0, lambda z, dz: np.where(z > 0, z, np.inf)):
+        with np.errstate(all="ignore"):
+            assert law().why_not(Local(z, np.gradient(z), 0.1, (50,), term=term)) == "the term is not finite"
+    assert not law().why_not(Local(z, np.gradient(z), 0.1, (50,), term=lambda z, dz: 2 * z))
 
 
 def test_a_limited_balance_follows_a_drive_with_limited_torque():
