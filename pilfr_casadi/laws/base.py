@@ -290,6 +290,8 @@ class Law:
         own = vars(cls)
         if "applies" in own and "why_not" not in own:  # the old name of the method
             cls.why_not = own["applies"]  # type: ignore[method-assign]
+        if own.get("driven") and "implied" not in own:  # an old spelling
+            cls.implied = "drive"
         if "units" in own and "strength" not in own:
             cls.strength = tuple(name for name, unit in cls.units.items() if re.match(r"w\b", unit))
 

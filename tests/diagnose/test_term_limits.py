@@ -11,6 +11,7 @@ from pilfr_casadi.laws import (
     CATALOGUE,
     CoulombFriction,
     ElasticDrive,
+    Law,
     LimitedTerm,
     Local,
     QuadraticDrag,
@@ -81,6 +82,14 @@ def test_a_limited_balance_follows_a_drive_with_limited_torque():
     law = drive().with_element("equation:speed", limited).with_element("equation:speed", drag)
     assert law.nrmse(recorded(1)) < 2 * NOISE
     assert drive().with_element("equation:speed", drag).nrmse(recorded(1)) > 8 * NOISE
+
+
+def test_a_law_with_the_old_spelling_of_its_implied_term_stands_at_a_drive():
+    class Slack(Law):
+        id, units, in_line, driven = "slack", {"g": "w"}, True, True
+
+    axis = Simulator(lambda x, u: {"x": x.v, "v": u.f}, lambda x: {"x": x.x}, states=("x", "v"), inputs=("f",))
+    assert axis.port("equation:v").admits(Slack) and axis.port("equation:v").implied == "drive"
 
 
 def test_a_limit_stands_beside_any_other_law_of_its_port():
