@@ -258,6 +258,8 @@ class Simulator(Equations):
         placed = Placed(port, law, self._choose_prefix(port))
         own = self.parameter_set | placed.named(law.parameters())
         at = len(self.elements) if index is None else index
+        if at not in range(len(self.elements) + 1):
+            raise InputError(f"The index is {index!r}; give a whole number from 0 to {len(self.elements)}.")
         return self._copy_with(parameters=own, elements=(*self.elements[:at], placed, *self.elements[at:]))
 
     def _choose_prefix(self, port: str) -> str:

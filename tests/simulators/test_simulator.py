@@ -594,3 +594,12 @@ def test_laws_at_a_speed_are_written_in_its_position(unit, damping, stiffness):
     own = Simulator(lambda x, u, p: {"w": u.f - x.w}, lambda x: {"w": x.w}, states=("w",), inputs=("f",), ports=port)
     placed = own.with_element("shaft", ViscousDamping()).with_element("shaft", LinearStiffness())
     assert [p.unit for p in placed.readable_parameters().values()] == [damping, stiffness]
+
+
+@pytest.mark.parametrize("index", [-1, 2, "a"])
+def test_a_law_has_no_place_beyond_the_others(index):
+    lag = Simulator(lambda x, u: {"v": u.f - x.v}, lambda x: {"v": x.v}, states=("v",), inputs=("f",))
+    one = lag.with_element("equation:v", LinearStiffness())
+    assert one.with_element("equation:v", ViscousDamping(), 0).elements[0].law.id == "viscous_damping"
+    with pytest.raises(InputError, match="whole number from 0 to 1"):
+        one.with_element("equation:v", ViscousDamping(), index)
