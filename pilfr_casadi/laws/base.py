@@ -203,7 +203,8 @@ class Law:
     turns : bool
         The force depends on where the motion last turned round; a motion that never does leaves a curve of z.
     in_line : bool
-        The law stands in line with the port's `term`, which `force` and `flow` may call: `term(z, dz)`.
+        The law stands in line with the port's `term`, which `force` and `flow` may call: `term(z, dz)`. That value has
+        the name `given`.
     implied : {"", "drive", "balance"}
         What the equations show as the term if the port names none: the force of a drive, or all that changes a state.
     sensed : bool

@@ -1,10 +1,10 @@
-"""Laws in line with a force that the equations have already: a gap, a compliance, a motor's rotor on a spring.
+"""Laws in line with a force that the equations have already: a gap, a compliance, a rotor on a spring, a limit.
 
 Let F(z, dz/dt) be that force at a port, the port's `term`. An element in line with it changes the coordinate of F to q:
 
     w = F(q, dq/dt) - F(z, dz/dt),
 
-so that F(q, dq/dt) takes the place of F(z, dz/dt) in the equations.
+so that F(q, dq/dt) takes the place of F(z, dz/dt) in the equations. A limit changes the value of F instead.
 """
 
 from __future__ import annotations
