@@ -19,6 +19,7 @@ from ..models import Named
 from .base import Law, Local, beyond_gap
 from .dynamic import SprungMass
 
+REACHED = 0.99  # share of the samples below the size of a term, without its rare peaks
 SAME = 1e-9  # relative difference that rounding may cause
 
 
@@ -174,6 +175,13 @@ class TermLimit(_InLine):
     absent: ClassVar[tuple[str, ...]] = ("thermal",)  # a flow of heat has no limit of its own
     source = "Khalil (2002), Nonlinear Systems, sec. 1.2"
 
+    def why_not(self, local: Local) -> str:
+        if found := super().why_not(local):
+            return found
+        given = np.abs(_term_along(local))
+        hardly_acts = not np.ptp(_term_along(local)) > 0 or not np.quantile(given, REACHED) > 0
+        return "the term is constant, or zero nearly always" if hardly_acts else ""
+
     def force(self, given: Any, p: Any) -> Any:
         return self.limited(given, p) - given
 
@@ -222,8 +230,8 @@ class SoftlyLimitedTerm(TermLimit):
     sentence = "saturation of a modelled force F: it approaches a limit gradually"
     units = {"L": "w"}
     strength: ClassVar[tuple[str, ...]] = ()  # the force is not linear in the limits
-    starts = {"L": lambda at: float(np.quantile(np.abs(_term_along(at)), 0.99)) * np.array([0.3, 0.6, 1.0, 2.0])}
-    ranges = {"L": lambda at: float(np.quantile(np.abs(_term_along(at)), 0.99)) * np.array([0.1, 10.0])}
+    starts = {"L": lambda at: float(np.quantile(np.abs(_term_along(at)), REACHED)) * np.array([0.3, 0.6, 1.0, 2.0])}
+    ranges = {"L": lambda at: float(np.quantile(np.abs(_term_along(at)), REACHED)) * np.array([0.1, 10.0])}
 
     def limited(self, given: Any, p: Any) -> Any:
         return p.L * ca.tanh(given / p.L)

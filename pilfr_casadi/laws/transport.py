@@ -60,7 +60,7 @@ class _Carried(Law):
         for begin, end in itertools.pairwise(ends):
             z, rates = local.z[begin:end], np.maximum(local.inputs[self.carried_by][begin:end], 0.0)
             passed = np.concatenate([[0.0], np.cumsum(rates[:-1]) * local.dt])
-            at_zero = local.from_zero[len(found) : len(found) + 1] == (True,)
+            at_zero = any(local.from_zero[len(found) : len(found) + 1])
             behind = (np.interp(passed - shape["V"], passed, z, left=0.0 if at_zero else z[0]) for shape in shapes)
             found.append(np.column_stack([now - z for now in behind]))
         return np.concatenate(found)[:, :, None]

@@ -109,3 +109,13 @@ def test_the_limited_torque_of_a_drive_is_named_beside_its_drag():
 def test_no_limit_is_named_where_the_torque_has_none():
     found = diagnose(drive(), [recorded(1, False), recorded(2, False)], test=recorded(3, False))
     assert found.effects and all(e.law != "saturation" for e in found.effects)  # the drag, or a curve of the speed
+
+
+@pytest.mark.parametrize("kind", [LimitedTerm, SoftlyLimitedTerm])
+def test_a_term_that_hardly_acts_has_no_limit(kind):
+    z = np.linspace(-1.0, 1.0, 500)
+    local = Local(z, np.ones(500), DT, (500,))
+    acting = replace(local, term=lambda z, dz: 3 * z)
+    assert kind().why_not(acting) == ""
+    for term in (lambda z, dz: 2 + 0 * z, lambda z, dz: 0 * z, lambda z, dz: (np.arange(500) < 2) * 5.0):
+        assert "constant, or zero nearly always" in kind().why_not(replace(local, term=term))

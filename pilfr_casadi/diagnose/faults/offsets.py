@@ -245,14 +245,14 @@ def _stands_for_load(bench: Workbench, port: str, value: float) -> bool:
 
 
 def _doubt_size(bench: Workbench, port: str, value: float) -> str:
-    """Say that an offset of an input that moves is larger than the input ever was; "" if it is not."""
+    """Say that an offset of an input that moves is more than the input ever was; "" if it is not."""
     kind, name = split_port(port)
     if kind != ACTUATOR:
         return ""
     at = bench.simulator.inputs.index(name)
     u = np.concatenate([r.u[:, at] for r in bench.recordings])
     larger = abs(value) > np.max(np.abs(u)) and np.ptp(u) > 0
-    return f"; that is more than {name} ever was, so that it is hardly an offset" if larger else ""
+    return f"; that is more than {name} ever was, which speaks for a constant load" if larger else ""
 
 
 def _with_constant(now: Checked, port: str) -> Checked | None:

@@ -135,7 +135,7 @@ def test_an_offset_above_all_that_its_input_ever_was_is_doubted(load):
     y = vessel.simulate(blank) + 1e-3 * np.random.default_rng(0).standard_normal(u.shape)
     (found,) = find_offsets(refitted(vessel, blank.with_(u=u, y=y))).gates
     assert found.channel == "flow" and found.value == pytest.approx(load, rel=0.05)
-    assert ("that is more than flow ever was, so that it is hardly an offset" in found.sentence) is (load > 1)
+    assert ("that is more than flow ever was, which speaks for a constant load" in found.sentence) is (load > 1)
 
 
 def test_friction_that_an_offset_hides_is_not_said_to_look_like_damping():
