@@ -36,7 +36,7 @@ class _Carried(Law):
 
     id = "delay"
     source = (
-        "Zenger & Niemi (2009), Automatica 45(10) (plug flow of variable rate); Golub & Van Loan (2013), Matrix "
+        "Levenspiel (1999), Chemical Reaction Engineering, ch. 5 (plug flow); Golub & Van Loan (2013), Matrix "
         "Computations, sec. 9.3 (Padé approximant)"
     )
     places = ("series",)
