@@ -101,6 +101,7 @@ if TYPE_CHECKING:
         DirectionalDamping as DirectionalDamping,
         DirectionalDrag as DirectionalDrag,
         DirectionalFriction as DirectionalFriction,
+        PowerDrag as PowerDrag,
         PreslidingFriction as PreslidingFriction,
         PreslidingStribeckFriction as PreslidingStribeckFriction,
         QuadraticDrag as QuadraticDrag,
