@@ -28,9 +28,11 @@ from pilfr_casadi.laws import (
     PeriodicForce,
     PiecewiseStiffness,
     PlayHysteresis,
+    PowerDrag,
     PreslidingFriction,
     PreslidingStribeckFriction,
     ProgressiveStiffness,
+    QuadraticDrag,
     QuadraticStiffness,
     Resonance,
     Saturation,
@@ -275,3 +277,10 @@ def test_a_law_with_a_further_term_starts_as_the_fitted_one_with_the_shapes_of_t
         {"F_c": 3.0, "F_e": 0.0, "v_s": v, "v_0": 0.01} for v in (2.0, 5.0)
     ]
     assert found[0].beside["a.F_c"] == 3.0  # all parameters begin where that fit has them
+
+
+@pytest.mark.parametrize("n", [1.5, 2.0])
+def test_a_drag_of_another_power_is_named_in_this_form_alone(n):
+    r = bench("ground", PowerDrag().at({"c_n": 3.0, "n": n})).recordings[0]
+    found = pilfr.diagnose(cart(), r, laws=(CubicDamping, QuadraticDrag, PowerDrag), hold="zero", workers=1)
+    assert [(e.port, e.law, e.form) for e in found.effects] == [("ground", "quadratic_drag", "power" if n < 2 else "")]
