@@ -3,9 +3,8 @@
 `base` holds the class `Law` and shows how to add a law in ten lines. Laws are grouped by kind: `stiffness` (springs,
 contacts, gaps, periodic forces), `friction` (forces of speed), `hysteresis` (loops), `curves` (saturation and other
 curves of actuators and sensors), `dynamic` (delays, creep, modes, trends), `in_line` (in line with a term of the
-equations), `thermal` and `electrical` (laws of one domain),
-`transport` (delays by a flow). `composed` makes laws of laws (scaled, scheduled, behind a
-gap). `catalogue` lists the laws that a diagnosis tries. `forces` evaluates laws along given signals.
+equations), `thermal` and `electrical` (laws of one domain), `transport` (delays by a flow). `composed` makes laws of
+laws (scaled, scheduled, behind a gap). `catalogue` lists the laws that a diagnosis tries. `forces` evaluates laws along given signals.
 """
 
 from typing import TYPE_CHECKING

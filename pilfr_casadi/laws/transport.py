@@ -13,7 +13,7 @@ import numpy as np
 
 from .base import Law, Local, rename_class
 
-ORDER = 6  # of the approximant; a heated pipe is followed to 3 % of the deviation, with 4 to 5 %, with 8 to 2 %
+ORDER = 6  # of the approximant, and states of the law; more follow sharper steps
 RATE = 8.0  # the size of its poles; it scales the states to about the size of the signal
 
 
