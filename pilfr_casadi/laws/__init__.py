@@ -4,7 +4,8 @@
 contacts, gaps, periodic forces), `friction` (forces of speed), `hysteresis` (loops), `curves` (saturation and other
 curves of actuators and sensors), `dynamic` (delays, creep, modes, trends), `in_line` (in line with a term of the
 equations), `thermal` and `electrical` (laws of one domain), `transport` (delays by a flow). `composed` makes laws of
-laws (scaled, scheduled, behind a gap). `catalogue` lists the laws that a diagnosis tries. `forces` evaluates laws along given signals.
+laws (scaled, scheduled, behind a gap). `catalogue` lists the laws that a diagnosis tries. `forces` evaluates laws along
+given signals.
 """
 
 from typing import TYPE_CHECKING
