@@ -29,6 +29,20 @@ def rig(k=400.0, d=4.0, name="ground", outputs=("pos",)):
     )
 
 
+def driven_rig(k=400.0, d=4.0):
+    """The rig with a port whose term is the force of its drive."""
+    plain = rig(k, d)
+    drive = Port("force", {"vel": 1.0}, lambda x: x.pos, lambda x: x.vel, "N", "m", term=lambda u: u.force)
+    return Simulator(
+        plain.dynamics,
+        plain.outputs,
+        states=plain.states,
+        inputs=plain.inputs,
+        parameters=plain.parameters,
+        ports=(*plain.ports, drive),
+    )
+
+
 LAWS = {
     "ground": CubicStiffness().at({"k_3": 2.0e4}),
     "hysteresis": BoucWen().at({"k_h": 300.0, "q_0": 0.02, "s": 0.5, "n": 1.0}),

@@ -398,10 +398,14 @@ def _write_law_expression(law: Any) -> tuple[tuple[Any, ...], str]:
         return (varying,), f"varying({law.scheduled_by!r}, {law.profile!r})"
     if law.carried_by:
         return (carried,), f"carried({law.carried_by!r})"
-    if by := law.scaled_by or law.scheduled_by:
-        compose, base = (scaled if law.scaled_by else scheduled), law.__base__
+    base = law.__base__
+    if law.scaled_by != getattr(base, "scaled_by", ""):
+        imported, inner = _write_law_expression(base)
+        return (scaled, *imported), f"scaled({inner}, {law.scaled_by!r})"
+    if law.scheduled_by != getattr(base, "scheduled_by", ""):
+        imported, inner = _write_law_expression(base)
         how = f", {law.profile!r}" if law.profile not in ("", "linear") else ""
-        return (compose, base), f"{compose.__name__}({base.__name__}, {by!r}{how})"
+        return (scheduled, *imported), f"scheduled({inner}, {law.scheduled_by!r}{how})"
     return (law,), law.__name__
 
 

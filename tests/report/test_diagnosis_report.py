@@ -19,7 +19,15 @@ from pilfr_casadi import Recording, multisine
 from pilfr_casadi._base import InputError
 from pilfr_casadi.diagnose import Gate, Workbench, diagnose
 from pilfr_casadi.diagnose.result_text import Basis
-from pilfr_casadi.laws import CoulombFriction, VaryingParameter
+from pilfr_casadi.laws import (
+    CoulombFriction,
+    LimitedTerm,
+    SoftlyLimitedTerm,
+    VaryingParameter,
+    carried,
+    scaled,
+    scheduled,
+)
 from pilfr_casadi.report import corrected_file, diagnosis_report, diagnosis_report as same, usage
 from pilfr_casadi.simulators import load_simulator
 
@@ -147,6 +155,31 @@ def test_faults_that_were_corrected_stand_right_after_the_verdict_and_in_the_cor
     assert "corrected" in lines[at - 1] and lines[at + 1] == "#   exec('1/0')" and "Interpolated" not in source
     assert "belongs to" not in corrected_file(example(), "rig.py")
     compile(source, "corrected.py", "exec")
+
+
+@pytest.mark.parametrize(
+    ("port", "law"),
+    [
+        ("ground", scheduled(scaled(CoulombFriction, "force"), "t")),
+        ("ground", scaled(scheduled(CoulombFriction, "force", "quadratic"), "force")),
+        ("actuator:force", carried("force")),
+        ("force", LimitedTerm),
+        ("force", SoftlyLimitedTerm),
+    ],
+)
+def test_the_corrected_file_makes_composed_laws_and_limits_again(port, law, tmp_path):
+    d, values = example(), {name: 0.5 for name in law.units}
+    if "low" in values:
+        values |= {"low": -1.0, "high": 1.0}
+    given = tmp_path / "rig.py"
+    given.write_text("from diagnosis_example import driven_rig\n\nsimulator = driven_rig(430.0, 5.0)\n")
+    own = load_simulator(given)
+    simulator = own.with_element(port, law().at(values))
+    (tmp_path / "corrected.py").write_text(corrected_file(replace(d, refitted=own, corrected=simulator), "rig.py"))
+    loaded = load_simulator(tmp_path / "corrected.py")
+    assert [type(e.law) for e in loaded.elements] == [law]
+    wanted = replace(simulator, hold=d.hold).simulate(d.train[0])
+    assert np.array_equal(loaded.simulate(d.train[0]), wanted)
 
 
 def test_the_corrected_file_keeps_values_for_which_the_search_widened_the_bounds(tmp_path):
