@@ -41,10 +41,10 @@ from ..fits.floor import ABOVE_NOISE
 from ..fits.linearise import linearise_runs
 from ..fits.screen import Remainder, Scored, screen, usable
 from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted, refit, refit_with_other_holds
-from .hypotheses import Hypotheses, likeliest
+from .hypotheses import Hypotheses
 from .learned import learn_forces, nearest_to_learned
 from .relatives import choose_pairs, complements, fit_pair, in_place_of_variation, relatives
-from .trials import Effort, Key, Name, Trial, place_law, select_pairs
+from .trials import Effort, Key, Trial, place_law, select_pairs
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -83,7 +83,6 @@ class Search(Hypotheses):
             if not self.interrupted:
                 self._grow(effects)
                 self._name_rest(effects)
-                self._widen(effects)
                 self._finish(effects)
         if self.interrupted:
             self.forget_held_out()
@@ -195,26 +194,7 @@ class Search(Hypotheses):
             for base in {t.key: t for t in (self.root, best, *without_weakest)}.values():
                 if len(base.effects) < effects and self.can_improve(self.best) and self.may_go_on():
                     name_rest(base)
-        self._go_on(best, effects)
-
-    def _widen(self, effects: float) -> None:
-        """Add laws beside other likely hypotheses with one law, because the best one may be on a wrong track.
-
-        Where all models are wrong, the recordings hardly tell which law comes first.
-        """
-        best, parents = self.best, dict[frozenset[Name], Trial]()
-        single = [t for t in self.memo.values() if len(t.effects) == 1 and kind_of(t.effects[0].port) != PARAMETER]
-        for trial in likeliest(single, self.evidence):
-            parents.setdefault(trial.names, trial)
-        left = [t for t in parents.values() if not self._expanded(t)]
-        for parent in left[:FEW] if effects > 1 else ():
-            if not self.must_repeat and self.can_improve(self.best) and self.may_go_on():
-                self.add(parent, few=True)
-        self._go_on(best, effects)
-
-    def _go_on(self, before: Trial, effects: float) -> None:
-        """Go on from a new best hypothesis: laws that were found before may have made up for its last one."""
-        if self.best is not before:
+        if self.best is not best:  # laws that were found before may have made up for its last one
             self.exchange()
             self._grow(effects, varied=True)
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from diagnosis_example import recorded, rig as example_rig
 from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
@@ -325,12 +324,3 @@ def test_samples_that_a_delay_follows_by_its_unknown_beginning_do_not_count_for_
         found.keep(Trial.of(found.without, 0, thorough=True))
         evidences.append(found.optimistic_evidence(alike) - found.optimistic_evidence(found.root))
     assert evidences[0] < evidences[1] - 1
-
-
-def test_if_nothing_explains_the_mismatch_laws_are_added_beside_several_first_laws():
-    true = example_rig().with_element("ground", laws.CoulombFriction().at({"F_c": 2.0, "v_0": 0.01}))
-    true = true.with_element("actuator:force", laws.Saturation().at({"L": 10.0}))
-    tried = (laws.CubicDamping, laws.DeadZone)
-    found = pilfr.diagnose(example_rig(430.0, 5.0), recorded(true, 0, samples=300), laws=tried, hold="zero", workers=1)
-    parents = {move.parent.names for move in found.evidence.search.moves if len(move.parent.effects) == 1}
-    assert found.verdict == "unexplained" and len(parents) > 1
