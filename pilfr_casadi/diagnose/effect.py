@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -112,12 +113,23 @@ class Effect:
             f"  {self.sentence}: {self.equation}",
             f"  {symbols}",
         ]
-        for name, p in (self.parameters | self.defined).items():
-            std = "" if p["std"] is None else f" ± {p['std']:.2g}"
-            lines.append(f"  {name} = {p['value']:.5g}{std} {p['unit']}".rstrip() + self.limit(name))
+        shown = self.parameters | self.defined
+        for name, keys in itertools.groupby(shown, lambda key: key.split("[")[0]):
+            values = [shown[key] for key in keys]
+            if name in shown:
+                p = shown[name]
+                std = "" if p["std"] is None else f" ± {p['std']:.2g}"
+                lines.append(f"  {name} = {p['value']:.5g}{std} {p['unit']}".rstrip() + self.limit(name))
+            else:  # an array; the report has the standard errors
+                lines.append(f"  {name} = {write_values([p['value'] for p in values], values[0]['unit'])}")
         if self.indistinguishable:
             others = ", ".join(name_at(port, law) for port, law in self.indistinguishable)
             lines.append(f"  cannot be told apart from {others}")
         return "\n".join(lines)
 
     __repr__ = __str__
+
+
+def write_values(values: Iterable[float], unit: str) -> str:
+    """Write one or several values with their unit."""
+    return f"{', '.join(f'{v:.5g}' for v in values)} {unit}".rstrip()
