@@ -100,6 +100,11 @@ class Local:
     firmest = property(lambda self: self.max_damping)
 
     @cached_property
+    def given(self) -> np.ndarray:
+        """Force (M,) of the term along the signals; zero if there is none."""
+        return np.zeros(len(self.z)) if self.term is None else self.term(self.z, self.dz)
+
+    @cached_property
     def low(self) -> float:
         """Smallest z, without the outermost 0.1 %."""
         return float(np.quantile(self.z, 0.001))
