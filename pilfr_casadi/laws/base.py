@@ -243,7 +243,7 @@ class Law:
     ------
     InputError
         If a value or limit is not a number, or names a parameter that the law does not have; if a value is outside of
-        its limits.
+        its limits, or `low` is above `high`.
     """
 
     id: ClassVar[str]
@@ -320,6 +320,9 @@ class Law:
                 raise InputError(
                     f"The law {self.id!r} has {name} = {value}, outside of its limits {low} to {high}; widen them."
                 )
+        if {"low", "high"} <= self.values.keys() and np.any(self.values["low"] > self.values["high"]):
+            low, high = self.values["low"], self.values["high"]
+            raise InputError(f"The law {self.id!r} has low = {low} above high = {high}; give them in order.")
 
     def force(self, *args: Any, **kwargs: Any) -> Any:
         """Force w from any of z, dz, q, t, x, u, p by name."""
@@ -515,6 +518,12 @@ def continue_along_tangents(
     inside = np.clip(x, low, high) if number else ca.fmin(ca.fmax(x, low), high)
     values, slopes = values_and_slopes(inside)
     return [value + (x - inside) * slope for value, slope in zip(values, slopes, strict=True)]
+
+
+def check_signal(by: Any) -> None:
+    """Raise an `InputError` unless the name of a signal is given."""
+    if not (isinstance(by, str) and by):
+        raise InputError(f"by = {by!r} was given; give the name of a signal.")
 
 
 def rename_class(law: Any, name: str, doc: str) -> Any:
