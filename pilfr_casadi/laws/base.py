@@ -211,7 +211,8 @@ class Law:
         The law stands in line with the port's `term`, which `force` and `flow` may call: `term(z, dz)`. That value has
         the name `given`.
     implied : {"", "drive", "balance"}
-        What the equations show as the term if the port names none: the force of a drive, or all that changes a state.
+        Kind of term that the law may stand in line with if the user names none and the simulator finds one in its
+        equations: the force of a drive, or all that changes a state. Empty if the user has to name the term.
     sensed : bool
         Outputs that read the port's coordinate or its rate read `far_side(q, p)` instead. The law is tried only where
         the coordinate is a state that outputs read.
