@@ -81,10 +81,10 @@ class Search(Hypotheses):
         with self.until_interrupted():
             self.estimate_noise()
             if not self.interrupted:
-                self._grow(effects)
-                self._name_rest(effects)
-                self._widen(effects)
-                self._finish(effects)
+                self._grow()
+                self._name_rest()
+                self._widen()
+                self._finish()
         if self.interrupted:
             self.forget_held_out()
         return self
@@ -94,11 +94,11 @@ class Search(Hypotheses):
         """Whether the search goes no further: it has to be repeated with another hold or with a channel shifted."""
         return bool(self.better_hold) or self.shift is not None
 
-    def resume(self, effects: float) -> None:
+    def resume(self) -> None:
         """Continue with the present hold because the other is no better, unless the search was interrupted."""
         self.hold_stated = True
         if not self.interrupted:
-            self.run(effects)
+            self.run(self.most_effects)
 
     def adopt(self, other: Trial) -> None:
         """Fit the laws of another search's hypothesis to these recordings, from its values, and keep the fit."""
@@ -117,7 +117,7 @@ class Search(Hypotheses):
         ranked = ((parent, sorted(trials.values(), key=lambda t: t.error)) for parent, trials in found.values())
         return [Move(parent, (), tuple(trials)) for parent, trials in ranked if trials]
 
-    def _grow(self, effects: float, varied: bool = False) -> None:
+    def _grow(self, varied: bool = False) -> None:
         """Add effects while that pays; end as soon as the other hold, or a channel's shift, proves better.
 
         A parameter that varies can imitate many laws. So hypotheses with one are a basis for more only if `varied`.
@@ -125,7 +125,7 @@ class Search(Hypotheses):
         """
         while (
             self.can_improve(self.best)
-            and len((parent := self._parent(varied)).effects) < effects
+            and len((parent := self._parent(varied)).effects) < self.most_effects
             and self._pays(parent)
             and (self.may_go_on() or not self.moves)
         ):
@@ -143,11 +143,11 @@ class Search(Hypotheses):
                 self.exchange()
             if len(self._parent(varied).laws) <= len(parent.laws):  # no added law is worth its prior
                 break
-        if effects > 1 and TWO not in self.times and self.can_improve(self.best) and self.may_go_on():
+        if self.most_effects > 1 and TWO not in self.times and self.can_improve(self.best) and self.may_go_on():
             best = self.best
             self.add_two()
             if self.best is not best:
-                self._grow(effects, varied)
+                self._grow(varied)
 
     def _parent(self, varied: bool) -> Trial:
         """Return the best hypothesis, or the best one in which no parameter varies."""
@@ -179,7 +179,7 @@ class Search(Hypotheses):
         if found:  # other laws may stand beside the new one in place of those before
             self.exchange()
 
-    def _name_rest(self, effects: float) -> None:
+    def _name_rest(self) -> None:
         """Try varying parameters and laws near learned forces beside three hypotheses.
 
         These are the simulator, the best one, and the best one without its weakest effect, which may imitate a law that
@@ -193,11 +193,11 @@ class Search(Hypotheses):
         without_weakest = sorted(fewer, key=lambda t: (-len(t.effects), t.mean_square))[:1]
         for name_rest in (self.vary_parameters, self.name_learned):
             for base in {t.key: t for t in (self.root, best, *without_weakest)}.values():
-                if len(base.effects) < effects and self.can_improve(self.best) and self.may_go_on():
+                if len(base.effects) < self.most_effects and self.can_improve(self.best) and self.may_go_on():
                     name_rest(base)
-        self._go_on(best, effects)
+        self._go_on(best)
 
-    def _widen(self, effects: float) -> None:
+    def _widen(self) -> None:
         """Add laws beside other likely hypotheses with one law, because the best one may be on a wrong track.
 
         Where all models are wrong, the recordings hardly tell which law comes first.
@@ -207,22 +207,22 @@ class Search(Hypotheses):
         for trial in likeliest(single, self.evidence):
             parents.setdefault(trial.names, trial)
         left = [t for t in parents.values() if not self._expanded(t)]
-        for parent in left[:FEW] if effects > 1 else ():
+        for parent in left[:FEW] if self.most_effects > 1 else ():
             if not self.must_repeat and self.can_improve(self.best) and self.may_go_on():
                 self.add(parent, few=True)
-        self._go_on(best, effects)
+        self._go_on(best)
 
-    def _go_on(self, before: Trial, effects: float) -> None:
+    def _go_on(self, before: Trial) -> None:
         """Go on from a new best hypothesis: laws that were found before may have made up for its last one."""
         if self.best is not before:
             self.exchange()
-            self._grow(effects, varied=True)
+            self._grow(varied=True)
 
-    def _finish(self, effects: float) -> None:
+    def _finish(self) -> None:
         """Look for what the moves before cannot find, and compare the likeliest hypotheses."""
         if self.must_repeat:
             return
-        if len(self.best.effects) < effects:
+        if len(self.best.effects) < self.most_effects:
             self._grow_to_noise()
         self._every_sensor()
         self._leave_out_each()
