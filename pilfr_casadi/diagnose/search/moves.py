@@ -365,15 +365,16 @@ class Search(Hypotheses):
             self.keep(trial)
 
     def _reorder(self, trial: Trial) -> Trial | None:
-        """Fit a hypothesis with its last law before the others of the same signal.
+        """Fit a hypothesis with its added law before the others of the same signal.
 
         A curve behind a lag is not a lag behind a curve (Wiener and Hammerstein models). Only linear laws commute.
         """
-        *others, last = trial.laws
-        at = next((i for i, e in enumerate(others) if e.port == last.port), None)
-        if at is None or not in_series(last.port) or (_is_filter(last.law) and _is_filter(others[at].law)):
+        added, laws = trial.element, [e for e in trial.laws if e is not trial.element]
+        first = next(e for e in trial.laws if e.port == added.port)
+        if first is added or not in_series(added.port) or (_is_filter(added.law) and _is_filter(first.law)):
             return None
-        found = self.run_laws([*others[:at], last, *others[at:]], trial).with_added(trial.pair)
+        laws.insert(laws.index(first), added)
+        found = self.run_laws(laws, trial).with_added(trial.pair)
         return self.fits.converge(found) if found.mean_square < DIVERGED else None
 
     def _finer(self, parent: Trial) -> None:
