@@ -145,6 +145,11 @@ def size_to_power(z: Any, n: Any, least: float = 1e-12) -> Any:
     return ca.exp(n * ca.log(ca.fabs(z) + least))
 
 
+def signed_power(z: Any, n: Any) -> Any:
+    """Compute sign(z) |z|^n."""
+    return ca.sign(z) * size_to_power(z, n)
+
+
 # an attribute of `Local` ("" for none) and its multiples, or the values as a function of it
 Grid = tuple[Any, ...] | Callable[[Local], Any]
 

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from ..models import Parameter
-from .base import Law, Local, continue_along_tangents, size_to_power
+from .base import Law, Local, continue_along_tangents, signed_power, size_to_power
 
 LINEAR_POWER = 0.03  # difference of a power from one, below which it is a gain
 NARROW_RANGE = 0.05  # half the range over its middle, below which any curve is a gain and an offset
@@ -118,7 +118,7 @@ class Power(Polynomial):
     ranges = {"n": ("", 0.3, 5.0)}
 
     def force(self, z: Any, p: Any) -> Any:
-        return p.a * ca.sign(z) * size_to_power(z, p.n)
+        return p.a * signed_power(z, p.n)
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether the power is about one, so that it is a gain, as from a wrong unit."""

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from .base import Law, Local, contact_onset, size_to_power
+from .base import Law, Local, contact_onset, signed_power
 
 LEAST_PERIODS = 2.0  # within the motion, from which a force counts as periodic
 
@@ -71,7 +71,7 @@ class PowerStiffness(CubicStiffness):
     ranges = {"n": ("", 1.7, 6.0)}
 
     def force(self, z: Any, p: Any) -> Any:
-        return p.k_n * ca.sign(z) * size_to_power(z, p.n)
+        return p.k_n * signed_power(z, p.n)
 
     def as_base(self, own: Mapping[str, Any]) -> dict[str, Any]:
         return {"k_n": own["k_3"], "n": 3.0}
