@@ -206,7 +206,7 @@ class LimitedTerm(TermLimit):
         return ca.fmax(ca.fmin(given, p.high), p.low)
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        """Generate limits of which at least one is reached."""
+        """Generate the pairs of limits, except the one that is never reached."""
         _, *reached = super().shapes(local)
         yield from reached
 
