@@ -72,7 +72,7 @@ class Forms(Hypotheses):
         scored, observer_gain = self.screened(parent)
         return [s for s in scored if may_stand_beside(parent.laws, s.port, s.law)], observer_gain
 
-    def fit_pairs(self, parent: Trial, scored: Sequence[Scored], effort: Effort) -> list[Trial]:
+    def fit_selected(self, parent: Trial, scored: Sequence[Scored], effort: Effort) -> list[Trial]:
         """Fit the pairs of port and law that are worth it beside a hypothesis, the smallest error first."""
         began = time.perf_counter()
         stage = f"fits, effect {len(parent.laws) + 1}" if parent.laws else "fits"
@@ -100,7 +100,7 @@ class Forms(Hypotheses):
 
     def try_beside(self, base: Trial, entries: Sequence[Scored], observer_gain: np.ndarray | None = None) -> None:
         """Fit some pairs beside a hypothesis, none of their relatives, and note the move."""
-        self.record(base, entries, self.fit_pairs(base, entries, self.little_effort(observer_gain)))
+        self.record(base, entries, self.fit_selected(base, entries, self.little_effort(observer_gain)))
 
     def little_effort(self, observer_gain: np.ndarray | None = None) -> Effort:
         """Fit few pairs, and refine none far behind one whose error is at the noise."""

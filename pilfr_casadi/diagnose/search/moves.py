@@ -254,11 +254,11 @@ class Search(Forms):
         self, parent: Trial, selected: Sequence[Scored], scored: Sequence[Scored], effort: Effort
     ) -> list[Trial]:
         """Fit some of the pairs screened, then those to which the best fits of these hypotheses point."""
-        found = self.fit_pairs(parent, selected, effort)
+        found = self.fit_selected(parent, selected, effort)
         trials = sorted(map(self.best_known, found), key=lambda t: t.error)
         more = relatives(self.bench, trials, scored) if self.may_go_on() else []
         if more:
-            trials = sorted([*trials, *self.fit_pairs(parent, more, effort)], key=lambda t: t.error)
+            trials = sorted([*trials, *self.fit_selected(parent, more, effort)], key=lambda t: t.error)
         return trials
 
     def learned(self, base: Trial) -> list[Fitted]:
