@@ -134,10 +134,11 @@ def diagnose(
         If simulator and recordings do not fit each other.
     """
     from .._base import shown_progress
+    from .arguments import read_arguments
     from .pipeline import diagnose_in_steps
 
     with shown_progress(progress) as report:
-        return diagnose_in_steps(
+        request = read_arguments(
             simulator,
             train,
             test=test,
@@ -153,3 +154,4 @@ def diagnose(
             search_samples=search_samples,
             progress=report,
         )
+        return diagnose_in_steps(request)

@@ -71,22 +71,19 @@ def build_diagnosis(
     search: Search,
     found: Conclusion,
     final: FinalFits,
-    tests: tuple[Recording, ...],
-    limits: Mapping[str, float] | None,
-    began: float,
 ) -> Diagnosis:
     """Put the search's conclusion and its proof into a Diagnosis."""
     proving = time.perf_counter()
     request.say("proof", 0, 1)
     bench, without, after = final.bench, final.without, final.after
     std = standard_errors(bench, after)
-    errors, fewer, compared, test_notes = _compute_errors(request, search, found, final, tests)
+    errors, fewer, compared, test_notes = _compute_errors(request, search, found, final)
     decided = found.decided or search
     forms = {e: _other_forms(decided, found.effects, e) for e in found.effects}
     effects = tuple(_make_effect(search, e, final, std, forms[e], fewer.get(e, np.nan)) for e in found.effects)
     floor = search.least_floor if found.verdict.kind == "unexplained" else search.floor
     simulated = [e + r.y for e, r in zip(without.residual, bench.recordings, strict=True)]
-    experiment = _design_experiment(decided, found.effects, limits)
+    experiment = _design_experiment(decided, found.effects, request.limits)
     blind_spots = _blind_spots(request, ready, search)
     request.say("proof", 1, 1)
     now = time.perf_counter()
@@ -114,9 +111,9 @@ def build_diagnosis(
         refitted=replace(without.corrected(), substeps=without.model.substeps),
         hold=bench.hold,
         train=bench.recordings,
-        test=tests,
+        test=request.tests,
         next_experiment=experiment,
-        seconds=now - began,
+        seconds=now - request.began,
         times={**search.times, "proof": now - proving},
         interrupted=search.interrupted,
         out_of_time=search.out_of_time,
@@ -145,13 +142,14 @@ def _describe_noise(floor: Floor, white: Floor, bench: Workbench, compared: Comp
 
 
 def _compute_errors(
-    request: Request, search: Search, found: Conclusion, final: FinalFits, tests: tuple[Recording, ...]
+    request: Request, search: Search, found: Conclusion, final: FinalFits
 ) -> tuple[dict[str, dict[str, float] | None], dict[LikelyEffect, float], Comparison | None, tuple[Gate, ...]]:
     """Compute the table of errors (see `Diagnosis`), the test errors without each of several effects, and notes.
 
     Also returns the comparison on the test recordings, if there are any.
     """
     bench, without, after, fewer = final.bench, final.without, final.after, dict[LikelyEffect, float]()
+    tests = request.tests
     notes, compared = tuple[Gate, ...](), None
     errors: dict[str, dict[str, float] | None] = {
         "train": {"nominal": final.nominal, "before": bench.nrmse(without), "after": bench.nrmse(after)},

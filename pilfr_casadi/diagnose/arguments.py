@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import difflib
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Stages, is_number, listed
+from .._base import InputError, Progress, Stages, is_number, listed, positive, processors, whole
 from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
 from ..laws import (
     CATALOGUE,
@@ -18,6 +19,7 @@ from ..laws import (
     Law,
     LinearStiffness,
     UnreadInput,
+    VaryingParameter,
     ViscousDamping,
     carried,
     scaled,
@@ -26,7 +28,8 @@ from ..laws import (
 )
 from ..simulators import Simulator, as_simulator, check_hold, stated_hold
 from .faults.gates import Gate, edited
-from .search.stretches import Stretches
+from .preparation import conversions, slow_note
+from .search.stretches import SEARCHED_SAMPLES, Stretches
 
 FEWEST_SHARED = 20  # equal samples in a row that cannot be chance, where the outputs move
 FEWEST_SAMPLES = 20  # samples in all training recordings together; fewer cannot determine a model
@@ -53,6 +56,10 @@ class Request:
     edits: tuple[Gate, ...] = ()  # corrections that `recordings` have already
     nominal: float = np.nan  # error at the user's values before these
     calls: Mapping[str, int] = field(default_factory=dict)  # of the simulator's programs before
+    tests: tuple[Recording, ...] = ()
+    limits: Mapping[str, float] | None = None
+    search_samples: int = SEARCHED_SAMPLES
+    began: float = 0.0  # time (of `time.perf_counter`) at which the diagnosis began
 
     def corrected(self, edits: Sequence[Gate], nominal: float, stage: str) -> Request:
         """Return the request with recordings corrected by further edits; its stages are shown under another name."""
@@ -63,6 +70,65 @@ class Request:
     def stated_hold(self) -> str | None:
         """Course of the inputs between samples; None if nobody stated it."""
         return stated_hold(self.simulator, self.recordings, self.hold)
+
+
+def read_arguments(
+    simulator: Any,
+    train: Recording | Sequence[Recording],
+    *,
+    test: Recording | Sequence[Recording] | None,
+    hold: str | None,
+    laws: Sequence[type[Law] | str] | None,
+    effects: int | None,
+    limits: Mapping[str, float] | None,
+    workers: int | None,
+    engine: str,
+    stand_in_error: float,
+    time_limit: float | None,
+    focus: str | None,
+    search_samples: int | None,
+    progress: Progress | None,
+) -> Request:
+    """Check the arguments of `diagnose`; return the request that they make.
+
+    Raises
+    ------
+    InputError
+        If an argument is wrong, or simulator and recordings do not fit each other.
+    """
+    began = time.perf_counter()
+    workers = min(processors(), 4) if workers is None else whole(workers, "workers", 1)
+    most_effects = np.inf if effects is None else whole(effects, "effects", 0)
+    check_time_and_focus(time_limit, focus)
+    positive(stand_in_error, "stand_in_error", "the NRMSE of a model that replaces the simulator", zero=True)
+    given = as_recordings(train)
+    simulator, recordings, stated = match_recordings(simulator, given, hold)
+    tests = match_tests(simulator, test, recordings, stated)
+    check_limits(simulator, limits)
+    tried = (*add_scaled_laws(check_laws(laws), simulator), *((VaryingParameter,) if laws is None else ()))
+    say = Stages(progress or (lambda stage, done, total, best: None))
+    calls, slow = simulator.program_calls, slow_note(simulator, recordings)
+    return Request(
+        simulator=simulator,
+        recordings=recordings,
+        laws=tried,
+        hold=hold,
+        engine=engine,
+        workers=workers,
+        most_effects=most_effects,
+        surrogate_nrmse=stand_in_error,
+        deadline=np.inf if time_limit is None else began + float(time_limit),
+        say=say.under(f"{slow[0].value:.2g} s a simulation: ") if slow else say,
+        focus=focus,
+        notes=(*conversions(simulator, given), *slow),
+        calls=calls,
+        tests=tests,
+        limits=limits,
+        search_samples=SEARCHED_SAMPLES
+        if search_samples is None
+        else whole(search_samples, "search_samples", FEWEST_SAMPLES),
+        began=began,
+    )
 
 
 def match_recordings(

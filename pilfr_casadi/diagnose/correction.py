@@ -146,7 +146,7 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
     """Choose the corrected simulator if nothing has a name.
 
     Where the time ends before a comparison, a hypothesis that is far better than the refit corrects. The floor may
-    contain error that no law explains, so that shares are told of the least noise.
+    contain error that no law explains, so that shares are relative to the least noise.
     """
     refit = _cross_validate_refit(search)
     candidates = [_Candidate.of(search, t) for t in _hypotheses_with_laws(search)]

@@ -92,7 +92,11 @@ def assess_laws(
         assess = partial(_assess_port, rest, base=base, own=(own, needed), level=levels[task.index], names=names)
         for form, row, response in assess(task):
             if laws is None and row.status == "followed" and row.law not in LINEAR:
-                row, response = _other_form(whole, wanted, row, assess)
+                # a root may look like a gain where a free curve does not
+                others = [pair for pair in whole.pairs if pair[0].id == row.law and type(pair[0]) not in wanted]
+                assessed = (found for pair in others for found in assess(replace(task, pairs=[pair])))
+                seen_form = next((found for found in assessed if found[1].status == "detectable"), None)
+                _, row, response = seen_form or (form, row, None)
             rows.append(row if laws is None else replace(row, form=form))
             responses += [response] if response else []
         seen = {type(law) for law, _ in task.pairs}
@@ -109,24 +113,6 @@ def _select_laws(port: Port, laws: Sequence[type[Law]] | None) -> tuple[type[Law
     placed = [law for law in (CATALOGUE if laws is None else laws) if port.admits(law)]
     first = {law.id: law for law in reversed(placed)}
     return tuple(law for law in placed if laws is not None or law is first[law.id])
-
-
-def _other_form(
-    task: Task,
-    assessed: Sequence[type[Law]],
-    row: LawRow,
-    assess: Callable[[Task], Iterator[tuple[str, LawRow, _Response | None]]],
-) -> tuple[LawRow, _Response | None]:
-    """Return the first form of a law that is detectable, in place of its plainest one, which own parameters imitate.
-
-    A root may look like a gain where a free curve does not. If no form is detectable, the row stays.
-    """
-    for pair in task.pairs:
-        if pair[0].id == row.law and type(pair[0]) not in assessed:
-            _, other, response = next(assess(replace(task, pairs=[pair])))
-            if other.status == "detectable":
-                return other, response
-    return row, None
 
 
 def _assess_port(

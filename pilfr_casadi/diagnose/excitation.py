@@ -12,7 +12,7 @@ from .fits.linearise import Probe, Run
 from .fits.workbench import Workbench
 
 SMALLEST_SWING = SMALL_SHARE / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
-LEAST_SAMPLES = 10  # of a signal of which a single frequency is told, and of a rest
+LEAST_SAMPLES = 10  # least length of a signal whose single frequency is reported, and of a rest
 
 
 @dataclass(frozen=True)

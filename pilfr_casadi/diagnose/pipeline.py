@@ -39,37 +39,16 @@ found there are refitted in free run (`_name_in_predictions`).
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from .._base import (
-    InputError,
-    Progress,
-    Stages,
-    deferred_interrupt,
-    one_blas_thread,
-    percent,
-    positive,
-    processors,
-    whole,
-)
-from ..data import Recording, as_recordings
-from ..laws import Law, VaryingParameter, display_name
+from .._base import InputError, deferred_interrupt, one_blas_thread, percent
+from ..laws import display_name
 from .answer import Conclusion, FinalFits, build_diagnosis
-from .arguments import (
-    FEWEST_SAMPLES,
-    Request,
-    add_scaled_laws,
-    check_laws,
-    check_limits,
-    check_time_and_focus,
-    match_recordings,
-    match_tests,
-)
+from .arguments import Request
 from .correction import Correction, find_named_correction, find_unnamed_correction, uncompared_correction
 from .faults.gates import EQUAL_RATIO, Gate
 from .faults.offsets import fix_idle_offsets, list_offsets, refit_without_offsets
@@ -86,65 +65,19 @@ from .other_explanations import (
 )
 from .posterior import Posterior, posterior
 from .prediction import drift_note, drifts, predictor
-from .preparation import LEAST_REFIT, Prepared, conversions, slow_note
+from .preparation import LEAST_REFIT, Prepared
 from .proof import errors_of
 from .repetitions import search_with_one_hold, search_with_repetitions
 from .result import Diagnosis
 from .search.moves import Search
-from .search.stretches import SEARCHED_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
+from .search.stretches import Everything, Stretches, back_on_stretches, choose_stretches
 from .verdict import Verdict, judge
 
 
 @one_blas_thread
-def diagnose_in_steps(
-    simulator: Any,
-    train: Recording | Sequence[Recording],
-    *,
-    test: Recording | Sequence[Recording] | None,
-    hold: str | None,
-    laws: Sequence[type[Law] | str] | None,
-    effects: int | None,
-    limits: Mapping[str, float] | None,
-    workers: int | None,
-    engine: str,
-    stand_in_error: float,
-    time_limit: float | None,
-    focus: str | None,
-    search_samples: int | None,
-    progress: Progress | None,
-) -> Diagnosis:
-    """Carry out `diagnose`, whose parameters these are, by the steps of the module docstring."""
-    began = time.perf_counter()
-    workers = min(processors(), 4) if workers is None else whole(workers, "workers", 1)
-    most_effects = np.inf if effects is None else whole(effects, "effects", 0)
-    check_time_and_focus(time_limit, focus)
-    positive(stand_in_error, "stand_in_error", "the NRMSE of a model that replaces the simulator", zero=True)
-    say = Stages(progress or (lambda stage, done, total, best: None))
-    given = as_recordings(train)
-    simulator, recordings, stated = match_recordings(simulator, given, hold)
-    tests = match_tests(simulator, test, recordings, stated)
-    check_limits(simulator, limits)
-    tried = (*add_scaled_laws(check_laws(laws), simulator), *((VaryingParameter,) if laws is None else ()))
-    deadline = np.inf if time_limit is None else began + float(time_limit)
-    calls, slow = simulator.program_calls, slow_note(simulator, recordings)
-    say = say.under(f"{slow[0].value:.2g} s a simulation: ") if slow else say
-    request = Request(
-        simulator=simulator,
-        recordings=recordings,
-        laws=tried,
-        hold=hold,
-        engine=engine,
-        workers=workers,
-        most_effects=most_effects,
-        surrogate_nrmse=stand_in_error,
-        deadline=deadline,
-        say=say,
-        focus=focus,
-        notes=(*conversions(simulator, given), *slow),
-        calls=calls,
-    )
-    most = SEARCHED_SAMPLES if search_samples is None else whole(search_samples, "search_samples", FEWEST_SAMPLES)
-    request, first = search_with_repetitions(_on_stretches(request, most))
+def diagnose_in_steps(request: Request) -> Diagnosis:
+    """Carry out the steps of the module docstring."""
+    request, first = search_with_repetitions(_on_stretches(request))
     ready, search = first.ready, first.search
     request, everything = _fit_to_everything(request, ready, search)
     found = _concluded(search, (*request.notes, *ready.gates))
@@ -153,7 +86,7 @@ def diagnose_in_steps(
             found = _name_in_predictions(request, search, found)
     final = _final_fits(request, ready, search, found, everything)
     with deferred_interrupt(again=False) as pressed:
-        built = build_diagnosis(request, ready, search, found, final, tests, limits, began)
+        built = build_diagnosis(request, ready, search, found, final)
     search.bench = replace(search.bench, deadline=np.inf)  # fits that a user asks for later, as by `refine`, have time
     return replace(built, interrupted=built.interrupted or bool(pressed))
 
@@ -161,13 +94,14 @@ def diagnose_in_steps(
 # long recordings
 
 
-def _on_stretches(request: Request, most: int) -> Request:
-    """Restrict a request to the most informative stretches if the recordings have more than `most` samples."""
-    if sum(map(len, request.recordings)) <= most:
+def _on_stretches(request: Request) -> Request:
+    """Restrict a request to the most informative stretches if there are more samples than a search uses."""
+    if sum(map(len, request.recordings)) <= request.search_samples:
         return request
     request.say("choice of stretches", 0, 1)
     recordings, notes = clean_recordings(request.recordings)
     hold = request.stated_hold or "zero"
+    most = request.search_samples
     chosen = choose_stretches(request.simulator, recordings, hold, request.engine, most, request.workers)
     stretches = Stretches(recordings, chosen)
     request.say("choice of stretches", 1, 1)

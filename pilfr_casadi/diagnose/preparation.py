@@ -140,7 +140,7 @@ class _Checks:
         return found or first_refit(replace(bench, deadline=self.refit_deadline()), gates)
 
     def begin_with_either_hold(self, bench: Workbench, gates: tuple[Gate, ...]) -> Checked:
-        """Begin; with the other hold too if a channel is at fault, of which the wrong hold may choose the wrong one."""
+        """Begin; if a channel is at fault, begin with the other hold too, since a wrong hold may blame a wrong one."""
         (other,) = bench.with_other_holds(PREPARED_HOLDS)
         try:
             first = self.begin(bench, gates)

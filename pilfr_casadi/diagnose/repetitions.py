@@ -83,19 +83,19 @@ def _search_with_better_hold(request: Request, first: Attempt, hold: str) -> Att
     other = _again(first, partial(search_with_one_hold, held))
     if other is None:
         if not search.hold_stated:
-            search.resume(request.most_effects)
+            search.resume()
         return first
     again = other.search
     only_refitted, before2, after2 = again.interrupted and len(again.memo) < 2, *first.compared_with(other)
     if after2 > before2 or only_refitted:
         if not search.hold_stated:  # else this search is finished
-            search.resume(request.most_effects)
+            search.resume()
         return first
     better = _find_better_hold(again)
     # the laws that were found since may have been what the hold had made up for
     if better == search.bench.hold:
         search.adopt(again.best)
-        search.resume(request.most_effects)
+        search.resume()
         before2, after2 = first.compared_with(other)
         if before2 < after2:
             return first

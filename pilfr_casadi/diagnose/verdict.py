@@ -180,7 +180,7 @@ def _describe_vanished(search: Hypotheses, found: Posterior) -> str:
 
 
 def _which_laws(search: Hypotheses) -> str:
-    """Describe the laws of which none explains the mismatch: after the time limit, only those that were fitted."""
+    """Name the laws that do not explain the mismatch; after the time limit, only those that were fitted."""
     if not search.out_of_time or search.tried >= search.selected:
         allowed = _allowed_laws(search)
         if allowed is None:
@@ -206,7 +206,7 @@ def _allowed_laws(search: Hypotheses) -> str | None:
 
 
 def _among_laws(search: Hypotheses) -> str:
-    """Say which laws were tried, unless it were all of the catalogue."""
+    """Say which laws were tried, unless the whole catalogue was."""
     allowed = _allowed_laws(search)
     if allowed is None:
         return ""

@@ -100,6 +100,11 @@ class Local:
     firmest = property(lambda self: self.max_damping)
 
     @cached_property
+    def given(self) -> np.ndarray:
+        """Force (M,) of the term along the signals; zero if there is none."""
+        return np.zeros(len(self.z)) if self.term is None else self.term(self.z, self.dz)
+
+    @cached_property
     def low(self) -> float:
         """Smallest z, without the outermost 0.1 %."""
         return float(np.quantile(self.z, 0.001))
@@ -140,6 +145,11 @@ def size_to_power(z: Any, n: Any, least: float = 1e-12) -> Any:
     return ca.exp(n * ca.log(ca.fabs(z) + least))
 
 
+def signed_power(z: Any, n: Any) -> Any:
+    """Compute sign(z) |z|^n."""
+    return ca.sign(z) * size_to_power(z, n)
+
+
 # an attribute of `Local` ("" for none) and its multiples, or the values as a function of it
 Grid = tuple[Any, ...] | Callable[[Local], Any]
 
@@ -164,6 +174,9 @@ class Law:
         `Local`. Every combination of start values is tried.
     defaults : mapping
         Values of parameters before any are given; otherwise strengths are zero and shapes one.
+    as_base : mapping
+        Values, or functions of the base class' values by name, at which the law equals its base class; parameters of
+        the same name have the same value. Left out if the law is its base class where its own strengths are zero.
     constants : tuple of str
         Shape parameters that no fit changes, such as the revolution of an angle.
     places : tuple of {"parallel", "series", "sensor", "parameter"}
@@ -206,7 +219,8 @@ class Law:
         The law stands in line with the port's `term`, which `force` and `flow` may call: `term(z, dz)`. That value has
         the name `given`.
     implied : {"", "drive", "balance"}
-        What the equations show as the term if the port names none: the force of a drive, or all that changes a state.
+        Kind of term that the law may stand in line with if the user names none and the simulator finds one in its
+        equations: the force of a drive, or all that changes a state. Empty if the user has to name the term.
     sensed : bool
         Outputs that read the port's coordinate or its rate read `far_side(q, p)` instead. The law is tried only where
         the coordinate is a state that outputs read.
@@ -238,7 +252,7 @@ class Law:
     ------
     InputError
         If a value or limit is not a number, or names a parameter that the law does not have; if a value is outside of
-        its limits.
+        its limits, or `low` is above `high`.
     """
 
     id: ClassVar[str]
@@ -251,6 +265,7 @@ class Law:
     starts: ClassVar[Mapping[str, Grid]] = {}
     ranges: ClassVar[Mapping[str, Grid]] = {}
     defaults: ClassVar[Mapping[str, Any]] = {}
+    as_base: ClassVar[Mapping[str, Any]] = {}
     constants: ClassVar[tuple[str, ...]] = ()
     places: ClassVar[tuple[str, ...]] = ("parallel",)
     domains: ClassVar[tuple[str, ...]] = ()
@@ -315,6 +330,9 @@ class Law:
                 raise InputError(
                     f"The law {self.id!r} has {name} = {value}, outside of its limits {low} to {high}; widen them."
                 )
+        if {"low", "high"} <= self.values.keys() and np.any(self.values["low"] > self.values["high"]):
+            low, high = self.values["low"], self.values["high"]
+            raise InputError(f"The law {self.id!r} has low = {low} above high = {high}; give them in order.")
 
     def force(self, *args: Any, **kwargs: Any) -> Any:
         """Force w from any of z, dz, q, t, x, u, p by name."""
@@ -352,17 +370,14 @@ class Law:
         """Tell whether the law degenerates at its fitted values, so that its sentence is hardly true."""
         return False
 
-    def as_base(self, own: Mapping[str, Any]) -> dict[str, Any]:
-        """Values at which it equals its base class with the values `own`; empty if only strengths tell them apart."""
-        return {}
-
     def starts_as(self, plain: Law, own: Mapping[str, Any], shape: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """Start values at which it equals a plainer law with the values `own`; empty if it does not refine that law.
 
         `shape` has values of the shape parameters of its further terms, which have no strength yet.
         """
         if "as_base" in vars(type(self)) and type(plain) is type(self).__base__:
-            return self.as_base(own)
+            values = {name: value(own) if callable(value) else value for name, value in self.as_base.items()}
+            return {**{name: value for name, value in own.items() if name in self.units}, **values}
         more = [name for name in self.strength if name not in plain.units]
         refines = plain.strength and plain.units.items() <= self.units.items()
         return {**(shape or {}), **dict.fromkeys(more, 0.0), **own} if more and refines else {}
@@ -510,6 +525,12 @@ def continue_along_tangents(
     inside = np.clip(x, low, high) if number else ca.fmin(ca.fmax(x, low), high)
     values, slopes = values_and_slopes(inside)
     return [value + (x - inside) * slope for value, slope in zip(values, slopes, strict=True)]
+
+
+def check_signal(by: Any) -> None:
+    """Raise an `InputError` unless the name of a signal is given."""
+    if not (isinstance(by, str) and by):
+        raise InputError(f"by = {by!r} was given; give the name of a signal.")
 
 
 def rename_class(law: Any, name: str, doc: str) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 
 from .._base import InputError
 from ..models import Named, Parameter
-from .base import Law, Local, beyond_gap, continue_along_tangents, rename_class
+from .base import Law, Local, beyond_gap, check_signal, continue_along_tangents, rename_class
 
 GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
 RATIOS, MOST_RATIO = (0.3, 3.0), 100.0  # tried ratios of an exponential profile, and the largest
@@ -108,8 +108,9 @@ def scaled(law: type[Law], by: str) -> type[Law]:
     Raises
     ------
     InputError
-        If it is not a law, or acts in series with a signal.
+        If it is not a law, or acts in series with a signal; if `by` is no name.
     """
+    check_signal(by)
     return _scaled(_check_force(law), by)
 
 
@@ -159,8 +160,9 @@ def scheduled(law: type[Law], by: str, profile: str = "linear") -> type[Law]:
     Raises
     ------
     InputError
-        If it is not a law, or acts in series with a signal, or there is no such profile.
+        If it is not a law, or acts in series with a signal; if `by` is no name, or there is no such profile.
     """
+    check_signal(by)
     return _scheduled(_check_force(law), by, _check_profile(profile, SCHEDULES))
 
 
@@ -208,8 +210,9 @@ def varying(by: str, profile: str = "tilt") -> type[Law]:
     Raises
     ------
     InputError
-        If there is no such profile.
+        If `by` is no name, or there is no such profile.
     """
+    check_signal(by)
     return _scheduled(VaryingParameter, by, _check_profile(profile, VARIATIONS))
 
 
@@ -224,7 +227,13 @@ def heated(by: str) -> type[Law]:
     ----------
     by : str
         A state or an input of the simulator.
+
+    Raises
+    ------
+    InputError
+        If `by` is no name.
     """
+    check_signal(by)
     return _heated(by)
 
 

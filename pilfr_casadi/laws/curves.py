@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from ..models import Parameter
-from .base import Law, Local, continue_along_tangents, size_to_power
+from .base import Law, Local, continue_along_tangents, signed_power, size_to_power
 
 LINEAR_POWER = 0.03  # difference of a power from one, below which it is a gain
 NARROW_RANGE = 0.05  # half the range over its middle, below which any curve is a gain and an offset
@@ -118,7 +118,7 @@ class Power(Polynomial):
     ranges = {"n": ("", 0.3, 5.0)}
 
     def force(self, z: Any, p: Any) -> Any:
-        return p.a * ca.sign(z) * size_to_power(z, p.n)
+        return p.a * signed_power(z, p.n)
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether the power is about one, so that it is a gain, as from a wrong unit."""
@@ -265,12 +265,10 @@ class AsymmetricSaturation(Saturation):
         "low": lambda at: (at.low - 0.1 * at.half, at.middle),
         "high": lambda at: (at.middle, at.high + 0.1 * at.half),
     }
+    as_base = {"low": lambda own: -own["L"], "high": lambda own: own["L"]}
 
     def force(self, z: Any, p: Any) -> Any:
         return ca.fmax(ca.fmin(z, p.high), p.low) - z
-
-    def as_base(self, own: Mapping[str, Any]) -> dict[str, Any]:
-        return {"low": -own["L"], "high": own["L"]}
 
 
 class SoftSaturation(Saturation):
@@ -341,12 +339,10 @@ class AsymmetricDeadZone(DeadZone):
     units = {"g_1": "z", "g_2": "z"}
     starts = dict.fromkeys(units, ("reach", 0.02, 0.15, 0.35))
     ranges = dict.fromkeys(units, ("reach", 0.0, 0.8))
+    as_base = dict.fromkeys(units, lambda own: own["g"])
 
     def force(self, z: Any, p: Any) -> Any:
         return -ca.fmax(ca.fmin(z, p.g_2), -p.g_1)
-
-    def as_base(self, own: Mapping[str, Any]) -> dict[str, Any]:
-        return {"g_1": own["g"], "g_2": own["g"]}
 
     def why_not(self, local: Local) -> str:
         return "" if local.low < 0 < local.high else "one side is never visited"

@@ -30,7 +30,7 @@ def unit_forces(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.
     if not shapes:
         return np.zeros((len(local.z), 0, count_columns(law)))
     kind: Any = type(law)
-    if law.in_line or law.carried_by:
+    if hasattr(kind, "forces_along"):  # not a force of the present signals alone
         return np.asarray(kind().forces_along(local, shapes))
     if law.scaled_by or law.scheduled_by:
         bare = unit_forces(kind.__base__(), local, [{k: s[k] for k in kind.__base__.units if k in s} for s in shapes])

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from ..models import play
-from .base import Law, Local, size_to_power
+from .base import Law, Local, signed_power
 
 FALL = 0.05  # smallest excess of the peak of a falling friction over the friction that is left at high speed
 SPRINGY = 0.08  # threshold of presliding over half the travel; above it the element is a stop of a hysteresis
@@ -252,12 +252,10 @@ class PowerDrag(QuadraticDrag):
     units = {"c_n": "w*s^n/z^n", "n": ""}
     starts = {"n": ("", 1.3, 1.6, 2.5)}
     ranges = {"n": ("", 1.15, 4.0)}
+    as_base = {"c_n": lambda own: own["c_2"], "n": 2.0}
 
     def force(self, dz: Any, p: Any) -> Any:
-        return p.c_n * ca.sign(dz) * size_to_power(dz, p.n)
-
-    def as_base(self, own: Mapping[str, Any]) -> dict[str, Any]:
-        return {"c_n": own["c_2"], "n": 2.0}
+        return p.c_n * signed_power(dz, p.n)
 
 
 class CubicDamping(Law):

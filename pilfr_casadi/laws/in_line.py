@@ -33,24 +33,20 @@ class _InLine(Law):
         """Say why the law cannot stand in line with the port's term; empty if it can."""
         if local.term is None:
             return "the port names no term of the equations"
-        given = _term_along(local)
-        if not np.all(np.isfinite(given)):  # the simulator divides by a parameter that is zero
+        if not np.all(np.isfinite(local.given)):  # the simulator divides by a parameter that is zero
             return "the term is not finite"
-        moved = not _alike(local.term(local.z + local.half, local.dz), given)
+        moved = not _alike(local.term(local.z + local.half, local.dz), local.given)
         if self.position is not None and moved is not self.position:
             return f"the term {'varies' if moved else 'does not vary'} with the coordinate"
         return super().why_not(local)
 
-    def inner(self, local: Local, shape: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinate and rate (M,) of the term along a port's signals."""
+    def change(self, local: Local, shape: Mapping[str, Any]) -> np.ndarray:
+        """Change w (M,) of the term's force along a port's signals; roughly, because it only ranks laws."""
         raise NotImplementedError
 
     def forces_along(self, local: Local, shapes: Sequence[Mapping[str, Any]]) -> np.ndarray:
-        """Forces along a port's signals, shape (M, len(shapes), 1); roughly, because they only rank laws."""
-        assert local.term is not None
-        before = local.term(local.z, local.dz)
-        found = [local.term(*self.inner(local, shape)) - before for shape in shapes]
-        return np.column_stack(found)[:, :, None]
+        """Compute the changes for several shapes, (M, len(shapes), 1)."""
+        return np.column_stack([self.change(local, shape) for shape in shapes])[:, :, None]
 
 
 class LineGap(_InLine):
@@ -70,10 +66,11 @@ class LineGap(_InLine):
     def force(self, z: Any, dz: Any, p: Any, term: Any) -> Any:
         return term(*beyond_gap(z, dz, p.g)) - term(z, dz)
 
-    def inner(self, local: Local, shape: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Travel beyond the gap, and its rate."""
+    def change(self, local: Local, shape: Mapping[str, Any]) -> np.ndarray:
+        """Change by the travel beyond the gap."""
+        assert local.term is not None
         travel, rate = beyond_gap(ca.DM(local.z), ca.DM(local.dz), shape["g"])
-        return travel.full().ravel(), rate.full().ravel()
+        return local.term(travel.full().ravel(), rate.full().ravel()) - local.given
 
 
 class Compliance(_InLine):
@@ -106,11 +103,11 @@ class Compliance(_InLine):
         rest = term(q, 0)
         return (p.k * (z - q) - rest) / (term(q, 1) - rest)
 
-    def inner(self, local: Local, shape: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Travel minus the deflection of the spring under the present load."""
+    def change(self, local: Local, shape: Mapping[str, Any]) -> np.ndarray:
+        """Change by the deflection of the spring under the present load."""
         assert local.term is not None
-        inner = local.z - local.term(local.z, local.dz) / shape["k"]
-        return inner, np.gradient(inner, local.dt)
+        inner = local.z - local.given / shape["k"]
+        return local.term(inner, np.gradient(inner, local.dt)) - local.given
 
 
 class ElasticDrive(SprungMass, _InLine):
@@ -147,15 +144,10 @@ class ElasticDrive(SprungMass, _InLine):
         """Rates of the rotor's angle and of its speed over W."""
         return ca.vertcat(p.W * q[1], p.W * (self.pull(z, dz, q, p) - term(q[0], p.W * q[1]) / p.k))
 
-    def forces_along(self, local: Local, shapes: Sequence[Mapping[str, Any]]) -> np.ndarray:
-        """Forces of inertia of the rotor, which lies ahead of the joint by the spring's deflection."""
-        assert local.term is not None
-        ahead = -local.term(local.z, local.dz)
-        found = []
-        for shape in shapes:
-            rate = local.dz + np.gradient(ahead / shape["k"], local.dt)
-            found.append(shape["k"] / shape["W"] ** 2 * np.gradient(rate, local.dt))
-        return np.column_stack(found)[:, :, None]
+    def change(self, local: Local, shape: Mapping[str, Any]) -> np.ndarray:
+        """Force of inertia of the rotor, which lies ahead of the joint by the spring's deflection."""
+        rate = local.dz + np.gradient(-local.given / shape["k"], local.dt)
+        return np.asarray(shape["k"] / shape["W"] ** 2 * np.gradient(rate, local.dt))
 
 
 class ElasticDriveSeenAtLoad(ElasticDrive):
@@ -178,8 +170,7 @@ class TermLimit(_InLine):
     def why_not(self, local: Local) -> str:
         if found := super().why_not(local):
             return found
-        given = np.abs(_term_along(local))
-        hardly_acts = not np.ptp(_term_along(local)) > 0 or not np.quantile(given, REACHED) > 0
+        hardly_acts = not np.ptp(local.given) > 0 or not _size(local) > 0
         return "the term is constant, or zero nearly always" if hardly_acts else ""
 
     def force(self, given: Any, p: Any) -> Any:
@@ -189,11 +180,9 @@ class TermLimit(_InLine):
         """Limit the term's force."""
         raise NotImplementedError
 
-    def forces_along(self, local: Local, shapes: Sequence[Mapping[str, Any]]) -> np.ndarray:
-        """Forces along a port's signals, shape (M, len(shapes), 1)."""
-        given = _term_along(local)
-        found = [np.asarray(self.limited(ca.DM(given), Named("parameter", shape))).ravel() - given for shape in shapes]
-        return np.column_stack(found)[:, :, None]
+    def change(self, local: Local, shape: Mapping[str, Any]) -> np.ndarray:
+        """Change by the limits."""
+        return np.asarray(self.limited(ca.DM(local.given), Named("parameter", shape))).ravel() - local.given
 
 
 class LimitedTerm(TermLimit):
@@ -205,8 +194,8 @@ class LimitedTerm(TermLimit):
     units = {"low": "w", "high": "w"}
     strength: ClassVar[tuple[str, ...]] = ()  # the force is not linear in the limits
     starts = {
-        "low": lambda at: np.quantile(_term_along(at), (0.0, 0.02, 0.1, 0.3)),
-        "high": lambda at: np.quantile(_term_along(at), (1.0, 0.98, 0.9, 0.7)),
+        "low": lambda at: np.quantile(at.given, (0.0, 0.02, 0.1, 0.3)),
+        "high": lambda at: np.quantile(at.given, (1.0, 0.98, 0.9, 0.7)),
     }
     ranges = {
         "low": lambda at: (_reach(at, 0.0, -0.1), _reach(at, 0.5)),
@@ -217,7 +206,7 @@ class LimitedTerm(TermLimit):
         return ca.fmax(ca.fmin(given, p.high), p.low)
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        """Generate limits of which at least one is reached."""
+        """Generate the pairs of limits, except the one that is never reached."""
         _, *reached = super().shapes(local)
         yield from reached
 
@@ -230,29 +219,26 @@ class SoftlyLimitedTerm(TermLimit):
     sentence = "saturation of a modelled force F: it approaches a limit gradually"
     units = {"L": "w"}
     strength: ClassVar[tuple[str, ...]] = ()  # the force is not linear in the limits
-    starts = {"L": lambda at: float(np.quantile(np.abs(_term_along(at)), REACHED)) * np.array([0.3, 0.6, 1.0, 2.0])}
-    ranges = {"L": lambda at: float(np.quantile(np.abs(_term_along(at)), REACHED)) * np.array([0.1, 10.0])}
+    starts = {"L": lambda at: _size(at) * np.array([0.3, 0.6, 1.0, 2.0])}
+    ranges = {"L": lambda at: _size(at) * np.array([0.1, 10.0])}
 
     def limited(self, given: Any, p: Any) -> Any:
         return p.L * ca.tanh(given / p.L)
 
 
-def _term_along(local: Local) -> np.ndarray:
-    """Force of the term along a port's signals; zero if the port names none."""
-    return np.zeros(len(local.z)) if local.term is None else local.term(local.z, local.dz)
-
-
 def _reach(local: Local, share: float, beyond: float = 0.0) -> float:
     """A quantile of the term's force, moved by a share of its span."""
-    given = _term_along(local)
-    return float(np.quantile(given, share) + beyond * np.ptp(given))
+    return float(np.quantile(local.given, share) + beyond * np.ptp(local.given))
+
+
+def _size(local: Local) -> float:
+    """Size of the term, without its rare peaks."""
+    return float(np.quantile(np.abs(local.given), REACHED))
 
 
 def _stiffness(local: Local) -> float:
     """Size of the term over the size of the coordinate."""
-    if local.term is None:
-        return 1.0
-    return float(np.quantile(np.abs(local.term(local.z, local.dz)), 0.99)) / local.half or 1.0
+    return _size(local) / local.half or 1.0
 
 
 def _alike(one: np.ndarray, other: np.ndarray) -> bool:

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import casadi as ca
-
-from .base import Law, Local, size_to_power
+from .base import Law, Local, signed_power
 
 ROOM = 293.0  # temperature of the surroundings that is tried first, K
 COLDEST = 150.0  # K, below which a temperature counts as a difference and not as absolute
@@ -71,4 +69,4 @@ class Convection(Law):
         return not low < float(values["n"]) < high
 
     def force(self, z: Any, p: Any) -> Any:
-        return p.h * ca.sign(z) * size_to_power(z, p.n)
+        return p.h * signed_power(z, p.n)

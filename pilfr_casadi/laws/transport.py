@@ -11,7 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .base import Law, Local, rename_class
+from .base import Law, Local, check_signal, rename_class
 
 ORDER = 6  # of the approximant, and states of the law; more follow sharper steps
 RATE = 8.0  # the size of its poles; it scales the states to about the size of the signal
@@ -96,7 +96,13 @@ def carried(by: str) -> type[Law]:
     ----------
     by : str
         An input of the simulator, the rate of flow; where it is negative, nothing flows.
+
+    Raises
+    ------
+    InputError
+        If `by` is no name.
     """
+    check_signal(by)
     return _carried(by)
 
 

@@ -378,16 +378,25 @@ class Equations:
         taken = {target for port, target in zip(ports, targets, strict=True) if port.term is not None}
         out = []
         for port, target in zip(ports, targets, strict=True):
-            if target not in taken and (drive := self._find_drive(port, *at)) is not None:
-                taken.add(target)
-                port = replace(port, term=drive, implied="drive")
-            elif target not in taken and (balance := self._find_balance(port, *at)) is not None:
-                taken.add(target)
-                port = replace(port, term=balance, implied="balance")
+            for kind, find in (("drive", self._find_drive), ("balance", self._find_balance)):
+                if target not in taken and (term := find(port, *at)) is not None:
+                    taken.add(target)
+                    port = replace(port, term=self._make_expression(term, *at[:3]), found=kind)
             out.append(port)
         return tuple(out)
 
-    def _find_drive(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Expression | None:
+    def _make_expression(self, value: Any, x: Named, u: Named, p: Named) -> Expression:
+        """Make a function of states, inputs and parameters from an expression in their symbols."""
+        of = ca.Function("term", [stack(x), stack(u), stack(p)], [value])
+        names = self.states, self.inputs, tuple(self.parameters)
+
+        def evaluate(x: Named, u: Named, p: Named) -> Any:
+            sides = zip((x, u, p), names, strict=True)
+            return of(*(ca.vertcat(*(ca.vec(ca.SX(one[n])) for n in some)) for one, some in sides))
+
+        return evaluate
+
+    def _find_drive(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Any:
         """Return the force of a drive at a port, with the sign of w; None if none acts on a position there.
 
         A drive acts by inputs, and by states that only inputs move, such as the lagged torque of an actuator.
@@ -404,20 +413,14 @@ class Equations:
             actuators -= coupled
             mechanism += [x[n] for n in coupled]
         forces = [n for n in self.inputs if not is_motion(self.units.get(n, ""))]
-        own = sorted(actuators)
-        slope = ca.jacobian(rates[speed], ca.vertcat(*(u[n] for n in forces), *(x[n] for n in own))) / into[speed]
-        if not slope.nnz() or ca.depends_on(slope, ca.vertcat(stack(u), *(x[n] for n in own), t)):
+        lagged = [x[n] for n in sorted(actuators)]
+        driving = ca.vertcat(*(u[n] for n in forces), *lagged)
+        slope = ca.jacobian(rates[speed], driving) / into[speed]
+        if not slope.nnz() or ca.depends_on(slope, ca.vertcat(stack(u), *lagged, t)):
             return None
-        of = ca.Function("slope", [stack(x), stack(p)], [slope])
+        return ca.mtimes(slope, driving)
 
-        def drive(x: Named, u: Named, p: Named) -> Any:
-            states = ca.vertcat(*(x[n] for n in self.states))
-            values = ca.vertcat(*(ca.vec(ca.SX(p[n])) for n in self.parameters))
-            return ca.mtimes(of(states, values), ca.vertcat(*(u[n] for n in forces), *(x[n] for n in own)))
-
-        return drive
-
-    def _find_balance(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Expression | None:
+    def _find_balance(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Any:
         """Return all that changes a state which a port's force changes at once, with the sign of w.
 
         None if the port's coordinate is no such state, if no input drives it, or if the force acts with a factor that
@@ -430,14 +433,7 @@ class Equations:
         rate = self.by_state(self.derivatives(x, u, p, t))[name]
         if not ca.depends_on(rate, stack(u)) or ca.depends_on(rate / factor, ca.vertcat(t)):
             return None
-        of = ca.Function("balance", [stack(x), stack(u), stack(p)], [rate / factor])
-        names = self.states, self.inputs, tuple(self.parameters)
-
-        def balance(x: Named, u: Named, p: Named) -> Any:
-            sides = zip((x, u, p), names, strict=True)
-            return of(*(ca.vertcat(*(ca.vec(ca.SX(one[n])) for n in some)) for one, some in sides))
-
-        return balance
+        return rate / factor
 
     @cached_property
     def state_units(self) -> dict[str, str]:

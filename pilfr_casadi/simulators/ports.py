@@ -102,8 +102,8 @@ class Port:
         compliance, a rotor on a spring) are then tried: they change its z and dz.
         If no term is given, the force of a drive is found in the equations; where a force changes z at once, as in a
         drive of first order, all that changes z is the term.
-    implied : {"", "drive", "balance"}
-        What the simulator has found as `term` in its equations, if none is given.
+    found : {"", "drive", "balance"}
+        Kind of the term that the simulator has found in its equations, if none is given.
     series : bool
         A law acts on a signal, as at an actuator or a sensor; of built-in ports.
     domain : {"mechanical", "thermal", "electrical", "fluid", "unknown"}, optional
@@ -131,7 +131,7 @@ class Port:
     domain: str = ""
     signals: Mapping[str, Expression] = field(default_factory=dict)
     term: Expression | None = None
-    implied: str = ""
+    found: str = ""
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -193,7 +193,7 @@ class Port:
 
     def has_term_for(self, law: Any) -> bool:
         """Tell whether it has the force that a law in line needs: its own term, or one found in the equations."""
-        return self.term is not None and self.implied in ("", law.implied)
+        return self.term is not None and self.found in ("", law.implied)
 
     def admits(self, law: Any) -> bool:
         """Tell whether a law (or its class) may be missing here: by its places, physical domains and coordinate.

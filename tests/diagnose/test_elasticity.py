@@ -115,7 +115,7 @@ def recorded_axis(sensors, seed=1, samples=3000):
 def test_the_force_of_a_drive_is_found_in_the_equations():
     own, given = axis(("motor",)), axis(("motor",), term=lambda u: -u.torque)
     port, declared = own.port("axis"), given.port("axis")
-    assert port.implied and not declared.implied
+    assert port.found and not declared.found
     alike = [
         s.with_element("axis", ElasticDrive().at({"k": 12.0, "W": 40.0, "D": 0.05})).simulate(recorded_axis(("motor",)))
         for s in (own, given)
@@ -125,14 +125,14 @@ def test_the_force_of_a_drive_is_found_in_the_equations():
     with pytest.raises(InputError, match="names none"):
         own.with_element("axis", LineGap())
     lagged = elastic_joint.simulator({"J": 0.02, "d": 0.2, "F_c": 0.3, "T": 0.003}, "link")
-    assert lagged.port("joint").implied  # by a state that only the input moves
-    assert not cart(ports=(replace(GROUND, domain="electrical"),)).port("ground").implied
+    assert lagged.port("joint").found  # by a state that only the input moves
+    assert not cart(ports=(replace(GROUND, domain="electrical"),)).port("ground").found
 
 
 def test_the_motion_of_the_ground_is_no_drive():
     rig = cart()
     moved = replace(rig, units={"force": "m"}, ports=(GROUND,))
-    assert rig.port("ground").implied and not moved.port("ground").implied
+    assert rig.port("ground").found and not moved.port("ground").found
 
 
 def test_one_of_two_sensors_is_on_the_far_side():

@@ -51,20 +51,20 @@ def recorded(seed, limited=True, samples=600):
 
 def test_the_balance_of_a_driven_lag_is_the_term_of_its_port():
     port = drive().port("equation:speed")
-    assert port.implied == "balance" and port.admits(LimitedTerm) and not port.admits(ElasticDrive)
+    assert port.found == "balance" and port.admits(LimitedTerm) and not port.admits(ElasticDrive)
     declared = Port("rotor", lambda p: {"speed": -1 / p.lag}, lambda x: x.speed)
-    assert drive(ports=(declared,)).port("rotor").implied == "balance"
+    assert drive(ports=(declared,)).port("rotor").found == "balance"
     # what no input drives, and a force on something else, are no term
     coasting = Simulator(lambda x: {"speed": -x.speed}, lambda x: {"y": x.speed}, states=("speed",))
-    assert not coasting.port("equation:speed").implied
+    assert not coasting.port("equation:speed").found
     elsewhere = replace(declared, across=lambda x: 2 * x.speed)
-    assert not drive(ports=(elsewhere,)).port("rotor").implied
+    assert not drive(ports=(elsewhere,)).port("rotor").found
 
 
 @pytest.mark.parametrize("into", [lambda u: {"speed": -u.voltage}, lambda x, p: {"speed": -x.speed / p.lag}])
 def test_a_balance_is_not_divided_by_a_factor_that_may_pass_through_zero(into):
     declared = Port("rotor", into, lambda x: x.speed)
-    assert not drive(ports=(declared,)).port("rotor").implied
+    assert not drive(ports=(declared,)).port("rotor").found
 
 
 @pytest.mark.parametrize("law", [LimitedTerm, SoftlyLimitedTerm])
@@ -89,7 +89,7 @@ def test_a_law_with_the_old_spelling_of_its_implied_term_stands_at_a_drive():
         id, units, in_line, driven = "slack", {"g": "w"}, True, True
 
     axis = Simulator(lambda x, u: {"x": x.v, "v": u.f}, lambda x: {"x": x.x}, states=("x", "v"), inputs=("f",))
-    assert axis.port("equation:v").admits(Slack) and axis.port("equation:v").implied == "drive"
+    assert axis.port("equation:v").admits(Slack) and axis.port("equation:v").found == "drive"
 
 
 def test_a_limit_stands_beside_any_other_law_of_its_port():

@@ -31,10 +31,13 @@ from pilfr_casadi.laws import (
     UnreadInput,
     ViscousDamping,
     behind_gap,
+    carried,
+    heated,
     likely_profiles,
     scaled,
     scheduled,
     unit_forces,
+    varying,
 )
 from pilfr_casadi.models import Named
 
@@ -309,6 +312,11 @@ def test_only_inputs_that_no_equation_reads_are_tried_as_scales():
         (lambda: behind_gap(Relaxation), "states of its own"),
         (lambda: behind_gap(SoftClearance), "a gap of its own"),
         (lambda: behind_gap(Drift), "reads more than z and dz"),
+        (lambda: scaled(CoulombFriction, ""), "by = '' was given; give the name of a signal"),
+        (lambda: scheduled(CoulombFriction, ""), "by = '' was given; give the name of a signal"),
+        (lambda: varying(""), "by = '' was given; give the name of a signal"),
+        (lambda: heated(""), "by = '' was given; give the name of a signal"),
+        (lambda: carried(""), "by = '' was given; give the name of a signal"),
     ],
 )
 def test_what_cannot_be_composed_is_said(compose, sentence):

@@ -372,6 +372,12 @@ def test_values_that_a_law_cannot_have(given, says):
         Clearance(**given)
 
 
+@pytest.mark.parametrize("kind", [laws.LimitedTerm, laws.AsymmetricSaturation])
+def test_a_lower_limit_above_the_upper_one_is_refused(kind):
+    with pytest.raises(InputError, match=r"has low = 2.0 above high = 1.0; give them in order"):
+        kind({"low": 2.0, "high": 1.0})
+
+
 def test_a_layer_refuses_weights_for_another_number_of_plays():
     with pytest.raises(InputError, match=r"has 6 values of w; 3 were given. Give one number for all, or one for each."):
         StopHysteresis().at({"w": [1.0, 2.0, 3.0]}).parameters()

@@ -100,7 +100,7 @@ class Gate:
         return replace(bench, recordings=recordings, scale=output_deviation(recordings))
 
     def apply_to_whole(self, whole: list[Recording], places: Sequence[tuple[int, int]]) -> list[Recording]:
-        """Return the recordings corrected of which stretches were checked, each from (recording, sample) on."""
+        """Correct whole recordings whose stretches were checked; `places` are their (recording, first sample)."""
         return list(map(self.edit, whole)) if self.corrected else whole
 
     def kept(self, r: Recording) -> slice:

@@ -1,8 +1,8 @@
 """Constant errors of recordings: offsets of channels, and wrong initial states.
 
 An offset that all recordings share becomes a parameter of the simulator, because a constant load has the same effect.
-Offsets that differ between the recordings are subtracted. A constant of an output may equal one of an input, which is
-told instead if the output's is larger than its deviation, or a constant load, which is told beside it.
+Offsets that differ between the recordings are subtracted. If an output's constant is larger than its deviation, one of
+an input that looks the same is reported instead. A constant load that looks the same is reported as well.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def find_wrong_start(now: Checked) -> Checked:
     """Estimate the initial states if the stated ones contradict the first samples more than a sensor's zero could.
 
     Missing dynamics cannot contradict a first sample. If the sensor's zero is wrong instead, it is wrong by that miss.
-    So both explanations begin at the first sample, and the one with which the refit follows better is told.
+    So both explanations begin at the first sample, and the refit decides which one is reported.
     """
     bench, misses = now.bench, _missed_starts(now)
     stated = [r for r in bench.recordings if r.begins in ("zero", "given")]

@@ -1,4 +1,4 @@
-"""Coloured noise: autoregressive models of residuals, with which slow noise is told from missing physics.
+"""Coloured noise: autoregressive models of residuals, to tell slow noise from missing physics.
 
 Neighbouring samples of slow noise are alike, so that a force or a law follows it a little wherever it is flexible. Its
 innovations are not alike, and no force follows them. A residual e of noise alone is taken as

@@ -99,7 +99,7 @@ UNKNOWN_SHARE = 1e-6  # squared share of a parameter in an unknown combination; 
 # Test recordings that go beyond the training recordings, where a correction extrapolates
 BEYOND_RANGE = 0.1  # distance from a channel's trained range, over the range, that counts
 NEW_DENSITY = 0.01  # trained over tested spectral density, both normalised, below which a frequency is new: 10 in size
-NEW_SHARE = 0.5  # share of an input's variance at new frequencies that is told: more than half
+NEW_SHARE = 0.5  # share of an input's variance at new frequencies that is reported: more than half
 
 # Held-out data
 FOLDS, ROUNDS = 4, 2  # folds, and blocks of a recording in each fold: eight blocks, spread over the recording
@@ -348,7 +348,7 @@ def _widths(fitted: Fitted, laws: Sequence[Placed], free: np.ndarray, square: np
 
 
 def prior_width(size: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Compute the prior standard deviations of values (n,) of a given size, of which only the bounds are known.
+    """Compute the prior standard deviations of values (n,) from their sizes and their bounds alone.
 
     The prior is uniform between the bounds, in logarithms if these span more than a decade. Without bounds the
     deviation is the size.

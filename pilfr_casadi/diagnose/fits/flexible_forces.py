@@ -25,7 +25,7 @@ from .workbench import Fitted, Workbench
 DEGREE = 4  # of the flexible surface
 # degrees in z and dz/dt of the surface's terms
 TERMS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j)
-# product of samples and squared number of states for a flexible force: that of more than LEAST_SAMPLES, and of any
+# limits of samples times squared number of states: of the time beyond LEAST_SAMPLES, and of memory in any case
 MOST_WORK, LEAST_SAMPLES, MOST_MEMORY = 600_000, 2500, 100_000_000
 
 

@@ -242,11 +242,11 @@ def signals_along(bench: Workbench, fitted: Fitted, number: int = -1) -> tuple[n
 
 
 def is_curve(z: np.ndarray, w: np.ndarray) -> bool:
-    """Tell whether a force w (M,) is a function of the coordinate z (M,) alone, as that of memory which is not shown.
+    """Tell whether a force w (M,) is a function of the coordinate z (M,) alone, so that no memory shows.
 
-    It has one value at each level of z then, as of a held input. In the order of z, each force lies between those of
-    its neighbours, or near them. Elsewhere the neighbours come from another branch. Of samples that nearly repeat each
-    other, as over many periods, one counts: they would be each other's neighbours.
+    Then it has one value at each level of z. In the order of z, each force lies between those of its neighbours, or
+    near them. Elsewhere the neighbours come from another branch. Of samples that nearly repeat each other, as over many
+    periods, one counts: they would be each other's neighbours.
     """
     finite = np.isfinite(z) & np.isfinite(w)
     if np.sum(finite) < 3 or np.ptp(z[finite]) == 0 or np.ptp(w[finite]) == 0:

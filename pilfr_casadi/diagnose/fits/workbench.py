@@ -165,11 +165,7 @@ class Workbench:
         """Return the bench with each hold of the inputs next to its own in HOLDS: these are most like it."""
         at = HOLDS.index(self.hold)
         near = HOLDS[max(at - 1, 0) : at + 2]
-        return [self.with_hold(hold) for hold in near if hold in among and hold not in (None, self.hold)]
-
-    def with_hold(self, hold: str) -> Workbench:
-        """Return the bench with another hold of the inputs between samples."""
-        return replace(self, hold=hold)
+        return [replace(self, hold=hold) for hold in near if hold in among and hold not in (None, self.hold)]
 
     def on(self, recordings: Sequence[Recording]) -> Workbench:
         """Return the bench with other recordings; errors stay in units of the training outputs' deviation."""

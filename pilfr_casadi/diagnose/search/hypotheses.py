@@ -257,10 +257,9 @@ class Hypotheses:
         if known is None:
             alike = [t for t in self.memo.values() if t.key < trial.key and t.thorough and self._alike(t, trial)]
             shown = min([*alike, trial], key=lambda t: len(t.key))
-            known = self.findings[shown.key].held_out
-            spread = self.spread_of(shown)
-            known = known or held_out_errors(self.bench, shown.fitted, self.workers)
+            known = self.findings[shown.key].held_out or held_out_errors(self.bench, shown.fitted, self.workers)
             if np.isfinite(known.rms) or not self.past_deadline:  # otherwise the time was over before they were known
+                spread = self.spread_of(shown)
                 for key in (shown.key, trial.key):
                     self.findings[key].held_out, self.findings[key].spread = known, spread
         return known

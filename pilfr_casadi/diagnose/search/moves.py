@@ -10,66 +10,37 @@ count in the posterior (`hypotheses`).
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..._base import InputError, side_by_side
-from ...laws import (
-    FINER,
-    LINEAR,
-    SCALABLE,
-    VARIATIONS,
-    Law,
-    VaryingParameter,
-    constant,
-    heated,
-    likely_profiles,
-    scheduled,
-    varying,
-)
-from ...simulators import ACTUATOR, PARAMETER, SENSOR, Placed, in_series, kind_of, name_at, port_name
+from ..._base import InputError
+from ...laws import constant
+from ...simulators import ACTUATOR, PARAMETER, SENSOR, kind_of, name_at, port_name
 from ..faults.gates import CLEARLY_BETTER, Checked, Gate
 from ..faults.timing import TimeShift, find_time_shift
-from ..fits.evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR, NEAR_RATIO
+from ..fits.evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR
 from ..fits.floor import ABOVE_NOISE
 from ..fits.linearise import linearise_runs
-from ..fits.screen import Remainder, Scored, screen, usable
+from ..fits.screen import Remainder, Scored
 from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted, refit, refit_with_other_holds
-from .hypotheses import Hypotheses
+from .forms import Forms, is_filter, may_stand_beside
 from .learned import learn_forces, nearest_to_learned
-from .relatives import choose_pairs, complements, fit_pair, in_place_of_variation, relatives
-from .trials import Effort, Key, Trial, place_law, select_pairs
-
-T = TypeVar("T")
-R = TypeVar("R")
+from .relatives import choose_pairs, fit_pair, relatives
+from .trials import Effort, Trial
 
 # Effort
-MOST_CONVERGED = 5  # trials of a move that are fitted to convergence at most
 NEARLY_EXPLAINED = 0.05  # share of the excess left by one law below which far worse laws are not refined
 TWO = "two at once"  # a stage, entered once
 MOST_LEARNED = 2  # learned forces that are kept: those with the smallest error
 
 
-@dataclass(frozen=True, eq=False)
-class Move:
-    """One move of the search: its parent hypothesis, the screen's scores, and the trials, best first."""
-
-    parent: Trial
-    scored: tuple[Scored, ...]
-    trials: tuple[Trial, ...]
-
-
 @dataclass(eq=False, repr=False)
-class Search(Hypotheses):
+class Search(Forms):
     """A search, filled by `run`."""
 
-    moves: list[Move] = field(default_factory=list)  # the moves, in their order
     aligned: bool = False  # whether the times of the channels are settled, so that no shift is looked for
     shift: Gate | None = None  # the shift of a channel that ended the search, because it shows only beside a law
     better_hold: str = ""  # the hold of the inputs that ended the search, because it proved better
@@ -81,9 +52,9 @@ class Search(Hypotheses):
         with self.until_interrupted():
             self.estimate_noise()
             if not self.interrupted:
-                self._grow(effects)
-                self._name_rest(effects)
-                self._finish(effects)
+                self._grow()
+                self._name_rest()
+                self._finish()
         if self.interrupted:
             self.forget_held_out()
         return self
@@ -93,11 +64,11 @@ class Search(Hypotheses):
         """Whether the search goes no further: it has to be repeated with another hold or with a channel shifted."""
         return bool(self.better_hold) or self.shift is not None
 
-    def resume(self, effects: float) -> None:
+    def resume(self) -> None:
         """Continue with the present hold because the other is no better, unless the search was interrupted."""
         self.hold_stated = True
         if not self.interrupted:
-            self.run(effects)
+            self.run(self.most_effects)
 
     def adopt(self, other: Trial) -> None:
         """Fit the laws of another search's hypothesis to these recordings, from its values, and keep the fit."""
@@ -106,17 +77,7 @@ class Search(Hypotheses):
             if there.mean_square < DIVERGED:
                 self.keep(self.fits.polish(there))
 
-    @property
-    def moves_by_parent(self) -> list[Move]:
-        """The moves, those from one hypothesis together, with the best fit of each trial once, smallest error first."""
-        found = dict[Key, tuple[Trial, dict[Key, Trial]]]()
-        for move in self.moves:
-            own = found.setdefault(move.parent.key, (move.parent, {}))[1]
-            own |= {t.key: self.memo.get(t.key, t) for t in move.trials}
-        ranked = ((parent, sorted(trials.values(), key=lambda t: t.error)) for parent, trials in found.values())
-        return [Move(parent, (), tuple(trials)) for parent, trials in ranked if trials]
-
-    def _grow(self, effects: float, varied: bool = False) -> None:
+    def _grow(self, varied: bool = False) -> None:
         """Add effects while that pays; end as soon as the other hold, or a channel's shift, proves better.
 
         A parameter that varies can imitate many laws. So hypotheses with one are a basis for more only if `varied`.
@@ -124,8 +85,8 @@ class Search(Hypotheses):
         """
         while (
             self.can_improve(self.best)
-            and len((parent := self._parent(varied)).effects) < effects
-            and self._pays(parent)
+            and len((parent := self._parent(varied)).effects) < self.most_effects
+            and self._was_worth_it(parent)
             and (self.may_go_on() or not self.moves)
         ):
             self.add(parent)
@@ -142,11 +103,11 @@ class Search(Hypotheses):
                 self.exchange()
             if len(self._parent(varied).laws) <= len(parent.laws):  # no added law is worth its prior
                 break
-        if effects > 1 and TWO not in self.times and self.can_improve(self.best) and self.may_go_on():
+        if self.most_effects > 1 and TWO not in self.times and self.can_improve(self.best) and self.may_go_on():
             best = self.best
             self.add_two()
             if self.best is not best:
-                self._grow(effects, varied)
+                self._grow(varied)
 
     def _parent(self, varied: bool) -> Trial:
         """Return the best hypothesis, or the best one in which no parameter varies."""
@@ -178,7 +139,7 @@ class Search(Hypotheses):
         if found:  # other laws may stand beside the new one in place of those before
             self.exchange()
 
-    def _name_rest(self, effects: float) -> None:
+    def _name_rest(self) -> None:
         """Try varying parameters and laws near learned forces beside three hypotheses.
 
         These are the simulator, the best one, and the best one without its weakest effect, which may imitate a law that
@@ -192,23 +153,23 @@ class Search(Hypotheses):
         without_weakest = sorted(fewer, key=lambda t: (-len(t.effects), t.mean_square))[:1]
         for name_rest in (self.vary_parameters, self.name_learned):
             for base in {t.key: t for t in (self.root, best, *without_weakest)}.values():
-                if len(base.effects) < effects and self.can_improve(self.best) and self.may_go_on():
+                if len(base.effects) < self.most_effects and self.can_improve(self.best) and self.may_go_on():
                     name_rest(base)
         if self.best is not best:  # laws that were found before may have made up for its last one
             self.exchange()
-            self._grow(effects, varied=True)
+            self._grow(varied=True)
 
-    def _finish(self, effects: float) -> None:
+    def _finish(self) -> None:
         """Look for what the moves before cannot find, and compare the likeliest hypotheses."""
         if self.must_repeat:
             return
-        if len(self.best.effects) < effects:
+        if len(self.best.effects) < self.most_effects:
             self._grow_to_noise()
         self._every_sensor()
         self._leave_out_each()
         self.cross_validate_likeliest()
 
-    def _pays(self, trial: Trial) -> bool:
+    def _was_worth_it(self, trial: Trial) -> bool:
         """Tell whether the last of several laws was worth it; a wrong model gains from any further law."""
         fewer = [t for t in self.memo.values() if t.laws and len(t.effects) < len(trial.effects)]
         return len(trial.effects) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
@@ -255,179 +216,29 @@ class Search(Hypotheses):
 
     def add(self, parent: Trial, few: bool = False) -> None:
         """Fit the laws, or only a few, that the screen selects beside a hypothesis; polish those that may win."""
-        scored, observer_gain = self._standing(parent)
+        scored, observer_gain = self.addable(parent)
         if self.moves and not self.may_go_on():
             return
         enough = float(np.sqrt(self.floor2 + NEARLY_EXPLAINED * max(parent.mean_square - self.floor2, 0.0)))
         trials = self._with_relatives(parent, scored, scored, Effort(observer_gain, enough, few))
         with self.stage("choice"):
-            self._record(parent, scored, trials)
+            self.record(parent, scored, trials)
             self.estimate_noise()
             best = self.best
-            self._finer(parent)
+            self.fit_finer_forms(parent)
             if self.best is not best:
                 self.estimate_noise()
-
-    def _standing(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
-        """Return what was screened beside a hypothesis and may stand beside its laws, and the observer's gain."""
-        scored, observer_gain = self.screened(parent)
-        return [s for s in scored if _may_stand_beside(parent.laws, s.port, s.law)], observer_gain
 
     def _with_relatives(
         self, parent: Trial, selected: Sequence[Scored], scored: Sequence[Scored], effort: Effort
     ) -> list[Trial]:
         """Fit some of the pairs screened, then those to which the best fits of these hypotheses point."""
-        found = self._fitted(parent, selected, effort)
-        trials = sorted(map(self._best_known, found), key=lambda t: t.error)
+        found = self.fit_selected(parent, selected, effort)
+        trials = sorted(map(self.best_known, found), key=lambda t: t.error)
         more = relatives(self.bench, trials, scored) if self.may_go_on() else []
         if more:
-            trials = sorted([*trials, *self._fitted(parent, more, effort)], key=lambda t: t.error)
+            trials = sorted([*trials, *self.fit_selected(parent, more, effort)], key=lambda t: t.error)
         return trials
-
-    def _best_known(self, trial: Trial) -> Trial:
-        """Return the best fit of a trial's hypothesis, whose laws may have been found in another order."""
-        known = self.memo.get(trial.key, trial)
-        if not known.error < trial.error:
-            return trial
-        return known.with_added(trial.pair)
-
-    def _best_with_one_more(self, parent: Trial) -> Trial | None:
-        """Return the best hypothesis if it has one law more than a parent, with that as the added one."""
-        best = self.best
-        added = best.key - parent.key
-        return best.with_added(*added) if len(added) == 1 and parent.key < best.key else None
-
-    def _record(self, parent: Trial, scored: Sequence[Scored], trials: Sequence[Trial]) -> None:
-        """Keep the trials of a move, and note the move."""
-        self._keep_all(trials)
-        self.moves.append(Move(parent, tuple(scored), tuple(trials)))
-
-    def _try(self, base: Trial, entries: Sequence[Scored], observer_gain: np.ndarray | None = None) -> None:
-        """Fit some pairs beside a hypothesis, none of their relatives, and note the move."""
-        self._record(base, entries, self._fitted(base, entries, self._little_effort(observer_gain)))
-
-    def _little_effort(self, observer_gain: np.ndarray | None = None) -> Effort:
-        """Fit few pairs, and refine none far behind one whose error is at the noise."""
-        return Effort(observer_gain, float(np.sqrt(self.floor2)), few=True)
-
-    def _fitted(self, parent: Trial, scored: Sequence[Scored], effort: Effort) -> list[Trial]:
-        began = time.perf_counter()
-        stage = f"fits, effect {len(parent.laws) + 1}" if parent.laws else "fits"
-        pairs = select_pairs(scored, effort.few)
-        trials, tried = self.fits.fit_pairs(parent, pairs, effort, partial(self.say, stage))
-        if not parent.laws:
-            self.tried, self.selected = self.tried + tried, self.selected + len(pairs)
-        self.times["fits"] = self.times.get("fits", 0.0) + time.perf_counter() - began
-        for trial in trials[:FEW] if self.interrupted else ():
-            self.keep(trial)
-        self.bench.interrupt.raise_pending()
-        return trials
-
-    def _keep_all(self, trials: Sequence[Trial]) -> None:
-        """Keep trials, and fit those that may win to convergence."""
-        for trial in trials:
-            self.keep(trial)
-        kept = {t.key: self.memo[t.key] for t in trials}.values()
-        ranked = sorted(kept, key=self.optimistic_evidence, reverse=True)
-        most = min(NEAR_RATIO * ranked[0].error if ranked else np.inf, FAR_RATIO * self.best.error)
-        # after the time of the search, the rest is for the comparison with the refit
-        count = MOST_CONVERGED if time.perf_counter() < self.until else 1
-        # where a brief fit follows the part that it was made to, the rest may only lack convergence
-        near = [t for t in ranked[:count] if not t.thorough and t.least_error < most]
-        converged = self._side_by_side(self.fits.converge, near)
-        converged += filter(None, self._side_by_side(self._reorder, converged))
-        for trial in converged:
-            self.keep(trial)
-        # finer steps are slow, and bring no hypothesis that is far behind to the front
-        least = min([t.error for t in (*converged, self.best)])
-        near = [t for t in converged if t.error < NEAR_RATIO * least]
-        for trial in self._side_by_side(self.fits.refine_knee, near):
-            self.keep(trial)
-
-    def _reorder(self, trial: Trial) -> Trial | None:
-        """Fit a hypothesis with its last law before the others of the same signal.
-
-        A curve behind a lag is not a lag behind a curve (Wiener and Hammerstein models). Only linear laws commute.
-        """
-        *others, last = trial.laws
-        at = next((i for i, e in enumerate(others) if e.port == last.port), None)
-        if at is None or not in_series(last.port) or (_is_filter(last.law) and _is_filter(others[at].law)):
-            return None
-        found = self.run_laws([*others[:at], last, *others[at:]], trial).with_added(trial.pair)
-        return self.fits.converge(found) if found.mean_square < DIVERGED else None
-
-    def _finer(self, parent: Trial) -> None:
-        """Fit the best law of a move in its finer forms; then schedule the strength of the best law that allows it."""
-        best = self._best_with_one_more(parent)
-        if best is not None:
-            self._refine(best, FINER.get(type(best.law), ()))
-        self._vary_strength()
-        best = self._best_with_one_more(parent)
-        by = (best.law.scheduled_by or best.law.scaled_by) if best is not None else ""
-        if best is not None and by and "parallel" in best.law.places and self.may_go_on():
-            kind = constant(type(best.law))
-            self._refine(best, [scheduled(kind, by, p) for p in likely_profiles(kind) if p != best.law.profile])
-        self.replace_variation(parent)
-
-    def _vary_strength(self) -> None:
-        """Let the strength of the likeliest law of the last move that may vary do so, with every signal.
-
-        With the signal found, its other forms may be the physics. A linear law was screened with every signal.
-        """
-        may_vary = [kind for kind in SCALABLE if kind.id not in LINEAR]
-        added = [t for t in self.moves[-1].trials if constant(type(t.law)) in may_vary]
-        kept = [self.memo[t.key].with_added(t.pair) for t in added]  # perhaps found before in another order
-        # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
-        if not kept or not self.can_improve(self.best, self.least_floor) or not self.may_go_on():
-            return
-        likeliest = max(kept, key=self.optimistic_evidence)
-        forms = [t for t in kept if t.law.id == likeliest.law.id and t is not likeliest]
-        entry = self._entry(likeliest)
-        self._vary([likeliest], ("z", *entry.local.inputs) if entry else ())
-        if self.best.laws and self.best.law.scheduled_by:
-            self._vary(forms, (self.best.law.scheduled_by,))
-
-    def _vary(self, trials: Sequence[Trial], signals: Sequence[str]) -> None:
-        """Fit hypotheses with the strength of their added law varying with each signal."""
-        for trial in trials:
-            kind = constant(type(trial.law))
-            self._refine(trial, [scheduled(kind, by, likely_profiles(kind)[0]) for by in signals])
-
-    def _entry(self, trial: Trial) -> Scored | None:
-        """Return how the added law of a trial, or another with the same sense, was first screened at its port.
-
-        None if none was there: the hypothesis comes from another search.
-        """
-        there = [s for move in self.moves for s in move.scored if s.port == trial.port]
-        return min(there, key=lambda s: s.law.dissipative != trial.law.dissipative, default=None)
-
-    def _refine(self, trial: Trial, kinds: Sequence[Any]) -> None:
-        """Fit a hypothesis with its added law in other forms, which start from its values and oppose motion alike.
-
-        The law keeps its place, because laws of one signal act one after the other.
-        """
-        entry, base, law = self._entry(trial), trial.fitted, trial.law
-        if entry is None or not kinds:
-            return
-        if law.dissipative and not entry.sense:
-            total = sum(np.sum(trial.own[name]) for name in law.strength if name not in law.signed)
-            entry = replace(entry, sense=int(np.sign(total)))
-        index = base.simulator.elements.index(trial.element)
-        bare = base.simulator.without_element(index)
-
-        def fit(kind: Any) -> Trial | None:
-            starts = list(kind.finer_starts(trial.law.at(trial.own), entry.local))
-            placed = [place_law(bare, replace(entry, law=kind()), own, index) for own in starts]
-            values = [{**base.values, **named} for _, named in placed]
-            found = self.fits.fit(placed[0][0], values, len(trial.laws), states=base.begin)
-            return found and found.with_added((trial.port, kind))
-
-        found = self._side_by_side(fit, [kind for kind in kinds if usable(kind(), entry.local)])
-        self._keep_all([t for t in found if t is not None])
-
-    def _side_by_side(self, fit: Callable[[T], R], tasks: Iterable[T]) -> list[R]:
-        """Carry out fits on the workers, in order; an interrupt of one ends all."""
-        return side_by_side(fit, tasks, self.workers, self.bench.interrupt)
 
     def learned(self, base: Trial) -> list[Fitted]:
         """Fit learned forces beside a hypothesis, at the most promising ports, to a part of the recordings."""
@@ -444,64 +255,16 @@ class Search(Hypotheses):
 
     def name_learned(self, base: Trial) -> None:
         """Fit the laws whose forces are nearest to those learned beside a hypothesis."""
-        entries, scored = list[Scored](), self._standing(base)[0]
+        entries, scored = list[Scored](), self.addable(base)[0]
         for fitted in self.learned(base):
             port = fitted.simulator.elements[-1].port
             for near in nearest_to_learned(self.fits.part, fitted, self.laws):
                 alike = [s for s in scored if s.port == port and s.law.dissipative == near.kind.dissipative]
-                if alike and _may_stand_beside(base.laws, port, near.kind):
+                if alike and may_stand_beside(base.laws, port, near.kind):
                     entries.append(replace(alike[0], law=near.kind, starts=(near.start,)))
         if entries:
-            effort = self._little_effort()
-            self._record(base, entries, self._with_relatives(base, entries, [*entries, *scored], effort))
-
-    def vary_parameters(self, base: Trial) -> None:
-        """Let parameters of the simulator vary with a signal beside a hypothesis: fit those that explain most."""
-        formulas_leave = self.may_leave()  # no machine follows one exactly
-        known = self.findings[base.key]
-        if VaryingParameter not in self.laws or self.best.mean_square < formulas_leave or known.varied:
-            return
-        known.varied = True
-        signals = ("t", *self.bench.simulator.inputs, *self.bench.simulator.states)
-        laws = [varying(by, profile) for by in dict.fromkeys(signals) for profile in VARIATIONS[:2]]
-        laws += [heated(by) for by in dict.fromkeys(signals[1:])]
-        with self.stage("varying parameters"):
-            scored, observer_gain = screen(self.bench, base.fitted, laws, self.floor.deviation, self.workers)
-            self.note_alternatives(scored)
-        best = list(dict.fromkeys((s.port, s.law.form) for s in scored))[:FEW]
-        taken = {e.port for e in base.laws}
-        entries = [s for s in scored if (s.port, s.law.form) in best and s.port not in taken]
-        if not entries:
-            return
-        self._try(base, entries, observer_gain)
-        self.replace_variation(base)
-        found = self.best
-        if found.laws and kind_of(found.port) == PARAMETER and found.law.scheduled_by:
-            self._curve(base, [s for s in entries if s.pair == found.pair], observer_gain)
-
-    def replace_variation(self, base: Trial) -> None:
-        """Fit laws with constant parameters whose force is like that of the law that the best hypothesis lets vary."""
-        best = self.best
-        known = self.findings[best.key]
-        if known.replaced or not best.laws or best.key - base.key != {best.pair} or base.key - best.key:
-            return
-        if not best.law.scheduled_by or not self.may_go_on():
-            return
-        known.replaced = True
-        entries = in_place_of_variation(self.bench, best, self._standing(base)[0])
-        if entries:
-            self._try(base, entries)
-
-    def _curve(self, base: Trial, entries: Sequence[Scored], observer_gain: np.ndarray | None) -> None:
-        """Let the parameter that varies in the best hypothesis follow a curve of higher degree."""
-        best = self.best
-        # what the curve misses is in no force at a port, so that it may have passed for noise
-        if not (self.can_improve(best, self.least_floor) and self.may_go_on()):
-            return
-        law = varying(best.law.scheduled_by, VARIATIONS[-1])()
-        finer = [replace(s, law=law, starts=(law.starts_as(best.law, best.own),)) for s in entries]
-        self.note_alternatives(finer)
-        self._try(base, finer, observer_gain)
+            effort = self.little_effort()
+            self.record(base, entries, self._with_relatives(base, entries, [*entries, *scored], effort))
 
     def exchange(self) -> None:
         """Try all other laws, and none, in place of each of several laws, the rest in place, until none changes."""
@@ -532,7 +295,7 @@ class Search(Hypotheses):
                     self.leave_out(best, [element])
                     plain = constant(type(element.law))
                     if plain is not type(element.law) and kind_of(element.port) != PARAMETER:
-                        self._refine(self.run_laws(best.laws, best).with_added(element.pair), [plain])
+                        self.fit_forms(self.run_laws(best.laws, best).with_added(element.pair), [plain])
                 if self.best.key == best.key:
                     return
 
@@ -545,8 +308,8 @@ class Search(Hypotheses):
         with self.stage(TWO):
             rest = Remainder.of(self.bench, *linearise_runs(self.bench, self.root.fitted), self.laws)
             fits, before = self.fits, self.best
-            found = self._side_by_side(lambda pair: fit_pair(fits, self.root.fitted, rest, pair), choose_pairs(rest))
-            self._keep_all([t for t in found if t is not None])
+            found = self.on_workers(lambda pair: fit_pair(fits, self.root.fitted, rest, pair), choose_pairs(rest))
+            self.keep_all([t for t in found if t is not None])
         if self.best is not before:
             self.exchange()
 
@@ -556,12 +319,12 @@ class Search(Hypotheses):
         Linear time-invariant systems commute (Oppenheim & Willsky 1997, Signals and Systems, sec. 2.3).
         """
         best, names = self.best, self.bench.simulator.output_names
-        filters = [e for e in best.laws if kind_of(e.port) == ACTUATOR and _is_filter(e.law)]
+        filters = [e for e in best.laws if kind_of(e.port) == ACTUATOR and is_filter(e.law)]
         if len(names) < 2 or len(filters) != 1 or not self.may_go_on():
             return
         source = filters[0]
         others = [e for e in best.laws if e is not source]
-        if not all(_may_stand_beside(others, port_name(SENSOR, name), source.law) for name in names):
+        if not all(may_stand_beside(others, port_name(SENSOR, name), source.law) for name in names):
             return
         with self.stage("every sensor"):
             joint = self.run_laws(others, best)
@@ -587,13 +350,3 @@ class Search(Hypotheses):
         self.findings.clear()
         self.keep(Trial.of(alone, 0, thorough=True))
         return True
-
-
-def _is_filter(law: Law) -> bool:
-    """Tell whether a law of a signal is a lag, a mode or a delay."""
-    return bool(law.order or law.shifts)
-
-
-def _may_stand_beside(laws: Sequence[Placed], port: str, law: Law) -> bool:
-    """Tell whether a law at a port may be a further effect beside some laws."""
-    return all(e.port != port or complements(e.law, law) for e in laws)

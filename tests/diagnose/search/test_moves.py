@@ -65,7 +65,7 @@ def test_laws_in_place_of_one_that_varies_are_looked_for_once(monkeypatch):
         found.keep(trial)
     assert found.best.key == varied.key
     monkeypatch.setattr(
-        sys.modules["pilfr_casadi.diagnose.search.moves"], "in_place_of_variation", lambda *_: asked.append(1) or []
+        sys.modules["pilfr_casadi.diagnose.search.forms"], "in_place_of_variation", lambda *_: asked.append(1) or []
     )
     for base, times in ((other, 0), (root, 1), (root, 1)):
         found.replace_variation(base)
@@ -137,7 +137,7 @@ def test_a_brief_fit_that_only_follows_its_part_is_converged(follows_its_part):
     off = Trial.of(found.bench.run(richer, start, plain.fitted.initial), 1)
     off = replace(off, part_mean_square=plain.part_mean_square) if follows_its_part else off
     assert off.error > 3 * plain.error
-    found._keep_all([plain, off])
+    found.keep_all([plain, off])
     assert found.memo[off.key].thorough is follows_its_part
     assert (found.memo[off.key].error < 1.05 * plain.error) is follows_its_part
 

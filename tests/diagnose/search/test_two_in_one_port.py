@@ -6,10 +6,14 @@ from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
+from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose.fits.floor import Floor
 from pilfr_casadi.diagnose.fits.linearise import linearise_runs
 from pilfr_casadi.diagnose.fits.screen import Remainder
+from pilfr_casadi.diagnose.search.moves import Search
 from pilfr_casadi.diagnose.search.relatives import choose_pairs, complements
+from pilfr_casadi.diagnose.search.trials import Trial
 
 FRICTION = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
 RIPPLE = laws.PeriodicForce(values={"a": 5.0, "b": 3.0, "L": 0.02})
@@ -86,6 +90,24 @@ def test_a_curve_behind_a_lag_is_told_from_a_lag_behind_a_curve(first, second):
     found = pilfr.diagnose(example_rig(430.0, 5.0), train, test=test, laws=tried, hold="zero", workers=1)
     assert tuple(type(e.law) for e in found.corrected.elements) == tried
     assert found.errors["test"]["after"] < 1.2 * found.floor["nrmse"]
+
+
+@pytest.mark.parametrize(
+    ("added", "order"),
+    [(0, None), (1, (laws.Saturation, laws.Lag, laws.DeadZone)), (2, (laws.DeadZone, laws.Lag, laws.Saturation))],
+)
+def test_the_law_that_was_added_is_tried_before_the_others_of_its_signal(added, order):
+    simulator = example_rig()
+    for law in (laws.Lag().at({"T": 0.02}), laws.Saturation().at({"L": 9.0}), laws.DeadZone().at({"g": 1.0})):
+        simulator = simulator.with_element("actuator:force", law)
+    bench = Workbench.of(example_rig(), [recorded(simulator, 0, samples=200)], "zero")
+    search = Search(
+        bench, bench.fit(bench.simulator), Floor(1e-3 * bench.scale, "repeats"), (), 1, Stages(lambda *_: None)
+    )
+    search.keep(Trial.of(search.without, 0))
+    trial = Trial.of(bench.run(simulator, {}, bench.fit(bench.simulator).begin), 3)
+    found = search._reorder(trial.with_added(trial.laws[added].pair))
+    assert order == (found and tuple(type(e.law) for e in found.laws))
 
 
 def test_a_finer_form_takes_the_place_of_its_law_in_series():
