@@ -85,7 +85,11 @@ class Relaxation(Law):
     equation = "w = k_v (z - q),  dq/dt = (z - q) / T"
     source = "Findley, Lai & Onaran (1976), Creep and Relaxation, ch. 5"
     sentence = "creep: under a constant load the deflection goes on slowly"
-    sentences: ClassVar[Mapping[str, str]] = {"thermal": "a slow heat capacity behind a thermal resistance"}
+    sentences: ClassVar[Mapping[str, str]] = {
+        "thermal": "a slow heat capacity behind a thermal resistance",
+        "fluid": "a slow store behind a resistance: a second volume or branch",
+        "electrical": "a slow store behind a resistance, as of diffusion in a cell or of eddy currents",
+    }
     units = {"k_v": "w/z", "T": "s"}
     dissipative = True
     order = follows = 1

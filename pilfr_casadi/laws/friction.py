@@ -191,7 +191,9 @@ class ViscousDamping(Law):
     source = "Meirovitch (2001), Fundamentals of Vibrations, sec. 1.4"
     sentence = "a viscous damper: a force in proportion to speed"
     sentences: ClassVar[Mapping[str, str]] = {
-        "thermal": "a heat capacity: a heat flow in proportion to the rate of the temperature"
+        "thermal": "a heat capacity: a heat flow in proportion to the rate of the temperature",
+        "fluid": "a capacity or an inertance: a term in proportion to the rate of the level, pressure or flow",
+        "electrical": "a capacitance or an inductance: a term in proportion to the rate of the voltage or current",
     }
     units = {"c_1": "w*s/z"}
     dissipative = True
@@ -207,6 +209,10 @@ class DirectionalDamping(ViscousDamping):
     equation = "w = c_1 dz/dt + c_0 |dz/dt|"
     source = "Dixon (2007), The Shock Absorber Handbook, ch. 6"
     sentence = "viscous damping that differs between the two directions"
+    sentences: ClassVar[Mapping[str, str]] = {
+        "fluid": "a capacity or an inertance that differs between rise and fall",
+        "electrical": "a capacitance or an inductance that differs between rise and fall",
+    }
     absent = ("thermal",)
     units = {"c_1": "w*s/z", "c_0": "w*s/z"}
     signed = ("c_0",)
@@ -222,6 +228,10 @@ class QuadraticDrag(Law):
     equation = "w = c_2 dz/dt |dz/dt|"
     source = "White (2011), Fluid Mechanics, sec. 7.6"
     sentence = "a drag that grows with the square of speed"
+    sentences: ClassVar[Mapping[str, str]] = {
+        "fluid": "a term that grows with the square of the rate of the level, pressure or flow",
+        "electrical": "a term that grows with the square of the rate of the voltage or current",
+    }
     absent: ClassVar[tuple[str, ...]] = ("thermal",)
     units = {"c_2": "w*s^2/z^2"}
     dissipative = True
@@ -236,6 +246,10 @@ class DirectionalDrag(QuadraticDrag):
     form = "directional"
     equation = "w = c_2 dz/dt |dz/dt| + c_0 (dz/dt)^2"
     sentence = "a drag that grows with the square of speed and differs between the two directions"
+    sentences: ClassVar[Mapping[str, str]] = {
+        "fluid": "a term that grows with the squared rate of the level, pressure or flow, not the same for rise and fall",
+        "electrical": "a term that grows with the squared rate of the voltage or current, not the same for rise and fall",
+    }
     units = {"c_2": "w*s^2/z^2", "c_0": "w*s^2/z^2"}
     signed = ("c_0",)
 
@@ -249,6 +263,10 @@ class PowerDrag(QuadraticDrag):
     form = "power"
     equation = "w = c_n sign(dz/dt) |dz/dt|^n"
     sentence = "a drag that grows with a power of the speed"
+    sentences: ClassVar[Mapping[str, str]] = {
+        "fluid": "a term that grows with a power of the rate of the level, pressure or flow",
+        "electrical": "a term that grows with a power of the rate of the voltage or current",
+    }
     units = {"c_n": "w*s^n/z^n", "n": ""}
     starts = {"n": ("", 1.3, 1.6, 2.5)}
     ranges = {"n": ("", 1.15, 4.0)}
@@ -265,6 +283,10 @@ class CubicDamping(Law):
     equation = "w = c_3 (dz/dt)^3"
     source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 3.3"
     sentence = "a damping force in proportion to the cube of speed"
+    sentences: ClassVar[Mapping[str, str]] = {
+        "fluid": "a term in proportion to the cube of the rate of the level, pressure or flow",
+        "electrical": "a term in proportion to the cube of the rate of the voltage or current",
+    }
     absent = ("thermal",)
     units = {"c_3": "w*s^3/z^3"}
 

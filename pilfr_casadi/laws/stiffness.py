@@ -30,7 +30,11 @@ class LinearStiffness(Law):
     equation = "w = k_1 z"
     source = "Meirovitch (2001), Fundamentals of Vibrations, sec. 1.4"
     sentence = "a spring (or a leak): a force in proportion to the deflection"
-    sentences: ClassVar[Mapping[str, str]] = {"thermal": "a heat path: a heat flow in proportion to the temperature"}
+    sentences: ClassVar[Mapping[str, str]] = {
+        "thermal": "a heat path: a heat flow in proportion to the temperature",
+        "fluid": "a leak or a resistance: a term in proportion to the level, pressure or flow",
+        "electrical": "a leak or a resistance: a term in proportion to the current or voltage",
+    }
     units = {"k_1": "w/z"}
     ranges = {"k_1": ("max_stiffness", -1.0, 1.0)}
 
@@ -47,7 +51,7 @@ class CubicStiffness(Law):
     sentence = "a stiffness that grows (or falls) with the square of the deflection, the same in both directions"
     sentences: ClassVar[Mapping[str, str]] = {
         "thermal": "a cubic loss: a heat flow that grows with the third power of the temperature",
-        "fluid": "a cubic loss: a flow that grows with the third power of the level or pressure",
+        "fluid": "a cubic loss: a term that grows with the third power of the level, pressure or flow",
         "electrical": "a cubic characteristic: a term that grows with the third power of the current or voltage",
     }
     units = {"k_3": "w/z^3"}
@@ -63,7 +67,7 @@ class PowerStiffness(CubicStiffness):
     equation = "w = k_n sign(z) |z|^n"
     sentence = "a force that grows with a power of the deflection, the same in both directions"
     sentences: ClassVar[Mapping[str, str]] = {
-        "fluid": "a flow that grows with a power of the level or pressure, the same in both directions"
+        "fluid": "a term that grows with a power of the level, pressure or flow, the same in both directions"
     }
     units = {"k_n": "w/z^n", "n": ""}
     domains = ("mechanical", "fluid")
@@ -112,7 +116,7 @@ class AsymmetricCubicStiffness(CubicStiffness):
     source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 4.2; Klippel (2006), J. Audio Eng. Soc. 54(10)"
     sentence = "a stiffness that grows (or falls) with the square of the deflection, not the same in both directions"
     sentences: ClassVar[Mapping[str, str]] = {
-        "fluid": "a flow that grows with the third power of the level or pressure, not the same in both directions"
+        "fluid": "a term that grows with the cube of the level, pressure or flow, not the same in both directions"
     }
     units = {"k_3": "w/z^3", "b": "z"}
     domains = ("mechanical", "fluid")
@@ -134,7 +138,7 @@ class QuadraticStiffness(Law):
     sentence = "a stiffness that changes in proportion to the deflection, so that it is stiffer in one direction"
     sentences: ClassVar[Mapping[str, str]] = {
         "thermal": "a quadratic loss: a heat flow that grows with the square of the temperature",
-        "fluid": "a quadratic loss: a flow that grows with the square of the level or pressure",
+        "fluid": "a quadratic loss: a term that grows with the square of the level, pressure or flow",
         "electrical": "a quadratic characteristic: a term that grows with the square of the current or voltage",
     }
     units = {"k_2": "w/z^2"}
@@ -168,6 +172,11 @@ class PiecewiseStiffness(Law):
     equation = "w = k_c max(z - g, 0)"
     source = "Shaw & Holmes (1983), J. Sound Vib. 90(1)"
     sentence = "another stiffness sets in beyond a point, as of a contact"
+    sentences: ClassVar[Mapping[str, str]] = {
+        "thermal": "another heat path sets in beyond a temperature",
+        "fluid": "another path sets in beyond a level, pressure or flow, as of a weir or a relief or check valve",
+        "electrical": "another path sets in beyond a current or voltage, as of a diode",
+    }
     units = {"k_c": "w/z", "g": "z"}
     starts = {"g": lambda at: at.low + 2 * at.half * np.array([0.15, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])}
     ranges = {
@@ -213,6 +222,10 @@ class Clearance(Law):
     equation = "w = k_g (z - clip(z, -g, g))"
     source = "Shaw & Holmes (1983), J. Sound Vib. 90(1)"
     sentence = "a clearance: the spring carries load only beyond a gap on either side"
+    sentences: ClassVar[Mapping[str, str]] = {
+        "fluid": "a dead zone: the path opens only beyond a level, pressure or flow on either side",
+        "electrical": "a dead zone: the path opens only beyond a current or voltage on either side",
+    }
     units = {"k_g": "w/z", "g": "z"}
     absent = ("thermal",)  # heat flows at any difference
     two_sided = True
@@ -247,6 +260,10 @@ class SlackSpring(Clearance):
     form = "in its own spring"
     equation = "w = -k_g clip(z, -g, g)"
     sentence = "a clearance in line with a spring of stiffness k_g that is modelled: it carries load only beyond a gap"
+    sentences: ClassVar[Mapping[str, str]] = {
+        "fluid": "a dead zone: a modelled path k_g opens only beyond a level, pressure or flow on either side",
+        "electrical": "a dead zone: a modelled path k_g opens only beyond a current or voltage on either side",
+    }
     restoring = True  # it reduces a modelled spring
 
     def force(self, z: Any, p: Any) -> Any:

@@ -3,6 +3,7 @@
 import doctest
 import importlib
 import inspect
+import re
 from dataclasses import replace
 
 import casadi as ca
@@ -440,10 +441,13 @@ def test_a_rectifying_sensor_sees_no_signs():
 
 
 @pytest.mark.parametrize("domain", ["thermal", "fluid", "electrical"])
-def test_a_curve_of_the_coordinate_is_no_stiffness_where_nothing_deflects(domain):
-    for law in (CubicStiffness, laws.QuadraticStiffness, laws.PowerStiffness, laws.AsymmetricCubicStiffness):
-        if not law.domains or domain in law.domains:
-            assert not {"stiffness", "deflection"} & set(law.sentences[domain].split())
+def test_nothing_deflects_or_speeds_where_heat_fluid_or_current_flows(domain):
+    mechanical = {"spring", "stiffness", "deflection", "damper", "damping", "speed", "contact"}
+    for law in laws.CATALOGUE:
+        admitted = "parallel" in law.places and domain not in law.absent and (not law.domains or domain in law.domains)
+        if admitted and not law.in_line:
+            words = set(re.findall(r"\w+", law.sentences.get(domain, law.sentence)))
+            assert not mechanical & words, (law.id, law.form)
 
 
 def test_a_free_curve_goes_on_along_its_tangents():
