@@ -247,8 +247,8 @@ class DirectionalDrag(QuadraticDrag):
     equation = "w = c_2 dz/dt |dz/dt| + c_0 (dz/dt)^2"
     sentence = "a drag that grows with the square of speed and differs between the two directions"
     sentences: ClassVar[Mapping[str, str]] = {
-        "fluid": "a term that grows with the squared rate of the level, pressure or flow, not the same for rise and fall",
-        "electrical": "a term that grows with the squared rate of the voltage or current, not the same for rise and fall",
+        "fluid": "a term in the squared rate of the level, pressure or flow, not the same for rise and fall",
+        "electrical": "a term in the squared rate of the voltage or current, not the same for rise and fall",
     }
     units = {"c_2": "w*s^2/z^2", "c_0": "w*s^2/z^2"}
     signed = ("c_0",)
