@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 DONE, NO_RESULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # Typer has moved its name between releases
 MOST_SAMPLES = 10**9  # of a period, or skipped: 8 GB per channel
+Hold = Literal["zero", "linear", "band-limited", "next"]
 FILE_TYPES = ".csv, .mat, .npz, .parquet, .mf4"  # of recordings, for help texts
 
 
@@ -121,7 +122,7 @@ class DataOptions:
         "20,0.5 (default: estimate; zero where no outputs were measured)."
     )
     period: int | None = integer("Samples per period; needs --initial.", 0, MOST_SAMPLES, metavar="SAMPLES")
-    hold: Literal["zero", "linear", "band-limited"] | None = option("Course of the inputs between samples.")
+    hold: Hold | None = option("Course of the inputs between samples.")
     skip: int = integer("Leading samples that are simulated but not scored.", 0, MOST_SAMPLES, 0, "SAMPLES")
     dt: float | None = option("Step, if the file has no time column.", "SECONDS")
     time_tolerance: float | None = option(

@@ -51,6 +51,7 @@ from ._common import (
     INTERRUPTED,
     NO_RESULT,
     DataOptions,
+    Hold,
     bounds_of,
     check_given_once,
     check_names,
@@ -496,7 +497,7 @@ class ExportOptions:
     name: str = option("Name of the function (default: model).", "NAME", "model")
     smooth: float = option("Width of the rounding of min and max (default: 0, exact).", "EPS", 0.0)
     dt: float | None = option("Duration of a step, needed for a simulator.", "SECONDS")
-    hold: Literal["zero", "linear", "band-limited"] | None = option("Course of a simulator's inputs between samples.")
+    hold: Hold | None = option("Course of a simulator's inputs between samples.")
     initial: Any = initial_state("State in which it begins: zero (default), or the states' values, such as 20,0.5.")
     overwrite: bool = flag("Replace existing files.", "--overwrite")
 

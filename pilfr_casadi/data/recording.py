@@ -21,8 +21,8 @@ from .units import conversion
 
 SAME_STEP = 1e-4  # relative difference up to which two steps count as the same; written times have few digits
 LONGEST_STEP = 1e30  # s, and its inverse the shortest one: rates are squared, and no experiment is outside
-HOLDS = ("zero", "linear", "band-limited", None)  # from the roughest to the smoothest; None is not known
-HOLD_WORDS = {"zero": "held", "linear": "interpolated", "band-limited": "band-limited"}  # in sentences
+HOLDS = ("zero", "linear", "band-limited", "next", None)  # None is not known
+HOLD_WORDS = {"zero": "held", "linear": "interpolated", "band-limited": "band-limited", "next": "at their next value"}
 INITIALS = ("zero", "estimate", "periodic")
 
 
@@ -50,9 +50,10 @@ class Recording:
         State at the first sample: estimated, zero, periodic steady state, or given as numbers. In steady state the
         memory of an operator that never slips in a period is not unique; the memory reached from rest with zero memory
         is used, and `fit` reports this.
-    hold : {"zero", "linear", "band-limited"}, optional
-        Input between the samples: held, interpolated linearly, or without content above half the sampling rate, as
-        behind an anti-alias filter. ``None`` leaves it open.
+    hold : {"zero", "linear", "band-limited", "next"}, optional
+        Input between the samples: held, interpolated linearly, without content above half the sampling rate, as
+        behind an anti-alias filter, or at the value of the later sample, as in logs of means over the interval that
+        ends at each time. ``None`` leaves it open.
     skip : int
         Leading samples that are simulated but not scored.
     name : str
@@ -557,7 +558,7 @@ def _check_options(r: Recording, m: int) -> None:
     if not (is_number(r.start) and np.isfinite(r.start)):
         raise InputError(f"start of {r.label} is {r.start!r}; give the time of its first sample in seconds.")
     if not (r.hold is None or isinstance(r.hold, str)) or r.hold not in HOLDS:
-        raise InputError(f"hold of {r.label} is {r.hold!r}; give 'zero', 'linear', 'band-limited' or None.")
+        raise InputError(f"hold of {r.label} is {r.hold!r}; give 'zero', 'linear', 'band-limited', 'next' or None.")
     if isinstance(r.initial, str) and r.initial not in INITIALS:
         raise InputError(f"initial of {r.label} is {r.initial!r}; give one of {listed(INITIALS)}, or the state itself.")
     if not is_whole(r.skip, 0, m - 1):

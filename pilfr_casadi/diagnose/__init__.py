@@ -95,7 +95,7 @@ def diagnose(
         Recordings to fit to and to choose on.
     test : Recording or sequence of Recording, optional
         Recordings to report on, never used to fit or to choose.
-    hold : {"zero", "linear", "band-limited"}, optional
+    hold : {"zero", "linear", "band-limited", "next"}, optional
         Course of the inputs between samples for recordings that do not state it; by default the simulator's, or else
         the data decide.
     laws : sequence of Law classes or names, optional

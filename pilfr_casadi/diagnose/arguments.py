@@ -144,7 +144,7 @@ def match_recordings(
         If the hold is unknown, or simulator and recordings do not fit each other.
     """
     if hold not in HOLDS:
-        raise InputError(f"hold={hold!r} was given; use 'zero', 'linear', 'band-limited' or None.")
+        raise InputError(f"hold={hold!r} was given; use 'zero', 'linear', 'band-limited', 'next' or None.")
     given = as_recordings(train)
     simulator = as_simulator(simulator, given)
     recordings = [simulator.matched(r) for r in given]

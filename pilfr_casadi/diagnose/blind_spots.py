@@ -215,7 +215,9 @@ class Check:
         yield f"noise ({self.noise['source']}): {noise}"
         if self.hold_taken:
             taken = HOLD_WORDS[self.hold_taken]
-            unsaid = f"not stated, here taken as {taken}; say hold='zero', 'linear' or 'band-limited' if you know"
+            unsaid = (
+                f"not stated, here taken as {taken}; say hold='zero', 'linear', 'band-limited' or 'next' if you know"
+            )
             yield f"inputs between samples: {taken if self.hold else unsaid}"
         yield f"start of each recording: {', '.join(self.starts)}"
         if self.unknown_domains:
@@ -257,7 +259,7 @@ def check(
         The simulator, with nominal parameters, bounds and ports.
     train : Recording or sequence of Recording
         The recordings that are to be diagnosed.
-    hold : {"zero", "linear", "band-limited"}, optional
+    hold : {"zero", "linear", "band-limited", "next"}, optional
         Course of the inputs between samples for recordings that do not state it; by default the simulator's, or else
         the one with which the refitted simulator follows better.
     laws : sequence of Law classes or names, optional

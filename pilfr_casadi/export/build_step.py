@@ -56,9 +56,10 @@ def exported(
         simulator.
     dt : float
         Duration of a step, s: required for a simulator and a model; a fit and a diagnosis have their own.
-    hold : {"zero", "linear", "band-limited"}, optional
+    hold : {"zero", "linear", "band-limited", "next"}, optional
         Inter-sample behaviour of the inputs, for a simulator; default: its own, else "zero". A step takes band-limited
-        inputs as linear, because it does not know the samples around it.
+        inputs as linear, because it does not know the samples around it. The input of a step acts until the next one,
+        also if recordings hold the next values.
     substeps : int, optional
         Runge-Kutta steps per sample, for a simulator; by default chosen from its fastest eigenvalue.
     start : Recording or array, optional
@@ -146,7 +147,7 @@ def _check_dt(dt: float | None) -> float:
 def _discretise_over_sample(model: Simulator, dt: float, hold: str | None, substeps: int | None) -> Model:
     hold = hold or model.hold or "zero"
     if hold not in HOLDS:
-        raise InputError(f"hold = {hold!r} was given; use 'zero', 'linear' or 'band-limited'.")
+        raise InputError(f"hold = {hold!r} was given; use 'zero', 'linear', 'band-limited' or 'next'.")
     hold = "linear" if hold == "band-limited" else hold  # a step does not know the inputs before and after it
     chosen = _choose_substeps_at_rest(model, dt) if substeps is None else whole(substeps, "substeps", 1)
     return discretise(model, dt, hold, chosen)
@@ -197,22 +198,24 @@ def _build_step(model: Model, dt: float, simulator: Simulator | None = None) -> 
         raise InputError("The model has an open port; close it with close_loop first.")
     if "y" in model.reads:
         raise InputError("The model is corrected by measured outputs at every step; export the model without that.")
-    sizes = (("x", model.n_state), ("row", model.n_u), ("p", model.parameters.size))
-    arguments = [ca.SX.sym(name, n) for name, n in sizes]
-    found = [ca.densify(e) for e in model.closed(*arguments)]
+    reads = tuple(signal for signal in model.reads if signal != "next" or model.hold != "next")
+    columns = {signal: ca.SX.sym(signal, 1 if signal == "t" else len(model.inputs)) for signal in reads}
+    row = ca.vertcat(*(columns.get(signal, columns["u"]) for signal in model.reads))  # the input acts at once
+    arguments = [ca.SX.sym("x", model.n_state), ca.vertcat(*columns.values()), ca.SX.sym("p", model.parameters.size)]
+    found = [ca.densify(e) for e in model.closed(arguments[0], row, arguments[2])]
     parametric = ca.Function("one", arguments, found, ["x", "row", "p"], ["x_next", "y"])
     parameters = model.parameters if simulator is None else simulator.readable_parameters()
     if simulator is None:
         states, thresholds, memory = _name_element_states(model)
     else:
         states, thresholds, memory = _name_law_states(model, dt, simulator)
-    inputs = model.inputs + (tuple(f"{name}{NEXT}" for name in model.inputs) if "next" in model.reads else ())
+    inputs = model.inputs + (tuple(f"{name}{NEXT}" for name in model.inputs) if "next" in reads else ())
     names = make_unique([*states, *([TIME] if "t" in model.reads else [])])
     renamed = dict(zip(states, names, strict=False))
     return Exported(
         parametric=parametric,
         parameters=parameters,
-        reads=model.reads,
+        reads=reads,
         substeps=model.substeps,
         dt=dt,
         states={name: i for i, name in enumerate(names)},

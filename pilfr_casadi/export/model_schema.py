@@ -75,7 +75,7 @@ class Signals(Table):
     outputs: list[Channel]
     states: list[str]
     memory: Count
-    hold: Literal["zero", "linear", "band-limited"] | None = None
+    hold: Literal["zero", "linear", "band-limited", "next"] | None = None
     substeps: Count = 0
 
     @property

@@ -66,8 +66,8 @@ class Model:
     begin_alike : tuple of int
         For each entry of the state, the number of the unknown that it is if the initial state is unknown; entries with
         the same number begin alike. By default each entry has its own.
-    band_limited : bool
-        Whether inputs that change between samples are band-limited there, in place of linear.
+    interpolation : {"linear", "band-limited", "next"}
+        Course of the inputs between samples, for a step that reads "next"; see `Recording.hold`.
     """
 
     step: ca.Function
@@ -83,7 +83,7 @@ class Model:
     stages: ca.Function | None = None
     resting: ca.Function | None = None
     begin_alike: tuple[int, ...] = ()
-    band_limited: bool = False
+    interpolation: str = "linear"
 
     @cached_property
     def initial_basis(self) -> np.ndarray:
@@ -98,7 +98,7 @@ class Model:
     @property
     def hold(self) -> str:
         """How the step takes inputs between samples; see `Recording.hold`."""
-        return "band-limited" if self.band_limited else "linear" if "next" in self.reads else "zero"
+        return self.interpolation if "next" in self.reads else "zero"
 
     def in_order(self, recording: Recording) -> Recording:
         """Return a recording with its channels in the model's order if it has the model's names; else as it is."""
@@ -109,8 +109,8 @@ class Model:
     def drive(self, recording: Recording) -> np.ndarray:
         """Collect the signals that the step reads along a recording, (M * substeps, n_u), in the order of `reads`.
 
-        `u` is the input at the start of a sub-step and `next` at its end (both interpolated between samples, in a line
-        or as `band_limited` signals; `u` alone is held over the sample), `t` the time in s (see `Recording.start`), `y`
+        `u` is the input at the start of a sub-step and `next` at its end (both by the `interpolation` between samples;
+        `u` alone is held over the sample), `t` the time in s (see `Recording.start`), `y`
         the measured output, and `sampled` one where a sample is taken and zero in the sub-steps after it.
         """
         n, m = self.substeps, len(recording)
@@ -128,12 +128,15 @@ class Model:
                 values = recording.y if signal == "y" else recording.u
                 period = recording.period if recording.period and m % recording.period == 0 else None
                 after = values[m - period] if period else values[-1]
-                if self.band_limited and signal != "y":
+                if self.interpolation == "band-limited" and signal != "y":
                     repeats = recording.period if recording.begins == "periodic" else period
                     fine = interpolate_band_limited(values, n, repeats)
                     columns.append(fine[1:] if signal == "next" else fine[:-1])
                     continue
                 a, b = np.repeat(values, n, axis=0), np.repeat(np.vstack([values[1:], after]), n, axis=0)
+                if self.interpolation == "next" and signal != "y":  # at its own sample an input still has its own value
+                    columns.append(np.where((share == 0)[:, None] & (signal == "u"), a, b))
+                    continue
                 columns.append(a + (b - a) * (share + (1 / n if signal == "next" else 0.0))[:, None])
         return np.ascontiguousarray(np.hstack(columns)) if len(columns) != 1 else columns[0]
 

@@ -65,7 +65,7 @@ class Equations:
         for kind in ("states", "inputs"):
             object.__setattr__(self, kind, check_names(getattr(self, kind), kind))
         if self.hold not in HOLDS:
-            raise InputError(f"hold = {self.hold!r} was given; use 'zero', 'linear', 'band-limited' or None.")
+            raise InputError(f"hold = {self.hold!r} was given; use 'zero', 'linear', 'band-limited', 'next' or None.")
         object.__setattr__(self, "substeps", whole(self.substeps, "substeps", 1))
         if not isinstance(self.units, Mapping) or not all(isinstance(unit, str) for unit in self.units.values()):
             raise InputError(f"The simulator's units are {self.units!r}; give {{name: unit}}.")

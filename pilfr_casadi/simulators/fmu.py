@@ -141,7 +141,7 @@ def from_fmu(
     inputs, outputs : str or sequence of str, optional
         Recorded inputs and outputs; by default all outputs, and all inputs that no port uses. Other inputs keep their
         start values, so name the recorded ones if the recordings lack some.
-    hold : {"zero", "linear", "band-limited"}, optional
+    hold : {"zero", "linear", "band-limited", "next"}, optional
         As of `Simulator`.
     cosimulation : CoSimulation, optional
         Step size and states of a unit for co-simulation; a unit for both kinds is then stepped.

@@ -176,7 +176,8 @@ def on_grid(simulator: E, h: float) -> E:
 def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: int = 1) -> Model:
     """Discretise a simulator with its laws to a closed model for samples dt apart, s.
 
-    `hold` says whether inputs are constant between samples ("zero"), interpolated ("linear") or band-limited;
+    `hold` says whether inputs are constant between samples ("zero"), interpolated ("linear"), band-limited, or at the
+    value of the later sample ("next"), which acts on the derivatives and not yet on the outputs of the earlier one;
     `substeps` is the number of Runge-Kutta steps per sample (`choose_substeps`), at least eight for band-limited
     inputs, which are linear within a step.
     """
@@ -219,7 +220,7 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
         stages=ca.Function("stages", [x, u, updated, p, stages[0]], stages[1:]) if stages else None,
         resting=step.resting(),
         begin_alike=step.alike_at_first(substeps),
-        band_limited=band_limited,
+        interpolation="linear" if hold == "zero" else hold,
     )
     return model if simulator.observer is None else inject_outputs(model, simulator.observer)
 
@@ -235,7 +236,8 @@ class _SubStep:
         n_x, n_u = len(simulator.states) + sum(equations.n_q), len(simulator.inputs)
         self.x, self.s = ca.SX.sym("x", n_x), ca.SX.sym("s", sum(equations.n_s))
         self.u0, self.u1, self.t = ca.SX.sym("u", n_u), ca.SX.sym("next", n_u), ca.SX.sym("t")
-        self.end, slope = (self.u1, (self.u1 - self.u0) / h) if hold != "zero" else (self.u0, ca.SX.zeros(n_u))
+        self.begin, self.end = self.u1 if hold == "next" else self.u0, self.u0 if hold == "zero" else self.u1
+        slope = (self.end - self.begin) / h
         sizes = (("x", n_x), ("s", self.s.numel()), ("u", n_u), ("t", 1))
         now = {name: ca.SX.sym(name, n) for name, n in sizes}
         f, y, after, local = equations.evaluate(Instant(**now, slope=slope))
@@ -249,7 +251,7 @@ class _SubStep:
         read = (self.s[i] if shift else self.updated[i] for i, shift in enumerate(self.shifts))
         self.memory = ca.vertcat(ca.SX(0, 1), *read)
         # a register's content moves on within the step if inputs are interpolated
-        self.drift = (self.updated - self.memory) * (hold != "zero")
+        self.drift = (self.updated - self.memory) * (hold not in ("zero", "next"))
 
     def _evaluate(self, x: Any, s: Any, u: Any, t: Any) -> Any:
         return self.function(x, s, u, t, self.u0, self.u1, self.vector)
@@ -262,9 +264,11 @@ class _SubStep:
         """Make the next states, the outputs, and the stages of `Model`, from the updated memory."""
         x, h, own = self.x, self.h, len(self.simulator.states)
         k1, y, *_ = self._evaluate(x, self.memory, self.u0, self.t)
+        if self.begin is not self.u0:
+            k1 = self._evaluate_stage(x, self.begin, 0.0)
         if self.simulator.discrete:  # laws' own states see a constant z over the sample
             return ca.vertcat(k1[:own], x[own:, 0] + h * k1[own:, 0]), y, None
-        middle, end = (self.u0 + self.end) / 2, self.end
+        middle, end = (self.begin + self.end) / 2, self.end
         c2 = x + h / 2 * k1
         k2 = self._evaluate_stage(c2, middle, 0.5)
         c3 = x + h / 2 * k2

@@ -64,7 +64,7 @@ def from_mujoco(
     outputs : str or sequence of str, optional
         Recorded sensors, or joints; by default all sensors of joint positions and speeds, or all joints if there is
         none. Sensors of an actuator's force and of the actuators' force on a joint may be given too.
-    hold : {"zero", "linear", "band-limited"}, optional
+    hold : {"zero", "linear", "band-limited", "next"}, optional
         As of `Simulator`.
 
     Raises

@@ -40,7 +40,7 @@ class Simulator(Equations):
         `Parameter` by name.
     ports : Port or tuple of Port
         Declared ports; by default each state's equation is a port.
-    hold : {"zero", "linear", "band-limited"}, optional
+    hold : {"zero", "linear", "band-limited", "next"}, optional
         Inputs between samples, for recordings that do not state it.
     discrete : bool
         `dynamics` gives the next sample's states instead of derivatives.

@@ -183,7 +183,11 @@ def local_signals(
 
 def input_slope(bench: Workbench, r: Recording) -> np.ndarray:
     """Compute the inputs' rates at the samples, (M, n_u); zero if the inputs are held."""
-    return np.gradient(r.u, r.dt, axis=0) if bench.hold != "zero" and len(r) > 2 else np.zeros_like(r.u)
+    return (
+        np.gradient(r.u, r.dt, axis=0)
+        if bench.hold in ("linear", "band-limited") and len(r) > 2
+        else np.zeros_like(r.u)
+    )
 
 
 def loudest_stretch(power: np.ndarray, length: int, skip: int) -> slice:

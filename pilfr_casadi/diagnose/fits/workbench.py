@@ -162,10 +162,12 @@ class Workbench:
         return self.recordings[0].dt
 
     def with_other_holds(self, among: Sequence[str | None] = HOLDS) -> list[Workbench]:
-        """Return the bench with each hold of the inputs next to its own in HOLDS: these are most like it."""
-        at = HOLDS.index(self.hold)
-        near = HOLDS[max(at - 1, 0) : at + 2]
-        return [replace(self, hold=hold) for hold in near if hold in among and hold not in (None, self.hold)]
+        """Return the bench with interpolated inputs, or with each other hold if they are interpolated already.
+
+        Held inputs come half a sample later than interpolated ones, the next values half a sample earlier.
+        """
+        near = ("zero", "band-limited", "next") if self.hold == "linear" else ("linear",)
+        return [replace(self, hold=hold) for hold in near if hold in among]
 
     def on(self, recordings: Sequence[Recording]) -> Workbench:
         """Return the bench with other recordings; errors stay in units of the training outputs' deviation."""
