@@ -85,10 +85,10 @@ from .other_explanations import (
     may_act_elsewhere,
 )
 from .posterior import Posterior, posterior
-from .prediction import drift_note, drifts, predictor
+from .prediction import drift_note, drifts
 from .preparation import LEAST_REFIT, Prepared, conversions, slow_note
 from .proof import errors_of
-from .repetitions import search_with_one_hold, search_with_repetitions
+from .repetitions import search_in_predictions, search_with_one_hold, search_with_repetitions
 from .result import Diagnosis
 from .search.moves import Search
 from .search.stretches import SEARCHED_SAMPLES, Everything, Stretches, back_on_stretches, choose_stretches
@@ -367,9 +367,9 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
         return found
     say, hold = request.say.under("predictions: "), search.bench.hold
     try:
-        observed, memory = predictor(request.simulator, request.recordings, hold, request.engine)
-        observed_request = replace(request, simulator=observed, hold=hold, focus="prediction", say=say)
-        predicting = search_with_one_hold(observed_request).search
+        predicted = replace(request, hold=hold, focus="prediction", say=say)
+        _, found_there, memory = search_in_predictions(predicted, hold, search_with_one_hold)
+        predicting = found_there.search
     except InputError:
         return found
     search.cut_short_with(predicting)
