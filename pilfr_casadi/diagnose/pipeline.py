@@ -85,7 +85,7 @@ from .other_explanations import (
     may_act_elsewhere,
 )
 from .posterior import Posterior, posterior
-from .prediction import drift_note, drifts
+from .prediction import drift_note, drifts, untried_note
 from .preparation import LEAST_REFIT, Prepared, conversions, slow_note
 from .proof import errors_of
 from .repetitions import search_in_predictions, search_with_one_hold, search_with_repetitions
@@ -148,9 +148,10 @@ def diagnose_in_steps(
     ready, search = first.ready, first.search
     request, everything = _fit_to_everything(request, ready, search)
     found = _concluded(search, (*request.notes, *ready.gates))
-    if found.verdict.kind == "unexplained" and request.focus is None and not search.cut_short:
+    if found.verdict.kind == "unexplained" and request.focus is None:
         with search.until_interrupted():
-            found = _name_in_predictions(request, search, found)
+            again = _advise_predictions if search.cut_short else _name_in_predictions
+            found = again(request, search, found)
     final = _final_fits(request, ready, search, found, everything)
     with deferred_interrupt(again=False) as pressed:
         built = build_diagnosis(request, ready, search, found, final, tests, limits, began)
@@ -355,6 +356,13 @@ def _conclude_unexplained(search: Search, judged: _Judged, elsewhere: Sequence[G
 
 
 # naming in predictions
+
+
+def _advise_predictions(request: Request, search: Search, found: Conclusion) -> Conclusion:
+    """Note that predictions were not tried for lack of time, although the simulator drifts."""
+    if search.interrupted or request.simulator.observer is not None or not drifts(search.bench, search.root.fitted):
+        return found
+    return replace(found, gates=(*found.gates, untried_note(request.simulator)))
 
 
 def _name_in_predictions(request: Request, search: Search, found: Conclusion) -> Conclusion:

@@ -173,6 +173,16 @@ def drift_note(simulator: Simulator, memory: float, what: str) -> Gate:
     return Gate(", ".join(simulator.output_names), "prediction", memory, sentence, corrected=False)
 
 
+def untried_note(simulator: Simulator) -> Gate:
+    """Note that the simulator drifts in a free run, and that there was no time for predictions."""
+    sentence = (
+        "In a free run small forces and disturbances add up over the whole recording, so that its errors hardly tell "
+        "laws apart. Predictions one sample ahead often do, but there was no time left for them: diagnose with the "
+        "focus 'prediction' (--focus prediction), or give more time."
+    )
+    return Gate(", ".join(simulator.output_names), "prediction", None, sentence, corrected=False)
+
+
 def observer(simulator: Simulator, recordings: Sequence[Recording], hold: str, memory: float) -> np.ndarray:
     """Compute the gain (n_x, n_y) of an observer that forgets within `memory` seconds.
 

@@ -143,6 +143,11 @@ def test_laws_do_not_imitate_an_observer_that_forgets_sooner(friction, push):
     assert "Disturbances that nobody recorded move the machine" in str(found)
 
 
+def test_predictions_are_advised_if_a_free_run_drifts_and_took_all_the_time():
+    found = pilfr.diagnose(cart(), pushed(0.4, 0.3, 2e-3), workers=1, time_limit=3)
+    assert found.verdict == "unexplained" and "--focus prediction" in str(found)
+
+
 def test_a_sensor_that_reads_more_does_not_forget_sooner():
     rig = replace(levitation(), observer=np.array([[0.3], [2.0]]))
     scaled = rig.with_element("sensor:gap", Gain().at({"g": 9.0}))
