@@ -31,7 +31,7 @@ def merge(
 
     Name, initial state and skipped samples come from the first record. The initial state is kept only if the common
     time begins with the first record. The hold comes from the records whose channels are inputs; if theirs differ, it
-    is `"linear"`. If all inputs are held (`hold="zero"`) and each of their levels lasts at least a new step, an input
+    is `"linear"`. If all inputs are held (`hold="zero"`) and their levels usually last at least a new step, an input
     becomes its mean over each new step, and is held; else it becomes `"linear"`, unless no input was resampled.
 
     Parameters

@@ -302,7 +302,7 @@ class _Request:
     ) -> tuple[list[np.ndarray], str | None]:
         """Bring each channel from its own samples to a common step, s; return them and the inputs' hold.
 
-        Inputs stay held if they are, and each of their levels lasts at least a step.
+        Inputs stay held if they are, and their levels usually last at least a step.
         """
         hold, n_u = self.options.get("hold"), len(self.inputs)
         series = table.series(wanted, time)

@@ -318,8 +318,8 @@ class Recording:
     def resample(self, dt: float) -> Self:
         """Resample to another step in seconds; an anti-alias filter precedes a longer step.
 
-        If `hold` is `"zero"` and each level of the inputs lasts at least a new step, an input becomes its mean over
-        each new step, and is held; else it becomes `"linear"`. `skip` covers the same time as before. A period
+        If `hold` is `"zero"` and the levels of the inputs usually last at least a new step, an input becomes its mean
+        over each new step, and is held; else it becomes `"linear"`. `skip` covers the same time as before. A period
         that is not a whole number of new samples is dropped.
 
         Raises

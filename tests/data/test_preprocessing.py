@@ -212,6 +212,18 @@ def test_held_steps_stay_held_at_uneven_times():
     assert np.sum(r.u[begin:end]) * r.dt == pytest.approx(between, abs=1e-9)
 
 
+def test_a_command_stays_held_although_the_clock_of_its_logger_jitters():
+    rng = np.random.default_rng(0)
+    t = np.cumsum(np.where(rng.random(4000) < 0.05, 1e-3, 2e-3))  # whole milliseconds, some samples early
+    levels = np.cumsum(rng.standard_normal(4000))
+    frame = pd.DataFrame({"t": t, "force": levels, "x": np.sin(20 * t)})
+    r = read_frame(frame, "force", "x", resample=2e-3, hold="zero")
+    assert r.hold == "zero"
+    held = np.append(0.0, np.cumsum(levels[:-1] * np.diff(t)))
+    impulse = np.interp(t[0] + r.t, t, held)
+    np.testing.assert_allclose(np.cumsum(r.u[:-1, 0]) * r.dt, impulse[1:], atol=1e-9)
+
+
 # ------------------------------------------------------------------------------------------- channels of several rates
 
 
