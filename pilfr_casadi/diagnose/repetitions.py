@@ -84,7 +84,8 @@ def search_in_predictions(
     found = search(replace(led, most_effects=min(1, led.most_effects)))
     other = _search_forgetting_sooner(request, found, memory, search)
     if other is None and not found.search.cut_short:
-        found.search.resume(request.most_effects)
+        found.search.most_effects = request.most_effects
+        found.search.resume()
         other = _search_forgetting_sooner(request, found, memory, search)
     return other or (led, found, memory)
 
