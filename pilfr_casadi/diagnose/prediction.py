@@ -37,7 +37,7 @@ from .faults.gates import LEAST_GAIN, USELESS_FIT, Gate, evidence_gain
 from .fits.linearise import linearise_runs
 from .fits.workbench import FEW, Fitted, Workbench, growth, refit
 from .search.hypotheses import Hypotheses
-from .search.trials import Trial
+from .search.trials import Name, Trial
 
 ROUNDING = 1e-9  # share of the largest entry that counts as zero
 # memories that are tried in turn, in half decades: times the time of e-fold growth (a longer one leaves the unstable
@@ -105,10 +105,12 @@ def forget_sooner(search: Hypotheses, simulator: Simulator, memory: float) -> tu
     The refitted simulator and the best laws have each their own best memory, from `memory` down to a sample. Laws count
     only if they then predict clearly better: with a memory that is too long, many can imitate one that forgets sooner.
     """
-    bench, ranked = search.bench, sorted(search.memo.values(), key=search.optimistic_evidence, reverse=True)
-    first = list({t.names: t for t in reversed(ranked) if t.laws}.values())[-FEW:]
+    bench, first = search.bench, dict[frozenset[Name], Trial]()  # of each set of laws the likeliest form
+    for trial in sorted(search.memo.values(), key=search.optimistic_evidence, reverse=True):
+        first.setdefault(trial.names, trial)
+    first.pop(search.root.names, None)
     plain = likeliest = _best_memory(search, search.root, simulator, memory)
-    for trial in first:
+    for trial in [*first.values()][:FEW]:
         own = _best_memory(search, trial, simulator, memory)
         count = 0 if trial.information is None else len(trial.information)
         gained = evidence_gain(plain.left, own.left, bench.scored(own.fitted.residual), count)
