@@ -64,10 +64,10 @@ from .other_explanations import (
     may_act_elsewhere,
 )
 from .posterior import Posterior, posterior
-from .prediction import drift_note, drifts, predictor
+from .prediction import drift_note, drifts, untried_note
 from .preparation import LEAST_REFIT, Prepared
 from .proof import errors_of
-from .repetitions import search_with_one_hold, search_with_repetitions
+from .repetitions import search_in_predictions, search_with_one_hold, search_with_repetitions
 from .result import Diagnosis
 from .search.moves import Search
 from .search.stretches import Everything, Stretches, back_on_stretches, choose_stretches
@@ -81,9 +81,10 @@ def diagnose_in_steps(request: Request) -> Diagnosis:
     ready, search = first.ready, first.search
     request, everything = _fit_to_everything(request, ready, search)
     found = _concluded(search, (*request.notes, *ready.gates))
-    if found.verdict.kind == "unexplained" and request.focus is None and not search.cut_short:
+    if found.verdict.kind == "unexplained" and request.focus is None:
         with search.until_interrupted():
-            found = _name_in_predictions(request, search, found)
+            again = _advise_predictions if search.cut_short else _name_in_predictions
+            found = again(request, search, found)
     final = _final_fits(request, ready, search, found, everything)
     with deferred_interrupt(again=False) as pressed:
         built = build_diagnosis(request, ready, search, found, final)
@@ -291,6 +292,13 @@ def _conclude_unexplained(search: Search, judged: _Judged, elsewhere: Sequence[G
 # naming in predictions
 
 
+def _advise_predictions(request: Request, search: Search, found: Conclusion) -> Conclusion:
+    """Note that predictions were not tried for lack of time, although the simulator drifts."""
+    if search.interrupted or request.simulator.observer is not None or not drifts(search.bench, search.root.fitted):
+        return found
+    return replace(found, gates=(*found.gates, untried_note(request.simulator)))
+
+
 def _name_in_predictions(request: Request, search: Search, found: Conclusion) -> Conclusion:
     """Search with one-step predictions if the simulator drifts: errors of its free runs hardly distinguish laws.
 
@@ -301,9 +309,9 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
         return found
     say, hold = request.say.under("predictions: "), search.bench.hold
     try:
-        observed, memory = predictor(request.simulator, request.recordings, hold, request.engine)
-        observed_request = replace(request, simulator=observed, hold=hold, focus="prediction", say=say)
-        predicting = search_with_one_hold(observed_request).search
+        predicted = replace(request, hold=hold, focus="prediction", say=say)
+        _, found_there, memory = search_in_predictions(predicted, hold, search_with_one_hold)
+        predicting = found_there.search
     except InputError:
         return found
     search.cut_short_with(predicting)

@@ -14,12 +14,16 @@ A long memory shows missing physics best, because its effect adds up over τ. It
 machine without disturbances, so that noise that a controller feeds back biases the fit least. Therefore the longest
 memory is used with which the refitted simulator follows the recordings; if it follows with none, the memory with the
 smallest error.
+
+Disturbances that nobody recorded need a shorter memory. With one that is too long, laws that only make the observer
+forget sooner look like missing physics. So the refitted simulator and the best laws are fitted with shorter memories
+too, and the search begins again with the memory with which the likeliest of them predicts best (`forget_sooner`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -29,14 +33,17 @@ from .._base import InputError
 from ..data import Recording
 from ..linear import steady_state_gain
 from ..simulators import Simulator, discretise, growth_rate
-from .faults.gates import USELESS_FIT, Gate
+from .faults.gates import LEAST_GAIN, USELESS_FIT, Gate, evidence_gain
 from .fits.linearise import linearise_runs
-from .fits.workbench import Fitted, Workbench, growth, refit
+from .fits.workbench import FEW, Fitted, Workbench, growth, refit
+from .search.hypotheses import Hypotheses
+from .search.trials import Name, Trial
 
 ROUNDING = 1e-9  # share of the largest entry that counts as zero
 # memories that are tried in turn, in half decades: times the time of e-fold growth (a longer one leaves the unstable
 # eigenvalue of the observer as it is); for a stable simulator times the longest recording's duration
 OF_GROWTH, OF_DURATION = (3.0, 1.0, 0.3, 0.1), (0.1, 0.03, 0.01, 0.003)
+SOONER = 10**-0.25  # ratio of the memories that are tried where disturbances need a shorter one: quarter decades
 
 
 def observer_keeps_up(simulator: Simulator, recordings: Sequence[Recording]) -> bool:
@@ -92,6 +99,61 @@ def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, 
     return best[1:]
 
 
+def forget_sooner(search: Hypotheses, simulator: Simulator, memory: float) -> tuple[Simulator, float] | None:
+    """Return the simulator with the memory, s, with which the likeliest hypothesis predicts best, if it is shorter.
+
+    The refitted simulator and the best laws have each their own best memory, from `memory` down to a sample. Laws count
+    only if they then predict clearly better: with a memory that is too long, many can imitate one that forgets sooner.
+    """
+    bench, first = search.bench, dict[frozenset[Name], Trial]()  # of each set of laws the likeliest form
+    for trial in sorted(search.memo.values(), key=search.optimistic_evidence, reverse=True):
+        first.setdefault(trial.names, trial)
+    first.pop(search.root.names, None)
+    plain = likeliest = _best_memory(search, search.root, simulator, memory)
+    for trial in [*first.values()][:FEW]:
+        own = _best_memory(search, trial, simulator, memory)
+        count = 0 if trial.information is None else len(trial.information)
+        gained = evidence_gain(plain.left, own.left, bench.scored(own.fitted.residual), count)
+        if gained > LEAST_GAIN and own.left < likeliest.left:
+            likeliest = own
+    if likeliest.memory >= memory:
+        return None
+    gain = observer(simulator, bench.recordings, bench.hold, likeliest.memory)
+    return replace(simulator, observer=gain), likeliest.memory
+
+
+@dataclass(frozen=True, eq=False)
+class _Led:
+    """A hypothesis led by an observer with a memory, s, and the mean square error that it leaves."""
+
+    fitted: Fitted
+    left: float
+    memory: float
+
+
+def _best_memory(search: Hypotheses, trial: Trial, simulator: Simulator, memory: float) -> _Led:
+    """Fit a hypothesis with shorter memories, and return it with the best."""
+    bench, best = search.bench, _Led(trial.fitted, trial.mean_square, memory)
+    last = trial.fitted
+    while (memory := memory * SOONER) >= bench.dt and search.may_go_on():
+        gain = observer(simulator, bench.recordings, bench.hold, memory)
+        found = refit(bench, [last.values], replace(last.simulator, observer=gain), states=last.begin)
+        if found is not None:
+            last, left = found, bench.pool(found.squares)
+            best = _Led(found, left, memory) if left < best.left else best
+    return best
+
+
+def disturbance_note(simulator: Simulator, memory: float, before: float) -> Gate:
+    """Note that disturbances explain more than the laws that were found with a longer memory."""
+    sentence = (
+        f"Disturbances that nobody recorded move the machine: with an observer that forgets within {memory:.3g} s, the "
+        f"simulator follows better than with one that forgets within {before:.3g} s. Physics whose effect is smaller "
+        "than theirs is not found."
+    )
+    return Gate(", ".join(simulator.output_names), "disturbance", memory, sentence, corrected=False)
+
+
 def prediction_note(simulator: Simulator, recordings: Sequence[Recording], memory: float) -> Gate:
     """Note that the errors are errors of predictions, and if so that the simulator is unstable."""
     rate = growth(simulator, recordings)
@@ -111,6 +173,16 @@ def drift_note(simulator: Simulator, memory: float, what: str) -> Gate:
         f"within {memory:.3g} s. The values and errors here are those of a fit in free run."
     )
     return Gate(", ".join(simulator.output_names), "prediction", memory, sentence, corrected=False)
+
+
+def untried_note(simulator: Simulator) -> Gate:
+    """Note that the simulator drifts in a free run, and that there was no time for predictions."""
+    sentence = (
+        "In a free run small forces and disturbances add up over the whole recording, so that its errors hardly tell "
+        "laws apart. Predictions one sample ahead often do, but there was no time left for them: diagnose with the "
+        "focus 'prediction' (--focus prediction), or give more time."
+    )
+    return Gate(", ".join(simulator.output_names), "prediction", None, sentence, corrected=False)
 
 
 def observer(simulator: Simulator, recordings: Sequence[Recording], hold: str, memory: float) -> np.ndarray:

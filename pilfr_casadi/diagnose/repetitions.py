@@ -1,14 +1,15 @@
 """Prepare and search, and repeat that where something that was taken for granted proves wrong.
 
-There are five cases:
+There are six cases:
 
 - If the simulator is unstable and runs away from the recordings, search with an observer (`prediction`).
 - If nobody stated the hold of the inputs and the best hypothesis follows better with another one, search with that.
 - If a channel seemed to be early, search without that correction, because missing physics can look like a lead.
 - If a channel proves shifted only beside the first law, search with it at its right times.
 - If a wrong zero was preferred to a wrong start, search from unknown initial states.
+- If disturbances move the machine, predict with an observer that forgets sooner.
 
-A sixth, in predictions, is `pipeline._name_in_predictions`. The functions are nested: `search_with_repetitions` calls
+A seventh, in predictions, is `pipeline._name_in_predictions`. The functions are nested: `search_with_repetitions` calls
 `_search_with_each_hold`, that calls `search_with_one_hold`, and that `_search_once`.
 
 Each search fits different data. Its evidence is therefore not comparable; the smaller error decides.
@@ -25,6 +26,7 @@ from functools import partial
 import numpy as np
 
 from .._base import InputError
+from ..simulators import Simulator
 from .arguments import Request
 from .faults.gates import LEAST_GAIN, USELESS_FIT, Checked, Gate, error_ratio, evidence_gain
 from .faults.offsets import Offset, WrongStart
@@ -32,7 +34,7 @@ from .faults.timing import TimeShift
 from .fits.evidence import AS_GIVEN_RATIO
 from .fits.floor import Floor, measured_floor
 from .fits.workbench import RunsAway
-from .prediction import observer_keeps_up, prediction_note, predictor
+from .prediction import disturbance_note, forget_sooner, observer_keeps_up, prediction_note, predictor
 from .preparation import CHECKS, Prepared, hold_note, prepare
 from .search.moves import Search
 
@@ -61,11 +63,51 @@ def search_with_repetitions(request: Request) -> tuple[Request, Attempt]:
             if request.focus == "simulation" or not observer_keeps_up(request.simulator, request.recordings):
                 raise
     # the gain depends little on the hold, which the search may still change
-    hold = request.stated_hold or "zero"
+    led, found, _ = search_in_predictions(request, request.stated_hold or "zero", _search_with_each_hold)
+    return led, found
+
+
+def search_in_predictions(
+    request: Request, hold: str, search: Callable[[Request], Attempt]
+) -> tuple[Request, Attempt, float]:
+    """Search with an observer, or with one that forgets sooner where disturbances move the machine.
+
+    Also returns the memory of the observer, s.
+
+    Raises
+    ------
+    InputError
+        If the simulator diverges with every observer.
+    """
     observed, memory = predictor(request.simulator, request.recordings, hold, request.engine)
+    led = _lead(request, observed, memory)
+    found = search(replace(led, most_effects=min(1, led.most_effects)))
+    other = _search_forgetting_sooner(request, found, memory, search)
+    if other is None and not found.search.cut_short:
+        found.search.most_effects = request.most_effects
+        found.search.resume()
+        other = _search_forgetting_sooner(request, found, memory, search)
+    return other or (led, found, memory)
+
+
+def _search_forgetting_sooner(
+    request: Request, found: Attempt, memory: float, search: Callable[[Request], Attempt]
+) -> tuple[Request, Attempt, float] | None:
+    """Search with a shorter memory if the likeliest hypothesis predicts better with one; None if it does not."""
+    sooner = forget_sooner(found.search, request.simulator, memory)
+    if sooner is None:
+        return None
+    observed, shorter = sooner
+    note = disturbance_note(request.simulator, shorter, memory)
+    led = _lead(replace(request, say=request.say.under("shorter memory: ")), observed, shorter, note)
+    other = _again(found, partial(search, led))
+    return None if other is None else (led, other, shorter)
+
+
+def _lead(request: Request, observed: Simulator, memory: float, *more: Gate) -> Request:
+    """Return the request for a simulator that an observer leads, with notes about it."""
     note = prediction_note(request.simulator, request.recordings, memory)
-    request = replace(request, simulator=observed, notes=(*request.notes, note))
-    return request, _search_with_each_hold(request)
+    return replace(request, simulator=observed, notes=(*request.notes, note, *more))
 
 
 def _search_with_each_hold(request: Request) -> Attempt:

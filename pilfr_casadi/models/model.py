@@ -341,8 +341,13 @@ def close_loop(model: Any, element: Element, port: str | None = None) -> Any:
     )
 
 
-def inject_outputs(model: Model, gain: np.ndarray, strength: Mapping[str, Parameter] | None = None) -> Model:
-    """Add `γ K (y_measured - y)` to the next state of a closed model, which then reads the measured outputs.
+def inject_outputs(
+    model: Model,
+    gain: np.ndarray,
+    strength: Mapping[str, Parameter] | None = None,
+    scales: ca.Function | None = None,
+) -> Model:
+    """Add `γ K (y_measured - y) / c` to the next state of a closed model, which then reads the measured outputs.
 
     Parameters
     ----------
@@ -350,6 +355,9 @@ def inject_outputs(model: Model, gain: np.ndarray, strength: Mapping[str, Parame
         K; it acts on the first k states, never on memory.
     strength : mapping of one Parameter, optional
         γ and its name. Without it γ is 1 in the sub-step at which a sample is taken and 0 in the sub-steps after it.
+    scales : casadi.Function, optional
+        c (n_y,) as `p -> c`; all 1 by default. A sensor that reads c times as much shall not make the observer forget
+        c times as fast.
     """
     x, s, u, p = model.symbols()
     sizes = (("z", model.n_w), ("w", model.n_w), ("measured", model.n_y), ("gamma", 1))
@@ -363,7 +371,8 @@ def inject_outputs(model: Model, gain: np.ndarray, strength: Mapping[str, Parame
     full = np.zeros((model.n_x, model.n_y))
     full[: len(gain)] = gain[: model.n_x]
     following, y = model.step(x, u, w, p)
-    pushed = gamma * (ca.DM(full) @ (measured - y))
+    error = measured - y if scales is None else (measured - y) / scales(p)
+    pushed = gamma * (ca.DM(full) @ error)
     stages = model.stages
     if stages is not None:
         c = ca.SX.sym("c", stages.size1_in(4))

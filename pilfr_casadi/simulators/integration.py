@@ -222,7 +222,9 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
         begin_alike=step.alike_at_first(substeps),
         interpolation="linear" if hold == "zero" else hold,
     )
-    return model if simulator.observer is None else inject_outputs(model, simulator.observer)
+    return (
+        model if simulator.observer is None else inject_outputs(model, simulator.observer, scales=step.sensor_scales())
+    )
 
 
 class _SubStep:
@@ -285,6 +287,20 @@ class _SubStep:
         )
         by_stages = (s2 + 2 * s3 + s4 - x) / 3 + h / 6 * self._evaluate_stage(s4, end, 1.0)
         return x_next, y, (c, ca.vertcat(c2, c3, c4), by_c, by_stages)
+
+    def sensor_scales(self) -> ca.Function | None:
+        """Make `p -> scales` (n_y,), by which laws multiply outputs that they only scale; None without such a law."""
+        laws = _LawsAtInstant(self.equations, Instant(self.x, self.s, self.u0, ca.SX.zeros(self.u0.shape), self.t))
+        names, scales = self.simulator.output_names, ca.SX.ones(len(self.simulator.output_names))
+        z, dz = ca.SX.sym("z"), ca.SX.sym("dz")
+        for i, e in enumerate(self.simulator.elements):
+            kind, name = split_port(e.port)
+            if kind != SENSOR or self.equations.n_q[i] or self.equations.n_s[i]:
+                continue
+            scale = 1 + ca.jacobian(laws.apply(i, z, dz), z)
+            if not ca.depends_on(scale, ca.vertcat(z, dz, self.x, self.s, self.u0, self.t)):
+                scales[names.index(name)] *= scale
+        return None if scales.is_constant() else ca.Function("scales", [self.vector], [ca.densify(scales)])
 
     def alike_at_first(self, substeps: int) -> tuple[int, ...]:
         """Number the unknowns of `Model.begin_alike`: entries of a shift register within one sample begin alike.

@@ -12,7 +12,7 @@ from pilfr_casadi._base import InputError
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.prediction import drifts, observer, observer_keeps_up
 from pilfr_casadi.engine import make_engine
-from pilfr_casadi.laws import CoulombFriction, CubicStiffness
+from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Gain
 from pilfr_casadi.simulators import discretise
 
 DT, SAMPLES = 0.01, 1500
@@ -103,6 +103,61 @@ def test_friction_in_an_unstable_machine_is_named_and_a_complete_simulator_is_to
     assert found.to_casadi().size1_in(1) == 1  # the exported step reads no measured output
     complete = pilfr.diagnose(levitation(30.0, 1.0), controlled(2, 0.0), laws=laws, workers=1)
     assert complete.verdict == "complete"
+
+
+def cart():
+    """A cart on rails: a free integrator."""
+    return Simulator(
+        lambda x, u, p: {"q": x.v, "v": p.k * u.f - p.d * x.v},
+        lambda x: {"pos": x.q},
+        states=("q", "v"),
+        inputs=("f",),
+        parameters={"k": Parameter(1.0, bounds=(0.1, 12)), "d": Parameter(0.2, bounds=(0, 5))},
+        ports=Port("rails", into={"v": -1.0}, across=lambda x: x.q, rate=lambda x: x.v),
+        hold="zero",
+    )
+
+
+def pushed(friction, push, noise):
+    """Record the cart under its controller, with friction, while somebody pushes it at random."""
+    rng, dt, count = np.random.default_rng(0), 0.1, 400
+    wish, pos, vel = 0.2 * np.cumsum(rng.standard_normal(count)), 0.0, 0.0
+    u, y = np.zeros((count, 1)), np.zeros((count, 1))
+    for k in range(count):
+        y[k] = pos + noise * rng.standard_normal()
+        u[k] = -1.5 * (y[k, 0] - wish[k]) - 1.5 * vel
+        more = push * rng.standard_normal()
+        for _ in range(20):
+            pos += dt / 20 * vel
+            vel += dt / 20 * (1.3 * u[k, 0] - 0.3 * vel + more - friction * np.tanh(vel / 0.01))
+    return Recording(u, y, dt, ("f",), ("pos",), hold="zero")
+
+
+@pytest.mark.parametrize(("friction", "push"), [(0.0, 0.3), (0.4, 0.02)])
+def test_laws_do_not_imitate_an_observer_that_forgets_sooner(friction, push):
+    laws = (Gain, CoulombFriction)
+    found = pilfr.diagnose(cart(), pushed(friction, push, 2e-3), laws=laws, focus="prediction", workers=1)
+    named = [(e.port, e.law) for e in found.effects]
+    assert named == ([("rails", "coulomb_friction")] if friction else [])
+    assert found.corrected.parameters["k"].value == pytest.approx(1.3, rel=0.15)
+    assert "Disturbances that nobody recorded move the machine" in str(found)
+
+
+def test_predictions_are_advised_if_a_free_run_drifts_and_took_all_the_time():
+    found = pilfr.diagnose(cart(), pushed(0.4, 0.3, 2e-3), workers=1, time_limit=3)
+    assert found.verdict == "unexplained" and "--focus prediction" in str(found)
+
+
+def test_a_sensor_that_reads_more_does_not_forget_sooner():
+    rig = replace(levitation(), observer=np.array([[0.3], [2.0]]))
+    scaled = rig.with_element("sensor:gap", Gain().at({"g": 9.0}))
+
+    def forgets(simulator):
+        model = discretise(simulator, DT, "zero", 1)
+        moved = [model.closed(unit, [0.0, 0.0, 1.0], model.parameters.start)[0] for unit in np.eye(2)]
+        return np.column_stack([np.asarray(x).ravel() for x in moved])
+
+    np.testing.assert_allclose(forgets(scaled), forgets(rig), atol=1e-12)
 
 
 def test_the_focus_can_be_stated(machine):
