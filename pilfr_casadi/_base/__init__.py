@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         is_number as is_number,
         is_whole as is_whole,
         listed as listed,
+        multiple as multiple,
         numbers as numbers,
         one_line as one_line,
         percent as percent,

@@ -58,6 +58,11 @@ def percent(share: float) -> str:
     return f"{100 * share:.0f} %" if 10 <= share < 1e4 else f"{100 * share:.3g} %"
 
 
+def multiple(ratio: float) -> str:
+    """Write how many times one value is another, to two digits: "1.4", "18", "230", without an exponent below 1e6."""
+    return f"{float(f'{ratio:.2g}'):g}"
+
+
 def usable(values: np.ndarray) -> np.ndarray:
     """Tell which values are finite and small enough that their squares can be summed; a boolean array."""
     return np.abs(values) <= LARGEST  # False for nan

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import in_words, one_blas_thread, percent, to_json
+from .._base import in_words, multiple, one_blas_thread, percent, to_json
 from ..data import HOLD_WORDS, Recording, moves_freely
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, UNKNOWN, in_series, kind_of, port_name, split_port
@@ -155,7 +155,7 @@ class Check:
         """State the error of the refitted simulator, and what follows if it is above the noise."""
         floor = float(np.mean(list(self.noise["share"].values())))
         times = self.error / max(floor, 1e-300)
-        yield f"refitted: error {percent(self.error)} of the outputs' deviation, {times:.2g} times the noise"
+        yield f"refitted: error {percent(self.error)} of the outputs' deviation, {multiple(times)} times the noise"
         if times > ABOVE_NOISE:
             yield "  Something is missing, or the noise is slow. Refitted values may stand in for missing physics;"
             yield "  standard errors and detectable strengths count the noise alone."

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base import multiple
 from ..data import Recording, nrmse
 from ..engine import make_engine
 from ..identify import run_free
@@ -238,7 +239,7 @@ def _waves(m: int, dt: float) -> Iterator[tuple[str, float, np.ndarray]]:
 def _describe_experiment(bench: Workbench, best: Mapping[str, Any], recorded: float, rivals: str) -> str:
     """Describe an experiment; `recorded` is the separation in the recordings."""
     unit = {**bench.simulator.units, **bench.recordings[0].units}.get(best["input"], "")
-    so_far = f"by {recorded:.2g} times" if recorded > VISIBLE_DIFFERENCE else "not at all"
+    so_far = f"by {multiple(recorded)} times" if recorded > VISIBLE_DIFFERENCE else "not at all"
     about = abs(best["level"]) > VISIBLE_LEVEL * best["amplitude"]
     swing = value_with_unit(best["amplitude"], unit)
     level = f" about {value_with_unit(best['level'], unit)}" if about else ""

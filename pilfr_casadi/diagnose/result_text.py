@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import percent
+from .._base import multiple, percent
 from ..data import DIVERGING, Recording
 from ..models import ParameterSet, is_at_bound
 from ..simulators import ACTUATOR, Placed, Simulator, name_at, split_port
@@ -249,12 +249,12 @@ class ResultText:
         law = best and f"{name_at(best['port'], best['law'], best['form'])} follows to {best['nrmse_train']:.3g}"
         if after > ABOVE_NOISE * noise:
             rest = f"more may be missing ({law})" if law else "more is missing, or a law is only near"
-            yield f"The remaining error is {after / noise:.2g} times the noise: {rest}."
+            yield f"The remaining error is {multiple(after / noise)} times the noise: {rest}."
         elif law or after > FAR_RATIO * white:
             rest = f"missing physics: {law}" if law else "physics that no law here explains"
             yield (
-                f"The remaining error is {after / white:.2g} times the white noise. Its slow part may be noise too, or "
-                f"{rest}."
+                f"The remaining error is {multiple(after / white)} times the white noise. Its slow part may be noise "
+                f"too, or {rest}."
             )
 
     def _doubtful_offsets(self) -> Iterator[str]:

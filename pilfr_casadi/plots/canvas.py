@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.textpath import TextPath
+from matplotlib.ticker import MaxNLocator
 
 from .._base import InputError
 from ..data import name_with_unit
@@ -39,6 +40,13 @@ class ShownFigure(Figure):
         buffer = io.BytesIO()
         self.savefig(buffer, format="png", dpi=SCREEN_DPI)
         return buffer.getvalue()
+
+
+class WholeLocator(MaxNLocator):
+    """Ticks at whole numbers only; a chart of these axes has them too."""
+
+    def __init__(self) -> None:
+        super().__init__(integer=True)
 
 
 def new_figure(width: float = 5.2, height: float = 3.5) -> Figure:

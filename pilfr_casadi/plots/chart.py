@@ -16,10 +16,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
+from matplotlib.container import BarContainer
 from matplotlib.patches import Polygon, Rectangle, StepPatch
 from matplotlib.text import Annotation
 
-from .canvas import SampledLine, thin
+from .canvas import SampledLine, WholeLocator, thin
 
 ENDLESS = 3e38  # end of a band across the whole axes: about the largest number of single precision
 Shape = tuple[dict[str, Any], np.ndarray, np.ndarray]  # style, x, y
@@ -44,13 +45,22 @@ def chart(axes: Axes, views: Mapping[str, Axes], most: int) -> dict[str, Any] | 
         shapes = [*map(_read_area, [*axes.patches, *axes.collections]), *map(_read_line, axes.lines)]
     except TypeError:
         return None
+    groups = [c for c in axes.containers if isinstance(c, BarContainer)]
+    bars: dict[Any, str] = {patch: str(group.get_label()) for group in groups for patch in group.patches}
+    for patch, (style, _, _) in zip(axes.patches, shapes, strict=False):  # bars have no label of their own
+        if not bars.get(patch, "_").startswith("_"):
+            style["label"] = _unescape(bars[patch])
     ranges = {name: [list(v.get_xlim()), list(v.get_ylim())] for name, v in {"": axes, **views}.items()}
     windows = sorted({x for limits, _ in ranges.values() for x in limits})
     legend = axes.get_legend()
     title = legend.get_title().get_text() if legend else axes.get_title(loc="left")
     return {
         "title": _unescape(title),
-        "x": {"label": _unescape(axes.get_xlabel()), "log": axes.get_xscale() == "log"},
+        "x": {
+            "label": _unescape(axes.get_xlabel()),
+            "log": axes.get_xscale() == "log",
+            "whole": isinstance(axes.xaxis.get_major_locator(), WholeLocator),
+        },
         "y": {"label": _unescape(axes.get_ylabel()), "log": axes.get_yscale() == "log"},
         "equal": axes.get_aspect() == 1.0,
         "views": ranges,
@@ -102,14 +112,19 @@ def _read_area(patch: Any) -> Shape:
             style["dash"] = [6, 4]
         return style, np.repeat(edges, 2)[1:-1], np.repeat(values, 2)
     if isinstance(patch, PolyCollection):
-        corners, colour = shape.get_paths()[0].vertices, shape.get_facecolor()[0]
+        gap = np.full((1, 2), np.nan)
+        parts = [np.concatenate([path.vertices, gap]) for path in shape.get_paths()]
+        corners, colour = np.concatenate(parts)[:-1], shape.get_facecolor()[0]
     elif isinstance(patch, Rectangle | Polygon):
         corners, colour = shape.get_path().transformed(shape.get_patch_transform()).vertices, shape.get_facecolor()
     else:
         raise TypeError(f"{type(shape).__name__} has no counterpart in a chart.")
     x, y = np.array(corners, dtype=float).T
     style = {**_read_label_and_colour(shape, colour[:3]), "area": True, "width": 0}
-    if isinstance(patch, Rectangle) and shape.get_transform() != shape.get_patch_transform() + shape.axes.transData:
+    in_x, in_y = shape.get_transform().contains_branch_seperately(shape.axes.transData)
+    if not in_x:
+        x, style["level"] = np.where(x > 0.5, ENDLESS, -ENDLESS), True  # `axhspan`
+    if not in_y:
         y, style["level"] = np.where(y > 0.5, ENDLESS, -ENDLESS), True  # `axvspan`
     return style, x, y
 

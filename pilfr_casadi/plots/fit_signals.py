@@ -120,7 +120,8 @@ def remains(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes 
     residual = mask_divergence(fit.simulate(recording)[:, output] - y, np.ptp(y))
     size, unit = choose_scale(residual[np.isfinite(residual)], _unit(fit, recording, recording.outputs[output]))
     rms = float(np.sqrt(np.mean((residual[recording.skip :] / size) ** 2)))
-    label = f"residual, this model (rms {rms:.3g} {unit}".rstrip() + ")"
+    times = "·" if unit.startswith("10") else " "  # such as 10⁻³ m
+    label = f"residual, this model (rms {rms:.3g}{times}{unit}".rstrip() + ")"
     line(ax, recording.t, residual / size, label, INK, linewidth=0.8)
     return finish_over_time(ax, recording, name_with_unit(f"simulated − measured {recording.outputs[output]}", unit))
 

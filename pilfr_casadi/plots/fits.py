@@ -16,7 +16,7 @@ from .._base import InputError
 from ..data import Recording, as_recordings, name_with_unit
 from ..models import weight_density
 from ..optimise import Iteration
-from .canvas import BLUE, GREY, PALE_BLUE, SKY, VERMILLION, axes_or_new, check_index, finish, new_figure
+from .canvas import BLUE, GREY, PALE_BLUE, SKY, VERMILLION, WholeLocator, axes_or_new, check_index, finish, new_figure
 from .fit_signals import PlottedFit, as_scored, spectrum, time
 
 Records = Recording | Sequence[Recording]
@@ -183,4 +183,5 @@ def convergence(fit: PlottedFit, *, ax: Axes | None = None) -> Axes:
     if fit.solution.history:
         draw(fit.solution.history, "last solve of the best", color=VERMILLION, linewidth=2.0)
     ax.set_yscale("log")
+    ax.xaxis.set_major_locator(WholeLocator())
     return finish(ax, "iteration", "training error √(2 · cost)", "convergence")

@@ -200,7 +200,7 @@ def compared_spectra(r: Recording, simulated: Simulated, output: int, unit: str,
     """Draw amplitude densities of the output, of each residual, and of white noise of standard deviation `floor`."""
     y = r.y[:, output]
     signals = [("measured", y, BLUE)]
-    signals += [(f"left {label}", v[:, output] - y, colour) for label, v, colour in assign_colours(simulated)]
+    signals += [(f"error {label}", v[:, output] - y, colour) for label, v, colour in assign_colours(simulated)]
     ends = amplitude_density(y, r)[0][[0, -1]]
     white = [("noise floor (white)", ends, np.full(2, 2 * r.dt * floor**2), GREEN)] if floor > 0 else []
     return draw_densities(r, output, unit, signals, white, None)

@@ -247,7 +247,8 @@ def _force_blocks(case: _Case, fitted: Fitted, port: str, number: int | None, na
         hidden = None
     if hidden is None:
         return [Text(f"The outputs do not show the {what} at {port}, so it cannot be recovered.")]
-    recording = hidden.recording or (f"training recording {strongest + 1}" if len(records) > 1 else "the recording")
+    numbered = f"training recording {strongest + 1}" if len(records) > 1 else "the recording"
+    recording = f"the recording “{hidden.recording}”" if hidden.recording else numbered
     text = (
         f"The points are the {what} at {port} that makes the simulator follow {recording}. A smoother computed it with "
         f"the fitted parameters, assuming only that the {what} changes in random steps; it uses no law."

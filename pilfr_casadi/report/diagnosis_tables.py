@@ -229,8 +229,9 @@ CANDIDATES = (
     "Each law is fitted together with the simulator's own parameters. Where a model is wrong, the likeliest laws are "
     "also judged on held-out blocks, which are not used in the fit. Bars: from the noise to the error without a law, "
     "logarithmic; the thin line ends at the error on held-out blocks, if it was computed. Margin: error of the fit "
-    "divided by that of the law in bold; below one, a law follows more closely but is less likely, such as one with "
-    "more parameters. ΔBIC: twice the loss of log evidence; below zero is better than no law."
+    "divided by that of the law in bold, or of the first law if none is bold; below one, a law follows more closely "
+    "but is less likely, such as one with more parameters. ΔBIC: twice the loss of log evidence; below zero is better "
+    "than no law."
 )
 
 
@@ -268,7 +269,7 @@ def candidate_tables(
                 f"{gain:+.0f}".replace("-", "−") if np.isfinite(gain) else "–",
             ]
         )
-    columns = ["law", "port", "error of the fit", "error, held-out blocks", "error / least error", "ΔBIC"]
+    columns = ["law", "port", "error of the fit", "error, held-out blocks", "margin", "ΔBIC"]
     emphasis = [] if winner is None else [winner]  # an index outside a table marks no row
     out: list[Block] = [Table(columns, cells[:OPEN_ROWS], caption=title, emphasis=emphasis)]
     if len(cells) > OPEN_ROWS:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .. import plots
-from .._base import make_folder, write_atomically
+from .._base import make_folder, multiple, write_atomically
 from ..data import DIVERGING, Recording, as_recordings, rmse_per_output
 from ..identify import Fit
 from ..linear import LinearPart, any_bla
@@ -184,7 +184,7 @@ def _facts(fit: Fit, rows: list[dict[str, Any]], judged: list[dict[str, Any]]) -
             facts[f"NRMSE, {role}" + (" (worst)" if len(values) > 1 else "")] = f"{max(values):.4f}"
     gain = np.min([r["linear"] / r["nrmse"] if 0 < r["nrmse"] < np.inf else np.nan for r in judged])
     if gain >= 1:
-        facts["error against a linear model"] = f"{gain:.2g} times smaller"
+        facts["error against a linear model"] = f"{multiple(gain)} times smaller"
     facts["free parameters"] = str(int(fit.model.parameters.free.sum()))
     if fit.seconds:
         facts["time of the fit"] = f"{fit.seconds:.1f} s"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -58,9 +59,14 @@ def _differing(content: Mapping[str, Any]) -> list[Block]:
     shown = [m for m in content["machines"] if m["reasons"] or m["failed"]]
     if not shown:
         return [Text("No machine differs from the others.")]
-    rows = [[_name(m), text, p] for m in shown for text, p in m["reasons"] or [(m["failed"], 1.0)]]
+    rows = [[_name(m), _with_minus(text), p] for m in shown for text, p in m["reasons"] or [(m["failed"], 1.0)]]
     note = "A row is shown if it is more likely than not. Each name leads to the machine's own page."
     return [Table(["machine", "finding", "probability"], rows, note=note, digits=3)]
+
+
+def _with_minus(text: str) -> str:
+    """Write the minus signs of numbers in a sentence as in print; hyphens of names stay."""
+    return re.sub(r"(?<=\s)-(?=\d)", "−", text)
 
 
 def _name(machine: Mapping[str, Any]) -> Link:
@@ -111,10 +117,12 @@ def _maps(content: Mapping[str, Any]) -> list[Block]:
     out: list[Block] = []
     if len(columns) > 1:
         caption = f"The machines by {columns[0][0]} and {columns[1][0]}; ellipses are two standard errors."
-        out.append(Picture(fleet_map(content), caption, "map of the machines", wide=True))
-    caption = "Values of the machines, sorted by the probability that they differ; bars are two standard errors."
-    strips = plots.machine_strips(columns[:MOST_STRIPS], *_names_and_differing(content))
-    return [*out, Picture(strips, caption, "values of the machines", wide=True)]
+        out.append(Picture(fleet_map(content).axes[0], caption, "map of the machines", wide=True))
+    for column in columns[:MOST_STRIPS]:
+        caption = f"{column[0]} of the machines, the most probable to differ first; bars are two standard errors."
+        strip = plots.machine_strips([column], *_names_and_differing(content))
+        out.append(Picture(strip.axes[0], caption, f"{column[0]} of the machines"))
+    return out
 
 
 def _rest(content: Mapping[str, Any], residuals: Mapping[str, Mapping[str, Any]]) -> list[Block]:
@@ -123,9 +131,9 @@ def _rest(content: Mapping[str, Any], residuals: Mapping[str, Mapping[str, Any]]
     if not shown:
         return []
     figure = plots.small_multiples([residuals[m["name"]] for m in shown], [m["name"] for m in shown])
-    rows = [[_name(m), m["rest"].get("verdict", ""), m["rest"].get("sentence", "")] for m in shown]
+    rows = [[_name(m), m["rest"].get("verdict", "").replace("-", " "), m["rest"].get("sentence", "")] for m in shown]
     return [
-        Picture(figure, RESIDUAL, "residuals of machines with more missing physics", wide=len(shown) > 1),
+        Picture(_alone(figure), RESIDUAL, "residuals of machines with more missing physics", wide=len(shown) > 1),
         Table(["machine", "verdict", "diagnosis of the remaining mismatch"], rows),
     ]
 
@@ -155,7 +163,12 @@ def _drift(content: Mapping[str, Any], machines: Sequence[Mapping[str, Any]]) ->
     if len(trends) > MOST_PICTURES:
         caption += f" {len(trends) - MOST_PICTURES} more are in the tables."
     figure = plots.machine_trends(trends[:MOST_PICTURES])
-    return [Picture(figure, caption, "values that drift", wide=len(trends) > 1)]
+    return [Picture(_alone(figure), caption, "values that drift", wide=len(trends) > 1)]
+
+
+def _alone(figure: Any) -> Any:
+    """Return the axes of a figure with one picture, of which a page makes a chart; otherwise the figure."""
+    return figure.axes[0] if len(figure.axes) == 1 else figure
 
 
 def _values(content: Mapping[str, Any]) -> Table:
@@ -198,7 +211,7 @@ def machine_page(content: Mapping[str, Any], name: str, residual: Mapping[str, A
         See `fleet_page`.
     """
     m = next(m for m in content["machines"] if m["name"] == name)
-    found = [f"{text} (probability {number_text(p, 3)})" for text, p in m["reasons"]]
+    found = [f"{_with_minus(text)} (probability {number_text(p, 3)})" for text, p in m["reasons"]]
     if m["failed"]:
         tone, answer, status = "bad", "Could not be fitted", m["failed"]
     elif found:
@@ -265,7 +278,8 @@ def _own_error(content: Mapping[str, Any], m: Mapping[str, Any], residual: Mappi
     )
     if not (m["reasons"] and residual):
         return [table]
-    return [table, Picture(plots.small_multiples([residual], [m["name"]]), RESIDUAL, "residual of the machine")]
+    figure = plots.small_multiples([residual], [m["name"]])
+    return [table, Picture(_alone(figure), RESIDUAL, "residual of the machine")]
 
 
 def _judgement(m: Mapping[str, Any]) -> list[Block]:

@@ -46,12 +46,15 @@ TONES = ("plain", "good", "warning", "bad")
 DPI = 160  # dots per inch of the pictures: sharp at twice the resolution of an ordinary screen
 PALETTE_SIZE = 64  # colours of a picture: a third of the bytes, and lines stay smooth
 CHART_BYTES = 1_200_000  # all charts of a page; with its pictures the page stays below 3 MB
+# uPlot asks for the number format of the browser's language as it loads; a language that `Intl` does not know, such as
+# "en-US@posix" of a Chromium under LANG=C, stops it. The page is in English, and the script writes numbers itself.
+ENGLISH = 'Object.defineProperty(navigator, "language", { value: "en" });\n'
 MOST_POINTS, FEWEST_POINTS = 16_000, 500  # points of a line in a view of a chart; CHART_BYTES decides
 
 
 def number_text(value: float, digits: int = 4) -> str:
-    """Write a number for people: `−1.7·10⁻⁶` rather than `-1.7e-06`."""
-    return typeset_numbers(f"{value:.{digits}g}")
+    """Write a number for people: `−1.7·10⁻⁶` rather than `-1.7e-06`, and 4000 rather than `4e+03`."""
+    return typeset_numbers(f"{float(f'{value:.{digits}g}'):.{max(digits, 6)}g}")
 
 
 def typeset_numbers(text: str) -> str:
@@ -269,7 +272,7 @@ class Page:
             charts = self._charts(most)
         scripts, style = [], read_asset("templates/report.css")
         if any(charts.values()):
-            scripts = [read_asset("uplot/uPlot.iife.min.js"), read_asset("templates/explore.js")]
+            scripts = [ENGLISH + read_asset("uplot/uPlot.iife.min.js"), read_asset("templates/explore.js")]
             style += read_asset("uplot/uPlot.min.css")
         licence = read_asset("uplot/LICENSE")
         return render(

@@ -249,7 +249,8 @@ class Fleet:
         else:
             text = f"The machines lack nothing in common (probability {self.common.probability:.2f} on {sampled})."
         counts = [(len(self.differing), "differ"), (len(self.drifting), "drift")]
-        return f"{text} Of {n} machines, " + " and ".join(f"{count} {word}" for count, word in counts) + "."
+        found = [f"{count} {verb}{'s' if count == 1 else ''}" for count, verb in counts]
+        return f"{text} Of {n} machines, {' and '.join(found)}."
 
     def judge(
         self,

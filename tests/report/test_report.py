@@ -9,16 +9,16 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from browser import in_a_browser, needs_chromium
+from browser import PICTURES, SEEN, browser, in_a_browser, needs_chromium
 from diagnosis_example import recorded, rig
 
-from pilfr_casadi._base import InputError
+from pilfr_casadi._base import InputError, multiple
 from pilfr_casadi.data import Recording
 from pilfr_casadi.identify import Fit, fit, load
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, block_shapes
 from pilfr_casadi.optimise import Iteration, Solution, Status
 from pilfr_casadi.plots import chart, new_figure
-from pilfr_casadi.plots.canvas import BLUE, INK, finish, line
+from pilfr_casadi.plots.canvas import BLUE, INK, WholeLocator, finish, line
 from pilfr_casadi.report import (
     Code,
     Link,
@@ -153,6 +153,8 @@ def test_tables_write_numbers_for_people():
     assert [text for text, _ in table.cells[0]] == ["x", "0.0123", "−1.5·10⁻⁶", "–", "12", "∞"]
     assert [number for _, number in table.cells[0]] == [False, True, True, True, True, True]
     assert number_text(np.float64(6.02214e23)) == "6.022·10²³"
+    assert number_text(4000, 3) == "4000" and number_text(123456, 3) == "123000"
+    assert [multiple(ratio) for ratio in (1.44, 18.4, 231.4)] == ["1.4", "18", "230"]
     assert uncertain_text(1.23456, 0.0123) == "1.235\xa0±\xa00.012"
     assert uncertain_text(-123456.0, 250.0) == "−123456\xa0±\xa0250"
     assert uncertain_text(1.5e-7, 2e-9) == "1.5·10⁻⁷\xa0±\xa02·10⁻⁹"
@@ -332,7 +334,10 @@ def test_a_picture_becomes_a_chart_of_all_samples():
     assert 900 < len(x) < 2500 and np.all(np.diff(x) > 0) and (x[0], x[-1]) == (0, 50)
     assert np.max(y) == 5.0 and np.count_nonzero((x > 0.25) & (x < 2.25)) > 350  # spikes stay, and windows are dense
     assert [line["label"] for line in content["lines"]] == ["measured", "costs $"]
-    assert content["x"] == {"label": "time [s]", "log": False} and list(content["views"]) == ["", "start"]
+    assert content["x"] == {"label": "time [s]", "log": False, "whole": False} and list(content["views"]) == [
+        "",
+        "start",
+    ]
     around, points = chart(loop, {}, 500)["lines"]
     assert len(unpacked(around["x"])) <= 510 and points["mark"] == "dot" and points["width"] == 0
     assert np.max(unpacked(around["x"])) == np.max(unpacked(around["y"])) == pytest.approx(1, abs=1e-6)
@@ -341,6 +346,15 @@ def test_a_picture_becomes_a_chart_of_all_samples():
     figure = new_figure()
     first, _ = figure.subplots(1, 2)
     assert chart(first, {}, 500) is None
+    bars = new_figure().add_subplot()
+    bars.bar([0.0, 1.0], [2.0, 3.0], label="strong")
+    assert [line["label"] for line in chart(bars, {}, 500)["lines"]] == ["strong", "strong"]
+    spans = new_figure().add_subplot()
+    spans.axhspan(2.0, 3.0)
+    spans.axvspan(4.0, 5.0)
+    across, up = ({k: unpacked(line[k]) for k in "xy"} for line in chart(spans, {}, 500)["lines"])
+    assert set(across["y"]) == {2, 3} and set(up["x"]) == {4, 5}
+    assert np.all(np.abs([across["x"], up["y"]]) > 1e38)
     html = page.html()
     assert html.count("data-chart=") == 3 and own_scripts_alone(html)
 
@@ -351,21 +365,116 @@ def unpacked(packed):
     return np.frombuffer(base64.b64decode(packed), "<f4").astype(float)
 
 
+@pytest.fixture
+def charts(tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text(chart_page()[1].html())
+    return path
+
+
 @needs_chromium
-def test_charts_in_a_browser(tmp_path):
-    (tmp_path / "report.html").write_text(chart_page()[1].html())
-    seen = in_a_browser(tmp_path, 390)
-    assert seen["pictures"] == seen["charts"] == 3
-    assert re.fullmatch(r"time [\d.]+ smeasured: \S+ mcosts \$: \S+ m", seen["used"][0]["tip"])
+def test_charts_in_a_browser(charts):
+    for seen in in_a_browser(charts, (390, 1280)):
+        assert seen["pictures"] == seen["charts"] == 3
+        assert re.fullmatch(r"time [\d.]+ smeasured: \S+ mcosts \$: \S+ m", seen["used"][0]["tip"])
+
+
+@needs_chromium
+def test_numbers_of_charts_are_english_whatever_the_language(charts):
+    with browser() as b:
+        tips = []
+        for language in ("en-US@posix", "de-DE"):
+            first = f"Object.defineProperty(Navigator.prototype, 'language', {{ get: () => '{language}' }});"
+            tips.append(b.open(charts, first=first).run(SEEN)["used"][0]["tip"])
+            assert b.messages == []
+        assert tips[0] == tips[1] != ""
+
+
+TICKS = """(() => {  // the texts that are drawn on canvases
+  window.texts = [];
+  const draw = CanvasRenderingContext2D.prototype.fillText;
+  CanvasRenderingContext2D.prototype.fillText = function (text, ...more) {
+    texts.push(text);
+    draw.call(this, text, ...more);
+  };
+})()"""
+
+
+@needs_chromium
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (0, 5e-4, ["0", "1·10⁻⁴", "5·10⁻⁴"]),
+        (-3.0, 3.0, ["−2", "0", "2"]),
+        (1e7, 1.1e7, ["1.02·10⁷", "1.10·10⁷"]),
+        (20.0, 20.001, ["20.0002", "20.0010"]),
+        (0.0, 30_000.0, ["10000", "30000"]),
+    ],
+)
+def test_ticks_tell_neighbours_apart(low, high, expected, tmp_path):
+    ax = new_figure().add_subplot()
+    ax.plot([0.0, 1.0], [low, high])
+    finish(ax, "time [s]", "y [m]")
+    (tmp_path / "report.html").write_text(Page("ticks", [Section("part", [Picture(ax, "caption", "alt")])]).html())
+    with browser() as b:
+        texts = b.open(tmp_path / "report.html", first=TICKS).run("texts")
+    assert set(expected) <= set(texts)
+
+
+@needs_chromium
+def test_iterations_are_whole_numbers(tmp_path):
+    ax = new_figure().add_subplot()
+    ax.plot([0.0, 1.0, 2.0], [1.0, 3.0, 5.0])
+    ax.xaxis.set_major_locator(WholeLocator())
+    finish(ax, "iteration", "error")
+    (tmp_path / "report.html").write_text(Page("whole", [Section("part", [Picture(ax, "caption", "alt")])]).html())
+    with browser() as b:
+        texts = b.open(tmp_path / "report.html", first=TICKS).run("texts")
+    assert {"0", "1", "2"} <= set(texts) and not {"0.5", "1.5"} & set(texts[: texts.index("error")])
+
+
+LABEL = """(() => {  // whether the label of the vertical axis is inside the canvas
+  window.inside = [];
+  const draw = CanvasRenderingContext2D.prototype.fillText;
+  CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
+    const m = this.getTransform(), half = this.measureText(text).width / 2;
+    if (Math.abs(m.b) > 0.5) inside.push(m.f - half >= 0 && m.f + half <= this.canvas.height);
+    draw.call(this, text, x, y);
+  };
+})()"""
+
+
+@needs_chromium
+def test_a_long_label_of_the_vertical_axis_is_not_cut(tmp_path):
+    ax = new_figure().add_subplot()
+    ax.plot([0.0, 1.0], [0.0, 1.0])
+    finish(ax, "time [s]", "simulated − measured displacement of the tip [10⁻⁶ m]")
+    (tmp_path / "report.html").write_text(Page("label", [Section("part", [Picture(ax, "caption", "alt")])]).html())
+    with browser() as b:
+        inside = b.open(tmp_path / "report.html", 390, first=LABEL).run("inside")
+    assert inside and all(inside)
+
+
+@needs_chromium
+def test_a_chart_that_cannot_be_drawn_leaves_its_picture(charts):
+    with browser() as b:
+        b.open(charts, first="HTMLCanvasElement.prototype.getContext = () => null;")
+        assert b.run(PICTURES) == {"figures": 4, "images": 4, "charts": 0}
+        assert any("TypeError" in text for text in b.messages)
+
+
+@needs_chromium
+def test_the_browser_reports_what_the_console_says_at_once(charts):
+    with browser() as b, pytest.raises(AssertionError, match=r"not so[\s\S]*broken"):
+        b.open(charts, first="console.error('broken')").run("(async () => { throw Error('not so'); })()")
 
 
 @needs_chromium
 @pytest.mark.slow
-@pytest.mark.parametrize("width", [390, 1280])
-def test_in_a_browser(width, tmp_path):
+def test_in_a_browser(tmp_path):
     fitted = example(n_u=2, n_y=2, channels=2)
     long_name = "a_recording_with_a_name_that_goes_on_and_on_without_a_single_blank_in_it"
     fit_report(fitted, record(fitted), [record(fitted, long_name, seed=2)], tmp_path)
-    seen = in_a_browser(tmp_path, width)
-    assert seen["title"] == "Identified model: u0, u1 → y0, y1"
-    assert seen["pictures"] > 10
+    for seen in in_a_browser(tmp_path / "report.html"):
+        assert seen["title"] == "Identified model: u0, u1 → y0, y1"
+        assert seen["pictures"] > 10

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from browser import in_a_browser, needs_chromium
 from command_line import refused, run
 from fleet_rig import LAWS, PORT, STIFFNESS, WEAR, machines, recording, rig, write_machines
 
@@ -54,7 +55,20 @@ def test_the_common_physics_is_found_and_confirmed(found):
     fleet, _ = found
     assert [(law.port, law.id) for law in fleet.common.laws] == [(PORT, "coulomb_friction")]
     assert fleet.common.probability > 0.9 and fleet.confirmed >= 4
-    assert "Coulomb friction" in fleet.summary and "1 differ and 1 drift" in fleet.summary
+    assert "Coulomb friction" in fleet.summary and "1 differs and 1 drifts." in fleet.summary
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_pages_in_a_browser(found, tmp_path):
+    fleet, _ = found
+    residual = {"seconds": 2.0, "low": [-0.1, 0.0, 0.1], "high": [0.0, 0.1, 0.2], "noise": 0.05}
+    residuals = {m.name: residual for m in fleet.machines}
+    page = report.fleet_page(fleet.to_dict(), residuals)
+    (tmp_path / "report.html").write_text(page.html())
+    for seen in in_a_browser(tmp_path / "report.html"):
+        assert seen["charts"] == seen["pictures"] == 6  # the map, three values, what is left, a drift
+    assert "drifts by −" in page.html()
 
 
 def test_a_second_fault_is_found_and_named(found):
@@ -104,8 +118,9 @@ def test_the_folder_holds_table_content_and_page(found):
     content = json.loads((folder / "fleet.json").read_text())
     assert content["differing"] == ["e"] and content["drifting"] == ["b"]
     page = (folder / "report.html").read_text()
-    assert "default-src" in page and "<script" not in page
-    assert page.count("<img") == 4  # map, strips, what is left, drift
+    assert "default-src 'none'" in page and page.count("<script>") == page.count("'sha256-") == 2  # its own, no others
+    assert page.count("<img") == 6  # map, three values, what is left, drift
+    assert page.count("data-chart=") == 6
     assert fleet.plot()._repr_png_()[:4] == b"\x89PNG"
     assert str(read_fleet(folder, rig(), laws=LAWS)) == str(fleet)
 
@@ -117,7 +132,8 @@ def test_every_machine_has_a_page(found):
     for m in fleet.machines:
         assert f'href="{m.page}"' in overview
         page = pages[m.name] = (folder / m.page).read_text()
-        assert "default-src" in page and "<script" not in page
+        scripts = 2 if "data-chart=" in page else 0  # only its own, allowed by their hash
+        assert "default-src 'none'" in page and page.count("<script>") == page.count("'sha256-") == scripts
         links = [link for link in re.findall(r'href="([^"]*)"', page) if not link.startswith(("data:", "#"))]
         assert "../../report.html" in links and all((folder / m.page).parent.joinpath(link).is_file() for link in links)
     assert f'href="../../{fleet["e"].report}"' in pages["e"] and "cubic stiffness" in pages["e"]

@@ -21,7 +21,7 @@ from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
-from ..._base import InputError, percent
+from ..._base import InputError, multiple, percent
 from ...data import Recording
 from ...optimise import GaussNewton
 from ..fits.evidence import FORMULA_ERROR
@@ -275,7 +275,7 @@ def accept(now: Checked, after: Checked | None, fault: Gate) -> Checked:
     sentence = f"{fault.sentence}; {fault.remedy} {describe_fall(*errors)}"
     noises = (after.cost / max(now.noise2, 1e-300)) ** 0.5
     if noises > NEAR_NOISE_RATIO:
-        sentence += f", still {noises:.2g} times the noise: more is wrong"
+        sentence += f", still {multiple(noises)} times the noise: more is wrong"
     told = replace(fault, sentence=f"{sentence}.", fault=True, left=after.cost / _cost_where_kept(now, after, fault))
     return now.then(after.bench, after.fitted, told)
 

@@ -2,12 +2,13 @@
    keyboard. Without this script the reader sees the pictures. */
 (() => {
 "use strict";
-const INK = { "#222222": "--ink", "#dddddd": "--line", "#7a7a7a": "--soft" };  // colours of plots/canvas.py for a white background
+const INK = { "#222222": "--ink", "#dddddd": "--line", "#7a7a7a": "--soft", "#0072b2": "--blue" };  // colours of plots/canvas.py for a white background
 const AREA = { "#eeeeee": "--line", "#e8f1f7": "--line" };
 const REACH = 40;  // pixels: a point this close to the pointer shows its values
 const style = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const make = (tag, parent, settings = {}) => parent.appendChild(Object.assign(document.createElement(tag), settings));
-const digits = v => Math.abs(v) >= 1e6 || (v && Math.abs(v) < 1e-4) ? v.toExponential(3) : String(+v.toPrecision(5));
+const typeset = text => text.replace(/e([+-]\d+)$/, (_, power) => "·10" + String(+power).replace(/./g, c => "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"["-0123456789".indexOf(c)])).replace("-", "−");
+const digits = v => typeset(Math.abs(v) >= 1e6 || (v && Math.abs(v) < 1e-4) ? v.toExponential(3) : String(+v.toPrecision(5)));
 const quantity = label => /^(.*?)(?: \[(.*)\])?$/.exec(label).slice(1);
 
 function numbers(packed) {
@@ -21,6 +22,13 @@ function nearest(x, at) {  // of increasing x
   return at - x[low] < x[high] - at ? low : high;
 }
 
+function tickTexts(at, step) {  // of a linear axis: as many digits as tell neighbours apart, and one power of ten for all
+  const most = Math.max(...at.map(Math.abs)), power = most >= 1e6 || most < 1e-3 ? Math.floor(Math.log10(most)) : 0;
+  const unit = step / 10 ** power, places = Math.max(0, Math.min(12, -Math.floor(Math.log10(unit) + 1e-9)));
+  const exact = Math.abs(unit * 10 ** places - Math.round(unit * 10 ** places)) < 1e-6 ? places : places + 1;  // a step may be 2.5
+  return at.map(v => v === 0 || !isFinite(v) ? "0" : typeset((v / 10 ** power).toFixed(exact) + (power ? `e${power > 0 ? "+" : ""}${power}` : "")));
+}
+
 function ticks(low, high) {  // of a logarithmic axis, few enough to label each
   const decades = Math.log10(high / low), out = [];
   const steps = decades > 3 ? [1] : decades > 1.4 ? [1, 3] : decades > 0.7 ? [1, 2, 5] : [1, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9];
@@ -31,7 +39,7 @@ function ticks(low, high) {  // of a logarithmic axis, few enough to label each
 }
 
 function colour(line) {
-  const name = (line.area ? AREA : INK)[line.colour];
+  const name = (line.area && AREA[line.colour]) || INK[line.colour];
   return name ? style(name) : line.colour;
 }
 
@@ -157,9 +165,13 @@ function explore(figure) {
     u.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
   }
 
-  const size = () => ({ width: plot.clientWidth, height: Math.round(Math.max(250, Math.min(0.62 * plot.clientWidth, 380))) });
-  const axis = (label, logged) => ({
-    ...(logged ? { splits: (_, __, low, high) => ticks(low, high), values: (_, at) => at.map(digits), filter: (_, at) => at } : {}),
+  const pen = document.createElement("canvas").getContext("2d");
+  pen.font = "13px system-ui, sans-serif";
+  const labelled = Math.min(pen.measureText(spec.y.label).width + 75, 460);  // the label beside the axis is not cut
+  const size = () => ({ width: plot.clientWidth, height: Math.round(Math.max(250, labelled, Math.min(0.62 * plot.clientWidth, 380))) });
+  const axis = (label, logged, whole) => ({
+    ...(logged ? { splits: (_, __, low, high) => ticks(low, high), values: (_, at) => at.map(digits), filter: (_, at) => at } : { values: (_, at, __, ___, step) => tickTexts(at, step) }),
+    ...(whole ? { incrs: [...Array(9).keys()].flatMap(k => [1, 2, 5].map(v => v * 10 ** k)) } : {}),
     label, labelSize: 20, font: "13px system-ui, sans-serif", labelFont: "13px system-ui, sans-serif", labelGap: 2,
     stroke: () => style("--ink"), grid: { stroke: () => style("--line"), width: 1 }, ticks: { stroke: () => style("--line"), width: 1, size: 5 },
   });
@@ -171,7 +183,7 @@ function explore(figure) {
       x: { time: false, auto: false, distr: log.x ? 3 : 1, min: x[0], max: x[1], range: (_, a, b) => [a, b] },
       y: { auto: false, distr: log.y ? 3 : 1, min: y[0], max: y[1], range: (_, a, b) => [a, b] },
     },
-    axes: [{ ...axis(spec.x.label, log.x), size: 30 }, {
+    axes: [{ ...axis(spec.x.label, log.x, spec.x.whole), size: 30 }, {
       ...axis(spec.y.label, log.y),
       size: (_, values) => spec.equal ? 62 : 14 + 8 * Math.max(3, ...(values || []).map(v => v == null ? 0 : String(v).length)),
     }],
@@ -239,8 +251,16 @@ function explore(figure) {
 }
 
 const repaint = [];
-document.querySelectorAll("figure[data-chart]").forEach(explore);
+for (const figure of document.querySelectorAll("figure[data-chart]")) {
+  const known = repaint.length;
+  try { explore(figure); } catch (error) {  // the picture stays
+    console.error(error);
+    repaint.length = known;
+    for (const box of figure.querySelectorAll(".chart")) box.remove();
+  }
+}
+if (!repaint.length) return;
 document.querySelectorAll("figure.replaced").forEach(f => { f.hidden = true; });
-if (repaint.length) document.querySelectorAll(".explore-help").forEach(p => { p.hidden = false; });
+document.querySelectorAll(".explore-help").forEach(p => { p.hidden = false; });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => repaint.forEach(paint => paint()));
 })();
