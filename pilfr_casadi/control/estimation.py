@@ -71,9 +71,15 @@ class Rollout:
 def roll_out(source: Any, recording: Recording, verb: str) -> Rollout:
     """Run a fit, a diagnosis, a simulator or an export along a recording; errors name the called `verb`."""
     model, recording = _export_step(source, recording, verb)
-    u = recording.u
+    u, following = recording.u, np.vstack([recording.u[1:], recording.u[-1:]])
     if len(model.inputs) > recording.n_u:
-        u = np.hstack([u, np.vstack([u[1:], u[-1:]])])
+        u = np.hstack([u, following])
+    elif "next" in (
+        recording.hold,
+        getattr(source, "hold", None),
+        getattr(getattr(source, "model", None), "hold", None),
+    ):
+        u = following  # the input of a step acts until the next one
     start = model.x0()
     x_next, y = (np.asarray(v) for v in model.step.mapaccum("rollout", len(u))(start, u.T))
     first = source.scored_from(recording) if isinstance(source, Fit) else recording.skip

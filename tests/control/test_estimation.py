@@ -197,6 +197,15 @@ def test_interpolated_inputs_are_observed_and_not_inverted():
     refused(lambda: feedforward(found, data[0]), "input is interpolated between samples")
 
 
+def test_next_values_act_one_step_earlier_in_an_observer():
+    simulator, data = two_masses().with_element("ground-m1", LAW), recordings(LAW, count=1, hold="zero")
+    late = data[0].with_(u=np.vstack([data[0].u[:1], data[0].u[:-1]]), hold="next")
+    wanted = kalman_filter(diagnosis(simulator, data, "zero"), data[0])
+    for given in (late, late.with_(hold=None)):
+        observer = kalman_filter(diagnosis(simulator, [late], "next"), given)
+        np.testing.assert_allclose(observer.Q, wanted.Q, rtol=1e-3)
+
+
 def test_an_observer_begins_at_the_time_of_the_recording():
     simulator = pilfr.Simulator(
         lambda x, u, t: {"a": -x.a + u.f + ca.sin(t)}, lambda x: {"y": x.a}, states=("a",), inputs=("f",)
