@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from .._base import InputError, is_number, listed, positive
-from .preprocessing import common_times, hold_at, levels_last, sample_at
+from .preprocessing import common_times, hold_at, hold_until, levels_last, sample_at
 from .recording import SAME_STEP, Recording, as_tuple
 
 Names = Sequence[str] | str | None
@@ -109,6 +109,8 @@ def _signals_at(r: Recording, times: np.ndarray, step: float, held: Sequence[str
     names = (*r.inputs, *r.outputs)
     values = np.hstack([r.u, r.y])
     signals = dict(zip(names, sample_at(values, r.dt, times, step).T, strict=True))
+    until = r.inputs if r.hold == "next" else ()
+    signals |= {n: hold_until(r.t, values[:, i], times, step) for i, n in enumerate(names) if n in until}
     return signals | {n: hold_at(r.t, values[:, i], times, step) for i, n in enumerate(names) if n in held}
 
 

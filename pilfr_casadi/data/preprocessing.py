@@ -190,6 +190,11 @@ def hold_at(t: Array, values: Array, times: Array, step: float) -> Array:
     return np.where(first == last, values[first], means)  # without rounding where the signal keeps its value
 
 
+def hold_until(t: Array, values: Array, times: Array, step: float) -> Array:
+    """Return the mean of a signal (M,), at its next value between its times t, over the step before each of `times`."""
+    return hold_at(np.append(t[0] - step, t[:-1]), values, times - step, step)
+
+
 def interpolate_band_limited(values: np.ndarray, n: int, period: int | None = None) -> np.ndarray:
     """Interpolate band-limited signals (M, k) at n points a sample; return (n M + 1, k), the samples unchanged.
 

@@ -17,7 +17,7 @@ import numpy as np
 from .._base import InputError, listed, positive
 from .columns import TIME_NAMES, find_column, find_time_column, refuse_other_unit
 from .csv_table import CsvTable
-from .preprocessing import check_times, common_times, hold_at, interpolate_at, levels_last
+from .preprocessing import check_times, common_times, hold_at, hold_until, interpolate_at, levels_last
 from .recording import Recording, as_tuple
 from .tables import ArrayTable, frame_table, open_table
 from .time_grid import step_of
@@ -324,7 +324,8 @@ class _Request:
             )
         parts = []
         for i, (t, values) in enumerate(series):
-            bring = hold_at if held and i < n_u else partial(interpolate_at, smooth=i >= n_u)
+            keeps = hold_at if held else hold_until if hold == "next" else partial(interpolate_at, smooth=False)
+            bring = keeps if i < n_u else partial(interpolate_at, smooth=True)
             parts.append(np.column_stack([bring(t, column, times, step) for column in values.T]))
         return parts, "linear" if hold == "zero" and not held else hold
 

@@ -37,6 +37,16 @@ def test_next_values_act_one_sample_earlier_than_held_ones_and_on_outputs_at_the
     np.testing.assert_allclose(store(direct).simulate(r), wanted + direct * r.u, rtol=0, atol=1e-12)
 
 
+def test_means_until_a_sample_keep_their_integral_at_another_step(tmp_path):
+    u = np.arange(1.0, 13.0)[:, None]
+    r = Recording(u, 0 * u, 1.0, ("q",), ("y",), initial="zero", hold="next")
+    assert r.resample(3.0).u[1:, 0] == pytest.approx([3.0, 6.0, 9.0])  # of samples 2 to 4, 5 to 7, 8 to 10
+    assert r.resample(0.5).u[1:5, 0] == pytest.approx([2.0, 2.0, 3.0, 3.0])
+    np.savetxt(tmp_path / "r.csv", np.column_stack([r.t, r.u, r.y]), delimiter=",", header="t,q,y", comments="")
+    read = pilfr.read_csv(tmp_path / "r.csv", inputs="q", outputs="y", hold="next", resample=3.0)
+    assert (read.hold, read.u[1:, 0].tolist()) == ("next", pytest.approx([3.0, 6.0, 9.0]))
+
+
 def test_the_input_of_an_exported_step_acts_until_the_next_one():
     step, held = (pilfr.exported(store(0.5), dt=DT, hold=hold, substeps=4) for hold in ("next", "zero"))
     assert step.inputs == held.inputs == ("q",)
