@@ -176,11 +176,14 @@ def levels_last(t: Array, values: Array, step: float) -> bool:
     return len(changes) < 2 or bool(np.median(np.diff(changes)) > step * (1 - SAME_TIME))
 
 
-def hold_at(t: Array, values: Array, times: Array, step: float) -> Array:
+def hold_at(t: Array, values: Array, times: Array, step: float, hold: str = "zero") -> Array:
     """Return the mean of a signal (M,), held from each of its times t to the next, over the step after each of `times`.
 
-    The means keep the signal's integral; a value that is held throughout a step is kept.
+    With `hold="next"` each value has been held since the time before, and the means are those over the step before each
+    of `times`. The means keep the signal's integral; a value that is held throughout a step is kept.
     """
+    if hold == "next":  # the same, backwards in time
+        return hold_at(-t[::-1], values[::-1], -times[::-1], step)[::-1]
     changes = np.append(True, np.diff(values) != 0)
     t, values = t[changes], values[changes]
     known = np.append(t, max(t[-1], times[-1]) + 2 * step)
