@@ -234,7 +234,10 @@ def test_users_text_is_text(drawn, tmp_path, without_drawing):
 
 @pytest.mark.parametrize(
     ("port", "law", "hold"),
-    [*((*pair, "zero") for pair in PAIRS), ("ground", "ground", "linear"), ("ground", "ground", "band-limited")],
+    [
+        *((*pair, "zero") for pair in PAIRS),
+        *(("ground", "ground", hold) for hold in ("linear", "band-limited", "next")),
+    ],
 )
 def test_the_lines_of_code_run(port, law, hold, tmp_path, monkeypatch):
     d = replace(example(port=port, law=law), hold=hold)
@@ -243,7 +246,7 @@ def test_the_lines_of_code_run(port, law, hold, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "your_file", module)
     monkeypatch.chdir(tmp_path)
     r = d.train[0].with_(hold=hold)
-    step_hold = "zero" if hold == "zero" else "linear"  # a step does not know the inputs around it
+    step_hold = "linear" if hold == "band-limited" else hold  # a step does not know the inputs around it
     r = r.with_(y=d.corrected.simulate(r.with_(hold=step_hold)))
     rows = np.column_stack([r.t, r.u, r.y])
     np.savetxt("new.csv", rows, delimiter=",", header="t,force,pos", comments="", fmt="%.12g")

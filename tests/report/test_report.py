@@ -208,9 +208,10 @@ def test_the_page_of_a_fit(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:.*holds the fitted values, not the simulator's equations")
-def test_the_lines_of_code_of_a_fit_with_interpolated_inputs_run(tmp_path, monkeypatch):
+@pytest.mark.parametrize("hold", ["linear", "next"])
+def test_the_lines_of_code_of_a_fit_with_interpolated_inputs_run(hold, tmp_path, monkeypatch):
     simulator = rig()
-    r = recorded(rig(), 0, samples=200, hold="linear")
+    r = recorded(rig(), 0, samples=200, hold=hold)
     fitted = fit(simulator, r, engine="vm")
     page = fit_page(fitted, [r], [])
     (code,) = [block.code for section in page.sections for block in section.blocks if isinstance(block, Code)]
