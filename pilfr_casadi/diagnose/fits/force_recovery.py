@@ -174,7 +174,8 @@ class HiddenForce:
     law_z: np.ndarray  # local coordinate of the law along the corrected run, at the samples; empty without a law
     law_dz: np.ndarray
     law: np.ndarray
-    instant: bool  # whether the force holds at a sample (True), or is the mean from one sample to the next (False)
+    # whether the force holds at a sample, or at the next one if inputs have their next value; else it is the mean
+    instant: bool
 
     @property
     def law_held(self) -> np.ndarray:
@@ -196,7 +197,9 @@ def hidden_force(
     with np.errstate(all="ignore"):
         law = law_signals(bench, fitted, number, i) if number is not None else None
         base, x0 = _remove_element(fitted, number, fitted.initial[i], bench.dt / fitted.model.substeps)
-        instant = kind_of(port) == SENSOR or (kind_of(port) == ACTUATOR and bench.hold == "zero")
+        instant = kind_of(port) == SENSOR or (kind_of(port) == ACTUATOR and bench.hold in ("zero", "next"))
+        ahead = kind_of(port) == ACTUATOR and bench.hold == "next"  # what acts after a sample is that of the next one
+        law = tuple(np.append(v[1:], v[-1]) for v in law) if ahead and law is not None else law
         expected = np.zeros(len(r)) if law is None else law[2]
         expected = expected if instant else (expected + np.append(expected[1:], expected[-1])) / 2
         size = expected if law is not None else np.abs(fitted.residual[i] / bench.scale).sum(axis=1)
@@ -205,7 +208,7 @@ def hidden_force(
     if found is None:
         return None
     z, dz, force, std = found
-    z, dz = (v[:-1] if instant else (v[1:] + v[:-1]) / 2 for v in (z, dz))
+    z, dz = (v[1:] if ahead else v[:-1] if instant else (v[1:] + v[:-1]) / 2 for v in (z, dz))
     empty = np.zeros(0)
     law_z, law_dz, law_force = (empty, empty, empty) if law is None else (v[window] for v in law)
     return HiddenForce(port, r.name, r.clock[window][:-1], z, dz, force, std, law_z, law_dz, law_force, instant)
