@@ -80,6 +80,6 @@ def test_a_diagnosis_finds_that_inputs_are_means_until_their_sample():
     r = recording(400).with_(y=noisy)
     found = pilfr.diagnose(store(), r, laws=(CubicStiffness,), workers=1)
     assert (found.hold, found.verdict) == ("next", "missing-physics"), str(found)
-    assert "at their next value between samples fits better" in str(found)
+    assert "inputs that are at their next value there fit better" in str(found)
     assert found.errors["train"]["after"] < 0.003
     assert found.corrected.nrmse(replace(r, hold="next")) == pytest.approx(found.errors["train"]["after"], rel=1e-3)
