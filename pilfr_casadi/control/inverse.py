@@ -334,12 +334,14 @@ def analyse_response(given: Any, run: Rollout, recording: Recording) -> Response
     function, states = run.model.step, run.states
     at = np.unique(np.linspace(min(1, len(recording) - 1), len(recording) - 1, LINEARISED_STATES).astype(int))
     slopes = build_jacobians(function)
-    linear = tuple(_linear_blocks(slopes(states[:, k], recording.u[k]), run.linear) for k in at)
+    linear = tuple(_linear_blocks(slopes(states[:, k], run.u[k]), run.linear) for k in at)
     each = np.array([_markov_parameters(point, RESPONSE_SAMPLES) for point in linear])
     markov = np.median(np.abs(each), axis=0)
     typical = int(np.argmin(np.sum(np.abs(np.abs(each) - markov), axis=1)))
-    point = states[:, at[typical]], recording.u[at[typical]]
-    errors = _markov_errors(given, recording, *point) if isinstance(given, Fit) else np.full(RESPONSE_SAMPLES, np.nan)
+    point = states[:, at[typical]], run.u[at[typical]]
+    errors = (
+        _markov_errors(given, run, recording, *point) if isinstance(given, Fit) else np.full(RESPONSE_SAMPLES, np.nan)
+    )
     largest = np.max(markov)
     counts = markov > np.where(
         np.isnan(errors), SMALL_MARKOV_NO_ERRORS * largest, np.maximum(COUNTED_ERRORS * errors, SMALL_MARKOV * largest)
@@ -369,7 +371,7 @@ def _markov_parameters(point: tuple[Array, ...], samples: int) -> Array:
     return np.array(out)
 
 
-def _markov_errors(fit: Fit, recording: Recording, state: Array, drive: Array) -> Array:
+def _markov_errors(fit: Fit, run: Rollout, recording: Recording, state: Array, drive: Array) -> Array:
     """Compute standard errors of the Markov parameters at a state; nan where the recording does not determine them."""
     model = fit.model
     parameters = model.parameters
@@ -378,12 +380,12 @@ def _markov_errors(fit: Fit, recording: Recording, state: Array, drive: Array) -
         problem = Problem(model, known, engine=fit.engine)
     except InputError:  # everything is fixed
         return np.full(RESPONSE_SAMPLES, np.nan)
-    slopes, derivatives = build_jacobians(model.closed), []
+    slopes, derivatives = build_jacobians(run.model.step_with_parameters("one")), []
     for i in np.flatnonzero(parameters.free):
         step = 1e-6 * max(abs(parameters.start[i]), 1e-3 * np.max(np.abs(parameters.start)))
         moved = [parameters.start + sign * step * (np.arange(parameters.size) == i) for sign in (1, -1)]
         up, down = (
-            _markov_parameters(_linear_blocks(slopes(state, drive, value), list(range(model.n_x))), RESPONSE_SAMPLES)
+            _markov_parameters(_linear_blocks(slopes(state, drive, value), run.linear), RESPONSE_SAMPLES)
             for value in moved
         )
         derivatives.append((up - down) / (2 * step))

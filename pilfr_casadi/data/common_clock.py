@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from .._base import InputError, is_number, listed, positive
-from .preprocessing import common_times, hold_at, hold_until, levels_last, sample_at
+from .preprocessing import common_times, hold_at, levels_last, sample_at
 from .recording import SAME_STEP, Recording, as_tuple
 
 Names = Sequence[str] | str | None
@@ -32,7 +32,8 @@ def merge(
     Name, initial state and skipped samples come from the first record. The initial state is kept only if the common
     time begins with the first record. The hold comes from the records whose channels are inputs; if theirs differ, it
     is `"linear"`. If all inputs are held (`hold="zero"`) and their levels usually last at least a new step, an input
-    becomes its mean over each new step, and is held; else it becomes `"linear"`, unless no input was resampled.
+    becomes its mean over each new step, and is held; else it becomes `"linear"`, unless no input was resampled. If all
+    inputs have their next value (`hold="next"`), each becomes its mean over the new step that ends at each sample.
 
     Parameters
     ----------
@@ -70,12 +71,13 @@ def merge(
     for name in (*u, *y):
         if name not in known:
             raise InputError(f"the two recordings have no channel {name!r}; they have {listed(known)}.")
-    held = u if all(_is_held(first, name, step) or _is_held(second, name, step) for name in u) else ()
-    signals = {**_signals_at(first, times, step, held), **_signals_at(second, times - start, step, held)}
     begin = times[0]
     sources = [(r, at) for r, at in ((first, begin), (second, begin - start)) if {*u} & {*r.inputs, *r.outputs}]
     holds = {r.hold for r, _ in sources if r.hold}
     hold = "linear" if len(holds) > 1 else next(iter(holds), None)
+    means = len(holds) == 1 and all(_is_held(first, name, step) or _is_held(second, name, step) for name in u)
+    held = u if means else ()
+    signals = {**_signals_at(first, times, step, held), **_signals_at(second, times - start, step, held)}
     as_sampled = bool(held) or all(_is_at_samples(r, at, step) for r, at in sources)
     keeps_initial = begin == 0 and first.begins != "periodic"
     return replace(
@@ -89,7 +91,7 @@ def merge(
         period=None,
         start=first.start + begin,
         initial=first.initial if keeps_initial else "estimate",
-        hold="linear" if hold == "zero" and not as_sampled else hold,
+        hold="linear" if hold in ("zero", "next") and not as_sampled else hold,
         skip=min(max(int(np.ceil((first.skip * first.dt - begin) / step - SAME_STEP)), 0), len(times) - 1),
     )
 
@@ -100,8 +102,10 @@ def _is_at_samples(r: Recording, begin: float, step: float) -> bool:
 
 
 def _is_held(r: Recording, name: str, step: float) -> bool:
-    """Tell whether a channel is an input that a recording holds for at least a step."""
-    return r.hold == "zero" and name in r.inputs and levels_last(r.t, r.u[:, r.inputs.index(name)], step)
+    """Tell whether a channel is an input that becomes its mean: at its next value, or held for at least a step."""
+    if name not in r.inputs:
+        return False
+    return r.hold == "next" or (r.hold == "zero" and levels_last(r.t, r.u[:, r.inputs.index(name)], step))
 
 
 def _signals_at(r: Recording, times: np.ndarray, step: float, held: Sequence[str]) -> dict[str, np.ndarray]:
@@ -109,9 +113,7 @@ def _signals_at(r: Recording, times: np.ndarray, step: float, held: Sequence[str
     names = (*r.inputs, *r.outputs)
     values = np.hstack([r.u, r.y])
     signals = dict(zip(names, sample_at(values, r.dt, times, step).T, strict=True))
-    until = r.inputs if r.hold == "next" else ()
-    signals |= {n: hold_until(r.t, values[:, i], times, step) for i, n in enumerate(names) if n in until}
-    return signals | {n: hold_at(r.t, values[:, i], times, step) for i, n in enumerate(names) if n in held}
+    return signals | {n: hold_at(r.t, values[:, i], times, step, str(r.hold)) for i, n in enumerate(names) if n in held}
 
 
 def _stack_columns(signals: dict[str, np.ndarray], names: tuple[str, ...], count: int) -> np.ndarray:

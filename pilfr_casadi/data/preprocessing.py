@@ -176,11 +176,14 @@ def levels_last(t: Array, values: Array, step: float) -> bool:
     return len(changes) < 2 or bool(np.median(np.diff(changes)) > step * (1 - SAME_TIME))
 
 
-def hold_at(t: Array, values: Array, times: Array, step: float) -> Array:
+def hold_at(t: Array, values: Array, times: Array, step: float, hold: str = "zero") -> Array:
     """Return the mean of a signal (M,), held from each of its times t to the next, over the step after each of `times`.
 
-    The means keep the signal's integral; a value that is held throughout a step is kept.
+    With `hold="next"` each value has been held since the time before, and the means are those over the step before each
+    of `times`. The means keep the signal's integral; a value that is held throughout a step is kept.
     """
+    if hold == "next":  # the same, backwards in time
+        return hold_at(-t[::-1], values[::-1], -times[::-1], step)[::-1]
     changes = np.append(True, np.diff(values) != 0)
     t, values = t[changes], values[changes]
     known = np.append(t, max(t[-1], times[-1]) + 2 * step)
@@ -188,11 +191,6 @@ def hold_at(t: Array, values: Array, times: Array, step: float) -> Array:
     means = np.diff(np.interp(np.append(times, times[-1] + step), known, integral)) / step
     first, last = (np.searchsorted(t, times + share * step, "right") - 1 for share in (SAME_TIME, 1 - SAME_TIME))
     return np.where(first == last, values[first], means)  # without rounding where the signal keeps its value
-
-
-def hold_until(t: Array, values: Array, times: Array, step: float) -> Array:
-    """Return the mean of a signal (M,), at its next value between its times t, over the step before each of `times`."""
-    return hold_at(np.append(t[0] - step, t[:-1]), values, times - step, step)
 
 
 def interpolate_band_limited(values: np.ndarray, n: int, period: int | None = None) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 from .._base import InputError, listed, positive
 from .columns import TIME_NAMES, find_column, find_time_column, refuse_other_unit
 from .csv_table import CsvTable
-from .preprocessing import check_times, common_times, hold_at, hold_until, interpolate_at, levels_last
+from .preprocessing import check_times, common_times, hold_at, interpolate_at, levels_last
 from .recording import Recording, as_tuple
 from .tables import ArrayTable, frame_table, open_table
 from .time_grid import step_of
@@ -71,7 +71,8 @@ def read_csv(
         New step in seconds, for times that are not uniform, and for channels of different rates, whose cells are empty
         or nan between their samples. Each channel is interpolated from its own samples, over the time that all cover;
         an anti-alias filter precedes a longer step. With ``hold="zero"`` an input becomes its mean over each step, and
-        is held. A gap longer than ten median steps is refused.
+        is held; with ``hold="next"`` it becomes its mean over the step that ends at each sample. A gap longer than ten
+        median steps is refused.
     **recording_options
         Further fields of :class:`Recording`: `hold`, `initial`, `period`, `skip`, `units`, and `name` (by default the
         file's name).
@@ -302,7 +303,7 @@ class _Request:
     ) -> tuple[list[np.ndarray], str | None]:
         """Bring each channel from its own samples to a common step, s; return them and the inputs' hold.
 
-        Inputs stay held if they are, and their levels usually last at least a step.
+        Inputs stay held if they are, and their levels usually last at least a step. Next values become means.
         """
         hold, n_u = self.options.get("hold"), len(self.inputs)
         series = table.series(wanted, time)
@@ -324,8 +325,8 @@ class _Request:
             )
         parts = []
         for i, (t, values) in enumerate(series):
-            keeps = hold_at if held else hold_until if hold == "next" else partial(interpolate_at, smooth=False)
-            bring = keeps if i < n_u else partial(interpolate_at, smooth=True)
+            means = i < n_u and (held or hold == "next")
+            bring = partial(hold_at, hold=str(hold)) if means else partial(interpolate_at, smooth=i >= n_u)
             parts.append(np.column_stack([bring(t, column, times, step) for column in values.T]))
         return parts, "linear" if hold == "zero" and not held else hold
 

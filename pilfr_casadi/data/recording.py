@@ -16,7 +16,7 @@ import numpy as np
 
 from .._base import REPAIR, InputError, is_number, is_whole, later, listed, positive, real_array, usable
 from .columns import name_with_unit
-from .preprocessing import butterworth, change_step, hold_at, hold_until, levels_last, remove_trend
+from .preprocessing import butterworth, change_step, hold_at, levels_last, remove_trend
 from .units import conversion
 
 SAME_STEP = 1e-4  # relative difference up to which two steps count as the same; written times have few digits
@@ -320,8 +320,9 @@ class Recording:
         """Resample to another step in seconds; an anti-alias filter precedes a longer step.
 
         If `hold` is `"zero"` and the levels of the inputs usually last at least a new step, an input becomes its mean
-        over each new step, and is held; else it becomes `"linear"`. Of `"next"` values the means are taken. `skip`
-        covers the same time as before. A period that is not a whole number of new samples is dropped.
+        over each new step, and is held; else it becomes `"linear"`. If `hold` is `"next"`, an input becomes its mean
+        over the new step that ends at each sample, as a slower logger writes it. `skip` covers the same time as
+        before. A period that is not a whole number of new samples is dropped.
 
         Raises
         ------
@@ -333,10 +334,10 @@ class Recording:
         if u is self.u:
             return self
         hold = self.hold
-        if self.n_u and hold == "zero" and all(levels_last(self.t, column, dt) for column in self.u.T):
-            u = np.column_stack([hold_at(self.t, column, np.arange(len(u)) * dt, dt) for column in self.u.T])
-        elif self.n_u and hold == "next":
-            u = np.column_stack([hold_until(self.t, column, np.arange(len(u)) * dt, dt) for column in self.u.T])
+        held = hold == "zero" and all(levels_last(self.t, column, dt) for column in self.u.T)
+        if self.n_u and (held or hold == "next"):
+            times = np.arange(len(u)) * dt
+            u = np.column_stack([hold_at(self.t, column, times, dt, str(hold)) for column in self.u.T])
         elif self.n_u and hold == "zero":
             hold = "linear"
         skip = min(int(np.ceil(self.skip * self.dt / dt * (1 - SAME_STEP))), len(u) - 2)

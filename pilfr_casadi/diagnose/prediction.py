@@ -123,24 +123,24 @@ def forget_sooner(search: Hypotheses, simulator: Simulator, memory: float) -> tu
 
 
 @dataclass(frozen=True, eq=False)
-class _Led:
-    """A hypothesis led by an observer with a memory, s, and the mean square error that it leaves."""
+class _ObservedFit:
+    """The fit of a hypothesis with an observer: its memory, s, and the mean square error that it leaves."""
 
     fitted: Fitted
     left: float
     memory: float
 
 
-def _best_memory(search: Hypotheses, trial: Trial, simulator: Simulator, memory: float) -> _Led:
+def _best_memory(search: Hypotheses, trial: Trial, simulator: Simulator, memory: float) -> _ObservedFit:
     """Fit a hypothesis with shorter memories, and return it with the best."""
-    bench, best = search.bench, _Led(trial.fitted, trial.mean_square, memory)
+    bench, best = search.bench, _ObservedFit(trial.fitted, trial.mean_square, memory)
     last = trial.fitted
     while (memory := memory * SOONER) >= bench.dt and search.may_go_on():
         gain = observer(simulator, bench.recordings, bench.hold, memory)
         found = refit(bench, [last.values], replace(last.simulator, observer=gain), states=last.begin)
         if found is not None:
             last, left = found, bench.pool(found.squares)
-            best = _Led(found, left, memory) if left < best.left else best
+            best = _ObservedFit(found, left, memory) if left < best.left else best
     return best
 
 

@@ -354,8 +354,8 @@ def slow_note(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Ga
 
 def hold_note(simulator: Simulator, hold: str, ratio: float) -> Gate:
     """Note that the hold was chosen from the data; the other's error is `ratio` times as large."""
-    words = f"{HOLD_WORDS[hold]} between samples"
-    how = f"fits better (error {ratio:.3g} times smaller)" if ratio > EQUAL_RATIO else "fits no worse"
-    how = how if np.isfinite(ratio) else "lets the simulation follow (otherwise it diverges)"
-    sentence = f"The recordings do not say what inputs do between samples; {words} {how} and is used."
+    how = f"fit better (error {ratio:.3g} times smaller)" if ratio > EQUAL_RATIO else "fit no worse"
+    how = how if np.isfinite(ratio) else "let the simulation follow (otherwise it diverges)"
+    words = f"inputs that are {HOLD_WORDS[hold]} there {how} and are used"
+    sentence = f"The recordings do not say what inputs do between samples; {words}."
     return Gate(", ".join(simulator.inputs), "hold", hold, sentence)

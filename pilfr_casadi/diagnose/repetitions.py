@@ -63,8 +63,8 @@ def search_with_repetitions(request: Request) -> tuple[Request, Attempt]:
             if request.focus == "simulation" or not observer_keeps_up(request.simulator, request.recordings):
                 raise
     # the gain depends little on the hold, which the search may still change
-    led, found, _ = search_in_predictions(request, request.stated_hold or "zero", _search_with_each_hold)
-    return led, found
+    observed_request, found, _ = search_in_predictions(request, request.stated_hold or "zero", _search_with_each_hold)
+    return observed_request, found
 
 
 def search_in_predictions(
@@ -80,32 +80,40 @@ def search_in_predictions(
         If the simulator diverges with every observer.
     """
     observed, memory = predictor(request.simulator, request.recordings, hold, request.engine)
-    led = _lead(request, observed, memory)
-    found = search(replace(led, most_effects=min(1, led.most_effects)))
+    observed_request = _with_observer(request, observed, memory)
+    found = search(replace(observed_request, most_effects=min(1, observed_request.most_effects)))
     other = _search_forgetting_sooner(request, found, memory, search)
     if other is None and not found.search.cut_short:
         found.search.most_effects = request.most_effects
         found.search.resume()
         other = _search_forgetting_sooner(request, found, memory, search)
-    return other or (led, found, memory)
+    return other or (observed_request, found, memory)
 
 
 def _search_forgetting_sooner(
     request: Request, found: Attempt, memory: float, search: Callable[[Request], Attempt]
 ) -> tuple[Request, Attempt, float] | None:
-    """Search with a shorter memory if the likeliest hypothesis predicts better with one; None if it does not."""
+    """Search with a shorter memory if the likeliest hypothesis predicts better with one; None if it does not.
+
+    None too if that search was cut short before it found as much.
+    """
     sooner = forget_sooner(found.search, request.simulator, memory)
     if sooner is None:
         return None
     observed, shorter = sooner
     note = disturbance_note(request.simulator, shorter, memory)
-    led = _lead(replace(request, say=request.say.under("shorter memory: ")), observed, shorter, note)
-    other = _again(found, partial(search, led))
-    return None if other is None else (led, other, shorter)
+    observed_request = _with_observer(
+        replace(request, say=request.say.under("shorter memory: ")), observed, shorter, note
+    )
+    other = _again(found, partial(search, observed_request))
+    if other is None:
+        return None
+    before2, after2 = found.compared_with(other)
+    return None if other.search.cut_short and before2 <= after2 else (observed_request, other, shorter)
 
 
-def _lead(request: Request, observed: Simulator, memory: float, *more: Gate) -> Request:
-    """Return the request for a simulator that an observer leads, with notes about it."""
+def _with_observer(request: Request, observed: Simulator, memory: float, *more: Gate) -> Request:
+    """Return the request with an observed simulator, and with notes about it."""
     note = prediction_note(request.simulator, request.recordings, memory)
     return replace(request, simulator=observed, notes=(*request.notes, note, *more))
 

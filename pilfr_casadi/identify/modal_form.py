@@ -59,7 +59,7 @@ class Mode:
 
 
 def to_continuous(a: Array, b: Array, c: Array, d: Array, dt: float, hold: str) -> tuple[Array, Array, Array, Array]:
-    """Convert a discrete state space to continuous time, for held or interpolated inputs.
+    """Convert a discrete state space to continuous time, for held or interpolated inputs, or next values.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def to_continuous(a: Array, b: Array, c: Array, d: Array, dt: float, hold: str) 
         Shapes (n, n), (n, n_u), (n_y, n), (n_y, n_u).
     dt : float
         Sampling interval, s.
-    hold : {"zero", "linear"}
+    hold : {"zero", "linear", "next"}
 
     Raises
     ------
@@ -93,6 +93,9 @@ def to_continuous(a: Array, b: Array, c: Array, d: Array, dt: float, hold: str) 
     gamma_1, gamma_2 = whole[:n, n : 2 * n], whole[:n, 2 * n :]
     if hold == "zero":
         return a_c, np.linalg.solve(gamma_1, b), c, d
+    if hold == "next":  # x⁺ = A x + Γ₁ B u⁺ is x⁺ = A x' + B_d u with x' = x - Γ₁ B u:  B_d = A Γ₁ B
+        b_c = np.linalg.solve(a @ gamma_1, b)
+        return a_c, b_c, c, d - c @ gamma_1 @ b_c
     # x⁺ = A x + (Γ₁ - Γ₂) B u + Γ₂ B u⁺ is x⁺ = A x' + B_d u with x' = x - Γ₂ B u:  B_d = (Γ₁ - Γ₂ + A Γ₂) B
     b_c = np.linalg.solve(gamma_1 - gamma_2 + a @ gamma_2, b)
     return a_c, b_c, c, d - c @ gamma_2 @ b_c

@@ -95,7 +95,8 @@ def _identify(records: Sequence[Recording], n: int, hold: str | None) -> tuple[f
     p = found.parameters
     a, b, c, d = (p[k] for k in ("A", "B_u", "C_y", "D_yu"))
     options = []
-    for between in (hold,) if hold in ("zero", "linear") else ("zero", "linear"):
+    stated = "linear" if hold == "band-limited" else hold  # a sampled model does not know the samples around
+    for between in (stated,) if stated else ("zero", "linear"):
         try:
             continuous = to_continuous(a, b, c, d, records[0].dt, between)
         except InputError:
@@ -106,7 +107,7 @@ def _identify(records: Sequence[Recording], n: int, hold: str | None) -> tuple[f
         return None
     # a simulation without direct feed-through reveals the course of its inputs between samples
     _, between, matrices = min(options, key=lambda o: o[0]) if not hold else options[0]
-    simulator = replace(modal_simulator(matrices, np.ravel(p["y_0"]), records[0]), hold=between)
+    simulator = replace(modal_simulator(matrices, np.ravel(p["y_0"]), records[0]), hold=hold or between)
     errors = [nrmse(r.y, found.simulate(r), skip=r.skip) for r in records]
     return float(np.mean(errors)), simulator
 

@@ -60,7 +60,8 @@ def machine_map(x: Column, y: Column, names: Sequence[str], differs: np.ndarray)
         if np.any(group):
             ax.plot(a[group], b[group], "o", color=colour, markersize=4, label=label)
     for k in _find_named(differs):
-        ax.annotate(plain(names[k]), (a[k], b[k]), (5, 5), textcoords="offset points", fontsize=FONT - 2, color=INK)
+        if np.isfinite(a[k]) and np.isfinite(b[k]):
+            ax.annotate(plain(names[k]), (a[k], b[k]), (5, 5), textcoords="offset points", fontsize=FONT - 2, color=INK)
     finish(ax, a_label, b_label)
     return figure
 

@@ -177,13 +177,16 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
     """Discretise a simulator with its laws to a closed model for samples dt apart, s.
 
     `hold` says whether inputs are constant between samples ("zero"), interpolated ("linear"), band-limited, or at the
-    value of the later sample ("next"), which acts on the derivatives and not yet on the outputs of the earlier one;
+    value of the later sample ("next"), which acts on the derivatives and not yet on the outputs of the earlier one. A
+    simulator in discrete time reads its inputs at the samples, so that "next" is "zero" there.
+
     `substeps` is the number of Runge-Kutta steps per sample (`choose_substeps`), at least eight for band-limited
     inputs, which are linear within a step.
     """
     own = getattr(simulator.dynamics, "dt", None)  # of a program that steps by itself
     if own is not None and abs(own / dt - 1) > SAME_STEP:
         raise InputError(f"The simulator has steps of {own:g} s, the recordings of {dt:g} s; give both the same step.")
+    hold = "zero" if hold == "next" and simulator.discrete else hold
     band_limited = hold == "band-limited"
     substeps = max(substeps, BAND_LIMITED_STEPS) if band_limited and not simulator.discrete else substeps
     simulator = on_grid(simulator, dt / substeps)
@@ -197,7 +200,7 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
     if ca.depends_on(ca.vertcat(x_next, y, update), t):
         reads, columns = [*reads, "t"], [*columns, t]
     x_next, y = ca.cse([x_next, y])
-    if s.numel() and not step.shifts.any() and not ca.depends_on(z, s):
+    if s.numel() and not step.shifts.any() and not ca.depends_on(ca.vertcat(z, y), s):
         # a port of its own for the memory makes the derivatives sparse
         channels = ca.SX.sym("z", s.numel())
         w = s_next = step.equations.memory(channels, s)
@@ -246,14 +249,18 @@ class _SubStep:
         z = ca.vertcat(ca.SX(0, 1), *(ca.repmat(local[i][0], n) for i, n in enumerate(equations.n_s) if n))
         signals = ca.vertcat(ca.SX(0, 1), *(local[i][0] for i in range(len(local))))
         self.function = ca.Function("closed", [*now.values(), self.u0, self.u1, self.vector], [f, y, after, z, signals])
-        _, _, self.update, self.z, _ = self._evaluate(self.x, self.s, self.u0, self.t)
+        _, _, self.update, self.z, _ = self._evaluate(self.x, self.s, self.begin, self.t)
         # the stages read a shift register as it was at the beginning of the step, and all other memory after its update
         self.updated = ca.SX.sym("updated", self.s.numel())
         self.shifts = np.repeat([getattr(e.law, "shifts", False) for e in simulator.elements], equations.n_s)
-        read = (self.s[i] if shift else self.updated[i] for i, shift in enumerate(self.shifts))
-        self.memory = ca.vertcat(ca.SX(0, 1), *read)
+        self.memory = self._read(self.updated)
         # a register's content moves on within the step if inputs are interpolated
         self.drift = (self.updated - self.memory) * (hold not in ("zero", "next"))
+
+    def _read(self, updated: Any) -> Any:
+        """Return the memory that the equations read, from the updated one."""
+        read = (self.s[i] if shift else updated[i] for i, shift in enumerate(self.shifts))
+        return ca.vertcat(ca.SX(0, 1), *read)
 
     def _evaluate(self, x: Any, s: Any, u: Any, t: Any) -> Any:
         return self.function(x, s, u, t, self.u0, self.u1, self.vector)
@@ -267,6 +274,9 @@ class _SubStep:
         x, h, own = self.x, self.h, len(self.simulator.states)
         k1, y, *_ = self._evaluate(x, self.memory, self.u0, self.t)
         if self.begin is not self.u0:
+            if ca.depends_on(self.update, self.u1):  # outputs read the memory of laws before the next inputs
+                own = self._evaluate(x, self.s, self.u0, self.t)[2]
+                y = self._evaluate(x, self._read(own), self.u0, self.t)[1]
             k1 = self._evaluate_stage(x, self.begin, 0.0)
         if self.simulator.discrete:  # laws' own states see a constant z over the sample
             return ca.vertcat(k1[:own], x[own:, 0] + h * k1[own:, 0]), y, None

@@ -10,7 +10,7 @@ from small_fits import A, fitted, plays, refused
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.cli.demo import demo_recordings
-from pilfr_casadi.control import PredictiveController, ekf_step, feedforward, kalman_filter, visibility
+from pilfr_casadi.control import PredictiveController, ekf_step, feedforward, kalman_filter, roll_out, visibility
 from pilfr_casadi.diagnose import Diagnosis
 from pilfr_casadi.laws import Delay, StopHysteresis
 from pilfr_casadi.linear import steady_state_gain
@@ -66,6 +66,14 @@ def test_a_linear_model_gets_the_kalman_gain_of_the_riccati_equation():
     np.testing.assert_allclose(
         np.asarray(following).ravel(), A @ state + 0.7 + (gain * (0.9 - c @ state)).ravel(), rtol=1e-10
     )
+
+
+def test_next_values_of_a_recording_are_inputs_that_act_until_the_next_sample():
+    train = recordings(LAW)[0].with_(hold="next")
+    simulator = two_masses().with_element("ground-m1", LAW)
+    for source in (simulator, diagnosis(simulator, [train], hold="next")):
+        run = roll_out(source, train, "test")
+        np.testing.assert_allclose(run.y, simulator.simulate(train), rtol=0, atol=1e-3 * np.std(train.y))
 
 
 def test_covariance_of_a_play_is_kept_while_it_sticks_and_replaced_when_it_slips():

@@ -298,3 +298,27 @@ def test_unusable_states_and_observers_are_refused(small):
 def test_unusable_limits_are_refused(small, limits):
     fit, record, _ = small
     refused(lambda: feedforward(fit, record, limits=limits), "The input limits")
+
+
+@pytest.mark.parametrize("hold", ["zero", "next"])
+def test_the_response_of_a_fitted_simulator_is_that_of_whole_samples(hold):
+    """Its standard errors do not depend on the number of sub-steps."""
+
+    def store(substeps):
+        return pilfr.Simulator(
+            lambda x, u, p: dict(a=u.q - p.g * x.a),
+            lambda x: dict(y=x.a),
+            states=("a",),
+            inputs=("q",),
+            parameters=dict(g=pilfr.Parameter(1.5, bounds=(0.1, 10))),
+            substeps=substeps,
+        )
+
+    rng = np.random.default_rng(0)
+    r = pilfr.Recording(rng.standard_normal(200), np.zeros(200), 0.3, "q", "y", initial="zero", hold=hold)
+    r = r.with_(y=store(4).simulate(r) + 0.01 * rng.standard_normal((200, 1)))
+    errors = []
+    for substeps in (4, 8):
+        fit = pilfr.fit(store(substeps), r)
+        errors.append(analyse_response(fit, roll_out(fit, r, "test"), r).errors[1:6])
+    np.testing.assert_allclose(*errors, rtol=1e-3)

@@ -224,6 +224,24 @@ def test_a_command_stays_held_although_the_clock_of_its_logger_jitters():
     np.testing.assert_allclose(np.cumsum(r.u[:-1, 0]) * r.dt, impulse[1:], atol=1e-9)
 
 
+def test_next_values_stay_means_over_the_longer_step_that_ends_at_each_sample():
+    minutes = np.random.default_rng(0).standard_normal(601)
+    power = Recording(minutes[:, None], np.zeros((601, 1)), 1.0, ("power",), ("y",), hold="next")
+    wanted = minutes[1:].reshape(60, 10).mean(axis=1)
+    frame = pd.DataFrame({"t": power.t, "power": minutes, "y": 0.0})
+    other = power.with_(inputs=("heat",), outputs=("z",))
+    for r in (
+        power.resample(10.0),
+        read_frame(frame, "power", "y", resample=10.0, hold="next"),
+        merge(power, other, dt=10.0),
+    ):
+        assert r.hold == "next"
+        np.testing.assert_allclose(r.u[1:, 0], wanted, rtol=0, atol=1e-9)
+    finer = power.resample(0.25)
+    np.testing.assert_allclose(finer.u[1:, 0], np.repeat(minutes[1:], 4), rtol=0, atol=1e-9)
+    assert merge(power, other.with_(hold="zero"), dt=10.0).hold == "linear"
+
+
 # ------------------------------------------------------------------------------------------- channels of several rates
 
 

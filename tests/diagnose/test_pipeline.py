@@ -71,7 +71,7 @@ def test_a_law_shows_that_inputs_are_band_limited():
     found, stages = diagnosed(spring(), stiffened(1e6, 400, hold="band-limited"), (laws.CubicStiffness,), effects=1)
     assert found.hold == "band-limited" and "other hold: checks and refit" in stages
     (note,) = (g.sentence for g in found.gates if g.finding == "hold")
-    assert "band-limited between samples fits better" in note
+    assert "inputs that are band-limited there fit better" in note
     assert [e.law for e in found.effects] == ["cubic_stiffness"] and found.errors["train"]["after"] < 0.01
 
 

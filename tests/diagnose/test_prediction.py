@@ -1,6 +1,7 @@
 """Prediction focus: an observer leads an unstable simulator along recordings of its closed loop."""
 
 from dataclasses import replace
+from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator
 from pilfr_casadi._base import InputError
-from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose import Workbench, repetitions
 from pilfr_casadi.diagnose.prediction import drifts, observer, observer_keeps_up
 from pilfr_casadi.diagnose.search.moves import Search
 from pilfr_casadi.engine import make_engine
@@ -142,6 +143,20 @@ def test_laws_do_not_imitate_an_observer_that_forgets_sooner(friction, push):
     assert named == ([("rails", "coulomb_friction")] if friction else [])
     assert found.corrected.parameters["k"].value == pytest.approx(1.3, rel=0.15)
     assert "Disturbances that nobody recorded move the machine" in str(found)
+
+
+def test_laws_stay_if_the_time_ends_in_the_search_with_a_shorter_memory(monkeypatch):
+    repeated = []
+
+    def without_time(first, search):
+        repeated.append(search)
+        return again(first, partial(search.func, replace(search.args[0], deadline=0.0)))
+
+    again = repetitions._again
+    monkeypatch.setattr(repetitions, "_again", without_time)
+    laws = (Gain, CoulombFriction)
+    found = pilfr.diagnose(cart(), pushed(0.4, 0.02, 2e-3), laws=laws, focus="prediction", workers=1)
+    assert repeated and [(e.port, e.law) for e in found.effects] == [("rails", "coulomb_friction")]
 
 
 def test_predictions_are_advised_if_a_free_run_drifts_and_took_all_the_time(monkeypatch):

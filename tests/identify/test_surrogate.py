@@ -53,6 +53,20 @@ def test_to_continuous_undoes_sampling(seed, hold):
         assert np.max(np.abs(response(*back, w) - expected)) < 1e-6 * np.max(np.abs(expected))
 
 
+@pytest.mark.parametrize("hold", ["zero", "linear", "band-limited", "next"])
+def test_a_surrogate_has_the_stated_hold(hold):
+    def dynamics(x, u):
+        return dict(x=x.v, v=u.f - 400 * x.x - 4 * x.v)
+
+    known = pilfr.Simulator(dynamics, lambda x: dict(x=x.x), states=("x", "v"), inputs=("f",), parameters={})
+    smooth = np.convolve(np.random.default_rng(0).standard_normal(1200), np.hanning(30), "valid")
+    u = smooth[:1000, None]
+    record = Recording(u, np.zeros_like(u), DT, ("f",), ("x",), initial="zero", hold=hold)
+    found = surrogate(record.with_(y=known.simulate(record)), nx=2)[0]
+    assert found.hold == hold
+    assert found.nrmse(record.with_(y=known.simulate(record))) < 0.01
+
+
 def test_a_mode_beyond_the_sampling_is_refused():
     one = np.ones((1, 1))
     for pole in (-0.5, 1e-6):

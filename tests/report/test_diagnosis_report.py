@@ -236,9 +236,7 @@ def test_users_text_is_text(drawn, tmp_path, without_drawing):
     ("port", "law", "hold"),
     [
         *((*pair, "zero") for pair in PAIRS),
-        ("ground", "ground", "linear"),
-        ("ground", "ground", "band-limited"),
-        ("ground", "ground", "next"),
+        *(("ground", "ground", hold) for hold in ("linear", "band-limited", "next")),
     ],
 )
 def test_the_lines_of_code_run(port, law, hold, tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import io
+import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -17,7 +18,7 @@ from pilfr_casadi.data import Recording
 from pilfr_casadi.identify import Fit, fit, load
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, block_shapes
 from pilfr_casadi.optimise import Iteration, Solution, Status
-from pilfr_casadi.plots import chart, new_figure
+from pilfr_casadi.plots import chart, machine_map, new_figure
 from pilfr_casadi.plots.canvas import BLUE, INK, WholeLocator, finish, line
 from pilfr_casadi.report import (
     Code,
@@ -208,9 +209,10 @@ def test_the_page_of_a_fit(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:.*holds the fitted values, not the simulator's equations")
-def test_the_lines_of_code_of_a_fit_with_interpolated_inputs_run(tmp_path, monkeypatch):
+@pytest.mark.parametrize("hold", ["linear", "next"])
+def test_the_lines_of_code_of_a_fit_with_interpolated_inputs_run(hold, tmp_path, monkeypatch):
     simulator = rig()
-    r = recorded(rig(), 0, samples=200, hold="linear")
+    r = recorded(rig(), 0, samples=200, hold=hold)
     fitted = fit(simulator, r, engine="vm")
     page = fit_page(fitted, [r], [])
     (code,) = [block.code for section in page.sections for block in section.blocks if isinstance(block, Code)]
@@ -325,6 +327,15 @@ def chart_page(samples=20_000):
     drawn = [Picture(ax, "caption", f"Picture {k}.") for k, ax in enumerate(axes)]
     drawn[0] = replace(drawn[0], views={"start": axes[0]})
     return axes, Page("charts", [Section("part", [*drawn, Picture(axes[0], "again", "Again.", replaced=True)])])
+
+
+def test_the_chart_of_a_map_leaves_out_machines_without_values():
+    values = np.array([1.0, np.nan, 3.0])
+    columns = [(name, "N", values, 0.1 * values) for name in ("k", "d")]
+    ax = machine_map(*columns, ["a", "failed", "c"], np.array([False, True, False])).axes[0]
+    content = chart(ax, {}, 500)
+    assert [note["text"] for note in content["notes"]] == ["a", "c"]
+    json.dumps(content, allow_nan=False)  # a browser reads no NaN
 
 
 def test_a_picture_becomes_a_chart_of_all_samples():

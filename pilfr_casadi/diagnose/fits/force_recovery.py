@@ -174,7 +174,8 @@ class HiddenForce:
     law_z: np.ndarray  # local coordinate of the law along the corrected run, at the samples; empty without a law
     law_dz: np.ndarray
     law: np.ndarray
-    instant: bool  # whether the force holds at a sample (True), or is the mean from one sample to the next (False)
+    # whether the force holds at a sample, or at the next one if inputs have their next value; else it is the mean
+    instant: bool
 
     @property
     def law_held(self) -> np.ndarray:
@@ -193,10 +194,11 @@ def hidden_force(
     if kind_of(port) == PARAMETER:  # no force acts there
         return None
     r = bench.recordings[i]
+    instant = kind_of(port) == SENSOR or (kind_of(port) == ACTUATOR and bench.hold in ("zero", "next"))
+    ahead = kind_of(port) == ACTUATOR and bench.hold == "next"  # what acts after a sample is that of the next one
     with np.errstate(all="ignore"):
-        law = law_signals(bench, fitted, number, i) if number is not None else None
+        law = law_signals(bench, fitted, number, i, ahead) if number is not None else None
         base, x0 = _remove_element(fitted, number, fitted.initial[i], bench.dt / fitted.model.substeps)
-        instant = kind_of(port) == SENSOR or (kind_of(port) == ACTUATOR and bench.hold == "zero")
         expected = np.zeros(len(r)) if law is None else law[2]
         expected = expected if instant else (expected + np.append(expected[1:], expected[-1])) / 2
         size = expected if law is not None else np.abs(fitted.residual[i] / bench.scale).sum(axis=1)
@@ -205,17 +207,23 @@ def hidden_force(
     if found is None:
         return None
     z, dz, force, std = found
-    z, dz = (v[:-1] if instant else (v[1:] + v[:-1]) / 2 for v in (z, dz))
+    z, dz = (v[1:] if ahead else v[:-1] if instant else (v[1:] + v[:-1]) / 2 for v in (z, dz))
     empty = np.zeros(0)
     law_z, law_dz, law_force = (empty, empty, empty) if law is None else (v[window] for v in law)
     return HiddenForce(port, r.name, r.clock[window][:-1], z, dz, force, std, law_z, law_dz, law_force, instant)
 
 
-def law_signals(bench: Workbench, fitted: Fitted, number: int, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute local coordinate, rate and force, (M,) each, of an element along the fitted run of recording i."""
+def law_signals(
+    bench: Workbench, fitted: Fitted, number: int, i: int, ahead: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute local coordinate, rate and force, (M,) each, of an element along the fitted run of recording i.
+
+    They are those of each sample, or `ahead` of the next one.
+    """
     r, function = bench.recordings[i], _law_function(fitted, number, bench.dt)
     states = simulate_states(fitted, r, fitted.initial[i])
     (rows,) = map_points(function, states, r.u, input_slope(bench, r), r.clock[:, None], fitted.vector)
+    rows = np.concatenate([rows[1:], rows[-1:]]) if ahead else rows
     return rows[:, 0, 0], rows[:, 1, 0], rows[:, 2, 0]
 
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from diagnosis_example import NOISE, PAIRS, as_it_stands, example, rig
+from diagnosis_example import NOISE, PAIRS, as_it_stands, example, recorded, rig
 
 from pilfr_casadi.diagnose import Workbench, hidden_force
-from pilfr_casadi.laws import CubicStiffness
+from pilfr_casadi.laws import CubicStiffness, Saturation
 
 
 @pytest.mark.parametrize(("port", "law"), PAIRS)
@@ -31,3 +31,16 @@ def test_the_recovered_force_owes_nothing_to_the_law():
     wrong = rig().with_element("ground", CubicStiffness().at({"k_3": 1.0e4}))
     other = hidden_force(bench, as_it_stands(bench, wrong), "ground", 0, NOISE * bench.scale)
     assert np.std(other.force - hidden.force) < 0.1 * np.std(hidden.force)
+
+
+@pytest.mark.parametrize("hold", ["zero", "next"])
+def test_the_force_of_an_actuator_acts_while_its_input_does(hold):
+    corrected = rig().with_element("actuator:force", Saturation().at({"L": 6.0}))
+    r = recorded(corrected, 0, samples=600, hold=hold)
+    y = corrected.simulate(r)
+    r = r.with_(y=y + NOISE * np.std(y) * np.random.default_rng(1).standard_normal(y.shape))
+    bench = Workbench.of(rig(), [r], hold)
+    hidden = hidden_force(bench, as_it_stands(bench, corrected), "actuator:force", 0, NOISE * bench.scale)
+    size = np.std(hidden.law_held)
+    assert size > 0 and np.std(hidden.force - hidden.law_held) < 0.25 * size
+    assert np.std(np.clip(hidden.z, -6, 6) - hidden.z - hidden.law_held) < 1e-6 * size
