@@ -310,7 +310,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
     say, hold = request.say.under("predictions: "), search.bench.hold
     try:
         predicted = replace(request, hold=hold, focus="prediction", say=say)
-        _, found_there, memory = search_in_predictions(predicted, hold, search_with_one_hold)
+        observed, found_there, memory = search_in_predictions(predicted, hold, search_with_one_hold)
         predicting = found_there.search
     except InputError:
         return found
@@ -320,7 +320,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
     named, answer = _concluded(predicting, ()), posterior(predicting)
     best = answer.best
     if named.verdict.kind != "missing-physics" or {e.name for e in named.effects} != best.names:
-        return found
+        return _advise_predictions(request, search, found) if predicting.cut_short else found
     with search.stage("fit in free run"):
         search.keep(search.run_laws(best.laws, best))
         trial = search.thorough(search.memo[best.key])
@@ -336,7 +336,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
     return replace(
         found,
         verdict=verdict,
-        gates=(*found.gates, note),
+        gates=(*found.gates, *(g for g in observed.notes if g.finding == "disturbance"), note),
         fitted=trial.fitted,
         correction=correction,
         effects=answer.effects,

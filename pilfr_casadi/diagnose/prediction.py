@@ -179,7 +179,7 @@ def untried_note(simulator: Simulator) -> Gate:
     """Note that the simulator drifts in a free run, and that there was no time for predictions."""
     sentence = (
         "In a free run small forces and disturbances add up over the whole recording, so that its errors hardly tell "
-        "laws apart. Predictions one sample ahead often do, but there was no time left for them: diagnose with the "
+        "laws apart. Predictions one sample ahead often do, but there was too little time for them: diagnose with the "
         "focus 'prediction' (--focus prediction), or give more time."
     )
     return Gate(", ".join(simulator.output_names), "prediction", None, sentence, corrected=False)

@@ -83,7 +83,7 @@ def search_in_predictions(
     observed_request = _with_observer(request, observed, memory)
     found = search(replace(observed_request, most_effects=min(1, observed_request.most_effects)))
     other = _search_forgetting_sooner(request, found, memory, search)
-    if other is None and not found.search.cut_short:
+    if other is None and request.most_effects > 1 and not found.search.cut_short:
         found.search.most_effects = request.most_effects
         found.search.resume()
         other = _search_forgetting_sooner(request, found, memory, search)

@@ -24,6 +24,7 @@ from ..data import Recording, default_names, interpolate_band_limited
 from .elements import Element
 from .parameters import Parameter, ParameterSet
 
+LEAST_SCALE = 0.1  # factor of a sensor below which an observer trusts it less
 BLOCK = 100  # points or steps of one call, which bounds the memory of the mapped function
 StepExpression = Callable[[Any, Any, Any, dict[str, Any]], tuple[Any, Any]]
 PortExpression = Callable[[Any, Any, dict[str, Any]], Any]
@@ -371,7 +372,10 @@ def inject_outputs(
     full = np.zeros((model.n_x, model.n_y))
     full[: len(gain)] = gain[: model.n_x]
     following, y = model.step(x, u, w, p)
-    error = measured - y if scales is None else (measured - y) / scales(p)
+    error = measured - y
+    if scales is not None:  # a sensor that reads hardly anything says little about the states
+        scale = scales(p)
+        error = error * scale / ca.fmax(scale**2, LEAST_SCALE**2)
     pushed = gamma * (ca.DM(full) @ error)
     stages = model.stages
     if stages is not None:

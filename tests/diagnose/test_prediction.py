@@ -215,3 +215,18 @@ def test_a_free_run_drifts_if_it_remembers_what_forces_have_done(stiffness, dura
     r = Recording(np.ones(duration), np.ones((duration, 2)), DT, ("f",), ("gap", "load"), initial="zero")
     bench = Workbench.of(simulator, [r.with_(y=np.random.default_rng(0).normal(size=(duration, 2)))], "zero")
     assert drifts(bench, bench.fit(simulator)) is there
+
+
+def test_an_observer_forgets_alike_behind_a_sensor_gain_and_hardly_behind_a_dead_sensor():
+    r = pushed(0.0, 0.0, 2e-3)
+    led = replace(cart(), observer=observer(cart(), [r], "zero", 0.5))
+
+    def corrected(gain):
+        model = discretise(led.with_element("sensor:pos", Gain().at({"g": gain})), r.dt, "zero", 1)
+        x = ca.DM.zeros(model.n_state)
+        u = ca.vertcat(*({"u": ca.DM(0), "y": ca.DM(1), "sampled": ca.DM(1)}[name] for name in model.reads))
+        return model.closed(x, u, model.parameters.start)[0].full().ravel()
+
+    plain = corrected(0.0)
+    np.testing.assert_allclose(corrected(1.0), plain / 2, rtol=1e-12)
+    assert np.max(np.abs(corrected(-1.0))) == 0 < np.max(np.abs(plain))
