@@ -216,7 +216,7 @@ class Check:
         if self.hold_taken:
             taken = HOLD_WORDS[self.hold_taken]
             unsaid = (
-                f"not stated, here taken as {taken}; say hold='zero', 'linear', 'band-limited' or 'next' if you know"
+                f"not stated, here taken as {taken}; state hold='zero', 'linear', 'band-limited' or 'next' if you know"
             )
             yield f"inputs between samples: {taken if self.hold else unsaid}"
         yield f"start of each recording: {', '.join(self.starts)}"

@@ -70,6 +70,8 @@ class TimeShift(Gate):
         moved = replace(self, value=value, sentence=words)
         if moved.delay > 0:
             moved = replace(moved, sentence=f"{words}, or the machine delays {it} by as much")
+        elif self.finding == "alignment" and abs(value / dt) < 1 + WHOLE_SHIFT:
+            moved = replace(moved, sentence=f"{words}, or inputs are means up to their samples (hold 'next')")
         return replace(moved, change=moved.read)
 
     def read(self, r: Recording, cut: bool = True, curves: Sequence[_Curve] = ()) -> Recording:
