@@ -454,6 +454,8 @@ def test_an_export_begins_at_the_given_state(capsys, files):
     command = (*command, "--overwrite")
     status, out, _ = run(capsys, *command, "--initial", "0.125,0.5")
     assert status == 0 and "note" not in out
+    status, out, _ = run(capsys, *command, "--initial", "0.125,0.5", "--hold", "next")
+    assert status == 0 and "the input of a step acts until the next one" in out
     assert "0.125" in (files / "c" / "model.c").read_text()
     status, _, err = run(capsys, *command, "--initial", "estimate")
     assert status == 2 and "--initial estimate needs a recording" in err
