@@ -25,6 +25,7 @@ from .faults.lost_samples import find_gaps, find_output_gaps
 from .faults.offsets import find_offsets, find_wrong_start
 from .faults.samples import clean_recordings, find_held_outputs, mend_stale_samples, unclip
 from .faults.timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps
+from .fits.evidence import BETTER_RATIO
 from .fits.floor import Floor, pool, white_part
 from .fits.linearise import linearise_runs, observer_gain, sample_run
 from .fits.step_refinement import refine_steps
@@ -354,7 +355,8 @@ def slow_note(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[Ga
 
 def hold_note(simulator: Simulator, hold: str, ratio: float) -> Gate:
     """Note that the hold was chosen from the data; the other's error is `ratio` times as large."""
-    how = f"fit better (error {ratio:.3g} times smaller)" if ratio > EQUAL_RATIO else "fit no worse"
+    known = "" if ratio > BETTER_RATIO else "; state the hold if you know it"
+    how = f"fit better (error {ratio:.3g} times smaller{known})" if ratio > EQUAL_RATIO else "fit no worse"
     how = how if np.isfinite(ratio) else "let the simulation follow (otherwise it diverges)"
     words = f"inputs that are {HOLD_WORDS[hold]} there {how} and are used"
     sentence = f"The recordings do not say what inputs do between samples; {words}."

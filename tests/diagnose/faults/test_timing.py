@@ -101,6 +101,7 @@ def test_what_seems_early_while_more_is_wrong_may_be_no_fault(stiffening):
 
 def test_why_a_hold_was_chosen_is_said():
     assert "fit better (error 1.3 times smaller)" in hold_note(spring(), "linear", 1.3).sentence
+    assert "error 1.03 times smaller; state the hold if you know it)" in hold_note(spring(), "linear", 1.03).sentence
     assert (
         "inputs that are interpolated there fit no worse and are used" in hold_note(spring(), "linear", 1.0004).sentence
     )
