@@ -147,9 +147,9 @@ def _best_memory(search: Hypotheses, trial: Trial, simulator: Simulator, memory:
 def disturbance_note(simulator: Simulator, memory: float, before: float) -> Gate:
     """Note that disturbances explain more than the laws that were found with a longer memory."""
     sentence = (
-        f"Disturbances that nobody recorded move the machine: with an observer that forgets within {memory:.3g} s, the "
-        f"simulator follows better than with one that forgets within {before:.3g} s. Physics whose effect is smaller "
-        "than theirs is not found."
+        "Disturbances that nobody recorded move the machine, or physics that no law here follows: with an observer "
+        f"that forgets within {memory:.3g} s, the simulator follows better than with one that forgets within "
+        f"{before:.3g} s. Physics whose effect is smaller than that is not found."
     )
     return Gate(", ".join(simulator.output_names), "disturbance", memory, sentence, corrected=False)
 
