@@ -26,7 +26,9 @@ class NotTraceable(Exception):
 
 
 class Decides(Protocol):
-    """Decide conditions that are symbols."""
+    """Decide conditions that are symbols; `refused` keeps the first wish for a number, which compiled code may lose."""
+
+    refused: NotTraceable | None
 
     def decide(self, condition: Any) -> bool:
         """Return the answer to a condition."""
@@ -63,11 +65,13 @@ class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
     def _number(self, does: str) -> float:
         if self.sx.is_constant():
             return float(self.sx)
-        raise NotTraceable(
+        refusal = NotTraceable(
             f"{does} from a value that is a symbol here",
             "leave out int(), use functions of NumPy in place of other modules (np.interp for tables), collect "
             "results by np.array([...]), give numeric=Numeric(...) for solvers",
         )
+        self.trace.refused = self.trace.refused or refusal
+        raise refusal
 
     def __float__(self) -> float:
         return self._number("makes a plain number")

@@ -52,6 +52,7 @@ class Trace:
     def __init__(self, prescribed: Sequence[bool], signals: Any) -> None:
         self.prescribed, self.signals = list(prescribed), signals
         self.decisions: list[tuple[Any, bool]] = []
+        self.refused: NotTraceable | None = None
 
     def decide(self, condition: Any) -> bool:
         """Answer a condition; the same condition gets the same answer again."""
@@ -98,7 +99,12 @@ def explore_paths(call: Callable[[Trace], Any], signals: Any) -> tuple[Any, int]
         if calls > MOST_CALLS:
             raise NotTraceable(f"has more than {MOST_CALLS} branches", "write np.where, np.maximum or np.sign for them")
         trace = Trace(prescribed, signals)
-        value = call(trace)
+        try:
+            value = call(trace)
+        except Exception as error:
+            if trace.refused and trace.refused not in (error, error.__cause__):
+                raise error from trace.refused  # compiled code may report what its lost error led to
+            raise
         answers = [answer for _, answer in trace.decisions]
         for i in reversed(range(len(prescribed), len(answers))):
             value = ca.if_else(trace.decisions[i][0], value, explore([*answers[:i], False]))

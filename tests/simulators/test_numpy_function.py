@@ -1,5 +1,6 @@
 """NumPy functions as simulators: the equations agree with the function, or one sentence says why not."""
 
+import contextlib
 import functools
 import itertools
 import math
@@ -321,6 +322,13 @@ def finds_a_root(t, x, u, p):
     return [brentq(lambda z: z + z**3 - x[0], -1e9, 1e9), x[1]]
 
 
+def loses_an_error(t, x, u, p):
+    with contextlib.suppress(Exception):  # as compiled code that calls on after an error
+        x[0].__float__()
+        return x
+    raise ValueError("f(a) and f(b) must have different signs")
+
+
 randn = np.random.randn
 BAD = {
     "not callable": (3, ("3", "function of t, x, u and p")),
@@ -350,6 +358,7 @@ BAD = {
     "adds into numbers": (adds_into_numbers, ("line", "total += x", "y = y + ...")),
     "table of another package": (looks_up, ("line", "TABLE(x[:1])", "CasADi")),
     "solver": (finds_a_root, ("line", "brentq(", "a plain number", "numeric=Numeric(...)")),
+    "lost error": (loses_an_error, ("line", "a plain number", "numeric=Numeric(...)")),
     "random": (lambda t, x, u, p: x * NOISE.random(), ("line", "NOISE.random()", "uses random numbers")),
     "legacy random": (lambda t, x, u, p: x + randn(), ("line", "randn()", "uses random numbers")),
     "random of Python": (lambda t, x, u, p: x + random.random(), ("line", "random.random()", "uses random numbers")),
