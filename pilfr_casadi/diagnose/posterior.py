@@ -300,7 +300,8 @@ def may_be_coloured_noise(search: Hypotheses, quiet: float = 1.0) -> bool:
     `quiet` is the share of its rms that is left without steady tones. Measured noise has its colour already.
     """
     most = COLOURED_NOISE_RATIO if search.floor.source == "estimated" else ABOVE_NOISE
-    return np.max(search.root.fitted.squares) < LOUDEST_NOISE**2 and quiet * times_of_noise(search) < most
+    small = np.max(search.root.fitted.squares) < LOUDEST_NOISE**2 and quiet * times_of_noise(search) < most
+    return bool(small) and not search.is_driven
 
 
 def _is_slow_noise(search: Hypotheses) -> bool:

@@ -30,7 +30,7 @@ from .fits.evidence import (
     SURE,
     WHITE_NOISE_RATIO,
 )
-from .fits.floor import ABOVE_NOISE, swells_with, white_part
+from .fits.floor import ABOVE_NOISE
 from .posterior import Posterior, may_be_coloured_noise, share_left, times_of_noise
 from .search.hypotheses import Hypotheses
 from .search.trials import Trial
@@ -132,21 +132,7 @@ def _is_noise(search: Hypotheses, quiet: float, explained: bool, mode: float | N
     else:
         near = quiet**2 * search.root.mean_square < ABOVE_NOISE**2 * search.floor2
         like = (near and times < WHITE_NOISE_RATIO) or (not explained and may_be_coloured_noise(search, quiet))
-    return like and mode is None and not _swells(search)
-
-
-def _swells(search: Hypotheses) -> bool:
-    """Tell whether the residual's power follows the inputs, the simulated outputs or their rates within the recordings.
-
-    The measured outputs hold the noise itself, and their rates hardly anything else where the machine is slow.
-    """
-    signals, residual = [], search.root.fitted.residual
-    for r, e in zip(search.bench.recordings, residual, strict=True):
-        simulated = r.y + e
-        signals.append(np.column_stack([r.u, simulated, np.gradient(simulated, axis=0)])[r.skip :])
-    # the noise may be of another level in each recording, such as with another range of a sensor
-    rest = [e / np.maximum(white_part([e]), 1e-300) for e in search.bench.scored(residual)]
-    return swells_with(rest, signals)
+    return like and mode is None and not search.is_driven
 
 
 def _describe_effects(search: Hypotheses, found: Posterior) -> str:

@@ -292,24 +292,51 @@ def count_samples(residuals: Sequence[np.ndarray], mismatch: Sequence[np.ndarray
 def swells_with(residuals: Sequence[np.ndarray], signals: Sequence[np.ndarray]) -> bool:
     """Tell whether a residual's power follows any column of signals of the same length; that of noise does not.
 
-    Test the rank correlation (Spearman 1904) of their powers over blocks longer than the residual's correlation time.
+    Test the rank correlation (Spearman 1904) of their powers over blocks longer than the residual's correlation time,
+    and from sample to sample, as of a gain that varies.
     """
     from scipy.stats import spearmanr
-
-    def powers(v: np.ndarray, block: int) -> np.ndarray:
-        count = len(v) // block
-        return np.asarray(np.mean(v[: count * block].reshape(count, block) ** 2, axis=1))
 
     for k in range(residuals[0].shape[1]):
         own = [e[:, [k]] for e in residuals]
         memory = sum(map(len, own)) / max(effective_size(own), 1.0)
         blocks = [int(np.clip(4 * memory, 10, max(len(e) // 12, 10))) for e in own]
-        loud = np.concatenate([powers(e[:, 0], b) for e, b in zip(own, blocks, strict=True)])
+        loud = [_powers(e[:, 0], b) for e, b in zip(own, blocks, strict=True)]
+        if sum(map(len, loud)) < 8 or not np.ptp(np.concatenate(loud)) > 0:
+            continue
+        at_once = [e[:, 0] ** 2 for e in own]
         for j in range(signals[0].shape[1]):
-            other = np.concatenate([powers(v[:, j] - v[:, j].mean(), b) for v, b in zip(signals, blocks, strict=True)])
-            if len(loud) < 8 or not np.ptp(other) > 0:
+            deviations = [v[:, j] - v[:, j].mean() for v in signals]
+            other = [_powers(v, b) for v, b in zip(deviations, blocks, strict=True)]
+            if not np.ptp(np.concatenate(other)) > 0:
                 continue
-            rank, chance = spearmanr(loud, other)
-            if rank > CORRELATED and chance < P_VALUE:
+            rank, chance = spearmanr(np.concatenate(loud), np.concatenate(other))
+            if (rank > CORRELATED and chance < P_VALUE) or _rank_together(at_once, [v**2 for v in deviations]):
                 return True
     return False
+
+
+def _powers(values: np.ndarray, width: int) -> np.ndarray:
+    """Compute the mean squares of blocks of a width in samples."""
+    count = len(values) // width
+    return np.asarray(np.mean(values[: count * width].reshape(count, width) ** 2, axis=1))
+
+
+def _rank_together(first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> bool:
+    """Tell whether the ranks of two series, in parts of equal lengths, are correlated although both are slow.
+
+    The variance of the covariance of two independent series is the sum of the products of their autocovariances
+    (Bartlett 1946).
+    """
+    from scipy.stats import norm, rankdata
+
+    ranks = [rankdata(np.concatenate(v)) for v in (first, second)]
+    cuts = np.cumsum([len(v) for v in first])[:-1]
+    parts = list(zip(*(np.split(v - v.mean(), cuts) for v in ranks), strict=True))
+    covariance = sum(float(a @ b) for a, b in parts)
+    variance = 0.0
+    for a, b in parts:
+        spectra = [np.abs(np.fft.fft(v, 2 * len(v))) ** 2 for v in (a, b)]
+        variance += float(np.mean(spectra[0] * spectra[1])) / len(a)
+    size = np.prod([np.linalg.norm(np.concatenate(v)) for v in zip(*parts, strict=True)])
+    return bool(covariance > CORRELATED * size and norm.sf(covariance / np.sqrt(variance)) < P_VALUE)

@@ -38,7 +38,7 @@ from ..fits.evidence import (
     spread,
 )
 from ..fits.flexible_forces import flexible_shares, innovation_share
-from ..fits.floor import FEWEST, Floor, count_samples, white_part
+from ..fits.floor import FEWEST, Floor, count_samples, swells_with, white_part
 from ..fits.force_recovery import is_curve_along
 from ..fits.screen import Scored, screen
 from ..fits.workbench import DIVERGED, Fitted, Workbench
@@ -55,6 +55,7 @@ class Findings:
     screened: tuple[list[Scored], np.ndarray | None] | None = None
     flexible: dict[str, float] | None = None  # the share of the residual that a flexible force at each port explains
     innovations: float | None = None  # the share of the residual's innovations that a flexible force explains
+    driven: bool | None = None  # whether the power of its residual follows the machine's signals
     # the log likelihood of a sample of its residual as coloured noise, and the log prior density of its first states
     likelihood: tuple[float, float] | None = None
     learned: list[Fitted] | None = None  # the learned forces beside it, best first
@@ -457,10 +458,29 @@ class Hypotheses:
             return
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
         share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
+        share = 0.0 if best is self.root and self.is_driven else share
         rest = np.minimum(np.sqrt(share) * self.rms(best), LOUDEST_NOISE * self.bench.scale)
         known, white = self.surrogate_nrmse * self.bench.scale, white_part(self.bench.scored(best.fitted.residual))
         noise = np.minimum(np.hypot(np.maximum(white, rest), known), self.rms(nearest))
         self.floor = Floor(noise, "estimated")
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether the power of the refit's residual follows the inputs, the simulated outputs or their rates.
+
+        That of noise does not. The measured outputs hold the noise itself, and their rates hardly anything else where
+        the machine is slow.
+        """
+        known, fitted = self.findings[self.root.key], self.root.fitted
+        if known.driven is None:
+            signals = []
+            for r, e in zip(self.bench.recordings, fitted.residual, strict=True):
+                simulated = r.y + e
+                signals.append(np.column_stack([r.u, simulated, np.gradient(simulated, axis=0)])[r.skip :])
+            # the noise may be of another level in each recording, such as with another range of a sensor
+            rest = [e / np.maximum(white_part([e]), 1e-300) for e in self.bench.scored(fitted.residual)]
+            known.driven = swells_with(rest, signals)
+        return known.driven
 
     def count_samples(self, fitted: Fitted) -> float:
         """Count the samples over the correlation time of a fit's residual, at most those in which the mismatch acts."""

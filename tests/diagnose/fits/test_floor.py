@@ -114,6 +114,17 @@ def test_samples_that_are_alike_count_less():
     assert effective_size([white]) > 0.6 * 4000 > 5 * effective_size([alike])
 
 
+@pytest.mark.parametrize("kind", ["gain", "noise"])
+def test_an_error_that_a_varying_gain_leaves_is_no_noise(kind):
+    """Over blocks the power of a steady input hardly varies."""
+    rng = np.random.default_rng(0)
+    signal = np.sin(2 * np.pi * np.arange(6000) / 50 + 0.1 * np.cumsum(rng.standard_normal(6000)))
+    noise = np.convolve(rng.standard_normal(6000), np.ones(50) / 8, "same")
+    gain = np.where(np.arange(6000) // 1000 % 2, 1.0, -1.0)
+    error = gain * signal + 0.3 * noise if kind == "gain" else noise
+    assert swells_with([error[:, None]], [signal[:, None]]) is (kind == "gain")
+
+
 @pytest.mark.parametrize("kind", ["swells", "steady", "short", "still"])
 def test_an_error_that_swells_with_a_signal_is_no_noise(kind):
     rng = np.random.default_rng(0)
