@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import LARGEST, InputError, is_number, numbers, positive, whole
-from ..data import HOLDS, SAME_STEP, Recording
+from ..data import SAME_STEP, Recording, known_hold, step_hold
 from ..engine import make_engine
 from ..models import Model, PrandtlIshlinskii
 from ..optimise import estimate_initial_state
@@ -145,10 +145,7 @@ def _check_dt(dt: float | None) -> float:
 
 
 def _discretise_over_sample(model: Simulator, dt: float, hold: str | None, substeps: int | None) -> Model:
-    hold = hold or model.hold or "zero"
-    if hold not in HOLDS:
-        raise InputError(f"hold = {hold!r} was given; use 'zero', 'linear', 'band-limited' or 'next'.")
-    hold = "linear" if hold == "band-limited" else hold  # a step does not know the inputs before and after it
+    hold = step_hold(known_hold(hold) or model.hold or "zero")
     chosen = _choose_substeps_at_rest(model, dt) if substeps is None else whole(substeps, "substeps", 1)
     return discretise(model, dt, hold, chosen)
 

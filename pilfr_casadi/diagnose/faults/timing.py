@@ -104,7 +104,7 @@ class TimeShift(Gate):
         return np.full(len(r), True) if self._wraps(r) else (at >= 0) & (at <= r.t[-1] + 1e-9 * r.dt)
 
     def _wraps(self, r: Recording) -> bool:
-        return bool(r.period) and len(r) % (r.period or 1) == 0 and self.finding == "alignment"
+        return r.wraps and self.finding == "alignment"
 
     def curves(self, r: Recording) -> list[_Curve]:
         """Interpolate the channels, whatever the value."""
