@@ -12,11 +12,12 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 import typer
 
 from .._base import InputError, listed
+from ..data import Hold
 
 if TYPE_CHECKING:
     from ..data import Recording
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 DONE, NO_RESULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # Typer has moved its name between releases
 MOST_SAMPLES = 10**9  # of a period, or skipped: 8 GB per channel
-Hold = Literal["zero", "linear", "band-limited", "next"]
 FILE_TYPES = ".csv, .mat, .npz, .parquet, .mf4"  # of recordings, for help texts
 
 

@@ -27,6 +27,7 @@ from .._base import (
     write_atomically,
 )
 from ..data import (
+    COURSES,
     NOTHING_SENTENCE,
     STACK_SUFFIXES,
     Recording,
@@ -535,7 +536,7 @@ def export_command(options: ExportOptions) -> int:
     step = exported(source, dt=options.dt, hold=options.hold, start=start, **more)
     if options.initial is None and step.states:
         print("note: the exported model begins with every state at zero; give other values with --initial.")
-    if (options.hold or (source.hold if simulated else source.model.hold)) == "next":
+    if COURSES[step.hold].begin:
         print("note: the input of a step acts until the next one; of a log of means, that is the next row.")
     with reserved_file(options.files[0], options.overwrite) as target:
         _write_exported(step, options, target)

@@ -111,7 +111,7 @@ def check_task(
 def as_step_function(given: Any) -> ca.Function:
     """Return the step `(x, u) -> (x_next, y)` of a fit, an observer or an export, or the function itself."""
     model = given.export() if isinstance(given, Fit) else given
-    if isinstance(model, Exported) and "next" in model.reads:
+    if isinstance(model, Exported) and model.interpolated:
         raise InputError(
             f"The inputs of {model.name} are interpolated, so a step also takes the inputs of the next sample, "
             'which are not free; export it with hold="zero" to plan with it.'

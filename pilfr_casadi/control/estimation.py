@@ -26,7 +26,7 @@ from ..export import Exported, exported
 from ..identify import Fit
 from ..linear import measurement_update
 from ..models import or_one
-from ..simulators import Simulator, stated_hold
+from ..simulators import Simulator
 
 Array = np.ndarray
 SMALLEST_SPREAD = 1e-6  # of the largest: keeps the covariance regular if a state never moves
@@ -71,12 +71,7 @@ class Rollout:
 def roll_out(source: Any, recording: Recording, verb: str) -> Rollout:
     """Run a fit, a diagnosis, a simulator or an export along a recording; errors name the called `verb`."""
     model, recording = _export_step(source, recording, verb)
-    u, after = recording.u, np.vstack([recording.u[1:], recording.u[-1:]])
-    if len(model.inputs) > recording.n_u:
-        u = np.hstack([u, after])
-    elif _hold_of(source, recording) == "next":
-        u = after
-    start = model.x0()
+    u, start = model.drive(recording), model.x0()
     x_next, y = (np.asarray(v) for v in model.step.mapaccum("rollout", len(u))(start, u.T))
     first = source.scored_from(recording) if isinstance(source, Fit) else recording.skip
     if not (np.all(np.abs(x_next) < LARGEST) and np.all(np.abs(y[:, first:]) < LARGEST)):
@@ -85,15 +80,6 @@ def roll_out(source: Any, recording: Recording, verb: str) -> Rollout:
     clock = [len(model.states) - 1] if model.timed else []
     linear = [i for i in range(len(model.states)) if i not in memory and i not in clock]
     return Rollout(model, recording, u, y.T, np.column_stack([start, x_next]), linear, clock, first)
-
-
-def _hold_of(source: Any, recording: Recording) -> str | None:
-    """Return the course of the inputs between samples with which a model follows a recording."""
-    if isinstance(source, Fit):
-        return source.model.hold
-    if isinstance(source, Simulator):
-        return stated_hold(source, [recording])
-    return getattr(source, "hold", None)
 
 
 def _export_step(source: Any, recording: Recording, verb: str) -> tuple[Exported, Recording]:

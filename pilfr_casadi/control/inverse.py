@@ -144,9 +144,9 @@ def feedforward(
             f"A look-ahead of {ahead!r} samples was given; give a whole number from 0 to {LONGEST_LOOK_AHEAD}."
         )
     response = analyse_response(fit, run, recording)
-    chosen, why = _choose_look_ahead(run, recording, response, ahead)
+    chosen, why = _choose_look_ahead(run, response, ahead)
     delay = response.delay
-    if chosen == delay and _gain_changes_sign(run, recording, response, ends):
+    if chosen == delay and _gain_changes_sign(run, response, ends):
         why = (
             "within the limits the output rises with the input in places and falls in others, so that several inputs "
             "give the same output"
@@ -215,7 +215,7 @@ def _output_ahead(function: ca.Function, ahead: int, delay: int) -> ca.Function:
     return ca.Function("output_ahead", [x, u_before, u], [y, *slopes])
 
 
-def _choose_look_ahead(run: Rollout, recording: Recording, response: Response, ahead: int | None) -> tuple[int, str]:
+def _choose_look_ahead(run: Rollout, response: Response, ahead: int | None) -> tuple[int, str]:
     """Choose the look-ahead given, or the shortest stable one; also say why its inverse is approximate."""
     n = response.delay
     if ahead is not None and ahead < n:
@@ -225,7 +225,7 @@ def _choose_look_ahead(run: Rollout, recording: Recording, response: Response, a
             f"know the wanted path {n} samples ahead and give ahead={n} or more, or leave it out."
         )
     tried = range(n, n + EXTRA_LOOK_AHEAD + 1) if ahead is None else sorted({n, ahead})
-    found = {d: _gain_and_radius(run, recording, response, d) for d in tried}
+    found = {d: _gain_and_radius(run, response, d) for d in tried}
     largest, limit = max(h for _, h, _ in found.values()), _stability_limit(response)
     usable = [d for d, (gain, _, radius) in found.items() if gain > SMALL_GAIN * largest and radius < limit]
     if usable and ahead in (None, usable[-1]):
@@ -245,12 +245,12 @@ def _choose_look_ahead(run: Rollout, recording: Recording, response: Response, a
     )
 
 
-def _gain_and_radius(run: Rollout, recording: Recording, response: Response, d: int) -> tuple[float, float, float]:
+def _gain_and_radius(run: Rollout, response: Response, d: int) -> tuple[float, float, float]:
     """Compute the median gain of a look-ahead, the gain of a constant input, and the largest spectral radius."""
     n = len(response.linear[0][0])
     output_ahead, gains, radii, constant = _output_ahead(run.model.step, d, response.delay), [], [], []
     for k, (a, b, _, _) in zip(response.at, response.linear, strict=True):
-        slopes = output_ahead(run.states[:, k], recording.u[max(k - 1, 0)], recording.u[k])
+        slopes = output_ahead(run.states[:, k], run.u[max(k - 1, 0)], run.u[k])
         _, g_x, g_before, g_u = (np.asarray(v) for v in slopes)
         gain = float(g_u.item())
         gains.append(abs(gain))
@@ -265,11 +265,11 @@ def _gain_and_radius(run: Rollout, recording: Recording, response: Response, d: 
     return median, float(np.median(constant)), radius
 
 
-def _gain_changes_sign(run: Rollout, recording: Recording, response: Response, ends: tuple[float, float]) -> bool:
+def _gain_changes_sign(run: Rollout, response: Response, ends: tuple[float, float]) -> bool:
     """Tell whether the output rises with the input in places and falls in others."""
     n = response.delay
     output_ahead, u = _output_ahead(run.model.step, n, n), np.linspace(*ends, GAIN_INPUTS)[None, :]
-    slopes = [output_ahead(run.states[:, k], recording.u[max(k - 1, 0)], u)[3] for k in response.at]
+    slopes = [output_ahead(run.states[:, k], run.u[max(k - 1, 0)], u)[3] for k in response.at]
     gains = np.ravel([np.asarray(slope) for slope in slopes])
     small = SMALL_GAIN * float(np.median(np.abs(gains[gains != 0]))) if np.any(gains) else 0.0
     return bool(np.min(gains) < -small and np.max(gains) > small)

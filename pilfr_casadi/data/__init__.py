@@ -1,9 +1,10 @@
 """Recordings, before any model: reading and preprocessing them, excitation signals, metrics, periods and units.
 
-`recording` holds the class `Recording`. `readers` makes recordings of files and frames: `tables` opens files by suffix
-(add a file type in `OPENERS`), `csv_table` parses text, `columns` tells time columns and units by their names,
-`time_grid` finds the step, and `common_clock` merges files. `preprocessing` resamples and filters, `periods` finds and
-averages periods, `units` converts units, `excitation` makes signals, and `metrics` compares them.
+`recording` holds the class `Recording`, and `holds` what its inputs do between samples. `readers` makes recordings of
+files and frames: `tables` opens files by suffix (add a file type in `OPENERS`), `csv_table` parses text, `columns`
+tells time columns and units by their names, `time_grid` finds the step, and `common_clock` merges files.
+`preprocessing` resamples and filters, `periods` finds and averages periods, `units` converts units, `excitation` makes
+signals, and `metrics` compares them.
 """
 
 from typing import TYPE_CHECKING
@@ -21,6 +22,15 @@ if TYPE_CHECKING:
         sine_sweep as sine_sweep,
         steady_periods as steady_periods,
         tukey_realizations as tukey_realizations,
+    )
+    from .holds import (
+        COURSES as COURSES,
+        HOLD_CHOICES as HOLD_CHOICES,
+        HOLDS as HOLDS,
+        Hold as Hold,
+        interpolate_band_limited as interpolate_band_limited,
+        known_hold as known_hold,
+        step_hold as step_hold,
     )
     from .metrics import (
         BAND as BAND,
@@ -42,7 +52,6 @@ if TYPE_CHECKING:
         repeats_itself as repeats_itself,
         same_input as same_input,
     )
-    from .preprocessing import interpolate_band_limited as interpolate_band_limited
     from .readers import (
         column_names as column_names,
         read as read,
@@ -53,8 +62,6 @@ if TYPE_CHECKING:
         written_times as written_times,
     )
     from .recording import (
-        HOLD_WORDS as HOLD_WORDS,
-        HOLDS as HOLDS,
         SAME_STEP as SAME_STEP,
         Recording as Recording,
         as_recordings as as_recordings,

@@ -12,7 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from .._base import InputError, is_number, listed, positive
-from .preprocessing import common_times, hold_at, levels_last, sample_at
+from .holds import COURSES, becomes_mean, hold_at
+from .preprocessing import common_times, sample_at
 from .recording import SAME_STEP, Recording, as_tuple
 
 Names = Sequence[str] | str | None
@@ -91,7 +92,7 @@ def merge(
         period=None,
         start=first.start + begin,
         initial=first.initial if keeps_initial else "estimate",
-        hold="linear" if hold in ("zero", "next") and not as_sampled else hold,
+        hold="linear" if hold and COURSES[hold].constant and not as_sampled else hold,
         skip=min(max(int(np.ceil((first.skip * first.dt - begin) / step - SAME_STEP)), 0), len(times) - 1),
     )
 
@@ -103,9 +104,7 @@ def _is_at_samples(r: Recording, begin: float, step: float) -> bool:
 
 def _is_held(r: Recording, name: str, step: float) -> bool:
     """Tell whether a channel is an input that becomes its mean: at its next value, or held for at least a step."""
-    if name not in r.inputs:
-        return False
-    return r.hold == "next" or (r.hold == "zero" and levels_last(r.t, r.u[:, r.inputs.index(name)], step))
+    return name in r.inputs and becomes_mean(r.hold, r.t, r.u[:, r.inputs.index(name)], step)
 
 
 def _signals_at(r: Recording, times: np.ndarray, step: float, held: Sequence[str]) -> dict[str, np.ndarray]:
@@ -113,7 +112,7 @@ def _signals_at(r: Recording, times: np.ndarray, step: float, held: Sequence[str
     names = (*r.inputs, *r.outputs)
     values = np.hstack([r.u, r.y])
     signals = dict(zip(names, sample_at(values, r.dt, times, step).T, strict=True))
-    return signals | {n: hold_at(r.t, values[:, i], times, step, str(r.hold)) for i, n in enumerate(names) if n in held}
+    return signals | {n: hold_at(r.t, values[:, i], times, step, r.hold) for i, n in enumerate(names) if n in held}
 
 
 def _stack_columns(signals: dict[str, np.ndarray], names: tuple[str, ...], count: int) -> np.ndarray:

@@ -15,19 +15,17 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, is_number, listed, positive, whole
+from .holds import SAME_TIME
 
 Array = np.ndarray
 
 TRENDS = ("constant", "linear")
-INTERPOLATION_REACH = 10  # samples on each side that an interpolated value depends on
-INTERPOLATION_WINDOW = ("kaiser", 8.0)  # of the sine cardinal: 80 dB of attenuation
 FILTERS = ("lowpass", "highpass", "bandpass", "bandstop")
 LARGEST_FACTOR = 1000  # largest numerator and denominator of a rational change of step
 RATIO_ERROR = 1e-9  # relative error of that ratio, far below a sample over the longest recordings
 MOST_SAMPLES = 1e8  # of a resampled recording: 0.8 GB a channel
 PASSBAND = 0.8  # share of the new Nyquist frequency that the anti-alias filter passes; the rest is its transition band
 ANTI_ALIAS_ORDER = 8  # order of the Butterworth filter before an irrational change of step
-SAME_TIME = 1e-4  # difference of two times in steps up to which they count as the same; written times have few digits
 MOST_UNEVEN = 0.5  # largest deviation of a gap from the median one for a spline, which wiggles between uneven samples
 LONGEST_GAP = 10  # in median steps; samples interpolated over a longer gap would be invented
 
@@ -165,54 +163,3 @@ def interpolate_at(t: Array, values: Array, times: Array, step: float, smooth: b
     else:
         even = np.interp(grid, t, values)
     return change_step(even[:, None], step / parts, step)[before : before + len(times), 0]
-
-
-def levels_last(t: Array, values: Array, step: float) -> bool:
-    """Tell whether the levels of a held signal (M,) usually last at least a step, so that its means keep its course.
-
-    A few shorter ones, as where the clock of a logger jitters, do not count: the means keep their integrals.
-    """
-    changes = t[1:][np.diff(values) != 0]
-    return len(changes) < 2 or bool(np.median(np.diff(changes)) > step * (1 - SAME_TIME))
-
-
-def hold_at(t: Array, values: Array, times: Array, step: float, hold: str = "zero") -> Array:
-    """Return the mean of a signal (M,), held from each of its times t to the next, over the step after each of `times`.
-
-    With `hold="next"` each value has been held since the time before, and the means are those over the step before each
-    of `times`. The means keep the signal's integral; a value that is held throughout a step is kept.
-    """
-    if hold == "next":  # the same, backwards in time
-        return hold_at(-t[::-1], values[::-1], -times[::-1], step)[::-1]
-    changes = np.append(True, np.diff(values) != 0)
-    t, values = t[changes], values[changes]
-    known = np.append(t, max(t[-1], times[-1]) + 2 * step)
-    integral = np.append(0.0, np.cumsum(values * np.diff(known)))
-    means = np.diff(np.interp(np.append(times, times[-1] + step), known, integral)) / step
-    first, last = (np.searchsorted(t, times + share * step, "right") - 1 for share in (SAME_TIME, 1 - SAME_TIME))
-    return np.where(first == last, values[first], means)  # without rounding where the signal keeps its value
-
-
-def interpolate_band_limited(values: np.ndarray, n: int, period: int | None = None) -> np.ndarray:
-    """Interpolate band-limited signals (M, k) at n points a sample; return (n M + 1, k), the samples unchanged.
-
-    The signals have no content above half the sampling rate, as behind an anti-alias filter. With `period`, in samples,
-    they repeat, so that the whole curve is known; else they are reflected in their first and last points, near which
-    the curve is uncertain.
-    """
-    from scipy.signal import firwin, upfirdn
-
-    reach, count = INTERPOLATION_REACH, len(values)
-    if period:
-        more = values[np.arange(-reach, count + reach + 1) % period]
-        more[reach : reach + count] = values
-    else:
-        more = np.pad(values, ((reach, reach + 1), (0, 0)), "reflect", reflect_type="odd")
-    if n == 1:
-        return np.asarray(more[reach : reach + count + 1])
-    taps = firwin(2 * reach * n + 1, 1 / n, window=INTERPOLATION_WINDOW)
-    for k in range(n):  # a constant stays one, however large
-        taps[k::n] /= np.sum(taps[k::n])
-    fine = upfirdn(taps, more, n, axis=0)[reach * n :]
-    fine[: n * len(more) : n] = more
-    return np.asarray(fine[n * reach : n * (reach + count) + 1])

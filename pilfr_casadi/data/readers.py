@@ -17,7 +17,8 @@ import numpy as np
 from .._base import InputError, listed, positive
 from .columns import TIME_NAMES, find_column, find_time_column, refuse_other_unit
 from .csv_table import CsvTable
-from .preprocessing import check_times, common_times, hold_at, interpolate_at, levels_last
+from .holds import hold_at, levels_last
+from .preprocessing import check_times, common_times, interpolate_at
 from .recording import Recording, as_tuple
 from .tables import ArrayTable, frame_table, open_table
 from .time_grid import step_of
@@ -326,7 +327,7 @@ class _Request:
         parts = []
         for i, (t, values) in enumerate(series):
             means = i < n_u and (held or hold == "next")
-            bring = partial(hold_at, hold=str(hold)) if means else partial(interpolate_at, smooth=i >= n_u)
+            bring = partial(hold_at, hold=hold) if means else partial(interpolate_at, smooth=i >= n_u)
             parts.append(np.column_stack([bring(t, column, times, step) for column in values.T]))
         return parts, "linear" if hold == "zero" and not held else hold
 

@@ -16,13 +16,12 @@ import numpy as np
 
 from .._base import REPAIR, InputError, is_number, is_whole, later, listed, positive, real_array, usable
 from .columns import name_with_unit
-from .preprocessing import butterworth, change_step, hold_at, levels_last, remove_trend
+from .holds import becomes_mean, hold_at, known_hold
+from .preprocessing import butterworth, change_step, remove_trend
 from .units import conversion
 
 SAME_STEP = 1e-4  # relative difference up to which two steps count as the same; written times have few digits
 LONGEST_STEP = 1e30  # s, and its inverse the shortest one: rates are squared, and no experiment is outside
-HOLDS = ("zero", "linear", "band-limited", "next", None)  # None is not known
-HOLD_WORDS = {"zero": "held", "linear": "interpolated", "band-limited": "band-limited", "next": "at their next value"}
 INITIALS = ("zero", "estimate", "periodic")
 
 
@@ -142,6 +141,25 @@ class Recording:
     def clock(self) -> np.ndarray:
         """Time of the samples from `start` on, (M,), in seconds, which equations and laws read."""
         return self.start + self.t
+
+    @property
+    def wraps(self) -> bool:
+        """Whether it repeats in whole periods, so that the last period's first sample follows the last sample."""
+        return self.period is not None and len(self) % self.period == 0
+
+    @property
+    def u_next(self) -> np.ndarray:
+        """Inputs of the next samples, (M, n_u); without a period the last sample follows itself."""
+        return self._one_later(self.u)
+
+    @property
+    def y_next(self) -> np.ndarray:
+        """Outputs of the next samples, (M, n_y); see `u_next`."""
+        return self._one_later(self.y)
+
+    def _one_later(self, values: np.ndarray) -> np.ndarray:
+        after = values[len(self) - self.period] if self.period and self.wraps else values[-1]
+        return np.vstack([values[1:], after])
 
     def __len__(self) -> int:
         return len(self.u)
@@ -334,10 +352,9 @@ class Recording:
         if u is self.u:
             return self
         hold = self.hold
-        held = hold == "zero" and all(levels_last(self.t, column, dt) for column in self.u.T)
-        if self.n_u and (held or hold == "next"):
+        if self.n_u and all(becomes_mean(hold, self.t, column, dt) for column in self.u.T):
             times = np.arange(len(u)) * dt
-            u = np.column_stack([hold_at(self.t, column, times, dt, str(hold)) for column in self.u.T])
+            u = np.column_stack([hold_at(self.t, column, times, dt, hold) for column in self.u.T])
         elif self.n_u and hold == "zero":
             hold = "linear"
         skip = min(int(np.ceil(self.skip * self.dt / dt * (1 - SAME_STEP))), len(u) - 2)
@@ -560,8 +577,7 @@ def _check_options(r: Recording, m: int) -> None:
         )
     if not (is_number(r.start) and np.isfinite(r.start)):
         raise InputError(f"start of {r.label} is {r.start!r}; give the time of its first sample in seconds.")
-    if not (r.hold is None or isinstance(r.hold, str)) or r.hold not in HOLDS:
-        raise InputError(f"hold of {r.label} is {r.hold!r}; give 'zero', 'linear', 'band-limited', 'next' or None.")
+    known_hold(r.hold, f"hold of {r.label}")
     if isinstance(r.initial, str) and r.initial not in INITIALS:
         raise InputError(f"initial of {r.label} is {r.initial!r}; give one of {listed(INITIALS)}, or the state itself.")
     if not is_whole(r.skip, 0, m - 1):

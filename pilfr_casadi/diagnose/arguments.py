@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, Progress, Stages, is_number, listed, positive, processors, whole
-from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
+from ..data import SAME_STEP, Recording, as_recordings, check_for_identification, known_hold
 from ..laws import (
     CATALOGUE,
     SCALABLE,
@@ -143,8 +143,7 @@ def match_recordings(
     InputError
         If the hold is unknown, or simulator and recordings do not fit each other.
     """
-    if hold not in HOLDS:
-        raise InputError(f"hold={hold!r} was given; use 'zero', 'linear', 'band-limited', 'next' or None.")
+    known_hold(hold)
     given = as_recordings(train)
     simulator = as_simulator(simulator, given)
     recordings = [simulator.matched(r) for r in given]

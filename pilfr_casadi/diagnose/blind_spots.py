@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from .._base import in_words, multiple, one_blas_thread, percent, to_json
-from ..data import HOLD_WORDS, Recording, moves_freely
+from ..data import COURSES, HOLD_CHOICES, Recording, moves_freely
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, UNKNOWN, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings
@@ -214,10 +214,8 @@ class Check:
         noise = ", ".join(f"{text} {units.get(port, '')}".rstrip() for text, port in each)
         yield f"noise ({self.noise['source']}): {noise}"
         if self.hold_taken:
-            taken = HOLD_WORDS[self.hold_taken]
-            unsaid = (
-                f"not stated, here taken as {taken}; state hold='zero', 'linear', 'band-limited' or 'next' if you know"
-            )
+            taken = COURSES[self.hold_taken].words
+            unsaid = f"not stated, here taken as {taken}; state hold={HOLD_CHOICES} if you know"
             yield f"inputs between samples: {taken if self.hold else unsaid}"
         yield f"start of each recording: {', '.join(self.starts)}"
         if self.unknown_domains:

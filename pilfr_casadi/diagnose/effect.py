@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from ..simulators import EQUATION, PARAMETER, in_series, name_at, split_port
+from .faults.gates import value_with_unit
 from .fits.evidence import SURE
 
 
@@ -121,15 +122,10 @@ class Effect:
                 std = "" if p["std"] is None else f" ± {p['std']:.2g}"
                 lines.append(f"  {name} = {p['value']:.5g}{std} {p['unit']}".rstrip() + self.limit(name))
             else:  # an array; the report has the standard errors
-                lines.append(f"  {name} = {write_values([p['value'] for p in values], values[0]['unit'])}")
+                lines.append(f"  {name} = {value_with_unit([p['value'] for p in values], values[0]['unit'], 5)}")
         if self.indistinguishable:
             others = ", ".join(name_at(port, law) for port, law in self.indistinguishable)
             lines.append(f"  cannot be told apart from {others}")
         return "\n".join(lines)
 
     __repr__ = __str__
-
-
-def write_values(values: Iterable[float], unit: str) -> str:
-    """Write one or several values with their unit."""
-    return f"{', '.join(f'{v:.5g}' for v in values)} {unit}".rstrip()

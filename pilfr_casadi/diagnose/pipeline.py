@@ -64,7 +64,7 @@ from .other_explanations import (
     may_act_elsewhere,
 )
 from .posterior import Posterior, posterior
-from .prediction import drift_note, drifts, untried_note
+from .prediction import drift_note, drifts, unfinished_note
 from .preparation import LEAST_REFIT, Prepared
 from .proof import errors_of
 from .repetitions import search_in_predictions, search_with_one_hold, search_with_repetitions
@@ -292,11 +292,11 @@ def _conclude_unexplained(search: Search, judged: _Judged, elsewhere: Sequence[G
 # naming in predictions
 
 
-def _advise_predictions(request: Request, search: Search, found: Conclusion) -> Conclusion:
-    """Note that predictions were not tried for lack of time, although the simulator drifts."""
+def _advise_predictions(request: Request, search: Search, found: Conclusion, begun: bool = False) -> Conclusion:
+    """Note that predictions were not tried, or not to the end, for lack of time, although the simulator drifts."""
     if search.interrupted or request.simulator.observer is not None or not drifts(search.bench, search.root.fitted):
         return found
-    return replace(found, gates=(*found.gates, untried_note(request.simulator)))
+    return replace(found, gates=(*found.gates, unfinished_note(request.simulator, begun)))
 
 
 def _name_in_predictions(request: Request, search: Search, found: Conclusion) -> Conclusion:
@@ -320,7 +320,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
     named, answer = _concluded(predicting, ()), posterior(predicting)
     best = answer.best
     if named.verdict.kind != "missing-physics" or {e.name for e in named.effects} != best.names:
-        return _advise_predictions(request, search, found) if predicting.cut_short else found
+        return _advise_predictions(request, search, found, begun=True) if predicting.cut_short else found
     with search.stage("fit in free run"):
         search.keep(search.run_laws(best.laws, best))
         trial = search.thorough(search.memo[best.key])

@@ -37,7 +37,7 @@ from .faults.gates import LEAST_GAIN, USELESS_FIT, Gate, evidence_gain
 from .fits.linearise import linearise_runs
 from .fits.workbench import FEW, Fitted, Workbench, growth, refit
 from .search.hypotheses import Hypotheses
-from .search.trials import Name, Trial
+from .search.trials import Trial
 
 ROUNDING = 1e-9  # share of the largest entry that counts as zero
 # memories that are tried in turn, in half decades: times the time of e-fold growth (a longer one leaves the unstable
@@ -105,12 +105,9 @@ def forget_sooner(search: Hypotheses, simulator: Simulator, memory: float) -> tu
     The refitted simulator and the best laws have each their own best memory, from `memory` down to a sample. Laws count
     only if they then predict clearly better: with a memory that is too long, many can imitate one that forgets sooner.
     """
-    bench, first = search.bench, dict[frozenset[Name], Trial]()  # of each set of laws the likeliest form
-    for trial in sorted(search.memo.values(), key=search.optimistic_evidence, reverse=True):
-        first.setdefault(trial.names, trial)
-    first.pop(search.root.names, None)
+    bench = search.bench
     plain = likeliest = _best_memory(search, search.root, simulator, memory)
-    for trial in [*first.values()][:FEW]:
+    for trial in search.likeliest_forms(t for t in search.memo.values() if t.names)[:FEW]:
         own = _best_memory(search, trial, simulator, memory)
         count = 0 if trial.information is None else len(trial.information)
         gained = evidence_gain(plain.left, own.left, bench.scored(own.fitted.residual), count)
@@ -175,12 +172,13 @@ def drift_note(simulator: Simulator, memory: float, what: str) -> Gate:
     return Gate(", ".join(simulator.output_names), "prediction", memory, sentence, corrected=False)
 
 
-def untried_note(simulator: Simulator) -> Gate:
-    """Note that the simulator drifts in a free run, and that there was no time for predictions."""
+def unfinished_note(simulator: Simulator, begun: bool) -> Gate:
+    """Note that the simulator drifts in a free run, and that there was no time for predictions, or to end them."""
+    why = "time ran out before they gave an answer" if begun else "there was no time for them"
     sentence = (
         "In a free run small forces and disturbances add up over the whole recording, so that its errors hardly tell "
-        "laws apart. Predictions one sample ahead often do, but there was too little time for them: diagnose with the "
-        "focus 'prediction' (--focus prediction), or give more time."
+        f"laws apart. Predictions one sample ahead often do, but {why}: diagnose with the focus 'prediction' "
+        "(--focus prediction), or give more time."
     )
     return Gate(", ".join(simulator.output_names), "prediction", None, sentence, corrected=False)
 

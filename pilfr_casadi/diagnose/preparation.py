@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from .._base import InputError, Stages, UntilInterrupted, in_words
-from ..data import HOLD_WORDS, Recording
+from ..data import COURSES, Recording
 from ..engine import make_engine
 from ..optimise import GaussNewton, Status
 from ..simulators import Simulator, discretise_for, stated_hold, unit_notes
@@ -358,6 +358,6 @@ def hold_note(simulator: Simulator, hold: str, ratio: float) -> Gate:
     known = "" if ratio > BETTER_RATIO else "; state the hold if you know it"
     how = f"fit better (error {ratio:.3g} times smaller{known})" if ratio > EQUAL_RATIO else "fit no worse"
     how = how if np.isfinite(ratio) else "let the simulation follow (otherwise it diverges)"
-    words = f"inputs that are {HOLD_WORDS[hold]} there {how} and are used"
+    words = f"inputs that are {COURSES[hold].words} there {how} and are used"
     sentence = f"The recordings do not say what inputs do between samples; {words}."
     return Gate(", ".join(simulator.inputs), "hold", hold, sentence)

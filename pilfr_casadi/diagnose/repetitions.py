@@ -84,8 +84,7 @@ def search_in_predictions(
     found = search(replace(observed_request, most_effects=min(1, observed_request.most_effects)))
     other = _search_forgetting_sooner(request, found, memory, search)
     if other is None and request.most_effects > 1 and not found.search.cut_short:
-        found.search.most_effects = request.most_effects
-        found.search.resume()
+        found.search.resume(request.most_effects)
         other = _search_forgetting_sooner(request, found, memory, search)
     return other or (observed_request, found, memory)
 
@@ -122,7 +121,7 @@ def _search_with_each_hold(request: Request) -> Attempt:
     """Search; if nobody stated the hold of the inputs and it matters, use the hold with the smallest error."""
     found = search_with_one_hold(request)
     search = found.search
-    hold = "" if search.hold_stated else search.better_hold or _find_better_hold(search)
+    hold = "" if search.hold_settled else search.better_hold or _find_better_hold(search)
     return _search_with_better_hold(request, found, hold) if hold else found
 
 
@@ -132,13 +131,13 @@ def _search_with_better_hold(request: Request, first: Attempt, hold: str) -> Att
     held = replace(request, hold=hold, say=request.say.under("other hold: "))
     other = _again(first, partial(search_with_one_hold, held))
     if other is None:
-        if not search.hold_stated:
+        if not search.hold_settled:
             search.resume()
         return first
     again = other.search
     only_refitted, before2, after2 = again.interrupted and len(again.memo) < 2, *first.compared_with(other)
     if after2 > before2 or only_refitted:
-        if not search.hold_stated:  # else this search is finished
+        if not search.hold_settled:  # else this search is finished
             search.resume()
         return first
     better = _find_better_hold(again)
@@ -268,7 +267,7 @@ def _search_once(request: Request, correct_early: bool) -> Attempt:
         laws=(*request.laws, Offset),
         workers=request.workers,
         say=request.say,
-        hold_stated=request.stated_hold is not None,
+        hold_settled=request.stated_hold is not None,
         aligned=request.aligned,
         surrogate_nrmse=request.surrogate_nrmse,
         until=began + SEARCH_SHARE * left,

@@ -14,9 +14,9 @@ from ..models import ParameterSet, is_at_bound
 from ..simulators import ACTUATOR, Placed, Simulator, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
-from .effect import Effect, write_values
+from .effect import Effect
 from .faults.gates import TEST_FAULT, TEST_OFFSET, Gate, value_with_unit
-from .faults.offsets import Offset, describe_offsets, find_placed_offsets
+from .faults.offsets import describe_offsets, find_placed_offsets
 from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, all_sure
 from .fits.floor import ABOVE_NOISE
 from .search.learned import Learned
@@ -348,11 +348,11 @@ class ResultText:
         if self.nameless is None:
             return []
         lines, parameters = list[str](), self.corrected.readable_parameters()
-        for e in (e for e in self.added if not isinstance(e.law, Offset) and e.law.id != "learned"):
+        for e in (e for e in self.added if e.law.listed):
             own = {name: parameters[f"{e.prefix}{name}"] for name in e.law.parameters()}
             lines.append(f"in the correction, without a sure name: {name_at(e.port, e.law.id, e.law.form)}")
             free = {name: p for name, p in own.items() if not np.all(p.fixed)}
-            lines += [f"  {name} = {write_values(np.ravel(p.value), p.unit)}" for name, p in free.items()]
+            lines += [f"  {name} = {value_with_unit(p.value, p.unit, 5)}" for name, p in free.items()]
         return lines
 
     def _value_lines(self) -> list[str]:

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import LARGEST, InputError, is_number, numbers, positive, whole
-from ..data import HOLDS, SAME_STEP, Recording
+from ..data import COURSES, SAME_STEP, Recording, known_hold, step_hold
 from ..engine import make_engine
 from ..models import Model, PrandtlIshlinskii
 from ..optimise import estimate_initial_state
@@ -145,10 +145,7 @@ def _check_dt(dt: float | None) -> float:
 
 
 def _discretise_over_sample(model: Simulator, dt: float, hold: str | None, substeps: int | None) -> Model:
-    hold = hold or model.hold or "zero"
-    if hold not in HOLDS:
-        raise InputError(f"hold = {hold!r} was given; use 'zero', 'linear', 'band-limited' or 'next'.")
-    hold = "linear" if hold == "band-limited" else hold  # a step does not know the inputs before and after it
+    hold = step_hold(known_hold(hold) or model.hold or "zero")
     chosen = _choose_substeps_at_rest(model, dt) if substeps is None else whole(substeps, "substeps", 1)
     return discretise(model, dt, hold, chosen)
 
@@ -198,7 +195,7 @@ def _build_step(model: Model, dt: float, simulator: Simulator | None = None) -> 
         raise InputError("The model has an open port; close it with close_loop first.")
     if "y" in model.reads:
         raise InputError("The model is corrected by measured outputs at every step; export the model without that.")
-    reads = tuple(signal for signal in model.reads if signal != "next" or model.hold != "next")
+    reads = tuple(signal for signal in model.reads if signal != "next" or not COURSES[model.hold].begin)
     columns = {signal: ca.SX.sym(signal, 1 if signal == "t" else len(model.inputs)) for signal in reads}
     row = ca.vertcat(*(columns.get(signal, columns["u"]) for signal in model.reads))  # the input acts at once
     arguments = [ca.SX.sym("x", model.n_state), ca.vertcat(*columns.values()), ca.SX.sym("p", model.parameters.size)]
@@ -218,6 +215,7 @@ def _build_step(model: Model, dt: float, simulator: Simulator | None = None) -> 
         reads=reads,
         substeps=model.substeps,
         dt=dt,
+        hold=model.hold,
         states={name: i for i, name in enumerate(names)},
         inputs=make_unique(inputs),
         outputs=model.outputs,

@@ -8,11 +8,12 @@ from __future__ import annotations
 import json
 import math
 from functools import partial
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from .._base import InputError
+from ..data import Hold
 from ..optimise import Status
 
 SHOWN = 40  # characters of a key or a value in a message
@@ -75,7 +76,7 @@ class Signals(Table):
     outputs: list[Channel]
     states: list[str]
     memory: Count
-    hold: Literal["zero", "linear", "band-limited", "next"] | None = None
+    hold: Hold | None = None
     substeps: Count = 0
 
     @property

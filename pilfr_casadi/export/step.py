@@ -23,7 +23,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, numbers, path_text, write_atomically
-from ..data import name_with_unit
+from ..data import COURSES, Recording, name_with_unit
 from ..models import ParameterSet
 from ..simulators import calls_external
 from .c_code import make_unique, write_c
@@ -109,6 +109,8 @@ class Exported:
         `(x, u) -> (xdot, y)`, or `(x, u, t) -> (xdot, y)`, if the model has equations in continuous time.
     start : array, (n_x,), or None
         State that `x0()` returns; None for zero.
+    hold : {"zero", "linear", "next"}
+        Inter-sample behaviour of the inputs for which the step was made; `drive` collects them from a recording.
     reads : tuple of str
         Signals in `row`, in this order: "u" the inputs, "next" the inputs at the sub-step's end, "t" the time.
     substeps : int
@@ -136,6 +138,7 @@ class Exported:
     start: np.ndarray | None = None
     units: dict[str, str] = field(default_factory=dict)
     rhs: ca.Function | None = None
+    hold: str = "zero"
 
     @cached_property
     def one(self) -> ca.Function:
@@ -184,6 +187,16 @@ class Exported:
     def interpolated(self) -> bool:
         """Whether the second half of u holds the inputs of the next sample."""
         return "next" in self.reads
+
+    def drive(self, recording: Recording) -> np.ndarray:
+        """Collect the inputs of the steps along a recording with the model's channels and units, (M, n_u).
+
+        They are the recording's inputs; with `hold="next"` those of the next sample, which act until then; where inputs
+        are interpolated, both.
+        """
+        if self.interpolated:
+            return np.hstack([recording.u, recording.u_next])
+        return recording.u_next if COURSES[self.hold].begin else recording.u
 
     def x0(self) -> np.ndarray:
         """Return the start state, (n_x,): `start` if it was given, else zero."""

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._base import InputError
+from ..data import COURSES
 
 Array = np.ndarray
 FASTEST = 0.9  # share of the Nyquist frequency above which an eigenvalue has no reliable continuous counterpart
@@ -91,14 +92,11 @@ def to_continuous(a: Array, b: Array, c: Array, d: Array, dt: float, hold: str) 
     block[:n, :n], block[:n, n : 2 * n], block[n : 2 * n, 2 * n :] = a_c * dt, np.eye(n) * dt, np.eye(n)
     whole = expm(block)
     gamma_1, gamma_2 = whole[:n, n : 2 * n], whole[:n, 2 * n :]
-    if hold == "zero":
-        return a_c, np.linalg.solve(gamma_1, b), c, d
-    if hold == "next":  # x⁺ = A x + Γ₁ B u⁺ is x⁺ = A x' + B_d u with x' = x - Γ₁ B u:  B_d = A Γ₁ B
-        b_c = np.linalg.solve(a @ gamma_1, b)
-        return a_c, b_c, c, d - c @ gamma_1 @ b_c
-    # x⁺ = A x + (Γ₁ - Γ₂) B u + Γ₂ B u⁺ is x⁺ = A x' + B_d u with x' = x - Γ₂ B u:  B_d = (Γ₁ - Γ₂ + A Γ₂) B
-    b_c = np.linalg.solve(gamma_1 - gamma_2 + a @ gamma_2, b)
-    return a_c, b_c, c, d - c @ gamma_2 @ b_c
+    # x⁺ = A x + (Γ₁ - Γ) B u + Γ B u⁺ is x⁺ = A x' + B_d u with x' = x - Γ B u:  B_d = (Γ₁ - Γ + A Γ) B
+    course = COURSES[hold]
+    gamma = gamma_1 if course.begin else gamma_2 if course.end else 0 * gamma_1
+    b_c = np.linalg.solve(gamma_1 - gamma + a @ gamma, b)
+    return a_c, b_c, c, d - c @ gamma @ b_c
 
 
 def modes(a: Array, b: Array, c: Array) -> list[Mode]:

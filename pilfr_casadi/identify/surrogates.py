@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, whole
-from ..data import Recording, as_recordings, check_for_identification, nrmse
+from ..data import Recording, as_recordings, check_for_identification, nrmse, step_hold
 from ..models import PILFR, Parameter
 from ..simulators import Named, Port, Simulator, one_hold
 from .fitting import fit
@@ -95,8 +95,7 @@ def _identify(records: Sequence[Recording], n: int, hold: str | None) -> tuple[f
     p = found.parameters
     a, b, c, d = (p[k] for k in ("A", "B_u", "C_y", "D_yu"))
     options = []
-    stated = "linear" if hold == "band-limited" else hold  # a sampled model does not know the samples around
-    for between in (stated,) if stated else ("zero", "linear"):
+    for between in (step_hold(hold),) if hold else ("zero", "linear"):
         try:
             continuous = to_continuous(a, b, c, d, records[0].dt, between)
         except InputError:

@@ -4,8 +4,9 @@
 contacts, gaps, periodic forces), `friction` (forces of speed), `hysteresis` (loops), `curves` (saturation and other
 curves of actuators and sensors), `dynamic` (delays, creep, modes, trends), `in_line` (in line with a term of the
 equations), `thermal` and `electrical` (laws of one domain), `transport` (delays by a flow). `composed` makes laws of
-laws (scaled, scheduled, behind a gap). `catalogue` lists the laws that a diagnosis tries. `forces` evaluates laws along
-given signals.
+laws (scaled, behind a gap, seen by one output), `scheduling` those whose strength varies with a signal, and
+`varying_parameters` the changes of a parameter. `catalogue` lists the laws that a diagnosis tries. `forces` evaluates
+laws along given signals.
 """
 
 from typing import TYPE_CHECKING
@@ -31,21 +32,11 @@ if TYPE_CHECKING:
         SMALL_AND_LARGE as SMALL_AND_LARGE,
     )
     from .composed import (
-        PROFILES as PROFILES,
-        SCHEDULES as SCHEDULES,
-        VARIATIONS as VARIATIONS,
         Feedthrough as Feedthrough,
         UnreadInput as UnreadInput,
-        VaryingParameter as VaryingParameter,
         behind_gap as behind_gap,
-        constant as constant,
-        heated as heated,
-        likely_profiles as likely_profiles,
         scaled as scaled,
-        scheduled as scheduled,
         seen_by as seen_by,
-        strengths_over as strengths_over,
-        varying as varying,
     )
     from .curves import (
         AsymmetricDeadZone as AsymmetricDeadZone,
@@ -131,6 +122,14 @@ if TYPE_CHECKING:
         SoftlyLimitedTerm as SoftlyLimitedTerm,
         TermLimit as TermLimit,
     )
+    from .scheduling import (
+        PROFILES as PROFILES,
+        SCHEDULES as SCHEDULES,
+        constant as constant,
+        likely_profiles as likely_profiles,
+        scheduled as scheduled,
+        strengths_over as strengths_over,
+    )
     from .stiffness import (
         AsymmetricCubicStiffness as AsymmetricCubicStiffness,
         Clearance as Clearance,
@@ -162,5 +161,12 @@ if TYPE_CHECKING:
         Radiation as Radiation,
     )
     from .transport import carried as carried
+    from .varying_parameters import (
+        VARIATIONS as VARIATIONS,
+        VaryingParameter as VaryingParameter,
+        heated as heated,
+        varying as varying,
+    )
+
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

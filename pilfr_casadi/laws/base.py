@@ -238,6 +238,8 @@ class Law:
         Input whose flow carries the signal along, if any; see `carried`.
     of_input : bool
         It is the effect of an input alone, whose name `scaled` and `scheduled` put into its texts in place of "{by}".
+    listed : bool
+        An answer lists it by its name with its values; offsets and learned forces are described apart.
     signal : str
         State or input that is the local coordinate of a law at a parameter, if any.
 
@@ -297,6 +299,7 @@ class Law:
     profile: ClassVar[str] = ""
     carried_by: ClassVar[str] = ""
     of_input: ClassVar[bool] = False
+    listed: ClassVar[bool] = True
     signal: ClassVar[str] = ""
 
     values: Mapping[str, Any] = field(default_factory=dict)

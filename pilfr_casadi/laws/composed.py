@@ -1,98 +1,38 @@
-"""Laws made of laws (scaled by a signal, varying with a signal, acting beyond a gap), and parameters that vary.
+"""Laws made of laws: scaled by an input, acting beyond a gap, or with a far side that one output reads.
 
-Two laws in parallel in one port need no class of their own: call `Simulator.with_element` twice.
+Two laws in parallel in one port need no class of their own: call `Simulator.with_element` twice. Strengths that vary
+with a signal are in `scheduling`.
 """
 
 from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
 from typing import Any, ClassVar
 
-import casadi as ca
 import numpy as np
 
 from .._base import InputError
-from ..models import Named, Parameter
-from .base import Law, Local, beyond_gap, check_signal, continue_along_tangents, rename_class
+from .base import Law, Local, beyond_gap, check_signal, rename_class
 
 GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
-RATIOS, MOST_RATIO = (0.3, 3.0), 100.0  # tried ratios of an exponential profile, and the largest
-PATTERNS = ((0.5, 1.0, 1.5), (1.5, 1.0, 0.5), (0.5, 1.5, 0.5), (1.5, 0.5, 1.5))  # variations, over the mean
-LEVEL = 0.1  # smallest variation of a strength, over the largest strength; below it the strength is constant
-SPARE = 0.25  # of the variation, the least strength from which a profile starts
 
 
-@dataclass(frozen=True)
-class Profile:
-    """How a strength varies over the range of a signal, from `low` to `high`."""
-
-    ends: tuple[str, ...]  # the names of a strength's values are its own name with these ends
-    how: str  # the variation in words
-    course: str  # the variation in an equation that names the signal
-    # weight of each value at a share of the range, from the values of the law's parameters
-    weights_at: Callable[[Any, Mapping[str, Any]], list[Any]]
-
-    def weights(self, signal: Any, values: Any) -> list[Any]:
-        """Compute the weights of a strength's values, such as `F_c` and `F_c_high`, at a signal."""
-        return self.weights_at((signal - values["low"]) / (values["high"] - values["low"]), values)
+def check_force(law: Any) -> Any:
+    """Return a class of laws that may act as a force; refuse anything else."""
+    if not (isinstance(law, type) and issubclass(law, Law)):
+        raise InputError(f"A composed law is made of a class of laws, such as CoulombFriction; got {law!r}.")
+    if "parallel" not in law.places and not law.of_input:
+        raise InputError(f"The law {law.id!r} stands in series with a signal; only a force can be composed.")
+    return law
 
 
-@functools.cache
-def _lagrange(count: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return the polynomials that are one at one of `count` equidistant nodes and zero at the others, and slopes."""
-    nodes = np.linspace(0, 1, count)
-    others = (np.poly(np.delete(nodes, i)) for i in range(count))
-    basis = [c / np.polyval(c, at) for c, at in zip(others, nodes, strict=True)]
-    return basis, [np.polyder(c) for c in basis]
-
-
-def _interpolation_weights(share: Any, count: int) -> list[Any]:
-    """Weigh values at `count` equidistant nodes by the polynomial through them; outside along its tangents."""
-
-    def evaluate(polynomials: list[np.ndarray], at: Any) -> list[Any]:
-        return [functools.reduce(lambda total, c: total * at + c, p.tolist()) for p in polynomials]
-
-    basis, slopes = _lagrange(count)
-    return continue_along_tangents(share, 0.0, 1.0, lambda at: (evaluate(basis, at), evaluate(slopes, at)))
-
-
-PROFILES = {
-    "linear": Profile(("", "_high"), "", "linear in {by}", lambda share, values: [1 - share, share]),
-    "quadratic": Profile(
-        ("", "_mid", "_high"),
-        " in a parabola",
-        "a parabola in {by} through three values",
-        lambda share, values: _interpolation_weights(share, 3),
-    ),
-    "exponential": Profile(
-        ("",),
-        " exponentially",
-        "times ratio^(({by} - low)/(high - low))",
-        lambda share, values: [values["ratio"] ** share],
-    ),
-    # changes that are added to a parameter, which has its own value in the middle of the signal's range
-    "tilt": Profile(
-        ("",), "", "change = c (2 share - 1),  share = ({by} - low)/(high - low)", lambda share, values: [2 * share - 1]
-    ),
-    "bend": Profile(
-        ("", "_high"),
-        "",
-        "change = (c (1 - share) - c_high share) (1 - 2 share),  share = ({by} - low)/(high - low)",
-        lambda share, values: _interpolation_weights(share, 3)[::2],
-    ),
-    "curve": Profile(
-        ("", "_25", "_75", "_high"),
-        "",
-        "change = curve of fourth degree in {by} through c, c_25, 0, c_75, c_high, at even steps from low to high",
-        lambda share, values: [weight for i, weight in enumerate(_interpolation_weights(share, 5)) if i != 2],
-    ),
-}
-SCHEDULES = ("linear", "quadratic", "exponential")  # profiles of a law's strength
-CURVE_NODES = {"": 0.0, "_25": 0.25, "_75": 0.75, "_high": 1.0}  # shares of the range at which a curve has its values
-VARIATIONS = ("tilt", "bend", "curve")  # profiles of a parameter
+def missing_signal(by: str, local: Local) -> str:
+    """Say why a signal cannot vary a strength at a port; empty if it can."""
+    if by not in local.inputs:
+        return f"the port has no signal {by}"
+    return "" if np.ptp(local.inputs[by]) > 0 else f"{by} is constant"
 
 
 def scaled(law: type[Law], by: str) -> type[Law]:
@@ -111,7 +51,33 @@ def scaled(law: type[Law], by: str) -> type[Law]:
         If it is not a law, or acts in series with a signal; if `by` is no name.
     """
     check_signal(by)
-    return _scaled(_check_force(law), by)
+    return _scaled(check_force(law), by)
+
+
+@functools.cache  # the same class for the same arguments
+def _scaled(base: Any, by: str) -> Any:
+    strengths = {name: f"{unit}/[{by}]" if name in base.strength else unit for name, unit in base.units.items()}
+
+    if base.of_input:
+        words = [text.format(by=by) for text in (base.form, base.equation, base.sentence)]
+    else:
+        form, equation = f"{base.form}, scaled by {by}".removeprefix(", "), base.equation.replace("w =", "f =", 1)
+        words = [form, f"w = {by} f,  {equation}", f"{base.sentence}; {by} scales its strength"]
+
+    class Scaled(base):
+        form, equation, sentence = words
+        sentences = {domain: f"{text}; {by} scales its strength" for domain, text in base.sentences.items()}
+        units, strength = strengths, base.strength
+        places = base.places
+        dissipative = restoring = False  # the signal may have either sign
+        scaled_by, of_input = by, False
+
+        def why_not(self, local: Local) -> str:
+            return super().why_not(local) or missing_signal(by, local)
+
+    return rename_class(
+        Scaled, f"{base.__name__}ScaledBy_{by}", f"{base.__doc__}\n\n    Its strength is scaled by {by}."
+    )
 
 
 class UnreadInput(Law):
@@ -141,122 +107,6 @@ class Feedthrough(UnreadInput):
     places = ("series",)
 
 
-def scheduled(law: type[Law], by: str, profile: str = "linear") -> type[Law]:
-    """Make a law whose strength varies with a signal, such as friction that grows with a pressure.
-
-    A strength has one value, such as `F_c`, where the signal is lowest in the recordings (`low`), and another, such as
-    `F_c_high`, where it is highest (`high`). A force that opposes motion does so at both.
-
-    Parameters
-    ----------
-    law : class of Law
-        Any law that may act in parallel, as a force.
-    by : str
-        An input of the simulator, one of the port's own `signals`, "z", the local coordinate, or "t", the time.
-    profile : {"linear", "quadratic", "exponential"}
-        How the strength varies: in a line, to `F_c_high`; in a parabola over `F_c_mid` in the middle to `F_c_high`,
-        along its tangents outside the range; or exponentially, to `ratio` times `F_c`, as viscosity with temperature.
-
-    Raises
-    ------
-    InputError
-        If it is not a law, or acts in series with a signal; if `by` is no name, or there is no such profile.
-    """
-    check_signal(by)
-    return _scheduled(_check_force(law), by, _check_profile(profile, SCHEDULES))
-
-
-class VaryingParameter(Law):
-    """A change that is added to a parameter of the equations, at the port `parameter:<name>`; see `varying`."""
-
-    id = "varying_parameter"
-    flexible = True
-    equation = "w = c"
-    source = "Toth (2010), Modeling and Identification of Linear Parameter-Varying Systems, sec. 2.1"
-    sentence = "a parameter that varies with {by}: a change is added to its value, within its bounds"
-    units = {"c": "w"}
-    places = ("parameter",)
-
-    def force(self, p: Any) -> Any:
-        return p.c
-
-    def varied(self, value: Any, change: Any, lower: float) -> Any:
-        """Evaluate a parameter of a value and a lower bound with its change."""
-        return value + change
-
-    def starts_as(self, plain: Law, own: Mapping[str, Any], shape: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """Start values at which a curve equals another variation with the same signal, fitted to `own`."""
-        ends = {name: own[name] for name in ("low", "high")}
-        shares = np.array([CURVE_NODES[name.removeprefix("c")] for name in self.strength])
-        levels = strengths_over(plain, own, ends["low"] + shares * (ends["high"] - ends["low"]))["c"]
-        return ends | dict(zip(self.strength, levels.tolist(), strict=True))
-
-
-def varying(by: str, profile: str = "tilt") -> type[Law]:
-    """Make the law by which a parameter varies with a signal, such as a force constant with the position.
-
-    It stands in the port `parameter:<name>`. The parameter has its own value in the middle of the signal's range in the
-    recordings, and stays within its bounds.
-
-    Parameters
-    ----------
-    by : str
-        A state or an input of the simulator, or "t", the time.
-    profile : {"tilt", "bend", "curve"}
-        How it varies: in a line that adds `c` at the upper end and takes it away at the lower one; in a parabola that
-        adds `c` at the lower end and `c_high` at the upper one; or in a curve of fourth degree through four such
-        values. Outside the range it continues along its tangents.
-
-    Raises
-    ------
-    InputError
-        If `by` is no name, or there is no such profile.
-    """
-    check_signal(by)
-    return _scheduled(VaryingParameter, by, _check_profile(profile, VARIATIONS))
-
-
-def heated(by: str) -> type[Law]:
-    """Make the law by which a parameter varies with a slow state that the square of a signal drives.
-
-    For example, a winding's resistance follows the heat of its current: `change = c q`, `dq/dt = (s^2 / s_2 - q) / T`,
-    with the mean square s_2 of the signal s in the recordings. The law stands in the port `parameter:<name>`. A
-    parameter that cannot be negative falls exponentially, with the same slope at first, as the viscosity of oil does.
-
-    Parameters
-    ----------
-    by : str
-        A state or an input of the simulator.
-
-    Raises
-    ------
-    InputError
-        If `by` is no name.
-    """
-    check_signal(by)
-    return _heated(by)
-
-
-def _check_profile(profile: str, known: Sequence[str]) -> str:
-    if profile not in known:
-        raise InputError(f"profile = {profile!r} was given; give {', '.join(map(repr, known))}.")
-    return profile
-
-
-def constant(law: type[Law]) -> type[Law]:
-    """Return the law whose strength is constant, if a signal varies or scales it; see `scheduled` and `scaled`."""
-    return law.__base__ if law.scheduled_by or law.scaled_by else law  # type: ignore[return-value]
-
-
-def likely_profiles(law: type[Law]) -> tuple[str, ...]:
-    """Return the profiles in which a strength may vary in a machine, the most general one first.
-
-    The operators of a layer vary together, by one ratio, because separately they could imitate any curve of position.
-    """
-    layer = any(law().parameters()[name].value.ndim for name in law.strength)
-    return ("exponential",) if layer else ("quadratic", "linear", "exponential")
-
-
 def behind_gap(law: type[Law]) -> type[Law]:
     """Make a law that acts beyond a gap only: on `z' = z - clip(z, -g, g)` and its rate, such as a stop that rubs.
 
@@ -272,294 +122,12 @@ def behind_gap(law: type[Law]) -> type[Law]:
     InputError
         If it is not a law, acts in series with a signal, has states or a gap of its own, or reads other signals.
     """
-    base = _check_force(law)
+    base = check_force(law)
     if base.order or "g" in base.units:
         raise InputError(f"The law {base.id!r} has {'states' if base.order else 'a gap'} of its own; take another.")
     if base.reads() - {"z", "dz"}:
         raise InputError(f"The law {base.id!r} reads more than z and dz; take another.")
     return _behind_gap(base)
-
-
-def _check_force(law: Any) -> Any:
-    if not (isinstance(law, type) and issubclass(law, Law)):
-        raise InputError(f"A composed law is made of a class of laws, such as CoulombFriction; got {law!r}.")
-    if "parallel" not in law.places and not law.of_input:
-        raise InputError(f"The law {law.id!r} stands in series with a signal; only a force can be composed.")
-    return law
-
-
-def _missing_signal(by: str, local: Local) -> str:
-    """Say why a signal cannot vary a strength at a port; empty if it can."""
-    if by not in local.inputs:
-        return f"the port has no signal {by}"
-    return "" if np.ptp(local.inputs[by]) > 0 else f"{by} is constant"
-
-
-def strengths_over(law: Law, values: Mapping[str, Any], signal: np.ndarray) -> dict[str, np.ndarray]:
-    """Compute the strengths (G,), or (G, n) for n operators, of a law that a signal (G,) varies; see `scheduled`."""
-    profile = PROFILES[law.profile]
-    weights = profile.weights(signal, values)
-    return {
-        own: sum(np.multiply.outer(w, values[f"{own}{end}"]) for w, end in zip(weights, profile.ends, strict=True))
-        for own in constant(type(law)).strength
-    }
-
-
-def seen_by(law: type[Law], output: str) -> type[Law]:
-    """Make a law with a far side that one output alone reads, such as a drive with a sensor at either end.
-
-    Parameters
-    ----------
-    law : class of Law
-        A law that changes what outputs read, such as `ElasticDrive`.
-    output : str
-        The output that reads the far side; others that read the port's coordinate still do so.
-
-    Raises
-    ------
-    InputError
-        If the law has no far side.
-    """
-    base: Any = law
-    if not getattr(base, "sensed", False):
-        raise InputError(f"{law!r} was given; give a class of laws that outputs see, such as ElasticDrive.")
-    return _seen_by(base, output)
-
-
-@functools.cache
-def _seen_by(base: Any, output: str) -> Any:
-    class Seen(base):
-        form = f"{base.form}, seen by {output}"
-        equation = base.equation.replace("outputs read", f"{output} reads")
-        sentence = f"{base.sentence}; {output} alone is on the far side"
-        units, strength = base.units, base.strength
-        seen_by = output
-
-    return rename_class(
-        Seen, f"{base.__name__}SeenBy_{output}", f"{base.__doc__}\n\n    {output} alone reads its far side."
-    )
-
-
-@functools.cache  # the same class for the same arguments
-def _scaled(base: Any, by: str) -> Any:
-    strengths = {name: f"{unit}/[{by}]" if name in base.strength else unit for name, unit in base.units.items()}
-
-    if base.of_input:
-        words = [text.format(by=by) for text in (base.form, base.equation, base.sentence)]
-    else:
-        form, equation = f"{base.form}, scaled by {by}".removeprefix(", "), base.equation.replace("w =", "f =", 1)
-        words = [form, f"w = {by} f,  {equation}", f"{base.sentence}; {by} scales its strength"]
-
-    class Scaled(base):
-        form, equation, sentence = words
-        sentences = {domain: f"{text}; {by} scales its strength" for domain, text in base.sentences.items()}
-        units, strength = strengths, base.strength
-        places = base.places
-        dissipative = restoring = False  # the signal may have either sign
-        scaled_by, of_input = by, False
-
-        def why_not(self, local: Local) -> str:
-            return super().why_not(local) or _missing_signal(by, local)
-
-    return rename_class(
-        Scaled, f"{base.__name__}ScaledBy_{by}", f"{base.__doc__}\n\n    Its strength is scaled by {by}."
-    )
-
-
-def _levels(found: Law, own: str, by: str, limits: Mapping[str, float]) -> np.ndarray:
-    """Compute a strength at the low end, the middle and the high end of a signal that varies it, (3,) or (3, n).
-
-    If another signal varies the law, its mean strength counts. A strength that a signal scales may be negative, which
-    the simulator's own spring or damper compensates; it is shifted, so that all levels here have one sign.
-    """
-    value = np.asarray(found.values[own], dtype=float)
-    if found.scaled_by == by:
-        levels = np.array([share * value for share in (limits["low"], sum(limits.values()) / 2, limits["high"])])
-        return np.asarray(levels - levels.min(axis=0) + SPARE * np.ptp(levels, axis=0))
-    if not found.scheduled_by:
-        return np.array([value] * 3)
-    signal = np.array([found.values["low"], (found.values["low"] + found.values["high"]) / 2, found.values["high"]])
-    levels = strengths_over(found, found.values, signal)[own]
-    return levels if found.scheduled_by == by else np.array([levels.mean(axis=0)] * 3)
-
-
-def _limits(signal: np.ndarray) -> dict[str, float]:
-    """Return the range of a signal that varies a law."""
-    return {"low": float(signal.min()), "high": float(signal.max())}
-
-
-def _follow_pattern(profile: str, levels: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Return the values of a profile from each strength at the low end, the middle and the high end of the signal."""
-    values: dict[str, Any] = {}
-    for own, (low, middle, high) in levels.items():
-        ends = PROFILES[profile].ends
-        chosen = {1: (low,), 2: (low, high), 3: (low, middle, high)}[len(ends)]
-        values |= {f"{own}{end}": level for end, level in zip(ends, chosen, strict=True)}
-        if profile == "exponential":
-            ratio = np.abs(np.sum(high)) / max(np.abs(np.sum(low)), 1e-300)
-            values["ratio"] = float(np.clip(ratio, 1 / MOST_RATIO, MOST_RATIO))
-    return values
-
-
-def _in_words(base: Any, varies: Profile, by: str, words: str) -> tuple[str, str, str]:
-    """Return form, equation and sentence of a law whose strength varies."""
-    course = varies.course.format(by=by)
-    if base.of_input:
-        return f"{by}{varies.how}, with an offset", f"w = a  with a {course}", base.sentence.format(by=words)
-    form = f"{base.form}, scheduled{varies.how} by {by}".removeprefix(", ")
-    if "parameter" in base.places:
-        return form, course, base.sentence.format(by=words)
-    equation = f"{base.equation}  with {', '.join(base.strength)} {course}"
-    return form, equation, f"{base.sentence}; its strength varies{varies.how} with {words}"
-
-
-@functools.cache
-def _scheduled(base: Any, by: str, name: str) -> Any:
-    varies = PROFILES[name]
-    ends = {own: [f"{own}{end}" for end in varies.ends] for own in base.strength}
-    further = {ends[own][k]: base.units[own] for k in range(1, len(varies.ends)) for own in base.strength}
-    shape = {"ratio": ""} if name == "exponential" else {}
-    with_z = by == "z" and base.places == ("parallel",)
-    unit = "z" if with_z else "s" if by == "t" else f"[{by}]"
-    words = "the local coordinate" if with_z else "time" if by == "t" else by
-    read = [*inspect.signature(base.step if base.memory else base.force).parameters]
-
-    def strengths(p: Any, u: Any, z: Any) -> dict[str, Any]:
-        """Parameters of the law at a value of the signal."""
-        signal = z if with_z else u[by]
-        weights = varies.weights(signal, p)
-        own = {name: p[name] for name in base.units}
-        return own | {k: sum(w * p[v] for w, v in zip(weights, names, strict=True)) for k, names in ends.items()}
-
-    def arguments(p: Any, u: Any, z: Any, **signals: Any) -> dict[str, Any]:
-        """Arguments of the law's force at a value of the signal."""
-        have = {"z": z, "p": Named("parameter", strengths(p, u, z)), **signals}
-        return {k: have[k] for k in read if k in have}
-
-    class Scheduled(base):
-        form, equation, sentence = _in_words(base, varies, by, words)
-        sentences = {k: f"{v}; its strength varies{varies.how} with {words}" for k, v in base.sentences.items()}
-        units = {**base.units, **further, **shape, "low": unit, "high": unit}
-        strength = (*base.strength, *further)
-        places = base.places
-        scheduled_by, profile, of_input = by, name, False
-
-        @classmethod
-        def reads(cls) -> set[str]:
-            """Signals of the law, and the one that varies its strength."""
-            return base.reads() | {"z" if with_z else "t" if by == "t" else "u"}
-
-        def schedule(self, local: Local) -> np.ndarray:
-            return local.z if with_z else super().schedule(local)
-
-        def why_not(self, local: Local) -> str:
-            unknown = not (local.readers or (local.from_zero and all(local.from_zero)))
-            if with_z and unknown:  # an unknown level of each recording would look like a variation with z
-                return "no output reads the coordinate, and its start is unknown"
-            return super().why_not(local) or ("" if with_z else _missing_signal(by, local))
-
-        def parameters(self) -> dict[str, Parameter]:
-            """Parameters: the ends of the signal's range are fixed, and all values of a strength have one shape."""
-            found = super().parameters()
-            for own, names in ends.items():
-                shape_of = found[own].value.shape
-                for name in names[1:]:
-                    if found[name].value.shape != shape_of:
-                        found[name] = replace(found[name], value=np.broadcast_to(found[name].value, shape_of))
-            fixed = {k: Parameter(float(self.values.get(k, k == "high")), unit, fixed=True) for k in ("low", "high")}
-            return {**found, **fixed}
-
-        def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-            """Bounds of the law, and of the ratio of its strengths."""
-            return super().bounds(local) | dict.fromkeys(shape, (1 / MOST_RATIO, MOST_RATIO))
-
-        def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-            """Shapes of the law, with the range of the signal."""
-            limits = _limits(self.schedule(local))
-            for own in super().shapes(local):
-                for ratio in RATIOS if shape else (1.0,):
-                    yield own | dict.fromkeys(shape, ratio) | limits
-
-        def doubtful(self, values: Mapping[str, Any]) -> bool:
-            """Tell whether the law hardly acts, or its strength hardly varies."""
-            middle = (values["low"] + values["high"]) / 2
-            found = strengths_over(self, values, np.array([values["low"], middle, values["high"]]))
-            varies = any(np.any(np.ptp(v, axis=0) > LEVEL * np.max(np.abs(v), axis=0)) for v in found.values())
-            return not varies or super().doubtful(values)
-
-        @classmethod
-        def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:
-            """Start as the found law varies, or else with every pattern of variation."""
-            limits = _limits(cls().schedule(local))
-            kept = {k: v for k, v in found.values.items() if k in base.units} | limits
-            levels = {own: _levels(found, own, by, limits) for own in base.strength}
-            known = by in (found.scheduled_by, found.scaled_by)
-            for pattern in ((1.0, 1.0, 1.0),) if known else PATTERNS[: None if name == "quadratic" else 2]:
-                yield kept | _follow_pattern(name, {k: np.multiply(pattern, v.T).T for k, v in levels.items()})
-
-        if base.memory:
-
-            def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0, u: Any = None) -> Any:
-                at = p if u is None and not with_z else strengths(p, u, z)
-                have = {"z": z, "s": s, "p": at, "dz": dz}
-                return super().step(**{k: have[k] for k in read if k in have})
-
-        elif "q" in read:
-
-            def force(self, z: Any, dz: Any, q: Any, u: Any, p: Any) -> Any:
-                return super().force(**arguments(p, u, z, dz=dz, q=q))
-
-        else:
-
-            def force(self, z: Any, dz: Any, u: Any, p: Any) -> Any:  # type: ignore[misc]
-                return super().force(**arguments(p, u, z, dz=dz))
-
-    return rename_class(
-        Scheduled,
-        f"{base.__name__}ScheduledBy_{by}{name.capitalize() if varies.how else ''}",
-        f"{base.__doc__}\n\n    Its strength varies{varies.how} with {words}.",
-    )
-
-
-@functools.cache
-def _heated(by: str) -> Any:
-    class Heated(VaryingParameter):
-        form = f"scheduled by the heat of {by}"
-        equation = f"change = c q, or p (exp(c q / p) - 1) if p >= 0 and it falls,  dq/dt = ({by}^2 / s_2 - q) / T"
-        source = (
-            "Incropera et al. (2007), Fundamentals of Heat and Mass Transfer, sec. 5.1 (lumped capacitance); "
-            "Stachowiak & Batchelor (2013), Engineering Tribology, sec. 2.3 (Reynolds' viscosity)"
-        )
-        sentence = f"a parameter that varies with a slow state which the square of {by} drives, as by self-heating"
-        units = {"c": "w", "T": "s", "s_2": f"[{by}]^2"}
-        order, signal = 1, by
-        constants = ("s_2",)
-        starts = {"T": ("duration", 0.03, 0.1, 0.3)}
-        ranges = {"T": ("duration", 0.01, 2.0)}
-
-        def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
-            return p.c * q[0]
-
-        def flow(self, z: Any, q: Any, p: Any) -> Any:
-            return (z**2 / p.s_2 - q[0]) / p.T
-
-        def varied(self, value: Any, change: Any, lower: float) -> Any:
-            """Let a parameter that cannot be negative fall exponentially, as viscosity does; a resistance rises."""
-            if lower < 0:
-                return value + change
-            falling = ca.fmin(change, 0.0)
-            least = 1e-150 - falling / 700  # keeps the derivatives finite where the value is zero
-            return ca.fmax(change, 0.0) + value * ca.exp(falling / ca.fmax(value, least))
-
-        def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-            """Time constants, with the mean square of the signal."""
-            for own in super().shapes(local):
-                yield {**own, "s_2": float(np.mean(local.z**2))}
-
-        def why_not(self, local: Local) -> str:
-            return "" if np.ptp(local.z) > 0 else f"{by} is constant"
-
-    return rename_class(Heated, f"Heated_{by}", f"{VaryingParameter.__doc__}")
 
 
 @functools.cache
@@ -599,3 +167,38 @@ def _behind_gap(base: Any) -> Any:
                 return super().force(**past(z, dz, p))
 
     return rename_class(Behind, f"{base.__name__}BehindGap", f"{base.__doc__}\n\n    It acts beyond a gap.")
+
+
+def seen_by(law: type[Law], output: str) -> type[Law]:
+    """Make a law with a far side that one output alone reads, such as a drive with a sensor at either end.
+
+    Parameters
+    ----------
+    law : class of Law
+        A law that changes what outputs read, such as `ElasticDrive`.
+    output : str
+        The output that reads the far side; others that read the port's coordinate still do so.
+
+    Raises
+    ------
+    InputError
+        If the law has no far side.
+    """
+    base: Any = law
+    if not getattr(base, "sensed", False):
+        raise InputError(f"{law!r} was given; give a class of laws that outputs see, such as ElasticDrive.")
+    return _seen_by(base, output)
+
+
+@functools.cache
+def _seen_by(base: Any, output: str) -> Any:
+    class Seen(base):
+        form = f"{base.form}, seen by {output}"
+        equation = base.equation.replace("outputs read", f"{output} reads")
+        sentence = f"{base.sentence}; {output} alone is on the far side"
+        units, strength = base.units, base.strength
+        seen_by = output
+
+    return rename_class(
+        Seen, f"{base.__name__}SeenBy_{output}", f"{base.__doc__}\n\n    {output} alone reads its far side."
+    )

@@ -13,7 +13,7 @@ import numpy as np
 from .._base import InputError, one_at_a_time
 from ..models import Named, accumulate_steps, map_points
 from .base import Law, Local
-from .composed import PROFILES
+from .scheduling import PROFILES
 
 
 def count_columns(law: Law) -> int:

@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, abandoned, listed
-from ..data import Recording, default_names, interpolate_band_limited
+from ..data import COURSES, Recording, default_names, interpolate_band_limited
 from .elements import Element
 from .parameters import Parameter, ParameterSet
 
@@ -67,8 +67,8 @@ class Model:
     begin_alike : tuple of int
         For each entry of the state, the number of the unknown that it is if the initial state is unknown; entries with
         the same number begin alike. By default each entry has its own.
-    interpolation : {"linear", "band-limited", "next"}
-        Course of the inputs between samples, for a step that reads "next"; see `Recording.hold`.
+    hold : {"zero", "linear", "band-limited", "next"}
+        Course of the inputs between samples; see `Recording.hold`. All but "zero" need a step that reads "next".
     """
 
     step: ca.Function
@@ -84,7 +84,7 @@ class Model:
     stages: ca.Function | None = None
     resting: ca.Function | None = None
     begin_alike: tuple[int, ...] = ()
-    interpolation: str = "linear"
+    hold: str = "zero"
 
     @cached_property
     def initial_basis(self) -> np.ndarray:
@@ -96,11 +96,6 @@ class Model:
         """Return the unknowns (n,) of an initial state (n_state,): of entries that begin alike, the first."""
         return np.asarray(state)[np.argmax(self.initial_basis, axis=0)] if self.n_state else np.zeros(0)
 
-    @property
-    def hold(self) -> str:
-        """How the step takes inputs between samples; see `Recording.hold`."""
-        return self.interpolation if "next" in self.reads else "zero"
-
     def in_order(self, recording: Recording) -> Recording:
         """Return a recording with its channels in the model's order if it has the model's names; else as it is."""
         outputs = self.outputs if recording.outputs else ()
@@ -110,35 +105,28 @@ class Model:
     def drive(self, recording: Recording) -> np.ndarray:
         """Collect the signals that the step reads along a recording, (M * substeps, n_u), in the order of `reads`.
 
-        `u` is the input at the start of a sub-step and `next` at its end (both by the `interpolation` between samples;
-        `u` alone is held over the sample), `t` the time in s (see `Recording.start`), `y`
-        the measured output, and `sampled` one where a sample is taken and zero in the sub-steps after it.
+        `u` is the input at the start of a sub-step and `next` at its end, both by the `hold` between samples, `t` the
+        time in s (see `Recording.start`), `y` the measured output, interpolated linearly, and `sampled` one where a
+        sample is taken and zero in the sub-steps after it.
         """
         n, m = self.substeps, len(recording)
-        share = np.tile(np.arange(n) / n, m)
+        share = np.tile(np.arange(n) / n, m)[:, None]
         columns = []
         for signal in self.reads:
             if signal == "t":
-                since = (np.repeat(np.arange(m), n) + share)[:, None] * recording.dt
-                columns.append(recording.start + since)
+                columns.append(recording.start + (np.repeat(np.arange(m), n)[:, None] + share) * recording.dt)
             elif signal == "sampled":
-                columns.append((share == 0)[:, None].astype(float))
-            elif signal == "u" and "next" not in self.reads:
-                columns.append(np.repeat(recording.u, n, axis=0))
+                columns.append((share == 0).astype(float))
+            elif signal == "y":
+                now, after = (np.repeat(v, n, axis=0) for v in (recording.y, recording.y_next))
+                columns.append(now + (after - now) * share)
+            elif self.hold == "band-limited":
+                known = recording.wraps or recording.begins == "periodic"
+                fine = interpolate_band_limited(recording.u, n, recording.period if known else None)
+                columns.append(fine[1:] if signal == "next" else fine[:-1])
             else:
-                values = recording.y if signal == "y" else recording.u
-                period = recording.period if recording.period and m % recording.period == 0 else None
-                after = values[m - period] if period else values[-1]
-                if self.interpolation == "band-limited" and signal != "y":
-                    repeats = recording.period if recording.begins == "periodic" else period
-                    fine = interpolate_band_limited(values, n, repeats)
-                    columns.append(fine[1:] if signal == "next" else fine[:-1])
-                    continue
-                a, b = np.repeat(values, n, axis=0), np.repeat(np.vstack([values[1:], after]), n, axis=0)
-                if self.interpolation == "next" and signal != "y":  # at its own sample an input still has its own value
-                    columns.append(np.where((share == 0)[:, None] & (signal == "u"), a, b))
-                    continue
-                columns.append(a + (b - a) * (share + (1 / n if signal == "next" else 0.0))[:, None])
+                now, after = (np.repeat(v, n, axis=0) for v in (recording.u, recording.u_next))
+                columns.append(COURSES[self.hold].between(now, after, share + (1 / n if signal == "next" else 0.0)))
         return np.ascontiguousarray(np.hstack(columns)) if len(columns) != 1 else columns[0]
 
     def rest_at(self, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:

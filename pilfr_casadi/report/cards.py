@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..data import HOLD_WORDS, Recording
+from ..data import COURSES, Recording
 from ..diagnose import Diagnosis
 from ..identify import Comparison, Fit
 from ..laws import display_name
@@ -56,7 +56,7 @@ def recording_card(recording: Recording) -> str:
     properties = [
         f"{len(r)} samples, step {r.dt:.6g} s, {len(r) * r.dt:.4g} s",
         f"initial state {start.get(r.begins, 'given')}",
-        f"inputs {HOLD_WORDS[r.hold]} between samples" if r.hold else "hold not stated",
+        f"inputs {COURSES[r.hold].words} between samples" if r.hold else "hold not stated",
         *([f"period {r.period} samples"] if r.period else []),
         *([f"first {r.skip} samples not scored"] if r.skip else []),
     ]

@@ -14,7 +14,7 @@ import numpy as np
 
 from .. import plots
 from .._base import InputError, make_folder, write_atomically
-from ..data import HOLD_WORDS
+from ..data import COURSES
 from ..diagnose import (
     BeforeAfter,
     Diagnosis,
@@ -124,8 +124,7 @@ def _subtitle(case: _Case) -> str:
     d, r = case.diagnosis, case.bench.recordings[0]
     parts = [f"{len(d.train)} training recording{'s' * (len(d.train) != 1)}, {sum(map(len, d.train))} samples"]
     parts += [f"{len(d.test)} held out, {sum(map(len, d.test))} samples"] if d.test else ["none held out"]
-    between = HOLD_WORDS.get(d.hold, d.hold)
-    parts += [f"step {r.dt:.4g} s", f"inputs {between} between samples" if r.n_u else "no input"]
+    parts += [f"step {r.dt:.4g} s", f"inputs {COURSES[d.hold].words} between samples" if r.n_u else "no input"]
     parts += [f"computed in {d.seconds:.1f} s"] if d.seconds else []
     return "; ".join(parts)
 

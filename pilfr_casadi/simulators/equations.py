@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, check_known, whole
-from ..data import HOLDS
+from ..data import known_hold
 from ..models import Named, Parameter, ParameterSet
 from .domains import MECHANICAL, UNKNOWN, common_domain, is_motion, may_be_speed
 from .external import calls_external
@@ -64,8 +64,7 @@ class Equations:
                 raise InputError(f"The simulator's {kind} are {getattr(self, kind)!r}; give a function of x, u and p.")
         for kind in ("states", "inputs"):
             object.__setattr__(self, kind, check_names(getattr(self, kind), kind))
-        if self.hold not in HOLDS:
-            raise InputError(f"hold = {self.hold!r} was given; use 'zero', 'linear', 'band-limited', 'next' or None.")
+        known_hold(self.hold)
         object.__setattr__(self, "substeps", whole(self.substeps, "substeps", 1))
         if not isinstance(self.units, Mapping) or not all(isinstance(unit, str) for unit in self.units.values()):
             raise InputError(f"The simulator's units are {self.units!r}; give {{name: unit}}.")

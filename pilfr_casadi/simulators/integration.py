@@ -23,7 +23,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, one_at_a_time
-from ..data import SAME_STEP
+from ..data import COURSES, SAME_STEP
 from ..models import Model, inject_outputs, model_functions
 from .equations import Equations, Named, stack
 from .ports import ACTUATOR, PARAMETER, SENSOR, Expression, Placed, Port, split_port
@@ -187,15 +187,15 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
     if own is not None and abs(own / dt - 1) > SAME_STEP:
         raise InputError(f"The simulator has steps of {own:g} s, the recordings of {dt:g} s; give both the same step.")
     hold = "zero" if hold == "next" and simulator.discrete else hold
-    band_limited = hold == "band-limited"
-    substeps = max(substeps, BAND_LIMITED_STEPS) if band_limited and not simulator.discrete else substeps
+    if hold == "band-limited" and not simulator.discrete:
+        substeps = max(substeps, BAND_LIMITED_STEPS)
     simulator = on_grid(simulator, dt / substeps)
     step = _SubStep(simulator, dt / substeps, hold)
     x, s, u0, u1, t, updated = step.x, step.s, step.u0, step.u1, step.t, step.updated
     x_next, y, stages = step.advance()
     update, z = step.update, step.z
     reads, columns = ["u"], [u0]
-    if hold != "zero":
+    if COURSES[hold].end:
         reads, columns = [*reads, "next"], [*columns, u1]
     if ca.depends_on(ca.vertcat(x_next, y, update), t):
         reads, columns = [*reads, "t"], [*columns, t]
@@ -223,7 +223,7 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
         stages=ca.Function("stages", [x, u, updated, p, stages[0]], stages[1:]) if stages else None,
         resting=step.resting(),
         begin_alike=step.alike_at_first(substeps),
-        interpolation="linear" if hold == "zero" else hold,
+        hold=hold,
     )
     return (
         model if simulator.observer is None else inject_outputs(model, simulator.observer, scales=step.sensor_scales())
@@ -235,13 +235,14 @@ class _SubStep:
 
     def __init__(self, simulator: Equations, h: float, hold: str) -> None:
         own = simulator.parameter_set
-        self.simulator, self.h, self.hold = simulator, h, hold
+        self.simulator, self.h = simulator, h
         self.vector = ca.SX.sym("p", own.size)
         self.equations = equations = ClosedEquations(simulator, self.vector)
         n_x, n_u = len(simulator.states) + sum(equations.n_q), len(simulator.inputs)
         self.x, self.s = ca.SX.sym("x", n_x), ca.SX.sym("s", sum(equations.n_s))
         self.u0, self.u1, self.t = ca.SX.sym("u", n_u), ca.SX.sym("next", n_u), ca.SX.sym("t")
-        self.begin, self.end = self.u1 if hold == "next" else self.u0, self.u0 if hold == "zero" else self.u1
+        course, samples = COURSES[hold], (self.u0, self.u1)
+        self.begin, self.end = samples[course.begin], samples[course.end]
         slope = (self.end - self.begin) / h
         sizes = (("x", n_x), ("s", self.s.numel()), ("u", n_u), ("t", 1))
         now = {name: ca.SX.sym(name, n) for name, n in sizes}
@@ -255,7 +256,7 @@ class _SubStep:
         self.shifts = np.repeat([getattr(e.law, "shifts", False) for e in simulator.elements], equations.n_s)
         self.memory = self._read(self.updated)
         # a register's content moves on within the step if inputs are interpolated
-        self.drift = (self.updated - self.memory) * (hold not in ("zero", "next"))
+        self.drift = (self.updated - self.memory) * (not course.constant)
 
     def _read(self, updated: Any) -> Any:
         """Return the memory that the equations read, from the updated one."""

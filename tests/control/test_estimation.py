@@ -212,6 +212,17 @@ def test_next_values_act_one_step_earlier_in_an_observer():
     for given in (late, late.with_(hold=None)):
         observer = kalman_filter(diagnosis(simulator, [late], "next"), given)
         np.testing.assert_allclose(observer.Q, wanted.Q, rtol=1e-3)
+    step = pilfr.exported(simulator, dt=DT, hold="next", start=late)
+    np.testing.assert_allclose(kalman_filter(step, late).Q, wanted.Q, rtol=1e-3)
+
+
+def test_a_simulator_in_discrete_time_is_observed_with_the_inputs_at_the_samples():
+    sampled = pilfr.Simulator(
+        lambda x, u: {"a": 0.5 * x.a + u.f}, lambda x: {"y": x.a}, ("a",), ("f",), hold="next", discrete=True
+    )
+    u = np.random.default_rng(0).standard_normal((200, 1))
+    r = pilfr.Recording(u, np.zeros_like(u), 0.1, ("f",), ("y",), initial="zero", hold="next")
+    np.testing.assert_allclose(roll_out(sampled, r, "test").y, sampled.simulate(r), rtol=0, atol=1e-12)
 
 
 def test_an_observer_begins_at_the_time_of_the_recording():

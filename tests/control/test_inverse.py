@@ -11,6 +11,7 @@ from small_fits import A, fitted, refused
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.control import analyse_response, feedforward, inverse_element, kalman_filter, roll_out
+from pilfr_casadi.control.inverse import _gain_and_radius
 from pilfr_casadi.models import play
 
 
@@ -322,3 +323,19 @@ def test_the_response_of_a_fitted_simulator_is_that_of_whole_samples(hold):
         fit = pilfr.fit(store(substeps), r)
         errors.append(analyse_response(fit, roll_out(fit, r, "test"), r).errors[1:6])
     np.testing.assert_allclose(*errors, rtol=1e-3)
+
+
+def test_the_gain_along_next_values_is_that_of_the_inputs_that_act():
+    """Where the gain depends on the input, the inputs of another sample gave another one."""
+    simulator = pilfr.Simulator(
+        lambda x, u: dict(a=u.q + 0.2 * u.q**3 - x.a), lambda x: dict(y=x.a), states=("a",), inputs=("q",)
+    )
+    v = np.random.default_rng(0).standard_normal((200, 1))
+    held = pilfr.Recording(v, np.zeros(200), 0.3, "q", "y", initial="zero", hold="zero")
+    held = held.with_(y=simulator.simulate(held))
+    late = held.with_(u=np.vstack([v[:1], v[:-1]]), hold="next")
+    found = []
+    for r in (held, late):
+        run = roll_out(simulator, r, "test")
+        found.append(_gain_and_radius(run, analyse_response(simulator, run, r), 1))
+    np.testing.assert_allclose(*found, rtol=1e-9)

@@ -66,6 +66,13 @@ def test_with_checks_again():
         r.with_(hold="cubic")
 
 
+def test_inputs_of_the_next_samples_follow_the_period():
+    r = Recording(np.arange(6.0), np.arange(6.0) + 10, 0.1)
+    assert r.u_next[:, 0].tolist() == [1, 2, 3, 4, 5, 5]
+    assert r.with_(period=3).u_next[:, 0].tolist() == [1, 2, 3, 4, 5, 3]
+    assert r.with_(period=4).y_next[:, 0].tolist() == [11, 12, 13, 14, 15, 15]  # one and a half periods
+
+
 NAN = np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 6.0]])
 
 

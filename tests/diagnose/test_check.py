@@ -394,7 +394,7 @@ def test_simulators_that_cannot_be_followed_get_a_sentence():
 
 def test_wrong_input_gets_a_sentence():
     given = record(MASS, noise_like(1))
-    with pytest.raises(InputError, match="hold='cubic' was given"):
+    with pytest.raises(InputError, match="hold is 'cubic'; give 'zero'"):
         check(MASS, given, hold="cubic")
     with pytest.raises(InputError, match="give classes of laws"):
         check(MASS, given, laws=[CoulombFriction()])

@@ -288,7 +288,7 @@ def test_tests_may_begin_in_the_training_data_where_they_are_not_scored(plain):
         ({"workers": 0}, "workers is 0; give a whole number, 1 or more"),
         ({"effects": -1}, "effects is -1"),
         ({"progress": "yes"}, "progress = 'yes' was given; give True"),
-        ({"hold": "cubic"}, "hold='cubic' was given"),
+        ({"hold": "cubic"}, "hold is 'cubic'"),
         ({"laws": ["friction"]}, "no law 'friction'; did you mean .*coulomb_friction"),
         ({"time_limit": "5"}, "time_limit='5' was given; give seconds"),
         ({"stand_in_error": np.nan}, "stand_in_error=nan was given"),

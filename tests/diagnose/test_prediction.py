@@ -163,6 +163,14 @@ def test_predictions_are_advised_if_a_free_run_drifts_and_took_all_the_time(monk
     monkeypatch.setattr(Search, "cut_short", True)
     found = pilfr.diagnose(cart(), pushed(0.4, 0.3, 2e-3), laws=(Gain,), workers=1)
     assert found.verdict == "unexplained" and "--focus prediction" in str(found)
+    assert "there was no time for them" in str(found)
+
+
+def test_predictions_that_time_ended_are_told_as_begun(monkeypatch):
+    cut_short = property(lambda search: search.bench.simulator.observer is not None)
+    monkeypatch.setattr(Search, "cut_short", cut_short)
+    found = pilfr.diagnose(cart(), pushed(0.4, 0.3, 2e-3), laws=(Gain,), workers=1)
+    assert found.verdict == "unexplained" and "time ran out before they gave an answer" in str(found)
 
 
 def test_a_sensor_that_reads_more_does_not_forget_sooner():

@@ -263,7 +263,7 @@ REFUSED = {
     "dt": (lambda: exported(mass_on_spring()), "dt=None was given"),
     "dt zero": (lambda: exported(mass_on_spring(), dt=0.0), "dt=0.0 was given"),
     "other dt": (lambda: exported(some_fit(), dt=0.1), "the fit's step is"),
-    "hold": (lambda: exported(mass_on_spring(), dt=0.1, hold="cubic"), "hold = 'cubic'"),
+    "hold": (lambda: exported(mass_on_spring(), dt=0.1, hold="cubic"), "hold is 'cubic'"),
     "hold of a fit": (lambda: exported(some_fit(), hold="zero"), "are for simulators"),
     "substeps": (
         lambda: exported(mass_on_spring(), dt=0.1, substeps=0),

@@ -188,12 +188,6 @@ def library(models, tmp_path_factory):
     return ctypes.CDLL(str(path))
 
 
-def inputs_of(model, data):
-    """Rows of u for the exported step, with the next sample's inputs if it interpolates."""
-    after = np.vstack([data.u[1:], data.u[-1:]])
-    return np.hstack([data.u, after]) if len(model.inputs) == 2 * data.n_u else data.u
-
-
 def agree(found, expected):
     assert np.all(np.isfinite(expected)) and np.ptp(expected) > 0
     size, apart = np.max(np.abs(expected), axis=0), np.max(np.abs(found - expected), axis=0)
@@ -215,7 +209,7 @@ def test_the_function_agrees_with_the_simulation(models):
     apart = []
     for model, data, expected in models.values():
         x, rows = model.x0(), []
-        for u in inputs_of(model, data):
+        for u in model.drive(data):
             x, y = model.step(x, u)
             rows.append(np.asarray(y).ravel())
         apart.append(agree(np.array(rows), expected))
@@ -231,7 +225,7 @@ def test_c_agrees_with_the_simulation(models, library):
         x, y, rows = np.full(max(1, len(model.states)), np.nan), np.zeros(len(model.outputs)), []
         begin(x)
         assert np.array_equal(x[: len(model.states)], model.x0())
-        for u in inputs_of(model, data):
+        for u in model.drive(data):
             step(x, np.ascontiguousarray(u), x, y)
             rows.append(y.copy())
         apart.append(agree(np.array(rows), expected))
@@ -243,7 +237,7 @@ def test_control_agrees_with_the_simulation(models):
 
     apart = []
     for model, data, expected in models.values():
-        system, u = model.to_control(), inputs_of(model, data)
+        system, u = model.to_control(), model.drive(data)
         assert (system.dt, system.ninputs, system.noutputs) == (model.dt, len(model.inputs), len(model.outputs))
         assert system.nstates == len(model.states)
         found = control.input_output_response(system, np.arange(len(u)) * model.dt, u.T, X0=model.x0())

@@ -210,9 +210,9 @@ def follows_better(one: float, other: float, residuals: Sequence[np.ndarray]) ->
     return one < CLEARLY_BETTER * other and evidence_gain(other, one, residuals, 0) > LEAST_GAIN
 
 
-def value_with_unit(value: float, unit: str, digits: int = 3) -> str:
-    """Write a value with its unit, if that is known."""
-    return f"{value:.{digits}g} {unit}".rstrip()
+def value_with_unit(value: float | Sequence[float] | np.ndarray, unit: str, digits: int = 3) -> str:
+    """Write a value, or several, with their unit, if that is known."""
+    return f"{', '.join(f'{v:.{digits}g}' for v in np.ravel(value))} {unit}".rstrip()
 
 
 def describe_fall(before: float, after: float) -> str:

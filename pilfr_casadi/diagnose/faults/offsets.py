@@ -133,6 +133,7 @@ class Offset(Law):
     units: ClassVar[Mapping[str, str]] = {"w_0": "w"}
     strength: ClassVar[tuple[str, ...]] = ("w_0",)
     places: ClassVar[tuple[str, ...]] = ("series",)
+    listed: ClassVar[bool] = False
 
     def force(self, p: Any) -> Any:
         """Return the constant."""

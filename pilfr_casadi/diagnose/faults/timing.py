@@ -58,6 +58,7 @@ class TimeShift(Gate):
 
     kind: str = "y"
     columns: tuple[int, ...] = (0,)
+    hold: str = "zero"  # of the inputs
     parameters: ClassVar[int] = 1
 
     def at(self, value: float, dt: float) -> Self:
@@ -70,7 +71,7 @@ class TimeShift(Gate):
         moved = replace(self, value=value, sentence=words)
         if moved.delay > 0:
             moved = replace(moved, sentence=f"{words}, or the machine delays {it} by as much")
-        elif self.finding == "alignment" and abs(value / dt) < 1 + WHOLE_SHIFT:
+        elif self.finding == "alignment" and abs(value / dt) < 1 + WHOLE_SHIFT and self.hold != "next":
             moved = replace(moved, sentence=f"{words}, or inputs are means up to their samples (hold 'next')")
         return replace(moved, change=moved.read)
 
@@ -104,7 +105,7 @@ class TimeShift(Gate):
         return np.full(len(r), True) if self._wraps(r) else (at >= 0) & (at <= r.t[-1] + 1e-9 * r.dt)
 
     def _wraps(self, r: Recording) -> bool:
-        return bool(r.period) and len(r) % (r.period or 1) == 0 and self.finding == "alignment"
+        return r.wraps and self.finding == "alignment"
 
     def curves(self, r: Recording) -> list[_Curve]:
         """Interpolate the channels, whatever the value."""
@@ -343,7 +344,7 @@ def _screen_shifts(bench: Workbench, plain: Fitted, also_given: bool = True) -> 
         first = FirstOrder.of(bench, reference)
         for kind, columns, name in channels:
             for finding, values in (("alignment", bench.dt * SHIFTS), ("clock", RATES)):
-                fault = TimeShift(name, finding, 0.0, kind=kind, columns=columns)
+                fault = TimeShift(name, finding, 0.0, kind=kind, columns=columns, hold=bench.hold)
                 left = fault.remainder(first, reference)
                 shares = [left(float(v)) for v in values]
                 k = int(np.argmin(shares))

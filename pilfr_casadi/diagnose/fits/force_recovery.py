@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from ..._base import one_at_a_time
-from ...data import Recording
+from ...data import COURSES, Recording
 from ...linear import measurement_update
 from ...models import Model
 from ...simulators import (
@@ -194,8 +194,9 @@ def hidden_force(
     if kind_of(port) == PARAMETER:  # no force acts there
         return None
     r = bench.recordings[i]
-    instant = kind_of(port) == SENSOR or (kind_of(port) == ACTUATOR and bench.hold in ("zero", "next"))
-    ahead = kind_of(port) == ACTUATOR and bench.hold == "next"  # what acts after a sample is that of the next one
+    course = COURSES[bench.hold]
+    instant = kind_of(port) == SENSOR or (kind_of(port) == ACTUATOR and course.constant)
+    ahead = kind_of(port) == ACTUATOR and course.begin == 1  # what acts after a sample is that of the next one
     with np.errstate(all="ignore"):
         law = law_signals(bench, fitted, number, i, ahead) if number is not None else None
         base, x0 = _remove_element(fitted, number, fitted.initial[i], bench.dt / fitted.model.substeps)

@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from ..._base import InputError, one_at_a_time
-from ...data import Recording
+from ...data import COURSES, Recording
 from ...laws import Law, Local
 from ...linear import steady_state_gain, with_output_injection
 from ...models import Model
@@ -183,11 +183,8 @@ def local_signals(
 
 def input_slope(bench: Workbench, r: Recording) -> np.ndarray:
     """Compute the inputs' rates at the samples, (M, n_u); zero if the inputs are held."""
-    return (
-        np.gradient(r.u, r.dt, axis=0)
-        if bench.hold in ("linear", "band-limited") and len(r) > 2
-        else np.zeros_like(r.u)
-    )
+    constant = COURSES[bench.hold].constant or len(r) < 3
+    return np.zeros_like(r.u) if constant else np.gradient(r.u, r.dt, axis=0)
 
 
 def loudest_stretch(power: np.ndarray, length: int, skip: int) -> slice:

@@ -161,13 +161,12 @@ class Workbench:
         """Sampling interval, s."""
         return self.recordings[0].dt
 
-    def with_other_holds(self, among: Sequence[str | None] = HOLDS) -> list[Workbench]:
+    def with_other_holds(self, among: Sequence[str] = HOLDS) -> list[Workbench]:
         """Return the bench with interpolated inputs, or with each other hold if they are interpolated already.
 
         Held inputs come half a sample later than interpolated ones, the next values half a sample earlier.
         """
-        near = ("zero", "band-limited", "next") if self.hold == "linear" else ("linear",)
-        return [replace(self, hold=hold) for hold in near if hold in among]
+        return [replace(self, hold=hold) for hold in among if (hold == "linear") != (self.hold == "linear")]
 
     def on(self, recordings: Sequence[Recording]) -> Workbench:
         """Return the bench with other recordings; errors stay in units of the training outputs' deviation."""
@@ -531,7 +530,7 @@ def refit_with_other_holds(
     *,
     states: Sequence[np.ndarray] = (),
     solver: GaussNewton = THOROUGH,
-    among: Sequence[str | None] = HOLDS,
+    among: Sequence[str] = HOLDS,
     may_go_on: Callable[[], bool] = lambda: True,
 ) -> list[tuple[Workbench, Fitted]]:
     """Refit with each other hold of the inputs; the smallest error is first, diverging ones are left out.

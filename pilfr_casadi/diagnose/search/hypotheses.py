@@ -42,7 +42,7 @@ from ..fits.floor import FEWEST, Floor, count_samples, swells_with, white_part
 from ..fits.force_recovery import is_curve_along
 from ..fits.screen import Scored, screen
 from ..fits.workbench import DIVERGED, Fitted, Workbench
-from .trials import Key, Trial, Trials
+from .trials import Key, Name, Trial, Trials
 
 MOST_CROSS_VALIDATED = 6  # hypotheses that are cross-validated; more only until the likeliest one is
 
@@ -77,7 +77,7 @@ class Hypotheses:
     laws: Sequence[type[Law]]
     workers: int
     say: Stages
-    hold_stated: bool = True  # whether somebody stated the hold of the inputs between samples
+    hold_settled: bool = True  # whether the hold of the inputs is stated, or was compared with the others
     surrogate_nrmse: float = 0.0  # NRMSE between a surrogate and its simulation; the floor contains it
     until: float = np.inf  # time (of `time.perf_counter`) at which the search ends
     memo: dict[Key, Trial] = field(default_factory=dict)  # the best trial of every fitted hypothesis, by key
@@ -173,6 +173,13 @@ class Hypotheses:
     def best(self) -> Trial:
         """The most promising hypothesis, from which the search continues."""
         return max(self.memo.values(), key=self.optimistic_evidence)
+
+    def likeliest_forms(self, trials: Iterable[Trial]) -> list[Trial]:
+        """Return of each set of laws the likeliest form, the likeliest set first."""
+        first = dict[frozenset[Name], Trial]()
+        for trial in sorted(trials, key=self.optimistic_evidence, reverse=True):
+            first.setdefault(trial.names, trial)
+        return [*first.values()]
 
     def optimistic_evidence(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis with as many effective samples as at the noise level."""

@@ -67,6 +67,7 @@ class LearnedForce(Law):
     places = ("parallel", "series")
     factor: ClassVar[str] = ""  # input that scales a part of the force
     follows = memory = STOPS
+    listed = False
 
     @classmethod
     def reads(cls) -> set[str]:

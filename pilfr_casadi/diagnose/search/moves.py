@@ -64,11 +64,11 @@ class Search(Forms):
         """Whether the search goes no further: it has to be repeated with another hold or with a channel shifted."""
         return bool(self.better_hold) or self.shift is not None
 
-    def resume(self) -> None:
-        """Continue with the present hold because the other is no better, unless the search was interrupted."""
-        self.hold_stated = True
+    def resume(self, effects: float | None = None) -> None:
+        """Continue with the present hold, for up to `effects` effects or as many as before; not after an interrupt."""
+        self.hold_settled = True
         if not self.interrupted:
-            self.run(self.most_effects)
+            self.run(self.most_effects if effects is None else effects)
 
     def adopt(self, other: Trial) -> None:
         """Fit the laws of another search's hypothesis to these recordings, from its values, and keep the fit."""
@@ -92,7 +92,7 @@ class Search(Forms):
             self.add(parent)
             if not parent.laws and self.may_go_on() and self._escape_local_minimum():
                 self.add(self.root)
-            self.better_hold = "" if self.hold_stated else self.find_better_hold()
+            self.better_hold = "" if self.hold_settled else self.find_better_hold()
             if not parent.laws and not self.must_repeat:
                 self._find_shift()
             if self.must_repeat:
@@ -199,12 +199,9 @@ class Search(Forms):
         first_move = {t.key for m in self.moves if not m.parent.laws for t in m.trials}
         kept = [self.memo[key] for key in first_move]
         plain = [t for t in kept if not (t.law.order or t.law.memory)]
-        first = dict[tuple[str, str], Trial]()  # of each law the likeliest form, the likeliest laws first
-        for trial in sorted(plain, key=self.optimistic_evidence, reverse=True):
-            first.setdefault(trial.name, trial)
-        best, shift_step = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_stated else 0.5
+        best, shift_step = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_settled else 0.5
         with self.stage("shifts beside a law"):
-            for trial in list(first.values())[:FEW] if self.may_go_on() else ():
+            for trial in self.likeliest_forms(plain)[:FEW] if self.may_go_on() else ():
                 bench = replace(self.bench, simulator=trial.fitted.simulator)
                 found = find_time_shift(Checked(bench, trial.fitted), shift_step, given=False)
                 shift = found.gates[0] if found.gates else None

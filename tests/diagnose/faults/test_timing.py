@@ -99,6 +99,13 @@ def test_what_seems_early_while_more_is_wrong_may_be_no_fault(stiffening):
         assert [g.finding for g in gates] == (["alignment"] if early or not stiffening else [])
 
 
+@pytest.mark.parametrize(("hold", "advised"), [("zero", True), ("next", False)])
+def test_next_values_are_no_advice_where_they_are_stated(hold, advised):
+    bench = Workbench.of(spring(), [shaken(hold, early=1)], hold)
+    (early,) = find_time_shift(Checked(bench, bench.fit(spring()))).gates
+    assert "too early" in early.sentence and ("hold 'next'" in early.sentence) is advised
+
+
 def test_why_a_hold_was_chosen_is_said():
     assert "fit better (error 1.3 times smaller)" in hold_note(spring(), "linear", 1.3).sentence
     assert "error 1.03 times smaller; state the hold if you know it)" in hold_note(spring(), "linear", 1.03).sentence
