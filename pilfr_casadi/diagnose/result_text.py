@@ -25,6 +25,7 @@ ERROR_NAMES = {"nominal": "as given", "before": "refitted", "after": "corrected"
 MOST_PRINTED = 8  # parameters and blind spots that are printed at most
 GRAVEST_SPOTS = 2  # blind spots that are printed right after the verdict
 NEAR_CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
+HELPS_MOTION = "; as fitted it helps the motion: the sign of the output, or of the port's rate, may be reversed"
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
 OUT_OF_TIME = (
     "The time limit ended the search: the answer rests on the fits made until then. A longer one (time_limit, "
@@ -351,9 +352,23 @@ class ResultText:
         for e in (e for e in self.added if not isinstance(e.law, Offset) and e.law.id != "learned"):
             own = {name: parameters[f"{e.prefix}{name}"] for name in e.law.parameters()}
             lines.append(f"in the correction, without a sure name: {name_at(e.port, e.law.id, e.law.form)}")
+            lines.append(f"  {e.law.equation}" + self._acts_with_motion(e) * HELPS_MOTION)
             free = {name: p for name, p in own.items() if not np.all(p.fixed)}
             lines += [f"  {name} = {write_values(np.ravel(p.value), p.unit)}" for name, p in free.items()]
         return lines
+
+    def _acts_with_motion(self, e: Placed) -> bool:
+        """Tell whether friction or damping in an output, where it may have either sign, helps the motion."""
+        law, simulator = e.law, self.corrected
+        if not law.dissipative or not set(simulator.into(simulator.port(e.port), *simulator.symbols())) <= set(
+            simulator.output_names
+        ):
+            return False
+        opposing = [v for name, v in e.own(self._values()).items() if name in {*law.strength} - {*law.signed}]
+        return all(np.all(v <= 0) for v in opposing) and any(np.any(v < 0) for v in opposing)
+
+    def _values(self) -> dict[str, np.ndarray]:
+        return {name: np.asarray(p.value) for name, p in self.corrected.parameters.items()}
 
     def _value_lines(self) -> list[str]:
         """List the simulator's own estimated values, largest changes first."""
