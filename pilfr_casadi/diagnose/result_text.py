@@ -19,6 +19,7 @@ from .faults.gates import TEST_FAULT, TEST_OFFSET, Gate, value_with_unit
 from .faults.offsets import Offset, describe_offsets, find_placed_offsets
 from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, all_sure
 from .fits.floor import ABOVE_NOISE
+from .posterior import indistinguishable
 from .search.learned import Learned
 
 ERROR_NAMES = {"nominal": "as given", "before": "refitted", "after": "corrected"}  # the errors that are printed
@@ -355,7 +356,17 @@ class ResultText:
             lines.append(f"  {e.law.equation}" + self._acts_with_motion(e) * HELPS_MOTION)
             free = {name: p for name, p in own.items() if not np.all(p.fixed)}
             lines += [f"  {name} = {write_values(np.ravel(p.value), p.unit)}" for name, p in free.items()]
+            others = self._alike(e)
+            lines += [f"  cannot be told apart from {', '.join(others)}"] if others else []
         return lines
+
+    def _alike(self, e: Placed) -> list[str]:
+        """Name the laws that explain the recordings about as well in place of one of a correction without a name."""
+        closest, search = self.correction.closest if self.correction else None, self.evidence.search
+        element = closest and next((own for own in closest.laws if own.name == e.name), None)
+        if closest is None or element is None or search is None:
+            return []
+        return [name_at(port, law) for port, law in indistinguishable(search, closest, element)]
 
     def _acts_with_motion(self, e: Placed) -> bool:
         """Tell whether friction or damping in an output, where it may have either sign, helps the motion."""
