@@ -45,7 +45,7 @@ from ..models import Parameter
 
 ONSET_WIDTH = 0.05  # of a contact, as a share of its gap
 
-MIN_SIDE = 0.05  # share of its reach that z (or ż) must visit on either side of zero, to tell the sides apart
+MIN_SIDE = 0.05  # share of the reach that a signal must visit on either side, to tell the sides apart
 
 PEOPLE = ("coulomb", "stribeck", "hertz")  # persons in the names of laws and forms
 PROPER_NAMES = {
@@ -134,12 +134,6 @@ class Local:
         """Largest |ż|, without the outermost 1 %."""
         return max(float(np.quantile(np.abs(self.dz), 0.99)), 1e-300)
 
-    @cached_property
-    def goes_one_way(self) -> bool:
-        """Whether ż hardly has the other sign, without the outermost 0.1 %."""
-        low, high = np.quantile(self.dz, (0.001, 0.999))
-        return bool(min(-low, high) <= MIN_SIDE * max(-low, high))
-
     @property
     def duration(self) -> float:
         """Length of the longest recording, s."""
@@ -213,8 +207,6 @@ class Law:
         Strengths of a dissipative or restoring law that may have either sign.
     two_sided : bool
         The data carries information on the law only if z is both above and below zero.
-    both_ways : bool
-        The data carries information on the law only if the motion at the port goes both ways.
     order, follows : int
         `order` is the number of its own states. If the signal stands still, the first `follows` of its states or its
         memory are at the signal's value, the others at zero, as for plays after the signal has moved there from zero.
@@ -286,7 +278,6 @@ class Law:
     dissipative: ClassVar[bool] = False
     restoring: ClassVar[bool] = False
     two_sided: ClassVar[bool] = False
-    both_ways: ClassVar[bool] = False
     flexible: ClassVar[bool] = False
     contains: ClassVar[tuple[str, ...]] = ()
     signed: ClassVar[tuple[str, ...]] = ()
@@ -363,9 +354,8 @@ class Law:
             return "no output reads the coordinate"
         if self.seen_by and (self.seen_by not in local.readers or len(local.readers) == 1):
             return f"{self.seen_by} does not read the coordinate, or does so alone"
-        if self.two_sided and min(-local.low, local.high) <= MIN_SIDE * local.reach:
-            return "one side of zero is hardly visited"
-        return "the motion hardly goes both ways" if self.both_ways and local.goes_one_way else ""
+        hidden = self.two_sided and min(-local.low, local.high) <= MIN_SIDE * local.reach
+        return "one side of zero is hardly visited" if hidden else ""
 
     @property
     def lacks(self) -> str:

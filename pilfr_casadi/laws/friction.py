@@ -81,7 +81,6 @@ class DirectionalFriction(AsymmetricFriction):
     )
     units = {"F_c": "w", "F_0": "w", "c_0": "w*s/z", "v_0": "z/s"}
     signed = ("F_0", "c_0")
-    both_ways = True  # one way alone, the terms follow any curve of the speed
 
     def force(self, dz: Any, p: Any) -> Any:
         return super().force(dz, p) + p.c_0 * ca.fabs(dz)
@@ -217,7 +216,6 @@ class DirectionalDamping(ViscousDamping):
     absent = ("thermal",)
     units = {"c_1": "w*s/z", "c_0": "w*s/z"}
     signed = ("c_0",)
-    both_ways = True
 
     def force(self, dz: Any, p: Any) -> Any:
         return super().force(dz, p) + p.c_0 * ca.fabs(dz)
@@ -254,7 +252,6 @@ class DirectionalDrag(QuadraticDrag):
     }
     units = {"c_2": "w*s^2/z^2", "c_0": "w*s^2/z^2"}
     signed = ("c_0",)
-    both_ways = True
 
     def force(self, dz: Any, p: Any) -> Any:
         return super().force(dz, p) + p.c_0 * dz**2

@@ -6,18 +6,7 @@ import numpy as np
 import pytest
 
 from pilfr_casadi import Parameter, Port, Recording, Simulator, diagnose
-from pilfr_casadi.laws import (
-    CATALOGUE,
-    Clearance,
-    CoulombFriction,
-    CubicDamping,
-    DirectionalDamping,
-    DirectionalDrag,
-    DirectionalFriction,
-    Local,
-    PowerWithGain,
-    StribeckFriction,
-)
+from pilfr_casadi.laws import CATALOGUE, Clearance, CoulombFriction, CubicDamping, PowerWithGain, StribeckFriction
 
 DT, J, B, K, F_C = 0.01, 2e-3, 1e-3, 0.08, 0.03  # s, kg m², N m s, N m/A, N m
 TRIED = (CoulombFriction, StribeckFriction, CubicDamping, PowerWithGain)
@@ -128,12 +117,3 @@ def test_no_law_of_a_position_is_admitted_at_a_speed(units: dict[str, str]) -> N
     assert {"coulomb_friction", "stribeck_friction", "cubic_damping"} <= {
         law.id for law in CATALOGUE if port.admits(law)
     }
-
-
-def test_laws_of_two_directions_need_a_motion_both_ways():
-    """One way alone, the terms of such a law follow any curve of the speed, with huge values that cancel."""
-    speed = np.linspace(1.0, 9.0, 200)
-    for law in (DirectionalFriction, DirectionalDamping, DirectionalDrag):
-        assert law().why_not(Local(speed, speed, 0.1, (200,))) == "the motion hardly goes both ways"
-        assert not law().why_not(Local(speed, speed - 5, 0.1, (200,)))
-        assert not law.__base__().why_not(Local(speed, speed, 0.1, (200,)))
