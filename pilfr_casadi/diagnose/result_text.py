@@ -363,10 +363,10 @@ class ResultText:
     def _alike(self, e: Placed) -> list[str]:
         """Name the laws that explain the recordings about as well in place of one of a correction without a name."""
         closest, search = self.correction.closest if self.correction else None, self.evidence.search
-        element = closest and next((own for own in closest.laws if own.name == e.name), None)
-        if closest is None or element is None or search is None:
+        if closest is None or search is None:
             return []
-        return [name_at(port, law) for port, law in indistinguishable(search, closest, element)]
+        own = [element for element in closest.laws if element.name == e.name]
+        return [name_at(port, law) for element in own for port, law in indistinguishable(search, closest, element)]
 
     def _acts_with_motion(self, e: Placed) -> bool:
         """Tell whether friction or damping in an output, where it may have either sign, helps the motion."""
