@@ -112,6 +112,11 @@ class _Candidate:
         return self.fitted is not self.base.fitted
 
     @property
+    def elements(self) -> int:
+        """Number of its laws, and of learned forces."""
+        return len(self.base.laws) + self.has_learned
+
+    @property
     def least(self) -> float:
         """Least expected mean square error: held-out error is hardly ever below the fit error."""
         return self.fitted.cost + self.spread
@@ -190,8 +195,11 @@ def _cross_validate(search: Search, candidates: Sequence[_Candidate], validated:
     out = list(validated)
     for c in sorted(candidates, key=lambda c: c.least):
         least = min((e.mean_square for _, e in out), default=np.inf)
-        if search.past_deadline or (out and c.least >= least):
+        if search.past_deadline:
             break
+        known = not c.has_learned and search.findings[c.base.key].held_out is not None
+        if out and c.least >= least and not known:
+            continue
         found = held_out_errors(search.bench, c.fitted, search.workers) if c.has_learned else search.held_out(c.base)
         if np.isfinite(found.rms) or not search.past_deadline:  # otherwise the time was over before it was known
             out.append((c, ExpectedError(found, c.spread if c.has_learned else search.spread_of(c.base))))
@@ -219,8 +227,16 @@ def _far_better(search: Search, candidates: Sequence[_Candidate]) -> Trial:
 
 
 def _choose(validated: Sequence[_Validated]) -> _Validated:
-    """Choose the candidate with the smallest expected error on other recordings."""
-    return min(validated, key=lambda p: p[1].mean_square)
+    """Choose the candidate with the smallest expected error on other recordings, or one with fewer laws.
+
+    The smallest of many errors is small by chance as well. So a candidate with fewer laws is chosen if its errors on
+    the held-out blocks are not clearly larger (`HeldOut.clearly_above`); of those with the fewest, the best.
+    """
+    best = min(validated, key=lambda p: p[1].mean_square)
+    plainer = [
+        p for p in validated if p[0].elements < best[0].elements and not p[1].held_out.clearly_above(best[1].held_out)
+    ]
+    return min(plainer, key=lambda p: (p[0].elements, p[1].mean_square), default=best)
 
 
 def _named_hypotheses(search: Search, answer: Posterior) -> list[Trial]:

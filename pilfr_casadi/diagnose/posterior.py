@@ -239,7 +239,7 @@ def _make_effect(
     search: Hypotheses, best: Trial, element: Placed, by_names: Mapping[frozenset[Name], float]
 ) -> LikelyEffect:
     """Make an effect, with its inclusion probability given that the physics is in the catalogue."""
-    twins, law = _indistinguishable(search, best, element), element.law.id
+    twins, law = indistinguishable(search, best, element), element.law.id
     ports = {element.port}
     for places, other in twins:
         ports |= set(places.split(" + ")) if other == law else set()
@@ -274,7 +274,7 @@ def _shares(logs: np.ndarray) -> np.ndarray:
     return np.asarray(found / found.sum())
 
 
-def _indistinguishable(search: Hypotheses, best: Trial, element: Placed) -> dict[Name, Trial]:
+def indistinguishable(search: Hypotheses, best: Trial, element: Placed) -> dict[Name, Trial]:
     """Find hypotheses, about as likely as the best, that have another effect in place of one of its effects.
 
     The same law in every sensor is one effect, at "sensor:a + sensor:b".

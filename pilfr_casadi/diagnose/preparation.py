@@ -23,6 +23,7 @@ from .faults.channels import accept_best, find_channel_errors, find_gross_channe
 from .faults.gates import CURED_SHARE, EQUAL_RATIO, NEAR_NOISE_RATIO, POOR_FIT, Checked, Gate, error_ratio
 from .faults.lost_samples import find_gaps, find_output_gaps
 from .faults.offsets import find_offsets, find_wrong_start
+from .faults.rates import find_wrong_rates
 from .faults.samples import clean_recordings, find_held_outputs, mend_stale_samples, unclip
 from .faults.timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps
 from .fits.evidence import BETTER_RATIO
@@ -114,6 +115,7 @@ def prepare(
     bench = replace(bench, typical=sample_run(bench, without))
     say(CHECKS, CHECKED, CHECKED, without.cost**0.5)
     notes = [Gate("recordings", "unchecked", None, sentence, corrected=False) for sentence in unchecked]
+    notes += find_wrong_rates(bench)
     return Prepared(bench, without, nominal, (*now.gates, *held, *notes), Checked(bench, without).floor)
 
 

@@ -19,12 +19,14 @@ from .faults.gates import TEST_FAULT, TEST_OFFSET, Gate, value_with_unit
 from .faults.offsets import describe_offsets, find_placed_offsets
 from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, all_sure
 from .fits.floor import ABOVE_NOISE
+from .posterior import indistinguishable
 from .search.learned import Learned
 
 ERROR_NAMES = {"nominal": "as given", "before": "refitted", "after": "corrected"}  # the errors that are printed
 MOST_PRINTED = 8  # parameters and blind spots that are printed at most
 GRAVEST_SPOTS = 2  # blind spots that are printed right after the verdict
 NEAR_CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
+HELPS_MOTION = "; as fitted it helps the motion: the sign of the output, or of the port's rate, may be reversed"
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
 OUT_OF_TIME = (
     "The time limit ended the search: the answer rests on the fits made until then. A longer one (time_limit, "
@@ -351,9 +353,33 @@ class ResultText:
         for e in (e for e in self.added if e.law.listed):
             own = {name: parameters[f"{e.prefix}{name}"] for name in e.law.parameters()}
             lines.append(f"in the correction, without a sure name: {name_at(e.port, e.law.id, e.law.form)}")
+            lines.append(f"  {e.law.equation}" + self._acts_with_motion(e) * HELPS_MOTION)
             free = {name: p for name, p in own.items() if not np.all(p.fixed)}
             lines += [f"  {name} = {value_with_unit(p.value, p.unit, 5)}" for name, p in free.items()]
+            others = self._alike(e)
+            lines += [f"  cannot be told apart from {', '.join(others)}"] if others else []
         return lines
+
+    def _alike(self, e: Placed) -> list[str]:
+        """Name the laws that explain the recordings about as well in place of one of a correction without a name."""
+        closest, search = self.correction.closest if self.correction else None, self.evidence.search
+        if closest is None or search is None:
+            return []
+        own = [element for element in closest.laws if element.name == e.name]
+        return [name_at(port, law) for element in own for port, law in indistinguishable(search, closest, element)]
+
+    def _acts_with_motion(self, e: Placed) -> bool:
+        """Tell whether friction or damping in an output, where it may have either sign, helps the motion."""
+        law, simulator = e.law, self.corrected
+        if not law.dissipative or not set(simulator.into(simulator.port(e.port), *simulator.symbols())) <= set(
+            simulator.output_names
+        ):
+            return False
+        opposing = [v for name, v in e.own(self._values()).items() if name in {*law.strength} - {*law.signed}]
+        return all(np.all(v <= 0) for v in opposing) and any(np.any(v < 0) for v in opposing)
+
+    def _values(self) -> dict[str, np.ndarray]:
+        return {name: np.asarray(p.value) for name, p in self.corrected.parameters.items()}
 
     def _value_lines(self) -> list[str]:
         """List the simulator's own estimated values, largest changes first."""

@@ -246,6 +246,12 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
     rest = max(search.flexible(closest).values(), default=0.0) if looked else 0.0
     words = " and ".join(name_at(e.port, e.law.id, e.law.form) for e in laws)
     named = f"laws, {words}, remove" if laws[1:] else f"law, {words}, removes"
+    if left < FORMULA_ERROR:
+        them, sure = ("they are", "names are") if laws[1:] else ("it is", "name is")
+        return (
+            f"Physics is missing, most likely at {port}. The closest {named} all of the mismatch on the training "
+            f"recordings, down to the noise; but it is not sure that {them} the physics, so the {sure} not stated."
+        )
     removed = f"{100 * (1 - left):.0f} %" if round(left, 2) else f"all but {100 * left:.1g} %"
     explained = ": nothing tried explains it" if looked else ""
     if rest > LEAST_EXPLAINED:

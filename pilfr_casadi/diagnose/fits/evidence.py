@@ -31,7 +31,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -436,6 +436,20 @@ class HeldOut:
     blocks: float  # on held-out blocks; infinite if the simulation diverges
     ahead: float  # the same on the second halves
     squares: np.ndarray  # (n_y,), the larger of the two, of each output
+    each: np.ndarray = field(default_factory=lambda: np.zeros(0))  # on each held-out block, in the order of the blocks
+
+    def clearly_above(self, other: HeldOut) -> bool:
+        """Tell whether the errors on the blocks are larger by more than two standard errors, paired, in logarithms.
+
+        A block in which everything fails, such as one with an event that nothing describes, counts like any other.
+        """
+        if self.each.shape != other.each.shape or len(self.each) < 2:
+            return True
+        with np.errstate(all="ignore"):
+            ratios = np.log(self.each / other.each)
+        if not np.all(np.isfinite(ratios)):
+            return True
+        return bool(np.mean(ratios) > 2 * np.std(ratios, ddof=1) / np.sqrt(len(ratios)))
 
     @property
     def mean_square(self) -> float:
@@ -487,9 +501,12 @@ def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldO
     later = [b >= FOLDS * ROUNDS // 2 for b in blocks]
     *squares, second = side_by_side(lambda left: _sum_of_squares(bench, fitted, left), [*folds, later], workers)
     scored, ahead = (max(sum(int(np.sum(mask)) for mask in masks), 1) for masks in ([b >= 0 for b in blocks], later))
-    both = np.sum(squares, axis=0) / scored, second / ahead
+    of_blocks = np.sum(squares, axis=0)
+    both = np.sum(of_blocks, axis=0) / scored, np.sum(second, axis=0) / ahead
     pooled = bench.pool(both[0]), bench.pool(both[1])
-    return HeldOut(*pooled, both[int(pooled[1] > pooled[0])])
+    sizes = np.concatenate([np.bincount(b[b >= 0], minlength=FOLDS * ROUNDS) for b in blocks])
+    each = np.array([bench.pool(one / n) for one, n in zip(of_blocks, sizes, strict=True) if n])
+    return HeldOut(*pooled, both[int(pooled[1] > pooled[0])], each)
 
 
 def _at_prior_means(fitted: Fitted) -> Fitted:
@@ -500,11 +517,12 @@ def _at_prior_means(fitted: Fitted) -> Fitted:
 
 
 def _sum_of_squares(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]) -> np.ndarray:
-    """Refit without scoring the samples in `left`; return each output's sum of squares there, (n_y,).
+    """Refit without scoring the samples in `left`; return each output's sum of squares there, by block (B, n_y).
 
     It is infinite if the run diverges or the time is over: a refit that is cut short has not left the samples out.
     """
-    infinite = np.full(len(bench.scale), np.inf)
+    count = FOLDS * ROUNDS
+    infinite = np.full((count * len(left), len(bench.scale)), np.inf)
     residual: Sequence[np.ndarray] = fitted.residual
     if np.any(fitted.model.parameters.free) or any(r.begins == "estimate" for r in bench.recordings):
         seconds = bench.deadline - time.perf_counter()
@@ -521,6 +539,9 @@ def _sum_of_squares(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]
             return infinite
         residual = [y - r.y for y, r in zip(simulated, bench.recordings, strict=True)]
     with np.errstate(over="ignore", invalid="ignore"):
-        pairs = zip(residual, left, strict=True)
-        total = np.sum([np.sum((e / bench.scale)[here] ** 2, axis=0) for e, here in pairs], axis=0)
+        found_there = list[np.ndarray]()
+        for e, here, number in zip(residual, left, blocks_of(bench), strict=True):
+            squares = (e / bench.scale) ** 2
+            found_there += [np.sum(squares[here & (number == k)], axis=0) for k in range(count)]
+        total = np.array(found_there)
     return total if np.sum(total) < DIVERGED else infinite

@@ -56,14 +56,15 @@ def test_the_correction_halves_the_error_without_a_name(nameless):
 def test_laws_without_a_sure_name_are_printed_with_their_values(nameless):
     law = CubicStiffness().at({"k_3": 5.0})
     shown = str(replace(nameless, corrected=nameless.corrected.with_element("ground", law)))
-    assert "in the correction, without a sure name: cubic stiffness at ground\n  k_3 = 5 N/m^3\n" in shown
+    header = "in the correction, without a sure name: cubic stiffness at ground"
+    assert f"{header}\n  w = k_3 z^3\n  k_3 = 5 N/m^3\n" in shown
     assert "learned" not in shown.split("without a sure name", 1)[1].split("values, refitted")[0]
 
 
 def test_a_law_with_many_values_is_printed_with_all_of_them_in_a_line(nameless):
     law = hysteresis_layer("stop", 2, series=False)().at({"w": [3.0, 0.5], "r": [0.1, 0.25]})
     shown = str(replace(nameless, corrected=nameless.corrected.with_element("ground", law)))
-    assert f"{law.id} (Prandtl-Ishlinskii) at ground\n  w = 3, 0.5 N/m\n  r = 0.1, 0.25 m\n" in shown
+    assert f"{law.id} (Prandtl-Ishlinskii) at ground\n  {law.equation}\n  w = 3, 0.5 N/m\n  r = 0.1, 0.25 m\n" in shown
     one = {"value": 3.0, "std": 0.1, "unit": "N/m"}
     values = {"w[0]": one, "w[1]": {**one, "value": 0.5}, "g": {**one, "unit": "m"}}
     effect = Effect("ground", law.id, 0.9, "a sentence", "w = 0", values)
