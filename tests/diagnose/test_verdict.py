@@ -19,7 +19,7 @@ from pilfr_casadi.diagnose.fits.evidence import standard_errors
 from pilfr_casadi.diagnose.fits.flexible_forces import flexible_shares, innovation_share
 from pilfr_casadi.diagnose.posterior import posterior
 from pilfr_casadi.diagnose.verdict import closest_hypothesis, judge
-from pilfr_casadi.laws import CATALOGUE, CoulombFriction, CubicDamping, Power as StaticPower, Relaxation
+from pilfr_casadi.laws import CATALOGUE, CoulombFriction, CubicDamping, Delay, Power as StaticPower, Relaxation
 
 
 def test_a_value_of_the_simulator_that_a_law_replaces_is_told_to_come_out_as_zero():
@@ -270,6 +270,31 @@ def test_where_no_effect_is_allowed_the_rest_is_not_called_noise(dry_friction):
     assert found.sentence.startswith("Physics is missing, and no law was fitted, as asked for. Refitted,"), (
         found.sentence
     )
+
+
+def test_a_law_without_a_sure_name_may_leave_only_the_noise(dry_friction):
+    true = cart().with_element("ground", CubicDamping().at({"c_3": 0.5}))
+    y = true.simulate(dry_friction)
+    noise = 0.01 * np.std(y) * np.random.default_rng(0).standard_normal(y.shape)
+    found = pilfr.diagnose(cart(), dry_friction.with_(y=y + noise), laws=(CubicDamping,), effects=1, workers=1)
+    said = judge(found.evidence.search, replace(posterior(found.evidence.search), effects=()), ()).sentence
+    assert said.startswith("Physics is missing, most likely at ground. The closest law, cubic damping at ground, remo")
+    assert said.endswith("down to the noise; but it is not sure that it is the physics, so the name is not stated.")
+
+
+def test_laws_without_a_sure_name_are_printed_with_those_that_explain_as_much(dry_friction):
+    """A delay of a linear machine acts alike at its input and at its output."""
+    true = cart().with_element("actuator:force", Delay().at({"T": 0.12}))
+    y = true.simulate(dry_friction)
+    noise = 0.01 * np.std(y) * np.random.default_rng(0).standard_normal(y.shape)
+    found = pilfr.diagnose(cart(), dry_friction.with_(y=y + noise), laws=(Delay,), effects=1, workers=1)
+    best = posterior(found.evidence.search).best
+    (e,) = best.laws
+    unnamed = replace(found.correction, closest=best, elements=((e.port, e.law.id, e.law.form),))
+    shown = str(replace(found, effects=(), verdict="unexplained", correction=unnamed))
+    other = {"actuator:force", "sensor:pos"} - {e.port}
+    assert f"without a sure name: delay at {e.port}\n  {e.law.equation}\n  T = 0.1" in shown
+    assert f"\n  cannot be told apart from delay at {other.pop()}\n" in shown
 
 
 def test_one_hypothesis_is_told_where_the_time_ended_before_a_comparison(dry_friction):
