@@ -5,8 +5,9 @@ training recordings (`evidence`): the refitted simulator; the named laws, all of
 likely hypotheses if no law is named; and a learned force, alone or beside laws. The score is the held-out error plus
 the spread of predictions for other inputs (`evidence.spread`), which is large if many parameters are hardly determined.
 The smallest score wins, unless a candidate with fewer laws is not clearly worse on the same blocks (`_choose`).
-Candidates are cross-validated in the order of their fit error plus spread, until that exceeds the smallest score. When time runs out first, the hypothesis with the smallest fit error plus spread is used if the
-refit is more than NEAR_RATIO worse. Test recordings are never used.
+Candidates are cross-validated in the order of their fit error plus spread, until that exceeds the smallest score. When
+time runs out first, the hypothesis with the smallest fit error plus spread is used if the refit is more than NEAR_RATIO
+worse. Test recordings are never used.
 """
 
 from __future__ import annotations
