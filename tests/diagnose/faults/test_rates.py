@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Simulator
-from pilfr_casadi.diagnose.faults.rates import find_wrong_rates
+from pilfr_casadi.diagnose.faults.rates import _compare, find_wrong_rates
+from pilfr_casadi.diagnose.fits.linearise import sample_run
 from pilfr_casadi.diagnose.fits.workbench import Workbench
+from pilfr_casadi.simulators import Numeric, from_function
 
 DT, TAU = 0.02, 0.2
 T = DT * np.arange(1500)
@@ -53,6 +58,50 @@ def test_a_filtered_speed_is_late() -> None:
     assert found.startswith("speed follows the derivative of position 0.2 s late, as from a filter. Laws that depend")
     (found,) = sentences(MASS, [SPEED], [POSITION, filtered(SPEED)])
     assert found.startswith("speed follows the derivative of position 0.2 s late")
+
+
+@pytest.mark.parametrize("delay", [0.2, 0.4])
+def test_a_delayed_speed_of_one_frequency_has_no_other_unit(delay: float) -> None:
+    """A lag of first order would also lose amplitude, so that a factor made up for it."""
+    late, factor = _compare(
+        [np.sin(2 * T), np.sin(2 * T[:5])], [2 * np.cos(2 * (T - delay)), 2 * np.cos(2 * T[:5])], DT
+    )
+    assert late == pytest.approx(delay, rel=0.01) and factor == pytest.approx(1, rel=0.01)
+
+
+@pytest.mark.parametrize("read", [True, False])
+def test_a_command_is_no_rate_unless_a_port_reads_it(read: bool) -> None:
+    """An actuator that moves more than it is told is physics of the actuator."""
+    port = Port("slide", into={"position": -1}, across=lambda x: x.position, rate=lambda u: u.speed)
+    cart = Simulator(
+        lambda x, u: {"position": u.speed},
+        lambda x: {"position": x.position},
+        states=("position",),
+        inputs=("speed",),
+        ports=(port,) if read else (),
+    )
+    found = sentences(cart, [SPEED], [1.5 * POSITION])
+    assert [text[:15] for text in found] == ["speed is 0.667 "] * read
+
+
+def test_another_program_is_called_only_where_its_run_has_been() -> None:
+    called = list[float]()
+
+    def swing(t: float, x: Any, u: Any, p: Any) -> list[float]:
+        called.append(float(p["k"]))
+        return [x[1], u[0] - p["k"] * x[0] - 2 * x[1]]
+
+    names = {"states": ("pos", "vel"), "inputs": "force", "parameters": {"k": Parameter(40.0, bounds=(20, 80))}}
+    simulator = from_function(swing, ("pos", "vel"), numeric=Numeric(), **names)
+    r = pilfr.Recording(SPEED, np.zeros((1500, 2)), DT, "force", ("pos", "vel"), hold="linear", initial="zero")
+    y = simulator.simulate(r)
+    r = r.with_(y=np.column_stack([y[:, 0], filtered(y[:, 1])]))
+    bench = Workbench.of(simulator, [r], "linear", "auto")
+    assert not find_wrong_rates(bench)  # nothing has run yet
+    bench = replace(bench, typical=sample_run(bench, bench.fit(simulator)))
+    called.clear()
+    (found,) = find_wrong_rates(bench)
+    assert found.sentence.startswith("vel follows the derivative of pos 0.201 s late") and set(called) == {40.0}
 
 
 @pytest.mark.parametrize(("factor", "words"), [(57.3, "57.3"), (-1.0, "-1")])
