@@ -4,10 +4,10 @@ If the named answer is not sure, or leaves error above the noise, several candid
 training recordings (`evidence`): the refitted simulator; the named laws, all of them and the sure ones alone; all
 likely hypotheses if no law is named; and a learned force, alone or beside laws. The score is the held-out error plus
 the spread of predictions for other inputs (`evidence.spread`), which is large if many parameters are hardly determined.
-The smallest score wins, unless a candidate with fewer laws is not clearly worse on the same blocks (`_choose`).
-Candidates are cross-validated in the order of their fit error plus spread, until that exceeds the smallest score. When
-time runs out first, the hypothesis with the smallest fit error plus spread is used if the refit is more than NEAR_RATIO
-worse. Test recordings are never used.
+The smallest score wins, unless a candidate with fewer laws, but every sure one, is not clearly worse on the same blocks
+(`_choose`). Candidates are cross-validated in the order of their fit error plus spread, until that exceeds the smallest
+score; those that the search has cross-validated already count as well. When time runs out first, the hypothesis with
+the smallest fit error plus spread is used if the refit is more than NEAR_RATIO worse. Test recordings are never used.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from .posterior import Posterior, explainable_remainder, hypotheses_named, share
 from .search.hypotheses import likeliest
 from .search.learned import Learned, LearnedForce, describe_learned, refit_learned
 from .search.moves import Search
-from .search.trials import Trial
+from .search.trials import Name, Trial
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,16 +136,16 @@ def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction
     best = answer.best
     if search.interrupted or _is_settled(search, answer):
         return uncompared_correction(search, best.fitted), best.fitted
-    refit = _cross_validate_refit(search)
+    refit, sure = _cross_validate_refit(search), _sure_names(answer)
     candidates = [_Candidate.of(search, t) for t in _named_hypotheses(search, answer)]
     validated = _compare(search, candidates, refit, candidates[0])
     if not validated:
         stays = candidates[0].base
         return replace(uncompared_correction(search, stays.fitted), closest=stays), stays.fitted
-    chosen = _choose(validated)[0].base
+    chosen = _choose(validated, sure)[0].base
     learned = _learned_candidates(search, search.memo[(chosen if chosen.laws else best).key])
     learned += _learned_candidates(search, search.root, taken={e.port for e in best.laws})
-    return _describe_best(search, _cross_validate(search, learned, validated), search.floor)
+    return _describe_best(search, _cross_validate(search, learned, validated), search.floor, sure)
 
 
 def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
@@ -172,9 +172,11 @@ def _cross_validate_refit(search: Search) -> list[_Validated]:
     return _cross_validate(search, [_Candidate.of(search, search.root)], [])
 
 
-def _describe_best(search: Search, validated: list[_Validated], floor: Floor) -> tuple[Correction, Fitted]:
-    """Describe the candidate with the smallest expected error, beside the refit, which comes first."""
-    candidate, expected = _choose(validated)
+def _describe_best(
+    search: Search, validated: list[_Validated], floor: Floor, sure: frozenset[Name] = frozenset()
+) -> tuple[Correction, Fitted]:
+    """Describe the chosen candidate, beside the refit, which comes first."""
+    candidate, expected = _choose(validated, sure)
     fitted, base = candidate.fitted, candidate.base
     shares = _shares(search, base.fitted, fitted, floor)
     learned: tuple[Learned, ...] = ()
@@ -227,25 +229,34 @@ def _far_better(search: Search, candidates: Sequence[_Candidate]) -> Trial:
     return search.root if best is None or near else best.base
 
 
-def _choose(validated: Sequence[_Validated]) -> _Validated:
+def _choose(validated: Sequence[_Validated], sure: frozenset[Name] = frozenset()) -> _Validated:
     """Choose the candidate with the smallest expected error on other recordings, or one with fewer laws.
 
-    The smallest of many errors is small by chance as well. So a candidate with fewer laws is chosen if its errors on
-    the held-out blocks are not clearly larger (`HeldOut.clearly_above`); of those with the fewest, the best.
+    The smallest of many errors is small by chance as well. So a candidate with fewer laws, and all those whose names
+    are sure, is chosen if its errors on the held-out blocks are not clearly larger (`HeldOut.clearly_above`); of those
+    with the fewest, the best.
     """
     best = min(validated, key=lambda p: p[1].mean_square)
     plainer = [
-        p for p in validated if p[0].elements < best[0].elements and not p[1].held_out.clearly_above(best[1].held_out)
+        p
+        for p in validated
+        if p[0].elements < best[0].elements
+        and sure <= p[0].base.names
+        and not p[1].held_out.clearly_above(best[1].held_out)
     ]
     return min(plainer, key=lambda p: (p[0].elements, p[1].mean_square), default=best)
 
 
 def _named_hypotheses(search: Search, answer: Posterior) -> list[Trial]:
     """List the likeliest hypothesis, and the one without the effects whose names are not certain."""
-    sure = frozenset(e.name for e in answer.effects if e.confidence > SURE)
+    sure = _sure_names(answer)
     fewer = hypotheses_named(search, sure) if sure else []
     tried = {t.key: t for t in (answer.best, *sorted(fewer, key=lambda t: t.mean_square)[:1])}
     return [search.thorough(t) for t in tried.values()]
+
+
+def _sure_names(answer: Posterior) -> frozenset[Name]:
+    return frozenset(e.name for e in answer.effects if e.confidence > SURE)
 
 
 def _hypotheses_with_laws(search: Search) -> list[Trial]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 
-from pilfr_casadi.diagnose.fits.evidence import HeldOut
+from pilfr_casadi.diagnose.correction import _choose
+from pilfr_casadi.diagnose.fits.evidence import ExpectedError, HeldOut
 
 BLOCKS = np.array([0.11, 0.26, 0.06, 0.19, 0.05, 0.12, 0.06, 0.18])
 
@@ -24,6 +27,27 @@ def test_a_small_but_steady_difference_decides() -> None:
     steadily = BLOCKS * np.array([1.1, 1.08, 1.12, 1.1, 1.09, 1.11, 1.1, 1.07])
     assert held_out(steadily).clearly_above(held_out(BLOCKS))
     assert not held_out(BLOCKS).clearly_above(held_out(steadily))
+
+
+def test_a_law_that_acts_in_few_blocks_decides() -> None:
+    """As a stop that is met once or twice: what it explains varies too much for a standard error."""
+    without = BLOCKS * np.array([1.0, 80.0, 2.0, 1.0, 1.0, 120.0, 1.0, 1.0])
+    assert held_out(without).clearly_above(held_out(BLOCKS))
+    assert not held_out(without * np.array([1, 1, 1, 1, 0.8, 1, 1, 1])).clearly_above(held_out(BLOCKS))
+    hardly = BLOCKS * np.array([1.0, 1.5, 1.0, 1.0, 1.0, 1.2, 1.0, 1.0])
+    assert not held_out(hardly).clearly_above(held_out(BLOCKS))
+
+
+def test_a_sure_law_stays() -> None:
+    """A law that the correction leaves out has no name in the answer either."""
+    law = ("wall", "clearance")
+    errors = {frozenset(): BLOCKS * np.array([1.1, 20.0, 0.9, 1.05, 0.95, 1.0, 0.9, 1.1]), frozenset({law}): BLOCKS}
+    refit, named = (
+        (SimpleNamespace(elements=len(names), base=SimpleNamespace(names=names)), ExpectedError(held_out(each), 0.0))
+        for names, each in errors.items()
+    )
+    assert _choose([refit, named]) is refit  # type: ignore[list-item]
+    assert _choose([refit, named], frozenset({law})) is named  # type: ignore[list-item]
 
 
 def test_without_blocks_the_smallest_error_decides() -> None:
