@@ -150,8 +150,9 @@ def _compare_delayed(
         g = float(integral @ path / (integral @ integral))
         return g, float(np.linalg.norm(path - g * integral) / np.sqrt(len(path)))
 
-    longest = np.clip(latest, *(sign * dt * max(map(len, z)) / 2 for sign in (-1, 1)))
-    found = minimize_scalar(lambda delay: fit(delay)[1], bounds=sorted((0.0, longest)), method="bounded")
+    half = dt * max(map(len, z)) / 2  # so that much of the longest recording is left
+    bounds = max(min(latest, 0.0), -half), min(max(latest, 0.0), half)
+    found = minimize_scalar(lambda delay: fit(delay)[1], bounds=bounds, method="bounded")
     g, left = fit(found.x)
     return float(found.x), 1 / g if g else np.inf, left
 
