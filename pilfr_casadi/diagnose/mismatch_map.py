@@ -61,7 +61,8 @@ def mismatch(
     power = np.concatenate([np.mean(v**2, axis=1) for v in e])
     low, high = _bands(max(map(len, e)), dt)
     envelope = [_envelope(v) for v in y]
-    rates = [np.sqrt(np.mean(np.gradient(v, dt, axis=0) ** 2, axis=1)) for v in y]
+    slopes = _scored([np.gradient(v, dt, axis=0) for v in simulated], recordings, scale)  # of which one may be scored
+    rates = [np.sqrt(np.mean(v**2, axis=1)) for v in slopes]
     u = [r.u[r.skip :] for r in recordings]
     spread = np.std(np.concatenate(u), axis=0)
     inputs = [_envelope(v / np.where(spread > 0, spread, 1.0)) for v in u]

@@ -155,6 +155,14 @@ def test_many_recordings_and_outputs_and_odd_ones():
     json.dumps(found, allow_nan=False)
 
 
+def test_a_recording_of_which_one_sample_is_scored():
+    rng = np.random.default_rng(0)
+    r = [Recording(np.zeros(m), rng.standard_normal(m), 0.01, "u", "y", skip=s) for m, s in ((400, 0), (40, 39))]
+    found = mismatch(r, [0.1 * v.y for v in r], [v.y for v in r], 1e-4, np.ones(1))
+    json.dumps(found, allow_nan=False)
+    assert len(found["time"]) == 2
+
+
 def test_a_diverging_simulation_still_gives_numbers():
     e = np.full(M, np.nan)
     e[:100] = 0.1
