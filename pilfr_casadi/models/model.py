@@ -68,7 +68,8 @@ class Model:
         For each entry of the state, the number of the unknown that it is if the initial state is unknown; entries with
         the same number begin alike. By default each entry has its own.
     hold : {"zero", "linear", "band-limited", "next"}
-        Course of the inputs between samples; see `Recording.hold`. All but "zero" need a step that reads "next".
+        Course of the inputs between samples; see `Recording.hold`. All but "zero" need a step that reads "next"; for
+        such a step "linear" takes the place of "zero".
     """
 
     step: ca.Function
@@ -85,6 +86,10 @@ class Model:
     resting: ca.Function | None = None
     begin_alike: tuple[int, ...] = ()
     hold: str = "zero"
+
+    def __post_init__(self) -> None:
+        if "next" in self.reads and not COURSES[self.hold].end:
+            object.__setattr__(self, "hold", "linear")
 
     @cached_property
     def initial_basis(self) -> np.ndarray:

@@ -1,5 +1,7 @@
 """Models: one step with a port, closing the loop, and properties of all models."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ from hypothesis import given, settings, strategies as st
 from random_models import OPERATORS, random_input, random_lfr, reference
 
 from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording
 from pilfr_casadi.models import (
     PILFR,
     GeneralizedPlay,
@@ -254,3 +257,10 @@ def test_gauge_freedoms_change_no_output(seed, operator, n_w):
     state = np.concatenate([np.linalg.solve(t, x), (alpha[:, None] * q).ravel()])
     again, _ = run(structure.model(2, 1, other), u, state)
     np.testing.assert_allclose(again, y, rtol=0, atol=1e-11 * np.max(np.abs(y)))
+
+
+@pytest.mark.parametrize("hold", ["zero", "linear", "next"])
+def test_a_step_that_reads_the_next_inputs_gets_them(hold):
+    plant = open_model(lambda x, u, w, p: (u[0] + u[1], x), lambda x, u, p: x, ParameterSet({}), n_x=1, n_u=2, n_w=0)
+    model = replace(plant, reads=("u", "next"), hold=hold)
+    assert model.drive(Recording(np.arange(3.0), np.zeros(3), 0.1)).tolist() == [[0, 1], [1, 2], [2, 2]]
