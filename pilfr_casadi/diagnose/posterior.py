@@ -277,11 +277,13 @@ def _shares(logs: np.ndarray) -> np.ndarray:
 def indistinguishable(search: Hypotheses, best: Trial, element: Placed) -> dict[Name, Trial]:
     """Find hypotheses, about as likely as the best, that have another effect in place of one of its effects.
 
-    The same law in every sensor is one effect, at "sensor:a + sensor:b".
+    Its laws count in their likeliest form: in a correction they may have another one. The same law in every sensor is
+    one effect, at "sensor:a + sensor:b".
     """
     own = element.name
     rest, out = best.names - {own}, dict[Name, Trial]()
-    least = search.evidence(best) - INDISTINGUISHABLE_NATS
+    likeliest_form = max(search.evidence(t) for t in (best, *search.memo.values()) if t.names == best.names)
+    least = likeliest_form - INDISTINGUISHABLE_NATS
     every = [port_name(SENSOR, name) for name in search.bench.simulator.output_names]
     for t in sorted(search.memo.values(), key=search.evidence, reverse=True):
         other = t.names - rest

@@ -8,6 +8,7 @@ import numpy as np
 
 from pilfr_casadi.diagnose.correction import _choose
 from pilfr_casadi.diagnose.fits.evidence import ExpectedError, HeldOut
+from pilfr_casadi.diagnose.posterior import indistinguishable
 
 BLOCKS = np.array([0.11, 0.26, 0.06, 0.19, 0.05, 0.12, 0.06, 0.18])
 
@@ -52,3 +53,17 @@ def test_a_sure_law_stays() -> None:
 
 def test_without_blocks_the_smallest_error_decides() -> None:
     assert HeldOut(0.2, 0.2, np.array([0.2])).clearly_above(HeldOut(0.1, 0.1, np.array([0.1])))
+
+
+def test_a_law_is_compared_in_its_likeliest_form() -> None:
+    """A correction may have another form, such as one with more values."""
+    trials = {
+        name: SimpleNamespace(names=frozenset({("wall", law)}), evidence=evidence)
+        for name, law, evidence in (("plain", "friction", 17), ("curved", "friction", 13), ("other", "damping", 13))
+    }
+    bench = SimpleNamespace(simulator=SimpleNamespace(output_names=("y",)))
+    search = SimpleNamespace(memo=trials, evidence=lambda t: t.evidence, bench=bench)
+    own = SimpleNamespace(name=("wall", "friction"), law=SimpleNamespace(id="friction"))
+    assert not indistinguishable(search, trials["curved"], own)  # type: ignore[arg-type]
+    trials["other"].evidence = 17
+    assert list(indistinguishable(search, trials["curved"], own)) == [("wall", "damping")]  # type: ignore[arg-type]
