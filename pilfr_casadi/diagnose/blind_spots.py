@@ -392,7 +392,7 @@ def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) 
 
     if found.rough:
         left = f"{percent(found.error)} of the outputs' deviation"
-        yield BlindSpot("rough", (), f"The refitted simulator leaves {left}, so all of this is rough.")
+        yield BlindSpot("rough", (), f"The refitted simulator leaves {left}: blind spots are known roughly.")
     yield from spot("constant-input", still, "Constant in all recordings: {}.")
     if not found.parameters:
         text = "The simulator has no free parameter, so a wrong value and a missing law look alike."

@@ -237,7 +237,7 @@ def _conclude_without_a_law(search: Search, judged: _Judged) -> Conclusion | Non
     if named and answer.sure >= SURE:
         return None
     refitted = search.root.fitted
-    left = answer.best.mean_square / search.root.mean_square if named else 1.0
+    left = (answer.best if named else search.best).mean_square / search.root.mean_square
     clipping = find_clipped_input(search.bench, refitted, left)
     if clipping is None:
         return None

@@ -189,13 +189,17 @@ def next_experiment(
     m = min(max(map(len, bench.recordings)), LONGEST_EXPERIMENT)
     rest = np.median(u, axis=0)
     best: dict[str, Any] | None = None
+    swings = np.zeros(len(noise))
 
-    def separation(drive: np.ndarray) -> float:
+    def simulated(drive: np.ndarray) -> list[np.ndarray]:
         recording = bench.recordings[0].with_(
             u=drive, y=np.zeros((len(drive), len(noise))), initial="zero", period=None, skip=0
         )
         with np.errstate(all="ignore"):
-            y = [f.simulate(recording, np.zeros(f.model.n_state)) for f in (one, other)]
+            return [f.simulate(recording, np.zeros(f.model.n_state)) for f in (one, other)]
+
+    def separation(y: Sequence[np.ndarray]) -> float:
+        with np.errstate(all="ignore"):
             value = float(np.sqrt(np.mean(((y[0] - y[1]) / np.maximum(noise, 1e-300)) ** 2)))
         return value if np.isfinite(value) else 0.0
 
@@ -209,7 +213,8 @@ def next_experiment(
                 least, largest = sorted((low + amplitude, high - amplitude))
                 level = float(np.clip(rest[i], least, largest))
                 drive[:, i] = level + amplitude * wave
-                value = separation(drive)
+                y = simulated(drive)
+                value = separation(y)
                 if best is None or value > BETTER_RATIO * best["separation"]:
                     best = {
                         "input": name,
@@ -219,12 +224,14 @@ def next_experiment(
                         "frequency": f,
                         "separation": value,
                     }
+                    swings = np.max([np.ptp(one, axis=0) for one in y], axis=0)
     if best is None or best["separation"] < 1.0:
         return None
-    recorded = max(separation(r.u[:m]) for r in bench.recordings)
+    recorded = max(separation(simulated(r.u[:m])) for r in bench.recordings)
     if best["separation"] < BETTER_RATIO * recorded:
         return None
-    return {**best, "recorded": recorded, "sentence": _describe_experiment(bench, best, recorded, rivals)}
+    sentence = _describe_experiment(bench, best, recorded, rivals) + _describe_travel(bench, swings)
+    return {**best, "recorded": recorded, "sentence": sentence}
 
 
 def _waves(m: int, dt: float) -> Iterator[tuple[str, float, np.ndarray]]:
@@ -247,6 +254,20 @@ def _describe_experiment(bench: Workbench, best: Mapping[str, Any], recorded: fl
         f"A {best['waveform']} of {best['frequency']:.3g} Hz with amplitude {swing}{level} at "
         f"{best['input']} separates {rivals} best: their outputs then differ by {best['separation']:.3g} times the "
         f"noise (in these recordings {so_far})."
+    )
+
+
+def _describe_travel(bench: Workbench, swings: np.ndarray) -> str:
+    """Warn of the output that would leave most the range over which it was recorded, if one would."""
+    known = np.max([np.ptp(r.y, axis=0) for r in bench.recordings], axis=0)
+    i = int(np.argmax(swings / np.maximum(known, 1e-300)))
+    if not swings[i] > known[i]:
+        return ""
+    name = bench.simulator.output_names[i]
+    unit = {**bench.simulator.units, **bench.recordings[0].units}.get(name, "")
+    return (
+        f" By the simulation {name} would vary over {value_with_unit(swings[i], unit)}; in these recordings it varies "
+        f"over {value_with_unit(known[i], unit)}."
     )
 
 

@@ -232,6 +232,8 @@ class ResultText:
                 "the outputs' deviation). Either its values, units or bounds are wrong: check them before you "
                 "trust a name. Or large physics is missing: then the corrected simulator follows far better."
             )
+            if train["before"] > 1:
+                out[-1] += " Shares of the mismatch count such an error as the outputs' deviation."
         if train and self.verdict != "unexplained":
             out += self._remaining_error(train["after"])
         far = test and train and test["after"] > FAR_RATIO * max(train["after"], self.noise_on_tests["nrmse"])

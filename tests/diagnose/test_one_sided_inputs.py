@@ -1,12 +1,17 @@
 """A valve that only opens: dead zones seen from one side, offsets that are none, inputs that the recorder clipped."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
 from pilfr_casadi.diagnose.faults.samples import find_clipped_input, find_clipping
+from pilfr_casadi.diagnose.pipeline import _conclude_without_a_law, _Judged
+from pilfr_casadi.diagnose.posterior import posterior
 from pilfr_casadi.diagnose.preparation import prepare
+from pilfr_casadi.laws import CubicStiffness
 
 DT = 0.02
 
@@ -82,6 +87,20 @@ def test_a_clipped_input_is_a_fault_of_the_recording():
 def swinging(m=1200):
     t = np.arange(m) * DT
     return 12 * np.sin(2 * np.pi * 0.21 * t) * np.cos(2 * np.pi * 0.043 * t)
+
+
+def test_an_input_at_its_limits_is_no_fault_where_a_law_without_a_name_leaves_less():
+    """As where the time ends before the law is sure: a drive's limit is the true input."""
+    d = pilfr.diagnose(
+        stage(), recorded(np.clip(swinging(), -9, 9), moved(swinging()), 6), laws=(CubicStiffness,), workers=1
+    )
+    assert d.verdict == "recording-fault"
+    search = d.evidence.search
+    judged = _Judged.of(search, replace(posterior(search), effects=()), ())
+    assert judged.kind == "unexplained" and _conclude_without_a_law(search, judged).verdict.kind == "recording-fault"
+    law = next(t for t in search.memo.values() if t.laws)
+    search.memo[law.key] = replace(law, mean_square=1e-3 * law.mean_square)
+    assert _conclude_without_a_law(search, judged) is None
 
 
 def test_a_command_that_stops_at_its_limits_is_no_fault_beside_a_missing_law():

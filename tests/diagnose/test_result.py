@@ -1,6 +1,7 @@
 """The answer of a diagnosis: its verbs, what it says of a doubtful correction, and the progress on the way to it."""
 
 import json
+import re
 from dataclasses import replace
 from itertools import pairwise
 from typing import ClassVar
@@ -18,7 +19,7 @@ from pilfr_casadi.diagnose.faults.offsets import Offset
 from pilfr_casadi.diagnose.proof import Started, compare_errors, next_experiment
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.identify import run_free
-from pilfr_casadi.laws import Backlash, CoulombFriction, CubicStiffness, StopHysteresis
+from pilfr_casadi.laws import Backlash, CoulombFriction, CubicDamping, CubicStiffness, StopHysteresis
 from pilfr_casadi.models import Parameter
 from pilfr_casadi.report import diagnosis_report
 from pilfr_casadi.simulators import Simulator
@@ -279,6 +280,19 @@ def test_the_next_experiment_has_a_unit_that_the_simulator_knows():
     both = [bench.run(s, {k: p.value for k, p in s.parameters.items()}, [np.zeros(2)]) for s in (known, stiffening)]
     found = next_experiment(bench, *both, noise=1e-3 * bench.scale)
     assert " N at force separates the two best" in found["sentence"]
+
+
+def test_the_next_experiment_says_where_the_machine_would_leave_its_recorded_range():
+    """A mass without a spring goes far with a slow sine."""
+    free = replace(rig(), parameters={"k": Parameter(0.0, fixed=True), "d": Parameter(4.0)})
+    r = recorded(HIDDEN, 0, samples=200)
+    bench = Workbench.of(free, [r.with_(units={"pos": "mm"})], "zero")
+    dragged = free.with_element("ground", CubicDamping().at({"c_3": 1.0}))
+    both = [bench.run(s, {k: p.value for k, p in s.parameters.items()}, [np.zeros(2)]) for s in (free, dragged)]
+    said = next_experiment(bench, *both, noise=1e-3 * bench.scale)["sentence"]
+    assert re.search(
+        r"By the simulation pos would vary over [^ ]+ mm; in these recordings it varies over [^ ]+ mm\.$", said
+    )
 
 
 def test_the_next_experiment_stays_within_the_recorded_range():

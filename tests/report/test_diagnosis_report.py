@@ -136,6 +136,9 @@ def test_a_test_that_gets_worse_a_refit_that_follows_nothing_and_an_interrupt_ar
     notes = " ".join(found.warnings())
     assert "makes the test recordings worse: their error is 97 % refitted and 140 % with it" in found.summary
     assert "hardly better than a constant (error 97" in notes and "The search was interrupted" in notes
+    far = {role: {**e, "before": 8.1} for role, e in d.errors.items()}
+    shares = "Shares of the mismatch count such an error as the outputs' deviation."
+    assert shares in " ".join(replace(d, errors=far).warnings()) and shares not in notes
     written = json.loads((diagnosis_report(found, tmp_path).parent / "diagnosis.json").read_text())
     text = Reader((tmp_path / "report.html").read_text()).text
     assert written["interrupted"] and written["notes"] == found.warnings()

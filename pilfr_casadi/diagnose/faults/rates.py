@@ -37,9 +37,12 @@ def find_wrong_rates(bench: Workbench) -> list[Gate]:
             when = "late, as from a filter" if late > 0 else "early"
             words.append(f"{'comes' if words else f'follows the derivative of {coordinate}'} {abs(late):.3g} s {when}")
         if words:
+            instead = f"compute it as the derivative of {coordinate}"
+            if rate in bench.simulator.output_names:
+                instead = f"leave {rate} out of the simulator's outputs"
             sentence = (
                 f"{rate} {in_words(words)}. Laws that depend on the rate, such as friction, may then go unnamed or get "
-                f"wrong names: take the rate from {coordinate} instead."
+                f"wrong names: {instead}."
             )
             found.append(Gate(rate, "rate", late, sentence, corrected=False))
     return found

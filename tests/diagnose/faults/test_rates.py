@@ -56,8 +56,10 @@ def sentences(simulator: Simulator, u: list[np.ndarray], y: list[np.ndarray]) ->
 def test_a_filtered_speed_is_late() -> None:
     (found,) = sentences(SPINDLE, [POSITION, filtered(SPEED)], [SPEED])
     assert found.startswith("speed follows the derivative of position 0.2 s late, as from a filter. Laws that depend")
+    assert found.endswith("wrong names: compute it as the derivative of position.")
     (found,) = sentences(MASS, [SPEED], [POSITION, filtered(SPEED)])
     assert found.startswith("speed follows the derivative of position 0.2 s late")
+    assert found.endswith("wrong names: leave speed out of the simulator's outputs.")
 
 
 @pytest.mark.parametrize("delay", [0.2, 0.4])
