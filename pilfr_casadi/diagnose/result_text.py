@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import multiple, percent
+from .._base import listed, multiple, percent
 from ..data import DIVERGING, Recording
 from ..models import ParameterSet, is_at_bound
 from ..simulators import ACTUATOR, Placed, Simulator, name_at, split_port
@@ -359,7 +359,7 @@ class ResultText:
             free = {name: p for name, p in own.items() if not np.all(p.fixed)}
             lines += [f"  {name} = {value_with_unit(p.value, p.unit, 5)}" for name, p in free.items()]
             others = self._alike(e)
-            lines += [f"  cannot be told apart from {', '.join(others)}"] if others else []
+            lines += [f"  cannot be told apart from {listed(others, MOST_PRINTED)}"] if others else []
         return lines
 
     def _alike(self, e: Placed) -> list[str]:
