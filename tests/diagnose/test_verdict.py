@@ -76,6 +76,27 @@ def test_noise_in_a_slow_machine_does_not_swell_with_it(pole):
     assert found.verdict == "complete", found.sentence
 
 
+@pytest.mark.parametrize("switches", [True, False])
+def test_what_a_gain_that_switches_leaves_is_no_slow_noise(switches):
+    """Over long blocks the power of a steady input hardly varies: only the samples show what drives the error."""
+    transducer = Simulator(
+        lambda x, u, p: {},
+        lambda x, u, p: {"reading": p.gain * u.drive},
+        states=(),
+        inputs=("drive",),
+        parameters={"gain": Parameter(2.5, bounds=(1, 5))},
+    )
+    rng, t = np.random.default_rng(4), np.arange(3000) * 0.01
+    u = np.sin(4 * np.pi * t + 0.1 * np.cumsum(rng.standard_normal(3000)))[:, None]
+    gain = 1 + 0.03 * np.where(np.sin(2 * np.pi * t / 12) > 0, 1, -1)[:, None]
+    slow = lfilter([1], [1, -0.98], rng.standard_normal((3300, 1)), axis=0)[300:]
+    y = 2.5 * u * gain if switches else 2.5 * u + 0.03 * slow * np.std(u) / np.std(slow)
+    noise = 1e-3 * np.std(u) * rng.standard_normal(u.shape)
+    r = Recording(u, y + noise, 0.01, ("drive",), ("reading",), hold="zero")
+    found = pilfr.diagnose(transducer, r, laws=("saturation",), effects=1, workers=1)
+    assert found.verdict == ("unexplained" if switches else "complete"), found.sentence
+
+
 def drifted(seed, laws, **options):
     """The verdict on a tank whose sensor drifts."""
     rng, blank = np.random.default_rng([seed, 1]), levels(seed, 2.0)

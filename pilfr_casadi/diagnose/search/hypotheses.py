@@ -21,6 +21,7 @@ from ..fits.coloured_noise import log_likelihood
 from ..fits.evidence import (
     CONTENDING_NATS,
     EFFECT_PRIOR,
+    EXPLAINED_QUIET_NOISE,
     FAR_RATIO,
     FORMULA_ERROR,
     INDISTINGUISHABLE_NATS,
@@ -465,7 +466,8 @@ class Hypotheses:
             return
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
         share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
-        share = 0.0 if best is self.root and self.is_driven else share
+        if best is self.root and share > 1 - EXPLAINED_QUIET_NOISE and self.is_driven:
+            share = 0.0  # what no force explains is noise, but not if the machine drives it
         rest = np.minimum(np.sqrt(share) * self.rms(best), LOUDEST_NOISE * self.bench.scale)
         known, white = self.surrogate_nrmse * self.bench.scale, white_part(self.bench.scored(best.fitted.residual))
         noise = np.minimum(np.hypot(np.maximum(white, rest), known), self.rms(nearest))
