@@ -28,8 +28,8 @@ from .arguments import match_recordings
 from .faults.channels import correct_gross_channel_errors
 from .faults.gates import Checked
 from .fits.evidence import (
-    FORMULA_ERROR,
     EffectiveSamples,
+    formula_tolerance,
     information,
     log_evidence,
     log_prior,
@@ -223,7 +223,7 @@ def _noise2(bench: Workbench, residuals: Sequence[np.ndarray]) -> float:
 
 def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ...], noise2: float) -> float:
     """Compute the log evidence with the laws minus the log evidence of the simulator as given."""
-    tolerance = FORMULA_ERROR * max(plain.cost - noise2, 0.0)
+    tolerance = formula_tolerance(plain.cost, noise2)
     costs = plain.cost + tolerance, after.cost + tolerance
     count = count_samples(bench.scored(after.residual), bench.scored(plain.residual), bench.scale)
     n = EffectiveSamples(noise2 + tolerance, count).at(min(costs))

@@ -392,7 +392,7 @@ class Law:
         for name in own:
             ends = [found.values[f"{name}{end}"] for end in ("", "_mid", "_high") if f"{name}{end}" in found.values]
             own[name] = np.mean(ends, axis=0)
-        yield own
+        yield {**cls().starts_as(found, own), **own}
 
     @property
     def free(self) -> set[str]:

@@ -184,8 +184,10 @@ class PiecewiseStiffness(Law):
         "k_c": ("max_stiffness", -1.0, 1.0),
     }
 
+    side: ClassVar[float] = 1.0  # 1 above the point, -1 below it
+
     def force(self, z: Any, p: Any) -> Any:
-        return p.k_c * ca.fmax(z - p.g, 0)
+        return self.side * p.k_c * ca.fmax(self.side * (z - p.g), 0)
 
 
 class PiecewiseStiffnessBelow(PiecewiseStiffness):
@@ -193,9 +195,61 @@ class PiecewiseStiffnessBelow(PiecewiseStiffness):
 
     form = "below"
     equation = "w = -k_c max(g - z, 0)"
+    side = -1.0
 
-    def force(self, z: Any, p: Any) -> Any:
-        return -p.k_c * ca.fmax(p.g - z, 0)
+
+class LossyContact(PiecewiseStiffness):
+    """A contact that loses energy: it presses harder while it is compressed, and never pulls (Hunt & Crossley 1975)."""
+
+    form = "above, with loss"
+    equation = "w = k_c max(z - g, 0) max(1 + b dz/dt, 0)"
+    source = "Hunt & Crossley (1975), J. Appl. Mech. 42(2)"
+    sentence = "a contact that loses energy: beyond a point, it presses harder while it is compressed, and never pulls"
+    sentences: ClassVar[Mapping[str, str]] = {}
+    units = {"k_c": "w/z", "g": "z", "b": "s/z"}
+    domains = ("mechanical",)
+    restoring = True  # it never pulls
+    starts = {**PiecewiseStiffness.starts, "b": lambda at: (1 / at.speed,)}
+    ranges = {**PiecewiseStiffness.ranges, "b": lambda at: (0.0, 10 / at.speed)}
+    as_base = {"b": 0.0}
+
+    def force(self, z: Any, dz: Any, p: Any) -> Any:  # type: ignore[override]
+        return super().force(z, p) * ca.fmax(1 + self.side * p.b * dz, 0)
+
+
+class LossyContactBelow(PiecewiseStiffnessBelow, LossyContact):
+    """A contact that loses energy, on the other side."""
+
+    form = "below, with loss"
+    equation = "w = -k_c max(g - z, 0) max(1 - b dz/dt, 0)"
+    as_base = LossyContact.as_base
+
+
+class DampedContact(PiecewiseStiffness):
+    """A contact with spring and damper that never pulls, as of a rubber pad; its force has no jump where it begins."""
+
+    form = "above, with damper"
+    equation = "w = k_c max(z - g + T dz/dt, 0)"
+    source = "Brogliato (2016), Nonsmooth Mechanics, ch. 2"
+    sentence = "a contact with a spring and a damper beyond a point, which never pulls"
+    sentences: ClassVar[Mapping[str, str]] = {}
+    units = {"k_c": "w/z", "g": "z", "T": "s"}
+    domains = ("mechanical",)
+    restoring = True  # it never pulls
+    starts = {**PiecewiseStiffness.starts, "T": lambda at: (0.1 * at.half / at.speed,)}
+    ranges = {**PiecewiseStiffness.ranges, "T": lambda at: (0.0, at.half / at.speed)}
+    as_base = {"T": 0.0}
+
+    def force(self, z: Any, dz: Any, p: Any) -> Any:  # type: ignore[override]
+        return super().force(z + p.T * dz, p)
+
+
+class DampedContactBelow(PiecewiseStiffnessBelow, DampedContact):
+    """A contact with spring and damper, on the other side."""
+
+    form = "below, with damper"
+    equation = "w = -k_c max(g - z - T dz/dt, 0)"
+    as_base = DampedContact.as_base
 
 
 class HertzContact(PiecewiseStiffness):

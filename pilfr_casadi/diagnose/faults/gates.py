@@ -24,7 +24,7 @@ import numpy as np
 from ..._base import InputError, multiple, percent
 from ...data import Recording
 from ...optimise import GaussNewton
-from ..fits.evidence import FORMULA_ERROR
+from ..fits.evidence import formula_tolerance
 from ..fits.floor import FEWEST, Floor, effective_size, noise_floor, pool
 from ..fits.linearise import Probe, Run, linearise_runs
 from ..fits.screen import block_diagonal, in_deviations, moved, orthonormal, project_off
@@ -165,7 +165,7 @@ class Checked:
         """
         bench, squares = self.bench, self.fitted.squares
         noise2 = (floor or self.floor).squares(bench.scale)
-        bench = replace(bench, noise2=noise2 + FORMULA_ERROR * max(float(np.mean(squares - noise2)), 0.0))
+        bench = replace(bench, noise2=noise2 + formula_tolerance(squares, noise2))
         cost, balance = pool(squares, bench.noise2)
         fitted = replace(self.fitted, cost=cost, balance=balance)
         if not near_balance(balance, self.fitted.balance):

@@ -121,6 +121,16 @@ class EffectiveSamples:
         return WRONG_MODEL_SAMPLES * self.count / (WRONG_MODEL_SAMPLES + wrong * self.count)
 
 
+def formula_tolerance(mismatch2: np.ndarray | float, noise2: np.ndarray | float) -> float:
+    """Compute the mean square error that any law may leave: no machine follows a formula exactly.
+
+    `mismatch2` and `noise2` are mean squares of the refit's residual and of the noise, in units of the outputs'
+    variance, of each output or pooled. A residual above the outputs' deviation counts as that: a simulator can be wrong
+    by any factor.
+    """
+    return FORMULA_ERROR * max(float(np.mean(np.minimum(mismatch2, 1.0) - noise2)), 0.0)
+
+
 def all_sure(confidences: Iterable[float]) -> bool:
     """Tell whether all confidences are above SURE; False if there is none."""
     return min(confidences, default=0.0) > SURE

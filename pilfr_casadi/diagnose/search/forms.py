@@ -146,11 +146,11 @@ class Forms(Hypotheses):
         added = best.key - parent.key
         return best.with_added(*added) if len(added) == 1 and parent.key < best.key else None
 
-    def fit_finer_forms(self, parent: Trial) -> None:
+    def refine_added(self, parent: Trial) -> None:
         """Fit the best law of a move in its finer forms; then schedule the strength of the best law that allows it."""
         best = self._best_with_one_more(parent)
         if best is not None:
-            self.fit_forms(best, FINER.get(type(best.law), ()))
+            self.fit_finer_forms(best)
         self._vary_strength()
         best = self._best_with_one_more(parent)
         by = (best.law.scheduled_by or best.law.scaled_by) if best is not None else ""
@@ -158,6 +158,12 @@ class Forms(Hypotheses):
             kind = constant(type(best.law))
             self.fit_forms(best, [scheduled(kind, by, p) for p in likely_profiles(kind) if p != best.law.profile])
         self.replace_variation(parent)
+
+    def fit_finer_forms(self, trial: Trial) -> None:
+        """Fit a hypothesis with its added law in each form that contains it, if it was not fitted before."""
+        kind, others = type(trial.law), trial.key - {trial.pair}
+        finer = [*FINER.get(kind, ()), *(k for k in self.laws if k.__base__ is kind and "as_base" in vars(k))]
+        self.fit_forms(trial, [k for k in finer if others | {(trial.port, k)} not in self.memo])
 
     def _vary_strength(self) -> None:
         """Let the strength of the likeliest law of the last move that may vary do so, with every signal.

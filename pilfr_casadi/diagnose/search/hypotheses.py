@@ -23,13 +23,13 @@ from ..fits.evidence import (
     EFFECT_PRIOR,
     EXPLAINED_QUIET_NOISE,
     FAR_RATIO,
-    FORMULA_ERROR,
     INDISTINGUISHABLE_NATS,
     LARGE_MODEL_ERROR,
     LOUDEST_NOISE,
     WRONG_MODEL_SAMPLES,
     EffectiveSamples,
     HeldOut,
+    formula_tolerance,
     held_out_errors,
     information,
     log_evidence,
@@ -92,8 +92,8 @@ class Hypotheses:
     selected: int = 0
     tried: int = 0
     count: float = FEWEST  # samples of the best residual over its correlation time
-    # reference mean square of the mismatch for `tolerance`, all outputs alike; None: that of the refit
-    mismatch2: float | None = None
+    # mean squares of the mismatch (n_y,) for `tolerance`; None: those of the refit
+    mismatch2: np.ndarray | None = None
     _least: tuple[tuple[object, ...], float] | None = None  # what `_least_tolerant` rests on, and its value
 
     @cached_property
@@ -130,9 +130,9 @@ class Hypotheses:
 
     @property
     def tolerance(self) -> float:
-        """Mean square error that any law may leave in any output, because no machine follows a formula exactly."""
-        mismatch2 = float(np.mean(self.root.fitted.squares)) if self.mismatch2 is None else self.mismatch2
-        return FORMULA_ERROR * max(mismatch2 - float(np.mean(self.floor.squares(self.bench.scale))), 0.0)
+        """Mean square error that any law may leave in any output; see `evidence.formula_tolerance`."""
+        mismatch2 = self.root.fitted.squares if self.mismatch2 is None else self.mismatch2
+        return formula_tolerance(mismatch2, self.floor.squares(self.bench.scale))
 
     def _tolerant(self, trial: Trial) -> float:
         """Compute the mean square error of a hypothesis and what its formulas may leave."""

@@ -122,12 +122,12 @@ class Search(Forms):
         An inexact formula can look like one more effect. The law is therefore kept only if the remaining residual can
         be white noise. Residuals below LEAST_FORMULA_ERROR are skipped.
         """
-        base, least = self.best, LEAST_FORMULA_ERROR * self.root.mean_square
+        base, least = self.best, LEAST_FORMULA_ERROR * min(self.root.mean_square, 1.0)
         is_noise = base.mean_square < ABOVE_NOISE**2 * self.least_noise2 + least
         if not base.laws or is_noise or base.mean_square > self.may_leave() or not self.may_go_on():
             return
         noise = self.floor, self.count
-        self.mismatch2, found = float(np.mean(base.fitted.squares)), False
+        self.mismatch2, found = base.fitted.squares, False
         try:
             if self.can_improve(base):
                 self.add(base, few=True)
@@ -222,7 +222,7 @@ class Search(Forms):
             self.record(parent, scored, trials)
             self.estimate_noise()
             best = self.best
-            self.fit_finer_forms(parent)
+            self.refine_added(parent)
             if self.best is not best:
                 self.estimate_noise()
 
@@ -282,14 +282,16 @@ class Search(Forms):
                 return
 
     def _leave_out_each(self) -> None:
-        """Fit the best hypothesis without each of its effects, and with each strength that varies held constant.
+        """Fit the best hypothesis without each of its effects, in other forms of each, and without its variations.
 
-        A later effect can make an earlier one, or its variation, idle.
+        A later effect can make an earlier one, or its variation, idle. It can also show the finer form of one.
         """
         with self.stage("without each effect"):
             while len((best := self.best).effects) > 1 and not self.past_deadline:
                 for element in best.effects:
                     self.leave_out(best, [element])
+                    if self.can_improve(best) and self.may_go_on():
+                        self.fit_finer_forms(best.with_added(element.pair))
                     plain = constant(type(element.law))
                     if plain is not type(element.law) and kind_of(element.port) != PARAMETER:
                         self.fit_forms(self.run_laws(best.laws, best).with_added(element.pair), [plain])
