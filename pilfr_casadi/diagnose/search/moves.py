@@ -166,7 +166,7 @@ class Search(Forms):
         if len(self.best.effects) < self.most_effects:
             self._grow_to_noise()
         self._every_sensor()
-        self._leave_out_each()
+        self.compare_effects()
         self.cross_validate_likeliest()
 
     def _was_worth_it(self, trial: Trial) -> bool:
@@ -281,7 +281,7 @@ class Search(Forms):
             if self.best.key == best.key:
                 return
 
-    def _leave_out_each(self) -> None:
+    def compare_effects(self) -> None:
         """Fit the best hypothesis without each of its effects, in other forms of each, and without its variations.
 
         A later effect can make an earlier one, or its variation, idle. It can also show the finer form of one.

@@ -82,8 +82,8 @@ def complements(one: Law, other: Law) -> bool:
 
 
 def _is_curve(law: Law) -> bool:
-    """Tell whether a law is a curve of position, without memory."""
-    return not law.dissipative and law.reads() == {"z"} and not hasattr(law, "step") and law.order == 0
+    """Tell whether a law is a curve of position, without memory; a contact may depend on the speed as well."""
+    return not law.dissipative and "z" in law.reads() and not hasattr(law, "step") and law.order == 0
 
 
 def relatives(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:

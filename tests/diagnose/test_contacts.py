@@ -1,0 +1,80 @@
+"""Contacts that lose energy, in front of which a simulator without the contact runs away."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from diagnosis_example import recorded, rig
+
+import pilfr_casadi as pilfr
+from pilfr_casadi.diagnose.fits.evidence import FORMULA_ERROR, formula_tolerance
+from pilfr_casadi.laws import CoulombFriction, DampedContact, Law, LossyContact, PiecewiseStiffness
+
+DT = 0.01
+
+
+class Pad(Law):
+    """A rubber pad at the end of the travel: spring and damper where they are in touch, and never a pull."""
+
+    id, equation = "pad", "w = max(k (z - g) + c dz/dt, 0)  (z > g)"
+    sentence = "a rubber pad"
+    units = {"k": "w/z", "c": "w*s/z", "g": "z"}
+
+    def force(self, z, dz, p):
+        return ca.if_else(z > p.g, ca.fmax(p.k * (z - p.g) + p.c * dz, 0), 0)
+
+
+def slider(m=1.0):
+    """A slider that nothing holds."""
+    return pilfr.Simulator(
+        lambda x, u, p: dict(pos=x.vel, vel=(u.force - p.d * x.vel) / p.m),
+        lambda x: dict(pos=x.pos),
+        states=("pos", "vel"),
+        inputs=("force",),
+        parameters=dict(
+            m=pilfr.Parameter(m, unit="kg", bounds=(0.5, 2)), d=pilfr.Parameter(2.0, unit="N s/m", bounds=(0, 6))
+        ),
+        ports=(pilfr.Port("end stop", lambda p: {"vel": -1 / p.m}, lambda x: x.pos, lambda x: x.vel, "N", "m"),),
+    )
+
+
+def pressed(true, seed, samples=500):
+    """A recording of pushes towards the stop and away from it."""
+    rng = np.random.default_rng(seed)
+    level = np.repeat(rng.uniform(-1, 3, samples // 50 + 1), 50)[:samples]
+    u = level + 1.5 * np.sin(2 * np.pi * 2.1 * np.arange(samples) * DT)
+    blank = pilfr.Recording(u[:, None], np.zeros((samples, 1)), DT, ("force",), ("pos",), initial="zero", hold="zero")
+    y = true.simulate(blank)
+    return blank.with_(y=y + 2e-4 * rng.standard_normal(y.shape))
+
+
+def test_a_contact_with_loss_is_told_from_one_without():
+    pad = Pad().at({"k": 400.0, "c": 12.0, "g": 0.1})
+    train, test = (pressed(slider().with_element("end stop", pad), seed) for seed in (0, 1))
+    laws = (PiecewiseStiffness, LossyContact, DampedContact, CoulombFriction)
+    found = pilfr.diagnose(slider(1.2), train, test=test, laws=laws, workers=1)
+    assert [e.law for e in found.effects] == ["piecewise_stiffness"]
+    assert found.effects[0].form in ("above, with loss", "above, with damper") and found.effects[0].confidence > 0.9
+    errors = found.errors["test"]
+    assert errors["before"] > 1 and errors["after"] < 0.1
+
+
+def test_friction_beside_a_contact_shows_its_damper():
+    """A contact with a damper can stand beside friction; and where one without was fitted first, it is refined."""
+    true = rig().with_element("ground", Pad().at({"k": 1000.0, "c": 30.0, "g": 0.01}))
+    true = true.with_element("ground", CoulombFriction().at({"F_c": 2.0, "v_0": 0.01}))
+    train, test = recorded(true, 0, samples=500), recorded(true, 1, samples=400)
+    laws = (PiecewiseStiffness, CoulombFriction, DampedContact)
+    found = pilfr.diagnose(rig(430.0, 5.0), train, test=test, laws=laws, workers=1)
+    forms = {"piecewise_stiffness": "above, with damper", "coulomb_friction": "smooth"}
+    assert {e.law: e.form for e in found.effects} == forms
+
+    search, plain = found.evidence.search, frozenset(("ground", law) for law in laws[:2])
+    search.memo = {key: trial for key, trial in search.memo.items() if key in (frozenset(), plain)}
+    assert search.best.key == plain
+    search.compare_effects()
+    assert search.best.key == {("ground", DampedContact), ("ground", CoulombFriction)}
+
+
+def test_a_simulator_that_runs_away_excuses_no_error():
+    assert formula_tolerance(np.array([0.5]), 0.1) == pytest.approx(0.4 * FORMULA_ERROR)
+    assert formula_tolerance(np.array([400.0, 0.5]), 0.0) == pytest.approx(0.75 * FORMULA_ERROR)
