@@ -47,9 +47,11 @@ class Effect:
 
     @property
     def place(self) -> str:
-        """Tell how sure it is that any law acts at the port, if that is surer than the law."""
+        """Tell for which ports the confidence holds, if for several; and that any law acts there, if that is surer."""
+        ports = dict.fromkeys([self.port, *(port for port, law in self.indistinguishable if law == self.law)])
+        where = f" that it acts at {' or '.join(ports)}" if len(ports) > 1 else ""
         surer = self.at_port > SURE > self.confidence
-        return f"; confidence {self.at_port:.2f} that a law acts there" if surer else ""
+        return where + (f"; confidence {self.at_port:.2f} that a law acts there" if surer else "")
 
     def limit(self, name: str) -> str:
         """Say that a parameter is at the limit of what is tried here, or not distinct from zero; else empty."""

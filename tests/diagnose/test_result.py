@@ -186,6 +186,14 @@ def test_a_port_that_is_surer_than_the_law_is_told(confidence, at_port, told):
     assert effect.to_dict()["confidence_at_port"] == at_port
 
 
+def test_a_confidence_that_holds_for_several_ports_says_so():
+    alike = (("sensor:level", "drift"), ("outlet", "offset"))
+    shown = str(Effect("outlet", "drift", 0.98, "", "", {}, indistinguishable=alike))
+    assert shown.startswith("drift at outlet, confidence 0.98 that it acts at outlet or sensor:level\n")
+    alone = str(Effect("outlet", "drift", 0.98, "", "", {}, indistinguishable=alike[1:]))
+    assert alone.startswith("drift at outlet, confidence 0.98\n")
+
+
 def test_a_value_at_a_limit_of_its_law_is_told():
     class Narrow(Backlash):
         ranges: ClassVar = {"r": ("half", 0.001, 0.06)}
