@@ -421,12 +421,15 @@ class Action:
 def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int | None) -> Action | None:
     """Measure the force of element `number` along the training recordings; None without one, or if its run diverges.
 
-    The equivalent stiffness k and damping c minimise the rms of w - k z - c dz/dt (equivalent linearisation, Krylov &
-    Bogoliubov 1943); a cycle is one upward crossing of the mean of z. If z is a speed, only the damping is measured;
-    a friction has no stiffness. Outside mechanics, where force times motion is no energy, neither has a meaning.
+    The equivalent damping takes the energy that the law takes (Jacobsen 1930), and the equivalent stiffness k minimises
+    the rms of w - k z; in a periodic motion both are those of Krylov & Bogoliubov (1943). A cycle is one upward
+    crossing of the mean of z. If z is a speed, only the damping is measured; a friction has no stiffness. Outside
+    mechanics, where force times motion is no energy, neither has a meaning.
     """
     if number is None:
         return None
+    from scipy.integrate import trapezoid
+
     port = bench.simulator.port(effect.port)
     with np.errstate(all="ignore"):
         runs = [law_signals(bench, fitted, number, i) for i in range(len(bench.recordings))]
@@ -443,8 +446,9 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
         damping = (w - np.mean(w)) @ z / (z @ z)
         rows += [["equivalent damping", float(damping), unit if port.unit and port.across_unit else ""]]
     elif mechanical:
-        (stiffness, damping), *_ = np.linalg.lstsq(np.column_stack([z, dz]), w - np.mean(w), rcond=None)
-        taken = sum(float(np.sum((f[1:] + f[:-1]) / 2 * np.diff(x))) for x, _, f in runs)
+        stiffness = (w - np.mean(w)) @ (z - np.mean(z)) / np.sum((z - np.mean(z)) ** 2)
+        taken = sum(float(trapezoid(f, x)) for x, _, f in runs)
+        damping = taken / max(sum(float(trapezoid(v, x)) for x, v, _ in runs), 1e-300)  # over the integral of v^2
         cycles = sum(int(np.sum(np.diff(np.signbit(x - np.mean(x)).astype(int)) < 0)) for x, _, _ in runs)
         units = [readable_unit(u, port.unit, port.across_unit) for u in ("w*z", "w/z")]
         known = bool(port.unit and port.across_unit)

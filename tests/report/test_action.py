@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from diagnosis_rig import recordings, rig
 
-from pilfr_casadi.diagnose import Effect, Workbench
+from pilfr_casadi.diagnose import Effect, Workbench, law_signals
 from pilfr_casadi.diagnose.faults.offsets import Offset
-from pilfr_casadi.laws import CoulombFriction, CubicStiffness
+from pilfr_casadi.laws import CoulombFriction, CubicStiffness, LossyContact
 from pilfr_casadi.report.diagnosis_tables import element_of, measure_action
 
 
@@ -37,3 +37,17 @@ def test_energy_stiffness_and_damping_are_told_where_they_mean_something(law, un
     action = measure_action(bench, fitted, Effect("ground-m1", law.id, 0.9, "", "", {}, ()), 0)
     told = [row[0].removeprefix("equivalent ").removeprefix("largest ") for row in action.table.rows]
     assert tuple(told) == rows
+
+
+def test_the_equivalent_damping_takes_the_energy_of_the_law():
+    """A contact that loses energy: in a motion that is not periodic, its force and the speed are correlated anyhow."""
+    law = LossyContact({"k_c": 2e4, "g": 0.0, "b": 0.2})
+    simulator = rig().with_element("ground-m1", law)
+    bench = Workbench.of(simulator, recordings(count=1), "zero")
+    fitted = bench.run(simulator, {}, [np.zeros(4)])
+    effect = Effect("ground-m1", law.id, 0.9, "", "", {}, ())
+    rows = {row[0]: row[1] for row in measure_action(bench, fitted, effect, 0).table.rows}
+    z, dz, w = law_signals(bench, fitted, 0, 0)
+    energy = float(np.sum((w[1:] + w[:-1]) / 2 * np.diff(z)))
+    assert energy > 0 and rows["equivalent stiffness"] > 0
+    assert rows["equivalent damping"] == pytest.approx(energy / np.sum((dz[1:] + dz[:-1]) / 2 * np.diff(z)))
