@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from .._base import in_words, multiple, one_blas_thread, percent, to_json
-from ..data import COURSES, HOLD_CHOICES, Recording, moves_freely
+from ..data import COURSES, HOLD_CHOICES, Recording, as_recordings, moves_freely
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, UNKNOWN, in_series, kind_of, port_name, split_port
 from .arguments import check_laws, match_recordings
@@ -30,7 +30,7 @@ from .fits.floor import ABOVE_NOISE, SENSOR_RESOLUTION, Floor
 from .fits.linearise import linearise_runs
 from .fits.workbench import QUICK, Fitted, Workbench
 from .identifiability import ParameterRow, Sensitivity, Tie, assess_parameters, helpful_sensors
-from .preparation import choose_hold
+from .preparation import choose_hold, conversions
 
 IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the blind spot
     "identifiable": ("yes", ""),
@@ -101,6 +101,8 @@ class Check:
         Inputs that the simulator's equations do not read.
     unknown_domains : tuple of str
         Declared ports whose units do not tell the physical domain, so that laws of all domains are tried there.
+    conversions : tuple of str
+        Sentences on channels that are recorded in another unit than the simulator's.
     next_record : str
         The recording that would help most.
     seconds : float
@@ -121,6 +123,7 @@ class Check:
     idle_inputs: tuple[str, ...] = ()
     unknown_domains: tuple[str, ...] = ()
     switches: tuple[str, ...] = ()
+    conversions: tuple[str, ...] = ()
     next_record: str = ""
     seconds: float = 0.0
 
@@ -227,6 +230,7 @@ class Check:
         if self.idle_inputs:
             idle = in_words(self.idle_inputs)
             yield f"inputs that the equations do not read: {idle}; a diagnosis tries their effects"
+        yield from (f"units: {sentence}" for sentence in self.conversions)
 
 
 def _why(r: LawRow) -> str:
@@ -274,10 +278,12 @@ def check(
     InputError
         If simulator and recordings do not fit each other, or the simulation diverges or runs away from them.
     """
-    simulator, recordings, stated = match_recordings(simulator, train, hold)
+    given = as_recordings(train)
+    simulator, recordings, stated = match_recordings(simulator, given, hold)
     wanted = None if laws is None else check_laws(laws)
     now = _refit(Workbench.of(simulator, recordings, stated or "zero", engine), hold_stated=stated is not None)
     found = assess_recordings(now.bench, now.fitted, now.floor, stated or "", wanted)
+    found = replace(found, conversions=tuple(note.sentence for note in conversions(simulator, given)))
     slow = find_held_outputs(recordings)
     return _with_faults(found, now.gates, slow, recordings) if now.gates or slow else found
 

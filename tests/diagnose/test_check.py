@@ -2,11 +2,13 @@
 
 import importlib
 import json
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 import pytest
 from cart import cart
+from diagnosis_example import recorded, rig as spring_rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, check, multisine
@@ -566,3 +568,13 @@ def test_a_law_can_be_told_from_a_parameter_if_one_of_its_forms_can():
     (curve,) = (r for r in found.laws if r.port == "ocv" and r.law == "static_curve")
     assert curve.status == "detectable"
     assert not [b for b in found.blind_spots if b.kind == "followed" and "static_curve" in b.names and "ocv" in b.names]
+
+
+def test_a_channel_in_another_unit_is_told():
+    simulator = replace(spring_rig(), units={"pos": "m"})
+    found = pilfr.check(simulator, recorded(spring_rig(), 0).with_(units={"pos": "mm"}))
+    assert found.conversions == (
+        "pos is recorded in mm, and the simulator has it in m: its values were multiplied by 0.001.",
+    )
+    assert f"\nunits: {found.conversions[0]}\n" in str(found)
+    assert not pilfr.check(spring_rig(), recorded(spring_rig(), 0)).conversions
