@@ -285,24 +285,25 @@ class Trials:
         reset = tuple(users) if first.law.special or not reset else reset
         nominal = {**base.values, **{name: users[name].value for name in reset}}
         starts: list[Mapping[str, Any]] = []
-        # values from the observer's run, which may be near the truth where the simulation is not
-        observed: list[Mapping[str, Any]] = []
+        # the best of each entry, by its score: of the simulation, and of the observer's run, which may be near the truth
+        # where the simulation is not; a start with hardly any force has a small cost as well
+        firsts: list[Mapping[str, Any]] = []
         given: list[Mapping[str, Any]] = []  # with the user's own values of the parameters
-        for entry in entries:
+        for entry in sorted(entries, key=lambda s: s.source != "observer"):
             others = {name: entry.beside.get(name, value) for name, value in base.values.items()}
             for i, own in enumerate(entry.starts):
                 _, named = place_law(base.simulator, entry, own)
                 starts.append({**others, **named})
                 if i == 0:
-                    observed += [starts[-1]] if entry.source == "observer" else []
+                    firsts.append(starts[-1])
                     given.append({**nominal, **named})
                 starts.append(given[-1])
         if first.law.free == set(first.law.strength):  # at zero strength the simulator is unchanged
             zero = {k: 0.0 * np.asarray(v) if k in first.law.free else v for k, v in first.starts[0].items()}
             starts.append({**base.values, **place_law(base.simulator, first, zero)[1]})
         best, *rest = self.part.by_cost(compiled, starts, base.begin)
-        last = (s for s in rest if not any(s is o for o in observed))
-        ranked = [best, *(s for s in observed if s is not best), *last]
+        last = (s for s in rest if not any(s is first for first in firsts))
+        ranked = [best, *(s for s in firsts if s is not best), *last]
         count = len(parent.laws) + 1
         options = {"states": base.begin, "like": compiled}
         brief = self.fit(placed, ranked[:1], count, solver=BRIEF, **options)
