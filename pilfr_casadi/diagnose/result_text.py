@@ -45,6 +45,17 @@ class Basis:
 
 
 @dataclass(frozen=True, eq=False)
+class NamelessLaw:
+    """A law of a correction without a sure name."""
+
+    name: str  # with its port, in words
+    equation: str
+    doubt: str  # what speaks against it, to follow the equation; empty if nothing does
+    values: Mapping[str, tuple[str, str]]  # of the free parameters, with their units
+    alike: str  # the laws, with their ports, that explain the recordings about as well; empty if none does
+
+
+@dataclass(frozen=True, eq=False)
 class ResultText:
     """The data of a `Diagnosis`, which are described there, and what they say in words."""
 
@@ -349,18 +360,25 @@ class ResultText:
 
     def _nameless_lines(self) -> list[str]:
         """List the laws of a correction without a sure name, with their values."""
-        if self.nameless is None:
-            return []
-        lines, parameters = list[str](), self.corrected.readable_parameters()
-        for e in (e for e in self.added if e.law.listed):
-            own = {name: parameters[f"{e.prefix}{name}"] for name in e.law.parameters()}
-            lines.append(f"in the correction, without a sure name: {name_at(e.port, e.law.id, e.law.form)}")
-            lines.append(f"  {e.law.equation}" + self._acts_with_motion(e) * HELPS_MOTION)
-            free = {name: p for name, p in own.items() if not np.all(p.fixed)}
-            lines += [f"  {name} = {value_with_unit(p.value, p.unit, 5)}" for name, p in free.items()]
-            others = self._alike(e)
-            lines += [f"  cannot be told apart from {listed(others, MOST_PRINTED)}"] if others else []
+        lines = list[str]()
+        for law in self.nameless_laws:
+            lines += [f"in the correction, without a sure name: {law.name}", f"  {law.equation}{law.doubt}"]
+            lines += [f"  {name} = {value} {unit}".rstrip() for name, (value, unit) in law.values.items()]
+            lines += [f"  cannot be told apart from {law.alike}"] if law.alike else []
         return lines
+
+    @property
+    def nameless_laws(self) -> list[NamelessLaw]:
+        """The laws of a correction without a sure name."""
+        out, parameters = list[NamelessLaw](), self.corrected.readable_parameters()
+        for e in self.added if self.nameless is not None else ():
+            if e.law.listed:
+                own = {name: parameters[f"{e.prefix}{name}"] for name in e.law.parameters()}
+                free = {name: p for name, p in own.items() if not np.all(p.fixed)}
+                values = {name: (value_with_unit(p.value, "", 5), p.unit) for name, p in free.items()}
+                doubt, alike = self._acts_with_motion(e) * HELPS_MOTION, listed(self._alike(e), MOST_PRINTED)
+                out.append(NamelessLaw(name_at(e.port, e.law.id, e.law.form), e.law.equation, doubt, values, alike))
+        return out
 
     def _alike(self, e: Placed) -> list[str]:
         """Name the laws that explain the recordings about as well in place of one of a correction without a name."""

@@ -205,6 +205,17 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
     return out
 
 
+def nameless_blocks(diagnosis: Diagnosis) -> list[Block]:
+    """Describe the laws of a correction without a sure name: equations, values, and the laws that explain as much."""
+    out = list[Block]()
+    for law in diagnosis.nameless_laws:
+        out += [Text(f"{law.name[0].upper()}{law.name[1:]}{law.doubt}:"), Code(law.equation)]
+        rows = [[name, value, unit or "–"] for name, (value, unit) in law.values.items()]
+        out += [Table(["parameter", "value", "unit"], rows)] if rows else []
+        out += [Text(f"These recordings cannot tell it apart from {law.alike}.")] if law.alike else []
+    return out
+
+
 def candidates_by_pass(diagnosis: Diagnosis) -> list[tuple[list[dict[str, Any]], Any]]:
     """Return the candidates of each pass of the search, best first, and the hypothesis to which they were added.
 

@@ -20,6 +20,7 @@ from pilfr_casadi.diagnose.fits.flexible_forces import flexible_shares, innovati
 from pilfr_casadi.diagnose.posterior import posterior
 from pilfr_casadi.diagnose.verdict import closest_hypothesis, judge
 from pilfr_casadi.laws import CATALOGUE, CoulombFriction, CubicDamping, Delay, Power as StaticPower, Relaxation
+from pilfr_casadi.report.diagnosis_tables import nameless_blocks
 
 
 def test_a_value_of_the_simulator_that_a_law_replaces_is_told_to_come_out_as_zero():
@@ -315,7 +316,10 @@ def test_laws_without_a_sure_name_are_printed_with_those_that_explain_as_much(dr
     shown = str(replace(found, effects=(), verdict="unexplained", correction=unnamed))
     other = {"actuator:force", "sensor:pos"} - {e.port}
     assert f"without a sure name: delay at {e.port}\n  {e.law.equation}\n  T = 0.1" in shown
-    assert f"\n  cannot be told apart from delay at {other.pop()}\n" in shown
+    assert f"\n  cannot be told apart from delay at {(twin := other.pop())}\n" in shown
+    page = nameless_blocks(replace(found, effects=(), verdict="unexplained", correction=unnamed))
+    assert page[0].text == f"Delay at {e.port}:" and page[1].code == e.law.equation
+    assert page[2].rows[0][0] == "T" and page[3].text == f"These recordings cannot tell it apart from delay at {twin}."
 
 
 def test_one_hypothesis_is_told_where_the_time_ended_before_a_comparison(dry_friction):

@@ -285,8 +285,8 @@ class Trials:
         reset = tuple(users) if first.law.special or not reset else reset
         nominal = {**base.values, **{name: users[name].value for name in reset}}
         starts: list[Mapping[str, Any]] = []
-        # the best of each entry, by its score: of the simulation, and of the observer's run, which may be near the truth
-        # where the simulation is not; a start with hardly any force has a small cost as well
+        # the best of each entry, by its score: the observer's run may be near the truth where the simulation is not,
+        # and the cost alone would prefer starts with hardly any force
         firsts: list[Mapping[str, Any]] = []
         given: list[Mapping[str, Any]] = []  # with the user's own values of the parameters
         for entry in sorted(entries, key=lambda s: s.source != "observer"):
