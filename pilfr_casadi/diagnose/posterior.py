@@ -43,7 +43,7 @@ from .fits.evidence import (
 )
 from .fits.floor import ABOVE_NOISE, Floor, times_white
 from .fits.workbench import Fitted
-from .search.hypotheses import Hypotheses
+from .search.hypotheses import Hypotheses, likeliest_forms
 from .search.trials import Name, Trial
 
 
@@ -282,10 +282,10 @@ def indistinguishable(search: Hypotheses, best: Trial, element: Placed) -> dict[
     """
     own = element.name
     rest, out = best.names - {own}, dict[Name, Trial]()
-    likeliest_form = max(search.evidence(t) for t in (best, *search.memo.values()) if t.names == best.names)
-    least = likeliest_form - INDISTINGUISHABLE_NATS
+    forms = likeliest_forms((best, *search.memo.values()), search.evidence)
+    least = next(search.evidence(t) for t in forms if t.names == best.names) - INDISTINGUISHABLE_NATS
     every = [port_name(SENSOR, name) for name in search.bench.simulator.output_names]
-    for t in sorted(search.memo.values(), key=search.evidence, reverse=True):
+    for t in forms:
         other = t.names - rest
         if search.evidence(t) < least or not rest <= t.names or own in other or not other:
             continue

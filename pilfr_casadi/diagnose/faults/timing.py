@@ -18,7 +18,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from ...data import Recording, moves_freely
+from ...data import COURSES, Recording, moves_freely
 from ...laws import Gain, Lag, Law
 from ...simulators import in_series
 from ..fits.floor import ABOVE_NOISE
@@ -71,7 +71,7 @@ class TimeShift(Gate):
         moved = replace(self, value=value, sentence=words)
         if moved.delay > 0:
             moved = replace(moved, sentence=f"{words}, or the machine delays {it} by as much")
-        elif self.finding == "alignment" and abs(value / dt) < 1 + WHOLE_SHIFT and self.hold != "next":
+        elif self.finding == "alignment" and abs(value / dt) < 1 + WHOLE_SHIFT and not COURSES[self.hold].begin:
             moved = replace(moved, sentence=f"{words}, or inputs are means up to their samples (hold 'next')")
         return replace(moved, change=moved.read)
 

@@ -27,6 +27,7 @@ from ..fits.linearise import linearise_runs
 from ..fits.screen import Remainder, Scored
 from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted, refit, refit_with_other_holds
 from .forms import Forms, is_filter, may_stand_beside
+from .hypotheses import likeliest_forms
 from .learned import learn_forces, nearest_to_learned
 from .relatives import choose_pairs, fit_pair, relatives
 from .trials import Effort, Trial
@@ -201,7 +202,7 @@ class Search(Forms):
         plain = [t for t in kept if not (t.law.order or t.law.memory)]
         best, shift_step = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_settled else 0.5
         with self.stage("shifts beside a law"):
-            for trial in self.likeliest_forms(plain)[:FEW] if self.may_go_on() else ():
+            for trial in likeliest_forms(plain, self.optimistic_evidence)[:FEW] if self.may_go_on() else ():
                 bench = replace(self.bench, simulator=trial.fitted.simulator)
                 found = find_time_shift(Checked(bench, trial.fitted), shift_step, given=False)
                 shift = found.gates[0] if found.gates else None
