@@ -145,7 +145,8 @@ def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction
     chosen = _choose(validated, sure)[0].base
     learned = _learned_candidates(search, search.memo[(chosen if chosen.laws else best).key])
     learned += _learned_candidates(search, search.root, taken={e.port for e in best.laws})
-    return _describe_best(search, _cross_validate(search, learned, validated), search.floor, sure)
+    validated = _cross_validate(search, learned, validated)
+    return _describe_chosen(search, _choose(validated, sure), validated[0], search.floor)
 
 
 def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
@@ -164,7 +165,8 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
     chosen = _choose(validated)[0].base
     learned = _learned_candidates(search, search.memo[chosen.key]) if chosen.laws else []
     learned += _learned_candidates(search, search.root)
-    return _describe_best(search, _cross_validate(search, learned, validated), search.least_floor)
+    validated = _cross_validate(search, learned, validated)
+    return _describe_chosen(search, _choose(validated), validated[0], search.least_floor)
 
 
 def _cross_validate_refit(search: Search) -> list[_Validated]:
@@ -172,18 +174,16 @@ def _cross_validate_refit(search: Search) -> list[_Validated]:
     return _cross_validate(search, [_Candidate.of(search, search.root)], [])
 
 
-def _describe_best(
-    search: Search, validated: list[_Validated], floor: Floor, sure: frozenset[Name] = frozenset()
-) -> tuple[Correction, Fitted]:
-    """Describe the chosen candidate, beside the refit, which comes first."""
-    candidate, expected = _choose(validated, sure)
+def _describe_chosen(search: Search, chosen: _Validated, refit: _Validated, floor: Floor) -> tuple[Correction, Fitted]:
+    """Describe the chosen candidate beside the refit."""
+    candidate, expected = chosen
     fitted, base = candidate.fitted, candidate.base
     shares = _shares(search, base.fitted, fitted, floor)
     learned: tuple[Learned, ...] = ()
     if candidate.has_learned:
         laws = dict.fromkeys((*CATALOGUE, *search.laws))
         learned = (describe_learned(search.bench, fitted, shares["learned"], laws),)
-    before, after = validated[0][1].held_out.rms, expected.held_out.rms
+    before, after = refit[1].held_out.rms, expected.held_out.rms
     described = _describe(search, fitted, shares)
     return replace(described, learned=learned, before=before, after=after, closest=base), fitted
 
