@@ -174,9 +174,6 @@ class Law:
         `Local`. Every combination of start values is tried.
     defaults : mapping
         Values of parameters before any are given; otherwise strengths are zero and shapes one.
-    as_base : mapping
-        Values, or functions of the base class' values by name, at which the law equals its base class; parameters of
-        the same name have the same value. Left out if the law is its base class where its own strengths are zero.
     constants : tuple of str
         Shape parameters that no fit changes, such as the revolution of an angle.
     places : tuple of {"parallel", "series", "sensor", "parameter"}
@@ -267,7 +264,6 @@ class Law:
     starts: ClassVar[Mapping[str, Grid]] = {}
     ranges: ClassVar[Mapping[str, Grid]] = {}
     defaults: ClassVar[Mapping[str, Any]] = {}
-    as_base: ClassVar[Mapping[str, Any]] = {}
     constants: ClassVar[tuple[str, ...]] = ()
     places: ClassVar[tuple[str, ...]] = ("parallel",)
     domains: ClassVar[tuple[str, ...]] = ()
@@ -372,18 +368,6 @@ class Law:
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether the law degenerates at its fitted values, so that its sentence is hardly true."""
         return False
-
-    def starts_as(self, plain: Law, own: Mapping[str, Any], shape: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """Start values at which it equals a plainer law with the values `own`; empty if it does not refine that law.
-
-        `shape` has values of the shape parameters of its further terms, which have no strength yet.
-        """
-        if "as_base" in vars(type(self)) and type(plain) is type(self).__base__:
-            values = {name: value(own) if callable(value) else value for name, value in self.as_base.items()}
-            return {**{name: value for name, value in own.items() if name in self.units}, **values}
-        more = [name for name in self.strength if name not in plain.units]
-        refines = plain.strength and plain.units.items() <= self.units.items()
-        return {**(shape or {}), **dict.fromkeys(more, 0.0), **own} if more and refines else {}
 
     @classmethod
     def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:

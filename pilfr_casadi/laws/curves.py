@@ -265,7 +265,6 @@ class AsymmetricSaturation(Saturation):
         "low": lambda at: (at.low - 0.1 * at.half, at.middle),
         "high": lambda at: (at.middle, at.high + 0.1 * at.half),
     }
-    as_base = {"low": lambda own: -own["L"], "high": lambda own: own["L"]}
 
     def force(self, z: Any, p: Any) -> Any:
         return ca.fmax(ca.fmin(z, p.high), p.low) - z
@@ -339,7 +338,6 @@ class AsymmetricDeadZone(DeadZone):
     units = {"g_1": "z", "g_2": "z"}
     starts = dict.fromkeys(units, ("reach", 0.02, 0.15, 0.35))
     ranges = dict.fromkeys(units, ("reach", 0.0, 0.8))
-    as_base = dict.fromkeys(units, lambda own: own["g"])
 
     def force(self, z: Any, p: Any) -> Any:
         return -ca.fmax(ca.fmin(z, p.g_2), -p.g_1)

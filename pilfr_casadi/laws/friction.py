@@ -270,7 +270,6 @@ class PowerDrag(QuadraticDrag):
     units = {"c_n": "w*s^n/z^n", "n": ""}
     starts = {"n": ("", 1.3, 1.6, 2.5)}
     ranges = {"n": ("", 1.15, 4.0)}
-    as_base = {"c_n": lambda own: own["c_2"], "n": 2.0}
 
     def force(self, dz: Any, p: Any) -> Any:
         return p.c_n * signed_power(dz, p.n)

@@ -73,7 +73,6 @@ class PowerStiffness(CubicStiffness):
     domains = ("mechanical", "fluid")
     starts = {"n": ("", 2.0, 2.5, 4.0)}
     ranges = {"n": ("", 1.7, 6.0)}
-    as_base = {"k_n": lambda own: own["k_3"], "n": 3.0}
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_n * signed_power(z, p.n)
@@ -123,7 +122,6 @@ class AsymmetricCubicStiffness(CubicStiffness):
     two_sided = True
     starts = {"b": ("reach", -0.3, 0.3)}
     ranges = {"b": ("reach", -1, 1)}  # beyond that it is a quadratic force
-    as_base = {"b": 0.0}
 
     def force(self, z: Any, p: Any) -> Any:
         return super().force(z, p) + p.k_3 * p.b * z**2
@@ -157,7 +155,6 @@ class ProgressiveStiffness(QuadraticStiffness):
     two_sided = True
     starts = {"b": lambda at: (-0.5 / at.reach, 0.5 / at.reach)}
     ranges = {"b": lambda at: (-1 / at.reach, 1 / at.reach)}  # the cubic part stays below the quadratic one
-    as_base = {"b": 0.0}
 
     def force(self, z: Any, p: Any) -> Any:
         return super().force(z, p) * (1 + p.b * z)
@@ -311,7 +308,6 @@ class OffCentreClearance(Clearance):
     units = {"k_g": "w/z", "g": "z", "m": "z"}
     starts = {"g": ("half", 0.1, 0.3, 0.6), "m": lambda at: at.middle + at.half * np.array([-0.3, 0.0, 0.3])}
     ranges = {"g": ("half", 1e-3, 1.0), "m": lambda at: (at.low, at.high), "k_g": ("max_stiffness", -1.0, 1.0)}
-    as_base = {"m": 0.0}
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_g * (ca.fmax(z - p.m - p.g, 0) - ca.fmax(p.m - z - p.g, 0))

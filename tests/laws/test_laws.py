@@ -475,24 +475,3 @@ def test_a_free_curve_is_free_where_the_signal_was_alone():
     values = {"c": np.ones(8), **shape}
     w = np.array([float(law.force(at, Named("p", values))) for at in (0.0, 2.0, 4.0, 5.0)])
     assert w[0] == pytest.approx(0, abs=1e-12) and np.diff(w) / [2, 2, 1] == pytest.approx([w[3] / 5] * 3)
-
-
-@pytest.mark.parametrize(
-    "kind", [kind for kind in CATALOGUE if "as_base" in vars(kind)], ids=lambda kind: kind.__name__
-)
-def test_a_form_that_contains_its_base_equals_it_where_it_starts(kind):
-    z = np.linspace(-1.0, 1.0, 201)
-    local = Local(z, np.ones(201), 0.01, (201,))
-    plain = kind.__base__()
-    shape = next(iter(plain.shapes(local)))
-    own = {**dict.fromkeys(plain.strength, 1.0), **shape}
-    start = kind().starts_as(plain.at(shape), own)
-    form = unit_forces(kind(), local, [start])[:, 0]
-    np.testing.assert_allclose(form, unit_forces(plain, local, [shape])[:, 0], atol=1e-9)
-    assert set(start) == set(kind.units) and all(start[name] == 1.0 for name in kind.strength)
-    assert kind().starts_as(kind(), start) == {}
-
-
-def test_only_the_class_itself_knows_its_base():
-    """A law that is derived from a form which contains its base does not contain that form in the same way."""
-    assert laws.SkewSaturation().starts_as(laws.AsymmetricSaturation(), {"low": -1.0, "high": 1.0}) == {}
