@@ -134,9 +134,10 @@ def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction
     before a comparison, the named laws stay.
     """
     best = answer.best
-    if search.interrupted or _is_settled(search, answer):
+    # sure names may leave nothing that a force at a port could explain
+    if search.interrupted or (answer.sure > SURE and explainable_remainder(search, best) < FORMULA_ERROR):
         return uncompared_correction(search, best.fitted), best.fitted
-    refit, sure = _cross_validate_refit(search), _sure_names(answer)
+    refit, sure = _cross_validate(search, [_Candidate.of(search, search.root)]), _sure_names(answer)
     candidates = [_Candidate.of(search, t) for t in _named_hypotheses(search, answer)]
     validated = _compare(search, candidates, refit, candidates[0])
     if not validated:
@@ -155,7 +156,7 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
     Where the time ends before a comparison, a hypothesis that is far better than the refit corrects. The floor may
     contain error that no law explains, so that shares are relative to the least noise.
     """
-    refit = _cross_validate_refit(search)
+    refit = _cross_validate(search, [_Candidate.of(search, search.root)])
     candidates = [_Candidate.of(search, t) for t in _hypotheses_with_laws(search)]
     validated = _compare(search, candidates, refit)
     if not validated:
@@ -167,11 +168,6 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
     learned += _learned_candidates(search, search.root)
     validated = _cross_validate(search, learned, validated)
     return _describe_chosen(search, _choose(validated), validated[0], search.least_floor)
-
-
-def _cross_validate_refit(search: Search) -> list[_Validated]:
-    """Cross-validate the refitted simulator; empty if the time is over."""
-    return _cross_validate(search, [_Candidate.of(search, search.root)], [])
 
 
 def _describe_chosen(search: Search, chosen: _Validated, refit: _Validated, floor: Floor) -> tuple[Correction, Fitted]:
@@ -188,12 +184,9 @@ def _describe_chosen(search: Search, chosen: _Validated, refit: _Validated, floo
     return replace(described, learned=learned, before=before, after=after, closest=base), fitted
 
 
-def _is_settled(search: Search, answer: Posterior) -> bool:
-    """Tell whether the names are sure and leave nothing that a force at a port could explain."""
-    return answer.sure > SURE and explainable_remainder(search, answer.best) < FORMULA_ERROR
-
-
-def _cross_validate(search: Search, candidates: Sequence[_Candidate], validated: list[_Validated]) -> list[_Validated]:
+def _cross_validate(
+    search: Search, candidates: Sequence[_Candidate], validated: Sequence[_Validated] = ()
+) -> list[_Validated]:
     """Cross-validate further candidates, the most promising first, as long as they can be best and there is time."""
     out = list(validated)
     for c in sorted(candidates, key=lambda c: c.least):

@@ -199,7 +199,7 @@ class Law:
     flexible : bool
         The law can imitate many others, and is less likely before the data are seen.
     contains : tuple of str
-        Ids of laws that are special cases of it.
+        Ids of laws that are special cases of it, for the catalogue in the documentation.
     signed : tuple of str
         Strengths of a dissipative or restoring law that may have either sign.
     two_sided : bool

@@ -20,9 +20,7 @@ import numpy as np
 
 from ...data import Recording
 
-# rank correlation from which a residual's power depends on a signal, which is then most of what varies it, and its
-# p-value: each residual is compared with many signals
-CORRELATED, P_VALUE = 0.5, 1e-4
+CORRELATED, P_VALUE = 0.5, 1e-4  # rank correlation with a signal that drives a residual, its p-value: many are tried
 REFUTED = 0.01  # probability under measured noise below which an error is not that noise
 ABOVE_NOISE = 2.0  # ratio of the error to the noise from which results say that more is missing
 FEWEST = 30.0  # effective samples that a residual has at least

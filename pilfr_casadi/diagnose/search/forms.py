@@ -111,7 +111,7 @@ class Forms(Hypotheses):
         # after the time of the search, the rest is for the comparison with the refit
         count = MOST_CONVERGED if time.perf_counter() < self.until else 1
         # where a brief fit follows the part that it was made to, the rest may only lack convergence
-        near = [t for t in ranked[:count] if not t.thorough and t.least_error < most]
+        near = [t for t in ranked[:count] if not t.thorough and min(t.mean_square, t.part_mean_square) < most**2]
         converged = self.on_workers(self.fits.converge, near)
         converged += filter(None, self.on_workers(self._reorder, converged))
         for trial in converged:
