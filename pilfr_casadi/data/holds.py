@@ -65,7 +65,7 @@ COURSES: dict[str, Course] = {
 def known_hold(hold: Any, role: str = "hold") -> str | None:
     """Return a hold, None if it is not known; refuse anything else. `role` names it in the message."""
     if hold is not None and not (isinstance(hold, str) and hold in HOLDS):
-        raise InputError(f"{role} is {hold!r}; give {', '.join(map(repr, HOLDS))} or None.")
+        raise InputError(f"{role} is {hold!r}; give {HOLD_CHOICES}, or None.")
     return hold
 
 
@@ -76,7 +76,8 @@ def step_hold(hold: str) -> str:
 
 def becomes_mean(hold: str | None, t: Array, values: Array, step: float) -> bool:
     """Tell whether an input (M,) at times t becomes its mean over a new step: at its next value, or held for a step."""
-    return hold == "next" or (hold == "zero" and levels_last(t, values, step))
+    course = COURSES[hold or "linear"]
+    return course.constant and bool(course.begin or levels_last(t, values, step))
 
 
 def levels_last(t: Array, values: Array, step: float) -> bool:

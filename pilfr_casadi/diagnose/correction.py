@@ -134,9 +134,10 @@ def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction
     before a comparison, the named laws stay.
     """
     best = answer.best
-    if search.interrupted or _is_settled(search, answer):
+    # sure names may leave nothing that a force at a port could explain
+    if search.interrupted or (answer.sure > SURE and explainable_remainder(search, best) < FORMULA_ERROR):
         return uncompared_correction(search, best.fitted), best.fitted
-    refit, sure = _cross_validate_refit(search), _sure_names(answer)
+    refit, sure = _cross_validate(search, [_Candidate.of(search, search.root)]), _sure_names(answer)
     candidates = [_Candidate.of(search, t) for t in _named_hypotheses(search, answer)]
     validated = _compare(search, candidates, refit, candidates[0])
     if not validated:
@@ -145,7 +146,8 @@ def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction
     chosen = _choose(validated, sure)[0].base
     learned = _learned_candidates(search, search.memo[(chosen if chosen.laws else best).key])
     learned += _learned_candidates(search, search.root, taken={e.port for e in best.laws})
-    return _describe_best(search, _cross_validate(search, learned, validated), search.floor, sure)
+    validated = _cross_validate(search, learned, validated)
+    return _describe_chosen(search, _choose(validated, sure), validated[0], search.floor)
 
 
 def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
@@ -154,7 +156,7 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
     Where the time ends before a comparison, a hypothesis that is far better than the refit corrects. The floor may
     contain error that no law explains, so that shares are relative to the least noise.
     """
-    refit = _cross_validate_refit(search)
+    refit = _cross_validate(search, [_Candidate.of(search, search.root)])
     candidates = [_Candidate.of(search, t) for t in _hypotheses_with_laws(search)]
     validated = _compare(search, candidates, refit)
     if not validated:
@@ -164,36 +166,27 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
     chosen = _choose(validated)[0].base
     learned = _learned_candidates(search, search.memo[chosen.key]) if chosen.laws else []
     learned += _learned_candidates(search, search.root)
-    return _describe_best(search, _cross_validate(search, learned, validated), search.least_floor)
+    validated = _cross_validate(search, learned, validated)
+    return _describe_chosen(search, _choose(validated), validated[0], search.least_floor)
 
 
-def _cross_validate_refit(search: Search) -> list[_Validated]:
-    """Cross-validate the refitted simulator; empty if the time is over."""
-    return _cross_validate(search, [_Candidate.of(search, search.root)], [])
-
-
-def _describe_best(
-    search: Search, validated: list[_Validated], floor: Floor, sure: frozenset[Name] = frozenset()
-) -> tuple[Correction, Fitted]:
-    """Describe the chosen candidate, beside the refit, which comes first."""
-    candidate, expected = _choose(validated, sure)
+def _describe_chosen(search: Search, chosen: _Validated, refit: _Validated, floor: Floor) -> tuple[Correction, Fitted]:
+    """Describe the chosen candidate beside the refit."""
+    candidate, expected = chosen
     fitted, base = candidate.fitted, candidate.base
     shares = _shares(search, base.fitted, fitted, floor)
     learned: tuple[Learned, ...] = ()
     if candidate.has_learned:
         laws = dict.fromkeys((*CATALOGUE, *search.laws))
         learned = (describe_learned(search.bench, fitted, shares["learned"], laws),)
-    before, after = validated[0][1].held_out.rms, expected.held_out.rms
+    before, after = refit[1].held_out.rms, expected.held_out.rms
     described = _describe(search, fitted, shares)
     return replace(described, learned=learned, before=before, after=after, closest=base), fitted
 
 
-def _is_settled(search: Search, answer: Posterior) -> bool:
-    """Tell whether the names are sure and leave nothing that a force at a port could explain."""
-    return answer.sure > SURE and explainable_remainder(search, answer.best) < FORMULA_ERROR
-
-
-def _cross_validate(search: Search, candidates: Sequence[_Candidate], validated: list[_Validated]) -> list[_Validated]:
+def _cross_validate(
+    search: Search, candidates: Sequence[_Candidate], validated: Sequence[_Validated] = ()
+) -> list[_Validated]:
     """Cross-validate further candidates, the most promising first, as long as they can be best and there is time."""
     out = list(validated)
     for c in sorted(candidates, key=lambda c: c.least):

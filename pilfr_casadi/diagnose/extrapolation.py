@@ -22,10 +22,10 @@ LONGEST_SEGMENT = 512  # samples from which a spectral density is computed
 def range_note(bench: Workbench, tests: Sequence[Recording]) -> Iterator[Gate]:
     """Note the channels of the test recordings with values or frequencies that the training recordings do not have."""
     simulator, trained, words = bench.simulator, bench.recordings, list[str]()
-    units, names = {**simulator.units, **trained[0].units}, (*simulator.inputs, *simulator.output_names)
+    names = (*simulator.inputs, *simulator.output_names)
     both = (np.concatenate([np.hstack([r.u, r.y])[r.skip :] for r in each]) for each in (trained, tests))
     for i, value, limit in ranges_left(*both):
-        reached, known = (value_with_unit(v, units.get(names[i], "")) for v in (value, limit))
+        reached, known = (value_with_unit(v, bench.unit_of(names[i])) for v in (value, limit))
         words.append(f"{names[i]} reaches {reached} ({known} in training)")
     for i, name in enumerate(simulator.inputs):
         before, now = ([r.u[r.skip :, i] for r in each] for each in (trained, tests))

@@ -37,7 +37,7 @@ from .faults.gates import (
 from .fits.evidence import AT_NOISE_RATIO, BETTER_RATIO, CONTENDING_NATS, FAR_RATIO, NEAR_RATIO, SURE, standard_errors
 from .fits.linearise import simulate_states
 from .fits.workbench import FEW, THOROUGH, Fitted, Workbench, refit
-from .posterior import Posterior, posterior, strained
+from .posterior import Posterior, posterior
 from .search.moves import Search
 from .search.trials import Trial
 
@@ -148,10 +148,12 @@ def may_act_elsewhere(search: Search, trial: Trial) -> bool:
 
     Such laws drive a parameter to a bound, or they are at an actuator or sensor and leave more than white noise.
     """
-    if not search.bench.simulator.unreached:
+    simulator = search.bench.simulator
+    if not simulator.unreached:
         return False
     at_ends = any(in_series(e.port) for e in trial.effects)
-    return strained(search, trial) > 0 or (at_ends and trial.mean_square > AT_NOISE_RATIO**2 * search.least_noise2)
+    above_noise = trial.mean_square > AT_NOISE_RATIO**2 * search.least_noise2
+    return trial.fitted.strained(simulator.parameters) > 0 or (at_ends and above_noise)
 
 
 def find_undeclared_port(search: Search, named: Trial | None = None) -> tuple[tuple[Gate, ...], float]:

@@ -43,7 +43,7 @@ from .fits.evidence import (
 )
 from .fits.floor import ABOVE_NOISE, Floor, times_white
 from .fits.workbench import Fitted
-from .search.hypotheses import Hypotheses
+from .search.hypotheses import Hypotheses, likeliest_forms
 from .search.trials import Name, Trial
 
 
@@ -206,7 +206,8 @@ def _named_beside(search: Hypotheses, best: Trial, effect: LikelyEffect) -> floa
 def _odds_against(search: Hypotheses, trial: Trial, elements: Sequence[Placed]) -> float:
     """Compute how much likelier the fitted values are of wrong laws: at a bound, or where every law degenerates."""
     degenerate = all(search.doubtful(trial, e) for e in elements)
-    return STRAINED_ODDS ** strained(search, trial) * (float(np.exp(-DOUBTFUL_PRIOR)) if degenerate else 1.0)
+    strained = trial.fitted.strained(search.bench.simulator.parameters)
+    return STRAINED_ODDS**strained * (float(np.exp(-DOUBTFUL_PRIOR)) if degenerate else 1.0)
 
 
 def _acts(search: Hypotheses, best: Trial, element: Placed) -> float:
@@ -220,11 +221,6 @@ def _without(search: Hypotheses, best: Trial, effect: LikelyEffect) -> Trial | N
     others = best.names - {effect.name}
     fitted = hypotheses_named(search, others) if others else []
     return min(fitted, key=lambda t: t.mean_square, default=None)
-
-
-def strained(search: Hypotheses, trial: Trial) -> int:
-    """Count the parameters of the simulator that a hypothesis would have beyond the user's bounds."""
-    return trial.fitted.strained(search.bench.simulator.parameters)
 
 
 def _plainest(search: Hypotheses, trials: Sequence[Trial]) -> Trial:
@@ -282,10 +278,10 @@ def indistinguishable(search: Hypotheses, best: Trial, element: Placed) -> dict[
     """
     own = element.name
     rest, out = best.names - {own}, dict[Name, Trial]()
-    likeliest_form = max(search.evidence(t) for t in (best, *search.memo.values()) if t.names == best.names)
-    least = likeliest_form - INDISTINGUISHABLE_NATS
+    forms = likeliest_forms((best, *search.memo.values()), search.evidence)
+    least = next(search.evidence(t) for t in forms if t.names == best.names) - INDISTINGUISHABLE_NATS
     every = [port_name(SENSOR, name) for name in search.bench.simulator.output_names]
-    for t in sorted(search.memo.values(), key=search.evidence, reverse=True):
+    for t in forms:
         other = t.names - rest
         if search.evidence(t) < least or not rest <= t.names or own in other or not other:
             continue
@@ -297,18 +293,18 @@ def indistinguishable(search: Hypotheses, best: Trial, element: Placed) -> dict[
 
 
 def may_be_coloured_noise(search: Hypotheses, quiet: float = 1.0) -> bool:
-    """Tell whether the refit's residual is small and irregular enough to be noise of any colour.
+    """Tell whether the refit's residual is small enough to be noise of any colour, if the machine does not drive it.
 
     `quiet` is the share of its rms that is left without steady tones. Measured noise has its colour already.
     """
     most = COLOURED_NOISE_RATIO if search.floor.source == "estimated" else ABOVE_NOISE
-    small = np.max(search.root.fitted.squares) < LOUDEST_NOISE**2 and quiet * times_of_noise(search) < most
-    return bool(small) and not search.is_driven
+    return bool(np.max(search.root.fitted.squares) < LOUDEST_NOISE**2) and quiet * times_of_noise(search) < most
 
 
 def _is_slow_noise(search: Hypotheses) -> bool:
     """Tell whether the refit's residual may be coloured noise, and no force explains most of its innovations."""
-    return may_be_coloured_noise(search) and search.innovation_share(search.root) < MOST_INNOVATIONS
+    small = may_be_coloured_noise(search) and not search.is_driven
+    return small and search.innovation_share(search.root) < MOST_INNOVATIONS
 
 
 def times_of_noise(search: Hypotheses) -> float:

@@ -36,7 +36,7 @@ from ..simulators import Simulator, discretise, growth_rate
 from .faults.gates import LEAST_GAIN, USELESS_FIT, Gate, evidence_gain
 from .fits.linearise import linearise_runs
 from .fits.workbench import FEW, Fitted, Workbench, growth, refit
-from .search.hypotheses import Hypotheses
+from .search.hypotheses import Hypotheses, likeliest_forms
 from .search.trials import Trial
 
 ROUNDING = 1e-9  # share of the largest entry that counts as zero
@@ -107,7 +107,8 @@ def forget_sooner(search: Hypotheses, simulator: Simulator, memory: float) -> tu
     """
     bench = search.bench
     plain = likeliest = _best_memory(search, search.root, simulator, memory)
-    for trial in search.likeliest_forms(t for t in search.memo.values() if t.names)[:FEW]:
+    named = (t for t in search.memo.values() if t.names)
+    for trial in likeliest_forms(named, search.optimistic_evidence)[:FEW]:
         own = _best_memory(search, trial, simulator, memory)
         count = 0 if trial.information is None else len(trial.information)
         gained = evidence_gain(plain.left, own.left, bench.scored(own.fitted.residual), count)

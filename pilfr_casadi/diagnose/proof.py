@@ -245,7 +245,7 @@ def _waves(m: int, dt: float) -> Iterator[tuple[str, float, np.ndarray]]:
 
 def _describe_experiment(bench: Workbench, best: Mapping[str, Any], recorded: float, rivals: str) -> str:
     """Describe an experiment; `recorded` is the separation in the recordings."""
-    unit = {**bench.simulator.units, **bench.recordings[0].units}.get(best["input"], "")
+    unit = bench.unit_of(best["input"])
     so_far = f"by {multiple(recorded)} times" if recorded > VISIBLE_DIFFERENCE else "not at all"
     about = abs(best["level"]) > VISIBLE_LEVEL * best["amplitude"]
     swing = value_with_unit(best["amplitude"], unit)
@@ -264,7 +264,7 @@ def _describe_travel(bench: Workbench, swings: np.ndarray) -> str:
     if not swings[i] > known[i]:
         return ""
     name = bench.simulator.output_names[i]
-    unit = {**bench.simulator.units, **bench.recordings[0].units}.get(name, "")
+    unit = bench.unit_of(name)
     return (
         f" By the simulation {name} would vary over {value_with_unit(swings[i], unit)}; in these recordings it varies "
         f"over {value_with_unit(known[i], unit)}."

@@ -11,12 +11,12 @@ import numpy as np
 from .._base import listed, multiple, percent
 from ..data import DIVERGING, Recording
 from ..models import ParameterSet, is_at_bound
-from ..simulators import ACTUATOR, Placed, Simulator, name_at, split_port
+from ..simulators import Placed, Simulator, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
 from .effect import Effect
 from .faults.gates import TEST_FAULT, TEST_OFFSET, Gate, value_with_unit
-from .faults.offsets import describe_offsets, find_placed_offsets
+from .faults.offsets import describe_offsets, find_placed_offsets, recorded_at
 from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, all_sure
 from .fits.floor import ABOVE_NOISE
 from .posterior import indistinguishable
@@ -275,11 +275,8 @@ class ResultText:
     def _doubtful_offsets(self) -> Iterator[str]:
         """Generate a note on each offset that is larger than its signal ever was."""
         for parameter, e in find_placed_offsets(self.corrected.elements if self.train else ()).items():
-            kind, name = split_port(e.port)
-            values = [r.u if kind == ACTUATOR else r.y for r in self.train]
-            at = (self.train[0].inputs if kind == ACTUATOR else self.train[0].outputs).index(name)
-            reach = max(float(np.max(np.abs(v[:, at]))) for v in values)
-            value = float(self.corrected.parameters[parameter].value)
+            name, value = split_port(e.port)[1], float(self.corrected.parameters[parameter].value)
+            reach = float(np.max(np.abs(recorded_at(self.train, e.port))))
             if abs(value) > reach:
                 yield (
                     f"The offset of {name} ({value:.3g}) is larger than {name} ever was ({reach:.3g}): it may make up "

@@ -66,7 +66,7 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
         return Verdict("missing-physics", _describe_effects(search, found))
     shares = search.flexible(search.root)
     share = max(shares.values(), default=0.0)
-    slow = share > EXPLAINED_NOISE and may_be_coloured_noise(search)
+    slow = share > EXPLAINED_NOISE and may_be_coloured_noise(search) and not search.is_driven
     if slow:  # a force always seems to explain some of slow noise
         share = search.innovation_share(search.root)
     matters = not slow and np.mean(search.root.fitted.squares) > NEGLIGIBLE_ERROR**2
@@ -127,12 +127,12 @@ def _is_noise(search: Hypotheses, quiet: float, explained: bool, mode: float | N
     times = quiet * times_of_noise(search)
     if times < AT_NOISE_RATIO:
         return True
+    if mode is not None or search.is_driven:
+        return False
     if search.floor.source != "estimated":
-        like = times < ABOVE_NOISE and not explained
-    else:
-        near = quiet**2 * search.root.mean_square < ABOVE_NOISE**2 * search.floor2
-        like = (near and times < WHITE_NOISE_RATIO) or (not explained and may_be_coloured_noise(search, quiet))
-    return like and mode is None and not search.is_driven
+        return times < ABOVE_NOISE and not explained
+    near = quiet**2 * search.root.mean_square < ABOVE_NOISE**2 * search.floor2
+    return (near and times < WHITE_NOISE_RATIO) or (not explained and may_be_coloured_noise(search, quiet))
 
 
 def _describe_effects(search: Hypotheses, found: Posterior) -> str:

@@ -43,7 +43,7 @@ ENVELOPE = {"c": (0, 1), "a0": (-1, 1), "a": (0, 1), "b": (-1, 0), "d": (0, 0)}
 STATES = ("A", "B_u", "B_w", "C_y", "C_z")  # blocks that depend on the coordinates of the states
 FADED = 1e-30  # share of its matrix's largest sensitivity up to which an entry has no effect
 LAGS = 40  # largest lag of the noise model
-DEPENDENT = 1e-10  # part of a unit vector outside the span of others up to which it depends on them
+DEPENDENT = 1e-10  # singular value of unit vectors, over the largest, below which they depend on each other
 AT_BOUND = 1e-9  # change of the normalised outputs that rounding at a bound may cause
 
 
@@ -157,23 +157,11 @@ def orbit_tangents(problem: Problem, theta: Array, structure: PILFR) -> tuple[Ar
 
 def null_space(rows: Array) -> Array:
     """Find an orthonormal basis of the vectors that every row maps to zero, rows scaled to unit length."""
+    from scipy import linalg
+
     length = np.linalg.norm(rows, axis=1)
     rows = rows[length > 0] / length[length > 0, None]
-    if not len(rows):
-        return np.eye(rows.shape[1])
-    return _complement(rows.T)
-
-
-def _complement(columns: Array) -> Array:
-    """Find an orthonormal basis of the orthogonal complement of columns, which may depend on each other."""
-    from scipy.linalg import qr
-
-    q, r = np.linalg.qr(columns, mode="complete")
-    diagonal = np.abs(np.diag(r))
-    if np.any(diagonal <= DEPENDENT * diagonal.max(initial=0.0)):  # pivoting counts the independent columns
-        q, r, _ = qr(columns, pivoting=True)
-        diagonal = np.abs(np.diag(r))
-    return np.asarray(q[:, int(np.sum(diagonal > DEPENDENT * diagonal.max(initial=0.0))) :])
+    return np.asarray(linalg.null_space(rows, rcond=DEPENDENT)) if len(rows) else np.eye(rows.shape[1])
 
 
 def covariance(problem: Problem, theta: Array, structure: PILFR | None = None) -> Array:
@@ -259,8 +247,7 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     used = np.flatnonzero(~at_bound & (sensitivity > 0))
     square, unit = np.ix_(used, used), sensitivity[used]
     removed = np.column_stack([tangents[used] * unit[:, None], slopes[:, used].T / unit[:, None]])
-    length = np.linalg.norm(removed, axis=0)
-    basis = _complement(removed[:, length > 0] / length[length > 0])
+    basis = null_space(removed.T)
     values, vectors = np.linalg.eigh(basis.T @ (hessian[square] / unit / unit[:, None]) @ basis)
     least = 1e-14 * len(used) * values.max(initial=0.0)
     determined, directions = values > least, basis @ vectors

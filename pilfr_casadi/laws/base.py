@@ -176,7 +176,8 @@ class Law:
         Values of parameters before any are given; otherwise strengths are zero and shapes one.
     as_base : mapping
         Values, or functions of the base class' values by name, at which the law equals its base class; parameters of
-        the same name have the same value. Left out if the law is its base class where its own strengths are zero.
+        the same name have the same value. Fits start there once the base class is named. Left out if the law is its base
+        class where its own strengths are zero.
     constants : tuple of str
         Shape parameters that no fit changes, such as the revolution of an angle.
     places : tuple of {"parallel", "series", "sensor", "parameter"}
@@ -202,7 +203,7 @@ class Law:
     flexible : bool
         The law can imitate many others, and is less likely before the data are seen.
     contains : tuple of str
-        Ids of laws that are special cases of it.
+        Ids of laws that are special cases of it, for the catalogue in the documentation.
     signed : tuple of str
         Strengths of a dissipative or restoring law that may have either sign.
     two_sided : bool
@@ -373,26 +374,23 @@ class Law:
         """Tell whether the law degenerates at its fitted values, so that its sentence is hardly true."""
         return False
 
-    def starts_as(self, plain: Law, own: Mapping[str, Any], shape: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """Start values at which it equals a plainer law with the values `own`; empty if it does not refine that law.
-
-        `shape` has values of the shape parameters of its further terms, which have no strength yet.
-        """
-        if "as_base" in vars(type(self)) and type(plain) is type(self).__base__:
-            values = {name: value(own) if callable(value) else value for name, value in self.as_base.items()}
-            return {**{name: value for name, value in own.items() if name in self.units}, **values}
-        more = [name for name in self.strength if name not in plain.units]
-        refines = plain.strength and plain.units.items() <= self.units.items()
-        return {**(shape or {}), **dict.fromkeys(more, 0.0), **own} if more and refines else {}
-
     @classmethod
     def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:
-        """Start values of this form for a law found in another form, with the means of strengths that vary."""
+        """Start values of this form for a law found in another form, with the means of strengths that vary.
+
+        A form that contains the found law begins where it equals it.
+        """
         own = {name: value for name, value in found.values.items() if name in cls.units}
         for name in own:
             ends = [found.values[f"{name}{end}"] for end in ("", "_mid", "_high") if f"{name}{end}" in found.values]
             own[name] = np.mean(ends, axis=0)
-        yield {**cls().starts_as(found, own), **own}
+        based = cls.as_base if cls.extends(type(found)) else {}
+        yield own | {name: value(found.values) if callable(value) else value for name, value in based.items()}
+
+    @classmethod
+    def extends(cls, found: type[Law]) -> bool:
+        """Tell whether this form contains another, so that `as_base` says where both are equal."""
+        return cls.__base__ is found and "as_base" in vars(cls)
 
     @property
     def free(self) -> set[str]:

@@ -112,18 +112,10 @@ class _TwoStages(Law):
 
     form = "two-stage"
     order = follows = 2
-    one_stage: ClassVar[type[Law]]
     ranges = dict.fromkeys(("T_1", "T_2"), Relaxation.ranges["T"])
 
     def flow(self, z: Any, q: Any, p: Any) -> Any:
         return ca.vertcat((z - q[0]) / p.T_1, (z - q[1]) / p.T_2)
-
-    def starts_as(self, plain: Law, own: Mapping[str, Any], shape: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """Start as two parts about as fast as the single part, together as strong."""
-        if type(plain) is not self.one_stage:
-            return {}
-        (strength,) = plain.strength
-        return {**dict.fromkeys(self.strength, own[strength] / 2), "T_1": own["T"] / 2, "T_2": own["T"] * 2}
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         times = np.geomspace(20 * local.dt, local.duration / 2, 5)
@@ -136,7 +128,6 @@ class TwoStageRelaxation(_TwoStages, Relaxation):
 
     equation = "w = k_1 (z - q_1) + k_2 (z - q_2),  dq_i/dt = (z - q_i) / T_i"
     units = {"k_1": "w/z", "k_2": "w/z", "T_1": "s", "T_2": "s"}
-    one_stage = Relaxation
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
         return p.k_1 * (z - q[0]) + p.k_2 * (z - q[1])
@@ -174,7 +165,6 @@ class TwoStageCreep(_TwoStages, Creep):
     equation = "w = c_1 q_1 + c_2 q_2,  dq_i/dt = (u - q_i) / T_i"
     units = {"c_1": "", "c_2": "", "T_1": "s", "T_2": "s"}
     strength = ("c_1", "c_2")
-    one_stage = Creep
     ranges = {**_TwoStages.ranges, "c_1": ("", 0.0, MOST_CREEP), "c_2": ("", 0.0, MOST_CREEP)}
 
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]

@@ -37,7 +37,7 @@ class VaryingParameter(Law):
         """Evaluate a parameter of a value and a lower bound with its change."""
         return value + change
 
-    def starts_as(self, plain: Law, own: Mapping[str, Any], shape: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
         """Start values at which a curve equals another variation with the same signal, fitted to `own`."""
         ends = {name: own[name] for name in ("low", "high")}
         shares = np.array([CURVE_NODES[name.removeprefix("c")] for name in self.strength])

@@ -83,11 +83,6 @@ class _Case:
         noise = float(d.floor["nrmse"]) * bench.scale if noise is None else noise
         return cls(d, bench, d.evidence.without, d.evidence.after, np.nan_to_num(noise))
 
-    def unit(self, name: str) -> str:
-        """Return the unit of an input or output; empty if it is unknown."""
-        known = self.bench.recordings[0].units
-        return known.get(name, self.diagnosis.refitted.units.get(name, ""))
-
 
 def diagnosis_page(diagnosis: Diagnosis) -> Page:
     """Build the page of a diagnosis; see `diagnosis_report`."""
@@ -154,7 +149,7 @@ def _mismatch(case: _Case) -> list[Block]:
     out: list[Block] = [Text(found["sentence"])] if found.get("sentence") else []
     if "map" not in found:
         return out
-    unit = case.unit(next(iter(found["scale"])))
+    unit = case.bench.unit_of(next(iter(found["scale"])))
     outputs = "the outputs" if len(found["scale"]) > 1 else next(iter(found["scale"]))
     drawn = (
         (
@@ -172,7 +167,7 @@ def _mismatch(case: _Case) -> list[Block]:
         (plots.mismatch_growth(found, unit, kind="rate"), "The error over the speed.", "Error over speed."),
         (plots.mismatch_time(found), "The error and the motion of the output over time.", "Error over time."),
         (
-            plots.mismatch_level(found, case.unit(found["level"]["output"])),
+            plots.mismatch_level(found, case.bench.unit_of(found["level"]["output"])),
             f"The error over the value of {found['level']['output']}.",
             "Error over the value of the output.",
         ),
@@ -338,7 +333,7 @@ def _proof(case: _Case) -> list[Block]:
 def _draw_comparison(case: _Case, c: BeforeAfter, i: int) -> list[Block]:
     """Draw one output of a recording: two stretches, errors over time, and spectra."""
     r, name = c.recording, c.recording.outputs[i]
-    unit, floor = case.unit(name), float(case.noise[i])
+    unit, floor = case.bench.unit_of(name), float(case.noise[i])
     noise = case.diagnosis.floor
     white = noise.get("white", noise["nrmse"]) / max(noise["nrmse"], 1e-300)  # the slow part is no white noise
     simulated: plots.Simulated = [("as given", c.given), ("refitted", c.before)]

@@ -27,7 +27,11 @@ if TYPE_CHECKING:
         UNKNOWN as UNKNOWN,
         infer_domain as infer_domain,
     )
-    from .equations import Named as Named, stack as stack
+    from .equations import (
+        Named as Named,
+        evaluate_at_random_points as evaluate_at_random_points,
+        stack as stack,
+    )
     from .external import (
         PythonFunction as PythonFunction,
         calls_external as calls_external,

@@ -199,9 +199,7 @@ class Equations:
         moving = stack(x, u)
         f, y = self.derivatives(x, u, p, t), ca.vertcat(*self.measured(x, u, p, t).values())
         both = ca.Function("both", [ca.vertcat(moving, stack(p), t)], [f, y])
-        if calls_external(both):
-            return out  # the user's program may fail at random points
-        rates, outputs = _evaluate_at_random_points(both)
+        rates, outputs = evaluate_at_random_points(both)
         with np.errstate(all="ignore"):
             ratios = outputs[:, :, None] / rates[:, None, :]
         same = np.all(np.isclose(ratios, ratios[0], rtol=1e-9, atol=0.0), axis=0) & (ratios[0] > 0)
@@ -271,7 +269,7 @@ class Equations:
         name, factor = next(iter(self.into(port, x, u, p, t).items()))
         entire = (self.measured(x, u, p, t) | self.by_state(self.derivatives(x, u, p, t)))[name]
         slopes = ca.Function("slopes", [known], [ca.jacobian(v, known) for v in (entire, factor * term, factor)])
-        total, own, scale = _evaluate_at_random_points(slopes)
+        total, own, scale = evaluate_at_random_points(slopes)
         moving = np.any(own != 0, axis=0) & ~np.any(scale != 0, axis=0)
         same, opposite = (np.any(np.all(np.isclose(total, sign * own, atol=0.0), axis=0) & moving) for sign in (1, -1))
         if opposite and not same:
@@ -518,8 +516,13 @@ def stack(*named: Named) -> Any:
     return ca.vertcat(ca.SX(0, 1), *(ca.vec(value) for names in named for value in names._values.values()))
 
 
-def _evaluate_at_random_points(function: ca.Function) -> list[np.ndarray]:
-    """Evaluate a function of one vector at random points; return an array (points, entries) per result."""
+def evaluate_at_random_points(function: ca.Function) -> list[np.ndarray]:
+    """Evaluate a function of one vector at random points; return an array (points, entries) per result.
+
+    They are nan if it calls another program, which may fail there.
+    """
+    if calls_external(function):
+        return [np.full((COMPARED_POINTS, function.numel_out(i)), np.nan) for i in range(function.n_out())]
     points = np.random.default_rng(0).uniform(0.5, 1.5, (COMPARED_POINTS, function.numel_in(0)))
     with np.errstate(all="ignore"):
         results = zip(*(function.call([point]) for point in points), strict=True)

@@ -111,7 +111,7 @@ NAN = np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 6.0]])
         (dict(inputs=("",)), "distinct and not empty"),
         (dict(inputs=("x",), outputs=("x",)), "both as an input and as an output"),
         (dict(units={"forc": "N"}), "'forc'; its columns are u, y"),
-        (dict(hold="cubic"), "'zero', 'linear', 'band-limited', 'next' or None"),
+        (dict(hold="cubic"), "'zero', 'linear', 'band-limited' or 'next', or None"),
         (dict(initial="steady"), "zero, estimate, periodic"),
         (dict(initial=[1.0, np.nan]), "finite numbers"),
         (dict(initial=np.zeros((2, 2))), "vector"),

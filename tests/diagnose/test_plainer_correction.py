@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,6 +29,18 @@ def test_a_small_but_steady_difference_decides() -> None:
     steadily = BLOCKS * np.array([1.1, 1.08, 1.12, 1.1, 1.09, 1.11, 1.1, 1.07])
     assert held_out(steadily).clearly_above(held_out(BLOCKS))
     assert not held_out(BLOCKS).clearly_above(held_out(steadily))
+
+
+def test_blocks_count_by_their_samples() -> None:
+    """A short recording has as many blocks as a long one; on a few samples an error is nearly random."""
+    long, short = np.full(8, 500), np.full(24, 1)
+    few = np.tile([3.0, 0.2, 5.0, 0.4, 1.0, 0.1, 2.0, 0.8], 3)
+    steadily = np.array([1.1, 1.08, 1.12, 1.1, 1.09, 1.11, 1.1, 1.07])
+    both, sizes = np.append(BLOCKS * steadily, np.tile(BLOCKS, 3) * few), np.append(long, short)
+    errors = [HeldOut(0.1, 0.1, np.array([0.1]), each, sizes) for each in (both, np.append(BLOCKS, np.tile(BLOCKS, 3)))]
+    assert errors[0].clearly_above(errors[1]) and not errors[1].clearly_above(errors[0])
+    alike = [replace(one, sizes=np.ones(1)) for one in errors]
+    assert not alike[0].clearly_above(alike[1])
 
 
 def test_a_law_that_acts_in_few_blocks_decides() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pilfr_casadi import Parameter, Port, Recording, Simulator, diagnose
-from pilfr_casadi.diagnose.search.relatives import complements
+from pilfr_casadi.diagnose.search.pairs import complements
 from pilfr_casadi.laws import (
     CATALOGUE,
     CoulombFriction,

@@ -233,27 +233,30 @@ def find_offsets(now: Checked, otherwise: Mapping[str, str] | None = None) -> Ch
     return each if evidence_gain(shared.cost, each.cost, each.residuals, more) > LEAST_GAIN else shared
 
 
+def recorded_at(recordings: Sequence[Recording], port: str) -> np.ndarray:
+    """Return the channel (M,) of an actuator or a sensor, of all recordings one after the other."""
+    kind, name = split_port(port)
+    sides = [(r.u, r.inputs) if kind == ACTUATOR else (r.y, r.outputs) for r in recordings]
+    return np.concatenate([values[:, names.index(name)] for values, names in sides])
+
+
 def _stands_for_load(bench: Workbench, port: str, value: float) -> bool:
     """Tell whether an offset of an output is larger than the output ever was, in recordings without a changing input.
 
     Such an offset acts like a constant load, as dry friction in a coast-down is until the machine stands.
     """
-    kind, name = split_port(port)
-    if kind != SENSOR or not moves_freely(bench.recordings):
+    if kind_of(port) != SENSOR or not moves_freely(bench.recordings):
         return False
-    at = bench.simulator.output_names.index(name)
-    return abs(value) > max(float(np.max(np.abs(r.y[:, at]))) for r in bench.recordings)
+    return bool(abs(value) > np.max(np.abs(recorded_at(bench.recordings, port))))
 
 
 def _doubt_size(bench: Workbench, port: str, value: float) -> str:
     """Say that an offset of an input that moves is more than the input ever was; "" if it is not."""
-    kind, name = split_port(port)
-    if kind != ACTUATOR:
+    if kind_of(port) != ACTUATOR:
         return ""
-    at = bench.simulator.inputs.index(name)
-    u = np.concatenate([r.u[:, at] for r in bench.recordings])
+    u = recorded_at(bench.recordings, port)
     larger = abs(value) > np.max(np.abs(u)) and np.ptp(u) > 0
-    return f"; that is more than {name} ever was, which speaks for a constant load" if larger else ""
+    return f"; that is more than {split_port(port)[1]} ever was, which speaks for a constant load" if larger else ""
 
 
 def _with_constant(now: Checked, port: str) -> Checked | None:

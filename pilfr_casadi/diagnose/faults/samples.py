@@ -28,7 +28,7 @@ from ..._base import percent
 from ...data import Recording
 from ...laws import AsymmetricSaturation
 from ...simulators import ACTUATOR, SENSOR, port_name
-from ..fits.floor import DISTINCT_SHARE, FEWEST_LEVELS
+from ..fits.floor import DISTINCT_SHARE, sensor_step
 from ..fits.screen import folds, held_out
 from ..fits.workbench import Fitted, Workbench
 from .gates import (
@@ -100,7 +100,7 @@ def mend(r: Recording) -> Recording:
 def find_glitches(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find single samples far off their neighbours, shape (k,); return them and the output without them."""
     clean, found = np.array(y), np.zeros(0, dtype=int)
-    least = max(GLITCH_SIZE * float(np.std(y)), FEWEST_STEPS * _resolution(y))
+    least = max(GLITCH_SIZE * float(np.std(y)), FEWEST_STEPS * sensor_step(y))
     while len(y) > 4 * NEIGHBOURHOOD * STENCIL and len(found) < EXCEPTION_SHARE * len(y):
         d = distances(clean)
         large = np.flatnonzero(np.abs(d) > least)
@@ -110,13 +110,6 @@ def find_glitches(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         clean[more] -= d[more]
         found = np.append(found, more)
     return np.zeros(0, dtype=int), np.array(y)
-
-
-def _resolution(y: np.ndarray) -> float:
-    """Return the smallest step of a quantised signal; zero for a continuous one, or one of a few levels."""
-    steps = np.diff(np.unique(y))
-    steps = steps[steps > ROUNDING * np.ptp(y)]
-    return float(np.min(steps)) if len(steps) >= FEWEST_LEVELS else 0.0
 
 
 def distances(y: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from ...data import Recording, moves_freely
+from ...data import COURSES, Recording, moves_freely
 from ...laws import Gain, Lag, Law
 from ...simulators import in_series
 from ..fits.floor import ABOVE_NOISE
@@ -71,7 +71,7 @@ class TimeShift(Gate):
         moved = replace(self, value=value, sentence=words)
         if moved.delay > 0:
             moved = replace(moved, sentence=f"{words}, or the machine delays {it} by as much")
-        elif self.finding == "alignment" and abs(value / dt) < 1 + WHOLE_SHIFT and self.hold != "next":
+        elif self.finding == "alignment" and abs(value / dt) < 1 + WHOLE_SHIFT and not COURSES[self.hold].begin:
             moved = replace(moved, sentence=f"{words}, or inputs are means up to their samples (hold 'next')")
         return replace(moved, change=moved.read)
 
@@ -153,7 +153,7 @@ class TimeShift(Gate):
         most = BEYOND * self.largest(now.bench.dt)
         first = FirstOrder.of(replace(now.bench, scale=after.bench.scale), after.fitted)
         low, high = max(self.value - width, -most), min(self.value + width, most)
-        value = _minimise(self.remainder(first, after.fitted), low, high)[0]
+        value = minimise(self.remainder(first, after.fitted), low, high)[0]
         return self if abs(value - self.value) < 2e-3 * width else self.at(value, now.bench.dt)
 
     def largest(self, dt: float) -> float:
@@ -198,7 +198,7 @@ def _interpolant(r: Recording, v: np.ndarray, wraps: bool, smooth: bool) -> _Cur
 
 
 @np.errstate(invalid="ignore")  # an infinite remainder has no parabola through it
-def _minimise(left: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
+def minimise(left: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
     """Find the minimum of the remainder between two values; return its place and its value."""
     from scipy.optimize import minimize_scalar
 
@@ -350,7 +350,7 @@ def _screen_shifts(bench: Workbench, plain: Fitted, also_given: bool = True) -> 
                 k = int(np.argmin(shares))
                 value, share = float(values[k]), shares[k]
                 if finding == "clock":  # over a whole record, one step of a rate is many samples
-                    value, share = _minimise(left, values[max(k - 1, 0)], values[min(k + 1, len(values) - 1)])
+                    value, share = minimise(left, values[max(k - 1, 0)], values[min(k + 1, len(values) - 1)])
                 if share < CLEARLY_BETTER:
                     found.append((share, fault.at(value, bench.dt)))
     best = list[TimeShift]()

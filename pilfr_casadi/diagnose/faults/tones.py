@@ -36,11 +36,11 @@ def find_tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
         if not steady or len(steady) < len(each) or np.ptp([f for f, _ in steady]) > 2 / longest:
             continue
         f, amplitude = (float(v) for v in np.mean(steady, axis=0))
-        unit = bench.recordings[0].units.get(name, "")
+        size = value_with_unit(amplitude, bench.unit_of(name))
         sentence = (
-            f"{name} holds a steady tone of {f:.4g} Hz, amplitude {value_with_unit(amplitude, unit)}, that is in no "
-            "input, as from mains hum, a fan, or a mode with little damping that the simulator lacks: shield or filter "
-            "it, record what causes it, or add the mode."
+            f"{name} holds a steady tone of {f:.4g} Hz, amplitude {size}, that is in no input, as from mains hum, a "
+            "fan, or a mode with little damping that the simulator lacks: shield or filter it, record what causes it, "
+            "or add the mode."
         )
         scale = bench.balanced(fitted).scale
         share = amplitude**2 / 2 / scale[i] ** 2 / len(scale) / fitted.cost

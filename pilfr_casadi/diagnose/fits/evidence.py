@@ -78,6 +78,7 @@ CONTENDING_NATS = 8.0  # nats below the best within which a hypothesis may still
 BETTER_RATIO = 1.05  # ratio of rms errors from which one is better than another
 NEAR_RATIO = 1.5  # ratio of rms errors within which one comes near another: more fits may reverse their order
 FAR_RATIO = 3.0  # ratio of rms errors from which one is far behind another: more fits cannot reverse their order
+CLEAR_ERRORS = 2.0  # standard errors of a paired difference from which it is clear: 1 in 40 by chance
 AS_GIVEN_RATIO = 0.5  # largest ratio of mean squares of a search with channels as given to one with shifted channels
 
 # Noise, by rms ratios to the noise and by shares of an output's deviation
@@ -447,13 +448,14 @@ class HeldOut:
     ahead: float  # the same on the second halves
     squares: np.ndarray  # (n_y,), the larger of the two, of each output
     each: np.ndarray = field(default_factory=lambda: np.zeros(0))  # on each held-out block, in the order of the blocks
+    sizes: np.ndarray = field(default_factory=lambda: np.ones(1))  # samples of each block; one number if all are alike
 
     def clearly_above(self, other: HeldOut) -> bool:
-        """Tell whether the errors on the blocks are larger by more than two standard errors, paired, in logarithms.
+        """Tell whether the errors on the blocks are larger by more than CLEAR_ERRORS, paired, in logarithms.
 
-        A block in which everything fails, such as one with an event that nothing describes, counts like any other.
-        But a law may act in few blocks, as a stop that is seldom met: errors that are nowhere smaller, and far larger
-        in all, are clearly above as well.
+        Blocks count by their samples: those of a short recording may have one each. A block in which everything fails,
+        such as one with an event that nothing describes, counts like any other. But a law may act in few blocks, as a
+        stop that is seldom met: errors that are nowhere smaller, and far larger in all, are clearly above as well.
         """
         if self.each.shape != other.each.shape or len(self.each) < 2:
             return True
@@ -463,7 +465,11 @@ class HeldOut:
             return True
         nowhere_smaller = np.min(ratios) > -2 * np.log(BETTER_RATIO)
         far = nowhere_smaller and self.blocks > FAR_RATIO**2 * other.blocks
-        return bool(far or np.mean(ratios) > 2 * np.std(ratios, ddof=1) / np.sqrt(len(ratios)))
+        weights = self.sizes * np.ones_like(ratios)
+        weights /= np.sum(weights)
+        mean = weights @ ratios
+        error = np.linalg.norm(weights * (ratios - mean)) * np.sqrt(len(ratios) / (len(ratios) - 1))
+        return bool(far or mean > CLEAR_ERRORS * error)
 
     @property
     def mean_square(self) -> float:
@@ -520,7 +526,7 @@ def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldO
     pooled = bench.pool(both[0]), bench.pool(both[1])
     sizes = np.concatenate([np.bincount(b[b >= 0], minlength=FOLDS * ROUNDS) for b in blocks])
     each = np.array([bench.pool(one / n) for one, n in zip(of_blocks, sizes, strict=True) if n])
-    return HeldOut(*pooled, both[int(pooled[1] > pooled[0])], each)
+    return HeldOut(*pooled, both[int(pooled[1] > pooled[0])], each, sizes[sizes > 0])
 
 
 def _at_prior_means(fitted: Fitted) -> Fitted:

@@ -20,7 +20,7 @@ import numpy as np
 
 from ...data import Recording
 
-CORRELATED, P_VALUE = 0.5, 1e-4  # rank correlation, and its p-value, from which a residual's power depends on a signal
+CORRELATED, P_VALUE = 0.5, 1e-4  # rank correlation with a signal that drives a residual, its p-value: many are tried
 REFUTED = 0.01  # probability under measured noise below which an error is not that noise
 ABOVE_NOISE = 2.0  # ratio of the error to the noise from which results say that more is missing
 FEWEST = 30.0  # effective samples that a residual has at least
@@ -123,24 +123,20 @@ def measured_floor(recordings: Sequence[Recording]) -> Floor | None:
     if not repeated:
         return None
     square = np.mean(np.concatenate([np.var(y, axis=0, ddof=1) for y in repeated]), axis=0)
-    deviation = np.maximum(np.sqrt(square), _sensor_steps(recordings) / np.sqrt(12))
+    steps = [sensor_step(column) for column in np.concatenate([r.y for r in recordings]).T]
+    deviation = np.maximum(np.sqrt(square), np.array(steps) / np.sqrt(12))
     noise = [y[0] - np.mean(y, axis=0) for y in repeated]
     independent = np.array([effective_size([e[:, [i]] for e in noise]) for i in range(len(deviation))])
     source = "periods" if periods else "repeats"
     return Floor(deviation, source, min(map(len, repeated)), np.maximum(independent, 1.0))
 
 
-def _sensor_steps(recordings: Sequence[Recording]) -> np.ndarray:
-    """Find the step of each output's values, (n_y,); zero if most samples have a value of their own."""
-    y = np.concatenate([r.y for r in recordings])
-    out = np.zeros(y.shape[1])
-    for i, column in enumerate(y.T):
-        levels = np.unique(column)
-        gaps = np.diff(levels)
-        gaps = gaps[gaps > SAME_LEVEL * np.ptp(column)]
-        if FEWEST_LEVELS <= len(levels) < DISTINCT_SHARE * len(column):
-            out[i] = gaps.min()
-    return out
+def sensor_step(values: np.ndarray) -> float:
+    """Find the smallest step of a quantised signal (M,); zero if most samples have a value of their own."""
+    levels = np.unique(values)
+    gaps = np.diff(levels)
+    quantised = FEWEST_LEVELS <= len(levels) < DISTINCT_SHARE * len(values)
+    return float(np.min(gaps[gaps > SAME_LEVEL * np.ptp(values)])) if quantised else 0.0
 
 
 def _is_driven(differences: np.ndarray, u: np.ndarray, before: np.ndarray) -> bool:

@@ -161,6 +161,10 @@ class Workbench:
         """Sampling interval, s."""
         return self.recordings[0].dt
 
+    def unit_of(self, channel: str) -> str:
+        """Return the unit of an input or output, "" if it is unknown; that of the recordings comes first."""
+        return {**self.simulator.units, **self.recordings[0].units}.get(channel, "")
+
     def with_other_holds(self, among: Sequence[str] = HOLDS) -> list[Workbench]:
         """Return the bench with interpolated inputs, or with each other hold if they are interpolated already.
 

@@ -21,25 +21,30 @@ from ...laws import (
     SCALABLE,
     VARIATIONS,
     Law,
+    Local,
     VaryingParameter,
     constant,
     heated,
     likely_profiles,
     scheduled,
+    unit_forces,
     varying,
 )
 from ...simulators import PARAMETER, Placed, in_series, kind_of
 from ..fits.evidence import FAR_RATIO, NEAR_RATIO
-from ..fits.screen import Scored, screen, usable
-from ..fits.workbench import DIVERGED, FEW
+from ..fits.force_recovery import forces_of_change, signals_along
+from ..fits.linearise import port_signals
+from ..fits.screen import HUGE, Pair, Scored, fit_shapes, orthonormal, project_off, screen, start_values, usable
+from ..fits.workbench import DIVERGED, FEW, Workbench
 from .hypotheses import Hypotheses
-from .relatives import complements, in_place_of_variation
+from .pairs import complements
 from .trials import Effort, Key, Trial, place_law, select_pairs
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 MOST_CONVERGED = 5  # trials of a move that are fitted to convergence at most
+MATCHED_SAMPLES = 4000  # approximate number of samples on which a law is matched to a force
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,25 +91,15 @@ class Forms(Hypotheses):
         self.bench.interrupt.raise_pending()
         return trials
 
-    def best_known(self, trial: Trial) -> Trial:
-        """Return the best fit of a trial's hypothesis, whose laws may have been found in another order."""
-        known = self.memo.get(trial.key, trial)
-        if not known.error < trial.error:
-            return trial
-        return known.with_added(trial.pair)
-
     def record(self, parent: Trial, scored: Sequence[Scored], trials: Sequence[Trial]) -> None:
         """Keep the trials of a move, and note the move."""
         self.keep_all(trials)
         self.moves.append(Move(parent, tuple(scored), tuple(trials)))
 
     def try_beside(self, base: Trial, entries: Sequence[Scored], observer_gain: np.ndarray | None = None) -> None:
-        """Fit some pairs beside a hypothesis, none of their relatives, and note the move."""
-        self.record(base, entries, self.fit_selected(base, entries, self.little_effort(observer_gain)))
-
-    def little_effort(self, observer_gain: np.ndarray | None = None) -> Effort:
-        """Fit few pairs, and refine none far behind one whose error is at the noise."""
-        return Effort(observer_gain, float(np.sqrt(self.floor2)), few=True)
+        """Fit a few pairs beside a hypothesis, none far behind one whose error is at the noise, and note the move."""
+        effort = Effort(observer_gain, float(np.sqrt(self.floor2)), few=True)
+        self.record(base, entries, self.fit_selected(base, entries, effort))
 
     def keep_all(self, trials: Sequence[Trial]) -> None:
         """Keep trials, and fit those that may win to convergence."""
@@ -116,7 +111,7 @@ class Forms(Hypotheses):
         # after the time of the search, the rest is for the comparison with the refit
         count = MOST_CONVERGED if time.perf_counter() < self.until else 1
         # where a brief fit follows the part that it was made to, the rest may only lack convergence
-        near = [t for t in ranked[:count] if not t.thorough and t.least_error < most]
+        near = [t for t in ranked[:count] if not t.thorough and min(t.mean_square, t.part_mean_square) < most**2]
         converged = self.on_workers(self.fits.converge, near)
         converged += filter(None, self.on_workers(self._reorder, converged))
         for trial in converged:
@@ -162,7 +157,7 @@ class Forms(Hypotheses):
     def fit_finer_forms(self, trial: Trial) -> None:
         """Fit a hypothesis with its added law in each form that contains it, if it was not fitted before."""
         kind, others = type(trial.law), trial.key - {trial.pair}
-        finer = [*FINER.get(kind, ()), *(k for k in self.laws if k.__base__ is kind and "as_base" in vars(k))]
+        finer = [*FINER.get(kind, ()), *(k for k in self.laws if k.extends(kind))]
         self.fit_forms(trial, [k for k in finer if others | {(trial.port, k)} not in self.memo])
 
     def _vary_strength(self) -> None:
@@ -264,7 +259,7 @@ class Forms(Hypotheses):
         # what the curve misses is in no force at a port, so that it may have passed for noise
         if not (self.can_improve(best, self.least_floor) and self.may_go_on()):
             return
-        law = varying(best.law.scheduled_by, VARIATIONS[-1])()
+        law: Any = varying(best.law.scheduled_by, VARIATIONS[-1])()
         finer = [replace(s, law=law, starts=(law.starts_as(best.law, best.own),)) for s in entries]
         self.note_alternatives(finer)
         self.try_beside(base, finer, observer_gain)
@@ -282,3 +277,44 @@ def is_filter(law: Law) -> bool:
 def may_stand_beside(laws: Sequence[Placed], port: str, law: Law) -> bool:
     """Tell whether a law at a port may be a further effect beside some laws."""
     return all(e.port != port or complements(e.law, law) for e in laws)
+
+
+def in_place_of_variation(bench: Workbench, best: Trial, scored: Sequence[Scored]) -> list[Scored]:
+    """Select laws with constant parameters, no more of them, whose force is most like that of a law that varies.
+
+    The added law of the best hypothesis varies with a signal. If it is a parameter, its change acts at some ports as a
+    force: a stiffness that varies with its own deflection is a stiffening spring. The laws start at their values there,
+    and everything else where the best hypothesis has it.
+    """
+    fitted, most = best.fitted, best.law.size(best.own)
+    force = signals_along(bench, fitted, fitted.simulator.elements.index(best.element))[2]
+    varied = kind_of(best.port) == PARAMETER
+    forces = forces_of_change(bench, fitted, best.port, force) if varied else {best.port: force}
+    local = {port: port_signals(bench, fitted, port) for port in forces}
+    # also excludes nan, for example from the root of a negative number
+    bounded = {k for k, v in local.items() if np.all(np.abs([v.z, v.dz, forces[k]]) < HUGE)}
+    found = dict[Pair, tuple[float, Scored]]()
+    for s in (s for s in scored if s.port in bounded and s.law.size(s.starts[0]) <= most):
+        if not (s.pair in found or s.law.flexible or s.law.scheduled_by or s.law.scaled_by):
+            left, start = _match_force(s.law, local[s.port], forces[s.port])
+            found[s.pair] = left, replace(s, starts=(start, *s.starts), beside=fitted.values)
+    ranked = sorted((f for f in found.values() if f[0] < 1), key=lambda f: f[0])
+    return [entry for _, entry in ranked[:FEW]]
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _match_force(law: Law, local: Local, force: np.ndarray) -> tuple[float, dict[str, Any]]:
+    """Compute the share of a force that a law leaves, beside gains of the signal and its rate, and its start values."""
+    shapes = list(law.shapes(local))
+    every = max(len(force) // MATCHED_SAMPLES, 1)
+    base = orthonormal(np.column_stack([np.ones_like(local.z), local.z, local.dz])[::every])
+    target = project_off(force[::every], base)
+    best, start = np.inf, dict[str, Any]()
+    columns = np.moveaxis(unit_forces(law, local, shapes)[::every], 1, 0)
+    for k, strengths, fit in fit_shapes((project_off(a, base) for a in columns), target):
+        if not law.strength and strengths[0] <= 0:  # the simulator's gain may scale the force, but not change its sign
+            continue
+        left = float(np.sum((target - fit) ** 2)) / max(float(target @ target), 1e-300)
+        if left < best:
+            best, start = left, start_values(law, shapes[k], strengths)
+    return best, start

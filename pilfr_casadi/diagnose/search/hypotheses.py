@@ -175,13 +175,6 @@ class Hypotheses:
         """The most promising hypothesis, from which the search continues."""
         return max(self.memo.values(), key=self.optimistic_evidence)
 
-    def likeliest_forms(self, trials: Iterable[Trial]) -> list[Trial]:
-        """Return of each set of laws the likeliest form, the likeliest set first."""
-        first = dict[frozenset[Name], Trial]()
-        for trial in sorted(trials, key=self.optimistic_evidence, reverse=True):
-            first.setdefault(trial.names, trial)
-        return [*first.values()]
-
     def optimistic_evidence(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis with as many effective samples as at the noise level."""
         return self._log_evidence(trial, self._tolerant(trial), self.effective_samples.at(0.0))
@@ -557,3 +550,11 @@ def likeliest(trials: Iterable[Trial], evidence: Callable[[Trial], float]) -> li
     """List the hypotheses whose evidence is near the largest, the likeliest first."""
     ranked = sorted(trials, key=evidence, reverse=True)
     return [t for t in ranked if evidence(t) > evidence(ranked[0]) - CONTENDING_NATS]
+
+
+def likeliest_forms(trials: Iterable[Trial], evidence: Callable[[Trial], float]) -> list[Trial]:
+    """Return of each set of laws the likeliest form, the likeliest set first."""
+    first = dict[frozenset[Name], Trial]()
+    for trial in sorted(trials, key=evidence, reverse=True):
+        first.setdefault(trial.names, trial)
+    return [*first.values()]

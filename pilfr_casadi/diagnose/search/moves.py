@@ -10,7 +10,6 @@ count in the posterior (`hypotheses`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -27,8 +26,9 @@ from ..fits.linearise import linearise_runs
 from ..fits.screen import Remainder, Scored
 from ..fits.workbench import DIVERGED, FEW, THOROUGH, Fitted, refit, refit_with_other_holds
 from .forms import Forms, is_filter, may_stand_beside
+from .hypotheses import likeliest_forms
 from .learned import learn_forces, nearest_to_learned
-from .relatives import choose_pairs, fit_pair, relatives
+from .pairs import choose_pairs, fit_pair
 from .trials import Effort, Trial
 
 # Effort
@@ -201,7 +201,7 @@ class Search(Forms):
         plain = [t for t in kept if not (t.law.order or t.law.memory)]
         best, shift_step = CLEARLY_BETTER * self.best.mean_square, 1.0 if self.hold_settled else 0.5
         with self.stage("shifts beside a law"):
-            for trial in self.likeliest_forms(plain)[:FEW] if self.may_go_on() else ():
+            for trial in likeliest_forms(plain, self.optimistic_evidence)[:FEW] if self.may_go_on() else ():
                 bench = replace(self.bench, simulator=trial.fitted.simulator)
                 found = find_time_shift(Checked(bench, trial.fitted), shift_step, given=False)
                 shift = found.gates[0] if found.gates else None
@@ -217,7 +217,7 @@ class Search(Forms):
         if self.moves and not self.may_go_on():
             return
         enough = float(np.sqrt(self.floor2 + NEARLY_EXPLAINED * max(parent.mean_square - self.floor2, 0.0)))
-        trials = self._with_relatives(parent, scored, scored, Effort(observer_gain, enough, few))
+        trials = self.fit_selected(parent, scored, Effort(observer_gain, enough, few))
         with self.stage("choice"):
             self.record(parent, scored, trials)
             self.estimate_noise()
@@ -225,17 +225,6 @@ class Search(Forms):
             self.refine_added(parent)
             if self.best is not best:
                 self.estimate_noise()
-
-    def _with_relatives(
-        self, parent: Trial, selected: Sequence[Scored], scored: Sequence[Scored], effort: Effort
-    ) -> list[Trial]:
-        """Fit some of the pairs screened, then those to which the best fits of these hypotheses point."""
-        found = self.fit_selected(parent, selected, effort)
-        trials = sorted(map(self.best_known, found), key=lambda t: t.error)
-        more = relatives(self.bench, trials, scored) if self.may_go_on() else []
-        if more:
-            trials = sorted([*trials, *self.fit_selected(parent, more, effort)], key=lambda t: t.error)
-        return trials
 
     def learned(self, base: Trial) -> list[Fitted]:
         """Fit learned forces beside a hypothesis, at the most promising ports, to a part of the recordings."""
@@ -260,8 +249,7 @@ class Search(Forms):
                 if alike and may_stand_beside(base.laws, port, near.kind):
                     entries.append(replace(alike[0], law=near.kind, starts=(near.start,)))
         if entries:
-            effort = self.little_effort()
-            self.record(base, entries, self._with_relatives(base, entries, [*entries, *scored], effort))
+            self.try_beside(base, entries)
 
     def exchange(self) -> None:
         """Try all other laws, and none, in place of each of several laws, the rest in place, until none changes."""

@@ -100,19 +100,9 @@ class Trial:
         return self.element.pair
 
     @property
-    def name(self) -> tuple[str, str]:
-        """Port and id of the law that was added."""
-        return self.element.name
-
-    @property
     def own(self) -> dict[str, Any]:
         """Fitted values of the law that was added, by its own names."""
         return self.element.own(self.fitted.values)
-
-    @property
-    def least_error(self) -> float:
-        """Rms error on all recordings, or on the part that it was fitted to if that is smaller."""
-        return min(self.error, float(np.sqrt(self.part_mean_square)))
 
     @property
     def error(self) -> float:

@@ -15,14 +15,9 @@ from pilfr_casadi.diagnose.preparation import hold_note
 from pilfr_casadi.diagnose.search.moves import Search
 from pilfr_casadi.laws import (
     CoulombFriction,
-    Creep,
     CubicStiffness,
     Lag,
     Mode,
-    PeriodicForce,
-    Relaxation,
-    TwoStageCreep,
-    TwoStageRelaxation,
 )
 from pilfr_casadi.models import Parameter
 from pilfr_casadi.simulators import Port, Simulator
@@ -112,13 +107,6 @@ def test_why_a_hold_was_chosen_is_said():
     assert (
         "inputs that are interpolated there fit no worse and are used" in hold_note(spring(), "linear", 1.0004).sentence
     )
-
-
-@pytest.mark.parametrize(("one", "two", "name"), [(Relaxation, TwoStageRelaxation, "k"), (Creep, TwoStageCreep, "c")])
-def test_creep_in_two_stages_goes_on_from_one(one, two, name):
-    own = {next(iter(one.units)): 8.0, "T": 0.5}
-    assert two().starts_as(one(), own) == {f"{name}_1": 4.0, f"{name}_2": 4.0, "T_1": 0.25, "T_2": 1.0}
-    assert two().starts_as(PeriodicForce(), {"a": 1.0, "b": 0.0, "L": 1.0}) == {}
 
 
 @pytest.mark.slow

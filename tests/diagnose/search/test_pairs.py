@@ -6,7 +6,7 @@ from hypothesis import given, settings, strategies as st
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose.fits.screen import orthonormal
-from pilfr_casadi.diagnose.search.relatives import pair_shares
+from pilfr_casadi.diagnose.search.pairs import pair_shares
 from problems.concealed import case
 from problems.concealed_score import score
 

@@ -12,7 +12,7 @@ from pilfr_casadi.diagnose.fits.floor import Floor
 from pilfr_casadi.diagnose.fits.linearise import linearise_runs
 from pilfr_casadi.diagnose.fits.screen import Remainder
 from pilfr_casadi.diagnose.search.moves import Search
-from pilfr_casadi.diagnose.search.relatives import choose_pairs, complements
+from pilfr_casadi.diagnose.search.pairs import choose_pairs, complements
 from pilfr_casadi.diagnose.search.trials import Trial
 
 FRICTION = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
