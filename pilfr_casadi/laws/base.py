@@ -176,8 +176,8 @@ class Law:
         Values of parameters before any are given; otherwise strengths are zero and shapes one.
     as_base : mapping
         Values, or functions of the base class' values by name, at which the law equals its base class; parameters of
-        the same name have the same value. Fits start there once the base class is named. Left out if the law is its base
-        class where its own strengths are zero.
+        the same name have the same value. Fits start there once the base class is named. Left out if the law is its
+        base class where its own strengths are zero.
     constants : tuple of str
         Shape parameters that no fit changes, such as the revolution of an angle.
     places : tuple of {"parallel", "series", "sensor", "parameter"}
