@@ -21,6 +21,7 @@ from pilfr_casadi.laws import (
     CubicDamping,
     CubicStiffness,
     LinearStiffness,
+    PeriodicForce,
     PowerDrag,
     ProgressiveStiffness,
     QuadraticDrag,
@@ -134,3 +135,19 @@ def test_a_drag_of_another_power_is_named_in_this_form_alone(n):
     r = bench("ground", PowerDrag().at({"c_n": 3.0, "n": n})).recordings[0]
     found = pilfr.diagnose(cart(), r, laws=(CubicDamping, QuadraticDrag, PowerDrag), hold="zero", workers=1)
     assert [(e.port, e.law, e.form) for e in found.effects] == [("ground", "quadratic_drag", "power" if n < 2 else "")]
+
+
+def test_a_fit_starts_from_the_best_values_of_both_runs(tiny):
+    """Starts with hardly any force cost little; they took all the places of those that the simulation points to."""
+    bench, refit = tiny
+    local = port_signals(bench, refit, "a")
+    largest = float(np.max(np.abs(local.z)))
+
+    def entry(source, periods, force):
+        starts = tuple({"a": force, "b": 0.0, "L": 2 * largest / n} for n in periods)
+        return Scored("a", PeriodicForce(), 0.5, starts, local, source=source)
+
+    entries = [entry("simulation", (3.0, 4.0, 5.0), 0.5), entry("observer", (20.0, 21.0, 22.0), 1e-9)]
+    first = Trials(bench, 1)._fit_briefly(Trial.of(refit, 0), entries, None)
+    periods = [2 * largest / float(start["a.L"]) for start, _ in first.starts_again(False)]
+    assert any(n == pytest.approx(3.0) for n in periods[1:])
