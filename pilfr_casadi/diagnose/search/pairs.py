@@ -17,14 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ...laws import (
-    DRAGS,
-    DRY,
-    SMALL_AND_LARGE,
-    Law,
-    SprungMass,
-    TermLimit,
-)
+from ...laws import DRAGS, DRY, SMALL_AND_LARGE, Law, SprungMass, TermLimit
 from ..fits.screen import Dose, Remainder, Scored, held_out, orthonormal, start_values
 from ..fits.workbench import BRIEF, Fitted
 from .trials import Trial, Trials, place_law
