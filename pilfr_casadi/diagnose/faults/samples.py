@@ -2,7 +2,7 @@
 
 - Glitches, for example from a lost bit or a loose contact: a sample far off the cubic through its four neighbours,
   relative to the distances nearby. Once the cubic replaces it, its neighbours are inconspicuous; at a step or a shock
-  they are not.
+  they are not. A sample that follows such a pulse of an input is the answer to it.
 - Stale samples: a channel that otherwise never repeats a value sometimes repeats its last one. Interpolation replaces
   them. Other repeats are not stale: a coarse converter, or an encoder that moves by no more than its step, has few
   values; a machine at rest repeats one value for long; a clipped channel repeats its limit.
@@ -94,17 +94,21 @@ def remove_glitches(recordings: Sequence[Recording]) -> tuple[tuple[Recording, .
 
 def mend(r: Recording) -> Recording:
     """Replace each glitch of a recording's outputs by the cubic through its neighbours."""
-    return r.with_(y=np.column_stack([find_glitches(column)[1] for column in r.y.T]))
+    return r.with_(y=np.column_stack([find_glitches(column, r.u)[1] for column in r.y.T]))
 
 
-def find_glitches(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find single samples far off their neighbours, shape (k,); return them and the output without them."""
+def find_glitches(y: np.ndarray, u: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Find single samples far off their neighbours, shape (k,); return them and the output without them.
+
+    Those at a pulse of one of the inputs u (M, n_u), or one sample later, may be the answer to it, and are left.
+    """
     clean, found = np.array(y), np.zeros(0, dtype=int)
     least = max(GLITCH_SIZE * float(np.std(y)), FEWEST_STEPS * _resolution(y))
     while len(y) > 4 * NEIGHBOURHOOD * STENCIL and len(found) < EXCEPTION_SHARE * len(y):
         d = distances(clean)
         large = np.flatnonzero(np.abs(d) > least)
-        more = [k for k in large[_may_stand_alone(d, large)] if _stands_alone(clean, d, int(k))]
+        alone = [k for k in large[_may_stand_alone(d, large)] if _stands_alone(clean, d, int(k))]
+        more = alone if u is None else [k for k in alone if not _answers(u, int(k))]
         if not more:
             return np.sort(found), clean
         clean[more] -= d[more]
@@ -148,6 +152,12 @@ def _stands_alone(y: np.ndarray, d: np.ndarray, k: int) -> bool:
     other = np.array(y[whole])
     other[k - whole.start] -= d[k]
     return bool(np.max(np.abs(distances(other))) < ISOLATED_SHARE * abs(d[k]))
+
+
+def _answers(u: np.ndarray, k: int) -> bool:
+    """Tell whether an input has a pulse of one sample at sample k, or just before it."""
+    inner = range(max(k - 1, STENCIL), min(k + 1, len(u) - STENCIL))
+    return any(d[i] and _stands_alone(v, d, i) for v in u.T for d in [distances(v)] for i in inner)
 
 
 # stale samples

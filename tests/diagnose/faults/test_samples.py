@@ -75,6 +75,19 @@ def test_a_lost_sample_of_a_channel_that_rests_is_a_glitch():
     assert find_glitches(y)[0].tolist() == [700]
 
 
+@pytest.mark.parametrize("late", [0, 1])
+def test_the_answer_to_a_pulse_of_an_input_is_no_glitch(late):
+    """As the flow of a brook on the day of a thunderstorm, or on the next day."""
+    rng = np.random.default_rng(0)
+    rain = np.zeros((1000, 1))
+    rain[[300, 620], 0] = 18.0, 12.0
+    y = 0.3 + 0.02 * rng.standard_normal(1000) + 0.3 * np.roll(rain[:, 0], late)
+    y[800] += 4.0  # nothing drives it
+    r = pilfr.Recording(rain, y[:, None], 1.0, inputs=("rain",), outputs=("flow",))
+    assert np.flatnonzero(mend(r).y != r.y).tolist() == [800]
+    assert find_glitches(y)[0].tolist() == [300 + late, 620 + late, 800]
+
+
 @pytest.mark.slow
 def test_friction_is_named_beside_glitches():
     train = [spoilt(r) for r in recordings(laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01}))]
