@@ -24,7 +24,7 @@ from .faults.gates import CURED_SHARE, EQUAL_RATIO, NEAR_NOISE_RATIO, POOR_FIT, 
 from .faults.lost_samples import find_gaps, find_output_gaps
 from .faults.offsets import find_offsets, find_wrong_start
 from .faults.rates import find_wrong_rates
-from .faults.samples import clean_recordings, find_held_outputs, mend_stale_samples, unclip
+from .faults.samples import clean_recordings, find_frozen_channels, find_held_outputs, mend_stale_samples, unclip
 from .faults.timing import AVERAGED_NOISE, TimeShift, find_time_shift, in_steps
 from .fits.evidence import BETTER_RATIO
 from .fits.floor import Floor, pool, white_part
@@ -90,7 +90,7 @@ def prepare(
     say = say or Stages(lambda *_: None)
     say(CHECKS, 0, CHECKED)
     recordings, cleaned = clean_recordings(recordings)
-    slow = find_held_outputs(recordings)
+    slow = [*find_held_outputs(recordings), *find_frozen_channels(recordings)]
     stated = stated_hold(simulator, recordings, hold)
     bench, times = open_bench(simulator, recordings, stated or "zero", engine)
     checks, noted = _Checks(workers, correct_early, say, until), (*cleaned, *slow, *times)

@@ -84,19 +84,22 @@ class Penalties:
 def state_precision(engine: Engine, drive: Array, p: Array, n_x: int, n_s: int) -> Array | None:
     """Compute the prior precision (n_state, n_state) of an initial state with memory, in units of the outputs.
 
-    The prior is `N(0, S)`; see `state_covariance`. It is weighed against errors of `STATE_NOISE` per sample. None if
-    the run diverges.
+    The prior is `N(0, S)`; see `state_covariance`. It is weighed against errors of `STATE_NOISE` per sample. None as
+    there.
     """
     covariance = state_covariance(engine, drive, p, n_x, n_s)
     return None if covariance is None else STATE_NOISE**2 * np.linalg.inv(covariance)
 
 
 def state_covariance(engine: Engine, drive: Array, p: Array, n_x: int, n_s: int) -> Array | None:
-    """Compute the prior covariance S (n_state, n_state) of an initial state with memory; None if the run diverges.
+    """Compute the prior covariance S (n_state, n_state) of an initial state with memory.
 
     S holds the second moments of the states in a run from rest on the same inputs. So an operator that this run does
-    not move begins at rest, and states and memories are correlated as they are in motion.
+    not move begins at rest, and states and memories are correlated as they are in motion. None if the run diverges, or
+    if there is no input: the motion then comes from the initial state alone, and a run from rest has no scale.
     """
+    if not drive.shape[1]:
+        return None
     state, found = np.zeros(n_x + n_s), []
     with np.errstate(over="ignore", invalid="ignore"):
         rows = engine.linear.substeps  # of each sample

@@ -2,10 +2,12 @@
 
 - Glitches, for example from a lost bit or a loose contact: a sample far off the cubic through its four neighbours,
   relative to the distances nearby. Once the cubic replaces it, its neighbours are inconspicuous; at a step or a shock
-  they are not.
+  they are not. A sample that follows such a pulse of an input is the answer to it.
 - Stale samples: a channel that otherwise never repeats a value sometimes repeats its last one. Interpolation replaces
   them. Other repeats are not stale: a coarse converter, or an encoder that moves by no more than its step, has few
   values; a machine at rest repeats one value for long; a clipped channel repeats its limit.
+- Frozen channels: a channel that otherwise hardly repeats a value holds one for long while an input moves, and then
+  goes farther in one step than ever elsewhere. This is only noted: what happened is not known.
 - Held outputs: an output that changes at every k-th sample alone was measured at that rate and held in between, which
   looks like a delay of (k - 1) / 2 samples. The values between cannot be told, so that this is only noted.
 - Clipped channels: exactly repeated extremes. A clipped output can be compared with an equally clipped simulation; the
@@ -94,17 +96,21 @@ def remove_glitches(recordings: Sequence[Recording]) -> tuple[tuple[Recording, .
 
 def mend(r: Recording) -> Recording:
     """Replace each glitch of a recording's outputs by the cubic through its neighbours."""
-    return r.with_(y=np.column_stack([find_glitches(column)[1] for column in r.y.T]))
+    return r.with_(y=np.column_stack([find_glitches(column, r.u)[1] for column in r.y.T]))
 
 
-def find_glitches(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find single samples far off their neighbours, shape (k,); return them and the output without them."""
+def find_glitches(y: np.ndarray, u: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Find single samples far off their neighbours, shape (k,); return them and the output without them.
+
+    Those at a pulse of one of the inputs u (M, n_u), or one sample later, may be the answer to it, and are left.
+    """
     clean, found = np.array(y), np.zeros(0, dtype=int)
     least = max(GLITCH_SIZE * float(np.std(y)), FEWEST_STEPS * sensor_step(y))
     while len(y) > 4 * NEIGHBOURHOOD * STENCIL and len(found) < EXCEPTION_SHARE * len(y):
         d = distances(clean)
         large = np.flatnonzero(np.abs(d) > least)
-        more = [k for k in large[_may_stand_alone(d, large)] if _stands_alone(clean, d, int(k))]
+        alone = [k for k in large[_may_stand_alone(d, large)] if _stands_alone(clean, d, int(k))]
+        more = alone if u is None else [k for k in alone if not _answers(u, int(k))]
         if not more:
             return np.sort(found), clean
         clean[more] -= d[more]
@@ -141,6 +147,12 @@ def _stands_alone(y: np.ndarray, d: np.ndarray, k: int) -> bool:
     other = np.array(y[whole])
     other[k - whole.start] -= d[k]
     return bool(np.max(np.abs(distances(other))) < ISOLATED_SHARE * abs(d[k]))
+
+
+def _answers(u: np.ndarray, k: int) -> bool:
+    """Tell whether an input has a pulse of one sample at sample k, or just before it."""
+    inner = range(max(k - 1, STENCIL), min(k + 1, len(u) - STENCIL))
+    return any(d[i] and _stands_alone(v, d, i) for v in u.T for d in [distances(v)] for i in inner)
 
 
 # stale samples
@@ -221,6 +233,51 @@ def _find_repeats(y: np.ndarray, step: float) -> np.ndarray:
         if end - begin > LONGEST_REST or abs(y[min(end, len(y) - 1)] - y[begin]) < LARGEST_MOTION * step:
             same[begin:end] = False
     return same
+
+
+# frozen channels
+
+
+def find_frozen_channels(recordings: Sequence[Recording]) -> list[Gate]:
+    """Note each channel that holds a value for long, as of a logger or a sensor that stood still."""
+    found, first = list[Gate](), recordings[0]
+    for side, names in (("u", first.inputs), ("y", first.outputs)):
+        for i, name in enumerate(names):
+            columns = [getattr(r, side)[:, i] for r in recordings]
+            others = [np.delete(r.u, i, axis=1) if side == "u" else r.u for r in recordings]
+            stretches = [_find_frozen(v, u) for v, u in zip(columns, others, strict=True)]
+            if not any(map(len, stretches)) or not _is_fine(columns):
+                continue
+            k = next(k for k, there in enumerate(stretches) if len(there))
+            begin, end = stretches[k][0]
+            jump = columns[k][end] - columns[k][begin]
+            where = f" of recording {k + 1}" if len(recordings) > 1 else ""
+            sentence = (
+                f"{name} repeats one value from t = {first.dt * begin:.6g} s to {first.dt * (end - 1):.6g} s{where}, "
+                f"and then jumps by {jump:.3g}, farther than in any other step, as if sensor or logger stood still. "
+                "Unless the machine stuck there, cut the recording, or empty the repeated cells of an input."
+            )
+            found.append(Gate(name, "frozen", int(sum(np.sum(np.diff(s)) for s in stretches)), sentence, False))
+    return found
+
+
+def _is_fine(columns: Sequence[np.ndarray]) -> bool:
+    """Tell whether most steps of a channel lead to another value, and most of its values are different."""
+    together = np.concatenate(columns)
+    return len(np.unique(together)) > DISTINCT_SHARE * len(together)
+
+
+def _find_frozen(v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Find begin and end (behind it) of the long stretches of one value of a channel that end by its largest step.
+
+    Those count in which one of the inputs u (M, n_u) moves, and which are not at the beginning or at a limit.
+    """
+    steps, moving = np.abs(np.diff(v)), np.any(np.diff(u, axis=0) != 0, axis=1)
+    stretches = [(b, e) for b, e in find_stretches(steps == 0) if e - b > LONGEST_REST and b > 0 and e < len(steps)]
+    largest = np.max(np.delete(steps, [e for _, e in stretches]), initial=0.0)  # except those that lead out of them
+    inside = (v > np.min(v, initial=np.inf)) & (v < np.max(v, initial=-np.inf))
+    frozen = [(b, e + 1) for b, e in stretches if steps[e] > largest and np.any(moving[b:e]) and inside[b]]
+    return np.array(frozen, dtype=int).reshape(-1, 2)
 
 
 # held outputs

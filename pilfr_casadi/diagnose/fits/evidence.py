@@ -41,6 +41,7 @@ from ...laws import Law
 from ...optimise import GaussNewton, Problem, Status
 from ...simulators import MECHANICAL, PARAMETER, SENSOR, UNKNOWN, Placed, kind_of
 from .floor import effective_size
+from .linearise import simulate_states
 from .workbench import DIVERGED, RUNAWAY, Fitted, Workbench
 
 # The priors and thresholds on which every answer of a search rests. Elsewhere are those of the noise (`floor`,
@@ -195,7 +196,8 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     problem, _, recorded = _hessian(bench, fitted)
     mean = np.mean(np.concatenate([r.u for r in bench.recordings]), axis=0)
     smaller = [r.with_(u=mean + INPUT_FACTOR * (r.u - mean)) for r in bench.recordings]
-    *_, other = _hessian(bench.on(smaller), fitted)
+    there, begun = bench.on(smaller), _begun_like(bench, fitted)
+    *_, other = _hessian(there, begun)
     free = int(problem.free.sum())
     if not (np.all(np.isfinite(recorded)) and np.all(np.isfinite(other))):
         return np.inf
@@ -219,8 +221,21 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     found = float(np.sum(covariance * other))
     if not np.isfinite(found):
         return np.inf
-    as_recorded, now = _amplification(bench, fitted), _amplification(bench.on(smaller), fitted)
+    as_recorded, now = _amplification(bench, fitted), _amplification(there, begun)
     return found / max(now / as_recorded, 1.0) if 0 < as_recorded < np.inf and now < np.inf else found
+
+
+def _begun_like(bench: Workbench, fitted: Fitted) -> Fitted:
+    """Return a fit whose estimated initial states are nearer to each run's mean state by INPUT_FACTOR.
+
+    With the recorded state, a motion that inputs and state cancel as recorded, such as a hardly damped vibration, would
+    appear for smaller inputs, and with it an uncertainty of its parameters that no recording has.
+    """
+    initial = []
+    for r, state in zip(bench.recordings, fitted.initial, strict=True):
+        mean = np.mean(simulate_states(fitted, r, state), axis=0) if r.begins == "estimate" else state
+        initial.append(mean + INPUT_FACTOR * (state - mean) if np.all(np.isfinite(mean)) else state)
+    return replace(fitted, initial=initial)
 
 
 def _own_states(fitted: Fitted, count: int) -> np.ndarray:

@@ -12,6 +12,7 @@ from pilfr_casadi import laws
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.faults import samples
 from pilfr_casadi.diagnose.faults.samples import (
+    find_frozen_channels,
     find_glitches,
     find_held_outputs,
     mend,
@@ -73,6 +74,42 @@ def test_a_lost_sample_of_a_channel_that_rests_is_a_glitch():
     y = np.full(1400, 23.0)
     y[700] = 0.0
     assert find_glitches(y)[0].tolist() == [700]
+
+
+@pytest.mark.parametrize("kind", ["frozen", "both", "rest", "limit", "coarse", "slow"])
+def test_a_channel_that_stands_still_while_the_machine_moves_is_noted(kind):
+    rng, t = np.random.default_rng(0), np.arange(600)
+    drive = np.sin(t / 30) + 0.01 * rng.standard_normal(600)
+    y = np.cos(t / 30) + 0.01 * rng.standard_normal(600)
+    if kind == "coarse":
+        y = np.round(y, 1)
+    y[300:340] = y[300]
+    if kind == "both":
+        drive[300:340] = drive[300]
+    if kind == "rest":  # until the input changes
+        drive[300:341] = drive[300]
+    if kind == "limit":
+        y = np.maximum(y, y[300])
+    if kind == "slow":
+        y[340:] += y[300] - y[340]  # it goes on from where it stood
+    inputs = np.column_stack([drive, rng.standard_normal(600)] if kind == "both" else [drive])
+    r = pilfr.Recording(inputs, y[:, None], 0.1, inputs=("u", "v")[: inputs.shape[1]], outputs=("y",))
+    found = find_frozen_channels([r])
+    assert [g.channel for g in found] == {"frozen": ["y"], "both": ["u", "y"]}.get(kind, [])
+    assert all(g.value == 40 and "from t = 30 s to 33.9 s" in g.sentence for g in found)
+
+
+@pytest.mark.parametrize("late", [0, 1])
+def test_the_answer_to_a_pulse_of_an_input_is_no_glitch(late):
+    """As the flow of a brook on the day of a thunderstorm, or on the next day."""
+    rng = np.random.default_rng(0)
+    rain = np.zeros((1000, 1))
+    rain[[300, 620], 0] = 18.0, 12.0
+    y = 0.3 + 0.02 * rng.standard_normal(1000) + 0.3 * np.roll(rain[:, 0], late)
+    y[800] += 4.0  # nothing drives it
+    r = pilfr.Recording(rain, y[:, None], 1.0, inputs=("rain",), outputs=("flow",))
+    assert np.flatnonzero(mend(r).y != r.y).tolist() == [800]
+    assert find_glitches(y)[0].tolist() == [300 + late, 620 + late, 800]
 
 
 @pytest.mark.slow

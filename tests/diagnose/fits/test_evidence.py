@@ -146,6 +146,24 @@ def test_other_inputs_that_lead_past_an_unstable_rest_do_not_count_as_ignorance_
     assert spread(bench, fitted, (), fitted.cost, 600.0) < 0.01 * fitted.cost  # one value from 600 samples
 
 
+def test_a_vibration_that_does_not_occur_does_not_make_predictions_less_sure():
+    """The recording begins in the course of a slow motion, which hardly excites a plate that hardly damps."""
+    plate = pilfr.Simulator(
+        lambda x, u, p: {"q": x.v, "v": p.w**2 * (u.force - x.q) - 2 * p.zeta * p.w * x.v},
+        lambda x: {"q": x.q},
+        states=("q", "v"),
+        inputs=("force",),
+        parameters={"w": pilfr.Parameter(60.0, bounds=(30, 120)), "zeta": pilfr.Parameter(1e-3, bounds=(1e-4, 0.1))},
+        hold="linear",
+    )
+    t = 0.01 * np.arange(800)[:, None] + 1
+    force = np.sin(1.3 * t) + np.sin(2.1 * t + 1)
+    y = force + 0.05 * np.random.default_rng(0).standard_normal(force.shape)
+    bench = Workbench.of(plate, [pilfr.Recording(force, y, 0.01, ("force",), ("q",))], "linear")
+    fitted = bench.fit(plate)
+    assert spread(bench, fitted, (), fitted.cost, 800.0) < 4 / 800 * fitted.cost  # two values and two states
+
+
 def test_first_states_of_laws_do_not_make_predictions_less_sure_and_those_of_the_simulator_do():
     """Each piece of a recording has a first state of the lag, which says nothing of other inputs, and of the heater."""
     heater = pilfr.Simulator(
