@@ -227,15 +227,16 @@ def _choose(validated: Sequence[_Validated], sure: frozenset[Name] = frozenset()
 
     The smallest of many errors is small by chance as well. So a candidate with fewer laws, and all those whose names
     are sure, is chosen if its errors on the held-out blocks are not clearly larger (`HeldOut.clearly_above`); of those
-    with the fewest, the best.
+    with the fewest, the best. None of them has more laws than another one, such as the refit, and a larger expected
+    error as well: on the blocks alone it may look good, and fail on the second halves.
     """
     best = min(validated, key=lambda p: p[1].mean_square)
+    fewer = [p for p in validated if p[0].elements < best[0].elements and sure <= p[0].base.names]
     plainer = [
         p
-        for p in validated
-        if p[0].elements < best[0].elements
-        and sure <= p[0].base.names
-        and not p[1].held_out.clearly_above(best[1].held_out)
+        for p in fewer
+        if not p[1].held_out.clearly_above(best[1].held_out)
+        and not any(q[0].elements < p[0].elements and q[1].mean_square <= p[1].mean_square for q in fewer)
     ]
     return min(plainer, key=lambda p: (p[0].elements, p[1].mean_square), default=best)
 

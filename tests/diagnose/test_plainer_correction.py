@@ -64,6 +64,21 @@ def test_a_sure_law_stays() -> None:
     assert _choose([refit, named], frozenset({law})) is named  # type: ignore[list-item]
 
 
+def test_more_laws_and_a_larger_expected_error_than_the_refit_are_no_correction() -> None:
+    """On the held-out blocks it is hardly worse than the best, but on the second halves worse than the refit."""
+    uneven = BLOCKS * np.array([1.3, 0.9, 1.5, 0.9, 1.0, 0.9, 1.0, 0.9])
+    of = {0: held_out(1.4 * BLOCKS), 1: replace(held_out(uneven), ahead=0.3), 2: held_out(BLOCKS)}
+    assert of[0].clearly_above(of[2]) and not of[1].clearly_above(of[2])
+    assert of[1].mean_square > of[0].mean_square > of[2].mean_square
+    refit, one, two = (
+        (SimpleNamespace(elements=n, base=SimpleNamespace(names=frozenset[object]())), ExpectedError(found, 0.0))
+        for n, found in of.items()
+    )
+    assert _choose([refit, one, two]) is two  # type: ignore[list-item]
+    better = (one[0], ExpectedError(replace(of[1], ahead=of[1].blocks), 0.0))
+    assert _choose([refit, better, two]) is better  # type: ignore[list-item]
+
+
 def test_without_blocks_the_smallest_error_decides() -> None:
     assert HeldOut(0.2, 0.2, np.array([0.2])).clearly_above(HeldOut(0.1, 0.1, np.array([0.1])))
 
