@@ -163,11 +163,31 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
         stays = _far_better(search, candidates)
         late = uncompared_correction(search, stays.fitted, search.least_floor)
         return replace(late, late=True, closest=stays), stays.fitted
+    validated = _grow(search, validated)
+    validated = _grow(search, validated)
     chosen = _choose(validated)[0].base
     learned = _learned_candidates(search, search.memo[chosen.key]) if chosen.laws else []
     learned += _learned_candidates(search, search.root)
     validated = _cross_validate(search, learned, validated)
     return _describe_chosen(search, _choose(validated), validated[0], search.least_floor)
+
+
+def _grow(search: Search, validated: list[_Validated]) -> list[_Validated]:
+    """Add laws to the correction as long as that predicts better.
+
+    Of a model that is wrong throughout, few samples count, so that no second law is worth its prior; on data that were
+    left out it may be clearly better. The search did not look beyond such a correction.
+    """
+    while (chosen := _choose(validated)[0].base).laws and len(chosen.effects) < search.most_effects:
+        if search.expanded(chosen) or not search.may_go_on():
+            break
+        search.add(chosen)
+        more = [t for t in search.memo.values() if t.names > chosen.names and len(t.effects) == len(chosen.effects) + 1]
+        best = sorted((t for t in more if _may_recur(search, t)), key=lambda t: t.mean_square)[:FEW]
+        candidates = [_Candidate.of(search, search.thorough(t)) for t in best]
+        candidates = [c for c in candidates if not runs_away(search.bench, c.fitted, search.without)]
+        validated = _cross_validate(search, candidates, validated)
+    return validated
 
 
 def _describe_chosen(search: Search, chosen: _Validated, refit: _Validated, floor: Floor) -> tuple[Correction, Fitted]:

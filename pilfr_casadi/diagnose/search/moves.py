@@ -259,11 +259,11 @@ class Search(Forms):
                 rest = self.run_laws([e for e in best.laws if e is not element], best)
                 if not rest.mean_square < DIVERGED:
                     continue
-                if self.may_go_on() and not self._expanded(rest):  # from the values of all laws, which may be right
+                if self.may_go_on() and not self.expanded(rest):  # from the values of all laws, which may be right
                     self.keep(rest)
                     self.add(rest, few=True)
                 found = self.leave_out(best, [element])
-                wrong = found is not None and not self._expanded(found, FAR_RATIO)  # it had been in a wrong minimum
+                wrong = found is not None and not self.expanded(found, FAR_RATIO)  # it had been in a wrong minimum
                 if found is not None and wrong and self.can_improve(self.best) and self.may_go_on():
                     self.add(found, few=True)
             if self.best.key == best.key:
@@ -286,7 +286,7 @@ class Search(Forms):
                 if self.best.key == best.key:
                     return
 
-    def _expanded(self, trial: Trial, ratio: float = np.inf) -> bool:
+    def expanded(self, trial: Trial, ratio: float = np.inf) -> bool:
         """Tell whether laws were added to a hypothesis, at an error of at most `ratio` times the present one."""
         return any(m.parent.key == trial.key and m.parent.error <= ratio * trial.error for m in self.moves)
 
