@@ -4,6 +4,7 @@ If the named answer is not sure, or leaves error above the noise, several candid
 training recordings (`evidence`): the refitted simulator; the named laws, all of them and the sure ones alone; all
 likely hypotheses if no law is named; and a learned force, alone or beside laws. The score is the held-out error plus
 the spread of predictions for other inputs (`evidence.spread`), which is large if many parameters are hardly determined.
+A correction without a sure name grows by further laws as long as that predicts better (`_grow`).
 The smallest score wins, unless a candidate with fewer laws, but every sure one, is not clearly worse on the same blocks
 (`_choose`). Candidates are cross-validated in the order of their fit error plus spread, until that exceeds the smallest
 score; those that the search has cross-validated already count as well. When time runs out first, the hypothesis with
@@ -163,7 +164,6 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
         stays = _far_better(search, candidates)
         late = uncompared_correction(search, stays.fitted, search.least_floor)
         return replace(late, late=True, closest=stays), stays.fitted
-    validated = _grow(search, validated)
     validated = _grow(search, validated)
     chosen = _choose(validated)[0].base
     learned = _learned_candidates(search, search.memo[chosen.key]) if chosen.laws else []
