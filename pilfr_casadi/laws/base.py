@@ -378,7 +378,7 @@ class Law:
     def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:
         """Start values of this form for a law found in another form, with the means of strengths that vary.
 
-        A form that contains the found law begins where it equals it.
+        A form that contains the found law, or its base class, begins where it equals that.
         """
         own = {name: value for name, value in found.values.items() if name in cls.units}
         for name in own:
@@ -389,8 +389,12 @@ class Law:
 
     @classmethod
     def extends(cls, found: type[Law]) -> bool:
-        """Tell whether this form contains another, so that `as_base` says where both are equal."""
-        return cls.__base__ is found and "as_base" in vars(cls)
+        """Tell whether this form contains another one, or the base class that both contain; see `as_base`."""
+        if "as_base" not in vars(cls) or cls is found:
+            return False
+        base: Any = found.__base__
+        both = "as_base" in vars(found) and base.units.items() <= found.units.items()
+        return cls.__base__ is found or (both and cls.__base__ is base)
 
     @property
     def free(self) -> set[str]:

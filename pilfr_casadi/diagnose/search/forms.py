@@ -155,7 +155,7 @@ class Forms(Hypotheses):
         self.replace_variation(parent)
 
     def fit_finer_forms(self, trial: Trial) -> None:
-        """Fit a hypothesis with its added law in each form that contains it, if it was not fitted before."""
+        """Fit a hypothesis with its added law in each form that extends it, if it was not fitted before."""
         kind, others = type(trial.law), trial.key - {trial.pair}
         finer = [*FINER.get(kind, ()), *(k for k in self.laws if k.extends(kind))]
         self.fit_forms(trial, [k for k in finer if others | {(trial.port, k)} not in self.memo])

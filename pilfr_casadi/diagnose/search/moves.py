@@ -270,16 +270,19 @@ class Search(Forms):
                 return
 
     def compare_effects(self) -> None:
-        """Fit the best hypothesis without each of its effects, in other forms of each, and without its variations.
+        """Fit the best hypothesis in other forms of each effect, without each of several, and without their variations.
 
-        A later effect can make an earlier one, or its variation, idle. It can also show the finer form of one.
+        A later effect can make an earlier one, or its variation, idle. It can also show the right form of one; a wrong
+        form leaves an error that may pass for slow noise.
         """
-        with self.stage("without each effect"):
-            while len((best := self.best).effects) > 1 and not self.past_deadline:
+        with self.stage("forms of each effect"):
+            while (best := self.best).effects and not self.past_deadline:
                 for element in best.effects:
-                    self.leave_out(best, [element])
-                    if self.can_improve(best) and self.may_go_on():
+                    if self.may_go_on():
                         self.fit_finer_forms(best.with_added(element.pair))
+                    if len(best.effects) == 1:
+                        continue
+                    self.leave_out(best, [element])
                     plain = constant(type(element.law))
                     if plain is not type(element.law) and kind_of(element.port) != PARAMETER:
                         self.fit_forms(self.run_laws(best.laws, best).with_added(element.pair), [plain])
