@@ -146,7 +146,7 @@ class Check:
 
     def __str__(self) -> str:
         lines = [*self._error_lines(), ""]
-        lines += ["Blind spots of these recordings:"] if self.blind_spots else ["No blind spot was found."]
+        lines += ["Blind spots of these recordings:"] if self.blind_spots else [self._none_found()]
         lines += [f"- {b.sentence}" for b in self.blind_spots]
         lines += ["", *self._parameter_lines(), "", *self._law_lines()]
         if groups := [] if self.rough else list(self._group_lines()):
@@ -154,13 +154,21 @@ class Check:
         lines += ["", *self._excitation_lines(), "", *self._circumstances(), f"next record: {self.next_record}"]
         return "\n".join([*lines, f"computed in {self.seconds:.1f} s"])
 
+    @property
+    def _times_of_noise(self) -> float:
+        return self.error / max(float(np.mean(list(self.noise["share"].values()))), 1e-300)
+
+    def _none_found(self) -> str:
+        """Say that there is no blind spot; near wrong values that says little."""
+        near = " near the refitted values, which what is missing may distort" * (self._times_of_noise > ABOVE_NOISE)
+        return f"No blind spot was found{near}."
+
     def _error_lines(self) -> Iterator[str]:
         """State the error of the refitted simulator, and what follows if it is above the noise."""
-        floor = float(np.mean(list(self.noise["share"].values())))
-        times = self.error / max(floor, 1e-300)
-        yield f"refitted: error {percent(self.error)} of the outputs' deviation, {multiple(times)} times the noise"
-        if times > ABOVE_NOISE:
-            yield "  Something is missing, or the noise is slow. Refitted values may stand in for missing physics;"
+        times = multiple(self._times_of_noise)
+        yield f"refitted: error {percent(self.error)} of the outputs' deviation, {times} times the noise"
+        if self._times_of_noise > ABOVE_NOISE:
+            yield "  Something is missing, or the noise is slow. What is missing may distort the refitted values;"
             yield "  standard errors and detectable strengths count the noise alone."
 
     def _parameter_lines(self) -> Iterator[str]:
@@ -511,6 +519,12 @@ def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) ->
         return "One that begins at rest, with initial='zero'." if inputs else "One whose start you know and state."
     if found.ties:
         return f"No further record of these signals helps: measure {found.ties[0].names[0]} separately and fix it."
+    if bounded := [p.name for p in found.parameters if p.at_bound]:
+        where = "a bound" if len(bounded) == 1 else "bounds"
+        return (
+            f"None yet: {in_words(bounded)} came out at {where}, so that values or bounds are wrong, or physics is "
+            "missing, which `pilfr diagnose` finds out from these recordings."
+        )
     return "These recordings tell most things. For the test, take amplitudes that the training recordings do not have."
 
 

@@ -150,7 +150,7 @@ def _describe_effects(search: Hypotheses, found: Posterior) -> str:
         sentence = f"The simulator most likely leaves out {unsure}; {the} {names_are} {certain}."
     else:
         these = "these" if " and " in unsure else "this"
-        more = f"More acts beside that, most likely {unsure}; {these} {names_are} {certain}."
+        more = f"More acts beside that; the best guess is {unsure}, but {these} {names_are} {certain}."
         sentence = f"The simulator leaves out {sure}. {more}"
     return sentence + _describe_vanished(search, found)
 

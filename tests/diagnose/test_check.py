@@ -274,7 +274,7 @@ def test_a_switch_is_not_to_be_given_another_amplitude():
 def test_an_error_above_the_noise_is_told_first():
     given = record(MASS, noise_like(1))
     bent = check(MASS, given.with_(y=given.y + 0.3 * np.abs(given.y)), laws=())
-    assert str(bent).startswith("refitted: error") and "Refitted values may stand in for missing physics" in str(bent)
+    assert str(bent).startswith("refitted: error") and "What is missing may distort the refitted values" in str(bent)
     assert "Something is missing" not in str(check(MASS, given, laws=()))
 
 
@@ -578,3 +578,13 @@ def test_a_channel_in_another_unit_is_told():
     )
     assert f"\nunits: {found.conversions[0]}\n" in str(found)
     assert not pilfr.check(spring_rig(), recorded(spring_rig(), 0)).conversions
+
+
+def test_a_refit_that_is_far_off_is_not_said_to_have_no_blind_spot():
+    true = spring_rig().with_element("ground", CubicStiffness().at({"k_3": 2e3}))
+    tight = replace(spring_rig(), parameters={"k": Parameter(400.0, bounds=(350, 402)), "d": Parameter(4.0)})
+    found = pilfr.check(tight, recorded(true, 0), laws=())
+    found = replace(found, blind_spots=())
+    assert "No blind spot was found near the refitted values, which what is missing may distort." in str(found)
+    assert next(p for p in found.parameters if p.name == "k").at_bound
+    assert "None yet: k came out at a bound" in found.next_record
