@@ -386,6 +386,9 @@ class Law:
             own[name] = np.mean(ends, axis=0)
         based = cls.as_base if cls.extends(type(found)) else {}
         yield own | {name: value(found.values) if callable(value) else value for name, value in based.items()}
+        shape = next(cls().shapes(local)) if based else {}
+        if shape.keys() - own.keys():  # its further shape may be far from that of the base
+            yield shape | own
 
     @classmethod
     def extends(cls, found: type[Law]) -> bool:

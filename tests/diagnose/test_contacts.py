@@ -7,7 +7,7 @@ from diagnosis_example import recorded, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose.fits.evidence import FORMULA_ERROR, formula_tolerance
-from pilfr_casadi.laws import CoulombFriction, DampedContact, Law, LossyContact, PiecewiseStiffness
+from pilfr_casadi.laws import CoulombFriction, DampedContact, HertzContact, Law, LossyContact, PiecewiseStiffness
 
 DT = 0.01
 
@@ -56,6 +56,19 @@ def test_a_contact_with_loss_is_told_from_one_without():
     assert found.effects[0].form in ("above, with loss", "above, with damper") and found.effects[0].confidence > 0.9
     errors = found.errors["test"]
     assert errors["before"] > 1 and errors["after"] < 0.1
+
+
+def test_forms_with_a_common_base_are_compared_for_a_single_effect_too():
+    """A wrong form leaves an error that may pass for slow noise."""
+    assert DampedContact.extends(LossyContact) and LossyContact.extends(DampedContact)
+    assert not HertzContact.extends(LossyContact) and not PiecewiseStiffness.extends(LossyContact)
+    train = pressed(slider().with_element("end stop", Pad().at({"k": 400.0, "c": 12.0, "g": 0.1})), 0)
+    search = pilfr.diagnose(slider(1.2), train, laws=(PiecewiseStiffness, LossyContact), workers=1).evidence.search
+    assert search.best.key == {("end stop", LossyContact)}
+    lossy, search.laws = search.best, (PiecewiseStiffness, LossyContact, DampedContact)
+    search.compare_effects()
+    damped = search.memo[frozenset({("end stop", DampedContact)})]
+    assert damped.error < lossy.error
 
 
 def test_friction_beside_a_contact_shows_its_damper():

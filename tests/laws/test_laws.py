@@ -486,7 +486,7 @@ def test_a_form_that_contains_its_base_equals_it_where_it_starts(kind):
     plain = kind.__base__()
     shape = next(iter(plain.shapes(local)))
     own = {**dict.fromkeys(plain.strength, 1.0), **shape}
-    (start,) = kind.finer_starts(plain.at(own), local)
+    start, *_ = kind.finer_starts(plain.at(own), local)
     form = unit_forces(kind(), local, [start])[:, 0]
     np.testing.assert_allclose(form, unit_forces(plain, local, [shape])[:, 0], atol=1e-9)
     assert set(start) == set(kind.units) and all(start[name] == 1.0 for name in kind.strength)
