@@ -1,5 +1,7 @@
 """Contacts that lose energy, in front of which a simulator without the contact runs away."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -72,7 +74,24 @@ def test_friction_beside_a_contact_shows_its_damper():
     search.memo = {key: trial for key, trial in search.memo.items() if key in (frozenset(), plain)}
     assert search.best.key == plain
     search.compare_effects()
-    assert search.best.key == {("ground", DampedContact), ("ground", CoulombFriction)}
+    key = frozenset({("ground", DampedContact), ("ground", CoulombFriction)})
+    assert search.best.key == key
+
+    found = search.memo[key]  # as a fit from other values that ended in a wrong minimum
+    search.memo[key] = replace(found, mean_square=2 * search.memo[plain].mean_square)
+    search.fit_finer_forms(search.memo[plain].with_added(("ground", PiecewiseStiffness)))
+    assert search.memo[key].mean_square == pytest.approx(found.mean_square, rel=0.05)
+
+
+def test_a_contact_that_never_pulls_takes_no_stiffness_away():
+    """A spring that softens beyond a point may be less stiff there; with a loss, that would give energy."""
+    train = recorded(rig().with_element("ground", PiecewiseStiffness().at({"k_c": -250.0, "g": 0.01})), 0, samples=500)
+    found = pilfr.diagnose(rig(430.0, 5.0), train, laws=(PiecewiseStiffness, LossyContact), workers=1)
+    search, plain = found.evidence.search, frozenset({("ground", PiecewiseStiffness)})
+    assert search.memo[plain].own["k_c"] < 0
+    search.memo = {key: search.memo[key] for key in (frozenset(), plain)}
+    search.fit_finer_forms(search.memo[plain])
+    assert search.memo[frozenset({("ground", LossyContact)})].own["k_c"] >= 0
 
 
 def test_a_simulator_that_runs_away_excuses_no_error():
