@@ -228,7 +228,7 @@ class LossyContactBelow(PiecewiseStiffnessBelow, LossyContact):
 class DampedContact(PiecewiseStiffness):
     """A contact with spring and damper that never pulls, as of a rubber pad; its force has no jump where it begins.
 
-    What comes fast is pressed upon a little before the point, by T dz/dt, as if the damper reached out.
+    It acts from z = g - T dz/dt on, which is a little before the point if the motion towards it is fast.
     """
 
     form = "above, with damper"
