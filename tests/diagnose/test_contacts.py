@@ -94,6 +94,27 @@ def test_a_contact_that_never_pulls_takes_no_stiffness_away():
     assert search.memo[frozenset({("ground", LossyContact)})].own["k_c"] >= 0
 
 
+def test_a_heat_path_that_sets_in_at_a_temperature_is_no_contact():
+    """Finer forms are of the port's physical domain as well."""
+    room = pilfr.Simulator(
+        lambda x, u, p: {"T": (u.heat - p.k * x.T) / 20},
+        lambda x: {"T": x.T},
+        states=("T",),
+        inputs=("heat",),
+        parameters={"k": pilfr.Parameter(0.6, unit="W/K", bounds=(0.05, 5))},
+        ports=pilfr.Port("wall", {"T": -0.05}, lambda x: x.T, unit="W", across_unit="K"),
+    )
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-15, 30, 20), 25)[:, None]
+    r = pilfr.Recording(u, np.zeros((500, 1)), 1.0, ("heat",), ("T",), initial="zero", hold="zero")
+    y = room.with_element("wall", PiecewiseStiffness().at({"k_c": 1.5, "g": 10.0})).simulate(r)
+    train = r.with_(y=y + 0.02 * rng.standard_normal(y.shape))
+    found = pilfr.diagnose(room, train, laws=("piecewise_stiffness",), workers=1)
+    assert [(e.law, e.form) for e in found.effects] == [("piecewise_stiffness", "above")]
+    tried = {kind for key in found.evidence.search.memo for _, kind in key}
+    assert PiecewiseStiffness in tried and not {LossyContact, DampedContact} & tried
+
+
 def test_a_simulator_that_runs_away_excuses_no_error():
     assert formula_tolerance(np.array([0.5]), 0.1) == pytest.approx(0.4 * FORMULA_ERROR)
     assert formula_tolerance(np.array([400.0, 0.5]), 0.0) == pytest.approx(0.75 * FORMULA_ERROR)

@@ -158,7 +158,8 @@ class Forms(Hypotheses):
     def fit_finer_forms(self, trial: Trial) -> None:
         """Fit a hypothesis with its added law in each form that contains it, if that was not fitted as well before."""
         kind, others, most = type(trial.law), trial.key - {trial.pair}, EQUAL_RATIO * trial.mean_square
-        finer = [*FINER.get(kind, ()), *(k for k in self.laws if k.extends(kind))]
+        port = self.bench.simulator.port(trial.port)
+        finer = [k for k in (*FINER.get(kind, ()), *(k for k in self.laws if k.extends(kind))) if port.admits(k)]
         known = {k: self.memo.get(others | {(trial.port, k)}) for k in finer}
         self.fit_forms(trial, [k for k, found in known.items() if found is None or found.mean_square > most])
 
