@@ -9,7 +9,15 @@ from diagnosis_example import recorded, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose.fits.evidence import FORMULA_ERROR, formula_tolerance
-from pilfr_casadi.laws import CoulombFriction, DampedContact, Law, LossyContact, PiecewiseStiffness
+from pilfr_casadi.laws import (
+    AsymmetricCubicStiffness,
+    CoulombFriction,
+    CubicStiffness,
+    DampedContact,
+    Law,
+    LossyContact,
+    PiecewiseStiffness,
+)
 
 DT = 0.01
 
@@ -92,6 +100,19 @@ def test_a_contact_that_never_pulls_takes_no_stiffness_away():
     search.memo = {key: search.memo[key] for key in (frozenset(), plain)}
     search.fit_finer_forms(search.memo[plain])
     assert search.memo[frozenset({("ground", LossyContact)})].own["k_c"] >= 0
+
+
+def test_a_softening_spring_may_have_finer_forms_where_a_contact_was_screened_first():
+    """A contact pushes back; that is no reason why the other laws of the position should."""
+    train = recorded(rig().with_element("ground", CubicStiffness().at({"k_3": -4e3})), 0, samples=500)
+    found = pilfr.diagnose(rig(430.0, 5.0), train, laws=(CubicStiffness, LossyContact), workers=1)
+    search, plain = found.evidence.search, frozenset({("ground", CubicStiffness)})
+    first = search.moves[0]
+    by_sense = tuple(sorted(first.scored, key=lambda s: -s.sense))
+    search.moves[0] = replace(first, scored=by_sense)
+    assert by_sense[0].sense == 1 and search.memo[plain].own["k_3"] < 0
+    search.fit_forms(search.memo[plain], [AsymmetricCubicStiffness])
+    assert search.memo[frozenset({("ground", AsymmetricCubicStiffness)})].own["k_3"] < 0
 
 
 def test_a_heat_path_that_sets_in_at_a_temperature_is_no_contact():

@@ -215,8 +215,8 @@ class Forms(Hypotheses):
 
         def fit(kind: Any) -> Trial | None:
             starts = list(kind.finer_starts(trial.law.at(trial.own), entry.local))
-            own_sense = self._sense(trial.port, kind) if kind.restoring and not entry.sense else entry.sense
-            placed = [place_law(bare, replace(entry, law=kind(), sense=own_sense), own, index) for own in starts]
+            sense = entry.sense if law.dissipative else self._sense(trial.port, constant(kind))
+            placed = [place_law(bare, replace(entry, law=kind(), sense=sense), own, index) for own in starts]
             values = [{**base.values, **named} for _, named in placed]
             found = self.fits.fit(placed[0][0], values, len(trial.laws), states=base.begin)
             return found and found.with_added((trial.port, kind))
