@@ -209,9 +209,10 @@ def nameless_blocks(diagnosis: Diagnosis) -> list[Block]:
     """Describe the laws of a correction without a sure name: equations, values, and the laws that explain as much."""
     out = list[Block]()
     for law in diagnosis.nameless_laws:
-        out += [Text(f"{law.name[0].upper()}{law.name[1:]}{law.doubt}:"), Code(law.equation)]
+        out += [Text(f"{law.name[0].upper()}{law.name[1:]}:"), Code(law.equation)]
         rows = [[name, value, unit or "–"] for name, (value, unit) in law.values.items()]
         out += [Table(["parameter", "value", "unit"], rows)] if rows else []
+        out += [Text(f"{law.doubt[0].upper()}{law.doubt[1:]}.")] if law.doubt else []
         out += [Text(f"These recordings cannot tell it apart from {law.alike}.")] if law.alike else []
     return out
 

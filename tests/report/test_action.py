@@ -1,6 +1,7 @@
 """The element of a fitted simulator that an effect is, and how it acts."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from diagnosis_rig import recordings, rig
 from pilfr_casadi import Recording
 from pilfr_casadi.diagnose import Effect, Workbench, law_signals
 from pilfr_casadi.diagnose.faults.offsets import Offset
+from pilfr_casadi.diagnose.result_text import NamelessLaw
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, LinearStiffness, LossyContact, ViscousDamping
-from pilfr_casadi.report.diagnosis_tables import element_of, measure_action
+from pilfr_casadi.report.diagnosis_tables import element_of, measure_action, nameless_blocks
+from pilfr_casadi.report.page import Text
 
 
 def test_an_effect_is_found_behind_an_offset():
@@ -78,3 +81,12 @@ def test_what_a_spring_stores_is_no_damping(law, d, damping):
     action = measure_action(bench, fitted, Effect("ground", law.id, 0.9, "", "", {}, ()), 0)
     rows = {row[0]: row[1] for row in action.table.rows}
     assert rows.get("equivalent damping") == (damping if damping is None else pytest.approx(damping, abs=1e-3))
+
+
+def test_what_speaks_against_a_law_without_a_sure_name_is_a_sentence():
+    law = NamelessLaw("dry friction at ground", "w = F_c sign(v)", "as fitted it helps the motion", {}, "")
+    blocks = nameless_blocks(SimpleNamespace(nameless_laws=[law]))
+    assert [b.text for b in blocks if isinstance(b, Text)] == [
+        "Dry friction at ground:",
+        "As fitted it helps the motion.",
+    ]

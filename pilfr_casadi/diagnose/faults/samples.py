@@ -265,7 +265,7 @@ def find_frozen_channels(recordings: Sequence[Recording]) -> list[Gate]:
 
 
 def _is_fine(columns: Sequence[np.ndarray]) -> bool:
-    """Tell whether most steps of a channel lead to another value, and most of its values are different."""
+    """Tell whether most samples of a channel have a value of their own."""
     together = np.concatenate(columns)
     return len(np.unique(together)) > DISTINCT_SHARE * len(together)
 
